@@ -1,0 +1,235 @@
+"""Elastic energy of the sheet on linear triangles: harmonic, neo-Hookean, Mooney-Rivlin; the paper's affine quadrilaterals.
+
+With the rest metric `G` and the deformed metric `g` of a triangle's edges, `I = tr(G^-1 g)` and `D = det g / det G` are the
+invariants of `C = F^T F`; the energy per rest area is `W(I, D)`. Everything is in units of shear modulus x thickness (at rest,
+that is already stretched) unless these are given; the prestretch `l` is that of the rest state.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from .errors import MembraneError
+from .membrane import Membrane, corners, corners_to_vertices, triangles_of, triangles_to_corners
+
+MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
+_FIRST = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+_SECOND = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+_EDGES = ((-1.0, 1.0, 0.0), (-1.0, 0.0, 1.0))
+
+
+class Derivatives(NamedTuple):
+    """Derivatives of `W(I, D)`."""
+
+    I: Tensor  # noqa: E741
+    D: Tensor
+    ID: Tensor
+    DD: Tensor
+    convex_D: Tensor
+    """The part of `D` that comes from terms convex in the metric; the rest is left out of the stiffness (Gauss-Newton)."""
+
+
+class Sheet(nn.Module):
+    """The sheet's elastic energy `U(x)`, its gradient, and its stiffness along given directions.
+
+    Arguments: the membrane; `model` harmonic | neo_hookean | mooney_rivlin; `prestretch` l; `modulus` = shear modulus x
+    thickness at rest (force / length); `c2_ratio` = C2 / C1.
+
+    harmonic       `W = mu/2 l^2 (I - 2)` (eq. 11 with the 1/2 and the area element that the printed formula lacks)
+    neo_hookean    `W = mu/2 (l^2 I + 1 / (l^4 D) - 3)`
+    mooney_rivlin  `W = C1 (I1 - 3) + C2 (I2 - 3)`, `I1 = l^2 I + 1 / (l^4 D)`, `I2 = l^4 D + I / (l^2 D)`, `2 (C1 + C2) = mu`
+    """
+
+    def __init__(self, membrane: Membrane, model="neo_hookean", prestretch=1.0, modulus=1.0, c2_ratio=0.0):
+        super().__init__()
+        if model not in MODELS:
+            raise MembraneError(f"Sheet: model = {model!r}; expected one of {', '.join(MODELS)}")
+        self.model, self.grid = model, membrane.grid
+        c2 = modulus / 2 * c2_ratio / (1 + c2_ratio) if model == "mooney_rivlin" else 0.0
+        for name, value in (("prestretch", prestretch), ("c1", modulus / 2 - c2), ("c2", c2)):
+            self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
+        g11, g12, g22 = _metric(_edges(membrane.rest, self.grid))
+        det = g11 * g22 - g12**2
+        self.register_buffer("inverse_metric", torch.stack([g22, -g12, g11], -1) / det[..., None])
+        self.register_buffer("rest_det", det)
+        self.register_buffer("rest_triangle_area", det.sqrt() / 2)
+
+    def _invariants(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        edges = _edges(x, self.grid)
+        g11, g12, g22 = _metric(edges)
+        G = self.inverse_metric
+        first = G[..., 0] * g11 + 2 * G[..., 1] * g12 + G[..., 2] * g22
+        return edges, first, torch.stack([g22, -g12, g11], -1), (g11 * g22 - g12**2) / self.rest_det
+
+    def density(self, I: Tensor, D: Tensor) -> Tensor:  # noqa: E741
+        """Energy per rest area `W(I, D)`."""
+        l2, c1, c2 = self.prestretch**2, self.c1, self.c2
+        if self.model == "harmonic":
+            return c1 * l2 * (I - 2)
+        return c1 * (l2 * I + 1 / (l2**2 * D) - 3) + c2 * (l2**2 * D + I / (l2 * D) - 3)
+
+    def derivatives(self, I: Tensor, D: Tensor) -> Derivatives:  # noqa: E741
+        """First and second derivatives of `density`."""
+        l2, c1, c2 = self.prestretch**2, self.c1, self.c2
+        if self.model == "harmonic":
+            zero = torch.zeros_like(I)
+            return Derivatives(c1 * l2 + zero, zero, zero, zero, zero)
+        convex_D = -c1 / (l2**2 * D**2) - c2 * I / (l2 * D**2)
+        return Derivatives(
+            c1 * l2 + c2 / (l2 * D),
+            convex_D + c2 * l2**2,
+            -c2 / (l2 * D**2),
+            2 * c1 / (l2**2 * D**3) + 2 * c2 * I / (l2 * D**3),
+            convex_D,
+        )
+
+    def energy(self, x: Tensor) -> Tensor:
+        """`U(x)`, `[..., V, 3]` to `[...]`."""
+        _, I, _, D = self._invariants(x)  # noqa: E741
+        return (self.rest_triangle_area * self.density(I, D)).sum((-1, -2, -3))
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """`dU/dx`, `[..., V, 3]`: the sheet's forces with opposite sign."""
+        edges, I, adj, D = self._invariants(x)  # noqa: E741
+        w = self.derivatives(I, D)
+        forces = torch.einsum("...ab,...bc->...ac", _symmetric(self._stress(w, adj)), edges)
+        return _from_edges(forces, self.grid)
+
+    def _stress(self, w: Derivatives, adj: Tensor) -> Tensor:
+        """Stress times area in edge components `[..., 3]` (11, 12, 22): force on edge a is `sum_b S_ab e_b`."""
+        scale = 2 * self.rest_triangle_area[..., None]
+        return scale * (w.I[..., None] * self.inverse_metric + (w.D / self.rest_det)[..., None] * adj)
+
+    def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
+        """Positive semi-definite stiffness of displacements along one direction a vertex.
+
+        Arguments: `x [..., V, 3]`, `directions [..., V, 3]`. Returns the corner matrices `[..., m-1, n-1, 4, 4]`, whose sum
+        over quadrilaterals is `K_kl = d_k . H_kl d_l` with `H` the Hessian of `U`: exact where the sheet is in tension (for
+        Mooney-Rivlin without the term of `D` that is not convex), and for the harmonic energy `L_kl d_k . d_l` (eq. 64).
+        """
+        edges, I, adj, D = self._invariants(x)  # noqa: E741
+        w = self.derivatives(I, D)
+        d = triangles_of(corners(directions, self.grid))
+        edge_map = torch.tensor(_EDGES, dtype=x.dtype, device=x.device)
+        S = _symmetric(_tension(self._stress(w, adj)))
+        K = torch.einsum("...ab,ak,bl->...kl", S, edge_map, edge_map) * (d @ d.mT)
+        if self.model != "harmonic":
+            K = K + self._metric_stiffness(w, edges, adj, d, edge_map)
+        return self._quadrilaterals(K)
+
+    def _metric_stiffness(self, w, edges, adj, d, edge_map):
+        projected = torch.einsum("...ac,...kc->...ak", edges, d)
+        d11 = 2 * projected[..., 0, :] * edge_map[0]
+        d22 = 2 * projected[..., 1, :] * edge_map[1]
+        d12 = projected[..., 0, :] * edge_map[1] + projected[..., 1, :] * edge_map[0]
+        G, det = self.inverse_metric, self.rest_det[..., None]
+        dI = G[..., 0:1] * d11 + 2 * G[..., 1:2] * d12 + G[..., 2:3] * d22
+        dD = (adj[..., 0:1] * d11 + 2 * adj[..., 1:2] * d12 + adj[..., 2:3] * d22) / det
+        outer = lambda p, q: p[..., :, None] * q[..., None, :]  # noqa: E731
+        area = self.rest_triangle_area
+        K = (area * w.DD)[..., None, None] * outer(dD, dD)
+        K = K + (area * w.ID)[..., None, None] * (outer(dI, dD) + outer(dD, dI))
+        bilinear = outer(d11, d22) + outer(d22, d11) - 2 * outer(d12, d12)
+        return K + (area * w.convex_D / self.rest_det)[..., None, None] * bilinear
+
+    @staticmethod
+    def _quadrilaterals(K: Tensor) -> Tensor:
+        first, second = (torch.tensor(t, dtype=K.dtype, device=K.device) for t in (_FIRST, _SECOND))
+        return first.T @ K[..., 0, :, :] @ first + second.T @ K[..., 1, :, :] @ second
+
+    @property
+    def tension(self) -> Tensor:
+        """Rest tension (force / length): the isotropic stress resultant at `x = X`."""
+        two, one = self.prestretch.new_tensor(2.0), self.prestretch.new_tensor(1.0)
+        w = self.derivatives(two, one)
+        return 2 * (w.I + w.D)
+
+
+def _edges(x: Tensor, grid) -> Tensor:
+    p = triangles_of(corners(x, grid))
+    return p[..., 1:, :] - p[..., :1, :]
+
+
+def _from_edges(forces: Tensor, grid) -> Tensor:
+    first = -forces.sum(-2, keepdim=True)
+    return corners_to_vertices(triangles_to_corners(torch.cat([first, forces], -2)), grid)
+
+
+def _metric(edges: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    e1, e2 = edges.unbind(-2)
+    return (e1 * e1).sum(-1), (e1 * e2).sum(-1), (e2 * e2).sum(-1)
+
+
+def _symmetric(components: Tensor) -> Tensor:
+    s11, s12, s22 = components.unbind(-1)
+    return torch.stack([torch.stack([s11, s12], -1), torch.stack([s12, s22], -1)], -2)
+
+
+def _tension(stress: Tensor) -> Tensor:
+    """The positive semi-definite part of a symmetric 2 x 2 matrix given as (11, 12, 22)."""
+    s11, s12, s22 = stress.unbind(-1)
+    mean, half = (s11 + s22) / 2, (s11 - s22) / 2
+    radius = (half**2 + s12**2).clamp_min(torch.finfo(stress.dtype).tiny).sqrt()
+    high, low = (mean + radius).clamp_min(0), (mean - radius).clamp_min(0)
+    centre, slope = (high + low) / 2, (high - low) / (2 * radius)
+    return torch.stack([centre + slope * half, slope * s12, centre - slope * half], -1)
+
+
+class AffineQuadrilaterals(nn.Module):
+    """The paper's element: one affine map fitted to the four corners (eqs. 15-18), linear in the corner positions.
+
+    The map is fitted in the plane of the quadrilateral (spanned by its diagonals; in space G of eq. 16 is singular), so that
+    `A [3, 2] = sum_k x_k g_k^T` with constant `g_k`, and `E = 1/2 tension sum area tr(A^T A)` (eq. 12 with its 1/2).
+    It is blind to the hourglass mode: use it with the smoother (eq. 28).
+    """
+
+    def __init__(self, membrane: Membrane, tension: float = 1.0):
+        super().__init__()
+        self.grid = membrane.grid
+        p = corners(membrane.rest, self.grid)
+        diagonal_1, diagonal_2 = p[..., 2, :] - p[..., 0, :], p[..., 3, :] - p[..., 1, :]
+        normal = torch.linalg.cross(diagonal_1, diagonal_2)
+        area = torch.linalg.vector_norm(normal, dim=-1) / 2
+        axis_1 = nn.functional.normalize(diagonal_1, dim=-1)
+        axis_2 = nn.functional.normalize(torch.linalg.cross(normal, axis_1), dim=-1)
+        centred = p - p.mean(-2, keepdim=True)
+        plane = torch.stack([(centred * axis_1[..., None, :]).sum(-1), (centred * axis_2[..., None, :]).sum(-1)], -1)
+        g11, g12, g22 = (plane[..., a] * plane[..., b] for a, b in ((0, 0), (0, 1), (1, 1)))
+        g11, g12, g22 = g11.sum(-1), g12.sum(-1), g22.sum(-1)
+        inverse = torch.stack([torch.stack([g22, -g12], -1), torch.stack([-g12, g11], -1)], -2)
+        inverse = inverse / (g11 * g22 - g12**2)[..., None, None]
+        self.register_buffer("map_weights", plane @ inverse)
+        self.register_buffer("tension", torch.as_tensor(tension, dtype=torch.float64).clone())
+        self.register_buffer("area", area)
+
+    def affine_maps(self, x: Tensor) -> Tensor:
+        """Linear parts `A [..., m-1, n-1, 3, 2]` of the maps from each quadrilateral's rest plane."""
+        return torch.einsum("...kc,...ka->...ca", corners(x, self.grid), self.map_weights)
+
+    def energy(self, x: Tensor) -> Tensor:
+        """`1/2 tension sum area tr(A^T A)`, `[..., V, 3]` to `[...]`; less the rest's, as `Sheet`'s harmonic energy."""
+        maps = self.affine_maps(x)
+        return self.tension / 2 * (self.area * ((maps**2).sum((-1, -2)) - 2)).sum((-1, -2))
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """`dE/dx`, `[..., V, 3]`."""
+        maps = self.affine_maps(x) * (self.tension * self.area)[..., None, None]
+        return corners_to_vertices(torch.einsum("...ca,...ka->...kc", maps, self.map_weights), self.grid)
+
+    def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
+        """Corner matrices `[..., m-1, n-1, 4, 4]` of `K = L o (R R^T)`, exactly quadratic: `x` is not looked at."""
+        d = corners(directions, self.grid)
+        L = (self.tension * self.area)[..., None, None] * (self.map_weights @ self.map_weights.mT)
+        return L * (d @ d.mT)
+
+    def q_matrix(self, directions: Tensor) -> Tensor:
+        """The paper's `Q` (eq. 18), `[..., 6 (m-1)(n-1), V]`: rows are the weighted entries of all maps, linear in `t`.
+
+        `||Q t||^2 = t^T K t`. Dense: for study and tests, the estimator works with its square.
+        """
+        V = self.grid[0] * self.grid[1]
+        one = torch.eye(V, dtype=directions.dtype, device=directions.device)
+        moved = one[..., :, None] * directions[..., None, :, :]
+        maps = self.affine_maps(moved) * (self.tension * self.area).sqrt()[..., None, None]
+        return maps.flatten(-4).mT
