@@ -93,7 +93,9 @@ class FlowInterpolation(nn.Module):
     def forward(self, displacement: Tensor, confidence: Tensor) -> Tensor:
         W, c = self.weights, confidence[..., None]
         b = W.mT @ (c * torch.where(c > 0, displacement, 0.0))
-        return conjugate_gradient(lambda f: W.mT @ (c * (W @ f)) + self.bending @ f, lambda f: self.inverse @ f, b, self.steps)
+        return conjugate_gradient(
+            lambda f: W.mT @ (c * (W @ f)) + self.bending @ f, lambda f: self.inverse @ f, b, self.steps
+        )
 
 
 def _laplacian(membrane: Membrane) -> Tensor:

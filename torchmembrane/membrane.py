@@ -101,7 +101,7 @@ class Membrane(nn.Module):
         return self._thirds_to_vertices(area).squeeze(-1)
 
     def normals(self, x: Tensor) -> Tensor:
-        """Unit outward normals at the vertices, `[..., V, 3]`: area vectors summed; inside the rim the volume gradient's direction."""
+        """Unit outward normals at the vertices, `[..., V, 3]`: of the summed area vectors, as the volume gradient's."""
         return F.normalize(self._thirds_to_vertices(self.area_vectors(x)), dim=-1)
 
     def volume(self, x: Tensor) -> Tensor:
@@ -159,15 +159,15 @@ class Membrane(nn.Module):
 
     def ray_points(self, origins, directions) -> SurfacePoints:
         """Where rays `[D, 3]` first meet the rest surface; `distance` is the range along the ray, NaN where it misses."""
-        O, d = np.asarray(origins, dtype=float)[:, None], np.asarray(directions, dtype=float)[:, None]
+        start, d = (np.asarray(a, dtype=float)[:, None] for a in (origins, directions))
         T = self.triangles.cpu().numpy()
         a, b, c = self.rest.cpu().double().numpy()[T].transpose(1, 0, 2)
         normal = np.cross(b - a, c - a)
         with np.errstate(divide="ignore", invalid="ignore"):
             area2 = (d * normal).sum(-1)
-            ranges = ((a - O) * normal).sum(-1) / area2
-            u = (np.cross(c - a, d) * (O - a)).sum(-1) / area2
-            v = (np.cross(d, b - a) * (O - a)).sum(-1) / area2
+            ranges = ((a - start) * normal).sum(-1) / area2
+            u = (np.cross(c - a, d) * (start - a)).sum(-1) / area2
+            v = (np.cross(d, b - a) * (start - a)).sum(-1) / area2
         w = np.stack([1 - u - v, u, v], -1)
         hit = (w > -1e-9).all(-1) & (ranges > 0)
         ranges = np.where(hit, ranges, np.inf)
@@ -196,7 +196,9 @@ def _checked_grid(vertices, fixed):
         )
     if not fixed[border].all():
         i, j = np.argwhere(border & ~fixed)[0]
-        raise MembraneError(f"Membrane: border vertex ({i}, {j}) is free; expected every border vertex to be fixed (the rim)")
+        raise MembraneError(
+            f"Membrane: border vertex ({i}, {j}) is free; expected every border vertex to be fixed (the rim)"
+        )
     if fixed.all():
         raise MembraneError("Membrane: every vertex is fixed; expected free vertices inside the rim")
     return X, fixed

@@ -21,7 +21,7 @@ VOLUMES = ("exact", "linear")
 
 
 class Equilibrium(NamedTuple):
-    """Surface `vertices [..., V, 3]`, pressure difference `[...]`, volume `[...]`, largest last step over the surface's size `[...]`."""
+    """`vertices [..., V, 3]`, pressure difference `[...]`, volume `[...]`, last step over the surface's size `[...]`."""
 
     vertices: Tensor
     pressure: Tensor
@@ -51,7 +51,11 @@ class MinimumEnergy(nn.Module):
     def __init__(self, membrane: Membrane, sheet: Sheet, rest_rays, element="triangle", smoothing=0.0, filling="liquid",
                  gas: tuple[float, float] | None = None, volume="exact", steps=8, solver_steps=12):  # fmt: skip
         super().__init__()
-        for name, value, known in (("element", element, ELEMENTS), ("filling", filling, FILLINGS), ("volume", volume, VOLUMES)):
+        for name, value, known in (
+            ("element", element, ELEMENTS),
+            ("filling", filling, FILLINGS),
+            ("volume", volume, VOLUMES),
+        ):
             if value not in known:
                 raise MembraneError(f"MinimumEnergy: {name} = {value!r}; expected one of {', '.join(known)}")
         if filling == "gas" and gas is None:
@@ -74,12 +78,12 @@ class MinimumEnergy(nn.Module):
     def _rest_inverse(self, directions: Tensor) -> Tensor:
         K = self.energy.stiffness_along(self.membrane.rest, directions)
         V, free = len(self.membrane.rest), self.membrane.free
-        dense = self._apply(K, torch.eye(V, dtype=torch.float64))[free][:, free]
+        dense = self._stiffness_product(K, torch.eye(V, dtype=torch.float64))[free][:, free]
         inverse = torch.zeros(V, V, dtype=torch.float64)
         inverse[free[:, None], free] = torch.linalg.inv(dense)
         return inverse
 
-    def _apply(self, K: Tensor, y: Tensor) -> Tensor:
+    def _stiffness_product(self, K: Tensor, y: Tensor) -> Tensor:
         moves, grid = self.moves[:, None], self.membrane.grid
         product = corners_to_vertices(K @ corners(moves * y, grid), grid)
         return moves * (product + self.smoothing * self._smoother(self._smoother(moves * y)))
@@ -123,7 +127,7 @@ class MinimumEnergy(nn.Module):
         load = load - self.smoothing * self.moves * self._smoother(self._smoother(psi)).squeeze(-1)
         K = self.energy.stiffness_along(x, directions)
         solved = conjugate_gradient(
-            lambda y: self._apply(K, y), lambda y: self.inverse @ y, torch.stack([load, v], -1), self.solver_steps
+            lambda y: self._stiffness_product(K, y), lambda y: self.inverse @ y, torch.stack([load, v], -1), self.solver_steps
         )
         y, g = solved.unbind(-1)
         if self.filling == "open":

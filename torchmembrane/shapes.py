@@ -32,7 +32,7 @@ def ellipsoid_cap(semi_axes, base_z: float, grid=(17, 17)) -> Membrane:
 
 
 def half_cylinder(radius: float, length: float, half_angle: float, base_z: float, grid=(17, 17)) -> Membrane:
-    """A cylinder along x, bulging away from the camera, `half_angle` degrees to both sides of the top, long edges at `base_z`."""
+    """A cylinder along x bulging away from the camera, `half_angle` degrees to both sides, long edges at `base_z`."""
     _positive("half_cylinder", radius=radius, length=length, half_angle=half_angle)
     if half_angle > 90:
         raise MembraneError(f"half_cylinder: half_angle = {half_angle}; expected at most 90 degrees")

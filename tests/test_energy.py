@@ -1,0 +1,178 @@
+"""Laws of the sheet's energy and of the paper's element."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchmembrane import MembraneError
+from torchmembrane.energy import MODELS, AffineQuadrilaterals, Sheet
+from torchmembrane.membrane import Membrane, corners, corners_to_vertices
+from torchmembrane.shapes import ellipsoid_cap, half_cylinder, spherical_cap
+
+ELASTIC = dict(prestretch=1.2, modulus=0.7, c2_ratio=0.15)
+
+
+@pytest.fixture(scope="module")
+def membrane():
+    return ellipsoid_cap((12, 9, 12), 2, (7, 8))
+
+
+def stretched(membrane, scale=1.08, noise=0.02):
+    generator = torch.Generator().manual_seed(0)
+    return scale * membrane.rest + noise * torch.randn(membrane.rest.shape, generator=generator, dtype=torch.float64)
+
+
+def dense(energy, membrane, x, directions):
+    K = energy.stiffness_along(x, directions)
+    one = torch.eye(len(membrane.rest), dtype=torch.float64)
+    return corners_to_vertices(K @ corners(one, membrane.grid), membrane.grid)
+
+
+def elements(membrane):
+    return [Sheet(membrane, model, **ELASTIC) for model in MODELS] + [AffineQuadrilaterals(membrane, 1.3)]
+
+
+def test_energy_density_is_that_of_the_principal_stretches():
+    """A plane sheet stretched by (a, b): closed forms with the 1/2 and the area that eqs. 11, 12, 54 leave out."""
+    X = np.stack(np.meshgrid(np.linspace(0, 2, 4), np.linspace(0, 3, 5), [5.0], indexing="ij"), -1)[:, :, 0]
+    plane = Membrane(X)
+    a, b, l, mu, r = 1.1, 0.95, ELASTIC["prestretch"], ELASTIC["modulus"], ELASTIC["c2_ratio"]  # noqa: E741
+    x = plane.rest * torch.tensor([a, b, 1.0], dtype=torch.float64)
+    s1, s2, s3 = (l * a) ** 2, (l * b) ** 2, 1 / (l**4 * a**2 * b**2)
+    c1, c2 = mu / 2 / (1 + r), mu / 2 * r / (1 + r)
+    closed = {
+        "harmonic": mu * l**2 / 2 * (a**2 + b**2 - 2),
+        "neo_hookean": mu / 2 * (s1 + s2 + s3 - 3),
+        "mooney_rivlin": c1 * (s1 + s2 + s3 - 3) + c2 * (s1 * s2 + s1 * s3 + s2 * s3 - 3),
+    }
+    for model, density in closed.items():
+        assert float(Sheet(plane, model, **ELASTIC).energy(x)) == pytest.approx(6 * density)
+    assert float(AffineQuadrilaterals(plane, mu * l**2).energy(x)) == pytest.approx(6 * closed["harmonic"])
+
+
+def test_gradient_is_autograd_of_energy(membrane):
+    for energy in elements(membrane):
+        x = stretched(membrane).requires_grad_()
+        (gradient,) = torch.autograd.grad(energy.energy(x), x)
+        torch.testing.assert_close(energy.gradient(x.detach()), gradient)
+
+
+def test_stiffness_is_the_hessian_along_the_directions_in_tension(membrane):
+    x = stretched(membrane)
+    d = torch.nn.functional.normalize(x + 0.3, dim=-1)
+    for energy in elements(membrane):
+        if getattr(energy, "model", "") == "mooney_rivlin":
+            continue
+        start = torch.zeros(len(x), dtype=torch.float64)
+        hessian = torch.autograd.functional.hessian(lambda t, e=energy: e.energy(x + t[:, None] * d), start)
+        torch.testing.assert_close(dense(energy, membrane, x, d), hessian, rtol=1e-9, atol=1e-9)
+
+
+def test_mooney_rivlin_stiffness_leaves_out_only_the_term_that_is_not_convex(membrane):
+    x = stretched(membrane)
+    d = torch.nn.functional.normalize(x, dim=-1)
+    sheet = Sheet(membrane, "mooney_rivlin", **ELASTIC)
+
+    edges, _, adj, D0 = sheet._invariants(x)
+
+    def with_linear_D(t):
+        """`C2 l^4 D` replaced by its tangent in the metric at `x`."""
+        moved, _, _, D = sheet._invariants(x + t[:, None] * d)
+        rise = moved @ moved.mT - edges @ edges.mT
+        tangent = adj[..., 0] * rise[..., 0, 0] + 2 * adj[..., 1] * rise[..., 0, 1] + adj[..., 2] * rise[..., 1, 1]
+        bend = D - D0 - tangent / sheet.rest_det
+        return sheet.energy(x + t[:, None] * d) - sheet.c2 * sheet.prestretch**4 * (sheet.rest_triangle_area * bend).sum()
+
+    start = torch.zeros(len(x), dtype=torch.float64)
+    hessian = torch.autograd.functional.hessian(with_linear_D, start)
+    torch.testing.assert_close(dense(sheet, membrane, x, d), hessian, rtol=1e-9, atol=1e-9)
+
+
+def test_stiffness_is_symmetric_and_positive_even_in_compression(membrane):
+    x = stretched(membrane, scale=0.8, noise=0.4)
+    d = torch.nn.functional.normalize(x, dim=-1)
+    for energy in elements(membrane):
+        K = dense(energy, membrane, x, d)
+        torch.testing.assert_close(K, K.T)
+        free = membrane.free
+        assert torch.linalg.eigvalsh(K[free][:, free])[0] > 0
+
+
+def test_harmonic_stiffness_is_the_hadamard_product(membrane):
+    """`K = L o (R R^T)` for any rays, and independent of the deformed surface."""
+    d = torch.nn.functional.normalize(stretched(membrane), dim=-1)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(d)
+    for energy in (Sheet(membrane, "harmonic", 1.2), AffineQuadrilaterals(membrane, 1.44)):
+        L = dense(energy, membrane, membrane.rest, up)
+        torch.testing.assert_close(dense(energy, membrane, stretched(membrane), d), L * (d @ d.T))
+
+
+def test_k_equals_q_transpose_q(membrane):
+    """Eqs. 14, 18, 64: `E(t) = 1/2 ||Q t||^2`, with the 1/2 of eq. 24, less the rest's energy."""
+    quads = AffineQuadrilaterals(membrane, 1.3)
+    d = torch.nn.functional.normalize(stretched(membrane), dim=-1)
+    Q, t = quads.q_matrix(d), stretched(membrane).norm(dim=-1)
+    torch.testing.assert_close(Q.T @ Q, dense(quads, membrane, membrane.rest, d))
+    constant = quads.tension * quads.area.sum()
+    torch.testing.assert_close(quads.energy(t[:, None] * d), (Q @ t).square().sum() / 2 - constant)
+
+
+def test_affine_element_is_blind_to_the_hourglass_and_triangles_are_not():
+    X = np.stack(np.meshgrid(np.linspace(0, 2, 6), np.linspace(0, 3, 6), [5.0], indexing="ij"), -1)[:, :, 0]
+    plane = Membrane(X)
+    checkerboard = torch.tensor([(-1.0) ** (i + j) for i in range(6) for j in range(6)], dtype=torch.float64)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(36, 3)
+    energy = lambda e: checkerboard @ dense(e, plane, plane.rest, up) @ checkerboard  # noqa: E731
+    assert abs(energy(AffineQuadrilaterals(plane))) < 1e-12
+    assert energy(Sheet(plane, "harmonic")) > 10
+
+
+def test_rest_metric_of_a_planar_quadrilateral_is_singular_in_space():
+    """Pins eq. 53: G of eq. 16 with three coordinates is singular for a planar quadrilateral; k runs over the plane's two."""
+    plane = torch.tensor([[0, 0, 1.0], [1, 0, 2], [1, 1, 2], [0, 1, 1]], dtype=torch.float64)
+    centred = plane - plane.mean(0)
+    assert torch.linalg.det(centred.T @ centred).abs() < 1e-12
+    rectangles = half_cylinder(10, 40, 80, 3, (7, 8))
+    maps = AffineQuadrilaterals(rectangles).affine_maps(rectangles.rest)
+    gram = maps.mT @ maps
+    torch.testing.assert_close(gram, torch.eye(2, dtype=torch.float64).expand_as(gram))
+
+
+def test_energy_ignores_rotation_and_translation(membrane):
+    angle = torch.tensor(0.7, dtype=torch.float64)
+    c, s = angle.cos(), angle.sin()
+    R = torch.stack([torch.stack([c, -s, c * 0]), torch.stack([s, c, c * 0]), torch.tensor([0, 0, 1.0]).double()])
+    x = stretched(membrane)
+    for energy in elements(membrane):
+        torch.testing.assert_close(energy.energy(x @ R.T + 3.0), energy.energy(x))
+        torch.testing.assert_close(energy.gradient(x @ R.T + 3.0), energy.gradient(x) @ R.T)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_rest_tension_is_the_derivative_of_the_energy_by_area(model):
+    cap = spherical_cap(12, 9, 15, (9, 9))
+    sheet, step = Sheet(cap, model, **ELASTIC), 1e-6
+    slope = (sheet.energy((1 + step) * cap.rest) - sheet.energy((1 - step) * cap.rest)) / (2 * step)
+    torch.testing.assert_close(slope, 2 * sheet.tension * cap.rest_area.sum(), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("make", "curvature"),
+    [(lambda n: spherical_cap(12, 9, 15, (n, n)), 2 / 12.5), (lambda n: half_cylinder(10, 40, 80, 3, (n, n)), 1 / 10)],
+)
+def test_rest_pressure_is_tension_times_curvature(make, curvature):
+    """Laplace's law: p = 2 T / R on a sphere, T / R on a cylinder."""
+    errors = []
+    for n in (17, 33):
+        membrane = make(n)
+        sheet = Sheet(membrane, "neo_hookean", 1.3)
+        free, normal = membrane.free, membrane.rest_normals
+        force, push = sheet.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
+        p0 = (force * normal)[free].sum() / (push * normal)[free].sum()
+        errors.append(abs(float(p0 / (sheet.tension * curvature)) - 1))
+    assert errors[1] < 0.01 and errors[1] < 0.6 * errors[0] + 1e-9
+
+
+def test_an_unknown_model_is_refused(membrane):
+    with pytest.raises(MembraneError, match="expected one of"):
+        Sheet(membrane, "hookean")

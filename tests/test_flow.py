@@ -1,0 +1,106 @@
+"""Laws of the local affine maps and of the flow between markers."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchmembrane import MembraneError
+from torchmembrane.flow import FlowInterpolation, LocalAffineMaps, affine_fit
+from torchmembrane.membrane import SurfacePoints
+from torchmembrane.shapes import heightfield, spherical_cap
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (3, 1, 2)])
+def test_affine_fit_recovers_an_affine_map(batch):
+    """Eqs. 15-17: `p' = A p + b` with `b = p'bar - A pbar`; eq. 17 prints -b."""
+    A, b, p = random(*batch, 3, 2), random(*batch, 3, seed=1), random(*batch, 5, 2, seed=2)
+    fit = affine_fit(p, p @ A.mT + b[..., None, :])
+    torch.testing.assert_close(fit.A, A)
+    torch.testing.assert_close(fit.b, b)
+
+
+def test_affine_fit_is_the_least_squares_minimum():
+    p, q = random(6, 2), random(6, 3, seed=1)
+    fit = affine_fit(p, q)
+    homogeneous = torch.cat([p, torch.ones(6, 1, dtype=torch.float64)], 1)
+    want = torch.linalg.lstsq(homogeneous, q).solution.T
+    torch.testing.assert_close(torch.cat([fit.A, fit.b[:, None]], 1), want)
+
+
+def test_local_maps_are_affine_fits_of_each_quadrilateral():
+    points, moved = random(20, 2), random(2, 20, 2, seed=1)
+    maps = LocalAffineMaps(points, (4, 5))(moved)
+    index = [1 * 5 + 2, 2 * 5 + 2, 2 * 5 + 3, 1 * 5 + 3]
+    want = affine_fit(points[index], moved[1][index])
+    torch.testing.assert_close(maps.A[1, 1, 2], want.A)
+    torch.testing.assert_close(maps.b[1, 1, 2], want.b)
+
+
+def pattern(membrane, per_side):
+    """Markers on a regular net in the membrane's own coordinates, as points of its triangles."""
+    inner = membrane.resampled((per_side + 2, per_side + 2)).rest.reshape(per_side + 2, per_side + 2, 3)
+    xyz = inner[1:-1, 1:-1].reshape(-1, 3).numpy()
+    return xyz, membrane.closest_points(xyz)
+
+
+def bump(xyz, radius=12.0):
+    """A smooth flow that vanishes at the rim, px."""
+    x, y = xyz[..., 0] / radius, xyz[..., 1] / radius
+    rest = np.clip(1 - x**2 - y**2, 0, None)
+    return np.stack([10 * rest * (x + 0.5 * y), 8 * rest**2], -1)
+
+
+def test_smooth_flow_is_reproduced_on_the_grid_and_better_with_more_markers():
+    cap = spherical_cap(12, 9, 15, (17, 17))
+    errors = []
+    for per_side in (7, 11, 15):
+        xyz, points = pattern(cap, per_side)
+        flow = FlowInterpolation(cap, points)
+        got = flow(torch.from_numpy(bump(xyz)), torch.ones(len(xyz), dtype=torch.float64))
+        errors.append(float((got - torch.from_numpy(bump(cap.rest.numpy()))).square().mean().sqrt()))
+    assert errors[0] > errors[1] > errors[2] and errors[2] < 0.1
+
+
+def test_flow_vanishes_on_the_rim_and_for_zero_displacement():
+    cap = spherical_cap(12, 9, 15, (17, 17))
+    xyz, points = pattern(cap, 11)
+    flow = FlowInterpolation(cap, points)
+    got = flow(random(2, len(xyz), 2), torch.ones(2, len(xyz), dtype=torch.float64))
+    assert (got[:, cap.fixed] == 0).all()
+    assert (flow(torch.zeros(len(xyz), 2).double(), torch.ones(len(xyz)).double()) == 0).all()
+
+
+def test_lost_markers_have_no_say_and_the_rest_fills_in():
+    """The preconditioned solve equals the dense one for any confidences; NaN of a lost marker goes nowhere."""
+    cap = spherical_cap(12, 9, 15, (17, 17))
+    xyz, points = pattern(cap, 11)
+    flow = FlowInterpolation(cap, points)
+    s, c = torch.from_numpy(bump(xyz)), torch.ones(len(xyz), dtype=torch.float64)
+    lost = [5, 30, 60, 61, 62, 90]
+    c[lost], s[lost] = 0.0, torch.nan
+    W, free = flow.weights, cap.free
+    normal = (W.T @ (c[:, None] * W) + flow.bending)[free][:, free]
+    want = torch.linalg.solve(normal, (W.T @ torch.where(c[:, None] > 0, s, 0.0))[free])
+    got = flow(s, c)
+    torch.testing.assert_close(got[free], want, rtol=0, atol=1e-4)
+    clean = flow(torch.from_numpy(bump(xyz)), torch.ones_like(c))
+    assert (got - clean).abs().max() < 1.0
+
+
+def test_batch_equals_singles():
+    field = heightfield(np.linspace(-3, 3, 9), np.linspace(-2, 2, 9), np.full((9, 9), 5.0))
+    _, points = pattern(field, 5)
+    flow, s, c = FlowInterpolation(field, points), random(3, 25, 2), random(3, 25, seed=4).sigmoid()
+    singles = torch.stack([flow(a, b) for a, b in zip(s, c, strict=True)])
+    torch.testing.assert_close(flow(s, c), singles)
+
+
+def test_too_few_markers_are_refused():
+    cap = spherical_cap(12, 9, 15)
+    points = SurfacePoints(np.zeros((2, 3), int), np.full((2, 3), 1 / 3), np.zeros(2))
+    with pytest.raises(MembraneError, match="at least 3"):
+        FlowInterpolation(cap, points)

@@ -1,0 +1,196 @@
+"""Laws of the rest surface: areas, normals, volume, orientation, material points."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchmembrane import MembraneError
+from torchmembrane.membrane import Membrane, corners, corners_to_vertices, triangles_of, triangles_to_corners
+from torchmembrane.shapes import ellipsoid_cap, half_cylinder, heightfield, spherical_cap
+
+SHAPES = {
+    "spherical_cap": lambda n: spherical_cap(12, 9, 15, (n, n)),
+    "ellipsoid_cap": lambda n: ellipsoid_cap((12, 9, 12), 2, (n, n)),
+    "half_cylinder": lambda n: half_cylinder(10, 40, 80, 3, (n, n)),
+    "heightfield": lambda n: heightfield(np.linspace(-3, 3, n), np.linspace(-2, 2, n + 2), np.full((n, n + 2), 5.0)),
+}
+
+
+@pytest.fixture(params=SHAPES)
+def membrane(request):
+    return SHAPES[request.param](9)
+
+
+def moved(membrane, batch=()):
+    generator = torch.Generator().manual_seed(3)
+    return membrane.rest + 0.1 * torch.randn(*batch, *membrane.rest.shape, generator=generator, dtype=torch.float64)
+
+
+def test_gathers_and_sums_are_adjoint(membrane):
+    grid = membrane.grid
+    x = moved(membrane)
+    y = torch.randn(grid[0] - 1, grid[1] - 1, 2, 3, 3, dtype=torch.float64)
+    gathered = (triangles_of(corners(x, grid)) * y).sum()
+    torch.testing.assert_close(gathered, (x * corners_to_vertices(triangles_to_corners(y), grid)).sum())
+
+
+def test_structured_triangles_are_the_listed_ones(membrane):
+    x = moved(membrane)
+    a, b, c = x[membrane.triangles].unbind(1)
+    listed = torch.linalg.cross(b - a, c - a) / 2
+    torch.testing.assert_close(membrane.area_vectors(x).reshape(-1, 3), listed)
+
+
+def test_volume_gradient_is_autograd_of_volume(membrane):
+    x = moved(membrane, (2,)).requires_grad_()
+    (gradient,) = torch.autograd.grad(membrane.volume(x).sum(), x)
+    torch.testing.assert_close(membrane.volume_gradient(x), gradient)
+
+
+def test_volume_gradient_is_a_third_of_the_area_vectors_inside_the_rim(membrane):
+    x, inside = moved(membrane), ~membrane.fixed
+    direction = torch.nn.functional.normalize(membrane.volume_gradient(x), dim=-1)
+    torch.testing.assert_close(membrane.normals(x)[inside], direction[inside])
+
+
+def test_moving_all_free_vertices_by_the_gradient_changes_the_volume_by_its_square(membrane):
+    """Pins eq. 20: the trace needs adj C, the transpose of the cofactors; with cofactors it fails."""
+    x, step = moved(membrane), 1e-5
+    v = membrane.volume_gradient(x)
+    rise = (membrane.volume(x + step * v) - membrane.volume(x - step * v)) / (2 * step)
+    torch.testing.assert_close(rise, (v**2).sum())
+
+
+def test_volume_is_positive_for_outward_triangles_clockwise_from_the_origin():
+    """Pins eq. 19: the paper says counterclockwise seen from the origin, which gives -V."""
+    cap = spherical_cap(12, 9, 15, (65, 65))
+    cone, dome = math.pi * 144 * 15 / 3, math.pi * 9 / 6 * (3 * 144 + 81)
+    assert float(cap.rest_volume) == pytest.approx(cone + dome, rel=1e-3)
+    assert cap.cavity_volume == pytest.approx(dome, rel=2e-3)
+    a, b, c = cap.rest[cap.triangles[0]]
+    from_origin = torch.linalg.cross(b - a, c - a) @ a
+    assert from_origin > 0
+
+
+@pytest.mark.parametrize(
+    ("make", "area"),
+    [
+        (SHAPES["spherical_cap"], 2 * math.pi * 12.5 * 9),
+        (SHAPES["half_cylinder"], 40 * 10 * math.radians(160)),
+    ],
+)
+def test_area_converges_quadratically(make, area):
+    errors = [abs(float(make(n).rest_area.sum()) - area) for n in (17, 33, 65)]
+    rates = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert (rates > 1.8).all() and (rates < 2.3).all()
+
+
+def test_normals_point_away_from_the_camera(membrane):
+    inside = ~membrane.fixed
+    assert ((membrane.rest_normals * membrane.rest).sum(-1)[inside] > 0).all()
+    torch.testing.assert_close(membrane.rest_normals.norm(dim=-1), torch.ones(len(membrane.rest), dtype=torch.float64))
+
+
+def test_sphere_normals_are_radial():
+    cap = spherical_cap(12, 9, 15, (33, 33))
+    radial = torch.nn.functional.normalize(cap.rest - torch.tensor([0, 0, 11.5], dtype=torch.float64), dim=-1)
+    assert ((cap.rest_normals * radial).sum(-1)[~cap.fixed] > 0.999).all()
+
+
+def test_either_winding_gives_the_same_surface(membrane):
+    m, n = membrane.grid
+    turned = Membrane(membrane.rest.reshape(m, n, 3).numpy().transpose(1, 0, 2))
+    torch.testing.assert_close(turned.rest_volume, membrane.rest_volume, rtol=5e-3, atol=0)
+    same = turned.rest_normals.reshape(n, m, 3).transpose(0, 1).reshape(-1, 3)
+    assert ((same * membrane.rest_normals).sum(-1) > 0.95).all()
+
+
+def test_resampling_keeps_common_vertices_and_the_rim():
+    fine = SHAPES["ellipsoid_cap"](33)
+    coarse = fine.resampled((17, 17))
+    torch.testing.assert_close(coarse.rest.reshape(17, 17, 3), fine.rest.reshape(33, 33, 3)[::2, ::2])
+    odd = fine.resampled((21, 19))
+    ellipse = (odd.rest[odd.fixed, :2] / torch.tensor([12.0, 9.0])).norm(dim=-1)
+    torch.testing.assert_close(ellipse, torch.ones_like(ellipse), rtol=0, atol=2e-3)
+
+
+def test_closest_points_recover_barycentric_points_and_their_distance():
+    cap = spherical_cap(12, 9, 15, (17, 17))
+    rng = np.random.default_rng(0)
+    weights = rng.dirichlet((1, 1, 1), 40)
+    index = cap.triangles.numpy()[rng.integers(len(cap.triangles), size=40)]
+    corners_xyz = cap.rest.numpy()[index]
+    normal = np.cross(corners_xyz[:, 1] - corners_xyz[:, 0], corners_xyz[:, 2] - corners_xyz[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    on_surface = (corners_xyz * weights[..., None]).sum(1)
+    found = cap.closest_points(on_surface)
+    again = (cap.rest.numpy()[found.vertices] * found.weights[..., None]).sum(1)
+    np.testing.assert_allclose(again, on_surface, atol=1e-9)
+    off = cap.closest_points(on_surface + 0.05 * normal).distance
+    assert (off <= 0.05 + 1e-12).all() and np.quantile(off, 0.1) > 0.0499
+
+
+def test_rays_meet_the_surface_where_their_points_came_from(membrane):
+    rng = np.random.default_rng(1)
+    weights = rng.dirichlet((1, 1, 1), 30)
+    index = membrane.triangles.numpy()[rng.integers(len(membrane.triangles), size=30)]
+    points = (membrane.rest.numpy()[index] * weights[..., None]).sum(1)
+    origin = np.tile([0.1, -0.2, 0.3], (30, 1))
+    ranges = np.linalg.norm(points - origin, axis=1)
+    hit = membrane.ray_points(origin, (points - origin) / ranges[:, None])
+    np.testing.assert_allclose(hit.distance, ranges, rtol=1e-9)
+    np.testing.assert_allclose((membrane.rest.numpy()[hit.vertices] * hit.weights[..., None]).sum(1), points, atol=1e-9)
+    missed = membrane.ray_points(origin[:1], -(points - origin)[:1])
+    assert np.isnan(missed.distance).all()
+
+
+FLAT = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), [4.0], indexing="ij"), -1)[:, :, 0]
+
+
+def _folded():
+    grid = FLAT.copy()
+    grid[2, 2] = (4.5, 2, 4)
+    return grid
+
+
+def _changed(index, value):
+    grid = FLAT.copy()
+    grid[index] = value
+    return grid
+
+
+@pytest.mark.parametrize(
+    ("vertices", "fixed", "words"),
+    [
+        (FLAT[..., :2], None, "expected [m, n, 3]"),
+        (FLAT[:2], None, "m, n >= 3"),
+        (_changed((1, 3, 2), np.nan), None, "vertex (1, 3) is not finite"),
+        (_folded(), None, "without folds"),
+        (FLAT * [1, 1, -1], None, "behind the camera"),
+        (_changed((2, 2), FLAT[2, 3]), None, "has no area"),
+        (FLAT, np.zeros((5, 5), bool), "border vertex (0, 0) is free"),
+        (FLAT, np.ones((5, 5), bool), "every vertex is fixed"),
+        (FLAT, np.ones((4, 5), bool), "one per vertex"),
+    ],
+)
+def test_wrong_grids_are_refused_in_words(vertices, fixed, words):
+    with pytest.raises(MembraneError) as error:
+        Membrane(vertices, fixed)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: spherical_cap(-1, 9, 15),
+        lambda: ellipsoid_cap((1, float("nan"), 1), 2),
+        lambda: half_cylinder(10, 40, 120, 3),
+        lambda: heightfield([0, 1, 1], [0, 1, 2], np.ones((3, 3))),
+        lambda: heightfield([0, 1, 2], [0, 1, 2], np.ones((3, 4))),
+    ],
+)
+def test_wrong_shapes_are_refused(make):
+    with pytest.raises(MembraneError):
+        make()
