@@ -10,6 +10,7 @@ from torch.func import functional_call
 
 from torchmembrane.camera import Camera, paper_image_point
 from torchmembrane.errors import MembraneError
+from torchmembrane.lens import distort
 
 PORTS = {"air": [], "port": [(2.0, 3.0, 1.49)], "stack": [(2.0, 1.0, 1.49), (3.5, 0.5, 1.52), (4.0, 1.0, 1.4)]}
 LENSES = {
@@ -81,6 +82,15 @@ def test_pinhole_distortion_is_opencvs():
     u = 400.0 * (a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a**2)) + 320.3
     v = 404.0 * (b * radial + p1 * (r2 + 2 * b**2) + 2 * p2 * a * b) + 238.8
     assert np.allclose(camera.point_to_pixel(torch.tensor([x, y, z], dtype=torch.float64)).numpy(), [u, v], atol=1e-10)
+
+
+def test_derivative_of_the_distortion_is_its_derivative():
+    """Newton converges with a slightly wrong one too, only slower."""
+    k1, k2, p1, p2, k3 = torch.tensor(LENSES["pinhole k1-k3"][2], dtype=torch.float64)
+    xy = torch.tensor([0.4, -0.3], dtype=torch.float64)
+    _, a, b, c = distort(xy, [k1, k2, k3], p1, p2)
+    jacobian = torch.func.jacrev(lambda xy: distort(xy, [k1, k2, k3], p1, p2)[0])(xy)
+    assert_close(torch.stack([a, b, b, c]).reshape(2, 2), jacobian, 1e-14)
 
 
 @pytest.mark.parametrize("z", [5.0, 0.0, -2.0])
@@ -172,9 +182,7 @@ def test_values_and_gradients_are_continuous_across_the_axis(lens, ports):
     pixels = camera.centre + offsets[:, None]
     jacobian = torch.func.vmap(torch.func.jacrev(lambda p: camera.pixel_to_ray(p).direction))(pixels)
     assert_close(jacobian, jacobian[-1:].expand_as(jacobian), 1e-7)
-    assert_close(
-        camera.pixel_to_ray(camera.centre).direction, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 1e-15
-    )
+    assert_close(camera.pixel_to_ray(camera.centre).direction, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 1e-15)
     assert_close(camera.point_to_pixel(torch.tensor([0.0, 0.0, 12.0]).double()), camera.centre, 1e-12)
 
 

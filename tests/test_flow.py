@@ -104,3 +104,36 @@ def test_too_few_markers_are_refused():
     points = SurfacePoints(np.zeros((2, 3), int), np.full((2, 3), 1 / 3), np.zeros(2))
     with pytest.raises(MembraneError, match="at least 3"):
         FlowInterpolation(cap, points)
+
+
+def test_bilinear_flow_is_exact_for_bilinear_fields_between_dots():
+    """On a net of dots a field bilinear in the grid's coordinates comes back exactly inside the net (section 5)."""
+    field = heightfield(np.linspace(-3, 3, 17), np.linspace(-2, 2, 17), np.full((17, 17), 5.0))
+    xyz, points = pattern(field, 7)
+    flow = FlowInterpolation(field, points, "bilinear")
+    bilinear = lambda p: torch.from_numpy(np.stack([1 + p[:, 0] * p[:, 1], p[:, 0] - 2 * p[:, 1]], 1))  # noqa: E731
+    got = flow(bilinear(xyz), torch.ones(len(xyz), dtype=torch.float64))
+    inner = (field.rest[:, 0].abs() <= xyz[:, 0].max()) & (field.rest[:, 1].abs() <= xyz[:, 1].max())
+    assert inner.sum() > 100
+    torch.testing.assert_close(got[inner], bilinear(field.rest.numpy())[inner])
+    assert (got[field.fixed] == 0).all()
+
+
+def test_bilinear_flow_between_scattered_dots_stays_between_their_values():
+    cap = spherical_cap(12, 9, 15, (17, 17))
+    rng = np.random.default_rng(2)
+    vertices = cap.triangles.numpy()[rng.integers(len(cap.triangles), size=60)]
+    points = SurfacePoints(vertices, rng.dirichlet((1, 1, 1), 60), np.zeros(60))
+    s, c = torch.from_numpy(rng.uniform(1, 2, (60, 2))), torch.ones(60, dtype=torch.float64)
+    got = FlowInterpolation(cap, points, "bilinear")(s, c)
+    assert (got >= -1e-9).all() and (got <= 2 + 1e-9).all()
+    assert (got[~cap.fixed] > 0).float().mean() > 0.95
+    c[7] = 0
+    s[7] = torch.nan
+    assert FlowInterpolation(cap, points, "bilinear")(s, c).isfinite().all()
+
+
+def test_an_unknown_kind_of_flow_is_refused():
+    cap = spherical_cap(12, 9, 15)
+    with pytest.raises(MembraneError, match="expected one of smooth, bilinear"):
+        FlowInterpolation(cap, pattern(cap, 5)[1], "cubic")

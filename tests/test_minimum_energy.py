@@ -103,7 +103,9 @@ def test_a_stiff_gas_is_a_liquid_and_a_soft_one_is_open(finger):
 def test_linear_volume_solves_equation_22(finger):
     """psi from the dense KKT system with `Q^T Q`, `gamma`, `v`, `c` of the paper's element, to rounding."""
     smoothing = 0.1
-    estimator = make(finger, "harmonic", element="quadrilateral", smoothing=smoothing, volume="linear", steps=1, solver_steps=120)
+    estimator = make(
+        finger, "harmonic", element="quadrilateral", smoothing=smoothing, volume="linear", steps=1, solver_steps=120
+    )
     origins, d = bent_rays(finger)
     quads = AffineQuadrilaterals(finger, estimator.energy.tension)
     free, rest_range = finger.free, estimator.rest_range
@@ -140,7 +142,10 @@ def test_smoother_is_a_sum_of_squares(finger):
     weak, strong = rough(0.01), rough(10.0)
     assert terms(strong) < 0.5 * terms(weak)
     hourglass = torch.tensor([(-1.0) ** (i + j) for i in range(13) for j in range(13)]).double()[:, None]
-    assert estimator._smoother(hourglass).square().sum() > 0 and estimator._smoother(torch.ones_like(hourglass)).abs().max() < 1e-12
+    assert (
+        estimator._smoother(hourglass).square().sum() > 0
+        and estimator._smoother(torch.ones_like(hourglass)).abs().max() < 1e-12
+    )
 
 
 def disc(n):
@@ -161,8 +166,14 @@ def observed(membrane, amplitude):
     ("options", "twin"),
     [
         (dict(model="harmonic", prestretch=1.0), lambda a: least_energy(a, harmonic, keep_volume=True)[0]),
-        (dict(model="harmonic", prestretch=1.0, element="quadrilateral"), lambda a: least_energy(a, harmonic, keep_volume=True)[0]),
-        (dict(model="neo_hookean", prestretch=1.2, filling="open"), lambda a: least_energy(a, neo_hookean(1.2), keep_volume=False)[0]),
+        (
+            dict(model="harmonic", prestretch=1.0, element="quadrilateral"),
+            lambda a: least_energy(a, harmonic, keep_volume=True)[0],
+        ),
+        (
+            dict(model="neo_hookean", prestretch=1.2, filling="open"),
+            lambda a: least_energy(a, neo_hookean(1.2), keep_volume=False)[0],
+        ),
     ],
 )
 def test_depth_converges_quadratically_to_the_continuous_minimum(options, twin):

@@ -5,18 +5,20 @@ import pytest
 import torch
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.markers.texture import TextureLocator, choose_patches
+from torchmembrane.markers.texture import Neighbourhood, TextureLocator, choose_patches, inverse_2x2
 
 HEIGHT, WIDTH = 240, 320
 CENTRE = np.array([165.0, 115.0])
 V, U = np.mgrid[:HEIGHT, :WIDTH]
+VIGNETTE = 1 - 0.5 * ((U - 190) ** 2 + (V - 100) ** 2) / 220**2
 SEEN = ((U - 160) / 150) ** 2 + ((V - 120) / 112) ** 2 < 1
 
 
 def speckle(points, seed, waves=120):
-    """Paint-like blotches in 0.15..0.85 at points [..., 2], px: a random sum of cosines of 5 to 40 px, pushed to two greys."""
+    """Paint-like blotches in 0.15..0.85 at points [..., 2], px: random waves of 5 to 40 px, pushed to two greys."""
     random = np.random.default_rng(seed)
-    length, angle, phase = np.exp(random.uniform(np.log(5), np.log(40), waves)), *random.uniform(0, 2 * np.pi, (2, waves))
+    length = np.exp(random.uniform(np.log(5), np.log(40), waves))
+    angle, phase = random.uniform(0, 2 * np.pi, (2, waves))
     field = np.zeros(points.shape[:-1], np.float32)
     for k, a, p in zip(2 * np.pi / length, angle, phase, strict=True):
         field += np.cos((k * (points @ [np.cos(a), np.sin(a)]) + p).astype(np.float32))
@@ -24,7 +26,7 @@ def speckle(points, seed, waves=120):
 
 
 def bump(points):
-    """Image to material under a push of 17 px with turning and stretching (strain up to 0.35), seen from where points [..., 2] are."""
+    """Image to material under a push of 17 px that also turns and stretches; points [..., 2], px."""
     away = points - CENTRE
     bell = np.exp(-(away**2).sum(-1, keepdims=True) / (2 * 32.0**2))
     return points - bell * (np.array([16.0, -5.0]) + away @ np.array([[0.1, -0.12], [0.12, 0.05]]))
@@ -39,8 +41,7 @@ def photograph(back, seed, noise=0.01, gain=1.0, offset=0.0, texture=1):
     image = np.zeros((HEIGHT, WIDTH))
     for du, dv in ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25)):
         image += speckle(back(np.stack([U + du, V + dv], -1)), texture) / 4
-    vignette = 1 - 0.5 * ((U - 190) ** 2 + (V - 100) ** 2) / 220**2
-    image = gain * image * vignette + offset + noise * np.random.default_rng(seed).normal(size=image.shape)
+    image = gain * image * VIGNETTE + offset + noise * np.random.default_rng(seed).normal(size=image.shape)
     return np.round(255 * image.clip(0, 1)) / 255
 
 
@@ -104,7 +105,7 @@ def test_stripes_are_no_texture():
 def test_shapes_are_checked(rest, pixels, locator):
     with pytest.raises(MembraneError, match="mask"):
         choose_patches(rest, SEEN.T)
-    with pytest.raises(MembraneError, match="pixels span"):
+    with pytest.raises(MembraneError, match="pixels from"):
         TextureLocator(rest, pixels + 100.0)
     with pytest.raises(MembraneError, match=r"D > 16"):
         TextureLocator(rest, pixels[:5])
@@ -116,10 +117,10 @@ def test_follows_a_large_smooth_warp(locator, pressed, pixels):
     error, confidence = errors(locator, pressed, forward(bump, pixels))
     kept = confidence > 0
     assert kept.mean() > 0.99
-    assert np.median(error[kept]) < 0.03 and np.percentile(error[kept], 95) < 0.15 and error[confidence > 0.5].max() < 1
+    assert np.median(error[kept]) < 0.05 and np.percentile(error[kept], 95) < 0.2 and error[confidence > 0.5].max() < 1
 
 
-@pytest.mark.parametrize("shift", [(0.5, 0.25), (-7.3, 4.6), (18.4, -14.7)])
+@pytest.mark.parametrize("shift", [(0.5, 0.25), (-7.3, 4.6), (25.4, -22.7)])
 def test_subpixel_shift_is_unbiased(locator, pixels, shift):
     inner = np.linalg.norm((pixels - [160, 120]) / [120, 85], axis=1) < 1
     with torch.no_grad():
@@ -157,6 +158,32 @@ def test_overwritten_region_is_lost_and_does_not_drag_the_rest(locator, pressed,
     assert error[confidence > 0.5].max() < 3 and np.median(error[distance > 50]) < 0.03
 
 
+def test_lost_pixels_are_what_the_neighbours_predict(locator, pixels):
+    image = photograph(lambda points: points - [9.0, -5.0], 7)
+    image[(U - 160) ** 2 + (V - 120) ** 2 < 30**2] = 0.5
+    error, confidence = errors(locator, image, pixels + [9.0, -5.0])
+    hidden = np.linalg.norm(pixels + [9.0, -5.0] - [160, 120], axis=1) < 20
+    assert hidden.sum() > 4 and (confidence[hidden] == 0).all()
+    assert np.median(error[hidden]) < 0.7 and error[hidden].max() < 3
+
+
+def test_affine_flow_is_predicted_and_outliers_have_no_say(pixels):
+    gradient, shift = torch.tensor([[0.1, -0.2], [0.3, 0.05]]), torch.tensor([3.0, -2.0])
+    flow = (torch.tensor(pixels, dtype=torch.float32) @ gradient.T + shift)[None]
+    broken = flow.clone()
+    broken[:, ::6] += 20.0
+    local = Neighbourhood(pixels, np.zeros((0, 2))).float()(broken, torch.ones(1, len(pixels)), 0.3)
+    inner = np.linalg.norm((pixels - [160, 120]) / [120, 85], axis=1) < 1
+    error = (local.flow - flow).norm(dim=-1)[:, inner]
+    assert error.median() < 0.1 and error.quantile(0.95) < 0.6
+    assert (local.gradient - gradient)[:, inner].abs().median() < 0.02
+
+
+def test_inverse_of_two_by_two():
+    matrix = torch.tensor([[[2.0, 0.7], [-0.4, 1.5]], [[0.1, 3.0], [2.0, 0.5]]])
+    torch.testing.assert_close(inverse_2x2(matrix) @ matrix, torch.eye(2).expand(2, 2, 2))
+
+
 def test_small_static_thing_is_not_followed(locator, rest, pressed, pixels):
     true = forward(bump, pixels)
     image = np.where((U - 172) ** 2 + (V - 110) ** 2 < 17**2, rest, pressed)
@@ -170,7 +197,7 @@ def test_clipped_highlight_is_survived(locator, pressed, pixels):
     assert (confidence > 0).mean() > 0.93 and error[confidence > 0.5].max() < 2
 
 
-@pytest.mark.parametrize("image", [np.zeros_like(U), np.ones_like(U), U / WIDTH, np.random.default_rng(4).random(U.shape)])
+@pytest.mark.parametrize("image", [0.0 * U, 0.0 * U + 0.5, U / WIDTH, np.random.default_rng(4).random(U.shape)])
 def test_image_without_the_texture_is_all_lost_but_finite(locator, image, pixels):
     error, confidence = errors(locator, image, pixels)
     assert (confidence == 0).all() and np.isfinite(error).all()
@@ -201,15 +228,19 @@ def test_float32_agrees_with_float64(rest, pixels, locator, pressed):
     assert (found - exact)[sure > 0].abs().max() < 1e-3 and (confidence - sure).abs().max() < 1e-3
 
 
-def test_gradient_is_that_of_the_motion(rest, pixels, locator, pressed):
-    """An image moved by e has moved each pixel by e: d pixels . (d image / d shift) = 1, where the patch was followed well."""
-    double = TextureLocator(rest, pixels).double()
-    image = batch(photograph(still, 0, noise=0.0), dtype=torch.float64).requires_grad_()
-    found, confidence = double(image)
-    pick = torch.as_tensor(np.linalg.norm((pixels - [160, 120]) / [120, 85], axis=1) < 1)
-    found[0, pick, 0].sum().backward()
-    step = 0.01
-    moved, back = (photograph(lambda p, s=s: p - [s * step, 0], 0, noise=0.0) for s in (1, -1))
-    slope = torch.as_tensor(moved - back)
-    assert torch.isfinite(image.grad).all() and (confidence > 0).all()
-    assert image.grad.abs().sum() > 0 and slope.shape == image.grad.shape[2:]
+def test_gradient_sees_the_motion(rest, pixels):
+    """The gradient is that of finite differences, and d pixels / d image . d image / d shift is nearly 1."""
+    inner = torch.as_tensor(np.linalg.norm((pixels - [160, 120]) / [120, 85], axis=1) < 1)
+    locator = TextureLocator(rest, pixels).double()
+    image, right, left = (
+        batch(photograph(lambda points, e=e: points - [e, 0.0], 0, noise=0.0), dtype=torch.float64)
+        for e in (0.3, 0.4, 0.2)
+    )
+    motion = (right - left) / 0.2
+    image.requires_grad_()
+    locator(image)[0][0, inner, 0].mean().backward()
+    with torch.no_grad():
+        ahead, behind = (locator(image + step * motion)[0][0, inner, 0].mean() for step in (1e-3, -1e-3))
+    slope = (image.grad * motion).sum().item()
+    assert slope == pytest.approx((ahead - behind).item() / 2e-3, rel=1e-2)
+    assert slope == pytest.approx(1, abs=0.05)

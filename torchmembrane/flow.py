@@ -6,11 +6,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .bilinear import bilinear_matrix
 from .energy import Sheet
 from .errors import MembraneError
 from .membrane import Membrane, SurfacePoints, corners, corners_to_vertices
-from .solve.conjugate_gradient import conjugate_gradient
+from .solve.conjugate_gradient import conjugate_gradient, symmetric_product
 
+KINDS = ("smooth", "bilinear")
 SMOOTHING_LENGTH = 0.45
 """Wavelength, in units of two marker spacings, at which the interpolated flow keeps half of the measured amplitude."""
 
@@ -64,15 +66,18 @@ class FlowInterpolation(nn.Module):
     Minimises `sum_d c_d |W_d f - s_d|^2 + alpha |Laplace f|^2` over grid flows `f` that vanish on the rim, with `c_d` the
     confidence, `W_d` the marker's barycentric weights and the rest surface's own Laplacian. With all markers found this is a
     constant operator; lost markers are a change of low rank, so a few conjugate-gradient steps preconditioned by the
-    constant inverse solve it for any confidences.
+    constant inverse solve it for any confidences. With `kind = "bilinear"` (the paper's) the flow is bilinear between the dots
+    instead; a lost dot then has the smooth flow.
 
-    Arguments: membrane, the markers' `SurfacePoints`. Calling it with `displacement [..., D, 2]` (px) and
+    Arguments: membrane, the markers' `SurfacePoints`, `kind`. Calling it with `displacement [..., D, 2]` (px) and
     `confidence [..., D]` gives the flow `[..., V, 2]` (px).
     """
 
-    def __init__(self, membrane: Membrane, markers: SurfacePoints, steps: int = 12):
+    def __init__(self, membrane: Membrane, markers: SurfacePoints, kind: str = "smooth", steps: int = 12):
         super().__init__()
-        self.grid, self.steps = membrane.grid, steps
+        if kind not in KINDS:
+            raise MembraneError(f"FlowInterpolation: kind = {kind!r}; expected one of {', '.join(KINDS)}")
+        self.kind, self.steps = kind, steps
         D, V = len(markers.vertices), len(membrane.rest)
         if D < 3:
             raise MembraneError(f"FlowInterpolation: {D} markers; expected at least 3")
@@ -89,13 +94,22 @@ class FlowInterpolation(nn.Module):
         self.register_buffer("bending", bending * (~membrane.fixed).double()[:, None] * (~membrane.fixed).double())
         self.register_buffer("inverse", inverse)
         self.register_buffer("weights", W * (~membrane.fixed).double())
+        if kind == "bilinear":
+            self.register_buffer("bilinear", torch.from_numpy(bilinear_matrix(membrane, markers)))
 
     def forward(self, displacement: Tensor, confidence: Tensor) -> Tensor:
         W, c = self.weights, confidence[..., None]
-        b = W.mT @ (c * torch.where(c > 0, displacement, 0.0))
-        return conjugate_gradient(
-            lambda f: W.mT @ (c * (W @ f)) + self.bending @ f, lambda f: self.inverse @ f, b, self.steps
+        at_markers = lambda f: (f.mT @ W.mT).mT  # noqa: E731
+        to_vertices = lambda s: (s.mT @ W).mT  # noqa: E731
+        smooth = conjugate_gradient(
+            lambda f: to_vertices(c * at_markers(f)) + symmetric_product(self.bending, f),
+            lambda f: symmetric_product(self.inverse, f),
+            to_vertices(c * torch.where(c > 0, displacement, 0.0)),
+            self.steps,
         )
+        if self.kind == "smooth":
+            return smooth
+        return (torch.where(c > 0, displacement, at_markers(smooth)).mT @ self.bilinear.mT).mT
 
 
 def _laplacian(membrane: Membrane) -> Tensor:

@@ -159,23 +159,14 @@ class Membrane(nn.Module):
 
     def ray_points(self, origins, directions) -> SurfacePoints:
         """Where rays `[D, 3]` first meet the rest surface; `distance` is the range along the ray, NaN where it misses."""
-        start, d = (np.asarray(a, dtype=float)[:, None] for a in (origins, directions))
         T = self.triangles.cpu().numpy()
-        a, b, c = self.rest.cpu().double().numpy()[T].transpose(1, 0, 2)
-        normal = np.cross(b - a, c - a)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            area2 = (d * normal).sum(-1)
-            ranges = ((a - start) * normal).sum(-1) / area2
-            u = (np.cross(c - a, d) * (start - a)).sum(-1) / area2
-            v = (np.cross(d, b - a) * (start - a)).sum(-1) / area2
-        w = np.stack([1 - u - v, u, v], -1)
-        hit = (w > -1e-9).all(-1) & (ranges > 0)
-        ranges = np.where(hit, ranges, np.inf)
-        first, row = ranges.argmin(1), np.arange(len(ranges))
-        distance = ranges[row, first]
-        seen = np.isfinite(distance)
-        weights = np.where(seen[:, None], w[row, first], 1 / 3)
-        return SurfacePoints(T[first], weights, np.where(seen, distance, np.nan))
+        triangles = self.rest.cpu().double().numpy()[T]
+        rays = (np.asarray(a, dtype=float)[:, None] for a in (origins, directions))
+        chunks = [
+            _first_hits(o, d, triangles) for o, d in zip(*(np.split(a, range(128, len(a), 128)) for a in rays), strict=True)
+        ]
+        first, weights, distance = (np.concatenate(part) for part in zip(*chunks, strict=True))
+        return SurfacePoints(T[first], weights, distance)
 
 
 def _checked_grid(vertices, fixed):
@@ -196,9 +187,7 @@ def _checked_grid(vertices, fixed):
         )
     if not fixed[border].all():
         i, j = np.argwhere(border & ~fixed)[0]
-        raise MembraneError(
-            f"Membrane: border vertex ({i}, {j}) is free; expected every border vertex to be fixed (the rim)"
-        )
+        raise MembraneError(f"Membrane: border vertex ({i}, {j}) is free; expected every border vertex to be fixed (the rim)")
     if fixed.all():
         raise MembraneError("Membrane: every vertex is fixed; expected free vertices inside the rim")
     return X, fixed
@@ -230,6 +219,23 @@ def _orientation(X, triangles, fixed):
             f"{triangles[k].tolist()}; expected a grid without folds whose inside is seen from the camera everywhere"
         )
     return outward
+
+
+def _first_hits(start, d, triangles):
+    """First triangle met by every ray `[D, 1, 3]`, barycentric weights there, and the range (NaN: none). Moller-Trumbore."""
+    a, b, c = triangles.transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        area2 = (d * normal).sum(-1)
+        ranges = ((a - start) * normal).sum(-1) / area2
+        u = (np.cross(c - a, d) * (start - a)).sum(-1) / area2
+        v = (np.cross(d, b - a) * (start - a)).sum(-1) / area2
+    w = np.stack([1 - u - v, u, v], -1)
+    ranges = np.where((w > -1e-9).all(-1) & (ranges > 0), ranges, np.inf)
+    first, row = ranges.argmin(1), np.arange(len(ranges))
+    distance = ranges[row, first]
+    seen = np.isfinite(distance)
+    return first, np.where(seen[:, None], w[row, first], 1 / 3), np.where(seen, distance, np.nan)
 
 
 def _closest_on_triangles(p, triangles):

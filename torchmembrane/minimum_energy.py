@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from .energy import AffineQuadrilaterals, Sheet
 from .errors import MembraneError
 from .membrane import Membrane, corners, corners_to_vertices
-from .solve.conjugate_gradient import conjugate_gradient
+from .solve.conjugate_gradient import conjugate_gradient, symmetric_product
 from .solve.kkt import constrained_minimum
 
 ELEMENTS = ("triangle", "quadrilateral")
@@ -127,7 +127,10 @@ class MinimumEnergy(nn.Module):
         load = load - self.smoothing * self.moves * self._smoother(self._smoother(psi)).squeeze(-1)
         K = self.energy.stiffness_along(x, directions)
         solved = conjugate_gradient(
-            lambda y: self._stiffness_product(K, y), lambda y: self.inverse @ y, torch.stack([load, v], -1), self.solver_steps
+            lambda y: self._stiffness_product(K, y),
+            lambda y: symmetric_product(self.inverse, y),
+            torch.stack([load, v], -1),
+            self.solver_steps,
         )
         y, g = solved.unbind(-1)
         if self.filling == "open":

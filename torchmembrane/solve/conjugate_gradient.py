@@ -6,6 +6,11 @@ import torch
 from torch import Tensor
 
 
+def symmetric_product(matrix: Tensor, columns: Tensor) -> Tensor:
+    """`A y` for one symmetric `A [N, N]` and many `y [..., N, C]`: one matrix product over batch and columns together."""
+    return (columns.mT @ matrix).mT
+
+
 def conjugate_gradient(
     apply: Callable[[Tensor], Tensor], precondition: Callable[[Tensor], Tensor], b: Tensor, steps: int
 ) -> Tensor:

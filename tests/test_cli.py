@@ -1,0 +1,208 @@
+"""The command as a person uses it, on the example sensor."""
+
+import csv
+import runpy
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from torchmembrane import __version__, cli
+from torchmembrane.errors import MembraneError
+from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.sensor import Sensor
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+SENSOR = str(EXAMPLES / "sensor.toml")
+
+
+@pytest.fixture(scope="module")
+def example_reconstructor():
+    return Reconstructor(Sensor.from_file(SENSOR))
+
+
+@pytest.fixture
+def built_once(example_reconstructor, monkeypatch):
+    monkeypatch.setattr(cli, "Reconstructor", lambda sensor, *_, **__: example_reconstructor)
+
+
+@pytest.fixture
+def sensor_copy(tmp_path):
+    """Path of an editable copy of the example sensor; `edit(old, new)` changes its text."""
+    for name in ("sensor.toml", "rest_grid.npz", "dots.csv", "rest.png"):
+        shutil.copyfile(EXAMPLES / name, tmp_path / name)
+    path = tmp_path / "sensor.toml"
+
+    def edit(old: str, new: str) -> str:
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+        return str(path)
+
+    return edit
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    code = cli.main([str(argument) for argument in arguments])
+    return code, *capsys.readouterr()
+
+
+def test_reconstruct_examples_end_to_end(tmp_path, capsys):
+    out = tmp_path / "out"
+    images = [EXAMPLES / "press_on_axis.png", EXAMPLES / "rest.png"]
+    code, said, progress = run(capsys, "reconstruct", SENSOR, *images, "--out", out)
+    assert code == 0 and "2 frames reconstructed, 0 failed" in said and "frame" in progress
+    with np.load(out / "press_on_axis.npz") as pressed, np.load(out / "rest.npz") as rest:
+        assert int(pressed["status"]) == int(rest["status"]) == 0
+        assert np.abs(rest["displacement"]).max() < 1e-3 < np.abs(pressed["displacement"]).max()
+        assert pressed["displacement"][len(pressed["displacement"]) // 2, 2] < -0.05
+
+
+def test_options_reach_the_reconstructor(monkeypatch, tmp_path, capsys):
+    def refuse(sensor, estimator, *, model, element):
+        raise MembraneError(f"{sensor.name} {estimator} {model} {element}")
+
+    monkeypatch.setattr(cli, "Reconstructor", refuse)
+    call = ("reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")
+    assert "nh130 minimum-energy neo_hookean triangle" in run(capsys, *call)[2]
+    options = ("--energy", "harmonic", "--element", "quadrilateral")
+    assert "nh130 minimum-energy harmonic quadrilateral" in run(capsys, *call, *options)[2]
+
+
+def test_some_frames_failed_gives_1_and_says_which(built_once, tmp_path, capsys):
+    (tmp_path / "broken.png").write_bytes(b"no image")
+    Image.new("L", (640, 480)).save(tmp_path / "dark.png")
+    images = [tmp_path / "broken.png", tmp_path / "dark.png", EXAMPLES / "rest.png"]
+    code, said, errors = run(capsys, "reconstruct", SENSOR, *images, "--out", tmp_path / "out")
+    assert code == 1 and "1 frames reconstructed, 2 failed" in said
+    assert f"{images[0]}: not readable" in errors and f"{images[1]}: blank" in errors
+    with open(tmp_path / "out" / "summary.csv", newline="") as file:
+        assert [(row["name"], row["status"]) for row in csv.DictReader(file)] == [
+            ("broken", "-1"), ("dark", "4"), ("rest", "0"),
+        ]  # fmt: skip
+
+
+def test_parquet_and_figures(built_once, tmp_path, capsys):
+    arguments = ("--out", tmp_path, "--format", "parquet", "--figures", "--batch", "1")
+    assert run(capsys, "reconstruct", SENSOR, EXAMPLES / "flat_plate.png", *arguments)[0] == 0
+    assert (tmp_path / "frames" / "part-00000.parquet").exists() and (tmp_path / "flat_plate.png").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments, expected",
+    [
+        (("reconstruct", "none.toml", EXAMPLES / "rest.png"), "none.toml"),
+        (("reconstruct", SENSOR, "none.png"), "none.png"),
+        (("reconstruct", SENSOR, EXAMPLES / "rest.png", EXAMPLES / "rest.png"), "'rest'"),
+        (("check", "none.toml"), "none.toml"),
+        (("view", "none.npz"), "none.npz"),
+    ],
+)
+def test_wrong_arguments_give_2_and_a_message(tmp_path, capsys, arguments, expected):
+    out = ("--out", tmp_path / "out")
+    code, said, errors = run(capsys, *arguments, *out)
+    assert code == 2 and errors.startswith("torchmembrane: error: ") and expected in errors and said == ""
+    assert not (tmp_path / "out").exists()
+
+
+def test_another_sensor_s_folder_gives_2(built_once, sensor_copy, tmp_path, capsys):
+    assert run(capsys, "reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")[0] == 0
+    other = sensor_copy("prestretch = 1.3", "prestretch = 1.4")
+    code, _, errors = run(capsys, "reconstruct", other, EXAMPLES / "rest.png", "--out", tmp_path / "out")
+    assert code == 2 and "another sensor" in errors
+
+
+def test_other_options_give_2(built_once, tmp_path, capsys):
+    call = ("reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")
+    assert run(capsys, *call)[0] == 0
+    code, said, _ = run(capsys, *call, "--energy", "neo_hookean")  # what the sensor file says anyway
+    assert code == 0 and "0 frames reconstructed, 0 failed, 1 were finished before" in said
+    code, _, errors = run(capsys, *call, "--energy", "harmonic")
+    assert code == 2 and "--energy neo_hookean" in errors
+
+
+@pytest.mark.parametrize("arguments", [[], ["reconstruct", SENSOR], ["reconstruct", SENSOR, "a.png", "--batch", "0"]])
+def test_usage_errors_exit_with_2(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(arguments)
+    assert stop.value.code == 2 and "usage: torchmembrane" in capsys.readouterr().err
+
+
+def test_cuda_without_a_device_is_refused(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    code, _, errors = run(capsys, "reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out", "--device", "cuda")
+    assert code == 2 and "CUDA" in errors
+
+
+def test_interruption_gives_130(built_once, monkeypatch, tmp_path, capsys):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "reconstruct_files", stop)
+    code, _, errors = run(capsys, "reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")
+    assert code == 130 and "interrupted" in errors
+
+
+def test_check_says_what_it_understood_and_draws_it(built_once, tmp_path, capsys):
+    code, said, _ = run(capsys, "check", SENSOR, "--out", tmp_path / "sensor.png")
+    assert code == 0
+    for part in (
+        "fisheye, 640 x 480 px", "field of view 229 x 172 degrees", "no ports", "grid 17 x 17: 289 vertices, 64",
+        "neo_hookean, prestretch 1.3", "tension 1.34 N/mm", "hPa", "liquid", "121 listed", "121 of 121 found",
+    ):  # fmt: skip
+        assert part in said
+    assert Image.open(tmp_path / "sensor.png").width == 1600
+
+
+def test_check_names_missing_markers(sensor_copy, tmp_path, capsys):
+    path = sensor_copy("finger", "scratched")
+    image = np.array(Image.open(tmp_path / "rest.png"))
+    image[226:260, 305:340] = image[232, 305]
+    Image.fromarray(image).save(tmp_path / "rest.png")
+    code, said, _ = run(capsys, "check", path)
+    assert code == 0 and "120 of 121 found" in said
+    assert "not found: marker 60 (from 0), expected at pixel 32" in said
+
+
+def test_check_of_a_bad_sensor_gives_2(sensor_copy, capsys):
+    code, _, errors = run(capsys, "check", sensor_copy("prestretch = 1.3", "prestretch = 0.5"))
+    assert code == 2 and "prestretch" in errors and "Traceback" not in errors
+
+
+def test_check_of_a_sensor_whose_markers_are_not_found(monkeypatch, tmp_path, capsys):
+    def refuse(*_, **__):
+        raise MembraneError("only 3 of 121 markers are found in the rest image")
+
+    monkeypatch.setattr(cli, "Reconstructor", refuse)
+    code, said, errors = run(capsys, "check", SENSOR, "--out", tmp_path / "sensor.png")
+    assert code == 2 and "only 3 of 121" in errors and "fisheye" in said and (tmp_path / "sensor.png").exists()
+
+
+def test_view_draws_a_stored_result(built_once, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(cli, "_has_display", lambda: False)
+    assert run(capsys, "reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")[0] == 0
+    result = tmp_path / "out" / "rest.npz"
+    code, said, _ = run(capsys, "view", result, "--image", EXAMPLES / "rest.png", "--out", tmp_path / "a.png")
+    assert code == 0 and str(tmp_path / "a.png") in said and Image.open(tmp_path / "a.png").width == 1600
+    assert run(capsys, "view", result)[0] == 0 and (tmp_path / "out" / "rest_view.png").exists()
+    code, _, errors = run(capsys, "view", shutil.copy(result, tmp_path))
+    assert code == 2 and "mesh.npz" in errors
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "check", "view"])
+def test_help_shows_examples_and_exit_codes(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main([command, "--help"])
+    said = capsys.readouterr().out
+    assert stop.value.code == 0 and f"  torchmembrane {command} " in said and "examples:" in said
+    assert "exit code" in said or command == "view"
+
+
+def test_version_also_as_a_module(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["torchmembrane", "--version"])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_module("torchmembrane", run_name="__main__")
+    assert stop.value.code == 0 and capsys.readouterr().out.strip() == f"torchmembrane {__version__}"

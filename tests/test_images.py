@@ -1,0 +1,110 @@
+"""One grey everywhere: 0.299 R + 0.587 G + 0.114 B in floating point, whatever the file or array."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from torchmembrane.errors import MembraneError
+from torchmembrane.images import read_image, to_grey, write_image
+
+RGB = np.random.default_rng(0).integers(0, 256, (7, 9, 3), dtype=np.uint8)
+GREY_OF_RGB = (RGB.astype(np.float64) @ [0.299, 0.587, 0.114]) / 255
+
+
+def saved(tmp_path, image, name="image.png", **options):
+    image.save(tmp_path / name, **options)
+    return read_image(tmp_path / name)
+
+
+def test_colour_is_weighed_in_floating_point_on_every_path(tmp_path):
+    image = Image.fromarray(RGB)
+    alpha = image.copy()
+    alpha.putalpha(Image.fromarray(RGB[..., 0]))
+    for grey in (
+        to_grey(RGB),
+        to_grey(RGB / 255),
+        saved(tmp_path, image),
+        saved(tmp_path, alpha),
+        saved(tmp_path, image, "i.tiff"),
+    ):
+        assert grey.dtype == np.float32 and grey.shape == (7, 9)
+        assert np.abs(grey - GREY_OF_RGB).max() < 1e-7
+    assert to_grey(np.full((1, 1, 3), 255, np.uint8)) == 1.0
+
+
+def test_grey_of_every_depth_is_the_fraction_of_white(tmp_path):
+    eight, sixteen = RGB[..., 0], RGB[..., 0].astype(np.uint16) * 255 + RGB[..., 1]
+    assert np.array_equal(saved(tmp_path, Image.fromarray(eight)), (eight / 255).astype(np.float32))
+    assert np.array_equal(saved(tmp_path, Image.fromarray(sixteen)), (sixteen / 65535).astype(np.float32))
+    assert np.array_equal(to_grey(sixteen), (sixteen / 65535).astype(np.float32))
+    assert np.array_equal(saved(tmp_path, Image.fromarray(eight > 100)), (eight > 100).astype(np.float32))
+    assert np.array_equal(saved(tmp_path, Image.fromarray(eight).convert("LA")), (eight / 255).astype(np.float32))
+
+
+def test_palette_is_looked_up_before_it_is_weighed(tmp_path):
+    image = Image.fromarray(RGB).quantize(8)
+    colours = np.asarray(image.convert("RGB"))
+    assert np.abs(saved(tmp_path, image) - (colours @ [0.299, 0.587, 0.114]) / 255).max() < 1e-7
+
+
+def test_exif_orientation_is_not_applied(tmp_path):
+    image = Image.fromarray(RGB)
+    exif = image.getexif()
+    exif[0x0112] = 6  # turned by 90 degrees
+    assert saved(tmp_path, image, "image.jpg", exif=exif).shape == (7, 9)
+
+
+@pytest.mark.parametrize(
+    "grey, suffix",
+    [(RGB[..., 0] / 255, ".png"), (RGB[..., 0] * 256.0 / 65535, ".png"), (GREY_OF_RGB, ".tiff")],
+)
+def test_what_is_written_is_read_back_bit_by_bit(tmp_path, grey, suffix):
+    grey = grey.astype(np.float32)
+    path = write_image(tmp_path / "a.rest", grey)
+    assert path.name == "a.rest" + suffix
+    assert np.array_equal(read_image(path), grey)
+
+
+def whole_png(tmp_path):
+    noise = np.random.default_rng(1).integers(0, 256, (64, 64), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "whole.png")
+    return (tmp_path / "whole.png").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        (None, "no such image"),
+        (lambda _: b"", "not readable as an image"),
+        (lambda _: b"x,y,z,size\n1,2,3,small\n", "cannot identify image file"),
+        (lambda png: png[: len(png) // 2], "truncated"),
+        (lambda png: png[:40], "not readable as an image"),
+        (lambda png: png[:60] + b"?" * 40 + png[100:], "not readable as an image"),
+    ],
+)
+def test_a_damaged_file_is_named_with_the_cause(tmp_path, content, words):
+    path = tmp_path / "broken.png"
+    if content is not None:
+        path.write_bytes(content(whole_png(tmp_path)))
+    with pytest.raises(MembraneError) as caught:
+        read_image(path)
+    assert str(path) in str(caught.value) and words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "array, words",
+    [
+        (np.zeros((4, 4, 4), np.uint8), "shape [4, 4, 4]"),
+        (np.zeros((0, 4), np.uint8), "shape [0, 4]"),
+        (np.zeros(4), "shape [4]"),
+        (np.zeros((4, 4), np.int64), "type int64"),
+        (np.full((4, 4), 1.5), "from 1.5 to 1.5"),
+        (np.full((4, 4), -0.1), "from -0.1"),
+        (np.full((4, 4), np.nan), "from nan"),
+        (np.where(np.eye(4), np.inf, 0.0), "to inf"),
+    ],
+)
+def test_arrays_that_are_no_image_are_refused(array, words):
+    with pytest.raises(MembraneError) as caught:
+        to_grey(array)
+    assert words in str(caught.value) and "expected" in str(caught.value)

@@ -1,0 +1,248 @@
+"""Images to surfaces: rendered example images (by an independent program) against their truth; bad images."""
+
+import dataclasses
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchmembrane import MembraneError, results
+from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.sensor import Cavity, Sensor
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+PRESSES = ("press_on_axis", "two_contacts", "flat_plate")
+
+
+@pytest.fixture(scope="module")
+def sensor():
+    return Sensor.from_file(EXAMPLES / "sensor.toml")
+
+
+@pytest.fixture(scope="module")
+def reconstructor(sensor):
+    return Reconstructor(sensor)
+
+
+@pytest.fixture(scope="module")
+def images(reconstructor):
+    return reconstructor.read(*(EXAMPLES / f"{press}.png" for press in PRESSES))
+
+
+@pytest.fixture(scope="module")
+def result(reconstructor, images):
+    with torch.no_grad():
+        return reconstructor(images)
+
+
+def truth(press):
+    return np.load(EXAMPLES / f"{press}_truth.npz")
+
+
+def relative_error(result, index, press):
+    """Rms marker error over rms marker displacement."""
+    Y, X = truth(press)["dots_deformed"], truth(press)["dots_nominal"]
+    miss = result.markers[index].double().numpy() - Y
+    return np.sqrt((miss**2).sum() / ((Y - X) ** 2).sum())
+
+
+def test_shapes_and_status_follow_the_contract(result):
+    B, V, D = 3, 289, 121
+    shapes = dict(
+        vertices=(B, V, 3), displacement=(B, V, 3), normals=(B, V, 3), markers=(B, D, 3), pixels=(B, D, 2), confidence=(B, D),
+        traction=(B, V, 3), contact=(B, V), contact_points=(B, 4, 3), force=(B, 3), pressure=(B,), pressure_change=(B,),
+        volume_error=(B,), residual=(B,), status=(B,),
+    )  # fmt: skip
+    assert {k: tuple(v.shape) for k, v in result._asdict().items()} == shapes
+    assert result.status.dtype == torch.int32 and (result.status == results.OK).all()
+    for key in set(shapes) - {"contact_points"}:
+        assert result._asdict()[key].isfinite().all(), key
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_every_dot_is_found_where_the_truth_is(result, index):
+    error = np.linalg.norm(result.pixels[index].numpy() - truth(PRESSES[index])["uv_deformed"], axis=1)
+    assert np.median(error) < 0.05 and np.percentile(error, 95) < 0.2 and error.max() < 1
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_minimum_energy_recovers_part_of_a_press_and_keeps_the_volume(result, index):
+    """It is poor where something presses along the rays, as its docstring says; it must not be worse than no answer."""
+    assert 0.3 < relative_error(result, index, PRESSES[index]) < 0.9
+    assert result.volume_error[index].abs() < 1e-5
+
+
+def test_the_rest_image_gives_the_rest_surface(reconstructor):
+    with torch.no_grad():
+        rest = reconstructor(reconstructor.read(EXAMPLES / "rest.png"))
+    assert rest.status[0] == results.OK
+    assert rest.displacement.abs().max() < 1e-5 and rest.residual.max() < 0.02
+
+
+def test_surface_lies_on_the_rays_of_the_markers(result):
+    assert (result.residual < 0.2).all() and (result.residual > 0).all()
+
+
+def test_a_frame_alone_equals_the_frame_in_a_batch(reconstructor, images, result):
+    with torch.no_grad():
+        alone = reconstructor(images[1:2])
+    torch.testing.assert_close(alone.vertices[0], result.vertices[1], rtol=0, atol=1e-4)
+    torch.testing.assert_close(alone.pixels[0], result.pixels[1], rtol=0, atol=1e-3)
+
+
+def test_double_precision_agrees(sensor, images, result):
+    with torch.no_grad():
+        double = Reconstructor(sensor, dtype=torch.float64)(images.double())
+    assert (double.vertices - result.vertices).abs().max() < 2e-3
+    assert (double.pixels - result.pixels).abs().max() < 5e-3
+
+
+def test_from_pixels_continues_where_the_image_left_off(reconstructor, result):
+    again = reconstructor.from_pixels(result.pixels, result.confidence)
+    torch.testing.assert_close(again.vertices, result.vertices, rtol=0, atol=1e-4)
+
+
+def test_exact_pixels_and_lost_ones(reconstructor):
+    pixels = torch.from_numpy(truth("two_contacts")["uv_deformed"].copy())
+    full = reconstructor.from_pixels(pixels)
+    pixels[[3, 50, 51]] = torch.nan
+    some = reconstructor.from_pixels(pixels)
+    assert some.status[0] == results.OK and (some.confidence[0, [3, 50, 51]] == 0).all()
+    assert some.pixels[0, [3, 50, 51]].isnan().all() and some.markers.isfinite().all()
+    assert (some.vertices - full.vertices).norm(dim=-1).max() < 0.1
+
+
+def test_colour_and_integer_images_are_the_same_image(reconstructor, images):
+    eight_bit = (images * 255).round().to(torch.uint8)
+    with torch.no_grad():
+        grey, colour = reconstructor(eight_bit), reconstructor(eight_bit.expand(-1, 3, -1, -1))
+    torch.testing.assert_close(colour.pixels, grey.pixels, rtol=0, atol=1e-3)
+
+
+def test_bad_frames_get_a_status_and_the_others_an_answer(reconstructor, images, result):
+    noise = torch.rand(480, 640, generator=torch.Generator().manual_seed(0))
+    nan = images[0, 0].clone()
+    nan[10, 10] = torch.nan
+    batch = torch.stack([torch.full_like(nan, 0.4), torch.ones_like(nan), nan, noise, images[1, 0], torch.zeros_like(nan)])
+    with torch.no_grad():
+        got = reconstructor(batch)
+    assert got.status[[0, 1, 2, 5]].tolist() == [results.BLANK, results.BLANK, results.BAD_VALUES, results.BLANK]
+    assert got.status[3] in (results.TOO_FEW_MARKERS, results.UNLIKE_REST)
+    for bad in (0, 1, 2, 3, 5):
+        for key in ("vertices", "normals", "markers", "traction", "contact", "force", "pressure", "residual"):
+            assert got._asdict()[key][bad].isnan().all(), key
+        assert bad == 3 or (got.confidence[bad] == 0).all()
+    assert got.status[4] == results.OK
+    torch.testing.assert_close(got.vertices[4], result.vertices[1], rtol=0, atol=1e-4)
+    assert all(int(code) in results.STATUS_TEXTS for code in got.status)
+
+
+def test_hidden_dots_are_lost_and_the_shape_hardly_changes(reconstructor, images, result):
+    hidden = [20, 37, 58, 83]
+    image = images[2, 0].clone()
+    for u, v in result.pixels[2, hidden].round().long().tolist():
+        patch = image[v - 12 : v + 13, u - 12 : u + 13]
+        patch[:] = patch[[0, -1]].mean()
+    with torch.no_grad():
+        got = reconstructor(image)
+    assert (got.confidence[0, hidden] == 0).all() and got.pixels[0, hidden].isnan().all()
+    assert (got.confidence[0] > 0).sum() >= 121 - len(hidden) - 2
+    assert (got.vertices - result.vertices[2]).norm(dim=-1).max() < 0.3
+
+
+def test_wrong_sizes_and_shapes_are_refused_with_both_sizes(reconstructor):
+    with pytest.raises(MembraneError, match="512 x 384.*640 x 480"):
+        reconstructor(torch.zeros(1, 1, 384, 512))
+    with pytest.raises(MembraneError, match=r"expected \[B, 1, height, width\]"):
+        reconstructor(torch.zeros(1, 2, 480, 640))
+    with pytest.raises(MembraneError, match="one for each marker"):
+        reconstructor.from_pixels(torch.zeros(1, 7, 2))
+
+
+def test_dots_may_be_found_in_the_rest_image(sensor, result):
+    found = dataclasses.replace(sensor.markers, positions=None, sizes=None)
+    reconstructor = Reconstructor(dataclasses.replace(sensor, markers=found))
+    listed = sensor.markers.positions
+    gap = np.linalg.norm(reconstructor.rest_markers.double().numpy()[:, None] - listed, axis=2)
+    assert len(gap) >= 0.97 * len(listed) and gap.min(1).max() < 0.3
+    with torch.no_grad():
+        got = reconstructor(reconstructor.read(EXAMPLES / "two_contacts.png"))
+    assert got.status[0] == results.OK
+    assert (got.vertices[0] - result.vertices[1]).norm(dim=-1).max() < 0.25
+
+
+def test_without_a_rest_image_dots_are_located_from_their_list_alone(sensor, images):
+    bare = dataclasses.replace(sensor, markers=dataclasses.replace(sensor.markers, rest_image=None))
+    with torch.no_grad():
+        got = Reconstructor(bare)(images[:1])
+    error = np.linalg.norm(got.pixels[0].numpy() - truth(PRESSES[0])["uv_deformed"], axis=1)
+    assert got.status[0] == results.OK and np.nanmedian(error) < 0.15
+
+
+def test_a_gas_without_modulus_is_a_liquid_and_says_so_once(sensor, result, images):
+    bare = dataclasses.replace(sensor.material, shear_modulus=None)
+    gas = dataclasses.replace(sensor, material=bare, cavity=Cavity("gas", pressure=1013.0))
+    with pytest.warns(UserWarning, match="acts as a liquid") as caught:
+        reconstructor = Reconstructor(gas)
+    assert len(caught) == 1
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("error")
+        got = reconstructor(images)
+    torch.testing.assert_close(got.vertices, result.vertices, rtol=0, atol=1e-4)
+
+
+def test_gas_pressure_is_in_the_sensors_units(sensor):
+    gas = Reconstructor(dataclasses.replace(sensor, cavity=Cavity("gas", pressure=1000.0))).estimator.gas
+    torch.testing.assert_close(gas[0], torch.tensor(0.1))
+    assert float(gas[1]) == pytest.approx(sensor.membrane.cavity_volume, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        dict(model="harmonic"),
+        dict(model="harmonic", element="quadrilateral", volume="linear"),
+        dict(flow="bilinear"),
+    ],
+)
+def test_the_papers_variants_agree_with_each_other(sensor, options, images, result):
+    with torch.no_grad():
+        got = Reconstructor(sensor, **options)(images)
+    assert (got.status == results.OK).all()
+    assert (got.vertices - result.vertices).norm(dim=-1).max() < 1.5
+    assert ((got.displacement * result.displacement).sum((1, 2)) > 0).all()
+
+
+def test_gradients_flow_from_the_surface_to_the_image(reconstructor, images):
+    image = images[1:2].clone().requires_grad_()
+    reconstructor(image).displacement.square().sum().backward()
+    assert image.grad.isfinite().all() and image.grad.abs().max() > 0
+
+
+def test_state_dict_round_trip(sensor, reconstructor, images, result):
+    other = Reconstructor(sensor, model="harmonic")
+    fresh = Reconstructor(sensor)
+    fresh.load_state_dict(reconstructor.state_dict())
+    with torch.no_grad():
+        torch.testing.assert_close(fresh(images).vertices, result.vertices)
+        assert (other(images).vertices - result.vertices).abs().max() > 1e-3
+
+
+def test_an_unknown_estimator_is_refused(sensor):
+    with pytest.raises(MembraneError, match="expected one of"):
+        Reconstructor(sensor, estimator="guess")
+
+
+def test_results_survive_the_disk_and_foreign_files_do_not(result, tmp_path):
+    results.save_frame(tmp_path / "a.npz", result.frame(1))
+    again = results.stack_frames([results.load_frame(tmp_path / "a.npz")])
+    for key, value in again._asdict().items():
+        assert value.dtype == (torch.int32 if key == "status" else torch.float32)
+        torch.testing.assert_close(value[0], result._asdict()[key][1], equal_nan=True)
+    np.savez(tmp_path / "b.npz", other=1)
+    (tmp_path / "c.npz").write_bytes(b"not a zip")
+    for name in ("b", "c", "missing"):
+        with pytest.raises(MembraneError, match=f"{name}.npz"):
+            results.load_frame(tmp_path / f"{name}.npz")

@@ -1,0 +1,170 @@
+"""Figures say what a frame holds: where, how deep, in which unit, and in words if there is no surface."""
+
+import numpy as np
+import pytest
+from matplotlib.quiver import Quiver
+
+from torchmembrane import results, view
+from torchmembrane.camera import Camera
+from torchmembrane.sensor import Cavity, Markers, Material, Sensor
+from torchmembrane.shapes import spherical_cap
+from torchmembrane.store import Mesh
+
+GRID = (15, 15)
+DENT = 7 * 15 + 10
+SIZE = (640, 480)
+
+
+def cap_mesh(camera: Camera, marker_count=150, force_unit="N") -> Mesh:
+    membrane = spherical_cap(12.0, 9.0, 8.0, grid=GRID)
+    vertex_pixels = camera.point_to_pixel(membrane.rest).numpy()
+    rng = np.random.default_rng(1)
+    weights = rng.dirichlet(np.ones(3), marker_count)
+    triangles = membrane.triangles.numpy()
+    corners = vertex_pixels[triangles[rng.integers(len(triangles), size=marker_count)]]
+    rest_pixels = (corners * weights[..., None]).sum(1)
+    return Mesh(
+        membrane.rest.numpy(), membrane.rest_normals.numpy(), triangles, membrane.fixed.numpy(), np.array(GRID),
+        vertex_pixels, rest_pixels, np.array(SIZE), "mm", force_unit, "cap", "f", "minimum-energy", "harmonic",
+        "triangle", "npz",
+    )  # fmt: skip
+
+
+def pressed(mesh: Mesh, depth=1.5, flow=4.0) -> dict[str, np.ndarray]:
+    """A dent about vertex `DENT`, markers moved by `flow` px to the right, two of them lost."""
+    near = np.exp(-(((mesh.rest_vertices - mesh.rest_vertices[DENT]) ** 2).sum(-1)) / 8)
+    displacement = -depth * near[:, None] * mesh.rest_normals
+    pixels = mesh.rest_pixels + [flow, 0.0]
+    pixels[:2] = np.nan
+    return {
+        "vertices": mesh.rest_vertices + displacement, "displacement": displacement, "pixels": pixels,
+        "confidence": np.isfinite(pixels[:, 0]).astype(np.float32), "pressure_change": np.float32(0.0123),
+        "residual": np.float32(0.25), "status": np.int32(results.OK),
+    }  # fmt: skip
+
+
+@pytest.fixture
+def mesh() -> Mesh:
+    return cap_mesh(Camera("fisheye", SIZE, (220, 220), (320, 240)))
+
+
+def texts(drawing) -> str:
+    found = [text.get_text() for text in drawing.findobj(match=lambda artist: hasattr(artist, "get_text"))]
+    return "\n".join(found)
+
+
+def arrows(axes) -> Quiver:
+    return next(artist for artist in axes.get_children() if isinstance(artist, Quiver))
+
+
+def labels(axes) -> list[str]:
+    return [text.get_text() for text in axes.get_legend().get_texts()]
+
+
+def test_three_panels_with_units_and_a_title(mesh):
+    drawing = view.figure(pressed(mesh), mesh, np.full((480, 640), 0.5), "press_7")
+    flow, side, map_ = drawing.axes
+    assert (flow.get_xlabel(), flow.get_ylabel()) == (map_.get_xlabel(), map_.get_ylabel()) == ("u [px]", "v [px]")
+    assert "[mm]" in side.get_xlabel() and "[mm]" in side.get_ylabel()
+    assert len(flow.images) == 1 and side.collections and map_.collections
+    title = drawing.get_suptitle()
+    assert all(part in title for part in ("press_7", "ok", "+0.0123 N/mm²", "0.25 px"))
+
+
+def test_the_deepest_point_is_marked_with_its_value(mesh):
+    map_ = view.figure(pressed(mesh), mesh).axes[2]
+    note = next(text for text in map_.texts if "mm" in text.get_text())
+    assert note.get_text() == "-1.50 mm"
+    assert note.xy == pytest.approx(mesh.vertex_pixels[DENT])
+    assert f"{mesh.rest_vertices[DENT][0] - 1.5 * mesh.rest_normals[DENT][0]:.1f}" in map_.get_title()
+
+
+def test_the_colour_scale_is_symmetric_and_does_not_blow_up_noise(mesh):
+    for depth, limit in ((1.5, 1.5), (1e-6, view.LEAST_SCALE * 24)):
+        shades = view.figure(pressed(mesh, depth), mesh).axes[2].collections[0]
+        assert shades.norm.vmin == pytest.approx(-shades.norm.vmax)
+        assert shades.norm.vmax == pytest.approx(limit, rel=0.02)
+
+
+def test_arrows_lead_from_rest_to_now_as_long_as_the_legend_says(mesh):
+    flow = view.figure(pressed(mesh, flow=4.0), mesh).axes[0]
+    drawn = arrows(flow)
+    assert drawn.U == pytest.approx(np.full(148, 40.0)) and drawn.V == pytest.approx(np.zeros(148), abs=1e-9)
+    assert np.allclose(drawn.XY, mesh.rest_pixels[2:])
+    assert any("10 times" in label for label in labels(flow)) and "lost (2)" in labels(flow)
+    assert arrows(view.figure(pressed(mesh, flow=30.0), mesh).axes[0]).U == pytest.approx(np.full(148, 30.0))
+
+
+def test_arrows_are_thinned_where_there_are_many():
+    mesh = cap_mesh(Camera("fisheye", SIZE, (220, 220), (320, 240)), marker_count=1400)
+    flow = view.figure(pressed(mesh), mesh).axes[0]
+    count = len(arrows(flow).U)
+    assert 100 < count < 350
+    assert f"at rest (1398, {count} drawn)" in labels(flow)
+
+
+@pytest.mark.parametrize("vertex, letter", [(7 * 15 + 1, "y"), (1 * 15 + 7, "x")])
+def test_the_side_view_shows_the_dent_in_profile(mesh, vertex, letter):
+    farther = "xy"[int(np.abs(mesh.rest_vertices[vertex][:2]).argmax())]
+    frame = pressed(mesh)
+    frame["displacement"] = np.zeros_like(mesh.rest_vertices)
+    frame["displacement"][vertex] = -mesh.rest_normals[vertex]
+    side = view.figure(frame, mesh).axes[1]
+    assert farther == letter and side.get_xlabel().startswith(letter)
+
+
+@pytest.mark.parametrize("status", [results.TOO_FEW_MARKERS, results.UNLIKE_REST, results.BLANK, results.BAD_VALUES])
+def test_a_failed_frame_says_so_in_words(mesh, status):
+    frame = pressed(mesh)
+    nothing = ("vertices", "displacement", "pressure_change", "pixels")
+    frame |= {key: np.full_like(frame[key], np.nan) for key in nothing}
+    frame |= {"status": np.int32(status), "confidence": np.zeros(150)}
+    drawing = view.figure(frame, mesh, np.zeros((480, 640)), "dark")
+    words = texts(drawing)
+    assert "no surface for this frame" in words and "0 of 150 markers found" in words
+    assert results.STATUS_TEXTS[status].partition(":")[0] in words and "NOT OK" in drawing.get_suptitle()
+    assert "nan" not in words
+
+
+def test_an_answer_without_convergence_is_drawn_and_named(mesh):
+    frame = pressed(mesh) | {"status": np.int32(results.NOT_CONVERGED)}
+    drawing = view.figure(frame, mesh)
+    assert len(drawing.axes) == 3 and "NOT OK: the solve has not converged" in drawing.get_suptitle()
+
+
+def test_relative_forces_are_called_relative():
+    mesh = cap_mesh(Camera("fisheye", SIZE, (220, 220), (320, 240)), force_unit="relative")
+    assert "(relative)" in view.figure(pressed(mesh), mesh).get_suptitle()
+
+
+def test_saved_as_png_1600_wide_whole_or_not_at_all(mesh, tmp_path):
+    from PIL import Image
+
+    view.save(view.figure(pressed(mesh), mesh), tmp_path / "a.png")
+    assert Image.open(tmp_path / "a.png").size == (1600, 600)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_a_sensor_is_drawn_with_rays_that_bend_at_ports():
+    camera = Camera("pinhole", SIZE, (240, 240), (320, 240), ports=[(2, 3, 1.49)], medium_index=1.33)
+    membrane = spherical_cap(12.0, 6.0, 20.0, grid=(9, 9))
+    markers = Markers("dots", positions=membrane.rest[membrane.free].numpy())
+    sensor = Sensor("cap", "mm", camera, membrane, Material("harmonic", 1.2), Cavity("liquid"), markers)
+    side, space, image = view.sensor_figure(sensor).axes
+    assert "[mm]" in side.get_xlabel() and "[mm]" in space.get_zlabel() and image.get_xlabel() == "u [px]"
+    assert {"camera", "port", "viewing rays", "rest surface"} <= set(labels(side))
+    rays = next(c for c in side.collections if c.get_segments() and len(c.get_segments()[0]) == 3).get_segments()
+    for start, kink, end in rays:
+        assert start == pytest.approx([0, 0]) and kink[1] == pytest.approx(5)
+        before, after = np.array(kink) - start, np.array(end) - kink
+        sines = [abs(step[0]) / np.linalg.norm(step) for step in (before, after)]
+        assert sines[0] >= sines[1] - 1e-12
+    assert max(abs(kink[0] / kink[1] - end[0] / end[1]) for _, kink, end in rays) > 0.05
+    assert "markers (49)" in texts(space)
+    rim = next(line for line in image.lines if "rim" in line.get_label()).get_xydata()
+    expected = camera.point_to_pixel(membrane.rest[membrane.fixed]).numpy()
+    assert np.allclose(np.unique(rim.round(6), axis=0), np.unique(expected.round(6), axis=0))
+
+
+def test_figures_belong_to_no_window(mesh):
+    assert view.figure(pressed(mesh), mesh).canvas.manager is None

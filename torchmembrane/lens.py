@@ -1,0 +1,127 @@
+"""Lenses as functions: the image plane (pixels less the centre, over the focal length) to unit directions and back.
+
+Both undo their distortion by a fixed number of Newton steps; where a distortion folds back, and beyond, is NaN. Even
+functions of the radius are taken of its square, with a safe argument on the axis: values and gradients are finite there.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+LENS_STEPS = 12  # Newton steps that undo a distortion
+FOLD_SAMPLES = 512  # angles from the axis at which a distortion is tested for folding back
+
+
+def pinhole_direction(image: Tensor, distortion: Tensor) -> Tensor:
+    """Image positions `[..., 2]` to directions `[..., 3]`; `distortion` is k1 k2 p1 p2 k3, or empty."""
+    xy = image
+    if len(distortion):
+        radial, p1, p2, fold = _pinhole_terms(distortion)
+        within = (image * image).sum(-1, keepdim=True) <= (fold * _radial(fold**2, radial)[0]) ** 2
+        target = xy = torch.where(within, image, 0.0)
+        for _ in range(LENS_STEPS):
+            xy = xy * (fold**2 / (xy * xy).sum(-1, keepdim=True).clamp(min=fold**2)).sqrt()
+            distorted, a, b, c = distort(xy, radial, p1, p2)
+            du, dv = (target - distorted).unbind(-1)
+            determinant = (a * c - b * b).clamp(min=1e-6)
+            xy = xy + torch.stack([c * du - b * dv, a * dv - b * du], -1) / determinant[..., None]
+        distorted, a, b, c = distort(xy, radial, p1, p2)
+        solved = ((distorted - target).abs() < _tolerance(xy)).all(-1) & (a + c > 0) & (a * c > b * b)
+        xy = torch.where(within & solved[..., None], xy, math.nan)
+    direction = torch.cat([xy, torch.ones_like(xy[..., :1])], -1)
+    return direction / (direction * direction).sum(-1, keepdim=True).sqrt()
+
+
+def pinhole_image(points: Tensor, distortion: Tensor) -> Tensor:
+    """Points `[..., 3]` to image positions `[..., 2]`; NaN behind the camera."""
+    ahead = points[..., 2:] > 0
+    xy = points[..., :2] / torch.where(ahead, points[..., 2:], 1.0)
+    if len(distortion):
+        radial, p1, p2, fold = _pinhole_terms(distortion)
+        ahead = ahead & ((xy * xy).sum(-1, keepdim=True) <= fold**2)
+        xy, a, b, c = distort(torch.where(ahead, xy, 0.0), radial, p1, p2)
+        ahead = ahead & ((a + c > 0) & (a * c > b * b))[..., None]
+    return torch.where(ahead, xy, math.nan)
+
+
+def _pinhole_terms(distortion: Tensor) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
+    """Radial k1 k2 k3, tangential p1, p2, and the radius (tan of the angle) at which the radial part folds."""
+    k1, k2, p1, p2, k3 = distortion.unbind()
+    angles = torch.linspace(0, math.radians(89.9), FOLD_SAMPLES, dtype=distortion.dtype, device=distortion.device)
+    return [k1, k2, k3], p1, p2, _fold(angles.tan(), [k1, k2, k3])
+
+
+def distort(xy: Tensor, radial: list[Tensor], p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """OpenCV's radial and tangential distortion `[..., 2]` and its derivative `[[a, b], [b, c]]`, each `[...]`."""
+    x, y = xy.unbind(-1)
+    r_squared = x * x + y * y
+    factor, rate = _radial(r_squared, radial)
+    u = x * factor + 2 * p1 * x * y + p2 * (r_squared + 2 * x * x)
+    v = y * factor + 2 * p2 * x * y + p1 * (r_squared + 2 * y * y)
+    a = factor + 2 * rate * x * x + 2 * p1 * y + 6 * p2 * x
+    b = 2 * rate * x * y + 2 * p1 * x + 2 * p2 * y
+    c = factor + 2 * rate * y * y + 6 * p1 * y + 2 * p2 * x
+    return torch.stack([u, v], -1), a, b, c
+
+
+def fisheye_direction(image: Tensor, distortion: Tensor) -> Tensor:
+    """Image positions `[..., 2]` (rad, distorted) to directions `[..., 3]`; `distortion` is k1 k2 k3 k4, or empty."""
+    r_squared = (image * image).sum(-1, keepdim=True)
+    off_axis = r_squared > torch.finfo(image.dtype).eps ** 2
+    radius = torch.where(off_axis, r_squared, 1.0).sqrt()
+    theta = target = torch.where(off_axis, radius, 0.0)
+    within = target < math.pi
+    if len(distortion):
+        fold = _fisheye_fold(distortion)
+        within = target <= fold * _radial(fold**2, distortion.unbind())[0]
+        theta = target = torch.where(within, target, 0.0)
+        for _ in range(LENS_STEPS):
+            theta = torch.minimum(theta.clamp(min=0.0), fold)
+            factor, rate = _radial(theta * theta, distortion.unbind())
+            theta = theta - (theta * factor - target) / (factor + 2 * theta * theta * rate)
+        residual = theta * _radial(theta * theta, distortion.unbind())[0] - target
+        within = within & (residual.abs() < _tolerance(theta))
+    sideways = torch.where(off_axis, theta.sin() / radius, 1.0)
+    return torch.where(within, torch.cat([image * sideways, theta.cos()], -1), math.nan)
+
+
+def fisheye_image(points: Tensor, distortion: Tensor) -> Tensor:
+    """Points `[..., 3]` to image positions `[..., 2]`, up to 180 degrees from the axis."""
+    xy, z = points[..., :2], points[..., 2:]
+    rho_squared = (xy * xy).sum(-1, keepdim=True)
+    off_axis = rho_squared > torch.finfo(points.dtype).eps ** 2 * z * z
+    rho = torch.where(off_axis, rho_squared, 1.0).sqrt()
+    theta = torch.atan2(torch.where(off_axis, rho, 0.0), torch.where(off_axis, z, 1.0))
+    scale = torch.where(off_axis, theta / rho, 1 / torch.where(z > 0, z, 1.0))
+    seen = off_axis | (z > 0)
+    if len(distortion):
+        seen = seen & (theta <= _fisheye_fold(distortion))
+        scale = scale * _radial(theta * theta, distortion.unbind())[0]
+    return torch.where(seen, xy * scale, math.nan)
+
+
+def _fisheye_fold(distortion: Tensor) -> Tensor:
+    angles = torch.linspace(0, math.pi, FOLD_SAMPLES + 1, dtype=distortion.dtype, device=distortion.device)
+    return _fold(angles, distortion.unbind())
+
+
+def _radial(r_squared: Tensor, coefficients: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """`1 + sum_i k_i r^(2 i)` and its derivative in r^2."""
+    factor, rate = torch.zeros_like(r_squared), torch.zeros_like(r_squared)
+    for k in (*reversed(coefficients), 1.0):
+        factor, rate = factor * r_squared + k, rate * r_squared + factor
+    return factor, rate
+
+
+def _fold(radii: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
+    """The last of the increasing `radii [S]` up to which the distorted radius increases."""
+    factor, rate = _radial(radii * radii, coefficients)
+    first = torch.where(factor + 2 * radii * radii * rate > 0, math.inf, radii).amin(-1)
+    return torch.where(radii < first, radii, 0.0).amax(-1)
+
+
+def _tolerance(value: Tensor) -> float:
+    """How far from its target, in focal lengths, Newton may end and still count as having found the position."""
+    return torch.finfo(value.dtype).eps ** (2 / 3)

@@ -1,0 +1,212 @@
+"""Matching: which blob of the frame is which dot, grown inwards from the rim along the smooth flow."""
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import nn
+
+GROWTH, SETTLING = 14, 4  # steps
+WIDTH = 1.1  # of the local average, pitches
+RIDGE = 0.12  # pulls the flow's gradient to zero where neighbours do not fix it
+TOLERANCE = 0.30  # standard deviation of a prediction, pitches
+SIZE_TOLERANCE = 0.22  # standard deviation of a blob's log radius
+NEIGHBOURS = 8
+FAR = 1e6
+
+
+def spacing(pixels):
+    """`[D]` distance of each dot to its nearest neighbour and `[D]` the mean over its four nearest."""
+    distance = cKDTree(pixels).query(pixels, k=min(5, len(pixels)))[0][:, 1:]
+    return distance[:, 0], distance.mean(1)
+
+
+def thin_out(points, gap):
+    """Every point farther than `gap` from those kept before it."""
+    kept = []
+    for point in points:
+        if all(np.hypot(*(point - other)) > gap for other in kept):
+            kept.append(point)
+    return np.array(kept).reshape(-1, 2)
+
+
+def sectors(pixels):
+    """`[7, D]` 0 or 1: the pattern cut into its middle and six outer parts."""
+    around = pixels - pixels.mean(0)
+    radius, angle = np.hypot(*around.T), np.arctan2(*around.T)
+    part = np.where(radius < np.quantile(radius, 1 / 7), 6, ((angle / (2 * np.pi) + 0.5) * 6).astype(int) % 6)
+    return (part == np.arange(7)[:, None]).astype(float)
+
+
+def inverse_2x2(matrix):
+    a, b, c, d = matrix.flatten(-2).unbind(-1)
+    return torch.stack([d, -b, -c, a], -1).unflatten(-1, (2, 2)) / (a * d - b * c)[..., None, None]
+
+
+class LocalDeformation(nn.Module):
+    """The deformation gradient at every blob of a frame, from the arrangement of the blobs around it alone.
+
+    The dots next to the rest dot at that place are mapped by `A`, laid on the nearest blobs, and `A` fitted, a fixed
+    number of times, with an average over nearby blobs between. Nothing needs to be known of which blob is which dot.
+    """
+
+    def __init__(self, pixels):
+        super().__init__()
+        near = cKDTree(pixels).query(pixels, k=NEIGHBOURS + 1)[1][:, 1:]
+        self.register_buffer("pixels", torch.as_tensor(pixels))
+        self.register_buffer("pitch", torch.as_tensor(spacing(pixels)[1]))
+        self.register_buffer("around", torch.as_tensor(pixels[near] - pixels[:, None]))
+
+    def forward(self, blobs, valid):
+        """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, K, 2, 2]`, quality `[B, K]`."""
+        nearest = (blobs[:, :, None] - self.pixels).square().sum(-1).argmin(-1)
+        pitch = self.pitch[nearest]
+        around = self.around[nearest] / pitch[..., None, None]  # [B, K, M, 2]
+        apart = (blobs[:, :, None] - blobs[:, None]).square().sum(-1)
+        index = (apart + FAR * (1 - valid[:, None])).topk(13, largest=False).indices[..., 1:]
+        others = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
+        others = (others - blobs[:, :, None]) / pitch[..., None, None]  # [B, K, 12, 2]
+        there = valid.gather(1, index.flatten(1)).unflatten(1, index.shape[1:])
+        nearby = torch.exp(-apart / (2 * (1.3 * pitch[..., None]) ** 2)) * valid[:, None]
+        eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)
+        ratio = others[..., :4, :].square().sum(-1).clamp_min(1e-12).sqrt().mean(-1).clamp(0.4, 2.0)
+        gradient = ratio[..., None, None] * eye
+        for width in (0.35, 0.3, 0.25, 0.2, 0.2, 0.2):
+            mapped = around @ gradient.mT
+            square = (mapped[..., None, :] - others[..., None, :, :]).square().sum(-1)
+            likely = torch.exp(-square / (2 * width**2)) * there[..., None, :]
+            total = likely.sum(-1)
+            target = (likely @ others) / (total[..., None] + 1e-9)
+            weight = total / (total + 0.1)
+            weighted = around.mT * weight[..., None, :]
+            moment = weighted @ around
+            fitted = ((weighted @ target).mT + 0.2 * gradient) @ inverse_2x2(moment + 0.2 * eye)
+            quality = valid * weight.mean(-1) ** 2
+            share = nearby * quality[:, None]
+            share = share / (share.sum(-1, keepdim=True) + 1e-6)
+            gradient = (share @ fitted.flatten(-2)).unflatten(-1, (2, 2))
+            gradient = gradient + (1 - share.sum(-1))[..., None, None] * eye
+        return gradient, quality
+
+
+class LocalFlow(nn.Module):
+    """Moving averages of the flow around every dot, over its neighbours, itself left out.
+
+    Weights `w_n exp(-|x_n - x_d|^2 / 2 h_d^2)`, `h_d` the local pitch times `width`.
+    """
+
+    def __init__(self, pixels, nodes, width):
+        super().__init__()
+        h = width * spacing(pixels)[1]
+        y = (nodes[:, None] - pixels) / h[None, :, None]  # [N, D, 2]
+        kernel = np.exp(-0.5 * (y**2).sum(-1))
+        kernel[np.arange(len(pixels)), np.arange(len(pixels))] = 0
+        u, v = y[..., 0], y[..., 1]
+        moments = kernel * np.stack([np.ones_like(u), u, v, u * u, u * v, v * v])  # [6, N, D]
+        self.register_buffer("moments", torch.as_tensor(np.moveaxis(moments, 0, 1).reshape(len(nodes), -1)))
+        self.register_buffer("h", torch.as_tensor(h))
+
+    def forward(self, weight, flow):
+        """Least-squares affine flow `f(x) ~ f_d + J_d (x - x_d)`.
+
+        `weight [B, N]`, `flow [B, N, 2]` at the nodes -> flow `[B, D, 2]`, gradient `[B, D, 2, 2]`, support `[B, D]`.
+        """
+        count = self.h.numel()
+        s, su, sv, suu, suv, svv = (weight @ self.moments).unflatten(-1, (6, count)).unbind(-2)
+        load = (weight[:, None] * flow.mT) @ self.moments[:, : 3 * count]
+        load = load.unflatten(-1, (3, count)).movedim(1, -1)  # [B, 3, D, 2]
+        suu, svv, s1 = suu + RIDGE, svv + RIDGE, s + 1e-3
+        # adjugate of the symmetric 3 x 3 normal matrix
+        c00, c01, c02 = suu * svv - suv**2, suv * sv - su * svv, su * suv - suu * sv
+        c11, c12, c22 = s1 * svv - sv**2, su * sv - s1 * suv, s1 * suu - su**2
+        adjugate = torch.stack([c00, c01, c02, c01, c11, c12, c02, c12, c22], -1).unflatten(-1, (3, 3))
+        determinant = s1 * c00 + su * c01 + sv * c02
+        fit = (adjugate @ load.movedim(-3, -2)) / determinant[..., None, None]
+        return fit[..., 0, :], fit[..., 1:, :].mT / self.h[:, None, None], s
+
+    def along(self, weight, flow, gradient):
+        """The same where the gradient is known at the dots: `f_d = mean_n f_n + (J_n + J_d) / 2 (x_d - x_n)`.
+
+        `gradient [B, D, 2, 2]`; anchors, the last nodes, take that of the dot.
+        """
+        count = self.h.numel()
+        kernel, ku, kv = self.moments[:, : 3 * count].unflatten(-1, (3, count)).unbind(-2)
+        dots, anchors = weight[:, :count], weight[:, count:]
+        support = weight @ kernel
+        sum_flow = (weight[:, None] * flow.mT) @ kernel  # [B, 2, D]
+        own = torch.stack([dots @ k[:count] / 2 + anchors @ k[count:] for k in (ku, kv)], -1)  # [B, D, 2]
+        theirs = (dots[..., None, None] * gradient / 2).movedim(1, -1)  # [B, 2, 2, D]
+        theirs = theirs[:, :, 0] @ ku[:count] + theirs[:, :, 1] @ kv[:count]  # [B, 2, D]
+        mine = (gradient @ own[..., None]).squeeze(-1)
+        total = sum_flow.mT - (theirs.mT + mine) * self.h[:, None]
+        return total / (support[..., None] + 1e-3), support
+
+
+class DotMatcher(nn.Module):
+    """Assigns blobs of a frame to the dots of the rest image.
+
+    The flow is smooth and, where `anchors` are given, zero at them. Starting there, each of a fixed number of steps
+    predicts every dot from the sure nodes around it and the local deformation, takes the blob nearest to the prediction
+    and of its size, and keeps it where the choice is mutual. Without anchors each part of the pattern in turn is held to
+    have moved least, and the start that matches most is kept.
+    """
+
+    def __init__(self, pixels, log_radius, anchors=None):
+        super().__init__()
+        nearest, mean = spacing(pixels)
+        anchors = np.empty((0, 2)) if anchors is None else thin_out(np.asarray(anchors, float), 0.7 * np.median(mean))
+        nodes = np.concatenate([pixels, anchors])
+        self.deformation = LocalDeformation(pixels)
+        self.local = LocalFlow(pixels, nodes, WIDTH)
+        self.register_buffer("pixels", torch.as_tensor(pixels))
+        self.register_buffer("nearest", torch.as_tensor(nearest))
+        self.register_buffer("log_radius", torch.as_tensor(log_radius))
+        self.register_buffer("starts", torch.as_tensor(sectors(pixels) if len(anchors) == 0 else np.zeros((1, len(pixels)))))
+        self.register_buffer("still", torch.zeros(len(anchors), 2, dtype=torch.float64))
+
+    def with_anchors(self, weight, flow):
+        still = self.still.expand(len(flow), -1, -1)
+        return torch.cat([weight, torch.ones_like(still[..., 0])], 1), torch.cat([flow, still], 1)
+
+    def predict(self, weight, flow):
+        """Flow, gradient and support at the dots, from the dots `weight [B, D]`, `flow [B, D, 2]` and the anchors."""
+        weight, flow = self.with_anchors(weight, flow)
+        _, gradient, _ = self.local(weight, flow)
+        predicted, support = self.local.along(weight, flow, gradient)
+        return predicted, gradient, support
+
+    def choose(self, predicted, support, blobs, log_radius):
+        """The blob for each dot: its certainty `[B, D]`, the flow `[B, D, 2]`, and squared offsets `[B, D, K]` to all blobs."""
+        expected = self.pixels + predicted
+        square = ((expected[:, :, None] - blobs[:, None]) / self.nearest[:, None, None]).square().sum(-1)
+        cost = square / TOLERANCE**2 + ((self.log_radius[:, None] - log_radius[:, None]) / SIZE_TOLERANCE) ** 2
+        cost = cost + FAR * (support[..., None] < 0.8)
+        best, chosen = cost.min(-1)
+        mutual = best <= cost.amin(1).gather(1, chosen) * (1 + 1e-6)
+        weight = torch.exp(-0.5 * best) * mutual * (support / (support + 0.5))
+        flow = blobs.gather(1, chosen[..., None].expand(-1, -1, 2)) - self.pixels
+        return weight, torch.where(weight[..., None] > 0.02, flow, predicted), square
+
+    def forward(self, blobs, log_radius, valid):
+        """`blobs [B, K, 2]`, `log_radius`, `valid [B, K]` -> positions `[B, D, 2]` and certainty `[B, D]` in 0..1."""
+        deformation, quality = self.deformation(blobs, valid)
+        known = torch.cat([deformation.flatten(-2), torch.ones_like(deformation[..., 0, :1])], -1) * quality[..., None]
+        log_radius = log_radius + 3 * (1 - valid)
+        starts = len(self.starts)
+        blobs, log_radius, known = (x.repeat_interleave(starts, 0) for x in (blobs, log_radius, known))
+        flow = torch.zeros_like(self.pixels).expand(len(blobs), -1, -1)
+        weight, flow, square = self.choose(flow, FAR + flow[..., 0], blobs, log_radius)
+        weight = weight * self.starts.repeat(len(blobs) // starts, 1)
+        for _ in range(GROWTH):
+            share = torch.exp(-square / (2 * 0.6**2)) @ known
+            gradient = ((share[..., :4] + 1e-3 * share.new_tensor([1.0, 0.0, 0.0, 1.0])) / (share[..., 4:] + 1e-3)).unflatten(
+                -1, (2, 2)
+            )
+            jacobian = gradient - torch.eye(2, dtype=gradient.dtype, device=gradient.device)
+            predicted, support = self.local.along(*self.with_anchors(weight, flow), jacobian)
+            weight, flow, square = self.choose(predicted, support, blobs, log_radius)
+        for _ in range(SETTLING):
+            predicted, _, support = self.predict(weight, flow)
+            weight, flow, square = self.choose(predicted, support, blobs, log_radius)
+        best = weight.sum(-1).unflatten(0, (-1, starts)).argmax(-1)
+        best = best + starts * torch.arange(len(best), device=best.device)
+        return self.pixels + flow[best], weight[best]

@@ -1,0 +1,222 @@
+"""From images to surfaces: `Reconstructor`, an `nn.Module` that holds everything constant of one sensor."""
+
+import copy
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from . import results
+from .energy import Sheet
+from .errors import MembraneError
+from .flow import FlowInterpolation
+from .images import read_image
+from .markers.place import FEWEST_MARKERS, place_markers
+from .minimum_energy import MinimumEnergy
+from .results import CONTACT_POINTS, Reconstruction
+from .sensor import Sensor
+
+ESTIMATORS = ("minimum-energy",)
+FOUND = 0.5
+"""Confidence above which a marker counts as found."""
+FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5
+LARGEST_LAST_STEP, LARGEST_VOLUME_ERROR = 2e-4, 1e-4
+LEAST_CONTRAST, SATURATED_SHARE = 0.02, 0.98
+
+
+class Reconstructor(nn.Module):
+    """Images of one sensor to surfaces.
+
+    Arguments
+        sensor      a `Sensor` (`Reconstructor.from_file` reads one)
+        estimator   "minimum-energy" (the paper's)
+        model       the sheet's energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin"
+        element     "triangle", or "quadrilateral": the paper's affine quadrilaterals (harmonic), with `smoothing` (eq. 28)
+        volume      "exact", or "linear": the paper's linearised constraint (eq. 21)
+        flow        "smooth", or "bilinear" between the dots (section 5)
+        dtype       torch.float32 or torch.float64
+
+    Calling it with images gives a `Reconstruction`; `from_pixels` starts from markers located elsewhere.
+
+    >>> reconstructor = Reconstructor.from_file("examples/sensor.toml")
+    >>> result = reconstructor(reconstructor.read("examples/two_contacts.png"))
+    >>> int(result.status[0]), list(result.vertices.shape)
+    (0, [1, 289, 3])
+    """
+
+    def __init__(self, sensor: Sensor, estimator="minimum-energy", *, model=None, element="triangle", smoothing=None,
+                 volume="exact", flow="smooth", dtype=torch.float32):  # fmt: skip
+        super().__init__()
+        if estimator not in ESTIMATORS:
+            raise MembraneError(f"Reconstructor: estimator = {estimator!r}; expected one of {', '.join(ESTIMATORS)}")
+        self.sensor, self.image_size = sensor, tuple(sensor.camera.image_size)
+        self.camera, membrane = copy.deepcopy(sensor.camera), copy.deepcopy(sensor.membrane)
+        vertex_pixels = self.camera.point_to_pixel(membrane.rest)
+        if not torch.isfinite(vertex_pixels).all():
+            raise MembraneError(
+                f"sensor {sensor.name!r}: parts of the rest surface cannot be imaged by its camera; check the poses"
+            )
+        markers = place_markers(sensor, vertex_pixels)
+        self.locator = markers.locator
+        self.flow = FlowInterpolation(membrane, markers.points, flow)
+        self.estimator = self._minimum_energy(membrane, vertex_pixels, model, element, smoothing, volume)
+        self.register_buffer("vertex_pixels", vertex_pixels)
+        self.register_buffer("rest_markers", torch.from_numpy(markers.positions))
+        self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
+        self.register_buffer("measured_rest", torch.from_numpy(markers.model_pixels))
+        self.register_buffer("marker_vertices", torch.from_numpy(markers.points.vertices.astype(np.int64)))
+        self.register_buffer("marker_weights", torch.from_numpy(markers.points.weights.copy()))
+        self.to(dtype)
+        if self.locator is not None and sensor.markers.rest_image is not None:
+            self._measure_rest(sensor.markers.rest_image)
+
+    @classmethod
+    def from_file(cls, path: str | Path, **options) -> "Reconstructor":
+        """The reconstructor of a sensor file; options as for the class."""
+        return cls(Sensor.from_file(path), **options)
+
+    def _minimum_energy(self, membrane, vertex_pixels, model, element, smoothing, volume) -> MinimumEnergy:
+        sensor, material = self.sensor, self.sensor.material
+        sheet = Sheet(membrane, model or material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
+        filling, gas = sensor.cavity.filling, None
+        if filling == "gas" and sensor.force_unit == "relative":
+            warnings.warn(
+                f"sensor {sensor.name!r}: a gas without shear_modulus and thickness acts as a liquid (volume kept)",
+                stacklevel=3,
+            )
+            filling = "liquid"
+        if filling == "gas":
+            gas = (sensor.gas_pressure, sensor.cavity.volume or membrane.cavity_volume)
+        if smoothing is None:
+            smoothing = 0.1 if element == "quadrilateral" else 0.0
+        return MinimumEnergy(membrane, sheet, self.camera.pixel_to_ray(vertex_pixels), element, smoothing, filling, gas, volume)
+
+    def _measure_rest(self, image: np.ndarray) -> None:
+        """Null rest offsets (section 5.2): the same locator's rest pixels are subtracted from every frame's."""
+        with torch.no_grad():
+            pixels, confidence = self.locator(torch.from_numpy(image).to(self.rest_pixels.dtype)[None, None])
+        found = confidence[0] > FOUND
+        if found.sum() < max(FEWEST_MARKERS, ALIKE_SHARE * len(found)):
+            raise MembraneError(
+                f"sensor {self.sensor.name!r}: only {int(found.sum())} of {len(found)} markers are found in the rest image; "
+                "expected most: check the marker file, the polarity and the camera against the image"
+            )
+        self.measured_rest = torch.where(found[:, None], pixels[0], self.measured_rest)
+
+    def read(self, *paths: str | Path) -> Tensor:
+        """Image files as a batch `[B, 1, height, width]` in 0..1, in this module's precision and on its device."""
+        images = [torch.from_numpy(read_image(path)) for path in paths]
+        for path, image in zip(paths, images, strict=True):
+            self._check_size(image.shape, f"{path}: ")
+        return torch.stack(images)[:, None].to(self.rest_pixels)
+
+    def forward(self, images) -> Reconstruction:
+        """Reconstruct a batch of images.
+
+        Argument: `[B, 1, height, width]` (also `[B, height, width]`, `[height, width]`, or `[B, 3, height, width]` RGB), float
+        in 0..1 or uint8. Grey is 0.299 R + 0.587 G + 0.114 B. Raises `MembraneError` for another size; a frame that cannot be
+        reconstructed gets a status and NaN, the others are not touched.
+        """
+        if self.locator is None:
+            raise MembraneError(f"sensor {self.sensor.name!r} has no image-based markers; use from_pixels")
+        images = self._as_batch(images)
+        bad = ~(images.isfinite() & (images > -1e-3) & (images < 1.001)).flatten(1).all(1)
+        images = torch.where(bad[:, None, None, None], 0.0, images)
+        flat = images.flatten(1)
+        contrast = flat.amax(1) - flat.amin(1)
+        saturated = ((flat < 0.005) | (flat > 0.995)).to(flat.dtype).mean(1)
+        blank = (contrast < LEAST_CONTRAST) | ((saturated > SATURATED_SHARE) & (flat.mean(1) > 0.5))
+        pixels, confidence = self.locator(images)
+        status = torch.where(bad, results.BAD_VALUES, torch.where(blank, results.BLANK, results.OK))
+        return self._reconstruct(pixels - self.measured_rest, confidence, status)
+
+    def from_pixels(
+        self, pixels: Tensor, confidence: Tensor | None = None, rest_pixels: Tensor | None = None
+    ) -> Reconstruction:
+        """Reconstruct from marker centres located elsewhere.
+
+        Arguments: `pixels [B, D, 2]` in the sensor file's order, NaN where lost; `confidence [B, D]` (default: 1 where finite);
+        `rest_pixels [D, 2]`: the same markers located in the rest image (default: the model's rest pixels).
+        """
+        pixels = torch.as_tensor(pixels).to(self.rest_pixels)
+        if pixels.ndim == 2:
+            pixels = pixels[None]
+        if pixels.shape[1:] != self.rest_pixels.shape:
+            raise MembraneError(
+                f"from_pixels: pixels {list(pixels.shape)}; expected [B, {len(self.rest_pixels)}, 2], one for each marker"
+            )
+        finite = pixels.isfinite().all(-1)
+        confidence = torch.ones_like(pixels[..., 0]) if confidence is None else torch.as_tensor(confidence).to(pixels)
+        rest = self.rest_pixels if rest_pixels is None else torch.as_tensor(rest_pixels).to(pixels)
+        confidence = torch.where(finite, confidence.expand(finite.shape), 0.0)
+        displacement = torch.where(finite[..., None], pixels - rest, 0.0)
+        return self._reconstruct(displacement, confidence, torch.zeros_like(confidence[:, 0], dtype=torch.long))
+
+    def _reconstruct(self, displacement: Tensor, confidence: Tensor, status: Tensor) -> Reconstruction:
+        found = confidence > FOUND
+        confidence = torch.where(found, confidence, 0.0)
+        status = torch.where(status == results.OK, _marker_status(found), status)
+        usable = status == results.OK
+        flow = self.flow(displacement * usable[:, None, None], confidence)
+        equilibrium = self.estimator(*self.camera.pixel_to_ray(self.vertex_pixels + flow))
+        return self._result(equilibrium, displacement, confidence, status)
+
+    def _result(self, equilibrium, displacement, confidence, status) -> Reconstruction:
+        membrane, lost = self.estimator.membrane, confidence <= FOUND
+        x, pressure = equilibrium.vertices, equilibrium.pressure
+        u = x - membrane.rest
+        corner_u = u[:, self.marker_vertices.ravel()].unflatten(1, (-1, 3))
+        markers = self.rest_markers + (self.marker_weights[..., None] * corner_u).sum(-2)
+        pixels = self.rest_pixels + displacement
+        volume_error = (equilibrium.volume - self.estimator.target_volume(equilibrium.volume, pressure)) / membrane.rest_volume
+        miss2 = torch.where(lost, 0.0, ((self.camera.point_to_pixel(markers) - pixels) ** 2).sum(-1))
+        residual = (miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()
+        unsettled = (equilibrium.last_step > LARGEST_LAST_STEP) | ~x.flatten(1).isfinite().all(1)
+        if self.estimator.volume_constraint == "exact":
+            unsettled = unsettled | (volume_error.abs() > LARGEST_VOLUME_ERROR)
+        status = torch.where((status == results.OK) & unsettled, results.NOT_CONVERGED, status)
+        gone = (status != results.OK) & (status != results.NOT_CONVERGED)
+        blank = lambda a: torch.where(gone.reshape(-1, *(1,) * (a.ndim - 1)), torch.nan, a)  # noqa: E731
+        zeros = torch.zeros_like(x)
+        no_points = x.new_full((len(x), CONTACT_POINTS, 3), torch.nan)
+        return Reconstruction(
+            blank(x), blank(u), blank(membrane.normals(x)), blank(markers),
+            torch.where(lost[..., None], torch.nan, pixels), confidence,
+            blank(zeros), blank(zeros[..., 0]), no_points, blank(zeros[:, 0]),
+            blank(pressure), blank(pressure - self.estimator.rest_pressure), blank(volume_error), blank(residual),
+            status.to(torch.int32),
+        )  # fmt: skip
+
+    def _as_batch(self, images) -> Tensor:
+        images = torch.as_tensor(images)
+        if images.dtype == torch.uint8:
+            images = images / 255.0
+        images = images.to(self.rest_pixels)
+        if images.ndim == 2:
+            images = images[None]
+        if images.ndim == 3:
+            images = images[:, None]
+        if images.ndim == 4 and images.shape[1] == 3:
+            red, green, blue = images.unbind(1)
+            images = (0.299 * red + 0.587 * green + 0.114 * blue)[:, None]
+        if images.ndim != 4 or images.shape[1] != 1:
+            raise MembraneError(f"Reconstructor: images {list(images.shape)}; expected [B, 1, height, width]")
+        self._check_size(images.shape[2:], "")
+        return images
+
+    def _check_size(self, shape, where: str) -> None:
+        width, height = self.image_size
+        if tuple(shape) != (height, width):
+            raise MembraneError(
+                f"{where}the image is {shape[1]} x {shape[0]} px, sensor {self.sensor.name!r} expects {width} x {height}; "
+                "use images of this sensor's camera at its calibrated resolution"
+            )
+
+
+def _marker_status(found: Tensor) -> Tensor:
+    count, D = found.sum(-1), found.shape[-1]
+    few = count < max(FEWEST_MARKERS, FEWEST_SHARE * D)
+    unlike = count < ALIKE_SHARE * D
+    return torch.where(few, results.TOO_FEW_MARKERS, torch.where(unlike, results.UNLIKE_REST, results.OK))
