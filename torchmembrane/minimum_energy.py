@@ -18,15 +18,17 @@ from .solve.kkt import constrained_minimum
 ELEMENTS = ("triangle", "quadrilateral")
 FILLINGS = ("liquid", "gas", "open")
 VOLUMES = ("exact", "linear")
+STEPS = 8
 
 
 class Equilibrium(NamedTuple):
-    """`vertices [..., V, 3]`, pressure difference `[...]`, volume `[...]`, last step over the surface's size `[...]`."""
+    """`vertices [..., V, 3]`, pressure difference `[...]`, volume `[...]`, and `unbalance [...]`: the displacement that the
+    forces left along the rays would still cause, largest vertex, over the surface's size."""
 
     vertices: Tensor
     pressure: Tensor
     volume: Tensor
-    last_step: Tensor
+    unbalance: Tensor
 
 
 class MinimumEnergy(nn.Module):
@@ -40,7 +42,7 @@ class MinimumEnergy(nn.Module):
         filling     "liquid" (volume kept), "gas" (pressure x volume kept), "open" (pressure stays at rest)
         gas         for a gas: absolute pressure at rest (force / length^2) and volume (length^3)
         volume      "exact", or "linear": linearised once, at the rest ranges (eq. 21)
-        steps       Newton steps; 1 suffices for the harmonic energy with linear volume
+        steps       Newton steps: 8, or 1 for the harmonic energy with linear volume, where the first is exact
         rest_rays   unit directions `[V, 3]` of the rest rays and their origins `[V, 3]`
 
     The rest load `h = grad U(X) - p0 grad V(X)` is subtracted, so that zero flow gives exactly zero displacement.
@@ -49,7 +51,7 @@ class MinimumEnergy(nn.Module):
     """
 
     def __init__(self, membrane: Membrane, sheet: Sheet, rest_rays, element="triangle", smoothing=0.0, filling="liquid",
-                 gas: tuple[float, float] | None = None, volume="exact", steps=8, solver_steps=12):  # fmt: skip
+                 gas: tuple[float, float] | None = None, volume="exact", steps=None, solver_steps=12):  # fmt: skip
         super().__init__()
         for name, value, known in (
             ("element", element, ELEMENTS),
@@ -61,7 +63,8 @@ class MinimumEnergy(nn.Module):
         if filling == "gas" and gas is None:
             raise MembraneError("MinimumEnergy: filling = 'gas' without gas = (pressure, volume); pass both")
         self.membrane, self.filling, self.volume_constraint = membrane, filling, volume
-        self.steps, self.solver_steps = steps, solver_steps
+        quadratic = volume == "linear" and (element == "quadrilateral" or sheet.model == "harmonic") and filling != "gas"
+        self.steps, self.solver_steps = steps or (1 if quadratic else STEPS), solver_steps
         self.energy = sheet if element == "triangle" else AffineQuadrilaterals(membrane, sheet.tension)
         origins, directions = rest_rays
         self.register_buffer("rest_range", ((membrane.rest - origins) * directions).sum(-1))
@@ -97,47 +100,30 @@ class MinimumEnergy(nn.Module):
 
     def forward(self, origins: Tensor, directions: Tensor) -> Equilibrium:
         """`origins`, `directions [..., V, 3]`: the ray of every grid vertex now. Returns the `Equilibrium`."""
+        state = _State(self, origins, directions)
         t = self.rest_range.expand(directions.shape[:-1])
         pressure = self.rest_pressure.expand(directions.shape[:-2])
-        start = self._exact_rise(origins, directions, t)
         for _ in range(self.steps):
-            if self.volume_constraint == "exact":
-                rise, v = self._exact_rise(origins, directions, t)
-            else:
-                rise, v = start[0] + (start[1] * (t - self.rest_range)).sum(-1), start[1]
-            t, pressure, step = self._newton_step(origins, directions, t, pressure, rise, v)
-        x = self._surface(origins, directions, t)
-        last = step.abs().amax(-1) / self.membrane.rest_area.sum().sqrt()
-        return Equilibrium(x, pressure, self.membrane.volume(x), last)
+            t, pressure = self._newton_step(state, t, pressure)
+        x = state.surface(t)
+        left = symmetric_product(self.inverse, state.load(t, pressure)[..., None])
+        error = left.abs().amax((-1, -2)) / self.membrane.rest_area.sum().sqrt()
+        return Equilibrium(x, pressure, self.membrane.volume(x), error)
 
-    def _surface(self, origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
-        return torch.where(self.membrane.fixed[:, None], self.membrane.rest, origins + t[..., None] * directions)
-
-    def _exact_rise(self, origins, directions, t):
-        """Volume above that at rest, and its derivative in `t`."""
-        x = self._surface(origins, directions, t)
-        v = self.moves * (self.membrane.volume_gradient(x) * directions).sum(-1)
-        return self.membrane.volume(x) - self.membrane.rest_volume, v
-
-    def _newton_step(self, origins, directions, t, pressure, rise, v):
-        x = self._surface(origins, directions, t)
-        force = ((self.energy.gradient(x) - self.rest_load) * directions).sum(-1)
-        load = pressure[..., None] * v - self.moves * force
-        psi = (self.moves * (t - self.rest_range))[..., None]
-        load = load - self.smoothing * self.moves * self._smoother(self._smoother(psi)).squeeze(-1)
-        K = self.energy.stiffness_along(x, directions)
+    def _newton_step(self, state: "_State", t: Tensor, pressure: Tensor):
+        rise, v = state.rise(t)
+        K = self.energy.stiffness_along(state.surface(t), state.directions)
         solved = conjugate_gradient(
             lambda y: self._stiffness_product(K, y),
             lambda y: symmetric_product(self.inverse, y),
-            torch.stack([load, v], -1),
+            torch.stack([state.load(t, pressure), v], -1),
             self.solver_steps,
         )
         y, g = solved.unbind(-1)
         if self.filling == "open":
-            return t + y, pressure, y
-        target, compliance = self._volume_condition(rise, pressure)
-        minimum = constrained_minimum(y, g, v, target, compliance)
-        return t + minimum.y, pressure - minimum.multiplier, minimum.y
+            return t + y, pressure
+        minimum = constrained_minimum(y, g, v, *self._volume_condition(rise, pressure))
+        return t + minimum.y, pressure - minimum.multiplier
 
     def _volume_condition(self, rise: Tensor, pressure: Tensor):
         """Target `c` and compliance `C` of the step's volume, `v.y = c + C lambda` with `lambda = -(pressure step)`."""
@@ -157,3 +143,35 @@ class MinimumEnergy(nn.Module):
             return volume
         absolute, gas = self.gas.unbind()
         return self.membrane.rest_volume + gas * (absolute / (absolute + pressure - self.rest_pressure) - 1)
+
+
+class _State:
+    """One call's rays, and what depends on the ranges `t [..., V]` along them."""
+
+    def __init__(self, estimator: MinimumEnergy, origins: Tensor, directions: Tensor):
+        self.estimator, self.origins, self.directions = estimator, origins, directions
+        self.start = self._exact_rise(estimator.rest_range.expand(directions.shape[:-1]))
+
+    def surface(self, t: Tensor) -> Tensor:
+        membrane = self.estimator.membrane
+        return torch.where(membrane.fixed[:, None], membrane.rest, self.origins + t[..., None] * self.directions)
+
+    def _exact_rise(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        membrane, x = self.estimator.membrane, self.surface(t)
+        v = self.estimator.moves * (membrane.volume_gradient(x) * self.directions).sum(-1)
+        return membrane.volume(x) - membrane.rest_volume, v
+
+    def rise(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Volume above that at rest `[...]` and its derivative `v [..., V]`: exact, or linear about the rest ranges."""
+        if self.estimator.volume_constraint == "exact":
+            return self._exact_rise(t)
+        rise, v = self.start
+        return rise + (v * (t - self.estimator.rest_range)).sum(-1), v
+
+    def load(self, t: Tensor, pressure: Tensor) -> Tensor:
+        """Force along the rays that no equilibrium balances, `[..., V]`: zero at the solution (eq. 25)."""
+        estimator, x = self.estimator, self.surface(t)
+        force = ((estimator.energy.gradient(x) - estimator.rest_load) * self.directions).sum(-1)
+        psi = (estimator.moves * (t - estimator.rest_range))[..., None]
+        smooth = estimator.smoothing * estimator._smoother(estimator._smoother(psi)).squeeze(-1)
+        return estimator.moves * (pressure[..., None] * self.rise(t)[1] - force - smooth)

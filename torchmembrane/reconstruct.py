@@ -22,7 +22,7 @@ ESTIMATORS = ("minimum-energy",)
 FOUND = 0.5
 """Confidence above which a marker counts as found."""
 FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5
-LARGEST_LAST_STEP, LARGEST_VOLUME_ERROR = 2e-4, 1e-4
+LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR = 1e-5, 1e-5
 LEAST_CONTRAST, SATURATED_SHARE = 0.02, 0.98
 
 
@@ -173,7 +173,7 @@ class Reconstructor(nn.Module):
         volume_error = (equilibrium.volume - self.estimator.target_volume(equilibrium.volume, pressure)) / membrane.rest_volume
         miss2 = torch.where(lost, 0.0, ((self.camera.point_to_pixel(markers) - pixels) ** 2).sum(-1))
         residual = (miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()
-        unsettled = (equilibrium.last_step > LARGEST_LAST_STEP) | ~x.flatten(1).isfinite().all(1)
+        unsettled = (equilibrium.unbalance > LARGEST_UNBALANCE) | ~x.flatten(1).isfinite().all(1)
         if self.estimator.volume_constraint == "exact":
             unsettled = unsettled | (volume_error.abs() > LARGEST_VOLUME_ERROR)
         status = torch.where((status == results.OK) & unsettled, results.NOT_CONVERGED, status)

@@ -1,0 +1,89 @@
+"""Marker and surface accuracy on rendered cases with truth.
+
+python bench/accuracy.py CASES [--json FILE]
+
+CASES holds index.json, a list of cases with `sensor`, `images` (files), `truth` (npz with `uv_deformed [D, 2]`, `dots_nominal`
+and `dots_deformed [D, 3]`, optionally `visible_deformed [D]`), `folder`, `case`; or it is a folder like examples/, with
+sensor.toml, NAME.png and NAME_truth.npz. Printed, for each sensor and kind of image: median and 95th percentile of the marker
+error in px over found visible markers, the share found, how many are more than 3 px off, and the surface's error over its
+displacement (rms at the markers, median over cases) for several estimators, from the image and from exact markers.
+"""
+
+import argparse
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+from record import write
+
+from torchmembrane.reconstruct import Reconstructor
+
+ESTIMATORS = {
+    "harmonic, quadrilaterals, linear volume (the paper)": dict(model="harmonic", element="quadrilateral", volume="linear"),
+    "harmonic, triangles": dict(model="harmonic"),
+    "the sensor's material": {},
+}
+
+
+def cases_in(folder: Path) -> list[dict]:
+    if (folder / "index.json").exists():
+        return json.loads((folder / "index.json").read_text())
+    return [
+        dict(case=path.stem[:-6], folder=".", sensor="sensor.toml", images=[path.stem[:-6] + ".png"], truth=path.name)
+        for path in sorted(folder.glob("*_truth.npz"))
+    ]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", type=Path)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    cases = cases_in(args.cases)
+    markers, surface = {}, {}
+    for name in sorted({case["sensor"] for case in cases}):
+        for label, options in ESTIMATORS.items():
+            reconstructor = Reconstructor.from_file(args.cases / name, **options)
+            for case in (c for c in cases if c["sensor"] == name):
+                score(reconstructor, args.cases, case, label, markers, surface)
+    table = []
+    for (folder, kind), groups in sorted(markers.items()):
+        error, seen = (np.concatenate(part) for part in zip(*groups, strict=True))
+        found = np.isfinite(error)
+        row = dict(
+            sensor=folder, images=kind, median=np.median(error[found]), p95=np.percentile(error[found], 95),
+            found=found.sum() / seen.sum(), wrong=int((error[found] > 3).sum()),
+        )  # fmt: skip
+        table.append({k: v if isinstance(v, str) else float(v) for k, v in row.items()})
+        print(
+            "{sensor:18s} {images:8s} median {median:.3f} px, 95 % {p95:.3f} px, found {found:.4f}, wrong {wrong}".format(**row)
+        )
+    for (label, kind), values in sorted(surface.items()):
+        print(
+            f"{label}, {kind}: surface error / displacement {np.median(values):.3f} in the median, {max(values):.3f} at worst"
+        )
+    write(args.json, dict(markers=table, surface={f"{a}, {b}": v for (a, b), v in surface.items()}))
+
+
+def score(reconstructor, root: Path, case: dict, label: str, markers: dict, surface: dict) -> None:
+    truth = np.load(root / case["truth"])
+    X, Y = truth["dots_nominal"].astype(float), truth["dots_deformed"].astype(float)
+    relative = lambda result: float(np.sqrt(((result.markers[0].numpy() - Y) ** 2).sum() / ((Y - X) ** 2).sum()))  # noqa: E731
+    exact = torch.from_numpy(truth["uv_deformed"].astype(np.float32))
+    with torch.no_grad():
+        surface.setdefault((label, "exact markers"), []).append(relative(reconstructor.from_pixels(exact)))
+        for image in case["images"]:
+            kind = Path(image).stem.rpartition("_")[2] if "_" in case["images"][0] and len(case["images"]) > 1 else "images"
+            result = reconstructor(reconstructor.read(root / image))
+            surface.setdefault((label, kind), []).append(relative(result))
+            if label == list(ESTIMATORS)[-1]:
+                seen = truth["visible_deformed"].astype(bool) if "visible_deformed" in truth else np.ones(len(X), bool)
+                error = np.linalg.norm(result.pixels[0].numpy() - truth["uv_deformed"], axis=1)
+                markers.setdefault((case["folder"], kind), []).append((error[seen], np.ones(seen.sum())))
+
+
+if __name__ == "__main__":
+    main()

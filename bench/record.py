@@ -1,0 +1,37 @@
+"""What every benchmark writes: results with the machine and versions that gave them."""
+
+import json
+import os
+import platform
+import statistics
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+
+
+def median_seconds(function, repeats: int = 7) -> tuple[float, float]:
+    """Median and spread (max - min) of the wall time of `function()`, after one warm-up call."""
+    function()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times), max(times) - min(times)
+
+
+def write(path: Path | None, results: dict) -> None:
+    """Print the results, and write them with the machine's description if a path is given."""
+    machine = dict(
+        processor=platform.processor() or platform.machine(), cores=os.cpu_count(), torch_threads=torch.get_num_threads(),
+        python=platform.python_version(), cuda=torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        **{name: version(name) for name in ("torch", "kornia", "numpy", "scipy", "torchmembrane")},
+    )  # fmt: skip
+    if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(dict(machine=machine, **results), indent=1))
+        print(f"written to {path}")

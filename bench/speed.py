@@ -1,0 +1,98 @@
+"""Time a frame: markers, flow, solve, at several batch sizes, beside a per-frame scipy twin of the solve.
+
+python bench/speed.py [--sensor examples/sensor.toml] [--image examples/two_contacts.png] [--device cpu] [--json FILE]
+
+The twin solves the same constrained harmonic problem (linear triangles, volume linearised once, eq. 22) as one would write it
+for one frame: sparse assembly and factorisation by scipy.
+"""
+
+import argparse
+import warnings
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.linalg import splu
+import torch
+from record import median_seconds, write
+
+from torchmembrane.energy import Sheet
+from torchmembrane.membrane import corners
+from torchmembrane.reconstruct import Reconstructor
+
+
+def scipy_twin(reconstructor):
+    """A function of one frame's ray directions `[V, 3]` that returns the vertices of eq. 22."""
+    estimator, membrane = reconstructor.estimator, reconstructor.estimator.membrane
+    index = corners(torch.arange(len(membrane.rest))[:, None], membrane.grid)[..., 0].reshape(-1, 4).numpy()
+    up = torch.zeros_like(membrane.rest)
+    up[:, 2] = 1
+    sheet = Sheet(reconstructor.sensor.membrane, "harmonic", reconstructor.sensor.material.prestretch)
+    local = sheet.to(up.dtype).stiffness_along(membrane.rest, up).reshape(-1, 4, 4).numpy().astype(float)
+    row, column = np.repeat(index, 4, 1).ravel(), np.tile(index, (1, 4)).ravel()
+    free, fixed = membrane.free.numpy(), membrane.fixed.numpy()
+    rest_range = estimator.rest_range.numpy().astype(float)
+    X, h, p0 = (a.numpy().astype(float) for a in (membrane.rest, estimator.rest_load, estimator.rest_pressure))
+    V0 = float(membrane.rest_volume)
+
+    def solve(d):
+        dots = np.einsum("qic,qjc->qij", d[index], d[index])
+        K = sparse.csc_matrix(((local * dots).ravel(), (row, column)), shape=(len(X), len(X)))
+        start = np.where(fixed[:, None], X, rest_range[:, None] * d)
+        x = torch.from_numpy(start).to(membrane.rest)
+        v = (membrane.volume_gradient(x).numpy() * d).sum(1)
+        load = p0 * v + (h * d).sum(1) - K @ rest_range
+        factor = splu(K[free][:, free])
+        y, w = factor.solve(load[free]), factor.solve(v[free])
+        multiplier = (v[free] @ y - (V0 - float(membrane.volume(x)))) / (v[free] @ w)
+        start[free] += (y - multiplier * w)[:, None] * d[free]
+        return start
+
+    return solve
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sensor", default="examples/sensor.toml")
+    parser.add_argument("--image", default="examples/two_contacts.png")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--batches", type=int, nargs="*", default=[1, 16, 64])
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(args.threads)
+    rows = []
+    for label, options in (
+        ("harmonic, linear volume (the paper)", dict(model="harmonic", volume="linear")),
+        ("the sensor's material, exact volume", {}),
+    ):
+        reconstructor = Reconstructor.from_file(args.sensor, **options).to(args.device)
+        image = reconstructor.read(args.image)
+        with torch.no_grad():
+            for batch in args.batches:
+                images = image.expand(batch, -1, -1, -1).contiguous()
+                pixels, confidence = reconstructor.locator(images)
+                displacement = pixels - reconstructor.measured_rest
+                flow = reconstructor.flow(displacement, confidence)
+                rays = reconstructor.camera.pixel_to_ray(reconstructor.vertex_pixels + flow)
+                parts = dict(
+                    markers=lambda images=images, r=reconstructor: r.locator(images),
+                    flow=lambda s=displacement, c=confidence, r=reconstructor: r.flow(s, c),
+                    solve=lambda rays=rays, r=reconstructor: r.estimator(*rays),
+                    whole=lambda images=images, r=reconstructor: r(images),
+                )
+                times = {name: [1000 * t / batch for t in median_seconds(part)] for name, part in parts.items()}
+                rows.append(dict(estimator=label, batch=batch, milliseconds_a_frame=times))
+                print(f"{label}, batch {batch}: " + ", ".join(f"{k} {t[0]:.2f} ms" for k, t in times.items()), flush=True)
+            if options and args.device == "cpu":
+                twin, d = scipy_twin(reconstructor), rays[1][0].double().numpy()
+                gap = np.abs(twin(d) - reconstructor.estimator(rays[0][:1], rays[1][:1]).vertices[0].numpy()).max()
+                seconds = median_seconds(lambda twin=twin, d=d: twin(d))
+                rows.append(dict(estimator="scipy twin", batch=1, milliseconds_a_frame=dict(solve=[1000 * s for s in seconds])))
+                print(f"scipy twin of the same solve, a frame: {1000 * seconds[0]:.2f} ms (largest difference {gap:.1e})")
+    write(args.json, dict(sensor=args.sensor, rows=rows))
+
+
+if __name__ == "__main__":
+    main()
