@@ -3,6 +3,7 @@
 import csv
 import io
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -37,7 +38,9 @@ class Denting:
     def __init__(self, fingerprint="a" * 64):
         membrane = spherical_cap(12.0, 9.0, 3.0, grid=(5, 5))
         camera = SimpleNamespace(image_size=(WIDTH, HEIGHT))
-        self.sensor = SimpleNamespace(name="cap", length_unit="mm", force_unit="N", fingerprint=fingerprint, camera=camera)
+        self.sensor = SimpleNamespace(
+            name="cap", length_unit="mm", force_unit="N", fingerprint=fingerprint, camera=camera
+        )
         self.estimator = SimpleNamespace(membrane=membrane)
         self.vertex_pixels = membrane.rest[:, :2] + 8
         self.rest_pixels = torch.linspace(2, 10, 14).reshape(7, 2)
@@ -176,10 +179,11 @@ def test_summary_is_rebuilt_from_the_frames(images, tmp_path):
     reconstruct(images[:3], tmp_path / "out")
     before = summary_of(tmp_path / "out")
     (tmp_path / "out" / "summary.csv").write_text("name;file\nmade by hand;\n")
-    reconstruct(images[3:], tmp_path / "out")
+    reconstruct(images[1:], tmp_path / "out")
     after = summary_of(tmp_path / "out")
     assert list(after) == [path.stem for path in images]
-    assert all(after["i0"][key] == before["i0"][key] for key in before["i0"] if key not in ("file", "seconds"))
+    assert [after[name]["file"] for name in ("i0", "i1")] == ["", str(images[1])]
+    assert all(after["i1"][key] == before["i1"][key] for key in before["i1"] if key != "seconds")
 
 
 @pytest.mark.parametrize("settings", [NPZ, PARQUET])
@@ -201,6 +205,18 @@ def test_an_interrupted_run_keeps_what_is_done_and_goes_on(images, tmp_path, set
 def test_only_few_batches_are_in_memory(images, tmp_path):
     paths = [grey_image(images[0].parent / f"m{k:02d}.png", 99) for k in range(24)]
     assert reconstruct(paths, tmp_path / "out")[2].furthest_ahead <= 4
+
+
+def test_the_next_batch_is_read_while_one_is_computed(images, tmp_path):
+    class Patient(Denting):
+        def __call__(self, batch):
+            deadline = time.monotonic() + 5
+            while self.read_count < min(sum(self.calls) + 4, len(images)):
+                assert time.monotonic() < deadline, "nothing is read meanwhile"
+                time.sleep(0.001)
+            return super().__call__(batch)
+
+    assert reconstruct(images, tmp_path / "out", reconstructor=Patient())[0] == (5, 0, 0, 0)
 
 
 def test_two_images_of_one_name_are_refused(images, tmp_path):
@@ -308,7 +324,8 @@ def write_video(path: Path, levels) -> Path:
 def test_a_video_gives_numbered_frames(tmp_path):
     video = write_video(tmp_path / "press.mkv", [100, 0, 120, 130, 140])
     outcome, lines, _ = reconstruct([video], tmp_path / "out")
-    assert outcome == (4, 0, 1, 0) and len(lines) == 1
+    assert outcome == (4, 0, 1, 0)
+    assert len(lines) == 1 and lines[0].startswith(f"{video}, press_000001: blank")
     names, batch = read_results(tmp_path / "out")
     assert names == [f"press_{k:06d}" for k in range(5)]
     assert torch.allclose(batch.pressure[[0, 2, 3, 4]] * 255, torch.tensor([100.0, 120, 130, 140]), atol=0.01)

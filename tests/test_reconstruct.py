@@ -243,6 +243,17 @@ def test_results_survive_the_disk_and_foreign_files_do_not(result, tmp_path):
         torch.testing.assert_close(value[0], result._asdict()[key][1], equal_nan=True)
     np.savez(tmp_path / "b.npz", other=1)
     (tmp_path / "c.npz").write_bytes(b"not a zip")
-    for name in ("b", "c", "missing"):
+    (tmp_path / "d.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:5000])
+    np.save(tmp_path / "e.npy", np.ones(3))
+    (tmp_path / "e.npy").rename(tmp_path / "e.npz")
+    for name in ("b", "c", "d", "e", "missing"):
         with pytest.raises(MembraneError, match=f"{name}.npz"):
             results.load_frame(tmp_path / f"{name}.npz")
+
+
+def test_pixels_that_break_the_solve_give_no_surface_and_say_so(reconstructor):
+    pixels = reconstructor.rest_pixels.clone()[None].repeat(2, 1, 1)
+    pixels[0] = pixels[0] * 1e30
+    got = reconstructor.from_pixels(pixels)
+    assert got.status.tolist() == [results.NO_SOLUTION, results.OK]
+    assert got.vertices[0].isnan().all() and got.vertices[1].isfinite().all()

@@ -160,7 +160,7 @@ def test_overwritten_region_is_lost_and_does_not_drag_the_rest(locator, pressed,
 
 def test_lost_pixels_are_what_the_neighbours_predict(locator, pixels):
     image = photograph(lambda points: points - [9.0, -5.0], 7)
-    image[(U - 160) ** 2 + (V - 120) ** 2 < 30**2] = 0.5
+    image[(U - 160) ** 2 + (V - 120) ** 2 < 40**2] = 0.5
     error, confidence = errors(locator, image, pixels + [9.0, -5.0])
     hidden = np.linalg.norm(pixels + [9.0, -5.0] - [160, 120], axis=1) < 20
     assert hidden.sum() > 4 and (confidence[hidden] == 0).all()
@@ -175,7 +175,7 @@ def test_affine_flow_is_predicted_and_outliers_have_no_say(pixels):
     local = Neighbourhood(pixels, np.zeros((0, 2))).float()(broken, torch.ones(1, len(pixels)), 0.3)
     inner = np.linalg.norm((pixels - [160, 120]) / [120, 85], axis=1) < 1
     error = (local.flow - flow).norm(dim=-1)[:, inner]
-    assert error.median() < 0.1 and error.quantile(0.95) < 0.6
+    assert error.median() < 0.15 and error.quantile(0.95) < 0.6
     assert (local.gradient - gradient)[:, inner].abs().median() < 0.02
 
 
@@ -203,14 +203,18 @@ def test_image_without_the_texture_is_all_lost_but_finite(locator, image, pixels
     assert (confidence == 0).all() and np.isfinite(error).all()
 
 
-def test_lost_patches_near_the_rim_stay_with_the_anchors(rest, pixels):
+def test_lost_patches_near_the_rim_stay_with_the_anchors(rest, locator, pixels):
     angle = np.linspace(0, 2 * np.pi, 120, endpoint=False)
     rim = np.stack([160 + 152 * np.cos(angle), 120 + 114 * np.sin(angle)], 1)
+    image = batch(np.where(U < 60, 0.3, photograph(lambda points: points - [9.0, 0.0], 1)))
+    near = np.linalg.norm(pixels[:, None] - rim, axis=-1).min(1) < 12
+    near &= pixels[:, 0] < 30
     with torch.no_grad():
-        found, confidence = TextureLocator(rest, pixels, rim)(batch(np.where(U < 60, 0.3, photograph(bump, 1))))
-    hidden = pixels[:, 0] < 40
-    assert (confidence[0, hidden] == 0).all()
-    assert np.linalg.norm(found[0].numpy() - pixels, axis=1)[hidden].max() < 1
+        held, confidence = TextureLocator(rest, pixels, rim)(image)
+        free, _ = locator(image)
+    moved = [(found[0, near] - torch.tensor(pixels[near])).norm(dim=-1) for found in (held, free)]
+    assert near.sum() > 2 and (confidence[0, near] == 0).all()
+    assert moved[0].median() < 2 < 6 < moved[1].median()
 
 
 def test_a_frame_alone_equals_the_frame_in_a_batch(locator, rest, pressed):

@@ -74,9 +74,15 @@ def test_three_panels_with_units_and_a_title(mesh):
 def test_the_deepest_point_is_marked_with_its_value(mesh):
     map_ = view.figure(pressed(mesh), mesh).axes[2]
     note = next(text for text in map_.texts if "mm" in text.get_text())
-    assert note.get_text() == "-1.50 mm"
+    assert note.get_text() == "-1.5 mm"
     assert note.xy == pytest.approx(mesh.vertex_pixels[DENT])
-    assert f"{mesh.rest_vertices[DENT][0] - 1.5 * mesh.rest_normals[DENT][0]:.1f}" in map_.get_title()
+    x, y, z = mesh.rest_vertices[DENT] - 1.5 * mesh.rest_normals[DENT]
+    assert map_.get_title() == f"Deepest at x, y, z = {x:.2f}, {y:.2f}, {z:.2f} mm"
+
+
+def test_where_nothing_is_pressed_nothing_is_marked(mesh):
+    map_ = view.figure(pressed(mesh, depth=0.01), mesh).axes[2]
+    assert not map_.texts and map_.get_title() == "Not pressed in by 0.05 mm anywhere"
 
 
 def test_the_colour_scale_is_symmetric_and_does_not_blow_up_noise(mesh):

@@ -173,10 +173,12 @@ class Reconstructor(nn.Module):
         volume_error = (equilibrium.volume - self.estimator.target_volume(equilibrium.volume, pressure)) / membrane.rest_volume
         miss2 = torch.where(lost, 0.0, ((self.camera.point_to_pixel(markers) - pixels) ** 2).sum(-1))
         residual = (miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()
-        unsettled = (equilibrium.unbalance > LARGEST_UNBALANCE) | ~x.flatten(1).isfinite().all(1)
+        unsettled = equilibrium.unbalance > LARGEST_UNBALANCE
         if self.estimator.volume_constraint == "exact":
             unsettled = unsettled | (volume_error.abs() > LARGEST_VOLUME_ERROR)
-        status = torch.where((status == results.OK) & unsettled, results.NOT_CONVERGED, status)
+        ok, broken = status == results.OK, ~x.flatten(1).isfinite().all(1)
+        status = torch.where(ok & unsettled, results.NOT_CONVERGED, status)
+        status = torch.where(ok & broken, results.NO_SOLUTION, status)
         gone = (status != results.OK) & (status != results.NOT_CONVERGED)
         blank = lambda a: torch.where(gone.reshape(-1, *(1,) * (a.ndim - 1)), torch.nan, a)  # noqa: E731
         zeros = torch.zeros_like(x)

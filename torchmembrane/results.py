@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from typing import NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from .errors import MembraneError
 
-OK, TOO_FEW_MARKERS, UNLIKE_REST, NOT_CONVERGED, BLANK, BAD_VALUES = range(6)
+OK, TOO_FEW_MARKERS, UNLIKE_REST, NOT_CONVERGED, BLANK, BAD_VALUES, NO_SOLUTION = range(7)
 
 STATUS_TEXTS = {
     OK: "ok",
@@ -17,7 +18,8 @@ STATUS_TEXTS = {
     UNLIKE_REST: "image unlike the rest image (most markers not found): is it this sensor's? no surface",
     NOT_CONVERGED: "the solve has not converged: the answer is kept, do not rely on it",
     BLANK: "blank or saturated image: no contrast; no surface",
-    BAD_VALUES: "image or pixels hold NaN, infinity or values outside 0..1; no surface",
+    BAD_VALUES: "image holds NaN, infinity or values outside 0..1; no surface",
+    NO_SOLUTION: "the solve broke down: the flow folds the surface or is far too large; no surface",
 }
 CONTACT_POINTS = 4
 
@@ -82,7 +84,7 @@ def load_frame(path: str | Path) -> dict[str, np.ndarray]:
             frame = {k: data[k] for k in Reconstruction._fields}
     except FileNotFoundError as error:
         raise MembraneError(f"{path}: no such file; expected a result NAME.npz") from error
-    except (KeyError, OSError, ValueError, EOFError) as error:
+    except (KeyError, OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
         raise MembraneError(
             f"{path}: not a result of torchmembrane ({error}); expected the arrays of Reconstruction"
         ) from error

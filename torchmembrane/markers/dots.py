@@ -8,7 +8,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.markers.locate import STRAY, EllipseFit, pyramid
+from torchmembrane.markers.locate import STRAY, EllipseFit, pyramid, size_tolerance
 from torchmembrane.markers.match import DotMatcher
 
 SCALES = 1.25  # ratio of neighbouring scales
@@ -31,7 +31,7 @@ class DotPattern(NamedTuple):
 
 
 def blob_seeds(dark):
-    """Maxima `[S, 2]` (u, v) over place and scale of the normalised Hessian's determinant, and their radii `[S]`, best first."""
+    """Maxima `[S, 2]` (u, v) over place and scale of the Hessian's determinant, and their radii `[S]`, best first."""
     count = int(np.log(min(dark.shape) * LARGEST / SMALLEST) / np.log(SCALES)) + 1
     radii = SMALLEST * SCALES ** np.arange(count)
     responses = []
@@ -46,7 +46,7 @@ def blob_seeds(dark):
 
 
 def outline(dark, seed, radius):
-    """The connected pixels about `seed` darker than half way to the background: area, centre, moments, contrast, or None."""
+    """The pixels about `seed` darker than half way to the background: area, centre, moments, contrast, or None."""
     reach = int(np.ceil(2.6 * radius)) + 2
     v0, u0 = max(seed[1] - reach, 0), max(seed[0] - reach, 0)
     patch = dark[v0 : seed[1] + reach + 1, u0 : seed[0] + reach + 1]
@@ -101,9 +101,9 @@ def find_blobs(dark, mask=None):
     return tuple(np.array(x) for x in zip(*blobs, strict=True))
 
 
-def refine(dark, pixels, shapes):
+def refine(dark, pixels, shapes, tolerance=0.45):
     """Centres `[D, 2]` fitted to sub-pixel accuracy, the outline's growth `[D]` px, quality `[D]` in 0..1."""
-    fit = EllipseFit(pixels, shapes, dark.shape[::-1], steps=8)
+    fit = EllipseFit(pixels, shapes, dark.shape[::-1], tolerance, steps=8)
     levels = pyramid(torch.as_tensor(dark)[None, None])
     return tuple(x[0].numpy() for x in fit(levels, torch.as_tensor(pixels)[None], torch.as_tensor(shapes)[None]))
 
@@ -147,12 +147,11 @@ def find_dots(image, polarity, mask=None):
     dark = np.asarray(image, float) if polarity == "dark" else 1 - np.asarray(image, float)
     pixels, shapes, contrasts = find_blobs(dark, mask)
     keep = population(pixels, shapes, contrasts)
+    pixels, shapes, contrasts = pixels[keep], shapes[keep], contrasts[keep]
+    pixels, growth, quality = refine(dark, pixels, shapes)
+    shapes = shapes * (1 + growth / (np.linalg.norm(shapes, axis=(1, 2)) / 2**0.5))[:, None, None]
+    keep = population(pixels, shapes, contrasts) & (quality > 0.3)
     pixels, shapes = pixels[keep], shapes[keep]
-    centre, growth, quality = refine(dark, pixels, shapes)
-    fitted = (quality > 0.1)[:, None]
-    pixels = np.where(fitted, centre, pixels)
-    radii = np.linalg.norm(shapes, axis=(1, 2)) / 2**0.5
-    shapes = np.where(fitted[..., None], shapes * (1 + growth / radii)[:, None, None], shapes)
     order = np.lexsort((pixels[:, 0], pixels[:, 1]))
     return DotPattern(pixels[order], shapes[order], size_classes(pixels, shapes)[order])
 
@@ -160,11 +159,12 @@ def find_dots(image, polarity, mask=None):
 def measure_dots(image, pixels, shapes, sizes, polarity):
     """The listed dots measured in the rest image.
 
-    image: `[H, W]` grey 0..1; pixels: `[D, 2]` predicted centres, off by up to half a pitch; shapes: `[D, 2, 2]` px, of dots
-    of unit radius; sizes: `[D]` int; polarity: "dark" or "light".
+    image: `[H, W]` grey 0..1; pixels: `[D, 2]` predicted centres, off by up to half a pitch; shapes: `[D, 2, 2]` px, of
+    dots of unit radius; sizes: `[D]` int; polarity: "dark" or "light".
     Returns a `DotPattern`, shapes scaled by each size's radius as found, the centre NaN where a dot is not seen.
     """
     dark = np.asarray(image, float) if polarity == "dark" else 1 - np.asarray(image, float)
+    pixels, shapes, sizes = np.asarray(pixels, float), np.asarray(shapes, float), np.asarray(sizes, int)
     found, outlines, contrasts = find_blobs(dark)
     keep = population(found, outlines, contrasts)
     found, outlines = found[keep], outlines[keep]
@@ -173,14 +173,16 @@ def measure_dots(image, pixels, shapes, sizes, polarity):
     nearest = cKDTree(found).query(pixels)[1]
     radius = {size: np.median((log_radius[nearest] - unit)[sizes == size]) for size in np.unique(sizes)}
     expected = unit + np.array([radius[size] for size in sizes])
-    match = DotMatcher(pixels, expected)
-    place, certainty = match(torch.as_tensor(found)[None], torch.as_tensor(log_radius)[None], torch.ones(1, len(found)))
     scaled = shapes * np.exp(expected - unit)[:, None, None]
-    centre, growth, quality = refine(dark, place[0].numpy(), scaled)
+    tolerance = size_tolerance(scaled, sizes)
+    match = DotMatcher(pixels, expected, tolerance)
+    blobs, log_radius = torch.as_tensor(found)[None], torch.as_tensor(log_radius)[None]
+    place, certainty = match(blobs, log_radius, torch.ones_like(log_radius))
+    centre, growth, quality = refine(dark, place[0].numpy(), scaled, tolerance)
     weight = certainty * torch.as_tensor(quality)
     predicted, _, _ = match.predict(weight, torch.as_tensor(centre - pixels)[None])
     stray = np.linalg.norm(centre - pixels - predicted[0].numpy(), axis=1)
     seen = (quality > 0.3) & (stray < STRAY * match.nearest.numpy())
     for size in np.unique(sizes):
         scaled[sizes == size] *= 1 + np.median((growth / np.exp(expected))[seen & (sizes == size)])
-    return DotPattern(np.where(seen[:, None], centre, np.nan), scaled, np.asarray(sizes))
+    return DotPattern(np.where(seen[:, None], centre, np.nan), scaled, sizes)

@@ -1,4 +1,4 @@
-"""Locating dots: soft, batched, exportable; blobs at the pattern's scales, matched, then fitted to sub-pixel accuracy."""
+"""Locating dots in a batch of frames: blobs at the pattern's scales, matched, then fitted to sub-pixel accuracy."""
 
 import numpy as np
 import torch
@@ -13,15 +13,25 @@ from torchmembrane.markers.match import DotMatcher, inverse_2x2, spacing
 
 SOFTNESS = 0.6  # px, logistic scale of a dot's blurred outline
 RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level
-FINEST = 2.4  # a dot's short half axis on its level of the pyramid is at least this, where it can be
+FINEST = 2.0  # a dot's short half axis on its level of the pyramid is at least this, where it can be
 LEVELS = 3
+RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, its slope, depth, shift, growth
 STRAY = 0.5  # from where its neighbours predict it, pitches: a dot so far off is half trusted
+FEWEST = 0.2  # mean confidence of a frame that is half trusted
 SCALE_STEP = 1.6  # ratio of neighbouring scales of the blob detector at most
 
 
 def half_axes(shapes):
     """Long and short half axis `[D, 2]` of the ellipses `shapes [D, 2, 2]`."""
     return np.linalg.svd(shapes, compute_uv=False)
+
+
+def size_tolerance(shapes, sizes):
+    """Standard deviation of a dot's log radius: wide, but less than half of what tells two sizes apart."""
+    log_radius = 0.5 * np.log(np.abs(np.linalg.det(shapes)))
+    if sizes.min() == sizes.max():
+        return 0.45
+    return float(np.clip(0.45 * abs(np.median(log_radius[sizes == 1]) - np.median(log_radius[sizes == 0])), 0.2, 0.45))
 
 
 def pyramid(image):
@@ -33,7 +43,7 @@ def pyramid(image):
 
 
 def solve_positive(matrix, load):
-    """`x [..., n]` with `matrix x = load`: Gauss-Jordan without pivoting, for symmetric positive definite `[..., n, n]`."""
+    """`x [..., n]` with `matrix x = load`: Gauss-Jordan without pivoting, for positive definite `[..., n, n]`."""
     system = torch.cat([matrix, load[..., None]], -1)
     unit = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     for i in range(matrix.shape[-1]):
@@ -49,7 +59,7 @@ class EllipseFit(nn.Module):
     outline, a neighbour or the world beyond the rim, loses its weight.
     """
 
-    def __init__(self, pixels, shapes, image_size, steps=4):
+    def __init__(self, pixels, shapes, image_size, size_tolerance, steps=3):
         super().__init__()
         width, height = image_size
         long, short = half_axes(shapes).T
@@ -61,7 +71,7 @@ class EllipseFit(nn.Module):
         half = int(np.ceil(((1.25 * long + ring) / stride).max()))
         step = np.arange(-half, half + 1)
         offset = np.stack(np.meshgrid(step, step), -1).reshape(-1, 2)
-        self.steps, self.image_size = steps, tuple(image_size)
+        self.steps, self.size_tolerance = steps, size_tolerance
         self.register_buffer("offset", torch.as_tensor(offset))
         self.register_buffer("start", torch.as_tensor(np.concatenate([[0], sizes.prod(1).cumsum()])[level]))
         self.register_buffer("limit", torch.as_tensor(sizes[level][:, ::-1].copy() - 1))
@@ -69,7 +79,7 @@ class EllipseFit(nn.Module):
         self.register_buffer("ring", torch.as_tensor(ring))
         self.register_buffer("size", torch.as_tensor(np.linalg.norm(shapes, axis=(1, 2)) / 2**0.5))
         self.register_buffer("softness", torch.as_tensor(SOFTNESS * np.sqrt(stride)))
-        self.register_buffer("ridge", torch.diag(torch.tensor([1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3], dtype=torch.float64)))
+        self.register_buffer("ridge", torch.diag(torch.tensor(RIDGE, dtype=torch.float64)))
 
     def windows(self, levels, centre):
         """Values `[B, D, P]` around `centre [B, D, 2]`, their places `[B, D, P, 2]` px, and which lie in the image."""
@@ -86,8 +96,8 @@ class EllipseFit(nn.Module):
     def forward(self, levels, centre, shape):
         """`levels` of `pyramid` with dark dots, `centre [B, D, 2]`, `shape [B, D, 2, 2]` to begin with.
 
-        Returns centre `[B, D, 2]`, growth of the outline `[B, D]` px, and quality `[B, D]` in 0..1, from the share of the
-        window's variance explained, the contrast `a / b_0`, and the size against that of `shape` or at rest.
+        Returns centre `[B, D, 2]`, growth of the outline `[B, D]` px, and quality `[B, D]` in 0..1, from the share of
+        the window's variance explained, the contrast `a / b_0`, and the size against that of `shape` or at rest.
         """
         values, place, inside = self.windows(levels, centre)
         trust = inside.to(values.dtype)
@@ -107,7 +117,8 @@ class EllipseFit(nn.Module):
             edge = template * (1 - template) / softness
             weight = trust * torch.sigmoid((depth + self.ring[:, None]) / (0.5 * self.stride[:, None]))
             shift = -edge[..., None] * normal
-            basis = torch.stack([torch.ones_like(edge), y[..., 0], y[..., 1], -template, shift[..., 0], shift[..., 1], -edge], -2)
+            columns = torch.ones_like(edge), *y.unbind(-1), -template, *shift.unbind(-1), -edge
+            basis = torch.stack(columns, -2)
             weighted = basis * weight[..., None, :]
             fit = solve_positive(weighted @ basis.mT + self.ridge, (weighted @ values[..., None]).squeeze(-1))
             residual = values - (fit[..., None, :] @ basis).squeeze(-2)
@@ -124,22 +135,23 @@ class EllipseFit(nn.Module):
         explained = 1 - (weight * residual**2).sum(-1) / (spread + 1e-6)
         contrast = amplitude / (fit[..., 0] + mean[..., 0]).clamp_min(1e-2)
         quality = torch.sigmoid(12 * (explained - 0.6)) * torch.sigmoid(40 * (contrast - 0.12))
-        grown = torch.log((size + growth) / size), torch.log((size + growth) / self.size)
-        return centre, growth, quality * torch.exp(-4 * torch.minimum(*(x.square() for x in grown)))
+        grown = torch.minimum(*(torch.log((size + growth) / usual).square() for usual in (size, self.size)))
+        return centre, growth, quality * torch.exp(-grown / (2 * self.size_tolerance) ** 2)
 
 
 class BlobDetector(nn.Module):
-    """The strongest `count` dark blobs of an image: maxima over place and scale of the normalised Hessian's determinant."""
+    """The strongest `count` dark blobs: maxima over place and scale of the normalised Hessian's determinant."""
 
     def __init__(self, radii, pitch, count, inside):
         super().__init__()
         smallest, largest = np.percentile(radii, [5, 95])
-        radii = np.geomspace(smallest, largest, 1 + int(np.ceil(np.log(max(largest / smallest, 1.001)) / np.log(SCALE_STEP))))
+        steps = np.log(max(largest / smallest, 1.001)) / np.log(SCALE_STEP)
+        radii = np.geomspace(smallest, largest, 1 + int(np.ceil(steps)))
         levels = np.log2(np.maximum(radii / (1.4 * np.sqrt(2)), 1)).astype(int).clip(0, LEVELS - 1)
         self.scales = [(int(k), float(r / np.sqrt(2) / 2**k)) for k, r in zip(levels, radii, strict=True)]
         self.level = int(levels[0])
         self.stride = 2**self.level
-        self.reach = 2 * max(1, int(0.25 * pitch / self.stride)) + 1
+        self.reach = max(1, int(0.125 * pitch / self.stride))
         self.count = count
         stencils = [[[0, 0, 0], [1, -2, 1], [0, 0, 0]], [[0, 1, 0], [0, -2, 0], [0, 1, 0]]]
         stencils.append([[0.25, 0, -0.25], [0, 0, 0], [-0.25, 0, 0.25]])
@@ -159,12 +171,19 @@ class BlobDetector(nn.Module):
         size = levels[self.level].shape[-2:]
         responses = [self.response(levels[k], sigma) for k, sigma in self.scales]
         background = gaussian_blur2d(F.avg_pool2d(levels[-1], 2), (7, 7), (2.0, 2.0), border_type="replicate")
-        maps = [x if x.shape[-2:] == size else F.interpolate(x, size, mode="bilinear") for x in (*responses, background)]
+        maps = [F.interpolate(x, size, mode="bilinear") for x in (*responses, background)]
         response = torch.cat(maps[:-1], 1) / (maps[-1] + 0.05)
         peak = response.amax(1, keepdim=True) * self.inside
-        reach = self.reach // 2
-        highest = F.max_pool2d(F.max_pool2d(peak, (1, self.reach), 1, (0, reach)), (self.reach, 1), 1, (reach, 0))
-        strength, index = (peak * (peak == highest)).flatten(1).topk(self.count)
+        cells = F.max_pool2d(peak, 2)
+        reach = self.reach
+        highest = F.max_pool2d(cells, (1, 2 * reach + 1), 1, (0, reach))
+        highest = F.max_pool2d(highest, (2 * reach + 1, 1), 1, (reach, 0))
+        strength, cell = (cells * (cells == highest)).flatten(1).topk(self.count)
+        columns = cells.shape[-1]
+        corner = (cell // columns) * 2 * size[1] + (cell % columns) * 2
+        four = torch.stack([corner, corner + 1, corner + size[1], corner + size[1] + 1], -1)  # the cell's pixels
+        inner = peak.flatten(1).gather(1, four.flatten(1)).unflatten(1, four.shape[1:]).argmax(-1, keepdim=True)
+        index = four.gather(-1, inner).squeeze(-1)
         scales = response.flatten(2).gather(2, index[:, None].expand(-1, len(self.scales), -1)) ** 4
         log_radius = (scales * self.log_radii[:, None]).sum(1) / scales.sum(1).clamp_min(1e-20)
         place = torch.stack([index % size[1], index // size[1]], -1).to(strength.dtype)
@@ -193,7 +212,8 @@ def draw(pixels, shapes, image_size):
     image = np.ones((height, width))
     for centre, shape in zip(pixels, shapes, strict=True):
         reach = int(half_axes(shape)[0]) + 4
-        u, v = (np.arange(max(round(c) - reach, 0), min(round(c) + reach + 1, n)) for c, n in zip(centre, image_size, strict=True))
+        low, high = np.round(centre).astype(int) - reach, np.round(centre).astype(int) + reach + 1
+        u, v = np.arange(max(low[0], 0), min(high[0], width)), np.arange(max(low[1], 0), min(high[1], height))
         y = (np.stack(np.meshgrid(u, v), -1) - centre) @ np.linalg.inv(shape).T
         depth = (1 - np.linalg.norm(y, axis=-1)) * np.sqrt(abs(np.linalg.det(shape)))
         image[np.ix_(v, u)] -= 0.9 / (1 + np.exp(-depth / SOFTNESS))
@@ -220,18 +240,21 @@ class DotLocator(nn.Module):
         pixels, shapes = np.asarray(pattern.pixels, float), np.asarray(pattern.shapes, float)
         if len(pixels) < 6 or not (np.isfinite(pixels).all() and np.isfinite(shapes).all()):
             raise MembraneError(
-                f"DotLocator: {len(pixels)} dots, {int(np.isnan(pixels).any(1).sum())} of them NaN, expected at least 6, all finite; "
-                "leave out dots that were not seen in the rest image"
+                f"DotLocator: {len(pixels)} dots, {int(np.isnan(pixels).any(1).sum())} of them NaN, expected at least 6, "
+                "all finite; leave out dots that were not seen in the rest image"
             )
         self.polarity, self.image_size = polarity, tuple(image_size)
-        self.fit = EllipseFit(pixels, shapes, image_size)
+        tolerance = size_tolerance(shapes, np.asarray(pattern.sizes))
+        self.fit = EllipseFit(pixels, shapes, image_size, tolerance)
         inside = membrane_mask(pixels, anchors, image_size)
         radii = np.sqrt(np.abs(np.linalg.det(shapes)))
         self.detect = BlobDetector(radii, spacing(pixels)[0].min(), int(1.2 * len(pixels)) + 16, inside)
-        blobs, log_radius, strength = (x[0].numpy() for x in self.detect.double()(pyramid(draw(pixels, shapes, image_size))))
+        drawn = pyramid(draw(pixels, shapes, image_size))
+        blobs, log_radius, strength = (x[0].numpy() for x in self.detect.double()(drawn))
         own = cKDTree(blobs).query(pixels)[1]
-        self.match = DotMatcher(pixels, log_radius[own], anchors)
+        self.match = DotMatcher(pixels, log_radius[own], tolerance, anchors)
         self.register_buffer("strength", torch.as_tensor(strength[own]))
+        self.register_buffer("rest", torch.as_tensor(pixels))
         self.register_buffer("shapes", torch.as_tensor(shapes))
         self.float()
 
@@ -239,10 +262,10 @@ class DotLocator(nn.Module):
         """`image [B, 1, H, W]` in 0..1 -> pixels `[B, D, 2]`, confidence `[B, D]` in 0..1."""
         levels = pyramid(1 - image if self.polarity == "light" else image)
         blobs, log_radius, strength = self.detect(levels)
-        rest = self.match.pixels
+        rest = self.rest
         nearest = (blobs[:, :, None] - rest).square().sum(-1).argmin(-1)
         relative = strength / self.strength[nearest]
-        level = relative[:, : len(rest) // 2].mean(1, keepdim=True)
+        level = relative[:, : rest.shape[0] // 2].mean(1, keepdim=True)
         place, certainty = self.match(blobs, log_radius, torch.sigmoid(20 * (relative / (level + 1e-3) - 0.4)))
         _, gradient, _ = self.match.predict(certainty, place - rest)
         shape = self.shapes + gradient.clamp(-0.6, 0.6) @ self.shapes
@@ -250,4 +273,5 @@ class DotLocator(nn.Module):
         predicted, _, _ = self.match.predict(certainty * quality, pixels - rest)
         stray = (pixels - rest - predicted).square().sum(-1).clamp_min(1e-12).sqrt() / self.match.nearest
         confidence = quality * torch.sigmoid(20 * (STRAY - stray))
+        confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
         return torch.where(confidence[..., None] > 0.05, pixels, rest + predicted), confidence

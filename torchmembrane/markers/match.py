@@ -5,12 +5,12 @@ import torch
 from scipy.spatial import cKDTree
 from torch import nn
 
-GROWTH, SETTLING = 14, 4  # steps
+SETTLING = 4  # steps after the growth has reached every dot
 WIDTH = 1.1  # of the local average, pitches
 RIDGE = 0.12  # pulls the flow's gradient to zero where neighbours do not fix it
 TOLERANCE = 0.30  # standard deviation of a prediction, pitches
-SIZE_TOLERANCE = 0.22  # standard deviation of a blob's log radius
 NEIGHBOURS = 8
+SUPPORT = 0.8  # sure nodes, weighed by distance, that a prediction needs
 FAR = 1e6
 
 
@@ -57,7 +57,7 @@ class LocalDeformation(nn.Module):
         self.register_buffer("around", torch.as_tensor(pixels[near] - pixels[:, None]))
 
     def forward(self, blobs, valid):
-        """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, K, 2, 2]`, quality `[B, K]`."""
+        """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, K, 2, 2]`."""
         nearest = (blobs[:, :, None] - self.pixels).square().sum(-1).argmin(-1)
         pitch = self.pitch[nearest]
         around = self.around[nearest] / pitch[..., None, None]  # [B, K, M, 2]
@@ -66,7 +66,7 @@ class LocalDeformation(nn.Module):
         others = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
         others = (others - blobs[:, :, None]) / pitch[..., None, None]  # [B, K, 12, 2]
         there = valid.gather(1, index.flatten(1)).unflatten(1, index.shape[1:])
-        nearby = torch.exp(-apart / (2 * (1.3 * pitch[..., None]) ** 2)) * valid[:, None]
+        nearby = torch.exp(-apart / (2 * (0.8 * pitch[..., None]) ** 2)) * valid[:, None]
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)
         ratio = others[..., :4, :].square().sum(-1).clamp_min(1e-12).sqrt().mean(-1).clamp(0.4, 2.0)
         gradient = ratio[..., None, None] * eye
@@ -85,7 +85,7 @@ class LocalDeformation(nn.Module):
             share = share / (share.sum(-1, keepdim=True) + 1e-6)
             gradient = (share @ fitted.flatten(-2)).unflatten(-1, (2, 2))
             gradient = gradient + (1 - share.sum(-1))[..., None, None] * eye
-        return gradient, quality
+        return gradient
 
 
 class LocalFlow(nn.Module):
@@ -104,6 +104,16 @@ class LocalFlow(nn.Module):
         moments = kernel * np.stack([np.ones_like(u), u, v, u * u, u * v, v * v])  # [6, N, D]
         self.register_buffer("moments", torch.as_tensor(np.moveaxis(moments, 0, 1).reshape(len(nodes), -1)))
         self.register_buffer("h", torch.as_tensor(h))
+
+    def rings(self, weight):
+        """How many steps it takes the growth from the nodes `weight [S, N]` to reach every dot it can reach."""
+        kernel = self.moments[:, : self.h.numel()].numpy()
+        reached, count = weight, 0
+        while True:
+            grown = np.maximum(reached[:, : kernel.shape[1]], reached @ kernel * 0.7 > SUPPORT)
+            if (grown == reached[:, : kernel.shape[1]]).all():
+                return count
+            reached, count = np.column_stack([grown, reached[:, kernel.shape[1] :]]), count + 1
 
     def forward(self, weight, flow):
         """Least-squares affine flow `f(x) ~ f_d + J_d (x - x_d)`.
@@ -146,25 +156,29 @@ class DotMatcher(nn.Module):
 
     The flow is smooth and, where `anchors` are given, zero at them. Starting there, each of a fixed number of steps
     predicts every dot from the sure nodes around it and the local deformation, takes the blob nearest to the prediction
-    and of its size, and keeps it where the choice is mutual. Without anchors each part of the pattern in turn is held to
-    have moved least, and the start that matches most is kept.
+    and of its size, and keeps it where the choice is mutual. Without anchors each part of the pattern in turn is held
+    to have moved least, and the start that matches most is kept.
     """
 
-    def __init__(self, pixels, log_radius, anchors=None):
+    def __init__(self, pixels, log_radius, size_tolerance, anchors=None):
         super().__init__()
+        self.size_tolerance = size_tolerance
         nearest, mean = spacing(pixels)
         anchors = np.empty((0, 2)) if anchors is None else thin_out(np.asarray(anchors, float), 0.7 * np.median(mean))
         nodes = np.concatenate([pixels, anchors])
         self.deformation = LocalDeformation(pixels)
         self.local = LocalFlow(pixels, nodes, WIDTH)
-        self.register_buffer("pixels", torch.as_tensor(pixels))
+        self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
+        self.register_buffer("pixels", torch.as_tensor(pixels - pixels.mean(0)))
         self.register_buffer("nearest", torch.as_tensor(nearest))
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
-        self.register_buffer("starts", torch.as_tensor(sectors(pixels) if len(anchors) == 0 else np.zeros((1, len(pixels)))))
+        starts = np.zeros((1, len(pixels))) if len(anchors) else sectors(pixels)
+        self.register_buffer("starts", torch.as_tensor(starts))
+        self.steps = self.local.rings(np.column_stack([starts, np.ones((len(starts), len(anchors)))])) + 3
         self.register_buffer("still", torch.zeros(len(anchors), 2, dtype=torch.float64))
 
     def with_anchors(self, weight, flow):
-        still = self.still.expand(len(flow), -1, -1)
+        still = self.still.expand(flow.shape[0], -1, -1)
         return torch.cat([weight, torch.ones_like(still[..., 0])], 1), torch.cat([flow, still], 1)
 
     def predict(self, weight, flow):
@@ -174,39 +188,40 @@ class DotMatcher(nn.Module):
         predicted, support = self.local.along(weight, flow, gradient)
         return predicted, gradient, support
 
-    def choose(self, predicted, support, blobs, log_radius):
-        """The blob for each dot: its certainty `[B, D]`, the flow `[B, D, 2]`, and squared offsets `[B, D, K]` to all blobs."""
+    def choose(self, predicted, support, blobs, misfit):
+        """Each dot's blob: its certainty `[B, D]`, the flow to it `[B, D, 2]` (the prediction where lost), its index.
+
+        `misfit [B, D, K]`: squared size differences, in standard deviations.
+        """
         expected = self.pixels + predicted
-        square = ((expected[:, :, None] - blobs[:, None]) / self.nearest[:, None, None]).square().sum(-1)
-        cost = square / TOLERANCE**2 + ((self.log_radius[:, None] - log_radius[:, None]) / SIZE_TOLERANCE) ** 2
-        cost = cost + FAR * (support[..., None] < 0.8)
+        square = expected.square().sum(-1)[..., None] + blobs.square().sum(-1)[:, None] - 2 * expected @ blobs.mT
+        cost = square / (TOLERANCE * self.nearest[:, None]) ** 2 + misfit
+        cost = cost + FAR * (support[..., None] < SUPPORT)
         best, chosen = cost.min(-1)
         mutual = best <= cost.amin(1).gather(1, chosen) * (1 + 1e-6)
         weight = torch.exp(-0.5 * best) * mutual * (support / (support + 0.5))
         flow = blobs.gather(1, chosen[..., None].expand(-1, -1, 2)) - self.pixels
-        return weight, torch.where(weight[..., None] > 0.02, flow, predicted), square
+        return weight, torch.where(weight[..., None] > 0.02, flow, predicted), chosen
 
     def forward(self, blobs, log_radius, valid):
         """`blobs [B, K, 2]`, `log_radius`, `valid [B, K]` -> positions `[B, D, 2]` and certainty `[B, D]` in 0..1."""
-        deformation, quality = self.deformation(blobs, valid)
-        known = torch.cat([deformation.flatten(-2), torch.ones_like(deformation[..., 0, :1])], -1) * quality[..., None]
-        log_radius = log_radius + 3 * (1 - valid)
-        starts = len(self.starts)
-        blobs, log_radius, known = (x.repeat_interleave(starts, 0) for x in (blobs, log_radius, known))
-        flow = torch.zeros_like(self.pixels).expand(len(blobs), -1, -1)
-        weight, flow, square = self.choose(flow, FAR + flow[..., 0], blobs, log_radius)
-        weight = weight * self.starts.repeat(len(blobs) // starts, 1)
-        for _ in range(GROWTH):
-            share = torch.exp(-square / (2 * 0.6**2)) @ known
-            gradient = ((share[..., :4] + 1e-3 * share.new_tensor([1.0, 0.0, 0.0, 1.0])) / (share[..., 4:] + 1e-3)).unflatten(
-                -1, (2, 2)
-            )
-            jacobian = gradient - torch.eye(2, dtype=gradient.dtype, device=gradient.device)
-            predicted, support = self.local.along(*self.with_anchors(weight, flow), jacobian)
-            weight, flow, square = self.choose(predicted, support, blobs, log_radius)
+        deformation = self.deformation(blobs, valid)
+        strain = (deformation - torch.eye(2, dtype=blobs.dtype, device=blobs.device)).flatten(-2)
+        blobs = blobs - self.origin
+        misfit = ((self.log_radius[:, None] - (log_radius + 3 * (1 - valid))[:, None]) / self.size_tolerance).square()
+        starts = self.starts.shape[0]
+        blobs, misfit, strain = (x[:, None].expand(-1, starts, -1, -1).flatten(0, 1) for x in (blobs, misfit, strain))
+        flow = torch.zeros_like(self.pixels).expand(blobs.shape[0], -1, -1)
+        weight, flow, chosen = self.choose(flow, FAR + flow[..., 0], blobs, misfit)
+        weight = (weight.unflatten(0, (-1, starts)) * self.starts).flatten(0, 1)
+        for _ in range(self.steps):
+            gradient = strain.gather(1, chosen[..., None].expand(-1, -1, 4)).unflatten(-1, (2, 2))
+            predicted, support = self.local.along(*self.with_anchors(weight, flow), gradient)
+            weight, flow, chosen = self.choose(predicted, support, blobs, misfit)
         for _ in range(SETTLING):
             predicted, _, support = self.predict(weight, flow)
-            weight, flow, square = self.choose(predicted, support, blobs, log_radius)
-        best = weight.sum(-1).unflatten(0, (-1, starts)).argmax(-1)
-        best = best + starts * torch.arange(len(best), device=best.device)
-        return self.pixels + flow[best], weight[best]
+            weight, flow, chosen = self.choose(predicted, support, blobs, misfit)
+        weight, flow = weight.unflatten(0, (-1, starts)), flow.unflatten(0, (-1, starts))
+        best = weight.sum(-1).argmax(-1)[:, None, None].expand(-1, -1, self.pixels.shape[0])
+        flow = flow.gather(1, best[..., None].expand(-1, -1, -1, 2)).squeeze(1)
+        return self.pixels + self.origin + flow, weight.gather(1, best).squeeze(1)

@@ -90,7 +90,7 @@ class LocalFlow(NamedTuple):
     def trust(self, flow: Tensor) -> Tensor:
         """Confidence [B, D] in 0..1 that flow [B, D, 2] belongs with its neighbours'."""
         distance = ((flow - self.flow).square().sum(-1) + 1e-12).sqrt()
-        return (2 - distance / self.scale).clamp(0, 1) * (self.support > 0.25)
+        return (2.5 - distance / self.scale).clamp(0, 1) * (self.support > 0.25)
 
 
 class Neighbourhood(nn.Module):
@@ -115,7 +115,7 @@ class Neighbourhood(nn.Module):
         fit = weighted_median(u, prior), flow.new_zeros(*flow.shape, 2)
         for _ in range(ROBUST_STEPS):
             squared, scale = self.misfit(fit, u, prior, tolerance)
-            fit = affine_fit(self.offset, u, prior * self.near / (1 + 0 * squared).square())
+            fit = affine_fit(self.offset, u, prior * self.near / (1 + squared / scale.square()).square())
         squared, scale = self.misfit(fit, u, prior, tolerance)
         return LocalFlow(*fit, scale[..., 0], (prior * (squared < 4 * scale.square())).mean(-1))
 
@@ -227,7 +227,7 @@ class TextureLocator(nn.Module):
         return self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow), confidence
 
     def settle(self, found: Tensor, weight: Tensor, before: Tensor, tolerance: float) -> tuple[Tensor, LocalFlow]:
-        """The flow [B, D, 2]: `found` where its neighbours bear it out, else what they say; it spreads from `before`."""
+        """The flow [B, D, 2]: `found` where its neighbours bear it out, else what they say, starting from `before`."""
         guess = torch.where((weight > 0)[..., None], found, before)
         local = self.neighbourhood(guess, weight.clamp(min=HEARSAY), tolerance)
         trust = (weight * local.trust(found))[..., None]
@@ -308,7 +308,7 @@ class Template(nn.Module):
             flow = flow - (affine @ shift[..., None])[..., 0]
         variance = value.square() @ self.weight - mean[..., 0].square()
         ncc = gain[..., 0] / (variance.clamp(min=0) + 1e-6).sqrt()
-        return flow, ((ncc - 0.6) / 0.3).clamp(0, 1)
+        return flow, ((ncc - 0.7) / 0.25).clamp(0, 1)
 
 
 class Search(nn.Module):

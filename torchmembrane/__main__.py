@@ -1,0 +1,8 @@
+"""`python -m torchmembrane`: the same as the command `torchmembrane`."""
+
+import sys
+
+from .cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

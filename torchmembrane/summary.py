@@ -1,0 +1,75 @@
+"""summary.csv: one row for every frame of a folder of results."""
+
+import csv
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from .results import STATUS_TEXTS
+from .store import PART_ROWS, FrameFiles, FrameTable, Mesh
+
+SUMMARY = "summary.csv"
+UNREADABLE = -1
+"""Status of a file that gave no image, hence no result."""
+COLUMNS = (
+    "name", "file", "status", "status_text", "markers_found", "markers_total", "residual_px", "pressure",
+    "pressure_change", "force", "deepest", "deepest_x", "deepest_y", "deepest_z", "volume_error", "seconds",
+    "length_unit", "force_unit",
+)  # fmt: skip
+
+
+class Summary:
+    """summary.csv: a row for every frame of the folder, finished in this call, before it, or unreadable.
+
+    Arguments: the folder; its frames and their status by name; its mesh; what tells a frame's file from its name.
+    Rows of an earlier summary.csv are kept where they are up to date, the others are made from the frames.
+    """
+
+    def __init__(self, folder: Path, frames: FrameFiles | FrameTable, stored: dict[str, int], mesh: Mesh, file_of):
+        self.path, self.mesh = folder / SUMMARY, mesh
+        rows = [row for row in _rows(self.path) if row["status"] == str(stored.get(row["name"], UNREADABLE))]
+        self.rows = {row["name"]: row for row in rows}
+        missing = iter(sorted(stored.keys() - self.rows.keys()))
+        while names := list(islice(missing, PART_ROWS)):
+            for name, frame in zip(names, frames.read(names), strict=True):
+                self.add(name, file_of(name) or "", frame, np.nan)
+
+    def add(self, name: str, file: Path | str, frame: dict[str, np.ndarray], seconds: float) -> None:
+        depth, lowest = self.mesh.normal_displacement(frame), np.full(4, np.nan)
+        if np.isfinite(depth).all():
+            lowest = [depth.min(), *frame["vertices"][depth.argmin()]]
+        status, found = int(frame["status"]), frame["confidence"] > 0
+        numbers = (
+            frame["residual"], frame["pressure"], frame["pressure_change"], np.linalg.norm(frame["force"]), *lowest,
+            frame["volume_error"], seconds,
+        )  # fmt: skip
+        self._set(name, file, status, STATUS_TEXTS[status], found.sum(), found.size, *map(_number, numbers))
+
+    def add_unreadable(self, name: str, file: Path, reason: str) -> None:
+        self._set(name, file, UNREADABLE, f"unreadable: {reason}", *[""] * 12)
+
+    def _set(self, *values) -> None:
+        row = dict(zip(COLUMNS, [*values, self.mesh.length_unit, self.mesh.force_unit], strict=True))
+        self.rows[row["name"]] = row
+
+    def write(self) -> None:
+        partial = self.path.with_name(self.path.name + ".partial")
+        with open(partial, "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows(self.rows[name] for name in sorted(self.rows))
+        partial.replace(self.path)
+
+
+def _rows(path: Path) -> list[dict]:
+    """The rows of an earlier summary.csv; none where it has other columns or is no table."""
+    if not path.exists():
+        return []
+    with open(path, newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        return list(reader) if tuple(reader.fieldnames or ()) == COLUMNS else []
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}" if np.isfinite(value) else ""
