@@ -8,7 +8,7 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.membrane import Membrane, corners, corners_to_vertices, triangles_of, triangles_to_corners
-from torchmembrane.shapes import ellipsoid_cap, half_cylinder, heightfield, spherical_cap
+from torchmembrane.shapes import disc_grid, ellipsoid_cap, half_cylinder, heightfield, spherical_cap
 
 SHAPES = {
     "spherical_cap": lambda n: spherical_cap(12, 9, 15, (n, n)),
@@ -107,13 +107,24 @@ def test_either_winding_gives_the_same_surface(membrane):
     assert ((same * membrane.rest_normals).sum(-1) > 0.95).all()
 
 
-def test_resampling_keeps_common_vertices_and_the_rim():
-    fine = SHAPES["ellipsoid_cap"](33)
+def test_resampling_a_uniform_grid_keeps_common_vertices():
+    fine = SHAPES["half_cylinder"](33)
     coarse = fine.resampled((17, 17))
-    torch.testing.assert_close(coarse.rest.reshape(17, 17, 3), fine.rest.reshape(33, 33, 3)[::2, ::2])
-    odd = fine.resampled((21, 19))
-    ellipse = (odd.rest[odd.fixed, :2] / torch.tensor([12.0, 9.0])).norm(dim=-1)
+    torch.testing.assert_close(coarse.rest.reshape(17, 17, 3), fine.rest.reshape(33, 33, 3)[::2, ::2], rtol=0, atol=1e-4)
+
+
+def test_resampling_spaces_lines_equally_on_steep_sides_and_stays_on_the_surface():
+    """A grid uniform in x and y is coarse where the finger is steep; its resampled twin is not, with the rim on the rim."""
+    x, y = disc_grid(33, 33)
+    steep = np.stack([12 * x, 9 * y, 2 + 12 * np.sqrt(np.clip(1 - x**2 - y**2, 0, None))], -1)
+    even = Membrane(steep).resampled((21, 19))
+    ellipse = (even.rest[even.fixed, :2] / torch.tensor([12.0, 9.0])).norm(dim=-1)
     torch.testing.assert_close(ellipse, torch.ones_like(ellipse), rtol=0, atol=2e-3)
+    ellipsoid = ((even.rest - torch.tensor([0, 0, 2.0])) / torch.tensor([12.0, 9.0, 12.0])).norm(dim=-1)
+    assert (ellipsoid - 1).abs().max() < 0.02
+    step = (even.rest.reshape(21, 19, 3).diff(dim=0).square().sum(-1).mean(1)) ** 0.5
+    assert step.max() < 1.15 * step.min()
+    assert np.linalg.norm(np.diff(steep, axis=0), axis=-1).max() > 3 * float(step.max())
 
 
 def test_closest_points_recover_barycentric_points_and_their_distance():

@@ -10,12 +10,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import CubicSpline, RectBivariateSpline
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from .errors import MembraneError
 
+FINE = 40  # samples a line interval, for arc lengths
 TRIANGLE_CORNERS = ((0, 1, 2), (0, 2, 3))
 
 
@@ -136,15 +137,23 @@ class Membrane(nn.Module):
         return float(self.rest_area.sum()) ** 0.5
 
     def resampled(self, grid: tuple[int, int]) -> "Membrane":
-        """The same rest surface on another grid, by bicubic interpolation in the grid's own coordinates."""
-        (m, n), (p, q) = self.grid, grid
-        if min(p, q) < 5:
-            raise MembraneError(f"Membrane.resampled: grid {p} x {q}; expected at least 5 x 5 vertices")
-        X = self.rest.cpu().double().numpy().reshape(m, n, 3)
-        s, t = np.linspace(0, m - 1, p), np.linspace(0, n - 1, q)
-        spline = [RectBivariateSpline(np.arange(m), np.arange(n), X[..., c])(s, t) for c in range(3)]
-        fixed = self.fixed.cpu().numpy().reshape(m, n)[np.rint(s).astype(int)][:, np.rint(t).astype(int)]
-        return Membrane(np.stack(spline, -1), fixed)
+        """The same rest surface on another grid whose lines are equally spaced along the surface.
+
+        Bicubic in the grid's own coordinates, so that the rim stays where it is; the new lines are at equal steps of the mean
+        arc length: steep sides, where a file's grid is often coarse, get their share.
+        """
+        if min(grid) < 5:
+            raise MembraneError(f"Membrane.resampled: grid {grid[0]} x {grid[1]}; expected at least 5 x 5 vertices")
+        X = self.rest.cpu().double().numpy().reshape(*self.grid, 3)
+        rows, columns = _even_lines(X, grid[0]), _even_lines(X.swapaxes(0, 1), grid[1])
+        along = [np.arange(count) for count in self.grid]
+        vertices = np.stack([RectBivariateSpline(*along, X[..., c])(rows, columns) for c in range(3)], -1)
+        nearest = [
+            np.rint(lines[1:-1]).clip(1, count - 2).astype(int) for lines, count in zip((rows, columns), self.grid, strict=True)
+        ]
+        fixed = np.ones(grid, bool)
+        fixed[1:-1, 1:-1] = self.fixed.cpu().numpy().reshape(self.grid)[nearest[0]][:, nearest[1]]
+        return Membrane(vertices, fixed)
 
     def closest_points(self, points) -> SurfacePoints:
         """The material points of the rest surface closest to `points [D, 3]`, with their distances."""
@@ -219,6 +228,14 @@ def _orientation(X, triangles, fixed):
             f"{triangles[k].tolist()}; expected a grid without folds whose inside is seen from the camera everywhere"
         )
     return outward
+
+
+def _even_lines(X, count):
+    """Coordinates along the first axis of `X [m, n, 3]` of `count` lines at equal rms distance from line to line."""
+    fine = np.linspace(0, len(X) - 1, FINE * (len(X) - 1) + 1)
+    step = np.diff(CubicSpline(np.arange(len(X)), X)(fine), axis=0)
+    length = np.concatenate([[0.0], np.cumsum(((step**2).sum(-1).mean(1)) ** 0.5)])
+    return np.interp(np.linspace(0, length[-1], count), length, fine)
 
 
 def _first_hits(start, d, triangles):

@@ -240,8 +240,8 @@ class DotLocator(nn.Module):
         pixels, shapes = np.asarray(pattern.pixels, float), np.asarray(pattern.shapes, float)
         if len(pixels) < 6 or not (np.isfinite(pixels).all() and np.isfinite(shapes).all()):
             raise MembraneError(
-                f"DotLocator: {len(pixels)} dots, {int(np.isnan(pixels).any(1).sum())} of them NaN, expected at least 6, "
-                "all finite; leave out dots that were not seen in the rest image"
+                f"DotLocator: {len(pixels)} dots, {int(np.isnan(pixels).any(1).sum())} of them NaN, expected at least "
+                "6, all finite; leave out dots that were not seen in the rest image"
             )
         self.polarity, self.image_size = polarity, tuple(image_size)
         tolerance = size_tolerance(shapes, np.asarray(pattern.sizes))

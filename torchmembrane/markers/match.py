@@ -51,7 +51,7 @@ class LocalDeformation(nn.Module):
 
     def __init__(self, pixels):
         super().__init__()
-        near = cKDTree(pixels).query(pixels, k=NEIGHBOURS + 1)[1][:, 1:]
+        near = cKDTree(pixels).query(pixels, k=min(NEIGHBOURS + 1, len(pixels)))[1][:, 1:]
         self.register_buffer("pixels", torch.as_tensor(pixels))
         self.register_buffer("pitch", torch.as_tensor(spacing(pixels)[1]))
         self.register_buffer("around", torch.as_tensor(pixels[near] - pixels[:, None]))
@@ -62,7 +62,7 @@ class LocalDeformation(nn.Module):
         pitch = self.pitch[nearest]
         around = self.around[nearest] / pitch[..., None, None]  # [B, K, M, 2]
         apart = (blobs[:, :, None] - blobs[:, None]).square().sum(-1)
-        index = (apart + FAR * (1 - valid[:, None])).topk(13, largest=False).indices[..., 1:]
+        index = (apart + FAR * (1 - valid[:, None])).topk(min(13, blobs.shape[1]), largest=False).indices[..., 1:]
         others = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
         others = (others - blobs[:, :, None]) / pitch[..., None, None]  # [B, K, 12, 2]
         there = valid.gather(1, index.flatten(1)).unflatten(1, index.shape[1:])

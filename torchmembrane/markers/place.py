@@ -56,7 +56,7 @@ def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[PlacedMarkers
     """Markers seen at `pixels` in the rest image, placed where their rays meet the rest surface; and which of them do."""
     rays = sensor.camera.pixel_to_ray(torch.from_numpy(pixels))
     m, n = sensor.membrane.grid
-    smooth = sensor.membrane.resampled((max(m, SMOOTH_GRID), max(n, SMOOTH_GRID)))
+    smooth = sensor.surface.membrane((max(m, SMOOTH_GRID), max(n, SMOOTH_GRID)))
     hits = smooth.ray_points(*(r.numpy() for r in rays))
     seen = np.isfinite(hits.distance)
     if seen.sum() < FEWEST_MARKERS:
