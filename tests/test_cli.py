@@ -133,9 +133,7 @@ def test_usage_errors_exit_with_2(arguments, capsys):
 
 def test_cuda_without_a_device_is_refused(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    code, _, errors = run(
-        capsys, "reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out", "--device", "cuda"
-    )
+    code, _, errors = run(capsys, "reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out", "--device", "cuda")
     assert code == 2 and "CUDA" in errors
 
 

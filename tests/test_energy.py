@@ -6,7 +6,7 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.energy import MODELS, AffineQuadrilaterals, Sheet
-from torchmembrane.membrane import Membrane, corners, corners_to_vertices
+from torchmembrane.membrane import Membrane, corners, corners_to_vertices, triangles_of
 from torchmembrane.shapes import ellipsoid_cap, half_cylinder, spherical_cap
 
 ELASTIC = dict(prestretch=1.2, modulus=0.7, c2_ratio=0.15)
@@ -86,6 +86,47 @@ def test_mooney_rivlin_stiffness_leaves_out_only_the_term_that_is_not_convex(mem
     start = torch.zeros(len(x), dtype=torch.float64)
     hessian = torch.autograd.functional.hessian(with_linear_D, start)
     torch.testing.assert_close(dense(sheet, membrane, x, d), hessian, rtol=1e-9, atol=1e-9)
+
+
+def assembled(blocks, membrane):
+    """The dense `[3V, 3V]` matrix of triangle blocks `[m-1, n-1, 2, 9, 9]`."""
+    V = len(membrane.rest)
+    triangles = triangles_of(corners(torch.arange(V)[:, None], membrane.grid)).reshape(-1, 3)
+    dofs = (3 * triangles[:, :, None] + torch.arange(3)).reshape(-1, 9)
+    full = torch.zeros(3 * V, 3 * V, dtype=torch.float64)
+    index = (dofs[:, :, None].expand(-1, 9, 9), dofs[:, None, :].expand(-1, 9, 9))
+    return full.index_put(index, blocks.reshape(-1, 9, 9), accumulate=True)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_hessian_blocks_are_autograd_of_the_gradient(membrane, model):
+    sheet = Sheet(membrane, model, **ELASTIC)
+    for x in (stretched(membrane), stretched(membrane, 0.8, 0.4)):
+        jacobian = torch.autograd.functional.jacobian(sheet.gradient, x).flatten(2).flatten(0, 1)
+        torch.testing.assert_close(assembled(sheet.hessian_blocks(x), membrane), jacobian, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_positive_hessian_blocks_are_positive_and_exact_in_tension(membrane, model):
+    sheet = Sheet(membrane, model, **ELASTIC)
+    lowest = torch.linalg.eigvalsh(sheet.hessian_blocks(stretched(membrane, 0.8, 0.4), positive=True))[..., 0]
+    assert lowest.min() > -1e-12
+    if model != "harmonic":
+        assert torch.linalg.eigvalsh(sheet.hessian_blocks(stretched(membrane, 0.8, 0.4))).min() < -0.1
+    if model != "mooney_rivlin":
+        x = stretched(membrane)
+        torch.testing.assert_close(sheet.hessian_blocks(x, positive=True), sheet.hessian_blocks(x))
+
+
+def test_positive_hessian_blocks_are_the_stiffness_along_directions(membrane):
+    x, d = stretched(membrane), torch.nn.functional.normalize(stretched(membrane), dim=-1)
+    along = torch.zeros(len(x), 3, len(x), dtype=torch.float64)
+    along[torch.arange(len(x)), :, torch.arange(len(x))] = d
+    along = along.flatten(0, 1)
+    for model in MODELS:
+        sheet = Sheet(membrane, model, **ELASTIC)
+        H = assembled(sheet.hessian_blocks(x, positive=True), membrane)
+        torch.testing.assert_close(along.T @ H @ along, dense(sheet, membrane, x, d), rtol=1e-9, atol=1e-9)
 
 
 def test_stiffness_is_symmetric_and_positive_even_in_compression(membrane):

@@ -237,8 +237,7 @@ def test_gradient_sees_the_motion(rest, pixels):
     inner = torch.as_tensor(np.linalg.norm((pixels - [160, 120]) / [120, 85], axis=1) < 1)
     locator = TextureLocator(rest, pixels).double()
     image, right, left = (
-        batch(photograph(lambda points, e=e: points - [e, 0.0], 0, noise=0.0), dtype=torch.float64)
-        for e in (0.3, 0.4, 0.2)
+        batch(photograph(lambda points, e=e: points - [e, 0.0], 0, noise=0.0), dtype=torch.float64) for e in (0.3, 0.4, 0.2)
     )
     motion = (right - left) / 0.2
     image.requires_grad_()

@@ -133,6 +133,31 @@ class Sheet(nn.Module):
         bilinear = outer(d11, d22) + outer(d22, d11) - 2 * outer(d12, d12)
         return K + (area * w.convex_D / self.rest_det)[..., None, None] * bilinear
 
+    def hessian_blocks(self, x: Tensor, positive=False) -> Tensor:
+        """Second derivatives of every triangle's energy in its nine vertex coordinates, `[..., m-1, n-1, 2, 9, 9]`.
+
+        Arguments: `x [..., V, 3]`. Exact; with `positive` the convex part: compression and (Mooney-Rivlin) the term of `D`
+        that is not convex are left out, so that every block is positive semi-definite. Vertices as in `TRIANGLE_CORNERS`.
+        """
+        edges, I, adj, D = self._invariants(x)  # noqa: E741
+        w = self.derivatives(I, D)
+        e1, e2 = edges.unbind(-2)
+        none = torch.zeros_like(e1)
+        d11, d12, d22 = torch.cat([2 * e1, none], -1), torch.cat([e2, e1], -1), torch.cat([none, 2 * e2], -1)
+        along = lambda G: G[..., 0:1] * d11 + 2 * G[..., 1:2] * d12 + G[..., 2:3] * d22  # noqa: E731
+        outer = lambda p, q: p[..., :, None] * q[..., None, :]  # noqa: E731
+        dI, dD = along(self.inverse_metric), along(adj) / self.rest_det[..., None]
+        scaled = lambda factor: (self.rest_triangle_area * factor)[..., None]  # noqa: E731
+        bend = (w.convex_D if positive else w.D) / self.rest_det
+        H = outer(dD, scaled(w.DD) * dD + scaled(w.ID) * dI) + outer(dI, scaled(w.ID) * dD)
+        H = H + outer(d11, scaled(bend) * d22) + outer(d22, scaled(bend) * d11) - 2 * outer(d12, scaled(bend) * d12)
+        stress = self._stress(w, adj)
+        S = _symmetric(_tension(stress) if positive else stress)
+        H = H.unflatten(-1, (2, 3)).unflatten(-3, (2, 3))
+        H = H + S[..., :, None, :, None] * torch.eye(3, dtype=x.dtype, device=x.device)[:, None, :]
+        rows = torch.cat([-H.sum(-4, keepdim=True), H], -4)
+        return torch.cat([-rows.sum(-2, keepdim=True), rows], -2).flatten(-2).flatten(-3, -2)
+
     @staticmethod
     def _quadrilaterals(K: Tensor) -> Tensor:
         first, second = (torch.tensor(t, dtype=K.dtype, device=K.device) for t in (_FIRST, _SECOND))

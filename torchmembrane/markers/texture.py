@@ -188,9 +188,7 @@ class TextureLocator(nn.Module):
         self.register_buffer("rest_pixels", torch.as_tensor(pixels))
         self.neighbourhood = Neighbourhood(pixels, anchors)
         levels = enumerate(pyramid(torch.as_tensor(rest_image)[None, None]))
-        self.templates = nn.ModuleList(
-            Template(rest, self.rest_pixels / 2**level, RADIUS[level]) for level, rest in levels
-        )
+        self.templates = nn.ModuleList(Template(rest, self.rest_pixels / 2**level, RADIUS[level]) for level, rest in levels)
         self.search = Search(self.templates[-1])
         self.to(torch.get_default_dtype())
 

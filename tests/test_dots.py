@@ -1,0 +1,264 @@
+"""Dots: found and measured in the rest image, located and matched in frames, all through rendered pixels."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from torchmembrane.errors import MembraneError
+from torchmembrane.markers.dots import DotPattern, find_dots, measure_dots
+from torchmembrane.markers.locate import DotLocator, pyramid
+
+SIZE, CENTRE, RADIUS, PITCH = (320, 240), np.array([158.3, 119.6]), 112.0, 22.0
+PATTERNS = [("square", True), ("square", False), ("hexagonal", True), ("hexagonal", False)]
+
+
+class Scene(NamedTuple):
+    pixels: np.ndarray
+    shapes: np.ndarray
+    sizes: np.ndarray
+    rim: np.ndarray
+
+
+def scene(arrangement="square", two_sizes=True):
+    """Dots foreshortened towards a round rim."""
+    i, j = (x.ravel() for x in np.meshgrid(np.arange(-9, 10), np.arange(-9, 10)))
+    lattice, large = (np.stack([i, j], -1), (i + j) % 2 == 0)
+    if arrangement == "hexagonal":
+        lattice, large = np.stack([i + 0.5 * j, 0.75**0.5 * j], -1), (i - j) % 3 == 0
+    inside = np.hypot(*lattice.T) * PITCH < RADIUS - 0.55 * PITCH
+    around, large = lattice[inside] * PITCH, large[inside] | (not two_sizes)
+    around = around + np.random.default_rng(0).normal(0, 0.2, around.shape)
+    distance = np.hypot(*around.T)
+    radial = around / np.maximum(distance, 1e-9)[:, None]
+    squeeze = np.sqrt(1 - 0.6 * (distance / RADIUS) ** 2) - 1
+    shapes = np.eye(2) + squeeze[:, None, None] * radial[:, :, None] * radial[:, None]
+    angle = np.linspace(0, 2 * np.pi, 120, endpoint=False)
+    rim = CENTRE + RADIUS * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return Scene(around + CENTRE, shapes * np.where(large, 4.4, 2.7)[:, None, None], large.astype(int), rim)
+
+
+def render(pixels, shapes, noise=0.02, seed=0, kept=None):
+    """Grey image `[H, W]`: dark dots, 5 x 5 samples a pixel, on an unevenly lit disc; blur, noise, 8 bit."""
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]].astype(float)
+    x, y = (u - CENTRE[0]) / RADIUS, (v - CENTRE[1]) / RADIUS
+    light = 0.7 - 0.25 * (x**2 + y**2) + 0.12 * np.sin(2 * x + 1) + 0.1 * y
+    cover = np.zeros_like(u)
+    steps = np.arange(-2, 3) / 5
+    kept = np.ones(len(pixels), bool) if kept is None else kept
+    for centre, shape in zip(pixels[kept], shapes[kept], strict=True):
+        (u0, v0), reach = np.round(centre).astype(int), 12
+        patch = np.s_[max(v0 - reach, 0) : v0 + reach + 1, max(u0 - reach, 0) : u0 + reach + 1]
+        place = np.stack([u[patch], v[patch]], -1)[..., None, None, :] + np.stack(np.meshgrid(steps, steps), -1)
+        inside = np.linalg.norm((place - centre) @ np.linalg.inv(shape).T, axis=-1) < 1
+        cover[patch] = np.maximum(cover[patch], inside.mean((-1, -2)))
+    image = np.where(x**2 + y**2 < 1, light * (1 - 0.85 * cover), 0.02)
+    image = ndimage.gaussian_filter(image, 0.8) + noise * np.random.default_rng(seed).normal(size=image.shape)
+    return np.round(image.clip(0, 1) * 255) / 255
+
+
+def slide(x):
+    """Everything moves one way, most in the middle, nothing at the rim."""
+    free = np.clip(1 - ((x - CENTRE) ** 2).sum(-1) / RADIUS**2, 0, 1)
+    return free[:, None] ** 1.5 * np.array([0.8, -0.6])
+
+
+def dent(x):
+    """A push beside the middle."""
+    free = np.clip(1 - ((x - CENTRE) ** 2).sum(-1) / RADIUS**2, 0, 1)
+    near = np.exp(-((x - CENTRE - [30, 15]) ** 2).sum(-1) / (2 * (3 * PITCH) ** 2))
+    return (free * near / 0.83)[:, None] * np.array([-0.5, 0.87])
+
+
+def deform(s, field, pitches):
+    """Pixels and shapes after the flow `pitches * field`."""
+
+    def flow(x):
+        return pitches * PITCH * field(x)
+
+    gradient = np.stack([(flow(s.pixels + e) - flow(s.pixels - e)) / 0.02 for e in 0.01 * np.eye(2)], -1)
+    return s.pixels + flow(s.pixels), (np.eye(2) + gradient) @ s.shapes
+
+
+def batch(*images, dtype=torch.float32):
+    return torch.as_tensor(np.stack(images), dtype=dtype)[:, None]
+
+
+def measured(s, seed=7):
+    return measure_dots(render(s.pixels, s.shapes, seed=seed), s.pixels, s.shapes / 4.4, s.sizes, "dark")
+
+
+@pytest.fixture(scope="module")
+def two():
+    s = scene()
+    return s, DotLocator(measured(s), SIZE, "dark", s.rim)
+
+
+@pytest.mark.parametrize("arrangement, two_sizes", PATTERNS)
+def test_finds_the_pattern_and_no_ring(arrangement, two_sizes):
+    s = scene(arrangement, two_sizes)
+    image = render(s.pixels, s.shapes)
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]]
+    image[abs(np.hypot(u - CENTRE[0], v - CENTRE[1]) - RADIUS - 4) < 3] = 0.5  # the rim's ring, dark within and without
+    found = find_dots(image, "dark")
+    distance, index = cKDTree(found.pixels).query(s.pixels)
+    assert len(found.pixels) == len(s.pixels) == len(set(index))
+    assert np.median(distance) < 0.05 and distance.max() < 0.25
+    assert (found.sizes[index] == s.sizes).all()
+    area = np.linalg.det(found.shapes[index]) / np.linalg.det(s.shapes)
+    assert abs(np.sqrt(area) - 1).max() < 0.2
+
+
+def test_finds_only_inside_the_mask():
+    s = scene()
+    mask = np.arange(SIZE[0]) < CENTRE[0] + 5
+    found = find_dots(render(s.pixels, s.shapes), "dark", np.broadcast_to(mask, SIZE[::-1]))
+    assert len(found.pixels) == (s.pixels[:, 0] < CENTRE[0] + 5).sum()
+
+
+def test_nothing_to_find_is_an_error():
+    with pytest.raises(MembraneError, match="find_dots: 0 dots found"):
+        find_dots(np.full(SIZE[::-1], 0.5), "dark")
+
+
+@pytest.mark.parametrize("offset", [[0.0, 0.0], [8.0, -4.0]])
+def test_measures_dots_predicted_up_to_half_a_pitch_off(offset):
+    s = scene()
+    hidden = np.isin(np.arange(len(s.pixels)), [10, 30])
+    image = render(s.pixels, s.shapes, kept=~hidden)
+    got = measure_dots(image, s.pixels + offset, s.shapes / np.where(s.sizes, 4.4, 2.7)[:, None, None], s.sizes, "dark")
+    error = np.linalg.norm(got.pixels - s.pixels, axis=1)
+    assert (np.isnan(error) == hidden).all()
+    assert np.median(error[~hidden]) < 0.05 and error[~hidden].max() < 0.25
+    radius = np.sqrt(np.linalg.det(got.shapes) / np.linalg.det(s.shapes))
+    np.testing.assert_allclose(radius, 1, atol=0.1)
+
+
+@pytest.mark.parametrize("arrangement, two_sizes", PATTERNS)
+@pytest.mark.parametrize("field", [slide, dent])
+def test_follows_a_smooth_flow_of_one_and_a_half_pitches(arrangement, two_sizes, field):
+    s = scene(arrangement, two_sizes)
+    pattern = measured(s)
+    frames = [deform(s, field, pitches) for pitches in (0.0, 0.5, 1.0, 1.5)]
+    images = batch(*(render(*frame, seed=k) for k, frame in enumerate(frames)))
+    pixels, confidence = DotLocator(pattern, SIZE, "dark", s.rim)(images)
+    for k, (truth, _) in enumerate(frames):
+        error = np.linalg.norm(pixels[k].numpy() - truth, axis=1)
+        assert confidence[k].min() > 0.5, k
+        assert error.max() < 0.5 and np.median(error) < 0.06 and np.percentile(error, 95) < 0.2, k
+
+
+def test_removed_dots_are_lost_and_no_neighbour_takes_their_place(two):
+    s, locate = two
+    truth, shapes = deform(s, dent, 0.8)
+    hidden = np.random.default_rng(3).random(len(truth)) < 0.1
+    pixels, confidence = locate(batch(render(truth, shapes, kept=~hidden)))
+    assert confidence[0, hidden].max() < 0.1
+    assert confidence[0, ~hidden].min() > 0.5
+    error = np.linalg.norm(pixels[0].numpy() - truth, axis=1)
+    assert error[~hidden].max() < 0.4
+    assert error[hidden].max() < 0.4 * PITCH  # the prediction
+
+
+def test_a_dot_out_of_line_with_the_flow_is_not_believed(two):
+    s, locate = two
+    truth, shapes = deform(s, slide, 0.3)
+    same = np.where(s.sizes == s.sizes[0])[0]
+    stray = same[np.linalg.norm(s.pixels[same] - CENTRE, axis=1).argmin()]
+    beside = np.argsort(np.linalg.norm(s.pixels - s.pixels[stray], axis=1))[1]
+    moved = truth.copy()
+    moved[stray] += 0.65 * (truth[beside] - truth[stray])
+    kept = np.arange(len(truth)) != beside
+    _, confidence = locate(batch(render(moved, shapes, kept=kept)))
+    assert confidence[0, [stray, beside]].max() < 0.5
+    assert np.delete(confidence[0].numpy(), [stray, beside]).min() > 0.5
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_an_image_without_dots_has_no_confidence(two, value, noise):
+    _, locate = two
+    image = (value + noise * np.random.default_rng(1).normal(size=SIZE[::-1])).clip(0, 1)
+    pixels, confidence = locate(batch(image))
+    assert confidence.max() < 0.05 and torch.isfinite(pixels).all()
+
+
+def test_a_saturated_highlight_does_not_move_the_dots(two):
+    s, locate = two
+    truth, shapes = deform(s, slide, 0.4)
+    image = render(truth, shapes, noise=0.0)
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]]
+    glare = 1 + 2 * np.exp(-((u - 180) ** 2 + (v - 110) ** 2) / (2 * 20**2))
+    plain, lit = locate(batch(image, (image * glare).clip(0, 1)))[0]
+    assert (plain - lit).norm(dim=-1).max() < 0.2
+    assert (plain - lit).norm(dim=-1).median() < 0.01
+
+
+def test_a_frame_alone_equals_the_frame_in_a_batch(two):
+    s, locate = two
+    images = batch(*(render(*deform(s, f, a)) for f, a in [(slide, 0.3), (dent, 0.9), (slide, 1.2)]))
+    together = locate(images)
+    for k in range(3):
+        for one, many in zip(locate(images[k : k + 1]), together, strict=True):
+            torch.testing.assert_close(one[0], many[k], atol=2e-4, rtol=0)
+
+
+def test_float32_agrees_with_float64():
+    s = scene()
+    image = render(*deform(s, dent, 1.0))
+    pattern = measured(s)
+    single = DotLocator(pattern, SIZE, "dark", s.rim)(batch(image))
+    double = DotLocator(pattern, SIZE, "dark", s.rim).double()(batch(image, dtype=torch.float64))
+    assert (single[0] - double[0]).abs().max() < 2e-3
+    assert (single[1] - double[1]).abs().max() < 1e-2
+
+
+def test_light_dots_are_dark_dots_of_the_negative(two):
+    s, locate = two
+    image = render(*deform(s, dent, 0.7))
+    inverse = measure_dots(1 - render(s.pixels, s.shapes, seed=7), s.pixels, s.shapes / 4.4, s.sizes, "light")
+    light = DotLocator(inverse, SIZE, "light", s.rim)
+    for a, b in zip(locate(batch(image)), light(1 - batch(image)), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-3, rtol=0)
+
+
+def test_a_shifted_image_shifts_the_pixels():
+    s = scene()
+    locate = DotLocator(measured(s), SIZE, "dark")
+    image = render(*deform(s, dent, 0.5), noise=0.0)
+    shifted = np.roll(image, (-4, 6), (0, 1))
+    pixels, confidence = locate(batch(image, shifted))
+    assert confidence.min() > 0.5
+    difference = pixels[1] - pixels[0] - torch.tensor([6.0, -4.0])
+    assert difference.norm(dim=-1).median() < 0.01 and difference.norm(dim=-1).max() < 0.1
+
+
+def test_the_pixels_are_differentiable_in_the_image():
+    s = scene()
+    locate = DotLocator(measured(s), SIZE, "dark", s.rim).double()
+    image = batch(render(*deform(s, slide, 0.5)), dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    weight = torch.randn(len(s.pixels), 2, generator=generator, dtype=torch.float64)
+    direction = torch.randn(image.shape, generator=generator, dtype=torch.float64)
+    slope = torch.autograd.functional.jvp(lambda x: (locate(x)[0] * weight).sum(), image, direction)[1]
+    ahead, behind = ((locate(image + e * direction)[0] * weight).sum() for e in (1e-6, -1e-6))
+    torch.testing.assert_close(slope, (ahead - behind) / 2e-6, rtol=1e-3, atol=0)
+
+
+def test_levels_of_the_pyramid_keep_the_mean():
+    image = torch.rand(2, 1, 16, 24, generator=torch.Generator().manual_seed(0))
+    for level in pyramid(image):
+        torch.testing.assert_close(level.mean((1, 2, 3)), image.mean((1, 2, 3)))
+
+
+def test_wrong_arguments_are_named():
+    s = scene()
+    pattern = DotPattern(s.pixels, s.shapes, s.sizes)
+    with pytest.raises(MembraneError, match="polarity is 'black'"):
+        DotLocator(pattern, SIZE, "black")
+    with pytest.raises(MembraneError, match="1 of them NaN"):
+        s.pixels[4] = np.nan
+        DotLocator(pattern, SIZE, "dark")
