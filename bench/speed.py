@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sparse
-from scipy.sparse.linalg import splu
 import torch
 from record import median_seconds, write
+from scipy.sparse.linalg import splu
 
 from torchmembrane.energy import Sheet
 from torchmembrane.membrane import corners
