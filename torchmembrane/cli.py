@@ -18,6 +18,7 @@ from .minimum_energy import ELEMENTS
 from .reconstruct import ESTIMATORS, Reconstructor
 from .results import load_frame
 from .sensor import Sensor
+from .simulate.command import add_simulate
 from .store import FORMATS, MESH, Mesh, Settings, check_folder
 
 RECONSTRUCT_EXAMPLES = """\
@@ -138,6 +139,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"torchmembrane {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _reconstruct_parser(commands)
+    add_simulate(commands, _command)
     _check_parser(commands)
     _view_parser(commands)
     return parser
