@@ -19,6 +19,7 @@ ELEMENTS = ("triangle", "quadrilateral")
 FILLINGS = ("liquid", "gas", "open")
 VOLUMES = ("exact", "linear")
 STEPS = 8
+SINGLE_SOLVE, REPEATED_SOLVE = 12, 4  # conjugate-gradient steps where one solve has to do, and where others follow
 
 
 class Equilibrium(NamedTuple):
@@ -51,7 +52,7 @@ class MinimumEnergy(nn.Module):
     """
 
     def __init__(self, membrane: Membrane, sheet: Sheet, rest_rays, element="triangle", smoothing=0.0, filling="liquid",
-                 gas: tuple[float, float] | None = None, volume="exact", steps=None, solver_steps=12):  # fmt: skip
+                 gas: tuple[float, float] | None = None, volume="exact", steps=None, solver_steps=None):  # fmt: skip
         super().__init__()
         for name, value, known in (
             ("element", element, ELEMENTS),
@@ -64,7 +65,8 @@ class MinimumEnergy(nn.Module):
             raise MembraneError("MinimumEnergy: filling = 'gas' without gas = (pressure, volume); pass both")
         self.membrane, self.filling, self.volume_constraint = membrane, filling, volume
         quadratic = volume == "linear" and (element == "quadrilateral" or sheet.model == "harmonic") and filling != "gas"
-        self.steps, self.solver_steps = steps or (1 if quadratic else STEPS), solver_steps
+        self.steps = steps or (1 if quadratic else STEPS)
+        self.solver_steps = solver_steps or (SINGLE_SOLVE if self.steps == 1 else REPEATED_SOLVE)
         self.energy = sheet if element == "triangle" else AffineQuadrilaterals(membrane, sheet.tension)
         origins, directions = rest_rays
         self.register_buffer("rest_range", ((membrane.rest - origins) * directions).sum(-1))

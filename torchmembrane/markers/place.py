@@ -13,7 +13,7 @@ from .locate import DotLocator
 from .texture import TextureLocator, choose_patches
 
 FEWEST_MARKERS = 8
-SMOOTH_GRID = 65
+SMOOTH_GRID = 33
 """Vertices a side of the surface on which markers are placed: the solver's facets are too coarse for oblique rays."""
 DOT_RADIUS = (0.16, 0.27)
 """Radius of small and large dots over the dot spacing, where no rest image shows it."""
