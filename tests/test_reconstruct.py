@@ -194,7 +194,7 @@ def test_a_gas_without_modulus_is_a_liquid_and_says_so_once(sensor, result, imag
 
 
 def test_gas_pressure_is_in_the_sensors_units(sensor):
-    gas = Reconstructor(dataclasses.replace(sensor, cavity=Cavity("gas", pressure=1000.0))).estimator.gas
+    gas = Reconstructor(dataclasses.replace(sensor, cavity=Cavity("gas", pressure=1000.0))).estimator.cavity.gas
     torch.testing.assert_close(gas[0], torch.tensor(0.1))
     assert float(gas[1]) == pytest.approx(sensor.membrane.cavity_volume, rel=1e-5)
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from .cavity import CavityLaw, rest_balance
 from .energy import AffineQuadrilaterals, Sheet
 from .errors import MembraneError
 from .membrane import Membrane, corners, corners_to_vertices
@@ -16,7 +17,6 @@ from .solve.conjugate_gradient import conjugate_gradient, symmetric_product
 from .solve.kkt import constrained_minimum
 
 ELEMENTS = ("triangle", "quadrilateral")
-FILLINGS = ("liquid", "gas", "open")
 VOLUMES = ("exact", "linear")
 STEPS = 8
 SINGLE_SOLVE, REPEATED_SOLVE = 12, 4  # conjugate-gradient steps where one solve has to do, and where others follow
@@ -54,16 +54,10 @@ class MinimumEnergy(nn.Module):
     def __init__(self, membrane: Membrane, sheet: Sheet, rest_rays, element="triangle", smoothing=0.0, filling="liquid",
                  gas: tuple[float, float] | None = None, volume="exact", steps=None, solver_steps=None):  # fmt: skip
         super().__init__()
-        for name, value, known in (
-            ("element", element, ELEMENTS),
-            ("filling", filling, FILLINGS),
-            ("volume", volume, VOLUMES),
-        ):
+        for name, value, known in (("element", element, ELEMENTS), ("volume", volume, VOLUMES)):
             if value not in known:
                 raise MembraneError(f"MinimumEnergy: {name} = {value!r}; expected one of {', '.join(known)}")
-        if filling == "gas" and gas is None:
-            raise MembraneError("MinimumEnergy: filling = 'gas' without gas = (pressure, volume); pass both")
-        self.membrane, self.filling, self.volume_constraint = membrane, filling, volume
+        self.membrane, self.volume_constraint = membrane, volume
         quadratic = volume == "linear" and (element == "quadrilateral" or sheet.model == "harmonic") and filling != "gas"
         self.steps = steps or (1 if quadratic else STEPS)
         self.solver_steps = solver_steps or (SINGLE_SOLVE if self.steps == 1 else REPEATED_SOLVE)
@@ -71,12 +65,10 @@ class MinimumEnergy(nn.Module):
         origins, directions = rest_rays
         self.register_buffer("rest_range", ((membrane.rest - origins) * directions).sum(-1))
         self.register_buffer("smoothing", sheet.tension * smoothing)
-        self.register_buffer("gas", torch.tensor(gas if gas else (1.0, 1.0), dtype=torch.float64))
-        force, push = self.energy.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
-        normal, free = membrane.rest_normals, membrane.free
-        p0 = (force * normal)[free].sum() / (push * normal)[free].sum()
-        self.register_buffer("rest_pressure", p0)
-        self.register_buffer("rest_load", force - p0 * push)
+        rest_pressure, rest_load = rest_balance(membrane, self.energy)
+        self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
+        self.register_buffer("rest_pressure", rest_pressure)
+        self.register_buffer("rest_load", rest_load)
         self.register_buffer("moves", (~membrane.fixed).double())
         self.register_buffer("inverse", self._rest_inverse(directions))
 
@@ -122,29 +114,10 @@ class MinimumEnergy(nn.Module):
             self.solver_steps,
         )
         y, g = solved.unbind(-1)
-        if self.filling == "open":
+        if self.cavity.filling == "open":
             return t + y, pressure
-        minimum = constrained_minimum(y, g, v, *self._volume_condition(rise, pressure))
+        minimum = constrained_minimum(y, g, v, *self.cavity.condition(rise, pressure))
         return t + minimum.y, pressure - minimum.multiplier
-
-    def _volume_condition(self, rise: Tensor, pressure: Tensor):
-        """Target `c` and compliance `C` of the step's volume, `v.y = c + C lambda` with `lambda = -(pressure step)`."""
-        if self.filling == "liquid":
-            return -rise, 0.0
-        absolute, volume = self.gas.unbind()
-        ratio = volume / (volume + rise)
-        compliance = volume / (absolute * ratio**2)
-        gas_pressure = self.rest_pressure + absolute * (ratio - 1)
-        return compliance * (gas_pressure - pressure), compliance
-
-    def target_volume(self, volume: Tensor, pressure: Tensor) -> Tensor:
-        """The volume that the cavity's law asks for at this pressure, `[...]`."""
-        if self.filling == "liquid":
-            return self.membrane.rest_volume.expand(volume.shape)
-        if self.filling == "open":
-            return volume
-        absolute, gas = self.gas.unbind()
-        return self.membrane.rest_volume + gas * (absolute / (absolute + pressure - self.rest_pressure) - 1)
 
 
 class _State:

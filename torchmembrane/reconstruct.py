@@ -170,7 +170,8 @@ class Reconstructor(nn.Module):
         corner_u = u[:, self.marker_vertices.ravel()].unflatten(1, (-1, 3))
         markers = self.rest_markers + (self.marker_weights[..., None] * corner_u).sum(-2)
         pixels = self.rest_pixels + displacement
-        volume_error = (equilibrium.volume - self.estimator.target_volume(equilibrium.volume, pressure)) / membrane.rest_volume
+        target = self.estimator.cavity.target_volume(equilibrium.volume, pressure)
+        volume_error = (equilibrium.volume - target) / membrane.rest_volume
         miss2 = torch.where(lost, 0.0, ((self.camera.point_to_pixel(markers) - pixels) ** 2).sum(-1))
         residual = (miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()
         unsettled = equilibrium.unbalance > LARGEST_UNBALANCE

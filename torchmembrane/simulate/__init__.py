@@ -1,0 +1,1 @@
+"""The forward problem: a membrane pressed by rigid indenters."""

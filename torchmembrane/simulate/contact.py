@@ -1,0 +1,166 @@
+"""Contact of the free vertices with one rigid indenter: unilateral, with Coulomb friction, by a primal-dual active set.
+
+    phi >= 0,  N >= 0,  N phi = 0;        |T| <= mu N,  slip = 0 where |T| < mu N,  T opposite to the slip elsewhere
+
+The nodal forces `N` (along the indenter's normal n) and `T` (tangential) are unknowns beside the positions, found by a
+semismooth Newton method on their projections (Alart, Curnier 1991; Hueber, Stadler, Wohlmuth 2008): `N = max(0, N - c phi)`,
+and T is `T - c_t slip` brought back on the cone. The weights c, c_t > 0 have no influence on the solution.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import MembraneError
+from .indenters import Indenter, norm
+
+RIGID = 1e3  # the linearised contact's stiffness over c: what still yields in one step is gone in the next
+GENTLE = 0.1  # c_t over c: large enough to tell the slip's direction, too small to let what sticks slip at once
+SAME_SIDE = 0.5  # cosine between an indenter's normals at one vertex before and after an increment
+
+
+class ActiveSet(NamedTuple):
+    """The touching vertices (`index [A]`) of a Newton step and their state, from which the law there is linear in the step.
+
+    phi `[A]`, n `[A, 3]`: distance and normal; slip `[A, 3]` so far; sticks `[A]`; e `[A, 3]`: direction of T where it slips;
+    turning `[A]`: stiffness against turning it.
+    """
+
+    index: Tensor
+    phi: Tensor
+    n: Tensor
+    slip: Tensor
+    sticks: Tensor
+    e: Tensor
+    turning: Tensor
+
+
+class Contact(NamedTuple):
+    """One indenter during one increment of its motion, against F free vertices `x [F, 3]`.
+
+    `normal [F]`: N; `tangential [F, 3]`: T; `anchor [F, 3]`: where the vertices would be had they stuck, which slip is
+    counted from; `weight`: c; `friction`: mu.
+    """
+
+    indenter: Indenter
+    normal: Tensor
+    tangential: Tensor
+    anchor: Tensor
+    weight: float
+    friction: float
+
+    @classmethod
+    def begun(cls, indenter: Indenter, x: Tensor, weight: float, friction: float) -> "Contact":
+        """No force yet, the indenter at its first pose."""
+        return cls(indenter, torch.zeros_like(x[:, 0]), torch.zeros_like(x), x, weight, friction)
+
+    def carried_to(self, pose: Indenter, x: Tensor) -> "Contact":
+        """The next increment: the indenter moves to `pose`, from an equilibrium `x` in which this contact held.
+
+        A vertex that it meets on the way is carried along only from where it is met. Raises `MembraneError` where the indenter
+        may overtake a vertex, which then would end up inside it, or on another side.
+        """
+        (before, n_before), (after, n_after) = (self._distance_and_normal(body, x) for body in (self.indenter, pose))
+        turn = pose.rotation @ self.indenter.rotation.T
+        along = (x - self.indenter.translation) @ turn.T + pose.translation
+        travel = along - x
+        reached = (before < travel.norm(dim=-1)) & ((n_before * travel).sum(-1) > 0)
+        if (reached & ((n_before * n_after).sum(-1) < SAME_SIDE)).any():
+            raise MembraneError("Contact: an indenter overtakes the membrane; expected smaller steps, which it can follow")
+        met = (-after / (before - after).clamp_min(1e-300)).clamp(0, 1)
+        share = torch.where(self.normal > 0, 1.0, met)[:, None]
+        return self._replace(indenter=pose, tangential=self.tangential @ turn.T, anchor=x + share * travel)
+
+    def projected(self, x: Tensor) -> "Contact":
+        """The contact with the projections of N and T at `x`; in equilibrium they are N and T."""
+        index, phi, n = self._touching(x)
+        normal = self.normal[index] - self.weight * phi
+        trial = self._trial(x, index, n)
+        cone = self.friction * normal / norm(trial).clamp_min(1e-300)
+        return self._with(index, normal, cone.clamp_max(1)[:, None] * trial)
+
+    def force(self, x: Tensor) -> Tensor:
+        """`N n + T` on the vertices at `x`, `[F, 3]`."""
+        index = torch.nonzero(self.normal).squeeze(-1)
+        n = self.indenter.normal(x[index]).detach()
+        return torch.zeros_like(x).index_copy(0, index, self.normal[index, None] * n + self.tangential[index])
+
+    def distance_from(self, other: "Contact") -> float:
+        """Largest difference of a nodal force component."""
+        normal, tangential = self.normal - other.normal, self.tangential - other.tangential
+        return float(torch.cat([normal, tangential.ravel()]).abs().max())
+
+    def active_set(self, x: Tensor) -> ActiveSet:
+        """Who touches at `x`, and who of them sticks."""
+        index, phi, n = self._touching(x)
+        trial = self._trial(x, index, n)
+        size, bound = norm(trial), self.friction * self.normal[index].clamp_min(0)
+        ratio = bound / size.clamp_min(1e-300)
+        turning = (GENTLE * self.weight * ratio / (1 - ratio).clamp_min(1e-300)).clamp(0, RIGID * self.weight)
+        e = trial / size.clamp_min(1e-300)[:, None]
+        return ActiveSet(index, phi, n, (x - self.anchor)[index], size <= bound, e, turning)
+
+    def linearised(self, active: ActiveSet, move: Tensor | float = 0.0) -> "Contact":
+        """The contact with the forces that the law, linearised, gives the active vertices after a `move [F, 3]`."""
+        rigid, index, n, e = RIGID * self.weight, active.index, active.n, active.e
+        move = torch.broadcast_to(torch.as_tensor(move, dtype=n.dtype), self.tangential.shape)[index]
+        normal = self.normal[index] - rigid * (active.phi + (n * move).sum(-1))
+        if self.friction == 0:
+            return self._with(index, normal, torch.zeros_like(n))
+        slip = _tangential(active.slip + move, n)
+        sticking = _tangential(self.tangential[index], n) - rigid * slip
+        slipping = self.friction * normal[:, None] * e - active.turning[:, None] * _tangential(slip, e)
+        return self._with(index, normal, torch.where(active.sticks[:, None], sticking, slipping))
+
+    def stiffness_blocks(self, x: Tensor, active: ActiveSet) -> Tensor:
+        """Minus the derivative of each vertex's linearised force in its own move, `[F, 3, 3]`; not symmetric with friction."""
+        outer = lambda p, q: p[:, :, None] * q[:, None, :]  # noqa: E731
+        rigid, index, n, e = RIGID * self.weight, active.index, active.n, active.e
+        blocks = rigid * outer(n, n) - self.normal[index, None, None] * self._curvature(x[index])
+        if self.friction:
+            plane = torch.eye(3, dtype=x.dtype) - outer(n, n)
+            slips = self.friction * rigid * outer(e, n) + active.turning[:, None, None] * (plane - outer(e, e))
+            blocks = blocks + torch.where(active.sticks[:, None, None], rigid * plane, slips)
+        return torch.zeros(len(x), 3, 3, dtype=x.dtype).index_copy(0, index, blocks)
+
+    def held(self, x: Tensor, active: ActiveSet) -> Tensor:
+        """Forces `[F, 3]` at `x` if nobody else touches: N and T, less c times what penetrates, or slips though stuck."""
+        phi, n = self._distance_and_normal(self.indenter, x[active.index])
+        force = (self.normal[active.index] - self.weight * phi)[:, None] * n + self.tangential[active.index]
+        if self.friction:
+            slip = _tangential((x - self.anchor)[active.index], n)
+            force = force - self.weight * torch.where(active.sticks[:, None], slip, 0.0)
+        return torch.zeros_like(x).index_copy(0, active.index, force)
+
+    @staticmethod
+    def _distance_and_normal(body: Indenter, x: Tensor) -> tuple[Tensor, Tensor]:
+        distance, normal = body.distance_and_normal(x)
+        return distance.detach(), normal.detach()
+
+    def _touching(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        index = torch.nonzero(self.normal - self.weight * self.indenter.distance(x) > 0).squeeze(-1)
+        return index, *self._distance_and_normal(self.indenter, x[index])
+
+    def _trial(self, x: Tensor, index: Tensor, n: Tensor) -> Tensor:
+        return _tangential(self.tangential[index] - GENTLE * self.weight * (x - self.anchor)[index], n)
+
+    def _with(self, index: Tensor, normal: Tensor, tangential: Tensor) -> "Contact":
+        zeros = torch.zeros_like
+        return self._replace(
+            normal=zeros(self.normal).index_copy(0, index, normal),
+            tangential=zeros(self.tangential).index_copy(0, index, tangential),
+        )
+
+    def _curvature(self, points: Tensor) -> Tensor:
+        """Second derivatives of the distance, `[A, 3, 3]`; zero where the indenter has none."""
+        points = points.detach().requires_grad_()
+        _, n = self.indenter.distance_and_normal(points)
+        if not n.requires_grad:
+            return torch.zeros(*points.shape, 3, dtype=points.dtype)
+        rows = [torch.autograd.grad(n[:, i].sum(), points, retain_graph=True, materialize_grads=True)[0] for i in range(3)]
+        return torch.stack(rows, 1)
+
+
+def _tangential(vectors: Tensor, n: Tensor) -> Tensor:
+    return vectors - (vectors * n).sum(-1, keepdim=True) * n
