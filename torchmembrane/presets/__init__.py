@@ -1,0 +1,30 @@
+"""Sensors that come with the package, complete with marker list and rest image, to try things and to start one's own from."""
+
+from pathlib import Path
+
+from ..errors import MembraneError
+from ..sensor import Sensor
+
+NAMES = ("fingertip", "bubble", "half_cylinder")
+PREFIX = "preset:"
+
+
+def preset_file(name: str) -> Path:
+    """The `sensor.toml` of a preset, one of `NAMES`."""
+    if name not in NAMES:
+        raise MembraneError(f"preset {name!r}: no such sensor; expected one of {', '.join(NAMES)}")
+    return Path(__file__).parent / name / "sensor.toml"
+
+
+def preset(name: str) -> Sensor:
+    """A sensor that comes with the package.
+
+    >>> preset("bubble").camera.model
+    'pinhole'
+    """
+    return Sensor.from_file(preset_file(name))
+
+
+def sensor_file(text: str) -> Path:
+    """The file that an argument names: a path, or `preset:NAME`."""
+    return preset_file(text.removeprefix(PREFIX)) if text.startswith(PREFIX) else Path(text)

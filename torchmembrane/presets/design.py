@@ -1,0 +1,113 @@
+"""How the presets are made: `python -m torchmembrane.presets.design` writes their files anew."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from ..camera import Camera
+from ..cavity import rest_balance
+from ..energy import Sheet
+from ..images import to_grey
+from ..sensor import METRE, Cavity, Markers, Material, Sensor, Surface
+from ..sensor_file import default_grid
+from ..simulate.look import Look, noisy
+from ..simulate.render import Renderer
+from . import NAMES
+
+AIR = 1013.0  # hPa
+MARGIN = 0.93  # of the way from pole to rim that is dotted
+NOISE = 40.0  # dB below white
+
+
+def fingertip() -> Sensor:
+    """Half an ellipsoid as large as a fingertip, a fisheye camera within it, filled with liquid."""
+    semi_axes = [10.0, 8.0, 12.0]
+    return _sensor(
+        "fingertip",
+        Camera("fisheye", (640, 480), (180.0, 180.0), (321.5, 238.2), (-0.012, 0.002)),
+        Surface("ellipsoid_cap", {"semi_axes": semi_axes, "base_z": 3.0}),
+        Material("neo_hookean", prestretch=1.25, shear_modulus=0.3, thickness=0.4),
+        *_dome_dots(semi_axes, np.pi / 2, 3.0, spacing=2.1),
+    )
+
+
+def bubble() -> Sensor:
+    """A wide air-filled bubble seen by a pinhole camera from afar."""
+    rim, height, base_z = 30.0, 18.0, 60.0
+    radius = (rim**2 + height**2) / (2 * height)
+    return _sensor(
+        "bubble",
+        Camera("pinhole", (640, 480), (440.0, 440.0), (317.8, 241.1), (-0.06, 0.02)),
+        Surface("spherical_cap", {"rim_radius": rim, "height": height, "base_z": base_z}),
+        Material("neo_hookean", prestretch=1.3, shear_modulus=0.3, thickness=0.3),
+        *_dome_dots((radius,) * 3, np.arctan2(rim, radius - height), base_z, spacing=4.4),
+        gas=True,
+    )
+
+
+def half_cylinder() -> Sensor:
+    """A water-filled half cylinder, longer than wide, seen through a sheet of Plexiglas: the paper's Appendix A."""
+    radius, length, half_angle, base_z, spacing = 10.0, 36.0, 80.0, 24.0, 2.4
+    return _sensor(
+        "half_cylinder",
+        Camera("pinhole", (640, 480), (265.0, 265.0), (322.4, 237.0), ports=[(4.0, 3.0, 1.49)], medium_index=1.33),
+        Surface("half_cylinder", {"radius": radius, "length": length, "half_angle": half_angle, "base_z": base_z}),
+        Material("mooney_rivlin", prestretch=1.2, c2_ratio=0.1, shear_modulus=0.35, thickness=0.3),
+        *_cylinder_dots(radius, length, np.deg2rad(half_angle), base_z, spacing),
+    )
+
+
+def write(folder: Path) -> None:
+    """The files of every preset: `NAME/sensor.toml`, `sensor_dots.csv`, `sensor_rest.png`."""
+    for name in tqdm(NAMES, desc="presets", unit="sensor"):
+        globals()[name]().to_file(folder / name)
+
+
+def _sensor(name, camera, surface, material, positions, sizes, gas=False) -> Sensor:
+    markers = Markers("dots", "dark", positions, sizes)
+    membrane = surface.membrane(default_grid(markers))
+    cavity = Cavity("gas", AIR + _overpressure(membrane, material)) if gas else Cavity("liquid")
+    blank = Sensor(name, "mm", camera, membrane, material, cavity, markers, surface)
+    image = noisy(Renderer(blank, look=Look())(membrane.rest), NOISE, np.random.default_rng(0))
+    return replace(blank, markers=replace(markers, rest_image=to_grey((255 * image).round().byte().numpy())))
+
+
+def _overpressure(membrane, material) -> float:
+    """What the sheet's tension holds at rest, whole hPa."""
+    sheet = Sheet(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
+    return float(round(rest_balance(membrane, sheet)[0] * METRE["mm"] ** 2 / 100))
+
+
+def _dome_dots(semi_axes, opening: float, base_z: float, spacing: float) -> tuple[np.ndarray, list[str]]:
+    """A square pattern, its pitch measured along the surface from the pole: positions `[D, 3]` and sizes, in turns."""
+    a, b, c = semi_axes
+    i, j = _lattice(opening * max(a, b) / spacing)
+    x, y = i * spacing / a, j * spacing / b
+    angle = np.hypot(x, y)
+    scale = np.sinc(angle / np.pi)
+    points = np.stack([a * scale * x, b * scale * y, base_z + c * (np.cos(angle) - np.cos(opening))], -1)
+    kept = angle < MARGIN * opening
+    return points[kept].round(5), _sizes((i + j)[kept])
+
+
+def _cylinder_dots(radius, length, half_angle, base_z, spacing) -> tuple[np.ndarray, list[str]]:
+    i, j = _lattice(length / spacing)
+    x, angle = i * spacing, j * spacing / radius
+    points = np.stack([x, radius * np.sin(angle), base_z + radius * (np.cos(angle) - np.cos(half_angle))], -1)
+    kept = (np.abs(x) < length / 2 - spacing / 2) & (np.abs(angle) < half_angle - spacing / radius / 2)
+    return points[kept].round(5), _sizes((i + j)[kept])
+
+
+def _lattice(reach: float) -> tuple[np.ndarray, np.ndarray]:
+    steps = np.arange(-int(reach), int(reach) + 1)
+    return tuple(a.ravel() for a in np.meshgrid(steps, steps, indexing="ij"))
+
+
+def _sizes(order: np.ndarray) -> list[str]:
+    return np.where(order % 2 == 0, "large", "small").tolist()
+
+
+if __name__ == "__main__":
+    write(Path(__file__).parent)

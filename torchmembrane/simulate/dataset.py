@@ -1,0 +1,151 @@
+"""Random presses of one sensor: the same for the same seed and number, on all cores, continued where they were interrupted."""
+
+import multiprocessing
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from ..errors import MembraneError
+from .frames import Frames
+from .indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge, facing
+from .simulator import Frame, Simulator, Stroke
+
+ATTEMPTS = 10
+RADIUS = (0.06, 0.25)  # of spheres and cylinders, over the square root of the rest area; evenly in the logarithm
+EDGE = (0.02, 0.05)  # of edges' rounding
+SIDE = (0.15, 0.4)  # of a box
+DEPTH = (0.01, 0.1)
+OFF_RIM = 0.15  # least distance from the rim of the point that is aimed at
+TILT = 20.0  # degrees, between the motion and the normal there, at most
+KINDS = ("sphere", "cylinder", "wedge", "box", "plane")
+
+
+class Plan(NamedTuple):
+    """What the presses of a data set share: `kinds` of indenters, `friction`, `seed`, longest travel in a step."""
+
+    kinds: Sequence[str] = KINDS
+    friction: float = 0.0
+    seed: int = 0
+    increment: float | None = None
+
+
+class Outcome(NamedTuple):
+    """How many frames of a data set were made, failed, and were there before."""
+
+    made: int
+    failed: int
+    skipped: int
+
+
+def random_frame(simulator: Simulator, plan: Plan, number: int) -> Frame:
+    """The data set's frame of that number. Strokes that the membrane cannot follow are drawn again."""
+    rng = np.random.default_rng([plan.seed, number])
+    for _ in range(ATTEMPTS):
+        try:
+            stroke = random_stroke(simulator, plan, rng)
+            (state,) = simulator.presses(stroke, ("push",), increment=plan.increment)
+        except MembraneError as error:
+            reason = error
+        else:
+            return simulator.frame(state, stroke, rng)
+    raise MembraneError(f"none of {ATTEMPTS} random strokes could be followed; the last one: {reason}")
+
+
+def random_stroke(simulator: Simulator, plan: Plan, rng: np.random.Generator) -> Stroke:
+    """A stroke towards a point of the surface off its rim, even in area, and tilted against the normal there."""
+    membrane, size = simulator.membrane, simulator.membrane.size
+    X, normals, fixed = (a.numpy() for a in (membrane.rest, membrane.rest_normals, membrane.fixed))
+    off_rim = np.linalg.norm(X[:, None] - X[fixed], axis=-1).min(1) > OFF_RIM * size
+    weight = np.where(off_rim, membrane.rest_area.numpy(), 0.0)
+    target = rng.choice(len(X), p=weight / weight.sum())
+    kind = plan.kinds[rng.integers(len(plan.kinds))]
+    body, turn, depth = _random_body(kind, size, rng), rng.uniform(0, 2 * np.pi), size * rng.uniform(*DEPTH)
+    axis, tilt = rng.normal(size=3), 0.0 if kind == "plane" else np.tan(np.deg2rad(TILT * rng.random() ** 0.5))
+    across = np.cross(normals[target], axis)
+    travel = -normals[target] + tilt * across / np.linalg.norm(across)
+    return stroke_to(simulator, body, X[target], travel, depth, turn=turn, friction=plan.friction)
+
+
+def stroke_to(simulator: Simulator, body: Indenter, aim, travel, depth, turn=0.0, slide=(0, 0, 0), friction=0.0) -> Stroke:
+    """The stroke of a body that moves along `travel [3]` to the point `aim [3]`, from where it first touches.
+
+    `turn`: radians about `travel`, from the pose that `facing` gives. Raises where it does not meet the surface.
+    """
+    travel = np.asarray(travel, float) / np.linalg.norm(travel)
+    c, s = np.cos(turn), np.sin(turn)
+    rotation = facing(travel) @ torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    touching = body.at(torch.as_tensor(np.asarray(aim, float)), rotation).touching(simulator.membrane, travel)
+    return Stroke(touching, travel, float(depth), np.asarray(slide, float), friction)
+
+
+def _random_body(kind: str, size: float, rng: np.random.Generator) -> Indenter:
+    radius = size * np.exp(rng.uniform(*np.log(RADIUS)))
+    edge = size * rng.uniform(*EDGE)
+    if kind == "sphere":
+        return Sphere(radius)
+    if kind == "cylinder":
+        return Cylinder(radius)
+    if kind == "wedge":
+        return Wedge(rng.uniform(40, 100), edge)
+    if kind == "box":
+        return Box(torch.from_numpy(size * rng.uniform(*SIDE, 3)), edge)
+    return Plane()
+
+
+def make_frames(
+    simulator: Simulator, plan: Plan, count: int, frames: Frames, jobs: int = 1,
+    report: Callable[[str], None] = lambda line: tqdm.write(line, file=sys.stderr),
+) -> Outcome:  # fmt: skip
+    """Make the frames 0 to `count - 1` of a data set that `frames` does not hold yet, in `jobs` processes.
+
+    A press that fails is reported and left out; the same call tries it again. Interrupted, what is done so far is kept.
+    """
+    names = {number: f"s{plan.seed}_{number:06d}" for number in range(count)}
+    held = frames.names()
+    wanted = [number for number, name in names.items() if name not in held]
+    failed, skipped = 0, count - len(wanted)
+    try:
+        for number, made in tqdm(
+            _in_processes(simulator, plan, wanted, jobs), total=count, initial=skipped, unit="press", desc="simulate"
+        ):
+            if isinstance(made, str):
+                failed += 1
+                report(f"{names[number]}: {made}")
+            else:
+                frames.write(names[number], made)
+    finally:
+        frames.flush()
+    return Outcome(len(wanted) - failed, failed, skipped)
+
+
+def _in_processes(simulator: Simulator, plan: Plan, numbers: Sequence[int], jobs: int) -> Iterator[tuple[int, Frame | str]]:
+    jobs = min(jobs, len(numbers))
+    if jobs <= 1:
+        yield from ((number, _frame_or_reason(simulator, plan, number)) for number in numbers)
+        return
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(jobs, _begin, (simulator, plan)) as pool:
+        yield from pool.imap(_work, numbers)
+
+
+def _begin(simulator: Simulator, plan: Plan) -> None:
+    global _simulator, _plan
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
+    torch.set_num_threads(1)
+    _simulator, _plan = simulator, plan
+
+
+def _work(number: int) -> tuple[int, Frame | str]:
+    return number, _frame_or_reason(_simulator, _plan, number)
+
+
+def _frame_or_reason(simulator: Simulator, plan: Plan, number: int) -> Frame | str:
+    try:
+        return random_frame(simulator, plan, number)
+    except MembraneError as error:
+        return str(error)

@@ -1,0 +1,186 @@
+"""Simulated frames on disk: the sensor they belong to, and each frame as PNG and npz or as a row of a Parquet data set."""
+
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ..batch import _pyav
+from ..errors import MembraneError
+from ..results import save_frame
+from ..sensor import Sensor
+from ..store import _pyarrow
+from .simulator import Frame, Simulator
+
+SENSOR, SETTINGS, REST = "sensor.toml", "simulation.json", "rest_truth.npz"
+CONSTANT = ("dots_nominal", "uv_nominal", "visible_nominal", "vertices_nominal", "triangles", "p0")
+PART_ROWS = 64
+FORMATS = ("png", "parquet")
+
+
+class Frames:
+    """Frames as NAME.png and NAME_truth.npz in a folder."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def names(self) -> set[str]:
+        """The frames that are there."""
+        found = {path.name.removesuffix("_truth.npz") for path in self.folder.glob("*_truth.npz")}
+        return {name for name in found if (self.folder / f"{name}.png").exists()}
+
+    def write(self, name: str, frame: Frame) -> None:
+        _write(self.folder / f"{name}.png", png(frame.image))
+        self.write_truth(name, frame)
+
+    def write_truth(self, name: str, frame: Frame) -> None:
+        save_frame(self.folder / f"{name}_truth.npz", frame.truth)
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def __iter__(self) -> Iterator[tuple[str, Frame]]:
+        """Names and frames in name order."""
+        for name in sorted(self.names()):
+            with np.load(self.folder / f"{name}_truth.npz") as truth:
+                yield name, Frame(np.asarray(Image.open(self.folder / f"{name}.png")), dict(truth))
+
+
+class FrameTable(Frames):
+    """Frames as rows of `frames/part-*.parquet`: `name`, `image` (a PNG file's bytes), and the truth, arrays as flat lists.
+
+    The schema's metadata hold the arrays' shapes (`shapes`, JSON). What is the same in all frames stands in `rest_truth.npz`.
+    Rows are held back until `PART_ROWS` of them make a file; `flush` writes the rest.
+    """
+
+    def __init__(self, folder: Path):
+        super().__init__(folder)
+        self.arrow, self.parquet = _pyarrow()
+        self.waiting: dict[str, Frame] = {}
+
+    def names(self) -> set[str]:
+        parts = (self.parquet.read_table(part, columns=["name"])["name"].to_pylist() for part in self._parts())
+        return {name for part in parts for name in part} | set(self.waiting)
+
+    def write(self, name: str, frame: Frame) -> None:
+        self.waiting[name] = frame
+        if not (self.folder / REST).exists():
+            save_frame(self.folder / REST, {key: frame.truth[key] for key in CONSTANT})
+        if len(self.waiting) >= PART_ROWS:
+            self.flush()
+
+    def flush(self) -> None:
+        if not self.waiting:
+            return
+        (self.folder / "frames").mkdir(exist_ok=True)
+        columns = {"name": list(self.waiting), "image": [png(frame.image) for frame in self.waiting.values()]}
+        shapes = {}
+        for key in next(iter(self.waiting.values())).truth.keys() - set(CONSTANT):
+            values = np.stack([frame.truth[key] for frame in self.waiting.values()])
+            shapes[key] = values.shape[1:]
+            flat = self.arrow.array(values.ravel())
+            size = int(np.prod(shapes[key]))
+            columns[key] = self.arrow.FixedSizeListArray.from_arrays(flat, size) if shapes[key] else flat
+        table = self.arrow.table(columns).replace_schema_metadata({"shapes": json.dumps(shapes)})
+        part = self.folder / "frames" / f"part-{len(self._parts()):05d}.parquet"
+        partial = part.with_name("." + part.name)
+        self.parquet.write_table(table, partial)
+        partial.replace(part)
+        self.waiting = {}
+
+    def __iter__(self) -> Iterator[tuple[str, Frame]]:
+        with np.load(self.folder / REST) as file:
+            constant = dict(file)
+        for part in self._parts():
+            table = self.parquet.read_table(part)
+            shapes = json.loads(table.schema.metadata[b"shapes"])
+            for row in table.to_pylist():
+                truth = {key: np.asarray(row[key]).reshape(shape) for key, shape in shapes.items()}
+                truth = {key: a.astype(np.float32) if a.dtype.kind == "f" else a for key, a in truth.items()}
+                yield row["name"], Frame(np.asarray(Image.open(io.BytesIO(row["image"]))), truth | constant)
+
+    def _parts(self) -> list[Path]:
+        return sorted((self.folder / "frames").glob("part-*.parquet"))
+
+
+class Video:
+    """An H.264 video `path`, written image by image."""
+
+    def __init__(self, path: Path, rate: int = 25):
+        self.path, self.rate, self.container = path, rate, None
+
+    def __enter__(self) -> "Video":
+        self.av = _pyav()
+        return self
+
+    def add(self, image: np.ndarray) -> None:
+        """The next image `[H, W]` uint8."""
+        if self.container is None:
+            self.container = self.av.open(str(self.path), "w")
+            even = all(side % 2 == 0 for side in image.shape)
+            self.stream = self.container.add_stream("libx264", rate=self.rate, options={"crf": "10"})
+            self.stream.height, self.stream.width = image.shape
+            self.stream.pix_fmt = "yuv420p" if even else "yuv444p"
+        self.container.mux(self.stream.encode(self.av.VideoFrame.from_ndarray(image, format="gray")))
+
+    def __exit__(self, *_) -> None:
+        if self.container is not None:
+            self.container.mux(self.stream.encode())
+            self.container.close()
+
+
+def open_frames(folder: Path, simulator: Simulator, settings: dict, format: str = "png") -> Frames:
+    """The frames of a folder that is made if need be, with the sensor as simulated: its rest image from the same light.
+
+    Raises `MembraneError` for a folder made with another sensor, look or `settings`, or with other contents.
+    """
+    settings = settings | {"sensor": simulator.sensor.fingerprint, "grid": list(simulator.grid), "format": format}
+    settings = json.loads(json.dumps(settings | asdict(simulator.look) | simulator.pattern.described()))
+    _check(folder, settings)
+    if not (folder / SETTINGS).exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        simulated(simulator).to_file(folder / SENSOR)
+        _write(folder / SETTINGS, json.dumps(settings, indent=1).encode())
+    return FrameTable(folder) if format == "parquet" else Frames(folder)
+
+
+def simulated(simulator: Simulator) -> Sensor:
+    """The sensor with the rest image that the simulator makes."""
+    sensor = simulator.sensor
+    return replace(sensor, markers=replace(sensor.markers, rest_image=simulator.rest_image()))
+
+
+def png(image: np.ndarray) -> bytes:
+    """An image `[H, W]` uint8 as a PNG file's content."""
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "png")
+    return file.getvalue()
+
+
+def _check(folder: Path, settings: dict) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise MembraneError(f"--out {folder}: is a file; expected a folder, new or of earlier simulations of this sensor")
+    if not (folder / SETTINGS).exists():
+        if any(folder.glob("*.npz")) or (folder / SENSOR).exists():
+            raise MembraneError(f"--out {folder}: holds other files (.npz, {SENSOR}) and no {SETTINGS}; choose another folder")
+        return
+    try:
+        before = json.loads((folder / SETTINGS).read_text())
+    except ValueError as error:
+        raise MembraneError(f"{folder / SETTINGS}: not readable ({error}); choose another folder") from error
+    for key, value in settings.items():
+        if before.get(key, value) != value:
+            raise MembraneError(
+                f"--out {folder}: was made with {key} {before[key]}, this call has {value}; choose another folder"
+            )
+
+
+def _write(path: Path, content: bytes) -> None:
+    """A file, whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(content)
+    partial.replace(path)

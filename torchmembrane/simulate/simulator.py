@@ -1,0 +1,142 @@
+"""A sensor in silico: presses on its membrane, on a grid finer than its solver's, their images and the truth about them."""
+
+import json
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ..energy import Sheet
+from ..errors import MembraneError
+from ..images import to_grey
+from ..sensor import Sensor
+from .indenters import Indenter
+from .look import Look, noisy
+from .pattern import pattern_of
+from .press import Press, presses
+from .render import Renderer
+
+LEGS = ("push", "slide", "release")
+REST_NOISE = 2**31 - 1  # its seed, unlike those of frames
+LIFT = 0.05  # above the first touch, over the surface's size, where a release ends
+
+
+class Stroke(NamedTuple):
+    """One indenter's motion from its first touch, lengths in the sensor's unit.
+
+    indenter   where it first touches
+    travel     `[3]` unit vector along which it pushes
+    depth      how far
+    slide      `[3]` how it moves then
+    friction   Coulomb's coefficient
+    """
+
+    indenter: Indenter
+    travel: np.ndarray
+    depth: float
+    slide: np.ndarray = np.zeros(3)
+    friction: float = 0.0
+
+    def poses(self, legs: Sequence[str], frames: int, lift: float) -> list[Indenter]:
+        """`frames` evenly spaced poses on each of the `legs`, "push", "slide", "release"; the release ends `lift` above."""
+        offsets, here = [], np.zeros(3)
+        motion = {"push": self.depth * self.travel, "slide": self.slide, "release": -(self.depth + lift) * self.travel}
+        for leg in legs:
+            offsets += [here + motion[leg] * k / frames for k in range(1, frames + 1)]
+            here = offsets[-1]
+        return [self.indenter.moved(offset) for offset in offsets]
+
+    def described(self) -> dict:
+        sizes = {
+            key: np.asarray(value).tolist()
+            for key, value in vars(self.indenter).items()
+            if key in ("radius", "axis", "length", "opening", "sides")
+        }
+        return {
+            "indenter": type(self.indenter).__name__.lower(), **sizes, "travel": self.travel.tolist(), "depth": self.depth,
+            "slide": self.slide.tolist(), "friction": self.friction, "touch": self.indenter.translation.tolist(),
+            "rotation": self.indenter.rotation.tolist(),
+        }  # fmt: skip
+
+
+class Frame(NamedTuple):
+    """`image [H, W]` uint8, and what is true in it, by the names of `Simulator.frame`."""
+
+    image: np.ndarray
+    truth: dict[str, np.ndarray]
+
+
+class Simulator:
+    """Presses and images of one sensor.
+
+    Arguments
+        sensor     a `Sensor`
+        grid       of the equilibrium; default `2 n + 3` for a solver grid of n, so that it is finer and shares no lines
+        look       light, lens, chip
+        radii      of small and large dots, length unit; default as in `Dots.of`
+        missing    dots that are not painted
+
+    A gas without modulus acts as a liquid. Raises `MembraneError` for a grid that is the sensor's own.
+    """
+
+    def __init__(self, sensor: Sensor, grid=None, look=Look(), radii=None, missing=()):  # noqa: B008
+        self.sensor, self.look = sensor, look
+        self.grid = tuple(grid or (2 * n + 3 for n in sensor.membrane.grid))
+        if any(mine <= solver for mine, solver in zip(self.grid, sensor.membrane.grid, strict=True)):
+            raise MembraneError(
+                f"Simulator: grid {list(self.grid)}; expected a finer one than the sensor's, {list(sensor.membrane.grid)}: "
+                "data simulated on the estimator's own grid flatter it"
+            )
+        self.membrane = sensor.surface.membrane(self.grid)
+        material, cavity = sensor.material, sensor.cavity
+        self.sheet = Sheet(self.membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
+        self.cavity = {"filling": cavity.filling}
+        if cavity.filling == "gas":
+            gas = (sensor.gas_pressure, cavity.volume or self.membrane.cavity_volume)
+            self.cavity = {"filling": "liquid"} if sensor.force_unit == "relative" else {"filling": "gas", "gas": gas}
+        self.pattern = pattern_of(sensor, radii, missing)
+        self.renderer = Renderer(sensor, self.grid, self.pattern, look)
+        self.rest_dots = self.renderer.dots(self.membrane.rest)
+
+    def image(self, vertices: torch.Tensor, rng: np.random.Generator) -> np.ndarray:
+        """The membrane at `vertices [V, 3]` as the chip delivers it, uint8 `[H, W]`; `rng` makes the noise."""
+        with torch.no_grad():
+            return (255 * noisy(self.renderer(vertices), self.look.noise, rng)).round().byte().cpu().numpy()
+
+    def rest_image(self) -> np.ndarray:
+        """The image at rest, float32 `[H, W]`, as a sensor keeps it."""
+        return to_grey(self.image(self.membrane.rest, np.random.default_rng(REST_NOISE)))
+
+    def presses(self, stroke: Stroke, legs: Sequence[str], frames: int = 1, increment=None) -> Iterator[Press]:
+        """Equilibria along a stroke; raises `MembraneError` where it never touches or the membrane cannot follow."""
+        poses = stroke.poses(legs, frames, LIFT * self.membrane.size)
+        states = presses(self.membrane, self.sheet, [poses], friction=stroke.friction, increment=increment, **self.cavity)
+        touched = False
+        for state in states:
+            touched = touched or bool(state.contact.any())
+            yield state
+        if not touched:
+            raise MembraneError("simulate: the indenter never touches the membrane; expected a depth that presses it in")
+
+    def frame(self, state: Press, stroke: Stroke, rng: np.random.Generator) -> Frame:
+        """The image of an equilibrium and its truth.
+
+        dots_nominal, dots_deformed `[D, 3]`, uv_nominal, uv_deformed `[D, 2]` px (of the dots' centres: the centre of the
+        outline lies some 0.1 px from it), visible_nominal, visible_deformed `[D]`; vertices_nominal, vertices_deformed
+        `[V, 3]`, triangles `[T, 3]`, contact_mask `[V]`, traction `[V, 3]`; p, p0 pressure difference now and at rest; force
+        `[3]` on the membrane, force_each `[I, 3]`, contact_centroid_each `[I, 3]`; stroke: JSON.
+        """
+        dots, rest = self.renderer.dots(state.vertices), self.rest_dots
+        truth = {
+            "dots_nominal": rest.positions, "dots_deformed": dots.positions,
+            "uv_nominal": rest.pixels, "uv_deformed": dots.pixels,
+            "visible_nominal": rest.visible, "visible_deformed": dots.visible,
+            "vertices_nominal": self.membrane.rest, "vertices_deformed": state.vertices,
+            "triangles": self.membrane.triangles.int(), "contact_mask": state.contact, "traction": state.traction,
+            "p": state.pressure, "p0": state.rest_pressure,
+            "force": state.force, "force_each": state.forces, "contact_centroid_each": state.contact_points,
+        }  # fmt: skip
+        arrays = {key: np.asarray(value) for key, value in truth.items()}
+        arrays = {key: a.astype(np.float32) if a.dtype.kind == "f" else a for key, a in arrays.items()}
+        return Frame(self.image(state.vertices, rng), arrays | {"stroke": np.array(json.dumps(stroke.described()))})
