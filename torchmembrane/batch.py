@@ -112,7 +112,7 @@ def reconstruct_files(
     if figures and (shadowed := [p for p in inputs.images if p.parent.resolve() == out.resolve()]):
         raise MembraneError(f"--out {out}: figures would overwrite images there ({shadowed[0]}); choose another")
     if inputs.videos:
-        _pyav()
+        load_pyav()
     frames = open_folder(out, mesh)
     stored, files = frames.statuses(), {path.stem: path for path in inputs.images}
     summary = Summary(out, frames, stored, mesh, lambda name: files.get(name) or inputs.video_of(name))
@@ -162,7 +162,7 @@ def _sources(inputs: Inputs, reconstructor) -> Iterator[Source]:
 
 def _video_frames(path: Path, reconstructor) -> Iterator[Source]:
     """The frames of a video one after another; one that cannot be decoded ends it."""
-    av, number = _pyav(), -1
+    av, number = load_pyav(), -1
     width, height = reconstructor.sensor.camera.image_size
     try:
         with av.open(str(path)) as container:
@@ -233,7 +233,7 @@ def _progress(inputs: Inputs, finished: set[str]) -> tqdm:
 
 
 def _video_length(path: Path) -> int | None:
-    av = _pyav()
+    av = load_pyav()
     try:
         with av.open(str(path)) as container:
             return container.streams.video[0].frames or None
@@ -241,7 +241,7 @@ def _video_length(path: Path) -> int | None:
         return None
 
 
-def _pyav():
+def load_pyav():
     try:
         import av
     except ImportError as error:

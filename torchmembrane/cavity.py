@@ -1,10 +1,24 @@
 """What the fluid asks of the enclosed volume: kept (liquid), pressure x volume kept (gas), or free at rest pressure (open)."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 
 from .errors import MembraneError
 from .membrane import Membrane
+
+
+class Equilibrium(NamedTuple):
+    """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`
+    (zero for minimum energy), and `unbalance [...]`, how far from settled: a displacement over the surface's size."""
+
+    vertices: Tensor
+    pressure: Tensor
+    volume: Tensor
+    traction: Tensor
+    unbalance: Tensor
+
 
 FILLINGS = ("liquid", "gas", "open")
 
@@ -49,7 +63,7 @@ class CavityLaw(nn.Module):
 def rest_balance(membrane: Membrane, energy) -> tuple[Tensor, Tensor]:
     """Rest pressure `p0 []` and rest load `h = grad U(X) - p0 grad V(X)` of the free vertices, `[V, 3]`, zero on the rim.
 
-    `p0` weights both with the normals, so that a spurious tangential part has no say; `energy`: a `Sheet` or the paper's element.
+    `p0` weights both with the normals, so spurious tangential parts have no say; `energy`: a `Sheet` or the paper's element.
     """
     force, push = energy.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
     normal, free = membrane.rest_normals, membrane.free

@@ -15,6 +15,7 @@ from .energy import MODELS
 from .errors import MembraneError
 from .images import read_image
 from .minimum_energy import ELEMENTS
+from .presets import sensor_file
 from .reconstruct import ESTIMATORS, Reconstructor
 from .results import load_frame
 from .sensor import Sensor
@@ -71,7 +72,7 @@ def reconstruct(arguments) -> int:
     if arguments.device == "cuda" and not torch.cuda.is_available():
         raise MembraneError("--device cuda: torch sees no CUDA device; pass --device cpu, or install torch with CUDA")
     inputs = find_inputs(arguments.images, arguments.video)
-    sensor = Sensor.from_file(arguments.sensor)
+    sensor = Sensor.from_file(sensor_file(arguments.sensor))
     energy = arguments.energy or sensor.material.model
     settings = Settings(arguments.estimator, energy, arguments.element, arguments.format)
     check_folder(arguments.out, sensor.fingerprint, settings)
@@ -90,7 +91,7 @@ def reconstruct(arguments) -> int:
 
 def check(arguments) -> int:
     """`torchmembrane check`"""
-    sensor = Sensor.from_file(arguments.sensor)
+    sensor = Sensor.from_file(sensor_file(arguments.sensor))
     try:
         reconstructor, problem = Reconstructor(sensor), None
     except MembraneError as error:
@@ -148,7 +149,7 @@ def _parser() -> argparse.ArgumentParser:
 def _reconstruct_parser(commands) -> None:
     purpose = "reconstruct surfaces from images or a video of one sensor"
     add = _command(commands, "reconstruct", reconstruct, purpose, RECONSTRUCT_EXAMPLES)
-    add("sensor", metavar="SENSOR.toml", type=Path, help="the sensor file")
+    add("sensor", metavar="SENSOR.toml", help="the sensor file, or preset:NAME")
     add("images", metavar="IMAGES", nargs="+", help="image files, globs (quoted or not), folders, or videos")
     add("--out", metavar="DIR", type=Path, required=True, help="folder of the results: new, or of the same sensor")
     add("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="how it is found (default: %(default)s)")
@@ -164,7 +165,7 @@ def _reconstruct_parser(commands) -> None:
 
 def _check_parser(commands) -> None:
     add = _command(commands, "check", check, "say in words, and draw, what a sensor file means", CHECK_EXAMPLES)
-    add("sensor", metavar="SENSOR.toml", type=Path, help="the sensor file")
+    add("sensor", metavar="SENSOR.toml", help="the sensor file, or preset:NAME")
     add("--out", metavar="FIGURE.png", type=Path, help="draw it: side view with rays, rest surface, rest image")
 
 

@@ -4,12 +4,10 @@ One unknown for each free vertex, its position `t_k` along its ray, `x_k = o_k +
 `E(t) = 1/2 t.K t - g.t` exactly, with `K = L o (R R^T)` (eqs. 14, 18, 64); for a hyperelastic sheet the same step is repeated.
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 
-from .cavity import CavityLaw, rest_balance
+from .cavity import CavityLaw, Equilibrium, rest_balance
 from .energy import AffineQuadrilaterals, Sheet
 from .errors import MembraneError
 from .membrane import Membrane, corners, corners_to_vertices
@@ -20,16 +18,6 @@ ELEMENTS = ("triangle", "quadrilateral")
 VOLUMES = ("exact", "linear")
 STEPS = 8
 SINGLE_SOLVE, REPEATED_SOLVE = 12, 4  # conjugate-gradient steps where one solve has to do, and where others follow
-
-
-class Equilibrium(NamedTuple):
-    """`vertices [..., V, 3]`, pressure difference `[...]`, volume `[...]`, and `unbalance [...]`: the displacement that the
-    forces left along the rays would still cause, largest vertex, over the surface's size."""
-
-    vertices: Tensor
-    pressure: Tensor
-    volume: Tensor
-    unbalance: Tensor
 
 
 class MinimumEnergy(nn.Module):
@@ -102,7 +90,7 @@ class MinimumEnergy(nn.Module):
         x = state.surface(t)
         left = symmetric_product(self.inverse, state.load(t, pressure)[..., None])
         error = left.abs().amax((-1, -2)) / self.membrane.rest_area.sum().sqrt()
-        return Equilibrium(x, pressure, self.membrane.volume(x), error)
+        return Equilibrium(x, pressure, self.membrane.volume(x), torch.zeros_like(x), error)
 
     def _newton_step(self, state: "_State", t: Tensor, pressure: Tensor):
         rise, v = state.rise(t)

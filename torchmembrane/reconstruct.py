@@ -9,20 +9,24 @@ import torch
 from torch import Tensor, nn
 
 from . import results
+from .contact import contact_indicator, contact_points
 from .energy import Sheet
 from .errors import MembraneError
 from .flow import FlowInterpolation
+from .force_balance import ForceBalance
 from .images import read_image
 from .markers.place import FEWEST_MARKERS, place_markers
 from .minimum_energy import MinimumEnergy
 from .results import CONTACT_POINTS, Reconstruction
 from .sensor import Sensor
 
-ESTIMATORS = ("minimum-energy",)
+ESTIMATORS = ("minimum-energy", "force-balance")
 FOUND = 0.5
 """Confidence above which a marker counts as found."""
 FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5
-LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR = 1e-5, 1e-5
+LARGEST_UNBALANCE = {False: 1e-5, True: 5e-3}  # minimum energy: forces left over; force balance: its last step
+LARGEST_VOLUME_ERROR = {False: 1e-5, True: 1e-4}
+MARKER_NOISE = 0.1  # px, assumed by force balance: twice the locator's
 LEAST_CONTRAST, SATURATED_SHARE = 0.02, 0.98
 
 
@@ -31,7 +35,7 @@ class Reconstructor(nn.Module):
 
     Arguments
         sensor      a `Sensor` (`Reconstructor.from_file` reads one)
-        estimator   "minimum-energy" (the paper's)
+        estimator   "minimum-energy" (the paper's), or "force-balance": finds contacts and their forces too; slower
         model       the sheet's energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin"
         element     "triangle", or "quadrilateral": the paper's affine quadrilaterals (harmonic), with `smoothing` (eq. 28)
         volume      "exact", or "linear": the paper's linearised constraint (eq. 21)
@@ -61,7 +65,19 @@ class Reconstructor(nn.Module):
         markers = place_markers(sensor, vertex_pixels)
         self.locator = markers.locator
         self.flow = FlowInterpolation(membrane, markers.points, flow)
-        self.estimator = self._minimum_energy(membrane, vertex_pixels, model, element, smoothing, volume)
+        self.finds_contacts = estimator == "force-balance"
+        sheet, cavity = self._sheet(membrane, model), self._cavity(membrane)
+        if self.finds_contacts:
+            if element != "triangle" or volume != "exact" or smoothing:
+                raise MembraneError(
+                    "Reconstructor: force-balance has linear triangles, exact volume, no smoother; leave those options out"
+                )
+            noise = MARKER_NOISE / float(self.camera.focal.mean())
+            self.estimator = ForceBalance(membrane, sheet, markers.points, markers.positions, noise, *cavity)
+        else:
+            smoothing = (0.1 if element == "quadrilateral" else 0.0) if smoothing is None else smoothing
+            rays = self.camera.pixel_to_ray(vertex_pixels)
+            self.estimator = MinimumEnergy(membrane, sheet, rays, element, smoothing, *cavity, volume)
         self.register_buffer("vertex_pixels", vertex_pixels)
         self.register_buffer("rest_markers", torch.from_numpy(markers.positions))
         self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
@@ -77,21 +93,22 @@ class Reconstructor(nn.Module):
         """The reconstructor of a sensor file; options as for the class."""
         return cls(Sensor.from_file(path), **options)
 
-    def _minimum_energy(self, membrane, vertex_pixels, model, element, smoothing, volume) -> MinimumEnergy:
-        sensor, material = self.sensor, self.sensor.material
-        sheet = Sheet(membrane, model or material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
-        filling, gas = sensor.cavity.filling, None
-        if filling == "gas" and sensor.force_unit == "relative":
+    def _sheet(self, membrane, model: str | None) -> Sheet:
+        material = self.sensor.material
+        return Sheet(membrane, model or material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
+
+    def _cavity(self, membrane) -> tuple[str, tuple[float, float] | None]:
+        """The cavity's filling, and a gas' pressure and volume."""
+        sensor = self.sensor
+        if sensor.cavity.filling != "gas":
+            return sensor.cavity.filling, None
+        if sensor.force_unit == "relative":
             warnings.warn(
                 f"sensor {sensor.name!r}: a gas without shear_modulus and thickness acts as a liquid (volume kept)",
                 stacklevel=3,
             )
-            filling = "liquid"
-        if filling == "gas":
-            gas = (sensor.gas_pressure, sensor.cavity.volume or membrane.cavity_volume)
-        if smoothing is None:
-            smoothing = 0.1 if element == "quadrilateral" else 0.0
-        return MinimumEnergy(membrane, sheet, self.camera.pixel_to_ray(vertex_pixels), element, smoothing, filling, gas, volume)
+            return "liquid", None
+        return "gas", (sensor.gas_pressure, sensor.cavity.volume or membrane.cavity_volume)
 
     def _measure_rest(self, image: np.ndarray) -> None:
         """Null rest offsets (section 5.2): the same locator's rest pixels are subtracted from every frame's."""
@@ -159,8 +176,12 @@ class Reconstructor(nn.Module):
         confidence = torch.where(found, confidence, 0.0)
         status = torch.where(status == results.OK, _marker_status(found), status)
         usable = status == results.OK
-        flow = self.flow(displacement * usable[:, None, None], confidence)
-        equilibrium = self.estimator(*self.camera.pixel_to_ray(self.vertex_pixels + flow))
+        displacement_used = displacement * usable[:, None, None]
+        if self.finds_contacts:
+            equilibrium = self.estimator(*self.camera.pixel_to_ray(self.rest_pixels + displacement_used), confidence)
+        else:
+            flow = self.flow(displacement_used, confidence)
+            equilibrium = self.estimator(*self.camera.pixel_to_ray(self.vertex_pixels + flow))
         return self._result(equilibrium, displacement, confidence, status)
 
     def _result(self, equilibrium, displacement, confidence, status) -> Reconstruction:
@@ -174,23 +195,32 @@ class Reconstructor(nn.Module):
         volume_error = (equilibrium.volume - target) / membrane.rest_volume
         miss2 = torch.where(lost, 0.0, ((self.camera.point_to_pixel(markers) - pixels) ** 2).sum(-1))
         residual = (miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()
-        unsettled = equilibrium.unbalance > LARGEST_UNBALANCE
-        if self.estimator.volume_constraint == "exact":
-            unsettled = unsettled | (volume_error.abs() > LARGEST_VOLUME_ERROR)
+        unsettled = equilibrium.unbalance > LARGEST_UNBALANCE[self.finds_contacts]
+        if self.finds_contacts or self.estimator.volume_constraint == "exact":
+            unsettled = unsettled | (volume_error.abs() > LARGEST_VOLUME_ERROR[self.finds_contacts])
         ok, broken = status == results.OK, ~x.flatten(1).isfinite().all(1)
         status = torch.where(ok & unsettled, results.NOT_CONVERGED, status)
         status = torch.where(ok & broken, results.NO_SOLUTION, status)
         gone = (status != results.OK) & (status != results.NOT_CONVERGED)
         blank = lambda a: torch.where(gone.reshape(-1, *(1,) * (a.ndim - 1)), torch.nan, a)  # noqa: E731
-        zeros = torch.zeros_like(x)
-        no_points = x.new_full((len(x), CONTACT_POINTS, 3), torch.nan)
+        normals, traction = membrane.normals(x), equilibrium.traction
+        contact, points = self._contacts(x, normals, traction)
+        force = (traction * membrane.rest_area[:, None]).sum(1)
         return Reconstruction(
-            blank(x), blank(u), blank(membrane.normals(x)), blank(markers),
+            blank(x), blank(u), blank(normals), blank(markers),
             torch.where(lost[..., None], torch.nan, pixels), confidence,
-            blank(zeros), blank(zeros[..., 0]), no_points, blank(zeros[:, 0]),
+            blank(traction), blank(contact), blank(points), blank(force),
             blank(pressure), blank(pressure - self.estimator.rest_pressure), blank(volume_error), blank(residual),
             status.to(torch.int32),
         )  # fmt: skip
+
+    def _contacts(self, x: Tensor, normals: Tensor, traction: Tensor) -> tuple[Tensor, Tensor]:
+        if not self.finds_contacts:
+            return torch.zeros_like(x[..., 0]), x.new_full((len(x), CONTACT_POINTS, 3), torch.nan)
+        membrane, reference = self.estimator.membrane, self.estimator.reference
+        contact = contact_indicator(traction, normals, reference)
+        inward = (contact > 0.5) * (-(traction * normals).sum(-1)).clamp_min(0) * membrane.rest_area
+        return contact, contact_points(x, membrane.rest, inward, self.estimator.size, CONTACT_POINTS)
 
     def _as_batch(self, images) -> Tensor:
         images = torch.as_tensor(images)

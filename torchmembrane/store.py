@@ -188,7 +188,7 @@ class FrameTable:
     """
 
     def __init__(self, folder: Path, mesh: Mesh):
-        self.arrow, self.parquet = _pyarrow()
+        self.arrow, self.parquet = load_pyarrow()
         self.folder, self.waiting = folder, {}
         self.metadata = {key: getattr(mesh, key) for key in ("length_unit", "force_unit", "name", "sensor")}
         self.part_of = {name: part for part in self._parts() for name in self._column(part, "name")}
@@ -265,7 +265,7 @@ class FrameTable:
         partial.replace(part)
 
 
-def _pyarrow():
+def load_pyarrow():
     try:
         import pyarrow
         import pyarrow.parquet

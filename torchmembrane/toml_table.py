@@ -119,7 +119,7 @@ def toml_lines(name: str, values: Mapping, repeated: bool = False) -> list[str]:
 def _shown(value) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
-    return repr(value)
+    return repr(list(value) if isinstance(value, tuple) else value)
 
 
 def _finite(value) -> bool:

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ..batch import _pyav
+from ..batch import load_pyav
 from ..errors import MembraneError
 from ..results import save_frame
 from ..sensor import Sensor
-from ..store import _pyarrow
+from ..store import load_pyarrow
 from .simulator import Frame, Simulator
 
 SENSOR, SETTINGS, REST = "sensor.toml", "simulation.json", "rest_truth.npz"
@@ -59,7 +59,7 @@ class FrameTable(Frames):
 
     def __init__(self, folder: Path):
         super().__init__(folder)
-        self.arrow, self.parquet = _pyarrow()
+        self.arrow, self.parquet = load_pyarrow()
         self.waiting: dict[str, Frame] = {}
 
     def names(self) -> set[str]:
@@ -114,7 +114,7 @@ class Video:
         self.path, self.rate, self.container = path, rate, None
 
     def __enter__(self) -> "Video":
-        self.av = _pyav()
+        self.av = load_pyav()
         return self
 
     def add(self, image: np.ndarray) -> None:

@@ -1,0 +1,227 @@
+"""Laws of the force-balance estimator and its solver; accuracy on presses simulated on another grid, and on the examples."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchmembrane.camera import Camera
+from torchmembrane.contact import contact_indicator, contact_points
+from torchmembrane.energy import Sheet
+from torchmembrane.force_balance import ForceBalance, Observation, _across
+from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.shapes import spherical_cap
+from torchmembrane.simulate.indenters import Sphere
+from torchmembrane.simulate.press import carried, press
+from torchmembrane.solve.block_tridiagonal import factor, solve
+from torchmembrane.solve.patches import PatchIndex, PatchSystem
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
+
+
+def dots(membrane, per_side=11):
+    net = membrane.resampled((per_side + 2, per_side + 2)).rest.reshape(per_side + 2, per_side + 2, 3)
+    return net[1:-1, 1:-1].reshape(-1, 3)
+
+
+def make(n=13, **options):
+    dome = spherical_cap(12, 9, 3, (n, n))
+    positions = dots(spherical_cap(12, 9, 3, (33, 33)))
+    sheet = Sheet(dome, "neo_hookean", 1.3)
+    return ForceBalance(dome, sheet, dome.closest_points(positions.numpy()), positions, noise=0.1 / 168, **options)
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    """A ball of radius 4 pressed 2 mm, 30 degrees off the axis, on 31 x 31 vertices: noisy marker rays, and the truth."""
+    dome = spherical_cap(12, 9, 3, (31, 31))
+    sheet = Sheet(dome, "neo_hookean", 1.3)
+    ball, direction = Sphere(4.0), torch.tensor([0.5, 0.0, 0.866], dtype=torch.float64)
+    start = ball.touching(dome, -direction)
+    truth = press(dome, sheet, [[start, start.moved(-2.0 * direction)]])
+    positions = dots(spherical_cap(12, 9, 3, (33, 33)))
+    moved = carried(truth.vertices, dome, positions)
+    pixels = CAMERA.point_to_pixel(moved)
+    noise = 0.05 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return CAMERA.pixel_to_ray(pixels + noise), positions, moved, truth
+
+
+def bent(membrane, batch=1, size=0.05):
+    generator = torch.Generator().manual_seed(2)
+    return (
+        membrane.rest
+        + size * torch.randn(batch, *membrane.rest.shape, generator=generator, dtype=torch.float64) * (~membrane.fixed)[:, None]
+    )
+
+
+def test_block_cholesky_solves_the_dense_system():
+    generator = torch.Generator().manual_seed(0)
+    A = torch.randn(2, 12, 12, generator=generator, dtype=torch.float64)
+    M = A @ A.mT + 5 * torch.eye(12, dtype=torch.float64)
+    M[:, :4, 8:] = M[:, 8:, :4] = 0
+    b = torch.randn(2, 12, 3, generator=generator, dtype=torch.float64)
+    diagonal = torch.stack([M[:, 4 * i : 4 * i + 4, 4 * i : 4 * i + 4] for i in range(3)], 1)
+    upper = torch.stack([M[:, 4 * i : 4 * i + 4, 4 * i + 4 : 4 * i + 8] for i in range(2)], 1)
+    x = solve(factor(diagonal, upper), b.unflatten(1, (3, 4))).flatten(1, 2)
+    torch.testing.assert_close(M @ x, b)
+
+
+@pytest.mark.parametrize("grid", [(7, 6), (8, 7)])
+def test_patch_sums_solve_as_the_dense_matrix_does(grid):
+    """Patches over vertices up to two grid rows apart, some of them fixed."""
+    m, n = grid
+    generator = torch.Generator().manual_seed(1)
+    fixed = torch.ones(m, n, dtype=torch.bool)
+    fixed[1:-1, 1:-1] = False
+    fixed[2, 2] = True
+    system = PatchSystem(grid, fixed.flatten())
+    corner = torch.arange(m * n).reshape(m, n)[:-2, :-1]
+    vertices = torch.stack([corner, corner + 1, corner + 2 * n], -1).reshape(-1, 3)
+    J = torch.randn(2, len(vertices), 9, 9, generator=generator, dtype=torch.float64)
+    patches = J @ J.mT
+    dense = torch.zeros(2, 3 * m * n, 3 * m * n, dtype=torch.float64)
+    for k, triple in enumerate(vertices):
+        entry = (3 * triple[:, None] + torch.arange(3)).flatten()
+        dense[:, entry[:, None], entry] += patches[:, k]
+    free = (3 * system.free[:, None] + torch.arange(3)).flatten()
+    load = torch.randn(2, m * n, 3, generator=generator, dtype=torch.float64)
+    index = PatchIndex(system, vertices)
+    got = system.solve(system.matrix([(index, patches)]), system.from_vertices(load)[..., None], damping=0.0)[..., 0]
+    want = torch.linalg.solve(dense[:, free[:, None], free], load.flatten(1)[:, free])
+    field = system.to_vertices(got)
+    torch.testing.assert_close(field.flatten(1)[:, free], want)
+    assert (field[:, fixed.flatten()] == 0).all()
+
+
+def test_force_jacobian_is_the_derivative_of_the_contact_force():
+    estimator = make(7)
+    x, p = bent(estimator.membrane), torch.tensor([0.3], dtype=torch.float64)
+    exact = torch.autograd.functional.jacobian(lambda y: estimator.contact_force(y, p), x)[0, :, :, 0]
+    A = estimator.force_jacobian(x, p)[0].unflatten(-1, (7, 3))
+    index = estimator.vertex_patches.vector.unflatten(0, (49, 7, 3))
+    unknowns = estimator.system.blocks * estimator.system.block_size
+    dense = torch.zeros(49, 3, unknowns + 1, dtype=torch.float64)
+    for k in range(49):
+        dense[k].index_add_(1, index[k].flatten(), A[k].flatten(-2))
+    torch.testing.assert_close(dense[..., estimator.system.unknowns], exact[:, :, estimator.system.free].flatten(-2))
+
+
+def test_marker_slopes_are_the_derivative_of_the_angles():
+    estimator = make(7)
+    directions = torch.nn.functional.normalize(estimator.positions + 0.3, dim=-1)[None]
+    seen = Observation(0.1 * directions, _across(directions), torch.ones(1, len(directions[0]), dtype=torch.float64))
+    x = bent(estimator.membrane)
+    _, slope = estimator._angles(x, seen)
+    exact = torch.autograd.functional.jacobian(lambda y: estimator._angles(y, seen)[0], x)[0, :, :, 0]
+    for d in (0, 17, 60):
+        torch.testing.assert_close(slope[0, d].unflatten(-1, (3, 3)), exact[d][:, estimator.marker_vertices[d]])
+
+
+def test_angles_vanish_on_the_rays_and_grow_with_the_distance_across():
+    estimator = make(7)
+    y = estimator.positions
+    directions = torch.nn.functional.normalize(y, dim=-1)[None]
+    seen = Observation(torch.zeros_like(directions), _across(directions), torch.ones(1, len(y), dtype=torch.float64))
+    angle, _ = estimator._angles(estimator.membrane.rest[None], seen)
+    assert angle.abs().max() < 1e-12
+    identity = seen.across @ seen.across.mT
+    torch.testing.assert_close(identity, torch.eye(2, dtype=torch.float64).expand_as(identity))
+
+
+@pytest.mark.parametrize("options", [{}, dict(filling="open"), dict(filling="gas", gas=(0.1, 2600.0))])
+def test_rest_rays_give_the_rest_surface_without_forces(options):
+    estimator = make(9, **options)
+    directions = torch.nn.functional.normalize(estimator.positions, dim=-1)[None]
+    result = estimator(torch.zeros_like(directions), directions, torch.ones_like(directions[..., 0]))
+    assert (result.vertices - estimator.membrane.rest).abs().max() < 1e-6
+    assert result.traction.abs().max() < 1e-6 * estimator.reference
+
+
+def relative(estimator, result, positions, moved):
+    got = estimator.markers(result.vertices)[0]
+    return float((got - moved).norm() / (moved - positions).norm())
+
+
+def test_a_press_simulated_on_another_grid_is_recovered_with_its_force_and_place(pressed):
+    rays, positions, moved, truth = pressed
+    estimator = make(17)
+    result = estimator(*(r[None] for r in rays), torch.ones(1, len(positions), dtype=torch.float64))
+    assert relative(estimator, result, positions, moved) < 0.2
+    force = (result.traction * estimator.membrane.rest_area[:, None]).sum(1)[0]
+    assert (force - truth.force).norm() < 0.25 * truth.force.norm()
+    assert abs(float(result.pressure - estimator.rest_pressure) - (truth.pressure - truth.rest_pressure)) < 0.25 * (
+        truth.pressure - truth.rest_pressure
+    )
+    torch.testing.assert_close(result.volume, estimator.membrane.rest_volume[None], rtol=1e-5, atol=0)
+    normals = estimator.membrane.normals(result.vertices)
+    inward = (-(result.traction * normals).sum(-1)).clamp_min(0) * estimator.membrane.rest_area
+    point = contact_points(result.vertices, estimator.membrane.rest, inward, estimator.size, 4)[0, 0]
+    assert (point - truth.contact_points[0]).norm() < 1.0
+
+
+def test_pulls_are_forbidden(pressed):
+    rays, positions, _, _ = pressed
+    estimator = make(17)
+    result = estimator(*(r[None] for r in rays), torch.ones(1, len(positions), dtype=torch.float64))
+    q_n = (result.traction * estimator.membrane.normals(result.vertices)).sum(-1)
+    assert q_n.max() < 0.05 * -q_n.min()
+
+
+def test_batch_equals_singles_and_lost_markers_have_no_say(pressed):
+    (origins, directions), positions, moved, _ = pressed
+    estimator = make(9, steps=10)
+    weight = torch.ones(2, len(positions), dtype=torch.float64)
+    weight[1, [3, 40, 41]] = 0
+    spoiled = torch.stack([directions, directions.clone()])
+    spoiled[1, [3, 40, 41]] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    both = estimator(torch.stack([origins, origins]), spoiled, weight)
+    alone = estimator(origins[None], spoiled[1:], weight[1:])
+    torch.testing.assert_close(both.vertices[1:], alone.vertices, rtol=0, atol=1e-7)
+    assert relative(estimator, alone, positions, moved) < 0.5
+
+
+def test_float32_agrees_with_float64(pressed):
+    (origins, directions), positions, _, _ = pressed
+    weight = torch.ones(1, len(positions), dtype=torch.float64)
+    double = make(13)(origins[None], directions[None], weight)
+    single = make(13).float()(origins[None].float(), directions[None].float(), weight.float())
+    assert (double.vertices - single.vertices).abs().max() < 0.05
+
+
+def test_indicator_and_points_of_known_loads():
+    dome = spherical_cap(12, 9, 3, (21, 21))
+    size = float(dome.rest_area.sum()) ** 0.5
+    load = torch.zeros(2, len(dome.rest), dtype=torch.float64)
+    first, second = 10 * 21 + 4, 10 * 21 + 16
+    load[0, first], load[0, second] = 3.0, 2.0
+    points = contact_points(dome.rest.expand(2, -1, -1), dome.rest, load, size, 4)
+    torch.testing.assert_close(points[0, 0], dome.rest[first], rtol=0, atol=1e-3)
+    torch.testing.assert_close(points[0, 1], dome.rest[second], rtol=0, atol=1e-3)
+    assert points[0, 2:].isnan().all() and points[1].isnan().all()
+    traction = -0.25 * dome.rest_normals[None]
+    torch.testing.assert_close(
+        contact_indicator(traction, dome.rest_normals, 0.25), torch.full((1, len(dome.rest)), 2 / 3, dtype=torch.float64)
+    )
+    assert (contact_indicator(-traction, dome.rest_normals, 0.25) == 0).all()
+
+
+def test_the_example_images_give_shape_force_and_place():
+    """Through rendered pixels, against an independent program's truth: several times better than minimum energy."""
+    reconstructor = Reconstructor.from_file(EXAMPLES / "sensor.toml", estimator="force-balance")
+    names = ("press_on_axis", "two_contacts", "flat_plate")
+    with torch.no_grad():
+        result = reconstructor(reconstructor.read(*(EXAMPLES / f"{name}.png" for name in names)))
+    assert (result.status == 0).all()
+    errors = []
+    for k, name in enumerate(names):
+        truth = np.load(EXAMPLES / f"{name}_truth.npz")
+        X, Y = truth["dots_nominal"], truth["dots_deformed"]
+        errors.append(np.sqrt(((result.markers[k].numpy() - Y) ** 2).sum() / ((Y - X) ** 2).sum()))
+        place = truth["contact_centroid_each"][0]
+        assert np.nanmin(np.linalg.norm(result.contact_points[k].numpy() - place, axis=1)) < 2.5
+        torch.testing.assert_close(
+            result.force[k], (result.traction[k] * reconstructor.estimator.membrane.rest_area[:, None]).sum(0)
+        )
+    assert np.median(errors) < 0.35 and max(errors) < 0.6, errors
