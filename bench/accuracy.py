@@ -6,7 +6,8 @@ CASES holds index.json, a list of cases with `sensor`, `images` (files), `truth`
 and `dots_deformed [D, 3]`, optionally `visible_deformed [D]`), `folder`, `case`; or it is a folder like examples/, with
 sensor.toml, NAME.png and NAME_truth.npz. Printed, for each sensor and kind of image: median and 95th percentile of the marker
 error in px over found visible markers, the share found, how many are more than 3 px off, and the surface's error over its
-displacement (rms at the markers, median over cases) for several estimators, from the image and from exact markers.
+displacement (rms at the markers, median over cases) for several estimators, from the image and from exact markers; for force
+balance also the relative errors of total force and pressure change, and the distance of the contact points from the true ones.
 """
 
 import argparse
@@ -24,6 +25,7 @@ ESTIMATORS = {
     "harmonic, quadrilaterals, linear volume (the paper)": dict(model="harmonic", element="quadrilateral", volume="linear"),
     "harmonic, triangles": dict(model="harmonic"),
     "the sensor's material": {},
+    "force balance": dict(estimator="force-balance"),
 }
 
 
@@ -62,9 +64,8 @@ def main():
             "{sensor:18s} {images:8s} median {median:.3f} px, 95 % {p95:.3f} px, found {found:.4f}, wrong {wrong}".format(**row)
         )
     for (label, kind), values in sorted(surface.items()):
-        print(
-            f"{label}, {kind}: surface error / displacement {np.median(values):.3f} in the median, {max(values):.3f} at worst"
-        )
+        what = "" if ": " in label else "surface error / displacement "
+        print(f"{label}, {kind}: {what}{np.nanmedian(values):.3f} in the median, {np.nanmax(values):.3f} at worst")
     write(args.json, dict(markers=table, surface={f"{a}, {b}": v for (a, b), v in surface.items()}))
 
 
@@ -78,11 +79,27 @@ def score(reconstructor, root: Path, case: dict, label: str, markers: dict, surf
         for image in case["images"]:
             kind = Path(image).stem.rpartition("_")[2] if "_" in case["images"][0] and len(case["images"]) > 1 else "images"
             result = reconstructor(reconstructor.read(root / image))
+            if reconstructor.finds_contacts:
+                for name, value in contact_errors(result, truth).items():
+                    surface.setdefault((f"{label}: {name}", kind), []).append(value)
             surface.setdefault((label, kind), []).append(relative(result))
-            if label == list(ESTIMATORS)[-1]:
+            if label == "the sensor's material":
                 seen = truth["visible_deformed"].astype(bool) if "visible_deformed" in truth else np.ones(len(X), bool)
                 error = np.linalg.norm(result.pixels[0].numpy() - truth["uv_deformed"], axis=1)
                 markers.setdefault((case["folder"], kind), []).append((error[seen], np.ones(seen.sum())))
+
+
+def contact_errors(result, truth) -> dict[str, float]:
+    """Relative error of the force vector and of the pressure change; distance of contacts, the larger of both ways."""
+    force, change = truth["force"], float(truth["p"] - truth["p0"])
+    points, places = result.contact_points[0].numpy(), truth["contact_centroid_each"]
+    points = points[np.isfinite(points).all(1)]
+    gap = np.linalg.norm(points[:, None] - places, axis=2) if len(points) else np.full((1, 1), np.nan)
+    return dict(
+        force=float(np.linalg.norm(result.force[0].numpy() - force) / np.linalg.norm(force)),
+        pressure_change=abs(float(result.pressure_change[0]) / change - 1),
+        contact=float(max(gap.min(0).mean(), gap.min(1).mean())),
+    )
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from torchmembrane import results, view
@@ -39,6 +40,7 @@ def pressed(mesh: Mesh, depth=1.5, flow=4.0) -> dict[str, np.ndarray]:
     return {
         "vertices": mesh.rest_vertices + displacement, "displacement": displacement, "pixels": pixels,
         "confidence": np.isfinite(pixels[:, 0]).astype(np.float32), "pressure_change": np.float32(0.0123),
+        "contact_points": np.full((4, 3), np.nan, np.float32),
         "residual": np.float32(0.25), "status": np.int32(results.OK),
     }  # fmt: skip
 
@@ -174,3 +176,16 @@ def test_a_sensor_is_drawn_with_rays_that_bend_at_ports():
 
 def test_figures_belong_to_no_window(mesh):
     assert view.figure(pressed(mesh), mesh).canvas.manager is None
+
+
+def test_contacts_are_marked_where_they_are(mesh):
+    frame = pressed(mesh)
+    axes = Figure().add_subplot()
+    view.draw_map(axes, frame, mesh)
+    unmarked = len(axes.lines)
+    frame["contact_points"][0] = frame["vertices"][DENT]
+    axes = Figure().add_subplot()
+    view.draw_map(axes, frame, mesh)
+    crosses = [line for line in axes.lines if line.get_marker() == "x"]
+    assert len(axes.lines) == unmarked + 1 and len(crosses) == 1
+    np.testing.assert_allclose(crosses[0].get_xydata()[0], mesh.vertex_pixels[DENT])

@@ -31,6 +31,9 @@ WIN = 0.98  # a later start wins below this share of the best objective
 NEIGHBOURS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1))
 
 
+LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR = 5e-3, 1e-4  # last step over the size, and volume error, of a settled surface
+
+
 class Balance(NamedTuple):
     """A start's outcome: `vertices [B, V, 3]`, pressure `[B]`, `traction [B, V, 3]` on the membrane, objective `[B]`, its data
     part `[B]`, and the longest vertex move of the last step over the surface's size `[B]`."""
@@ -72,6 +75,7 @@ class ForceBalance(nn.Module):
                  steps=STEPS):  # fmt: skip
         super().__init__()
         self.membrane, self.sheet, self.steps, self.friction = membrane, sheet, steps, friction
+        self.largest_unbalance, self.largest_volume_error = LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR
         rest_pressure, rest_load = rest_balance(membrane, sheet)
         self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
         self.size = float(membrane.rest_area.sum()) ** 0.5

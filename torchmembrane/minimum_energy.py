@@ -17,6 +17,7 @@ from .solve.kkt import constrained_minimum
 ELEMENTS = ("triangle", "quadrilateral")
 VOLUMES = ("exact", "linear")
 STEPS = 8
+CONVERGED = 1e-5  # largest unbalance, and volume error where the volume is exact, of a converged surface
 SINGLE_SOLVE, REPEATED_SOLVE = 12, 4  # conjugate-gradient steps where one solve has to do, and where others follow
 
 
@@ -46,6 +47,7 @@ class MinimumEnergy(nn.Module):
             if value not in known:
                 raise MembraneError(f"MinimumEnergy: {name} = {value!r}; expected one of {', '.join(known)}")
         self.membrane, self.volume_constraint = membrane, volume
+        self.largest_unbalance, self.largest_volume_error = CONVERGED, CONVERGED if volume == "exact" else float("inf")
         quadratic = volume == "linear" and (element == "quadrilateral" or sheet.model == "harmonic") and filling != "gas"
         self.steps = steps or (1 if quadratic else STEPS)
         self.solver_steps = solver_steps or (SINGLE_SOLVE if self.steps == 1 else REPEATED_SOLVE)

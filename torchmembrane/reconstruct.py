@@ -24,8 +24,6 @@ ESTIMATORS = ("minimum-energy", "force-balance")
 FOUND = 0.5
 """Confidence above which a marker counts as found."""
 FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5
-LARGEST_UNBALANCE = {False: 1e-5, True: 5e-3}  # minimum energy: forces left over; force balance: its last step
-LARGEST_VOLUME_ERROR = {False: 1e-5, True: 1e-4}
 MARKER_NOISE = 0.1  # px, assumed by force balance: twice the locator's
 LEAST_CONTRAST, SATURATED_SHARE = 0.02, 0.98
 
@@ -39,7 +37,7 @@ class Reconstructor(nn.Module):
         model       the sheet's energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin"
         element     "triangle", or "quadrilateral": the paper's affine quadrilaterals (harmonic), with `smoothing` (eq. 28)
         volume      "exact", or "linear": the paper's linearised constraint (eq. 21)
-        flow        "smooth", or "bilinear" between the dots (section 5)
+        flow        "smooth", or "bilinear" between the dots (section 5); minimum energy only, as element and volume
         dtype       torch.float32 or torch.float64
 
     Calling it with images gives a `Reconstruction`; `from_pixels` starts from markers located elsewhere.
@@ -64,7 +62,6 @@ class Reconstructor(nn.Module):
             )
         markers = place_markers(sensor, vertex_pixels)
         self.locator = markers.locator
-        self.flow = FlowInterpolation(membrane, markers.points, flow)
         self.finds_contacts = estimator == "force-balance"
         sheet, cavity = self._sheet(membrane, model), self._cavity(membrane)
         if self.finds_contacts:
@@ -77,6 +74,7 @@ class Reconstructor(nn.Module):
         else:
             smoothing = (0.1 if element == "quadrilateral" else 0.0) if smoothing is None else smoothing
             rays = self.camera.pixel_to_ray(vertex_pixels)
+            self.flow = FlowInterpolation(membrane, markers.points, flow)
             self.estimator = MinimumEnergy(membrane, sheet, rays, element, smoothing, *cavity, volume)
         self.register_buffer("vertex_pixels", vertex_pixels)
         self.register_buffer("rest_markers", torch.from_numpy(markers.positions))
@@ -85,7 +83,7 @@ class Reconstructor(nn.Module):
         self.register_buffer("marker_vertices", torch.from_numpy(markers.points.vertices.astype(np.int64)))
         self.register_buffer("marker_weights", torch.from_numpy(markers.points.weights.copy()))
         self.to(dtype)
-        if self.locator is not None and sensor.markers.rest_image is not None:
+        if sensor.markers.rest_image is not None:
             self._measure_rest(sensor.markers.rest_image)
 
     @classmethod
@@ -136,8 +134,6 @@ class Reconstructor(nn.Module):
         in 0..1 or uint8. Grey is 0.299 R + 0.587 G + 0.114 B. Raises `MembraneError` for another size; a frame that cannot be
         reconstructed gets a status and NaN, the others are not touched.
         """
-        if self.locator is None:
-            raise MembraneError(f"sensor {self.sensor.name!r} has no image-based markers; use from_pixels")
         images = self._as_batch(images)
         bad = ~(images.isfinite() & (images > -1e-3) & (images < 1.001)).flatten(1).all(1)
         images = torch.where(bad[:, None, None, None], 0.0, images)
@@ -195,9 +191,9 @@ class Reconstructor(nn.Module):
         volume_error = (equilibrium.volume - target) / membrane.rest_volume
         miss2 = torch.where(lost, 0.0, ((self.camera.point_to_pixel(markers) - pixels) ** 2).sum(-1))
         residual = (miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()
-        unsettled = equilibrium.unbalance > LARGEST_UNBALANCE[self.finds_contacts]
-        if self.finds_contacts or self.estimator.volume_constraint == "exact":
-            unsettled = unsettled | (volume_error.abs() > LARGEST_VOLUME_ERROR[self.finds_contacts])
+        unsettled = (equilibrium.unbalance > self.estimator.largest_unbalance) | (
+            volume_error.abs() > self.estimator.largest_volume_error
+        )
         ok, broken = status == results.OK, ~x.flatten(1).isfinite().all(1)
         status = torch.where(ok & unsettled, results.NOT_CONVERGED, status)
         status = torch.where(ok & broken, results.NO_SOLUTION, status)

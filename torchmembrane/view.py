@@ -97,7 +97,7 @@ def draw_side(axes, frame, mesh: Mesh) -> None:
 
 
 def draw_map(axes, frame, mesh: Mesh) -> None:
-    """Displacement along the rest normals where the rest vertices are seen in the image, its deepest point marked."""
+    """Displacement along the rest normals where the rest vertices are seen in the image; deepest point o, contacts x."""
     depth, place, unit = mesh.normal_displacement(frame), mesh.vertex_pixels, mesh.length_unit
     limit = max(np.abs(depth).max(), _least(mesh))
     marks = MaxNLocator(9, steps=(1, 2, 5, 10), symmetric=True).tick_values(-limit, limit)
@@ -112,6 +112,9 @@ def draw_map(axes, frame, mesh: Mesh) -> None:
     bar.ax.tick_params(labelsize=8.5)
     bar.set_label(f"displacement along the normal [{unit}], negative: pressed in")
     _image_axes(axes, mesh.image_size, None)
+    for point in frame["contact_points"][np.isfinite(frame["contact_points"]).all(1)]:
+        nearest = np.linalg.norm(frame["vertices"] - point, axis=1).argmin()
+        axes.plot(*place[nearest], "x", ms=10, color="k", mew=2)
     if _is_pressed(mesh, frame):
         deepest, decimals = depth.argmin(), int(-np.floor(np.log10(_least(mesh))))
         axes.plot(*place[deepest], "o", ms=9, mfc="none", mec="k", mew=1.6)
