@@ -16,6 +16,7 @@ from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor import Cavity, Markers, Material, Sensor, Surface
 from torchmembrane.simulate import dataset
 from torchmembrane.simulate.frames import Frames, FrameTable
+from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.simulator import Simulator
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -45,6 +46,16 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def same(a, b) -> bool:
     return a.keys() == b.keys() and all(np.array_equal(a[k], b[k], equal_nan=a[k].dtype.kind == "f") for k in a)
+
+
+def test_forces_of_friction_do_not_depend_on_the_number_of_frames(sensor_path):
+    """The path begins at the first touch, not at the first frame's pose."""
+    simulator = Simulator(Sensor.from_file(sensor_path))
+    travel, aim = np.array([-0.5, 0.0, -0.866]), np.array([0.0, 0.0, 18.0])
+    stroke = dataset.stroke_to(simulator, Sphere(3.0), aim, travel, 1.0, friction=0.5)
+    (one,) = simulator.presses(stroke, ["push"])
+    *_, last = simulator.presses(stroke, ["push"], frames=4)
+    assert (one.force - last.force).norm() < 0.03 * one.force[:2].norm()
 
 
 def test_a_press_gives_image_truth_and_the_sensor_as_simulated(sensor_path, tmp_path, capsys):

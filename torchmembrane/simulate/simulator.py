@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -109,12 +110,17 @@ class Simulator:
         return to_grey(self.image(self.membrane.rest, np.random.default_rng(REST_NOISE)))
 
     def presses(self, stroke: Stroke, legs: Sequence[str], frames: int = 1, increment=None) -> Iterator[Press]:
-        """Equilibria along a stroke; raises `MembraneError` where it never touches or the membrane cannot follow."""
-        poses = stroke.poses(legs, frames, LIFT * self.membrane.size)
+        """Equilibria along a stroke; raises `MembraneError` where it never touches or the membrane cannot follow.
+
+        The motion starts at the first touch, which is no frame: with friction the force depends on the path from there.
+        """
+        poses = [stroke.indenter, *stroke.poses(legs, frames, LIFT * self.membrane.size)]
         states = presses(self.membrane, self.sheet, [poses], friction=stroke.friction, increment=increment, **self.cavity)
         touched = False
-        for state in states:
+        for state in islice(states, 1, None):
             touched = touched or bool(state.contact.any())
+            if bool((state.vertices[:, 2] <= 0).any()):
+                raise MembraneError("simulate: the press takes the membrane behind the camera; expected a smaller depth")
             yield state
         if not touched:
             raise MembraneError("simulate: the indenter never touches the membrane; expected a depth that presses it in")
