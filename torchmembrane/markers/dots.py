@@ -177,10 +177,10 @@ def measure_dots(image, pixels, shapes, sizes, polarity):
     tolerance = size_tolerance(scaled, sizes)
     match = DotMatcher(pixels, expected, tolerance)
     blobs, log_radius = torch.as_tensor(found)[None], torch.as_tensor(log_radius)[None]
-    place, certainty = match(blobs, log_radius, torch.ones_like(log_radius))
+    place, certainty, strain = match(blobs, log_radius, torch.ones_like(log_radius))
     centre, growth, quality = refine(dark, place[0].numpy(), scaled, tolerance)
     weight = certainty * torch.as_tensor(quality)
-    predicted, _, _ = match.predict(weight, torch.as_tensor(centre - pixels)[None])
+    predicted, _, _ = match.predict(weight, torch.as_tensor(centre - pixels)[None], strain)
     stray = np.linalg.norm(centre - pixels - predicted[0].numpy(), axis=1)
     seen = (quality > 0.3) & (stray < STRAY * match.nearest.numpy())
     for size in np.unique(sizes):

@@ -9,7 +9,7 @@ from scipy.spatial import Delaunay, cKDTree
 from torch import nn
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.markers.match import DotMatcher, inverse_2x2, spacing
+from torchmembrane.markers.match import Coherence, DotMatcher, inverse_2x2, spacing
 
 SOFTNESS = 0.6  # px, logistic scale of a dot's blurred outline
 RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level
@@ -18,6 +18,7 @@ LEVELS = 3
 RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, its slope, depth, shift, growth
 STRAY = 0.5  # from where its neighbours predict it, pitches: a dot so far off is half trusted
 FEWEST = 0.2  # mean confidence of a frame that is half trusted
+FINEST_SIGMA = 1.4  # of the blob detector on a level of the pyramid, pixels of the level
 SCALE_STEP = 1.6  # ratio of neighbouring scales of the blob detector at most
 
 
@@ -70,7 +71,7 @@ class EllipseFit(nn.Module):
         ring = np.clip(0.7 * gap, 1.5, RING) * stride
         half = int(np.ceil(((1.25 * long + ring) / stride).max()))
         step = np.arange(-half, half + 1)
-        offset = np.stack(np.meshgrid(step, step), -1).reshape(-1, 2)
+        offset = np.stack(np.meshgrid(step, step)).reshape(2, -1)
         self.steps, self.size_tolerance = steps, size_tolerance
         self.register_buffer("offset", torch.as_tensor(offset))
         self.register_buffer("start", torch.as_tensor(np.concatenate([[0], sizes.prod(1).cumsum()])[level]))
@@ -82,12 +83,12 @@ class EllipseFit(nn.Module):
         self.register_buffer("ridge", torch.diag(torch.tensor(RIDGE, dtype=torch.float64)))
 
     def windows(self, levels, centre):
-        """Values `[B, D, P]` around `centre [B, D, 2]`, their places `[B, D, P, 2]` px, and which lie in the image."""
-        stride, limit = self.stride[:, None], self.limit[:, None]
+        """Values `[B, D, P]` around `centre [B, D, 2]`, their places `[B, D, 2, P]` px, and which lie in the image."""
+        stride, limit = self.stride[:, None], self.limit[..., None]
         origin = ((centre.detach() - (stride - 1) / 2) / stride).round().to(torch.int64)
-        pixel = origin[:, :, None] + self.offset
-        inside = ((pixel >= 0) & (pixel <= limit)).all(-1)
-        u, v = torch.minimum(pixel.clamp_min(0), limit).unbind(-1)
+        pixel = origin[..., None] + self.offset
+        inside = ((pixel >= 0) & (pixel <= limit)).all(-2)
+        u, v = torch.minimum(pixel.clamp_min(0), limit).unbind(-2)
         index = self.start[:, None] + v * (self.limit[:, :1] + 1) + u
         flat = torch.cat([level.flatten(1) for level in levels], 1)
         values = flat.gather(1, index.flatten(1)).unflatten(1, index.shape[1:])
@@ -103,21 +104,21 @@ class EllipseFit(nn.Module):
         trust = inside.to(values.dtype)
         mean = (values * trust).sum(-1, keepdim=True) / trust.sum(-1, keepdim=True).clamp_min(1)
         values = values - mean
-        inverse = inverse_2x2(shape)
+        a, b, c, d = inverse_2x2(shape).flatten(-2)[..., None, :].unbind(-1)  # [B, D, 1]
         size = torch.linalg.vector_norm(shape, dim=(-2, -1)) / 2**0.5
         start, growth, softness = centre, torch.zeros_like(size), self.softness[:, None]
         for _ in range(self.steps):
-            y = (place - centre[..., None, :]) @ inverse.mT
-            normal = y @ inverse
-            slope = normal.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
-            normal = normal / slope
-            rho = y.square().sum(-1).clamp_min(1e-12).sqrt()
-            depth = (1 - rho) * rho / slope.squeeze(-1) + growth[..., None]  # inside the outline, px
+            u, v = (place - centre[..., None]).unbind(-2)  # [B, D, P]
+            y1, y2 = a * u + b * v, c * u + d * v
+            normal_u, normal_v = a * y1 + c * y2, b * y1 + d * y2
+            slope = (normal_u.square() + normal_v.square()).clamp_min(1e-12).sqrt()
+            rho = (y1.square() + y2.square()).clamp_min(1e-12).sqrt()
+            depth = (1 - rho) * rho / slope + growth[..., None]  # inside the outline, px
             template = torch.sigmoid(depth / softness)
             edge = template * (1 - template) / softness
             weight = trust * torch.sigmoid((depth + self.ring[:, None]) / (0.5 * self.stride[:, None]))
-            shift = -edge[..., None] * normal
-            columns = torch.ones_like(edge), *y.unbind(-1), -template, *shift.unbind(-1), -edge
+            shift = -edge / slope
+            columns = torch.ones_like(edge), y1, y2, -template, shift * normal_u, shift * normal_v, -edge
             basis = torch.stack(columns, -2)
             weighted = basis * weight[..., None, :]
             fit = solve_positive(weighted @ basis.mT + self.ridge, (weighted @ values[..., None]).squeeze(-1))
@@ -147,7 +148,7 @@ class BlobDetector(nn.Module):
         smallest, largest = np.percentile(radii, [5, 95])
         steps = np.log(max(largest / smallest, 1.001)) / np.log(SCALE_STEP)
         radii = np.geomspace(smallest, largest, 1 + int(np.ceil(steps)))
-        levels = np.log2(np.maximum(radii / (1.4 * np.sqrt(2)), 1)).astype(int).clip(0, LEVELS - 1)
+        levels = np.log2(np.maximum(radii / (FINEST_SIGMA * np.sqrt(2)), 1)).astype(int).clip(0, LEVELS - 1)
         self.scales = [(int(k), float(r / np.sqrt(2) / 2**k)) for k, r in zip(levels, radii, strict=True)]
         self.level = int(levels[0])
         self.stride = 2**self.level
@@ -253,6 +254,7 @@ class DotLocator(nn.Module):
         blobs, log_radius, strength = (x[0].numpy() for x in self.detect.double()(drawn))
         own = cKDTree(blobs).query(pixels)[1]
         self.match = DotMatcher(pixels, log_radius[own], tolerance, anchors)
+        self.coherence = Coherence(pixels, log_radius[own], tolerance)
         self.register_buffer("strength", torch.as_tensor(strength[own]))
         self.register_buffer("rest", torch.as_tensor(pixels))
         self.register_buffer("shapes", torch.as_tensor(shapes))
@@ -266,12 +268,16 @@ class DotLocator(nn.Module):
         nearest = (blobs[:, :, None] - rest).square().sum(-1).argmin(-1)
         relative = strength / self.strength[nearest]
         level = relative[:, : rest.shape[0] // 2].mean(1, keepdim=True)
-        place, certainty = self.match(blobs, log_radius, torch.sigmoid(20 * (relative / (level + 1e-3) - 0.4)))
-        _, gradient, _ = self.match.predict(certainty, place - rest)
+        valid = torch.sigmoid(20 * (relative / (level + 1e-3) - 0.4))
+        place, certainty, strain = self.match(blobs, log_radius, valid)
+        _, gradient, _ = self.match.predict(certainty, place - rest, strain)
         shape = self.shapes + gradient.clamp(-0.6, 0.6) @ self.shapes
         pixels, _, quality = self.fit(levels, place, shape)
-        predicted, _, _ = self.match.predict(certainty * quality, pixels - rest)
+        predicted, _, _ = self.match.predict(certainty * quality, pixels - rest, strain)
         stray = (pixels - rest - predicted).square().sum(-1).clamp_min(1e-12).sqrt() / self.match.nearest
         confidence = quality * torch.sigmoid(20 * (STRAY - stray))
+        confidence = confidence * self.coherence(
+            pixels, confidence, strain, rest + predicted, blobs, log_radius, valid
+        )
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
         return torch.where(confidence[..., None] > 0.05, pixels, rest + predicted), confidence

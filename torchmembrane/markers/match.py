@@ -7,9 +7,13 @@ from torch import nn
 
 SETTLING = 4  # steps after the growth has reached every dot
 WIDTH = 1.1  # of the local average, pitches
-RIDGE = 0.12  # pulls the flow's gradient to zero where neighbours do not fix it
+RIDGE = 0.5  # pulls the flow's gradient to the one measured, where neighbours do not fix it
 TOLERANCE = 0.30  # standard deviation of a prediction, pitches
 NEIGHBOURS = 8
+SEAM = 2.0  # width of the neighbourhood in which a seam is looked for, pitches
+TEAR = 0.045  # root of the share of dots lost and blobs left over, times the relative error of steps
+CLAIM = 0.35  # a blob so near to a dot is the dot's, pitches
+RIVAL = 0.05  # a blob left over is as near to the prediction as the dot's own, pitches
 SUPPORT = 0.8  # sure nodes, weighed by distance, that a prediction needs
 FAR = 1e6
 
@@ -115,7 +119,7 @@ class LocalFlow(nn.Module):
                 return count
             reached, count = np.column_stack([grown, reached[:, kernel.shape[1] :]]), count + 1
 
-    def forward(self, weight, flow):
+    def forward(self, weight, flow, gradient):
         """Least-squares affine flow `f(x) ~ f_d + J_d (x - x_d)`.
 
         `weight [B, N]`, `flow [B, N, 2]` at the nodes -> flow `[B, D, 2]`, gradient `[B, D, 2, 2]`, support `[B, D]`.
@@ -124,6 +128,8 @@ class LocalFlow(nn.Module):
         s, su, sv, suu, suv, svv = (weight @ self.moments).unflatten(-1, (6, count)).unbind(-2)
         load = (weight[:, None] * flow.mT) @ self.moments[:, : 3 * count]
         load = load.unflatten(-1, (3, count)).movedim(1, -1)  # [B, 3, D, 2]
+        prior = RIDGE * self.h[:, None, None] * gradient.mT
+        load = torch.cat([load[:, :1], load[:, 1:] + prior.movedim(-2, 1)], 1)
         suu, svv, s1 = suu + RIDGE, svv + RIDGE, s + 1e-3
         # adjugate of the symmetric 3 x 3 normal matrix
         c00, c01, c02 = suu * svv - suv**2, suv * sv - su * svv, su * suv - suu * sv
@@ -149,6 +155,56 @@ class LocalFlow(nn.Module):
         mine = (gradient @ own[..., None]).squeeze(-1)
         total = sum_flow.mT - (theirs.mT + mine) * self.h[:, None]
         return total / (support[..., None] + 1e-3), support
+
+
+class Coherence(nn.Module):
+    """Whether the matches around every dot hang together: 1, or towards 0 where the pattern is torn.
+
+    A region matched one pitch off ends in a seam, where dots are lost, blobs of their size are left over, and the step
+    from a dot to its neighbour is not what the deformation measured at both makes of it at rest. Lost dots or blobs left
+    over alone, or a field that varies fast, are no seam. A blob left over as near to the prediction as the dot's own is
+    its rival: then neither is believed.
+    """
+
+    def __init__(self, pixels, log_radius, size_tolerance):
+        super().__init__()
+        self.size_tolerance = size_tolerance
+        near = cKDTree(pixels).query(pixels, k=min(NEIGHBOURS - 1, len(pixels)))[1][:, 1:]
+        step = pixels[near] - pixels[:, None]
+        nearest, mean = spacing(pixels)
+        square = ((pixels[:, None] - pixels) ** 2).sum(-1)
+        kernel = np.exp(-square / (2 * (SEAM * mean) ** 2))  # [from, to]
+        self.register_buffer("near", torch.as_tensor(near))
+        self.register_buffer("step", torch.as_tensor(step))
+        self.register_buffer("length", torch.as_tensor(np.linalg.norm(step, axis=-1)))
+        self.register_buffer("share", torch.as_tensor(kernel / kernel.sum(0)))
+        self.register_buffer("total", torch.as_tensor(kernel.sum(0)))
+        self.register_buffer("reach", torch.as_tensor(SEAM * mean))
+        self.register_buffer("nearest", torch.as_tensor(nearest))
+        self.register_buffer("log_radius", torch.as_tensor(log_radius))
+
+    def forward(self, pixels, confidence, gradient, predicted, blobs, log_radius, valid):
+        """`pixels [B, D, 2]`, `confidence [B, D]`, `gradient [B, D, 2, 2]`, `predicted [B, D, 2]` px; blobs as for
+        `DotMatcher` -> `[B, D]` in 0..1.
+        """
+        sure = torch.sigmoid(20 * (confidence - 0.5))
+        square = (blobs[:, :, None] - pixels[:, None]).square().sum(-1)  # [B, K, D]
+        claimed = ((square < (CLAIM * self.nearest) ** 2) * sure[:, None]).amax(-1)
+        misfit = (log_radius - self.log_radius[square.argmin(-1)]) / self.size_tolerance
+        left = valid * torch.exp(-0.5 * misfit.square()) * (1 - claimed)
+        own = (pixels - predicted).square().sum(-1).clamp_min(1e-12).sqrt()
+        other = (blobs[:, :, None] - predicted[:, None]).square().sum(-1).clamp_min(1e-12).sqrt()
+        margin = (other - own[:, None]) / self.nearest
+        alone = 1 - (left[..., None] * torch.sigmoid(20 * (RIVAL - margin))).amax(1)
+        left = (left[:, None] @ torch.exp(-square / (2 * self.reach**2))).squeeze(1) / self.total
+        lost = (1 - sure) @ self.share
+        ends = (gradient[:, self.near] + gradient[:, :, None]) / 2
+        change = pixels[:, self.near] - pixels[:, :, None] - self.step - (ends @ self.step[..., None]).squeeze(-1)
+        pair = sure[:, self.near] * sure[:, :, None]
+        error = (pair * change.square().sum(-1).clamp_min(1e-12).sqrt() / self.length).sum(-1) @ self.share
+        error = error / (pair.sum(-1) @ self.share + 1e-3)
+        tear = torch.minimum(lost, left).clamp_min(1e-12).sqrt() * error
+        return alone * torch.sigmoid(8 * (1 - tear / TEAR))
 
 
 class DotMatcher(nn.Module):
@@ -181,10 +237,10 @@ class DotMatcher(nn.Module):
         still = self.still.expand(flow.shape[0], -1, -1)
         return torch.cat([weight, torch.ones_like(still[..., 0])], 1), torch.cat([flow, still], 1)
 
-    def predict(self, weight, flow):
+    def predict(self, weight, flow, strain):
         """Flow, gradient and support at the dots, from the dots `weight [B, D]`, `flow [B, D, 2]` and the anchors."""
         weight, flow = self.with_anchors(weight, flow)
-        _, gradient, _ = self.local(weight, flow)
+        _, gradient, _ = self.local(weight, flow, strain)
         predicted, support = self.local.along(weight, flow, gradient)
         return predicted, gradient, support
 
@@ -219,9 +275,11 @@ class DotMatcher(nn.Module):
             predicted, support = self.local.along(*self.with_anchors(weight, flow), gradient)
             weight, flow, chosen = self.choose(predicted, support, blobs, misfit)
         for _ in range(SETTLING):
-            predicted, _, support = self.predict(weight, flow)
+            gradient = strain.gather(1, chosen[..., None].expand(-1, -1, 4)).unflatten(-1, (2, 2))
+            predicted, _, support = self.predict(weight, flow, gradient)
             weight, flow, chosen = self.choose(predicted, support, blobs, misfit)
         weight, flow = weight.unflatten(0, (-1, starts)), flow.unflatten(0, (-1, starts))
         best = weight.sum(-1).argmax(-1)[:, None, None].expand(-1, -1, self.pixels.shape[0])
         flow = flow.gather(1, best[..., None].expand(-1, -1, -1, 2)).squeeze(1)
-        return self.pixels + self.origin + flow, weight.gather(1, best).squeeze(1)
+        gradient = gradient.unflatten(0, (-1, starts)).gather(1, best[..., None, None].expand(-1, -1, -1, 2, 2)).squeeze(1)
+        return self.pixels + self.origin + flow, weight.gather(1, best).squeeze(1), gradient
