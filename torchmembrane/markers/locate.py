@@ -276,8 +276,6 @@ class DotLocator(nn.Module):
         predicted, _, _ = self.match.predict(certainty * quality, pixels - rest, strain)
         stray = (pixels - rest - predicted).square().sum(-1).clamp_min(1e-12).sqrt() / self.match.nearest
         confidence = quality * torch.sigmoid(20 * (STRAY - stray))
-        confidence = confidence * self.coherence(
-            pixels, confidence, strain, rest + predicted, blobs, log_radius, valid
-        )
+        confidence = confidence * self.coherence(pixels, confidence, strain, rest + predicted, blobs, log_radius, valid)
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
         return torch.where(confidence[..., None] > 0.05, pixels, rest + predicted), confidence
