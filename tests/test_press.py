@@ -10,7 +10,7 @@ from torchmembrane.energy import Sheet
 from torchmembrane.membrane import Membrane, corners, triangles_of
 from torchmembrane.shapes import half_cylinder, heightfield, spherical_cap
 from torchmembrane.simulate import equilibrium as equilibrium_module
-from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open, volume_hessian_blocks
+from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
 from torchmembrane.simulate.indenters import Plane, Sphere, facing
 from torchmembrane.simulate.press import carried, press, presses
 
@@ -90,7 +90,7 @@ def test_volume_hessian_blocks_are_autograd_of_the_volume(dome):
     p = triangles_of(corners(dome.rest, dome.grid))[3, 4, 1]
     volume = lambda p: dome.outward / 6 * torch.linalg.det(p)  # noqa: E731
     hessian = torch.autograd.functional.hessian(volume, p).reshape(9, 9)
-    torch.testing.assert_close(volume_hessian_blocks(dome, dome.rest)[3, 4, 1], hessian)
+    torch.testing.assert_close(dome.volume_hessian_blocks(dome.rest)[3, 4, 1], hessian)
 
 
 def test_without_contact_the_rest_surface_stays(dome):

@@ -153,7 +153,7 @@ class ForceBalance(nn.Module):
 
     def force_jacobian(self, x: Tensor, pressure: Tensor) -> Tensor:
         """Derivative of `contact_force` in the seven neighbours of every vertex, `[B, V, 3, 21]`; zero for fixed neighbours."""
-        blocks = self.sheet.hessian_blocks(x) - pressure.reshape(-1, *(1,) * 5) * _volume_blocks(self.membrane, x)
+        blocks = self.sheet.hessian_blocks(x) - pressure.reshape(-1, *(1,) * 5) * self.membrane.volume_hessian_blocks(x)
         pairs = blocks.unflatten(-1, (3, 3)).unflatten(-3, (3, 3)).transpose(-3, -2).flatten(1, 5)
         rows = pairs.new_zeros(len(x), self.inside.numel(), 3, 3).index_add(1, self.scatter, pairs)
         rows = rows.unflatten(1, self.inside.shape) * (self.inside * self.moves)[..., None, None]
@@ -215,20 +215,6 @@ def _across(directions: Tensor) -> Tensor:
     least = torch.where(directions[..., 2:].abs() < 0.9, z, x)
     first = nn.functional.normalize(torch.linalg.cross(directions, least), dim=-1)
     return torch.stack([first, torch.linalg.cross(directions, first)], -2)
-
-
-def _volume_blocks(membrane: Membrane, x: Tensor) -> Tensor:
-    """Second derivatives of every triangle's share of the volume, `[..., m-1, n-1, 2, 9, 9]`."""
-    a, b, c = (_cross_matrix(v) for v in triangles_of(corners(x, membrane.grid)).unbind(-2))
-    none = torch.zeros_like(a)
-    rows = [torch.cat(row, -1) for row in ((none, -c, b), (c, none, -a), (-b, a, none))]
-    return membrane.outward / 6 * torch.cat(rows, -2)
-
-
-def _cross_matrix(v: Tensor) -> Tensor:
-    x, y, z = v.unbind(-1)
-    none = torch.zeros_like(x)
-    return torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).unflatten(-1, (3, 3))
 
 
 def _stencil(membrane: Membrane) -> tuple[Tensor, Tensor, Tensor]:

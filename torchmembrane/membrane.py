@@ -121,6 +121,13 @@ class Membrane(nn.Module):
         cofactors = torch.stack([cross(b, c), cross(c, a), cross(a, b)], -2)
         return self.outward / 6 * corners_to_vertices(triangles_to_corners(cofactors), self.grid)
 
+    def volume_hessian_blocks(self, x: Tensor) -> Tensor:
+        """Second derivatives of every triangle's share of the volume, `[..., V, 3]` to `[..., m-1, n-1, 2, 9, 9]`."""
+        a, b, c = (_cross_matrix(p) for p in triangles_of(corners(x, self.grid)).unbind(-2))
+        none = torch.zeros_like(a)
+        rows = [torch.cat(row, -1) for row in ((none, -c, b), (c, none, -a), (-b, a, none))]
+        return self.outward / 6 * torch.cat(rows, -2)
+
     @property
     def cavity_volume(self) -> float:
         """Volume between the rest surface and a fan from the rim's centroid over its rim, in length unit cubed."""
@@ -228,6 +235,13 @@ def _orientation(X, triangles, fixed):
             f"{triangles[k].tolist()}; expected a grid without folds whose inside is seen from the camera everywhere"
         )
     return outward
+
+
+def _cross_matrix(p: Tensor) -> Tensor:
+    """The matrix of `q -> p x q`, `[..., 3]` to `[..., 3, 3]`."""
+    x, y, z = p.unbind(-1)
+    none = torch.zeros_like(x)
+    return torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).unflatten(-1, (3, 3))
 
 
 def _even_lines(X, count):

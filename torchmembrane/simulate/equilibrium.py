@@ -111,7 +111,7 @@ class Equilibrium:
         """One Newton step: vertices, pressure and contacts, or None where it does not descend."""
         active = [contact.active_set(x[self.free]) for contact in contacts]
         each = list(zip(contacts, active, strict=True))
-        blocks = self.sheet.hessian_blocks(x, positive) - pressure * volume_hessian_blocks(self.membrane, x)
+        blocks = self.sheet.hessian_blocks(x, positive) - pressure * self.membrane.volume_hessian_blocks(x)
         K = self.matrix(blocks, sum(contact.stiffness_blocks(x[self.free], a) for contact, a in each))
         linear = [contact.linearised(a).force(x[self.free]) for contact, a in each]
         push, (gap, compliance) = self.membrane.volume_gradient(x)[self.free].numpy().ravel(), self._gap(x, pressure)
@@ -142,21 +142,6 @@ class Equilibrium:
 
 def _solved(K: csc_matrix, loads: np.ndarray) -> np.ndarray:
     return splu(K, "MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options={"SymmetricMode": True}).solve(loads)
-
-
-def volume_hessian_blocks(membrane: Membrane, x: Tensor) -> Tensor:
-    """Second derivatives of each triangle's volume, `[..., V, 3]` to `[..., m-1, n-1, 2, 9, 9]`."""
-    a, b, c = (_cross_matrix(p) for p in triangles_of(corners(x, membrane.grid)).unbind(-2))
-    none = torch.zeros_like(a)
-    rows = [torch.cat(row, -1) for row in ((none, -c, b), (c, none, -a), (-b, a, none))]
-    return membrane.outward / 6 * torch.cat(rows, -2)
-
-
-def _cross_matrix(p: Tensor) -> Tensor:
-    """The matrix of `q -> p x q`, `[..., 3]` to `[..., 3, 3]`."""
-    x, y, z = p.unbind(-1)
-    none = torch.zeros_like(x)
-    return torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).unflatten(-1, (3, 3))
 
 
 class _Pattern:
