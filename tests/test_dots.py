@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from torchmembrane.errors import MembraneError
 from torchmembrane.markers.dots import DotPattern, find_dots, measure_dots
-from torchmembrane.markers.locate import DotLocator, pyramid
+from torchmembrane.markers.locate import DotLocator, EllipseFit, pyramid
+from torchmembrane.markers.match import Coherence
 
 SIZE, CENTRE, RADIUS, PITCH = (320, 240), np.array([158.3, 119.6]), 112.0, 22.0
 PATTERNS = [("square", True), ("square", False), ("hexagonal", True), ("hexagonal", False)]
@@ -73,6 +74,26 @@ def dent(x):
     return (free * near / 0.83)[:, None] * np.array([-0.5, 0.87])
 
 
+def spread(x):
+    """Everything moves outwards, most at 40 px from the middle."""
+    away = (x - CENTRE) / 40
+    return away * np.exp(0.5 * (1 - (away**2).sum(-1, keepdims=True)))
+
+
+def twist(x):
+    """The middle turns by one radian, the rim by nothing, in pitches."""
+    around = x - CENTRE
+    angle = np.clip(1 - (around**2).sum(-1) / RADIUS**2, 0, 1)
+    turned = around[:, ::-1] * [-1, 1]
+    return (np.cos(angle)[:, None] * around + np.sin(angle)[:, None] * turned - around) / PITCH
+
+
+def press(x):
+    """Everything moves to the middle, where nothing is left of the spacing, in pitches."""
+    around = x - CENTRE
+    return -(np.clip(1 - (around**2).sum(-1) / RADIUS**2, 0, 1) ** 2)[:, None] * around / PITCH
+
+
 def deform(s, field, pitches):
     """Pixels and shapes after the flow `pitches * field`."""
 
@@ -117,6 +138,15 @@ def test_finds_only_inside_the_mask():
     mask = np.arange(SIZE[0]) < CENTRE[0] + 5
     found = find_dots(render(s.pixels, s.shapes), "dark", np.broadcast_to(mask, SIZE[::-1]))
     assert len(found.pixels) == (s.pixels[:, 0] < CENTRE[0] + 5).sum()
+
+
+def test_finds_few_false_dots_in_heavy_noise():
+    s = scene()
+    noise = np.random.default_rng(0).normal(size=SIZE[::-1])
+    found = find_dots(0.3 + 0.5 * render(s.pixels, s.shapes, noise=0) + 0.05 * noise, "dark")
+    distance = cKDTree(s.pixels).query(found.pixels)[0]
+    assert (distance > 2).sum() < 15
+    assert (distance < 2).sum() > 0.9 * len(s.pixels)
 
 
 def test_nothing_to_find_is_an_error():
@@ -175,6 +205,60 @@ def test_a_dot_out_of_line_with_the_flow_is_not_believed(two):
     _, confidence = locate(batch(render(moved, shapes, kept=kept)))
     assert confidence[0, [stray, beside]].max() < 0.5
     assert np.delete(confidence[0].numpy(), [stray, beside]).min() > 0.5
+
+
+def test_a_bar_beside_a_border_dot_is_not_taken_for_it():
+    s = scene(two_sizes=False)
+    kept = np.linalg.norm(s.pixels - CENTRE, axis=1) < 85
+    s = s._replace(pixels=s.pixels[kept], shapes=s.shapes[kept], sizes=s.sizes[kept])
+    truth, shapes = deform(s, spread, 0.65)
+    corner = np.linalg.norm(s.pixels - CENTRE, axis=1).argsort()[-1]
+    away = (truth[corner] - CENTRE) / np.linalg.norm(truth[corner] - CENTRE)
+    frame = np.stack([away, away[::-1] * [-1, 1]], -1)
+    bar = frame @ np.diag([2.2, 6.0]) @ frame.T
+    image = render(np.vstack([truth, truth[corner] + 11 * away]), np.concatenate([shapes, bar[None]]))
+    pixels, confidence = DotLocator(measured(s), SIZE, "dark")(batch(image))
+    error = np.linalg.norm(pixels[0].numpy() - truth, axis=1)
+    sure = confidence[0].numpy() > 0.5
+    assert error[sure].max() < 0.5 and np.delete(sure, corner).all()
+
+
+@pytest.mark.parametrize("rival, believed", [(0.1, False), (0.9, True)])
+def test_a_dot_is_not_believed_beside_a_blob_nearer_to_the_prediction(rival, believed):
+    rest = PITCH * np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), -1).reshape(-1, 2)
+    coherence = Coherence(rest, np.ones(25), 0.45)
+    predicted = torch.tensor(rest)[None]
+    pixels = predicted.clone()
+    pixels[0, 12, 0] += 0.4 * PITCH
+    blobs = torch.cat([pixels, predicted[:, 12:13] - rival * PITCH * torch.tensor([0.6, 0.8])], 1)
+    log_radius = torch.ones(1, 26, dtype=torch.float64)
+    sure, flat = torch.full((1, 25), 0.95, dtype=torch.float64), torch.zeros(1, 25, 2, 2, dtype=torch.float64)
+    trust = coherence(pixels, sure, flat, predicted, blobs, log_radius, log_radius)
+    assert (trust[0, 12] > 0.9) == believed and np.delete(trust[0].numpy(), 12).min() > 0.9
+
+
+@pytest.mark.parametrize("arrangement, two_sizes", PATTERNS)
+def test_what_cannot_be_followed_is_lost_and_not_wrong(arrangement, two_sizes):
+    s = scene(arrangement, two_sizes)
+    frames = [deform(s, field, amount) for field, amount in [(twist, 0.6), (twist, 0.8), (press, 0.6), (slide, 2.5)]]
+    images = batch(*(render(*frame, seed=k) for k, frame in enumerate(frames)))
+    pixels, confidence = DotLocator(measured(s), SIZE, "dark", s.rim)(images)
+    for k, (truth, _) in enumerate(frames):
+        error = np.linalg.norm(pixels[k].numpy() - truth, axis=1)
+        assert ((error > 0.3 * PITCH) & (confidence[k].numpy() > 0.5)).sum() <= 1, k
+
+
+def test_missing_and_false_dots_do_not_cost_the_others(two):
+    s, locate = two
+    truth, shapes = deform(s, dent, 0.8)
+    generator = np.random.default_rng(3)
+    hidden = generator.random(len(truth)) < 0.1
+    false = CENTRE + generator.uniform(-70, 70, (60, 2))
+    false = false[cKDTree(truth).query(false)[0] > 0.5 * PITCH][:5]
+    places = np.vstack([truth[~hidden], false])
+    pixels, confidence = locate(batch(render(places, np.concatenate([shapes[~hidden], shapes[: len(false)]]))))
+    assert len(false) == 5 and confidence[0, ~hidden].min() > 0.5
+    assert np.linalg.norm(pixels[0].numpy() - truth, axis=1)[~hidden].max() < 0.5
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
@@ -252,6 +336,27 @@ def test_levels_of_the_pyramid_keep_the_mean():
     image = torch.rand(2, 1, 16, 24, generator=torch.Generator().manual_seed(0))
     for level in pyramid(image):
         torch.testing.assert_close(level.mean((1, 2, 3)), image.mean((1, 2, 3)))
+
+
+@pytest.mark.parametrize("radius", [2.5, 4.5, 9.0])
+def test_windows_hold_the_pixels_around_each_dot_at_their_places(radius):
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]].astype(float)
+    pixels = np.random.default_rng(0).uniform(60, 180, (7, 2))
+    fit = EllipseFit(pixels, np.broadcast_to(radius * np.eye(2), (7, 2, 2)), SIZE, 0.45).double()
+    values, place, inside = fit.windows(pyramid(batch(u + 1000 * v, dtype=torch.float64)), torch.tensor(pixels)[None])
+    torch.testing.assert_close(values[inside], (place[..., 0, :] + 1000 * place[..., 1, :])[inside])
+    middle = place.mean(-1) - torch.tensor(pixels)
+    assert middle.abs().max() <= 0.5 * fit.stride.max() + 1e-9
+
+
+def test_the_fit_does_not_run_off_to_a_neighbour():
+    pixels = CENTRE + PITCH * np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), -1).reshape(-1, 2)
+    shapes = np.broadcast_to(2.7 * np.eye(2), (25, 2, 2))
+    levels = pyramid(batch(render(pixels, shapes), dtype=torch.float64))
+    begin = torch.tensor(pixels + [9.0, 0.0])[None]
+    fit = EllipseFit(pixels, shapes, SIZE, 0.45, steps=8).double()
+    centre, _, _ = fit(levels, begin, torch.tensor(shapes)[None])
+    assert (centre - begin).abs().max() <= 2.7 + 1 + 1e-9
 
 
 def test_wrong_arguments_are_named():

@@ -230,8 +230,12 @@ class DotLocator(nn.Module):
     pattern: `DotPattern`, the markers in the rest image; image_size: width, height; polarity: "dark" or "light";
     anchors: `[A, 2]` pixels of the rim, where nothing moves, closer together than the dots; without them the pattern's
     own outline has to do.
-    Wrong when the flow changes by more than about half a pitch from one dot to the next, or, without anchors, when most
-    of a pattern of one size moves by a pitch.
+    Wrong when the flow changes by more than about half a pitch from one dot to the next: spacing below about half of
+    that at rest, rotation or shear of more than about 25 degrees, or a flow of more than two pitches. Most such regions
+    end in a seam and are lost with all that is near it; what is left is confidently a whole pitch off, one-size patterns
+    more often. Without anchors a pattern that moves as a whole by a pitch, two sizes by the pitch of the large ones,
+    looks as at rest: that cannot be told at all. A dot that is missing beside a blob of its size may be taken for it.
+    Where many dots are missing (20 %) and as many false ones stand among them, right dots are lost as well.
     """
 
     def __init__(self, pattern, image_size, polarity, anchors=None):
