@@ -55,6 +55,11 @@ class Sheet(nn.Module):
         self.register_buffer("rest_det", det)
         self.register_buffer("rest_triangle_area", det.sqrt() / 2)
 
+    def on(self, membrane: Membrane) -> "Sheet":
+        """The same material on another membrane or grid."""
+        modulus = 2 * float(self.c1 + self.c2)
+        return Sheet(membrane, self.model, float(self.prestretch), modulus, float(self.c2 / self.c1))
+
     def _invariants(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         edges = _edges(x, self.grid)
         g11, g12, g22 = _metric(edges)

@@ -1,19 +1,25 @@
-"""Force balance: the surface and the pressure whose residual forces, the contact forces, are sparse and push inwards.
+"""Force balance: the surface and the pressure whose residual forces, the contact forces, are few and push inwards.
 
 Every vertex carries three equations of equilibrium and one unknown depth. With the contact traction
 
-    q_k = (grad_k U(x) - h_k - p grad_k V(x)) / a_k,    q_n = q . n,  q_t the rest,
+    q_k = (grad_k U(x) - h_k - p grad_k V(x)) / a_k,    s = -q . n / p0 the push, q_t the part along the surface,
 
-    min over x, p:  1/2 sum_d |r_d(x)|^2 / sigma^2 + beta sum_k a_k [rho(q_n) + kappa rho(|q_t|)]   at the cavity's volume,
+    min over x, p:  sum_d 1/2 R^2 log(1 + |r_d(x)|^2 / (R sigma)^2) + beta sum_k a_k [f(s_k) + kappa |q_t| / (1 + c s_k)]
 
-where `r_d` is the angle between a marker's ray and its modelled position, `rho(s) = sqrt(s^2 + eps^2)`, and for a pull
-(`q_n > 0`) `eps + 50 q_n^2 / eps`. Iteratively reweighted Gauss-Newton steps while eps falls; of several starts the one with
-the lowest objective wins.
+at the cavity's volume. `r_d` is the angle between a marker's ray and its modelled position; its price saturates, so that a
+wrongly matched marker has little say. A convex body without friction pushes with at least the fluid's pressure or not at all: a
+small push is the grid's error or noise, a large one is a contact. So the price `f` of a push is quadratic at first and saturates
+beyond `tau` (like s^2 / (1 + s^2 / tau^2)), that of a pull stays quadratic, and what rubs is cheaper where something pushes.
+Whether a vertex is pushed is asked of its surroundings (`REACH`): contacts are patches.
+
+Reweighted Gauss-Newton steps while `tau` falls from where everything is quadratic (graduated non-convexity): no start but the
+rest surface is needed. A fine grid starts from the solution on every second of its lines.
 """
 
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .cavity import CavityLaw, Equilibrium, rest_balance
@@ -21,29 +27,19 @@ from .energy import Sheet
 from .membrane import Membrane, SurfacePoints, corners, triangles_of
 from .solve.patches import PatchIndex, PatchSystem
 
-STEPS = 28
-FALL = 0.7  # share of the steps over which eps falls
-EPS = (5.0, 0.1)  # first and last eps, over the reference traction
-PULL = 100.0  # weight of a pull, over beta / eps
+STEPS, TAU = 12, (10.0, 0.5)  # from rest
+FINE_STEPS, FINE_TAU = 10, (2.0, 0.4)  # from the coarser grid's solution
+WARM_STEPS, WARM_TAU = 4, (2.0, 0.4)  # from the previous frame's solution
+FALL = 0.7  # share of the steps over which tau falls
+SPARSITY = 3200.0  # price of the push p0 on the whole surface, while it is quadratic
+FRICTION, SLIP, CONE = 3.75, 0.05, 10.0  # kappa over the price of a push; where |q_t| begins to be linear, over p0; c
+REACH = 0.04  # over the surface's size
+FLOOR = 1e-3  # of a push's weight; without it a vertex under a contact has no place of its own
+OUTLIER = 5.0  # R
 LONGEST_STEP = 0.026  # over the surface's size
-DENTS = ((0.075, 0.11), (0.094, 0.225))  # depth and width of the later starts' dents, over the surface's size
-WIN = 0.98  # a later start wins below this share of the best objective
+COARSEST = 13  # fewest lines of a coarser grid
 NEIGHBOURS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1))
-
-
-LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR = 5e-3, 1e-4  # last step over the size, and volume error, of a settled surface
-
-
-class Balance(NamedTuple):
-    """A start's outcome: `vertices [B, V, 3]`, pressure `[B]`, `traction [B, V, 3]` on the membrane, objective `[B]`, its data
-    part `[B]`, and the longest vertex move of the last step over the surface's size `[B]`."""
-
-    vertices: Tensor
-    pressure: Tensor
-    traction: Tensor
-    objective: Tensor
-    misfit: Tensor
-    last_step: Tensor
+LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR = 1e-3, 3e-4  # rms of the last step over the size, and volume error, when settled
 
 
 class Observation(NamedTuple):
@@ -62,80 +58,77 @@ class ForceBalance(nn.Module):
         markers            the markers' `SurfacePoints`, and `positions [D, 3]`, their rest positions
         noise              angular noise of a marker, radians; about twice the locator's, to leave room for the grid's own error
         filling, gas       the cavity, as for `MinimumEnergy`
-        sparsity           b of `beta = b / (reference x area)`; the reference traction is the rest pressure, or tension / size
-        friction           kappa, the price of tangential traction
-        steps              of each start
+        steps              from rest, on the coarsest grid
 
-    Wrong when: the press is shallow (its tractions drown in noise), contacts are close, a far camera is pressed along its axis.
-    Sparsity shrinks the tractions, noise adds to them.
+    A grid with an odd number of lines, at least 25, holds the estimator on every second line as `coarse`. The reference
+    traction `p0` is the rest pressure, or tension / size where that is larger.
+    Wrong when: the press is so shallow that its tractions drown in noise; two contacts lie within `REACH`.
     """
 
     def __init__(self, membrane: Membrane, sheet: Sheet, markers: SurfacePoints, positions: Tensor, noise: float,
-                 filling="liquid", gas: tuple[float, float] | None = None, sparsity=400.0, friction=10.0,
-                 steps=STEPS):  # fmt: skip
+                 filling="liquid", gas: tuple[float, float] | None = None, steps=STEPS):  # fmt: skip
         super().__init__()
-        self.membrane, self.sheet, self.steps, self.friction = membrane, sheet, steps, friction
+        self.membrane, self.sheet, self.noise, self.steps = membrane, sheet, noise, steps
         self.largest_unbalance, self.largest_volume_error = LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR
         rest_pressure, rest_load = rest_balance(membrane, sheet)
         self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
-        self.size = float(membrane.rest_area.sum()) ** 0.5
+        self.size = membrane.size
         self.reference = max(float(rest_pressure), float(sheet.tension) / self.size, float(sheet.c1 + sheet.c2) / self.size)
-        self.noise, self.beta = noise, sparsity / (self.reference * self.size**2)
         self.register_buffer("rest_pressure", rest_pressure)
         self.register_buffer("rest_load", rest_load)
         self.register_buffer("moves", (~membrane.fixed).double()[:, None])
         self.register_buffer("positions", torch.as_tensor(positions, dtype=torch.float64))
         self.register_buffer("marker_vertices", torch.as_tensor(markers.vertices).long())
         self.register_buffer("marker_weights", torch.as_tensor(markers.weights, dtype=torch.float64))
+        self.register_buffer("surroundings", _surroundings(membrane))
         stencil, scatter, inside = _stencil(membrane)
         self.register_buffer("scatter", scatter)
         self.register_buffer("inside", inside)
         self.system = PatchSystem(membrane.grid, membrane.fixed)
         self.vertex_patches = PatchIndex(self.system, stencil)
         self.marker_patches = PatchIndex(self.system, self.marker_vertices)
+        self.coarse = self._coarser(filling, gas, steps)
 
-    def forward(self, origins: Tensor, directions: Tensor, weight: Tensor) -> Equilibrium:
-        """`origins`, `directions [B, D, 3]`: the markers' measured rays; `weight [B, D]`: 0 for a lost one, else up to 1."""
+    def _coarser(self, filling, gas, steps) -> "ForceBalance | None":
+        grid = self.membrane.grid
+        if any(count % 2 == 0 or count < 2 * COARSEST - 1 for count in grid):
+            return None
+        every_second = lambda field: field.unflatten(0, grid)[::2, ::2].numpy()  # noqa: E731
+        membrane = Membrane(every_second(self.membrane.rest), every_second(self.membrane.fixed))
+        markers = membrane.closest_points(self.positions.numpy())
+        sheet = self.sheet.on(membrane)
+        return ForceBalance(membrane, sheet, markers, self.positions, self.noise, filling, gas, steps)
+
+    def forward(
+        self, origins: Tensor, directions: Tensor, weight: Tensor, start: tuple[Tensor, Tensor] | None = None
+    ) -> Equilibrium:
+        """Arguments: `origins`, `directions [B, D, 3]`, the markers' measured rays; `weight [B, D]`: 0 for a lost one, else up
+        to 1; `start`: vertices `[B, V, 3]` and pressure `[B]` near the solution, such as the previous frame's."""
         seen = Observation(origins, _across(directions), weight / self.noise**2)
-        X, rest = self.membrane.rest.expand(len(weight), -1, -1), self.rest_pressure.expand(len(weight))
-        best = self._descend(X, rest, seen)
-        push = (-best.traction * self.membrane.normals(best.vertices)).sum(-1).clamp_min(0) * self.membrane.rest_area
-        centre = (push[..., None] * X).sum(1) / push.sum(1, keepdim=True).clamp_min(torch.finfo(push.dtype).tiny)
-        distance2 = ((X - centre[:, None]) ** 2).sum(-1, keepdim=True)
-        for depth, width in DENTS:
-            dent = depth * self.size * torch.exp(-distance2 / (2 * (width * self.size) ** 2)) * self.moves
-            other = self._descend(X - dent * self.membrane.rest_normals, rest, seen)
-            wins = other.objective < WIN * best.objective
-            choose = lambda a, b, wins=wins: torch.where(wins.reshape(-1, *(1,) * (a.ndim - 1)), a, b)  # noqa: E731
-            best = Balance(*(choose(a, b) for a, b in zip(other, best, strict=True)))
-        volume = self.membrane.volume(best.vertices)
-        return Equilibrium(best.vertices, best.pressure, volume, best.traction, best.last_step)
+        if start is not None:
+            return self._descend(*start, seen, WARM_STEPS, WARM_TAU)
+        if self.coarse is None:
+            X, rest = self.membrane.rest.expand(weight.shape[0], -1, -1), self.rest_pressure.expand(weight.shape[0])
+            return self._descend(X, rest, seen, self.steps, TAU)
+        coarse = self.coarse(origins, directions, weight)
+        u = (coarse.vertices - self.coarse.membrane.rest).unflatten(1, self.coarse.membrane.grid).permute(0, 3, 1, 2)
+        u = F.interpolate(u, self.membrane.grid, mode="bilinear", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
+        return self._descend(self.membrane.rest + u * self.moves, coarse.pressure, seen, FINE_STEPS, FINE_TAU)
 
-    def _descend(self, x: Tensor, pressure: Tensor, seen: Observation) -> Balance:
-        first, last = (eps * self.reference for eps in EPS)
-        for k in range(self.steps):
-            eps = first * (last / first) ** min(1.0, k / (FALL * (self.steps - 1)))
+    def _descend(self, x: Tensor, pressure: Tensor, seen: Observation, steps: int, fall: tuple[float, float]) -> Equilibrium:
+        first, last = fall
+        for k in range(steps):
+            tau = first * (last / first) ** min(1.0, k / (FALL * (steps - 1)))
             before = x
-            x, pressure = self.step(x, pressure, seen, eps)
-        moved = torch.linalg.vector_norm(x - before, dim=-1).amax(-1) / self.size
-        return self.balance(x, pressure, seen)._replace(last_step=moved)
+            x, pressure = self.step(x, pressure, seen, tau, OUTLIER * tau / last)
+        moved = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
+        traction = self.contact_force(x, pressure) / self.membrane.rest_area[:, None]
+        return Equilibrium(x, pressure, self.membrane.volume(x), traction, moved)
 
     def contact_force(self, x: Tensor, pressure: Tensor) -> Tensor:
         """Force that something outside must exert on every free vertex, `[B, V, 3]`."""
         push = pressure[:, None, None] * self.membrane.volume_gradient(x)
         return (self.sheet.gradient(x) - self.rest_load - push) * self.moves
-
-    def balance(self, x: Tensor, pressure: Tensor, seen: Observation) -> Balance:
-        """The objective, at the last eps, and its parts."""
-        eps, area = EPS[1] * self.reference, self.membrane.rest_area
-        traction = self.contact_force(x, pressure) / area[:, None]
-        q_n, q_t = _split(traction, self.membrane.normals(x))
-        pressed, pulled = (q_n**2 + eps**2).sqrt() - eps, PULL / 2 * q_n**2 / eps
-        sideways = (q_t.square().sum(-1) + eps**2).sqrt() - eps
-        contact = self.beta * (area * (torch.where(q_n < 0, pressed, pulled) + self.friction * sideways)).sum(-1)
-        angle, _ = self._angles(x, seen)
-        misfit = (seen.weight[..., None] * angle**2).sum((-1, -2)) / 2
-        return Balance(x, pressure, traction, misfit + contact, misfit, torch.zeros_like(misfit))
 
     def markers(self, x: Tensor) -> Tensor:
         """The markers' positions on the surface `x`, `[B, D, 3]`."""
@@ -155,17 +148,17 @@ class ForceBalance(nn.Module):
         """Derivative of `contact_force` in the seven neighbours of every vertex, `[B, V, 3, 21]`; zero for fixed neighbours."""
         blocks = self.sheet.hessian_blocks(x) - pressure.reshape(-1, *(1,) * 5) * self.membrane.volume_hessian_blocks(x)
         pairs = blocks.unflatten(-1, (3, 3)).unflatten(-3, (3, 3)).transpose(-3, -2).flatten(1, 5)
-        rows = pairs.new_zeros(len(x), self.inside.numel(), 3, 3).index_add(1, self.scatter, pairs)
+        rows = pairs.new_zeros(x.shape[0], self.inside.numel(), 3, 3).index_add(1, self.scatter, pairs)
         rows = rows.unflatten(1, self.inside.shape) * (self.inside * self.moves)[..., None, None]
         return rows.transpose(2, 3).flatten(-2)
 
-    def step(self, x: Tensor, pressure: Tensor, seen: Observation, eps: float) -> tuple[Tensor, Tensor]:
+    def step(self, x: Tensor, pressure: Tensor, seen: Observation, tau: float, outlier: float) -> tuple[Tensor, Tensor]:
         """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped."""
         force, A = self.contact_force(x, pressure), self.force_jacobian(x, pressure)
         v = self.membrane.volume_gradient(x) * self.moves
-        W = self._weights(x, force, eps)
+        W = self.force_weights(x, force, tau)
         angle, J = self._angles(x, seen)
-        angle_weight = seen.weight[..., None]
+        angle_weight = self._marker_weights(angle, seen, outlier)[..., None]
         gram = lambda M, w: M.mT @ (w[..., None] * M)  # noqa: E731
         matrix = self.system.matrix([(self.vertex_patches, A.mT @ W @ A), (self.marker_patches, gram(J, angle_weight))])
         to_system = lambda field: self.system.vector([(self.vertex_patches, (A.mT @ W @ field[..., None]).squeeze(-1))])  # noqa: E731
@@ -179,15 +172,22 @@ class ForceBalance(nn.Module):
         share = (LONGEST_STEP * self.size / longest.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1.0)
         return x + share[:, None, None] * move, pressure + share * rise
 
-    def _weights(self, x: Tensor, force: Tensor, eps: float) -> Tensor:
-        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, V, 3, 3]`."""
-        area, normal = self.membrane.rest_area, self.membrane.normals(x)
-        q_n, q_t = _split(force / area[:, None], normal)
-        w_n = torch.where(q_n < 0, (q_n**2 + eps**2).rsqrt(), PULL / eps)
-        w_t = self.friction * (q_t.square().sum(-1) + eps**2).rsqrt()
+    def force_weights(self, x: Tensor, force: Tensor, tau: float) -> Tensor:
+        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, V, 3, 3]`: second derivatives of the price's parabolas in the force."""
+        area, normal, p0 = self.membrane.rest_area, self.membrane.normals(x), self.reference
+        traction = force / area[:, None]
+        q_n = (traction * normal).sum(-1)
+        q_t = traction - q_n[..., None] * normal
+        push2 = (-q_n / p0).clamp_min(0) ** 2 @ self.surroundings
+        w_n = torch.where(q_n < 0, FLOOR + (1 + push2 / tau**2) ** -2, 1.0)
+        dearer = FRICTION / (1 + CONE * (push2 + SLIP**4).sqrt())
+        w_t = dearer * (q_t.square().sum(-1) / p0**2 + SLIP**2).rsqrt()
         one = torch.eye(3, dtype=x.dtype, device=x.device)
         W = (w_n - w_t)[..., None, None] * normal[..., :, None] * normal[..., None, :] + w_t[..., None, None] * one
-        return self.beta * W / area[:, None, None]
+        return SPARSITY / (p0 * self.size) ** 2 * W / area[:, None, None]
+
+    def _marker_weights(self, angle: Tensor, seen: Observation, outlier: float) -> Tensor:
+        return seen.weight / (1 + seen.weight * angle.square().sum(-1) / outlier**2)
 
     def _bordered(self, x, pressure, y, m, n, v, W, force):
         """Step `d` and rise of the pressure: `M d + m dp + n lambda = -g` with the rows of the pressure and of the volume."""
@@ -204,17 +204,19 @@ class ForceBalance(nn.Module):
         return -Mg - rise[:, None] * Mm - multiplier[:, None] * Mn, rise
 
 
-def _split(traction: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    normal_part = (traction * normal).sum(-1)
-    return normal_part, traction - normal_part[..., None] * normal
-
-
 def _across(directions: Tensor) -> Tensor:
     """Two unit vectors across each unit direction, `[..., 3]` to `[..., 2, 3]`."""
     x, z = directions.new_tensor([1.0, 0.0, 0.0]), directions.new_tensor([0.0, 0.0, 1.0])
     least = torch.where(directions[..., 2:].abs() < 0.9, z, x)
-    first = nn.functional.normalize(torch.linalg.cross(directions, least), dim=-1)
+    first = F.normalize(torch.linalg.cross(directions, least), dim=-1)
     return torch.stack([first, torch.linalg.cross(directions, first)], -2)
+
+
+def _surroundings(membrane: Membrane) -> Tensor:
+    """Weights `[V, V]` of a Gaussian mean over the rest surface; column k is that around vertex k."""
+    weight = torch.exp(-torch.cdist(membrane.rest, membrane.rest) ** 2 / (2 * (REACH * membrane.size) ** 2))
+    weight = membrane.rest_area[:, None] * weight
+    return weight / weight.sum(0)
 
 
 def _stencil(membrane: Membrane) -> tuple[Tensor, Tensor, Tensor]:
