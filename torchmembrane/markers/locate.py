@@ -3,7 +3,6 @@
 import numpy as np
 import torch
 import torch.nn.functional as F
-from kornia.filters import gaussian_blur2d
 from scipy import ndimage
 from scipy.spatial import Delaunay, cKDTree
 from torch import nn
@@ -18,7 +17,7 @@ LEVELS = 3
 RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, its slope, depth, shift, growth
 STRAY = 0.5  # from where its neighbours predict it, pitches: a dot so far off is half trusted
 FEWEST = 0.2  # mean confidence of a frame that is half trusted
-FINEST_SIGMA = 1.4  # of the blob detector on a level of the pyramid, pixels of the level
+FINEST_SIGMA = 1.1  # of the blob detector on a level of the pyramid, pixels of the level
 SCALE_STEP = 1.6  # ratio of neighbouring scales of the blob detector at most
 
 
@@ -43,14 +42,17 @@ def pyramid(image):
     return levels
 
 
-def solve_positive(matrix, load):
-    """`x [..., n]` with `matrix x = load`: Gauss-Jordan without pivoting, for positive definite `[..., n, n]`."""
-    system = torch.cat([matrix, load[..., None]], -1)
-    unit = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    for i in range(matrix.shape[-1]):
-        row = system[..., i : i + 1, :] / system[..., i : i + 1, i : i + 1]
-        system = system - (system[..., i : i + 1] - unit[:, i : i + 1]) * row
-    return system[..., -1]
+def solve_positive(system):
+    """`x [n, ...]` with `matrix x = load` from `system = [matrix, load] [n, n + 1, ...]`: Gauss-Jordan without pivoting.
+
+    The matrix must be positive definite; the batch comes last, so that each row is one long vector.
+    """
+    n = system.shape[0]
+    unit = torch.eye(n, dtype=system.dtype, device=system.device).reshape(n, n, *(1,) * (system.ndim - 2))
+    for i in range(n):
+        column, rest = system[:, :1], system[:, 1:]
+        system = rest - (column - unit[:, i : i + 1]) * (rest[i : i + 1] / column[i : i + 1])
+    return system[:, 0]
 
 
 class EllipseFit(nn.Module):
@@ -70,29 +72,43 @@ class EllipseFit(nn.Module):
         gap = (0.85 * spacing(pixels)[0] - 2 * long) / stride
         ring = np.clip(0.7 * gap, 1.5, RING) * stride
         half = int(np.ceil(((1.25 * long + ring) / stride).max()))
+        half = min(half, (min(sizes[level].min(0)) - 1) // 2)
         step = np.arange(-half, half + 1)
         offset = np.stack(np.meshgrid(step, step)).reshape(2, -1)
-        self.steps, self.size_tolerance = steps, size_tolerance
-        self.register_buffer("offset", torch.as_tensor(offset))
-        self.register_buffer("start", torch.as_tensor(np.concatenate([[0], sizes.prod(1).cumsum()])[level]))
-        self.register_buffer("limit", torch.as_tensor(sizes[level][:, ::-1].copy() - 1))
+        offset = offset[:, np.hypot(*offset) <= half + 0.5]
+        self.steps, self.size_tolerance, self.half = steps, size_tolerance, half
+        self.levels = [(k, torch.as_tensor(np.flatnonzero(level == k))) for k in np.unique(level)]
+        order = np.concatenate([dots for _, dots in self.levels])
+        self.register_buffer("order", torch.as_tensor(np.argsort(order)))
+        self.register_buffer("offset", torch.as_tensor(offset.astype(float)))
+        for k, dots in self.levels:
+            self.register_buffer(f"dots{k}", dots)
+            self.register_buffer(f"step{k}", torch.as_tensor(offset[1] * sizes[k, 1] + offset[0]))
+        self.register_buffer("limit", torch.as_tensor(sizes[level][:, ::-1].copy() - 1 - half))
         self.register_buffer("stride", torch.as_tensor(stride.astype(float)))
         self.register_buffer("ring", torch.as_tensor(ring))
-        self.register_buffer("size", torch.as_tensor(np.linalg.norm(shapes, axis=(1, 2)) / 2**0.5))
+        size = np.linalg.norm(shapes, axis=(1, 2)) / 2**0.5
+        self.register_buffer("size", torch.as_tensor(size))
         self.register_buffer("softness", torch.as_tensor(SOFTNESS * np.sqrt(stride)))
-        self.register_buffer("ridge", torch.diag(torch.tensor(RIDGE, dtype=torch.float64)))
+        ridge = np.diag(RIDGE)[..., None] * np.ones(len(size))
+        ridge[4:6] *= size**2
+        self.register_buffer("ridge", torch.as_tensor(np.concatenate([ridge, np.zeros((7, 1, len(size)))], 1))[:, :, None])
 
     def windows(self, levels, centre):
-        """Values `[B, D, P]` around `centre [B, D, 2]`, their places `[B, D, 2, P]` px, and which lie in the image."""
-        stride, limit = self.stride[:, None], self.limit[..., None]
-        origin = ((centre.detach() - (stride - 1) / 2) / stride).round().to(torch.int64)
-        pixel = origin[..., None] + self.offset
-        inside = ((pixel >= 0) & (pixel <= limit)).all(-2)
-        u, v = torch.minimum(pixel.clamp_min(0), limit).unbind(-2)
-        index = self.start[:, None] + v * (self.limit[:, :1] + 1) + u
-        flat = torch.cat([level.flatten(1) for level in levels], 1)
-        values = flat.gather(1, index.flatten(1)).unflatten(1, index.shape[1:])
-        return values, pixel * stride[..., None] + (stride[..., None] - 1) / 2, inside
+        """Values `[B, D, P]` of the pixels of a disc about `centre [B, D, 2]`, and the disc's middle `[B, D, 2]` px.
+
+        Near the image's border the disc stops where its last pixel meets the border.
+        """
+        stride = self.stride[:, None]
+        middle = ((centre.detach() - (stride - 1) / 2) / stride).round()
+        pixel = torch.minimum(middle.clamp_min(self.half).to(torch.int64), self.limit)
+        values = []
+        for k, _ in self.levels:
+            at = pixel[:, getattr(self, f"dots{k}")]
+            index = (at[..., 1] * levels[k].shape[-1] + at[..., 0])[..., None] + getattr(self, f"step{k}")
+            values.append(levels[k].flatten(1).gather(1, index.flatten(1)).unflatten(1, index.shape[1:]))
+        values = values[0] if len(values) == 1 else torch.cat(values, 1)[:, self.order]
+        return values, pixel * stride + (stride - 1) / 2
 
     def forward(self, levels, centre, shape):
         """`levels` of `pyramid` with dark dots, `centre [B, D, 2]`, `shape [B, D, 2, 2]` to begin with.
@@ -100,48 +116,80 @@ class EllipseFit(nn.Module):
         Returns centre `[B, D, 2]`, growth of the outline `[B, D]` px, and quality `[B, D]` in 0..1, from the share of
         the window's variance explained, the contrast `a / b_0`, and the size against that of `shape` or at rest.
         """
-        values, place, inside = self.windows(levels, centre)
-        trust = inside.to(values.dtype)
-        mean = (values * trust).sum(-1, keepdim=True) / trust.sum(-1, keepdim=True).clamp_min(1)
+        values, middle = self.windows(levels, centre)
+        mean = values.mean(-1, keepdim=True)
         values = values - mean
-        a, b, c, d = inverse_2x2(shape).flatten(-2)[..., None, :].unbind(-1)  # [B, D, 1]
+        inverse = inverse_2x2(shape)
+        spread_out = (inverse * self.stride[:, None, None]) @ self.offset
+        softness, sharpness = 1 / self.softness[:, None], 2 / self.stride[:, None]
         size = torch.linalg.vector_norm(shape, dim=(-2, -1)) / 2**0.5
-        start, growth, softness = centre, torch.zeros_like(size), self.softness[:, None]
-        for _ in range(self.steps):
-            u, v = (place - centre[..., None]).unbind(-2)  # [B, D, P]
-            y1, y2 = a * u + b * v, c * u + d * v
-            normal_u, normal_v = a * y1 + c * y2, b * y1 + d * y2
-            slope = (normal_u.square() + normal_v.square()).clamp_min(1e-12).sqrt()
-            rho = (y1.square() + y2.square()).clamp_min(1e-12).sqrt()
-            depth = (1 - rho) * rho / slope + growth[..., None]  # inside the outline, px
-            template = torch.sigmoid(depth / softness)
-            edge = template * (1 - template) / softness
-            weight = trust * torch.sigmoid((depth + self.ring[:, None]) / (0.5 * self.stride[:, None]))
-            shift = -edge / slope
-            columns = torch.ones_like(edge), y1, y2, -template, shift * normal_u, shift * normal_v, -edge
-            basis = torch.stack(columns, -2)
-            weighted = basis * weight[..., None, :]
-            fit = solve_positive(weighted @ basis.mT + self.ridge, (weighted @ values[..., None]).squeeze(-1))
-            residual = values - (fit[..., None, :] @ basis).squeeze(-2)
-            amplitude = fit[..., 3]
+        start, growth, trust, one = centre, torch.zeros_like(size), 1.0, torch.ones_like(values)
+        for k in range(self.steps):
+            y = spread_out + inverse @ (middle - centre)[..., None]  # [B, D, 2, P]
+            normal = inverse.mT @ y
+            rho = (y.square().sum(-2) + 1e-12).sqrt()
+            along = (normal.square().sum(-2) + 1e-12).rsqrt()
+            depth = (1 - rho) * rho * along + growth[..., None]  # inside the outline, px
+            template = torch.sigmoid(depth * softness)
+            outside = 1 - template
+            edge = template * outside * softness
+            weight = trust * torch.sigmoid((depth + self.ring[:, None]) * sharpness)
+            shift = (edge * along)[:, :, None] * y
+            one_row = lambda x: x[..., None, :]  # noqa: E731
+            basis = torch.cat([one_row(one), y, one_row(template), shift, one_row(edge), one_row(values)], -2)
+            gram = ((basis * one_row(weight)) @ basis.mT).movedim((-2, -1), (0, 1))
+            fit = solve_positive(gram[:7] + self.ridge)  # [7, B, D]
+            excess = (torch.cat([fit, -one[None, ..., 0]]).movedim(0, -1)[..., None, :] @ basis).squeeze(-2)
+            amplitude = -fit[3]
             gain = amplitude / (amplitude**2 + 1e-6)
             reach = 0.5 * size + 0.5
-            centre = centre + reach[..., None] * torch.tanh(fit[..., 4:6] * (gain / reach)[..., None])
+            towards = (shape @ fit[4:6].movedim(0, -1)[..., None]).squeeze(-1)
+            centre = centre + reach[..., None] * torch.tanh(towards * (-gain / reach)[..., None])
             centre = start + torch.maximum(torch.minimum(centre - start, size[..., None] + 1), -size[..., None] - 1)
-            growth = (growth + 0.5 * size * torch.tanh(2 * fit[..., 6] * gain / size)).clamp(-0.5 * size, 0.8 * size)
-            intruder = (1 - template) * (-residual * gain[..., None] / 0.35).clamp(0, 10) ** 4
-            trust = inside / (1 + intruder)
-        background = (weight * values).sum(-1) / weight.sum(-1).clamp_min(1)
-        spread = (weight * (values - background[..., None]) ** 2).sum(-1)
-        explained = 1 - (weight * residual**2).sum(-1) / (spread + 1e-6)
-        contrast = amplitude / (fit[..., 0] + mean[..., 0]).clamp_min(1e-2)
+            growth = (growth + 0.5 * size * torch.tanh(-2 * fit[6] * gain / size)).clamp(-0.5 * size, 0.8 * size)
+            if k + 1 < self.steps:
+                intruder = outside * (excess * (gain / 0.35)[..., None]).clamp(0, 10).square().square()
+                trust = 1 / (1 + intruder)
+        spread = gram[7, 7] - gram[0, 7].square() / gram[0, 0].clamp_min(1)
+        explained = 1 - (weight * excess.square()).sum(-1) / (spread.clamp_min(0) + 1e-6)
+        contrast = amplitude / (fit[0] + mean[..., 0]).clamp_min(1e-2)
         quality = torch.sigmoid(12 * (explained - 0.6)) * torch.sigmoid(40 * (contrast - 0.12))
         grown = torch.minimum(*(torch.log((size + growth) / usual).square() for usual in (size, self.size)))
         return centre, growth, quality * torch.exp(-grown / (2 * self.size_tolerance) ** 2)
 
 
+def blur_rows(size, sigma, rows):
+    """`[len(rows), size]`: a Gaussian about each of `rows` over `size` pixels, the border's repeated beyond it."""
+    reach = int(np.ceil(2.5 * sigma))
+    step = np.arange(-reach, reach + 1)
+    kernel = np.exp(-0.5 * (step / sigma) ** 2)
+    matrix = np.zeros((len(rows), size))
+    place = (np.clip(rows, 0, size - 1)[:, None] + step).clip(0, size - 1)
+    np.add.at(matrix, (np.arange(len(rows))[:, None], place), kernel / kernel.sum())
+    return matrix
+
+
+def linear_rows(size, rows):
+    """`[len(rows), size]`: linear interpolation of `size` values at `rows`, which need not be whole."""
+    rows = np.clip(rows, 0, size - 1)
+    below = np.minimum(rows.astype(int), size - 2)
+    matrix = np.zeros((len(rows), size))
+    matrix[np.arange(len(rows)), below] = 1 - (rows - below)
+    matrix[np.arange(len(rows)), below + 1] = rows - below
+    return matrix
+
+
+def halves(size):
+    """`[size // 2, size]`: means of pairs."""
+    return np.kron(np.eye(size // 2, dtype=float), [0.5, 0.5]) if size % 2 == 0 else np.pad(halves(size - 1), ((0, 0), (0, 1)))
+
+
 class BlobDetector(nn.Module):
-    """The strongest `count` dark blobs: maxima over place and scale of the normalised Hessian's determinant."""
+    """The strongest `count` dark blobs: maxima over place and scale of the normalised Hessian's determinant.
+
+    Only the box that holds the membrane is looked at. A Gaussian over it is two products with constant matrices, on the
+    level of the pyramid that suits the scale; maxima are looked for on cells of 2 x 2 pixels of the finest of them.
+    """
 
     def __init__(self, radii, pitch, count, inside):
         super().__init__()
@@ -150,45 +198,73 @@ class BlobDetector(nn.Module):
         radii = np.geomspace(smallest, largest, 1 + int(np.ceil(steps)))
         levels = np.log2(np.maximum(radii / (FINEST_SIGMA * np.sqrt(2)), 1)).astype(int).clip(0, LEVELS - 1)
         self.scales = [(int(k), float(r / np.sqrt(2) / 2**k)) for k, r in zip(levels, radii, strict=True)]
-        self.level = int(levels[0])
-        self.stride = 2**self.level
-        self.reach = max(1, int(0.125 * pitch / self.stride))
-        self.count = count
-        stencils = [[[0, 0, 0], [1, -2, 1], [0, 0, 0]], [[0, 1, 0], [0, -2, 0], [0, 1, 0]]]
-        stencils.append([[0.25, 0, -0.25], [0, 0, 0], [-0.25, 0, 0.25]])
-        self.register_buffer("stencils", torch.tensor(stencils, dtype=torch.float64)[:, None])
+        self.cell = 2 ** (int(levels[0]) + 1)
+        self.reach, self.count = max(1, int(0.25 * pitch / self.cell)), count
+        block, sides = max(self.cell, 2 ** (LEVELS - 1)), inside.shape[-2:]
+        lit = [np.flatnonzero(inside[0, 0].numpy().any(1 - axis)) for axis in (0, 1)]
+        self.box = [
+            (int(on[0]) // block * block, min(-(-(int(on[-1]) + 1) // block), side // block) * block)
+            for on, side in zip(lit, sides, strict=True)
+        ]
+        (v0, v1), (u0, u1) = self.box
         self.register_buffer("log_radii", torch.as_tensor(np.log(radii)))
-        self.register_buffer("inside", F.avg_pool2d(inside, self.stride) > 0.5)
+        self.register_buffer("inside", (F.avg_pool2d(inside[..., v0:v1, u0:u1], self.cell) > 0.5).double())
+        for axis, ((begin, end), side) in enumerate(zip(self.box, sides, strict=True)):
+            cells = (np.arange(begin, end, self.cell) + (self.cell - 1) / 2) / 2 ** (LEVELS - 1)
+            for i, (k, sigma) in enumerate(self.scales):
+                rows = np.arange(begin // 2**k - 1, end // 2**k + 1)
+                self._matrix(f"blur{i}", axis, blur_rows(side // 2**k, sigma, rows))
+                if 2**k > self.cell:
+                    places = (np.arange(begin, end, self.cell) + (self.cell - 1) / 2 - (2**k - 1) / 2) / 2**k
+                    self._matrix(f"spread{i}", axis, linear_rows(len(rows) - 2, places - begin // 2**k))
+            coarse = side // 2 ** (LEVELS - 1)
+            places = (cells - (2 ** (LEVELS - 1) - 1) / 2**LEVELS - 0.5) / 2
+            smooth = blur_rows(coarse // 2, 2.0, np.arange(coarse // 2)) @ halves(coarse)
+            self._matrix("background", axis, linear_rows(coarse // 2, places) @ smooth)
 
-    def response(self, image, sigma):
-        """`sigma^2 sqrt(det Hessian)` where the image is darkest, else 0."""
-        side = 2 * int(np.ceil(2.5 * sigma)) + 1
-        blurred = gaussian_blur2d(image, (side, side), (sigma, sigma), border_type="replicate")
-        uu, vv, uv = F.conv2d(F.pad(blurred, (1, 1, 1, 1), mode="replicate"), self.stencils).split(1, 1)
-        return sigma**2 * ((uu * vv - uv**2) * (uu + vv > 0)).clamp_min(1e-16).sqrt()
+    def _matrix(self, name, axis, matrix):
+        self.register_buffer(f"{name}_{'vu'[axis]}", torch.as_tensor(matrix if axis == 0 else matrix.T.copy()))
+
+    def apply(self, name, image):
+        return getattr(self, f"{name}_v") @ image @ getattr(self, f"{name}_u")
+
+    def response(self, levels, i):
+        """`sigma^4 det Hessian` where the image is darkest, else 0, `[B, 1, rows, columns]` of the cells."""
+        k, sigma = self.scales[i]
+        blurred = self.apply(f"blur{i}", levels[k])
+        middle = 2 * blurred[..., 1:-1, 1:-1]
+        uu = blurred[..., 1:-1, 2:] + blurred[..., 1:-1, :-2] - middle
+        vv = blurred[..., 2:, 1:-1] + blurred[..., :-2, 1:-1] - middle
+        across = blurred[..., 2:] - blurred[..., :-2]
+        uv = 0.25 * (across[..., 2:, :] - across[..., :-2, :])
+        response = sigma**4 * torch.where(uu + vv > 0, uu * vv - uv * uv, 0.0).clamp_min(0)
+        if 2**k > self.cell:
+            return self.apply(f"spread{i}", response)
+        return response if 2**k == self.cell else F.max_pool2d(response, 2)
 
     def forward(self, levels):
         """`levels` of `pyramid` with dark dots -> blobs `[B, K, 2]` px, log radius `[B, K]`, strength `[B, K]`."""
-        size = levels[self.level].shape[-2:]
-        responses = [self.response(levels[k], sigma) for k, sigma in self.scales]
-        background = gaussian_blur2d(F.avg_pool2d(levels[-1], 2), (7, 7), (2.0, 2.0), border_type="replicate")
-        maps = [F.interpolate(x, size, mode="bilinear") for x in (*responses, background)]
-        response = torch.cat(maps[:-1], 1) / (maps[-1] + 0.05)
-        peak = response.amax(1, keepdim=True) * self.inside
-        cells = F.max_pool2d(peak, 2)
+        background = self.apply("background", levels[-1]) + 0.05
+        scales = torch.cat([self.response(levels, i) for i in range(len(self.scales))], 1)
+        peak = scales.amax(1, keepdim=True) / background.square() * self.inside
         reach = self.reach
-        highest = F.max_pool2d(cells, (1, 2 * reach + 1), 1, (0, reach))
+        highest = F.max_pool2d(peak, (1, 2 * reach + 1), 1, (0, reach))
         highest = F.max_pool2d(highest, (2 * reach + 1, 1), 1, (reach, 0))
-        strength, cell = (cells * (cells == highest)).flatten(1).topk(self.count)
-        columns = cells.shape[-1]
-        corner = (cell // columns) * 2 * size[1] + (cell % columns) * 2
-        four = torch.stack([corner, corner + 1, corner + size[1], corner + size[1] + 1], -1)  # the cell's pixels
-        inner = peak.flatten(1).gather(1, four.flatten(1)).unflatten(1, four.shape[1:]).argmax(-1, keepdim=True)
-        index = four.gather(-1, inner).squeeze(-1)
-        scales = response.flatten(2).gather(2, index[:, None].expand(-1, len(self.scales), -1)) ** 4
-        log_radius = (scales * self.log_radii[:, None]).sum(1) / scales.sum(1).clamp_min(1e-20)
-        place = torch.stack([index % size[1], index // size[1]], -1).to(strength.dtype)
-        return place * self.stride + (self.stride - 1) / 2, log_radius, strength
+        strength, cell = (peak * (peak == highest)).flatten(1).topk(self.count)
+        rows, columns = peak.shape[-2:]
+        sides = torch.stack([cell - 1, cell + 1, cell - columns, cell + columns], -1).clamp(0, rows * columns - 1)
+        beside = (
+            peak.flatten(1).gather(1, sides.flatten(1)).unflatten(1, (-1, 2, 2)).clamp_min(1e-12).sqrt()
+        )  # [B, K, uv, before or after]
+        strength = strength.clamp_min(1e-20).sqrt()
+        before, after = beside.unbind(-1)
+        shift = 0.5 * (after - before) / (2 * strength[..., None] - after - before).clamp_min(1e-12)
+        place = torch.stack([cell % columns, cell // columns], -1) + shift.clamp(-0.5, 0.5)
+        scale = scales.flatten(2).gather(2, cell[:, None].expand(-1, len(self.scales), -1)).square()
+        log_radius = (scale * self.log_radii[:, None]).sum(1) / scale.sum(1).clamp_min(1e-20)
+        (v0, _), (u0, _) = self.box
+        place = place * self.cell + (self.cell - 1) / 2 + place.new_tensor([u0, v0])
+        return place, log_radius, strength
 
 
 def membrane_mask(pixels, anchors, image_size):

@@ -5,7 +5,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import nn
 
-SETTLING = 4  # steps after the growth has reached every dot
+SETTLING = 6  # steps after the growth has reached every dot
 WIDTH = 1.1  # of the local average, pitches
 RIDGE = 0.5  # pulls the flow's gradient to the one measured, where neighbours do not fix it
 TOLERANCE = 0.30  # standard deviation of a prediction, pitches
