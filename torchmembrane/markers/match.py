@@ -46,115 +46,116 @@ def inverse_2x2(matrix):
     return torch.stack([d, -b, -c, a], -1).unflatten(-1, (2, 2)) / (a * d - b * c)[..., None, None]
 
 
+def square_distance(x, y):
+    """`[..., K, D]` between the points `x [..., K, 2]` and `y [..., D, 2]`."""
+    return (x.square().sum(-1)[..., None] + y.square().sum(-1)[..., None, :] - 2 * x @ y.mT).clamp_min(0)
+
+
 class LocalDeformation(nn.Module):
     """The deformation gradient at every blob of a frame, from the arrangement of the blobs around it alone.
 
     The dots next to the rest dot at that place are mapped by `A`, laid on the nearest blobs, and `A` fitted, a fixed
     number of times, with an average over nearby blobs between. Nothing needs to be known of which blob is which dot.
+    Blobs are the last axis throughout.
     """
 
     def __init__(self, pixels):
         super().__init__()
         near = cKDTree(pixels).query(pixels, k=min(NEIGHBOURS + 1, len(pixels)))[1][:, 1:]
+        pitch = spacing(pixels)[1]
+        around = (pixels[near] - pixels[:, None]) / pitch[:, None, None]
         self.register_buffer("pixels", torch.as_tensor(pixels))
-        self.register_buffer("pitch", torch.as_tensor(spacing(pixels)[1]))
-        self.register_buffer("around", torch.as_tensor(pixels[near] - pixels[:, None]))
+        self.register_buffer("table", torch.as_tensor(np.column_stack([around.reshape(len(pixels), -1), pitch])))
 
     def forward(self, blobs, valid):
-        """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, K, 2, 2]`."""
-        nearest = (blobs[:, :, None] - self.pixels).square().sum(-1).argmin(-1)
-        pitch = self.pitch[nearest]
-        around = self.around[nearest] / pitch[..., None, None]  # [B, K, M, 2]
-        apart = (blobs[:, :, None] - blobs[:, None]).square().sum(-1)
+        """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, 2, 2, K]`."""
+        middle = self.pixels.mean(0)
+        local = self.table[square_distance(blobs - middle, self.pixels - middle).argmin(-1)].mT
+        around, pitch = local[:, :-1].unflatten(1, (-1, 2)), local[:, -1]  # [B, M, 2, K]
+        apart = square_distance(blobs - middle, blobs - middle)
         index = (apart + FAR * (1 - valid[:, None])).topk(min(13, blobs.shape[1]), largest=False).indices[..., 1:]
-        others = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
-        others = (others - blobs[:, :, None]) / pitch[..., None, None]  # [B, K, 12, 2]
-        there = valid.gather(1, index.flatten(1)).unflatten(1, index.shape[1:])
+        known = torch.cat([blobs.mT, valid[:, None]], 1)
+        beside = known.gather(2, index.mT.flatten(1)[:, None].expand(-1, 3, -1)).unflatten(2, (-1, blobs.shape[1]))
+        others = ((beside[:, :2] - blobs.mT[:, :, None]) / pitch[:, None, None]).transpose(1, 2)  # [B, 12, 2, K]
+        there = beside[:, 2]
         nearby = torch.exp(-apart / (2 * (0.8 * pitch[..., None]) ** 2)) * valid[:, None]
-        eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)
-        ratio = others[..., :4, :].square().sum(-1).clamp_min(1e-12).sqrt().mean(-1).clamp(0.4, 2.0)
-        gradient = ratio[..., None, None] * eye
+        eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
+        ratio = others[:, :4].square().sum(2).clamp_min(1e-12).sqrt().mean(1).clamp(0.4, 2.0)
+        gradient = ratio[:, None, None] * eye
         for width in (0.35, 0.3, 0.25, 0.2, 0.2, 0.2):
-            mapped = around @ gradient.mT
-            square = (mapped[..., None, :] - others[..., None, :, :]).square().sum(-1)
-            likely = torch.exp(-square / (2 * width**2)) * there[..., None, :]
-            total = likely.sum(-1)
-            target = (likely @ others) / (total[..., None] + 1e-9)
+            mapped = (gradient[:, None] * around[:, :, None]).sum(3)
+            square = (mapped[:, :, None] - others[:, None]).square().sum(3)  # [B, M, 12, K]
+            likely = torch.exp(square * (-0.5 / width**2)) * there[:, None]
+            total = likely.sum(2)
+            target = (likely[:, :, :, None] * others[:, None]).sum(2) / (total + 1e-9)[:, :, None]
             weight = total / (total + 0.1)
-            weighted = around.mT * weight[..., None, :]
-            moment = weighted @ around
-            fitted = ((weighted @ target).mT + 0.2 * gradient) @ inverse_2x2(moment + 0.2 * eye)
-            quality = valid * weight.mean(-1) ** 2
-            share = nearby * quality[:, None]
-            share = share / (share.sum(-1, keepdim=True) + 1e-6)
-            gradient = (share @ fitted.flatten(-2)).unflatten(-1, (2, 2))
-            gradient = gradient + (1 - share.sum(-1))[..., None, None] * eye
+            weighted = around * weight[:, :, None]
+            moment, cross = (torch.cat([around, target], 2)[:, :, :, None] * weighted[:, :, None]).sum(1).split(2, 1)
+            a, b, _, d = (moment + 0.2 * eye).flatten(1, 2).unbind(1)
+            adjugate = torch.stack([d, -b, -b, a], 1).unflatten(1, (2, 2))
+            fitted = ((cross + 0.2 * gradient)[:, :, :, None] * adjugate[:, None]).sum(2).flatten(1, 2)
+            quality = (valid * weight.mean(1).square())[:, None]
+            scaled = fitted * (quality / (a * d - b * b)[:, None])
+            average = torch.cat([scaled, quality], 1) @ nearby.mT + 1e-6 * eye.new_tensor([1, 0, 0, 1, 1])[:, None]
+            gradient = (average[:, :4] / average[:, 4:]).unflatten(1, (2, 2))
         return gradient
 
 
 class LocalFlow(nn.Module):
     """Moving averages of the flow around every dot, over its neighbours, itself left out.
 
-    Weights `w_n exp(-|x_n - x_d|^2 / 2 h_d^2)`, `h_d` the local pitch times `width`.
+    Weights `w_n exp(-|x_n - x_d|^2 / 2 h_d^2)`, `h_d` the local pitch times `width`. The last nodes, the anchors, have no
+    flow and weight 1. Dots are the last axis throughout: weight `[B, D]`, flow `[B, 2, D]`, gradient `[B, 2, 2, D]`.
     """
 
     def __init__(self, pixels, nodes, width):
         super().__init__()
-        h = width * spacing(pixels)[1]
+        count, h = len(pixels), width * spacing(pixels)[1]
         y = (nodes[:, None] - pixels) / h[None, :, None]  # [N, D, 2]
-        kernel = np.exp(-0.5 * (y**2).sum(-1))
-        kernel[np.arange(len(pixels)), np.arange(len(pixels))] = 0
+        self.kernel = np.exp(-0.5 * (y**2).sum(-1))
+        self.kernel[np.arange(count), np.arange(count)] = 0
         u, v = y[..., 0], y[..., 1]
-        moments = kernel * np.stack([np.ones_like(u), u, v, u * u, u * v, v * v])  # [6, N, D]
-        self.register_buffer("moments", torch.as_tensor(np.moveaxis(moments, 0, 1).reshape(len(nodes), -1)))
+        moments = self.kernel * np.stack([np.ones_like(u), u, v, u * u, u * v, v * v])  # [6, N, D]
+        self.register_buffer("moments", torch.as_tensor(np.moveaxis(moments[:, :count], 0, 1).reshape(count, -1).copy()))
+        self.register_buffer("still", torch.as_tensor(moments[:, count:].sum(1)))
         self.register_buffer("h", torch.as_tensor(h))
 
     def rings(self, weight):
         """How many steps it takes the growth from the nodes `weight [S, N]` to reach every dot it can reach."""
-        kernel = self.moments[:, : self.h.numel()].numpy()
-        reached, count = weight, 0
+        count, reached, steps = self.kernel.shape[1], weight, 0
         while True:
-            grown = np.maximum(reached[:, : kernel.shape[1]], reached @ kernel * 0.7 > SUPPORT)
-            if (grown == reached[:, : kernel.shape[1]]).all():
-                return count
-            reached, count = np.column_stack([grown, reached[:, kernel.shape[1] :]]), count + 1
+            grown = np.maximum(reached[:, :count], reached @ self.kernel * 0.7 > SUPPORT)
+            if (grown == reached[:, :count]).all():
+                return steps
+            reached, steps = np.column_stack([grown, reached[:, count:]]), steps + 1
 
-    def forward(self, weight, flow, gradient):
-        """Least-squares affine flow `f(x) ~ f_d + J_d (x - x_d)`.
-
-        `weight [B, N]`, `flow [B, N, 2]` at the nodes -> flow `[B, D, 2]`, gradient `[B, D, 2, 2]`, support `[B, D]`.
-        """
-        count = self.h.numel()
-        s, su, sv, suu, suv, svv = (weight @ self.moments).unflatten(-1, (6, count)).unbind(-2)
-        load = (weight[:, None] * flow.mT) @ self.moments[:, : 3 * count]
-        load = load.unflatten(-1, (3, count)).movedim(1, -1)  # [B, 3, D, 2]
-        prior = RIDGE * self.h[:, None, None] * gradient.mT
-        load = torch.cat([load[:, :1], load[:, 1:] + prior.movedim(-2, 1)], 1)
+    def gradient(self, weight, flow, prior):
+        """Gradient `[B, 2, 2, D]` of the least-squares affine flow, drawn to `prior` where neighbours do not fix it."""
+        rows = weight[:, None] * torch.cat([torch.ones_like(weight)[:, None], flow], 1)
+        sums = (rows @ self.moments).unflatten(-1, (6, -1))  # [B, 3, 6, D]
+        s, su, sv, suu, suv, svv = (sums[:, 0] + self.still).unbind(1)
+        load = torch.cat([sums[:, 1:, :1], sums[:, 1:, 1:3] + RIDGE * self.h * prior], 2)
         suu, svv, s1 = suu + RIDGE, svv + RIDGE, s + 1e-3
         # adjugate of the symmetric 3 x 3 normal matrix
         c00, c01, c02 = suu * svv - suv**2, suv * sv - su * svv, su * suv - suu * sv
         c11, c12, c22 = s1 * svv - sv**2, su * sv - s1 * suv, s1 * suu - su**2
-        adjugate = torch.stack([c00, c01, c02, c01, c11, c12, c02, c12, c22], -1).unflatten(-1, (3, 3))
-        determinant = s1 * c00 + su * c01 + sv * c02
-        fit = (adjugate @ load.movedim(-3, -2)) / determinant[..., None, None]
-        return fit[..., 0, :], fit[..., 1:, :].mT / self.h[:, None, None], s
+        adjugate = torch.stack([c01, c11, c12, c02, c12, c22], 1).unflatten(1, (2, 3))
+        determinant = (s1 * c00 + su * c01 + sv * c02) * self.h
+        return (load[:, :, None] * adjugate[:, None]).sum(3) / determinant[:, None, None]
 
     def along(self, weight, flow, gradient):
-        """The same where the gradient is known at the dots: `f_d = mean_n f_n + (J_n + J_d) / 2 (x_d - x_n)`.
-
-        `gradient [B, D, 2, 2]`; anchors, the last nodes, take that of the dot.
+        """Flow `f_d = mean_n f_n + (J_n + J_d) / 2 (x_d - x_n)` where the gradient is known at the dots, and the support
+        `[B, D]`; anchors take the gradient of the dot.
         """
+        one = torch.ones_like(weight)[:, None]
+        rows = weight[:, None] * torch.cat([one, flow, gradient.flatten(1, 2) / 2], 1)
         count = self.h.numel()
-        kernel, ku, kv = self.moments[:, : 3 * count].unflatten(-1, (3, count)).unbind(-2)
-        dots, anchors = weight[:, :count], weight[:, count:]
-        support = weight @ kernel
-        sum_flow = (weight[:, None] * flow.mT) @ kernel  # [B, 2, D]
-        own = torch.stack([dots @ k[:count] / 2 + anchors @ k[count:] for k in (ku, kv)], -1)  # [B, D, 2]
-        theirs = (dots[..., None, None] * gradient / 2).movedim(1, -1)  # [B, 2, 2, D]
-        theirs = theirs[:, :, 0] @ ku[:count] + theirs[:, :, 1] @ kv[:count]  # [B, 2, D]
-        mine = (gradient @ own[..., None]).squeeze(-1)
-        total = sum_flow.mT - (theirs.mT + mine) * self.h[:, None]
-        return total / (support[..., None] + 1e-3), support
+        sums = (rows @ self.moments[:, : 3 * count]).unflatten(-1, (3, count))  # [B, 7, 3, D]
+        support = sums[:, 0, 0] + self.still[0]
+        own = sums[:, 0, 1:] / 2 + self.still[1:3]
+        theirs = sums[:, 3::2, 1] + sums[:, 4::2, 2]
+        mine = (gradient * own[:, None]).sum(2)
+        return (sums[:, 1:3, 0] - self.h * (theirs + mine)) / (support + 1e-3)[:, None], support
 
 
 class Coherence(nn.Module):
@@ -227,59 +228,56 @@ class DotMatcher(nn.Module):
         self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
         self.register_buffer("pixels", torch.as_tensor(pixels - pixels.mean(0)))
         self.register_buffer("nearest", torch.as_tensor(nearest))
+        self.register_buffer("stiffness", torch.as_tensor((TOLERANCE * nearest) ** -2.0))
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
         starts = np.zeros((1, len(pixels))) if len(anchors) else sectors(pixels)
         self.register_buffer("starts", torch.as_tensor(starts))
         self.steps = self.local.rings(np.column_stack([starts, np.ones((len(starts), len(anchors)))])) + 3
-        self.register_buffer("still", torch.zeros(len(anchors), 2, dtype=torch.float64))
-
-    def with_anchors(self, weight, flow):
-        still = self.still.expand(flow.shape[0], -1, -1)
-        return torch.cat([weight, torch.ones_like(still[..., 0])], 1), torch.cat([flow, still], 1)
 
     def predict(self, weight, flow, strain):
-        """Flow, gradient and support at the dots, from the dots `weight [B, D]`, `flow [B, D, 2]` and the anchors."""
-        weight, flow = self.with_anchors(weight, flow)
-        _, gradient, _ = self.local(weight, flow, strain)
+        """Flow `[B, D, 2]`, gradient `[B, D, 2, 2]` and support `[B, D]` at the dots, from weight, flow and strain there."""
+        flow, strain = flow.mT, strain.movedim(1, -1)
+        gradient = self.local.gradient(weight, flow, strain)
         predicted, support = self.local.along(weight, flow, gradient)
-        return predicted, gradient, support
+        return predicted.mT, gradient.movedim(-1, 1), support
 
-    def choose(self, predicted, support, blobs, misfit):
-        """Each dot's blob: its certainty `[B, D]`, the flow to it `[B, D, 2]` (the prediction where lost), its index.
+    def choose(self, predicted, support, blobs, base):
+        """Each dot's blob: its certainty `[B, D]`, the flow to it `[B, 2, D]` (the prediction where lost), its strain
+        `[B, 2, 2, D]`.
 
-        `misfit [B, D, K]`: squared size differences, in standard deviations.
+        `blobs [B, 6, K]`: positions and strains; `base [B, D, K]`: what of the cost does not depend on the prediction.
         """
-        expected = self.pixels + predicted
-        square = expected.square().sum(-1)[..., None] + blobs.square().sum(-1)[:, None] - 2 * expected @ blobs.mT
-        cost = square / (TOLERANCE * self.nearest[:, None]) ** 2 + misfit
-        cost = cost + FAR * (support[..., None] < SUPPORT)
+        expected = self.pixels.mT + predicted
+        alone = expected.square().sum(1) * self.stiffness + FAR * (support < SUPPORT)
+        cost = (-2 * self.stiffness * expected).mT @ blobs[:, :2] + base + alone[..., None]
         best, chosen = cost.min(-1)
-        mutual = best <= cost.amin(1).gather(1, chosen) * (1 + 1e-6)
+        mutual = best <= cost.amin(1).gather(1, chosen) + 1e-6 * best.abs()
         weight = torch.exp(-0.5 * best) * mutual * (support / (support + 0.5))
-        flow = blobs.gather(1, chosen[..., None].expand(-1, -1, 2)) - self.pixels
-        return weight, torch.where(weight[..., None] > 0.02, flow, predicted), chosen
+        found, strain = blobs.gather(2, chosen[:, None].expand(-1, 6, -1)).split([2, 4], 1)
+        flow = torch.where(weight[:, None] > 0.02, found - self.pixels.mT, predicted)
+        return weight, flow, strain.unflatten(1, (2, 2))
 
     def forward(self, blobs, log_radius, valid):
-        """`blobs [B, K, 2]`, `log_radius`, `valid [B, K]` -> positions `[B, D, 2]` and certainty `[B, D]` in 0..1."""
-        deformation = self.deformation(blobs, valid)
-        strain = (deformation - torch.eye(2, dtype=blobs.dtype, device=blobs.device)).flatten(-2)
-        blobs = blobs - self.origin
+        """`blobs [B, K, 2]`, `log_radius`, `valid [B, K]` -> positions `[B, D, 2]`, certainty `[B, D]` in 0..1 and strain
+        `[B, D, 2, 2]`."""
+        strain = self.deformation(blobs, valid) - torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
+        known = torch.cat([(blobs - self.origin).mT, strain.flatten(1, 2)], 1)
         misfit = ((self.log_radius[:, None] - (log_radius + 3 * (1 - valid))[:, None]) / self.size_tolerance).square()
+        base = misfit + self.stiffness[:, None] * known[:, :2].square().sum(1, keepdim=True)
         starts = self.starts.shape[0]
-        blobs, misfit, strain = (x[:, None].expand(-1, starts, -1, -1).flatten(0, 1) for x in (blobs, misfit, strain))
-        flow = torch.zeros_like(self.pixels).expand(blobs.shape[0], -1, -1)
-        weight, flow, chosen = self.choose(flow, FAR + flow[..., 0], blobs, misfit)
+        if starts > 1:
+            known, base = (x[:, None].expand(-1, starts, -1, -1).flatten(0, 1) for x in (known, base))
+        flow = torch.zeros_like(self.pixels.mT).expand(known.shape[0], -1, -1)
+        weight, flow, strain = self.choose(flow, FAR + flow[:, 0], known, base)
         weight = (weight.unflatten(0, (-1, starts)) * self.starts).flatten(0, 1)
         for _ in range(self.steps):
-            gradient = strain.gather(1, chosen[..., None].expand(-1, -1, 4)).unflatten(-1, (2, 2))
-            predicted, support = self.local.along(*self.with_anchors(weight, flow), gradient)
-            weight, flow, chosen = self.choose(predicted, support, blobs, misfit)
+            weight, flow, strain = self.choose(*self.local.along(weight, flow, strain), known, base)
         for _ in range(SETTLING):
-            gradient = strain.gather(1, chosen[..., None].expand(-1, -1, 4)).unflatten(-1, (2, 2))
-            predicted, _, support = self.predict(weight, flow, gradient)
-            weight, flow, chosen = self.choose(predicted, support, blobs, misfit)
-        weight, flow = weight.unflatten(0, (-1, starts)), flow.unflatten(0, (-1, starts))
-        best = weight.sum(-1).argmax(-1)[:, None, None].expand(-1, -1, self.pixels.shape[0])
-        flow = flow.gather(1, best[..., None].expand(-1, -1, -1, 2)).squeeze(1)
-        gradient = gradient.unflatten(0, (-1, starts)).gather(1, best[..., None, None].expand(-1, -1, -1, 2, 2)).squeeze(1)
-        return self.pixels + self.origin + flow, weight.gather(1, best).squeeze(1), gradient
+            gradient = self.local.gradient(weight, flow, strain)
+            weight, flow, strain = self.choose(*self.local.along(weight, flow, gradient), known, base)
+        if starts > 1:
+            weight, flow, strain = (x.unflatten(0, (-1, starts)) for x in (weight, flow, strain))
+            best = weight.sum(-1).argmax(-1)[:, None]
+            take = lambda x: torch.take_along_dim(x, best.reshape(-1, *(1,) * (x.ndim - 1)), 1).squeeze(1)  # noqa: E731
+            weight, flow, strain = take(weight), take(flow), take(strain)
+        return self.pixels + self.origin + flow.mT, weight, strain.movedim(-1, 1)
