@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from torchmembrane.solve import block_tridiagonal, matrix_products
 from torchmembrane.solve.conjugate_gradient import conjugate_gradient
 from torchmembrane.solve.kkt import constrained_minimum
 
@@ -46,3 +47,32 @@ def test_two_solves_equal_the_dense_kkt_system(compliance):
     want = torch.linalg.solve(kkt, torch.cat([g, c[:, None]], 1))
     torch.testing.assert_close(got.y, want[:, :9])
     torch.testing.assert_close(got.multiplier, want[:, 9])
+
+
+def _grid_system(blocks, size, dtype, seed=0):
+    """A positive definite block-tridiagonal system with a diagonal of about 1 and a right-hand side."""
+    generator = torch.Generator().manual_seed(seed)
+    rows = torch.randn(2, blocks, 2 * size, 2 * size, dtype=torch.float64, generator=generator) / (2 * size) ** 0.5
+    gram = rows.mT @ rows
+    diagonal = gram[..., :size, :size].clone() + 1e-2 * torch.eye(size, dtype=torch.float64)
+    diagonal[:, 1:] += gram[:, :-1, size:, size:]
+    b = torch.randn(2, blocks, size, 3, dtype=torch.float64, generator=generator)
+    return diagonal.to(dtype), gram[:, :-1, :size, size:].to(dtype), b.to(dtype)
+
+
+@pytest.mark.parametrize("dtype, bound", [(torch.float64, 1e-9), (torch.float32, 2e-4)])
+@pytest.mark.parametrize("blocks, size", [(1, 9), (4, 42), (7, 90)])
+def test_elimination_by_products_agrees_with_cholesky(blocks, size, dtype, bound):
+    diagonal, upper, b = _grid_system(blocks, size, dtype)
+    ours = matrix_products.solve(matrix_products.factor(diagonal, upper), b)
+    theirs = block_tridiagonal.solve(block_tridiagonal.factor(diagonal.double(), upper.double()), b.double())
+    assert (ours - theirs).norm() / theirs.norm() < bound
+
+
+@pytest.mark.parametrize("size", [3, 47, 96])
+def test_inverse_by_products(size):
+    generator = torch.Generator().manual_seed(size)
+    q, _ = torch.linalg.qr(torch.randn(2, size, size, dtype=torch.float64, generator=generator))
+    matrix = q @ torch.diag(torch.logspace(-3, 0, size, dtype=torch.float64)) @ q.mT
+    one = torch.eye(size, dtype=torch.float64)
+    assert (matrix_products.inverse(matrix) @ matrix - one).abs().max() < 1e-9

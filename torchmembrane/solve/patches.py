@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from .block_tridiagonal import factor, solve
+from . import block_tridiagonal, matrix_products
 
 
 class PatchIndex(nn.Module):
@@ -53,7 +53,7 @@ class PatchSystem(nn.Module):
     def matrix(self, parts: list[tuple[PatchIndex, Tensor]]) -> Tensor:
         """Sum of patches `[B, N, 3k, 3k]`: the blocks on and above the diagonal, flat, `[B, ...]`."""
         s, batch = self.block_size, parts[0][1]
-        total = batch.new_zeros(len(batch), (2 * self.blocks - 1) * s * s + 1)
+        total = batch.new_zeros(batch.shape[0], (2 * self.blocks - 1) * s * s + 1)
         for index, patches in parts:
             total = total.index_add(1, index.matrix, patches.flatten(1))
         return total
@@ -61,19 +61,19 @@ class PatchSystem(nn.Module):
     def vector(self, parts: list[tuple[PatchIndex, Tensor]]) -> Tensor:
         """Sum of patch vectors `[B, N, 3k]`, in the system's order `[B, unknowns]`."""
         batch = parts[0][1]
-        total = batch.new_zeros(len(batch), self.blocks * self.block_size + 1)
+        total = batch.new_zeros(batch.shape[0], self.blocks * self.block_size + 1)
         for index, patches in parts:
             total = total.index_add(1, index.vector, patches.flatten(1))
         return total[:, :-1]
 
     def from_vertices(self, field: Tensor) -> Tensor:
         """A vertex field `[B, V, 3]` in the system's order."""
-        total = field.new_zeros(len(field), self.blocks * self.block_size)
+        total = field.new_zeros(field.shape[0], self.blocks * self.block_size)
         return total.index_copy(1, self.unknowns, field[:, self.free].flatten(1))
 
     def to_vertices(self, vector: Tensor) -> Tensor:
         """The vertex field `[B, V, 3]` of a vector in the system's order; zero where fixed."""
-        field = vector.new_zeros(len(vector), len(self.place), 3)
+        field = vector.new_zeros(vector.shape[0], len(self.place), 3)
         return field.index_copy(1, self.free, vector[:, self.unknowns].unflatten(1, (-1, 3)))
 
     def solve(self, matrix: Tensor, loads: Tensor, damping: float = 1e-6) -> Tensor:
@@ -87,4 +87,5 @@ class PatchSystem(nn.Module):
         above = above * scale[:, :-1, :, None] * scale[:, 1:, None, :]
         flat_scale = scale.flatten(1)[..., None]
         scaled = (loads * flat_scale).unflatten(1, (blocks, s))
-        return solve(factor(diagonal, above), scaled).flatten(1, 2) * flat_scale
+        elimination = matrix_products if torch.compiler.is_exporting() else block_tridiagonal
+        return elimination.solve(elimination.factor(diagonal, above), scaled).flatten(1, 2) * flat_scale

@@ -1,0 +1,79 @@
+"""The solves of `block_tridiagonal` by matrix products alone, for runtimes that have no Cholesky factor: ONNX.
+
+An inverse is split into 2 x 2 blocks down to `LEAF` rows, and there iterated, `X <- X (2 I - A X)` (Schulz 1933), with `X`
+scaled in between so that the eigenvalues of `A X` lie evenly about 1: each step then divides their spread by four.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+LEAF = 48
+LARGEST_CONDITION = 1e4  # of a leaf, Jacobi-scaled
+
+
+class BlockInverse(NamedTuple):
+    """`P_i^-1` of the pivots `P_i` and `P_i^-1 U_i`, each a list of `[..., s, s]`."""
+
+    pivots: list[Tensor]
+    upper: list[Tensor]
+
+
+def schulz_scales(condition: float, rounding: float) -> list[float]:
+    """By what to scale `X` before every step, for eigenvalues of `A X` from `1 / condition` to 1 at first."""
+    low, scales = 1 / condition, []
+    while not scales or 1 - low > rounding:
+        scales.append(2 / (1 + low))
+        low = 1 - (1 - scales[-1] * low) ** 2
+    return [*scales, 1.0]
+
+
+def inverse(matrix: Tensor) -> Tensor:
+    """Inverse of symmetric positive definite `[..., n, n]`, best with a diagonal of about 1.
+
+    Wrong when a leaf's condition exceeds `LARGEST_CONDITION`: its smallest eigenvalues are then too small in the inverse.
+    """
+    n = matrix.shape[-1]
+    if n > LEAF:
+        k = n // 2
+        A, B, C = matrix[..., :k, :k], matrix[..., :k, k:], matrix[..., k:, k:]
+        P = inverse(A)
+        PB = P @ B
+        Q = inverse(C - B.mT @ PB)
+        R = PB @ Q
+        return torch.cat([torch.cat([P + R @ PB.mT, -R], -1), torch.cat([-R.mT, Q], -1)], -2)
+    two = 2 * torch.eye(n, dtype=matrix.dtype, device=matrix.device)
+    largest = matrix.abs().sum(-1).amax(-1)[..., None, None]
+    first, *scales = schulz_scales(LARGEST_CONDITION, torch.finfo(matrix.dtype).eps)
+    X = (first / largest) * (two - (first / largest) * matrix)
+    for scale in scales:
+        X = scale * X
+        X = X @ (two - matrix @ X)
+    return (X + X.mT) / 2
+
+
+def factor(diagonal: Tensor, upper: Tensor) -> BlockInverse:
+    """Block elimination; arguments as for `block_tridiagonal.factor`."""
+    pivots, coupled = [], []
+    pivot = diagonal[..., 0, :, :]
+    for i in range(diagonal.shape[-3]):
+        scale = pivot.diagonal(dim1=-2, dim2=-1).rsqrt()
+        pivots.append(inverse(pivot * scale[..., :, None] * scale[..., None, :]) * scale[..., :, None] * scale[..., None, :])
+        if i + 1 < diagonal.shape[-3]:
+            U = upper[..., i, :, :]
+            coupled.append(pivots[-1] @ U)
+            pivot = diagonal[..., i + 1, :, :] - U.mT @ coupled[-1]
+    return BlockInverse(pivots, coupled)
+
+
+def solve(factored: BlockInverse, b: Tensor) -> Tensor:
+    """`M^-1 b` for `b [..., n, s, C]`."""
+    forward = []
+    for i in range(len(factored.pivots)):
+        forward.append(b[..., i, :, :] - (factored.upper[i - 1].mT @ forward[-1] if i else 0.0))
+    x = []
+    for i in reversed(range(len(factored.pivots))):
+        own = factored.pivots[i] @ forward[i]
+        x.append(own - factored.upper[i] @ x[-1] if x else own)
+    return torch.stack(x[::-1], -3)
