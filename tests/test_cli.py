@@ -192,7 +192,7 @@ def test_view_draws_a_stored_result(built_once, monkeypatch, tmp_path, capsys):
     assert code == 2 and "mesh.npz" in errors
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "check", "view"])
+@pytest.mark.parametrize("command", ["reconstruct", "check", "view", "export"])
 def test_help_shows_examples_and_exit_codes(command, capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main([command, "--help"])

@@ -52,6 +52,17 @@ examples:
 Without --out a window is opened; without a display, RESULT_view.png is written."""
 
 
+EXPORT_EXAMPLES = """\
+examples:
+  torchmembrane export sensor.toml -o model.onnx
+  torchmembrane export preset:fingertip -o fingertip.onnx --estimator force-balance
+
+The model takes `image` [batch, 1, height, width], grey in 0..1, and gives the arrays of a NAME.npz, a row a frame. To run it
+without torch: the package torchmembrane-edge (folder export/). Needs: pip install "torchmembrane[export]"
+
+exit code: 0 written, 2 wrong usage or sensor file"""
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command with these arguments (default: the process's); returns the exit code."""
     arguments = _parser().parse_args(argv)
@@ -108,6 +119,23 @@ def check(arguments) -> int:
     return 0
 
 
+def export(arguments) -> int:
+    """`torchmembrane export`"""
+    try:
+        from .export import export as write_model
+    except ImportError as error:
+        raise MembraneError(
+            f'export needs {error.name}, which is not installed: pip install "torchmembrane[export]"'
+        ) from error
+    sensor = Sensor.from_file(sensor_file(arguments.sensor))
+    energy = arguments.energy or sensor.material.model
+    settings = Settings(arguments.estimator, energy, arguments.element, FORMATS[0])
+    reconstructor = Reconstructor(sensor, arguments.estimator, model=energy, element=arguments.element)
+    write_model(reconstructor, arguments.out, settings)
+    print(f"written: {arguments.out}, {arguments.out.stat().st_size / 1e6:.1f} MB")
+    return 0
+
+
 def view(arguments) -> int:
     """`torchmembrane view`"""
     from .view import figure, save, show
@@ -143,6 +171,7 @@ def _parser() -> argparse.ArgumentParser:
     add_simulate(commands, _command)
     _check_parser(commands)
     _view_parser(commands)
+    _export_parser(commands)
     return parser
 
 
@@ -175,6 +204,15 @@ def _view_parser(commands) -> None:
     add("--mesh", metavar="mesh.npz", type=Path, help="the mesh of its folder (default: mesh.npz beside it)")
     add("--image", metavar="IMAGE", type=Path, help="the frame's image, drawn behind the flow")
     add("--out", metavar="FILE.png", type=Path, help="where to draw it (default: in a window, if there is a display)")
+
+
+def _export_parser(commands) -> None:
+    add = _command(commands, "export", export, "write image to result as one ONNX model", EXPORT_EXAMPLES)
+    add("sensor", metavar="SENSOR.toml", help="the sensor file, or preset:NAME")
+    add("-o", "--out", metavar="MODEL.onnx", type=Path, required=True, help="the model's file")
+    add("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="how it is found (default: %(default)s)")
+    add("--energy", choices=MODELS, help="the sheet's elastic energy (default: the sensor file's)")
+    add("--element", choices=ELEMENTS, default=ELEMENTS[0], help="as for reconstruct (default: %(default)s)")
 
 
 def _command(commands, name: str, run, purpose: str, examples: str):

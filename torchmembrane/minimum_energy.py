@@ -84,11 +84,25 @@ class MinimumEnergy(nn.Module):
 
     def forward(self, origins: Tensor, directions: Tensor) -> Equilibrium:
         """`origins`, `directions [..., V, 3]`: the ray of every grid vertex now. Returns the `Equilibrium`."""
+        t, pressure = self.start(directions)
         state = _State(self, origins, directions)
-        t = self.rest_range.expand(directions.shape[:-1])
-        pressure = self.rest_pressure.expand(directions.shape[:-2])
         for _ in range(self.steps):
             t, pressure = self._newton_step(state, t, pressure)
+        return self._equilibrium(state, t, pressure)
+
+    def start(self, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """The rest ranges `[..., V]` and the rest pressure `[...]`, from which the steps begin."""
+        return self.rest_range.expand(directions.shape[:-1]), self.rest_pressure.expand(directions.shape[:-2])
+
+    def step(self, t: Tensor, pressure: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """One Newton step in the ranges `t [..., V]` and the pressure `[...]`."""
+        return self._newton_step(_State(self, origins, directions), t, pressure)
+
+    def equilibrium(self, t: Tensor, pressure: Tensor, origins: Tensor, directions: Tensor) -> Equilibrium:
+        """What these ranges and this pressure amount to, and how far they are from a solution."""
+        return self._equilibrium(_State(self, origins, directions), t, pressure)
+
+    def _equilibrium(self, state: "_State", t: Tensor, pressure: Tensor) -> Equilibrium:
         x = state.surface(t)
         left = symmetric_product(self.inverse, state.load(t, pressure)[..., None])
         error = left.abs().amax((-1, -2)) / self.membrane.rest_area.sum().sqrt()

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from . import results
+from .camera import Rays
 from .contact import contact_indicator, contact_points
 from .energy import Sheet
 from .errors import MembraneError
@@ -134,7 +135,10 @@ class Reconstructor(nn.Module):
         in 0..1 or uint8. Grey is 0.299 R + 0.587 G + 0.114 B. Raises `MembraneError` for another size; a frame that cannot be
         reconstructed gets a status and NaN, the others are not touched.
         """
-        images = self._as_batch(images)
+        return self._reconstruct(*self.observe(self._as_batch(images)))
+
+    def observe(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Marker displacements `[B, D, 2]` px, confidence `[B, D]` and status `[B]` of grey images `[B, 1, height, width]`."""
         bad = ~(images.isfinite() & (images > -1e-3) & (images < 1.001)).flatten(1).all(1)
         images = torch.where(bad[:, None, None, None], 0.0, images)
         flat = images.flatten(1)
@@ -143,7 +147,7 @@ class Reconstructor(nn.Module):
         blank = (contrast < LEAST_CONTRAST) | ((saturated > SATURATED_SHARE) & (flat.mean(1) > 0.5))
         pixels, confidence = self.locator(images)
         status = torch.where(bad, results.BAD_VALUES, torch.where(blank, results.BLANK, results.OK))
-        return self._reconstruct(pixels - self.measured_rest, confidence, status)
+        return pixels - self.measured_rest, confidence, status
 
     def from_pixels(
         self, pixels: Tensor, confidence: Tensor | None = None, rest_pixels: Tensor | None = None
@@ -168,19 +172,24 @@ class Reconstructor(nn.Module):
         return self._reconstruct(displacement, confidence, torch.zeros_like(confidence[:, 0], dtype=torch.long))
 
     def _reconstruct(self, displacement: Tensor, confidence: Tensor, status: Tensor) -> Reconstruction:
-        found = confidence > FOUND
-        confidence = torch.where(found, confidence, 0.0)
-        status = torch.where(status == results.OK, _marker_status(found), status)
-        usable = status == results.OK
-        displacement_used = displacement * usable[:, None, None]
-        if self.finds_contacts:
-            equilibrium = self.estimator(*self.camera.pixel_to_ray(self.rest_pixels + displacement_used), confidence)
-        else:
-            flow = self.flow(displacement_used, confidence)
-            equilibrium = self.estimator(*self.camera.pixel_to_ray(self.vertex_pixels + flow))
-        return self._result(equilibrium, displacement, confidence, status)
+        usable, confidence, status = self.judge(displacement, confidence, status)
+        rays = self.rays(usable, confidence)
+        equilibrium = self.estimator(*rays, confidence) if self.finds_contacts else self.estimator(*rays)
+        return self.result(equilibrium, displacement, confidence, status)
 
-    def _result(self, equilibrium, displacement, confidence, status) -> Reconstruction:
+    def judge(self, displacement: Tensor, confidence: Tensor, status: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""
+        found = confidence > FOUND
+        status = torch.where(status == results.OK, _marker_status(found), status)
+        return displacement * (status == results.OK)[:, None, None], torch.where(found, confidence, 0.0), status
+
+    def rays(self, displacement: Tensor, confidence: Tensor) -> Rays:
+        """What the estimator is given: rays of the markers (force balance), or of the grid's vertices."""
+        if self.finds_contacts:
+            return self.camera.pixel_to_ray(self.rest_pixels + displacement)
+        return self.camera.pixel_to_ray(self.vertex_pixels + self.flow(displacement, confidence))
+
+    def result(self, equilibrium, displacement, confidence, status) -> Reconstruction:
         membrane, lost = self.estimator.membrane, confidence <= FOUND
         x, pressure = equilibrium.vertices, equilibrium.pressure
         u = x - membrane.rest
@@ -212,7 +221,7 @@ class Reconstructor(nn.Module):
 
     def _contacts(self, x: Tensor, normals: Tensor, traction: Tensor) -> tuple[Tensor, Tensor]:
         if not self.finds_contacts:
-            return torch.zeros_like(x[..., 0]), x.new_full((len(x), CONTACT_POINTS, 3), torch.nan)
+            return torch.zeros_like(x[..., 0]), x.new_full((x.shape[0], CONTACT_POINTS, 3), torch.nan)
         membrane, reference = self.estimator.membrane, self.estimator.reference
         contact = contact_indicator(traction, normals, reference)
         inward = (contact > 0.5) * (-(traction * normals).sum(-1)).clamp_min(0) * membrane.rest_area

@@ -1,0 +1,6 @@
+"""Runs the models that `torchmembrane export` writes, with numpy and onnxruntime alone."""
+
+from .session import EdgeError, Session
+
+__all__ = ["EdgeError", "Session"]
+__version__ = "0.1.0"

@@ -1,0 +1,118 @@
+"""One ONNX graph from pieces, each traced once: a step that is repeated is neither traced nor stored again."""
+
+import logging
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torch import Tensor, nn
+
+OPSET, IR_VERSION = 18, 8
+"""onnxruntime reads them from 1.14 on."""
+
+
+def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> onnx.ModelProto:
+    """A module as ONNX, its inputs and outputs named in order; the first axis of every input is the batch (of scalars none)."""
+    batch = torch.export.Dim("batch")
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    shapes = tuple({0: batch} if value.ndim else None for value in inputs.values())
+    program = torch.onnx.export(
+        module.eval(), tuple(inputs.values()), input_names=list(inputs), output_names=outputs, opset_version=OPSET,
+        dynamic_shapes=(shapes,), dynamo=True, external_data=False, verbose=False,
+    )  # fmt: skip
+    return program.model_proto
+
+
+class Assembly:
+    """An ONNX graph that grows by pieces; equal constants are kept once.
+
+    `append` and `repeat` take a model from `traced` and the names that its inputs have here, and return its outputs' names.
+    """
+
+    def __init__(self):
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: dict[tuple, TensorProto] = {}
+        self.pieces = 0
+
+    def append(self, piece: onnx.ModelProto, names: dict[str, str]) -> dict[str, str]:
+        """Add the piece's nodes."""
+        nodes, outputs = self._renamed(piece, names)
+        self.nodes.extend(nodes)
+        return outputs
+
+    def constant(self, array: np.ndarray) -> str:
+        """The name of a constant."""
+        tensor = numpy_helper.from_array(array)
+        key = (tensor.data_type, tuple(tensor.dims), tensor.raw_data)
+        if key not in self.constants:
+            tensor.name = f"constant{len(self.constants)}"
+            self.constants[key] = tensor
+        return self.constants[key].name
+
+    def named(self, name: str, output: str) -> None:
+        """Give a value the name of an output."""
+        self.nodes.append(helper.make_node("Identity", [name], [output]))
+
+    def repeat(
+        self, piece: onnx.ModelProto, names: dict[str, str], steps: int, tables: dict[str, np.ndarray]
+    ) -> dict[str, str]:
+        """Add a Loop of the piece, whose outputs, in order, are the next values of its first inputs.
+
+        `tables` hold, for further inputs, a row for every step; inputs not in them keep their value.
+        """
+        k, count = self.pieces, len(piece.graph.output)
+        state = [value.name for value in piece.graph.input][:count]
+        inside = {name: f"{k}/{name}" for name in [*state, *tables]}
+        nodes, outputs = self._renamed(piece, names | inside)
+        rows = [
+            helper.make_node("Gather", [self.constant(table), f"{k}/step"], [inside[name]]) for name, table in tables.items()
+        ]
+        go_on = helper.make_node("Identity", [f"{k}/on"], [f"{k}/still"])
+        kinds = {value.name: value.type.tensor_type.elem_type for value in piece.graph.input}
+        described = lambda name, kind: helper.make_tensor_value_info(name, kind, None)  # noqa: E731
+        body = helper.make_graph(
+            [*rows, *nodes, go_on], "step",
+            [helper.make_tensor_value_info(f"{k}/step", TensorProto.INT64, []),
+             helper.make_tensor_value_info(f"{k}/on", TensorProto.BOOL, []),
+             *(described(inside[name], kinds[name]) for name in state)],
+            [helper.make_tensor_value_info(f"{k}/still", TensorProto.BOOL, []),
+             *(described(here, kinds[name]) for name, here in zip(state, outputs.values(), strict=True))],
+        )  # fmt: skip
+        last = {name: f"{here}/last" for name, here in outputs.items()}
+        trips = [self.constant(np.array(steps)), self.constant(np.array(True))]
+        self.nodes.append(helper.make_node("Loop", [*trips, *(names[name] for name in state)], list(last.values()), body=body))
+        return last
+
+    def model(self, inputs, outputs, metadata: dict[str, str]) -> onnx.ModelProto:
+        """The whole as a checked model; `inputs` and `outputs` are ONNX value descriptions."""
+        graph = helper.make_graph(self.nodes, "torchmembrane", inputs, outputs, list(self.constants.values()))
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="torchmembrane")
+        model.ir_version = IR_VERSION
+        helper.set_model_props(model, metadata)
+        onnx.checker.check_model(model, full_check=True)
+        return model
+
+    def _renamed(self, piece: onnx.ModelProto, names: dict[str, str]) -> tuple[list[onnx.NodeProto], dict[str, str]]:
+        """Copies of the piece's nodes under names of their own, and its outputs' names here."""
+        known, k = {"": ""} | names, self.pieces
+        self.pieces += 1
+        for tensor in piece.graph.initializer:
+            known[tensor.name] = self.constant(numpy_helper.to_array(tensor))
+        nodes = [_bare(node) for node in piece.graph.node]
+        for node in nodes:
+            for name in node.output:
+                known[name] = f"{k}/{name}" if name else ""
+        for node in nodes:
+            node.input[:] = [known[name] for name in node.input]
+            node.output[:] = [known[name] for name in node.output]
+        return nodes, {value.name: known[value.name] for value in piece.graph.output}
+
+
+def _bare(node: onnx.NodeProto) -> onnx.NodeProto:
+    """The node without its name and the exporter's notes."""
+    copy = onnx.NodeProto()
+    copy.CopyFrom(node)
+    for field in ("metadata_props", "doc_string", "name"):
+        copy.ClearField(field)
+    return copy
