@@ -124,8 +124,8 @@ def test_edge_runs_without_torch(model_file, reconstructor, bare_python, tmp_pat
 def test_edge_says_what_is_wrong(model_file, bare_python, tmp_path):
     (tmp_path / "broken.png").write_bytes(b"no image")
     images = [str(tmp_path / "broken.png"), str(IMAGES[0])]
-    call = f"from torchmembrane_edge.cli import main; sys.exit(main([{str(model_file)!r}, *{images!r}, '--out', {str(tmp_path)!r}]))"
-    done = bare_python(call)
+    arguments = [str(model_file), *images, "--out", str(tmp_path)]
+    done = bare_python(f"from torchmembrane_edge.cli import main; sys.exit(main({arguments!r}))")
     assert done.returncode == 1 and "broken.png: not readable" in done.stderr and "1 reconstructed, 1 failed" in done.stdout
     done = bare_python("from torchmembrane_edge.cli import main; sys.exit(main(['nothing.onnx', 'a.png', '--out', 'b']))")
     assert done.returncode == 2 and "nothing.onnx: no such file" in done.stderr

@@ -27,13 +27,15 @@ def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> 
 class Assembly:
     """An ONNX graph that grows by pieces; equal constants are kept once.
 
+    Nodes are named `PART/NUMBER/...` after the `part` at the time and the number of the piece.
+
     `append` and `repeat` take a model from `traced` and the names that its inputs have here, and return its outputs' names.
     """
 
     def __init__(self):
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[tuple, TensorProto] = {}
-        self.pieces = 0
+        self.pieces, self.part = 0, ""
 
     def append(self, piece: onnx.ModelProto, names: dict[str, str]) -> dict[str, str]:
         """Add the piece's nodes."""
@@ -61,7 +63,7 @@ class Assembly:
 
         `tables` hold, for further inputs, a row for every step; inputs not in them keep their value.
         """
-        k, count = self.pieces, len(piece.graph.output)
+        k, count = f"{self.part}/{self.pieces}", len(piece.graph.output)
         state = [value.name for value in piece.graph.input][:count]
         inside = {name: f"{k}/{name}" for name in [*state, *tables]}
         nodes, outputs = self._renamed(piece, names | inside)
@@ -95,7 +97,7 @@ class Assembly:
 
     def _renamed(self, piece: onnx.ModelProto, names: dict[str, str]) -> tuple[list[onnx.NodeProto], dict[str, str]]:
         """Copies of the piece's nodes under names of their own, and its outputs' names here."""
-        known, k = {"": ""} | names, self.pieces
+        known, k = {"": ""} | names, f"{self.part}/{self.pieces}"
         self.pieces += 1
         for tensor in piece.graph.initializer:
             known[tensor.name] = self.constant(numpy_helper.to_array(tensor))
@@ -106,6 +108,7 @@ class Assembly:
         for node in nodes:
             node.input[:] = [known[name] for name in node.input]
             node.output[:] = [known[name] for name in node.output]
+            node.name = next(filter(None, node.output))
         return nodes, {value.name: known[value.name] for value in piece.graph.output}
 
 

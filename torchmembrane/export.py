@@ -17,6 +17,8 @@ from torch import Tensor, nn
 from .assembly import Assembly, traced
 from .cavity import Equilibrium
 from .force_balance import DENTS, EPS, FALL, Balance, Observation, _across
+from .markers.locate import LEVELS, DotLocator
+from .markers.match import SETTLING, WIDTHS, DotMatcher, LocalDeformation
 from .reconstruct import Reconstructor
 from .results import STATUS_TEXTS, Reconstruction
 from .store import Mesh, Settings
@@ -86,16 +88,49 @@ def export(reconstructor: Reconstructor, path: str | Path, settings: Settings) -
     tracer = Tracer()
     image = torch.rand(EXAMPLES, 1, height, width, generator=torch.Generator().manual_seed(0))
     tracer.given("image", image.to(reconstructor.rest_pixels))
-    tracer.piece(reconstructor, Reconstructor.observe, ["image"], ["displacement", "confidence", "status"])
+    tracer.assembly.part = "markers"
+    tracer.piece(reconstructor, Reconstructor.check, ["image"], ["image", "status"])
+    locate = dots if isinstance(reconstructor.locator, DotLocator) else texture
+    locate(tracer, reconstructor.locator)
+    tracer.piece(reconstructor, _displacement, ["pixels"], ["displacement"])
+    tracer.assembly.part = "assembly"
     seen = ["displacement", "confidence", "status"]
     tracer.piece(reconstructor, Reconstructor.judge, seen, ["usable", "confidence", "status"])
     tracer.piece(reconstructor, Reconstructor.rays, ["usable", "confidence"], ["origins", "directions"])
     estimate = force_balance if reconstructor.finds_contacts else minimum_energy
+    tracer.assembly.part = "solve"
     estimate(tracer, reconstructor.estimator)
+    tracer.assembly.part = "assembly"
     tracer.piece(reconstructor, _result, [*Equilibrium._fields, *seen], list(Reconstruction._fields))
     model = _finished(tracer, reconstructor, settings)
     onnx.save(model, path)
     return model
+
+
+def dots(tracer: Tracer, locator: DotLocator) -> None:
+    """From `image` to `pixels` and `confidence`."""
+    match, deformation = locator.match, locator.match.deformation
+    levels, blobs = [f"level {k}" for k in range(LEVELS)], ["blobs", "log radius", "valid"]
+    tracer.piece(locator, DotLocator.begin, ["image"], [*levels, *blobs])
+    scene = ["around", "others", "there", "nearby"]
+    tracer.piece(deformation, LocalDeformation.begin, ["blobs", "valid"], ["deformation", *scene])
+    widths = np.array(WIDTHS, np.float32)
+    tracer.steps(deformation, LocalDeformation.refine, ["deformation"], [*scene, "valid"], len(widths), width=widths)
+    state, known = ["weight", "flow", "strain"], ["known", "base"]
+    tracer.piece(match, DotMatcher.begin, ["deformation", *blobs], [*state, *known])
+    tracer.steps(match, DotMatcher.grow, state, known, match.steps)
+    tracer.steps(match, DotMatcher.settle, state, known, SETTLING)
+    tracer.piece(match, DotMatcher.end, state, ["place", "certainty", "strain"])
+    tracer.piece(locator, DotLocator.end, [*levels, *blobs, "place", "certainty", "strain"], ["pixels", "confidence"])
+
+
+def texture(tracer: Tracer, locator) -> None:
+    """From `image` to `pixels` and `confidence`."""
+    tracer.piece(locator, type(locator).forward, ["image"], ["pixels", "confidence"])
+
+
+def _displacement(reconstructor, pixels):
+    return (pixels - reconstructor.measured_rest,)
 
 
 def minimum_energy(tracer: Tracer, estimator) -> None:

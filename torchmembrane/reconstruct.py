@@ -139,15 +139,19 @@ class Reconstructor(nn.Module):
 
     def observe(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Marker displacements `[B, D, 2]` px, confidence `[B, D]` and status `[B]` of grey images `[B, 1, height, width]`."""
+        images, status = self.check(images)
+        pixels, confidence = self.locator(images)
+        return pixels - self.measured_rest, confidence, status
+
+    def check(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """The images, black where they hold bad values, and their status."""
         bad = ~(images.isfinite() & (images > -1e-3) & (images < 1.001)).flatten(1).all(1)
         images = torch.where(bad[:, None, None, None], 0.0, images)
         flat = images.flatten(1)
         contrast = flat.amax(1) - flat.amin(1)
         saturated = ((flat < 0.005) | (flat > 0.995)).to(flat.dtype).mean(1)
         blank = (contrast < LEAST_CONTRAST) | ((saturated > SATURATED_SHARE) & (flat.mean(1) > 0.5))
-        pixels, confidence = self.locator(images)
-        status = torch.where(bad, results.BAD_VALUES, torch.where(blank, results.BLANK, results.OK))
-        return pixels - self.measured_rest, confidence, status
+        return images, torch.where(bad, results.BAD_VALUES, torch.where(blank, results.BLANK, results.OK))
 
     def from_pixels(
         self, pixels: Tensor, confidence: Tensor | None = None, rest_pixels: Tensor | None = None

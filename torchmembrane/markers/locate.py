@@ -342,14 +342,22 @@ class DotLocator(nn.Module):
 
     def forward(self, image):
         """`image [B, 1, H, W]` in 0..1 -> pixels `[B, D, 2]`, confidence `[B, D]` in 0..1."""
-        levels = pyramid(1 - image if self.polarity == "light" else image)
+        *levels, blobs, log_radius, valid = self.begin(image)
+        return self.end(*levels, blobs, log_radius, valid, *self.match(blobs, log_radius, valid))
+
+    def begin(self, image):
+        """The levels of the pyramid, and the blobs: places `[B, K, 2]`, log radius `[B, K]`, and how surely one is a dot."""
+        levels, rest = pyramid(1 - image if self.polarity == "light" else image), self.rest
         blobs, log_radius, strength = self.detect(levels)
-        rest = self.rest
         nearest = (blobs[:, :, None] - rest).square().sum(-1).argmin(-1)
         relative = strength / self.strength[nearest]
         level = relative[:, : rest.shape[0] // 2].mean(1, keepdim=True)
         valid = torch.sigmoid(20 * (relative / (level + 1e-3) - 0.4))
-        place, certainty, strain = self.match(blobs, log_radius, valid)
+        return *levels, blobs, log_radius, valid
+
+    def end(self, level_0, level_1, level_2, blobs, log_radius, valid, place, certainty, strain):
+        """Pixels and confidence, by the fit about where the matcher places the dots."""
+        levels, rest = (level_0, level_1, level_2), self.rest
         _, gradient, _ = self.match.predict(certainty, place - rest, strain)
         shape = self.shapes + gradient.clamp(-0.6, 0.6) @ self.shapes
         pixels, _, quality = self.fit(levels, place, shape)

@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 from torch import nn
 
 SETTLING = 6  # steps after the growth has reached every dot
+WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
 WIDTH = 1.1  # of the local average, pitches
 RIDGE = 0.5  # pulls the flow's gradient to the one measured, where neighbours do not fix it
 TOLERANCE = 0.30  # standard deviation of a prediction, pitches
@@ -69,6 +70,15 @@ class LocalDeformation(nn.Module):
 
     def forward(self, blobs, valid):
         """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, 2, 2, K]`."""
+        gradient, *scene = self.begin(blobs, valid)
+        for width in WIDTHS:
+            (gradient,) = self.refine(gradient, *scene, valid, width)
+        return gradient
+
+    def begin(self, blobs, valid):
+        """A first gradient; the dots around `[B, M, 2, K]`, the blobs beside `[B, 12, 2, K]` and their validity, in
+        pitches; how near all blobs are to each other `[B, K, K]`.
+        """
         middle = self.pixels.mean(0)
         local = self.table[square_distance(blobs - middle, self.pixels - middle).argmin(-1)].mT
         around, pitch = local[:, :-1].unflatten(1, (-1, 2)), local[:, -1]  # [B, M, 2, K]
@@ -81,24 +91,26 @@ class LocalDeformation(nn.Module):
         nearby = torch.exp(-apart / (2 * (0.8 * pitch[..., None]) ** 2)) * valid[:, None]
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
         ratio = others[:, :4].square().sum(2).clamp_min(1e-12).sqrt().mean(1).clamp(0.4, 2.0)
-        gradient = ratio[:, None, None] * eye
-        for width in (0.35, 0.3, 0.25, 0.2, 0.2, 0.2):
-            mapped = (gradient[:, None] * around[:, :, None]).sum(3)
-            square = (mapped[:, :, None] - others[:, None]).square().sum(3)  # [B, M, 12, K]
-            likely = torch.exp(square * (-0.5 / width**2)) * there[:, None]
-            total = likely.sum(2)
-            target = (likely[:, :, :, None] * others[:, None]).sum(2) / (total + 1e-9)[:, :, None]
-            weight = total / (total + 0.1)
-            weighted = around * weight[:, :, None]
-            moment, cross = (torch.cat([around, target], 2)[:, :, :, None] * weighted[:, :, None]).sum(1).split(2, 1)
-            a, b, _, d = (moment + 0.2 * eye).flatten(1, 2).unbind(1)
-            adjugate = torch.stack([d, -b, -b, a], 1).unflatten(1, (2, 2))
-            fitted = ((cross + 0.2 * gradient)[:, :, :, None] * adjugate[:, None]).sum(2).flatten(1, 2)
-            quality = (valid * weight.mean(1).square())[:, None]
-            scaled = fitted * (quality / (a * d - b * b)[:, None])
-            average = torch.cat([scaled, quality], 1) @ nearby.mT + 1e-6 * eye.new_tensor([1, 0, 0, 1, 1])[:, None]
-            gradient = (average[:, :4] / average[:, 4:]).unflatten(1, (2, 2))
-        return gradient
+        return ratio[:, None, None] * eye, around, others, there, nearby
+
+    def refine(self, gradient, around, others, there, nearby, valid, width):
+        """The gradient after another fit, with blobs believed up to about `width` pitches off."""
+        eye = torch.eye(2, dtype=gradient.dtype, device=gradient.device)[..., None]
+        mapped = (gradient[:, None] * around[:, :, None]).sum(3)
+        square = (mapped[:, :, None] - others[:, None]).square().sum(3)  # [B, M, 12, K]
+        likely = torch.exp(square * (-0.5 / width**2)) * there[:, None]
+        total = likely.sum(2)
+        target = (likely[:, :, :, None] * others[:, None]).sum(2) / (total + 1e-9)[:, :, None]
+        weight = total / (total + 0.1)
+        weighted = around * weight[:, :, None]
+        moment, cross = (torch.cat([around, target], 2)[:, :, :, None] * weighted[:, :, None]).sum(1).split(2, 1)
+        a, b, _, d = (moment + 0.2 * eye).flatten(1, 2).unbind(1)
+        adjugate = torch.stack([d, -b, -b, a], 1).unflatten(1, (2, 2))
+        fitted = ((cross + 0.2 * gradient)[:, :, :, None] * adjugate[:, None]).sum(2).flatten(1, 2)
+        quality = (valid * weight.mean(1).square())[:, None]
+        scaled = fitted * (quality / (a * d - b * b)[:, None])
+        average = torch.cat([scaled, quality], 1) @ nearby.mT + 1e-6 * eye.new_tensor([1, 0, 0, 1, 1])[:, None]
+        return ((average[:, :4] / average[:, 4:]).unflatten(1, (2, 2)),)
 
 
 class LocalFlow(nn.Module):
@@ -260,7 +272,16 @@ class DotMatcher(nn.Module):
     def forward(self, blobs, log_radius, valid):
         """`blobs [B, K, 2]`, `log_radius`, `valid [B, K]` -> positions `[B, D, 2]`, certainty `[B, D]` in 0..1 and strain
         `[B, D, 2, 2]`."""
-        strain = self.deformation(blobs, valid) - torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
+        *state, known, base = self.begin(self.deformation(blobs, valid), blobs, log_radius, valid)
+        for _ in range(self.steps):
+            state = self.grow(*state, known, base)
+        for _ in range(SETTLING):
+            state = self.settle(*state, known, base)
+        return self.end(*state)
+
+    def begin(self, deformation, blobs, log_radius, valid):
+        """Weight, flow and strain of the dots before the first step; what `choose` needs to know of the blobs."""
+        strain = deformation - torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
         known = torch.cat([(blobs - self.origin).mT, strain.flatten(1, 2)], 1)
         misfit = ((self.log_radius[:, None] - (log_radius + 3 * (1 - valid))[:, None]) / self.size_tolerance).square()
         base = misfit + self.stiffness[:, None] * known[:, :2].square().sum(1, keepdim=True)
@@ -269,12 +290,20 @@ class DotMatcher(nn.Module):
             known, base = (x[:, None].expand(-1, starts, -1, -1).flatten(0, 1) for x in (known, base))
         flow = torch.zeros_like(self.pixels.mT).expand(known.shape[0], -1, -1)
         weight, flow, strain = self.choose(flow, FAR + flow[:, 0], known, base)
-        weight = (weight.unflatten(0, (-1, starts)) * self.starts).flatten(0, 1)
-        for _ in range(self.steps):
-            weight, flow, strain = self.choose(*self.local.along(weight, flow, strain), known, base)
-        for _ in range(SETTLING):
-            gradient = self.local.gradient(weight, flow, strain)
-            weight, flow, strain = self.choose(*self.local.along(weight, flow, gradient), known, base)
+        return (weight.unflatten(0, (-1, starts)) * self.starts).flatten(0, 1), flow, strain, known, base
+
+    def grow(self, weight, flow, strain, known, base):
+        """One step outwards along the strain measured."""
+        return self.choose(*self.local.along(weight, flow, strain), known, base)
+
+    def settle(self, weight, flow, strain, known, base):
+        """One step along the strain measured and what the neighbours' flow says of it."""
+        gradient = self.local.gradient(weight, flow, strain)
+        return self.choose(*self.local.along(weight, flow, gradient), known, base)
+
+    def end(self, weight, flow, strain):
+        """Positions, certainty and strain, of the best start."""
+        starts = self.starts.shape[0]
         if starts > 1:
             weight, flow, strain = (x.unflatten(0, (-1, starts)) for x in (weight, flow, strain))
             best = weight.sum(-1).argmax(-1)[:, None]
