@@ -3,6 +3,7 @@
 import argparse
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,8 @@ def main(argv=None) -> int:
 
 def reconstruct(session: Session, paths: list, out: Path, batch: int) -> int:
     """Every image's result as `NAME.npz` in the folder `out`, with `mesh.npz`."""
+    if find_spec("PIL") is None:
+        raise EdgeError('image files need Pillow, which is not installed: pip install "torchmembrane-edge[images]"')
     if len({path.stem for path in paths}) < len(paths):
         raise EdgeError("two images of one name; results bear it: rename, or use two calls")
     if any(path.stem == Path(MESH).stem for path in paths):
@@ -96,10 +99,8 @@ def _line(session: Session, result: dict) -> str:
 
 def _read(path: Path, size) -> np.ndarray:
     """An image file as grey values `[1, height, width]`."""
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise SystemExit('image files need Pillow, which is not installed: pip install "torchmembrane-edge[images]"') from error
+    from PIL import Image
+
     try:
         with Image.open(path) as image:
             plain = image.mode in ("1", "L", "LA", "La")
