@@ -65,7 +65,7 @@ class Tracer:
         self._keep(names, {name: self.names[name] for name in known}, [self.examples[name] for name in known])
 
     def _trace(self, owner, function, inputs, outputs):
-        examples = {name: self.examples[name] for name in inputs}
+        examples = {name: self.examples[name].clone() for name in inputs}  # one tensor twice would be traced as one input
         with torch.no_grad():
             values = function(owner, *examples.values())
         key = (function, *inputs)
