@@ -5,12 +5,13 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from kornia.filters import gaussian_blur2d
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from torchmembrane.errors import MembraneError
 from torchmembrane.markers.dots import DotPattern, find_dots, measure_dots
-from torchmembrane.markers.locate import DotLocator, EllipseFit, pyramid
+from torchmembrane.markers.locate import DotLocator, EllipseFit, blur_rows, pyramid
 from torchmembrane.markers.match import Coherence
 
 SIZE, CENTRE, RADIUS, PITCH = (320, 240), np.array([158.3, 119.6]), 112.0, 22.0
@@ -336,6 +337,17 @@ def test_levels_of_the_pyramid_keep_the_mean():
     image = torch.rand(2, 1, 16, 24, generator=torch.Generator().manual_seed(0))
     for level in pyramid(image):
         torch.testing.assert_close(level.mean((1, 2, 3)), image.mean((1, 2, 3)))
+
+
+@pytest.mark.parametrize("sigma", [1.1, 2.7])
+def test_the_products_are_the_gaussian_of_a_part_of_the_image(sigma):
+    image = torch.rand(2, 1, 30, 41, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    rows, columns = np.arange(-1, 20), np.arange(11, 42)
+    left, right = (torch.tensor(blur_rows(n, sigma, k)) for n, k in ((30, rows), (41, columns)))
+    side = 2 * int(np.ceil(2.5 * sigma)) + 1
+    whole = gaussian_blur2d(image, (side, side), (sigma, sigma), border_type="replicate")
+    expected = whole[..., rows.clip(0, 29)[:, None], columns.clip(0, 40)]
+    torch.testing.assert_close(left @ image @ right.T, expected)
 
 
 @pytest.mark.parametrize("radius", [2.5, 4.5, 9.0])
