@@ -16,6 +16,7 @@ from torch import nn
 from torchmembrane import cli
 from torchmembrane.assembly import Assembly, traced
 from torchmembrane.export import Piece
+from torchmembrane.images import to_grey
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.results import BAD_VALUES, BLANK, OK, STATUS_TEXTS, TOO_FEW_MARKERS, Reconstruction, load_frame
 from torchmembrane.store import Mesh
@@ -119,6 +120,16 @@ def test_edge_runs_without_torch(model_file, reconstructor, bare_python, tmp_pat
     mesh = Mesh.load(tmp_path / "mesh.npz")
     np.testing.assert_array_equal(mesh.rest_vertices, reconstructor.estimator.membrane.rest.numpy())
     assert mesh.sensor == reconstructor.sensor.fingerprint and mesh.fixed.dtype == bool
+
+
+@pytest.mark.parametrize("kind, shape", [(np.uint8, (5, 7, 3)), (np.uint16, (5, 7)), (np.float32, (5, 7, 3))])
+def test_edge_sees_the_same_grey(kind, shape, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "export")
+    from torchmembrane_edge.session import grey
+
+    white = np.iinfo(kind).max if kind != np.float32 else 1
+    image = (white * np.random.default_rng(0).random(shape)).astype(kind)
+    np.testing.assert_array_equal(grey(image[None])[0], to_grey(image))
 
 
 def test_edge_says_what_is_wrong(model_file, bare_python, tmp_path):
