@@ -1,0 +1,92 @@
+"""Nonlinear least squares, and what it leaves uncertain."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+from torch import Tensor
+
+from ..errors import MembraneError
+
+TOLERANCE, MOST_STEPS = 1e-7, 200
+LEAST = 1e-13  # smallest singular value told from nothing, over the largest
+STRAY = 6.0  # residuals beyond so many robust standard deviations are mistakes, not noise
+
+
+class Fit(NamedTuple):
+    """The minimum of `|r(theta)|^2`: `values [n]`, their `covariance [n, n]`, `residuals [m]`, and the `noise` of one residual.
+
+    With `J = dr / dtheta` at the minimum and `s^2 = |r|^2 / (m - n)` the covariance is `s^2 (J^T J)^-1`. What the data cannot
+    tell apart shows in it: as huge deviations with correlations near one.
+    """
+
+    values: np.ndarray
+    covariance: np.ndarray
+    residuals: np.ndarray
+    noise: float
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """Standard deviations `[n]`."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def fit(residuals: Callable, jacobian: Callable, start: np.ndarray, what: str) -> Fit:
+    """Levenberg-Marquardt (scipy's trust region) from `start [n]`; both functions take `theta [n]` as float64.
+
+
+    Wrong when the residuals are not independent and alike, and when what is held fixed is not right. Raises `MembraneError`
+    where there are too few data or no finite start; `what` names the fit.
+    """
+    start = np.asarray(start, float)
+    first = residuals(start)
+    if first.size <= start.size:
+        raise MembraneError(f"{what}: {first.size} data for {start.size} unknowns; expected more: give more images or dots")
+    if not np.isfinite(first).all():
+        raise MembraneError(f"{what}: parts cannot be imaged from the first guess; check the sensor file's design values")
+    solution = least_squares(
+        residuals, start, jacobian, x_scale="jac", xtol=TOLERANCE, ftol=TOLERANCE, gtol=None, max_nfev=MOST_STEPS
+    )
+    if solution.status <= 0:
+        raise MembraneError(f"{what}: not converged after {solution.nfev} steps; check the images and the design values")
+    noise = float(np.sqrt((solution.fun**2).sum() / (first.size - start.size)))
+    return Fit(solution.x, noise**2 * _inverse_gram(solution.jac), solution.fun, noise)
+
+
+def strays(residuals: np.ndarray) -> np.ndarray:
+    """Which of the residual vectors `[N, 2]` are mistakes: far beyond the others."""
+    length = np.linalg.norm(residuals, axis=-1)
+    return length > STRAY * max(np.median(length) / 1.18, 1e-9)  # 1.18: median length for unit deviation in the plane
+
+
+def rotations(vectors: Tensor) -> Tensor:
+    """Rotation matrices of rotation vectors (rad), `[..., 3]` to `[..., 3, 3]`, smooth at 0."""
+    x, y, z = vectors.unbind(-1)
+    none = torch.zeros_like(x)
+    skew = torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).unflatten(-1, (3, 3))
+    return torch.linalg.matrix_exp(skew)
+
+
+def outline_centres(pixels: Tensor) -> Tensor:
+    """Centres of area `[..., 2]` of outlines in the image `[..., K, 2]`; K = 1: the points themselves.
+
+    The shoelace formula about the mean, `c = sum (p_k + p_k+1) (p_k x p_k+1) / (3 sum p_k x p_k+1)`.
+    """
+    mean = pixels.mean(-2)
+    if pixels.shape[-2] == 1:
+        return mean
+    p = pixels - mean[..., None, :]
+    q = p.roll(-1, -2)
+    cross = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
+    return mean + ((p + q) * cross[..., None]).sum(-2) / (3 * cross.sum(-1, keepdim=True))
+
+
+def _inverse_gram(jacobian: np.ndarray) -> np.ndarray:
+    """`(J^T J)^-1` by singular values, columns scaled; directions that nothing determines get huge entries, not errors."""
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale[scale == 0] = 1e-150
+    _, singular, V = np.linalg.svd(jacobian / scale, full_matrices=False)
+    half = V.T / np.maximum(singular, LEAST * singular[0]) / scale[:, None]
+    return half @ half.T

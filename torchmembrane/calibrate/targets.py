@@ -1,0 +1,112 @@
+"""Targets found in images: corners of a checkerboard by OpenCV, dots by this package's own detector."""
+
+import heapq
+
+import numpy as np
+
+from ..boards import LARGE, MARKS, Checkerboard, DotBoard
+from ..errors import MembraneError
+from ..markers.dots import find_dots
+
+WINDOW = 0.35  # of the shortest side of a square, in which a corner is fitted
+FAR_OFF = 10**6
+STEP_ERROR = 0.35  # of a lattice step, by which a neighbour may be off its prediction
+
+
+def opencv():
+    """The module cv2, or a `MembraneError` that names the extra."""
+    try:
+        import cv2
+    except ImportError as error:
+        raise MembraneError("calibrate: OpenCV is missing; install it with pip install 'torchmembrane[calibrate]'") from error
+    return cv2
+
+
+def find_target(image: np.ndarray, board: Checkerboard | DotBoard) -> np.ndarray:
+    """Where the board's points are in an image `[H, W]` (grey 0..1): `[D, 2]` px, NaN where not seen."""
+    return (_find_corners if isinstance(board, Checkerboard) else _find_board_dots)(image, board)
+
+
+def _find_corners(image: np.ndarray, board: Checkerboard) -> np.ndarray:
+    cv2 = opencv()
+    grey = np.rint(255 * image).astype(np.uint8)
+    flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
+    found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=flags)
+    if not found:
+        raise MembraneError(
+            f"no checkerboard of {board.columns} x {board.rows} inner corners found; expected all of it in the image, sharp, "
+            "with a light margin"
+        )
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
+    lattice = corners.reshape(board.rows, board.columns, 2)
+    gap = min(np.linalg.norm(np.diff(lattice, axis=axis), axis=-1).min() for axis in (0, 1))
+    reach = int(np.clip(WINDOW * gap, 2, 10))
+    corners = cv2.cornerSubPix(grey, np.ascontiguousarray(corners), (reach, reach), (-1, -1), criteria)
+    return corners[:, 0].astype(float)
+
+
+def _find_board_dots(image: np.ndarray, board: DotBoard) -> np.ndarray:
+    dots = find_dots(image, "dark")
+    radius = np.sqrt(np.abs(np.linalg.det(dots.shapes)))
+    steps = _walk(dots.pixels)
+    large = _larger_than_neighbours(steps, radius)
+    steps = _turned_to_marks(steps, large)
+    pixels = np.full((len(board.points), 2), np.nan)
+    row = {tuple(step): d for d, step in enumerate(board.steps)}
+    for step, pixel in zip(steps, dots.pixels, strict=True):
+        if tuple(step) in row:
+            pixels[row[tuple(step)]] = pixel
+    return pixels
+
+
+def _walk(pixels: np.ndarray) -> np.ndarray:
+    """Lattice steps `[N, 2]` of dots `[N, 2]`, from the one nearest to their middle, surest steps first; `FAR_OFF` where not reached."""
+    start = int(np.linalg.norm(pixels - np.median(pixels, 0), axis=1).argmin())
+    steps, placed, taken = np.full(pixels.shape, FAR_OFF), set(), set()
+    front = [(0.0, start, (0, 0), _first_basis(pixels, start))]
+    while front:
+        _, here, step, basis = heapq.heappop(front)
+        if here in placed or step in taken:
+            continue
+        steps[here] = step
+        placed.add(here)
+        taken.add(step)
+        for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            stride = sign * np.array(basis[axis])
+            gap = np.linalg.norm(pixels - pixels[here] - stride, axis=1) / np.linalg.norm(stride)
+            there = int(gap.argmin())
+            if gap[there] < STEP_ERROR and there not in placed:
+                turned = tuple(tuple(sign * (pixels[there] - pixels[here])) if k == axis else tuple(basis[k]) for k in (0, 1))
+                next_step = (step[0] + sign * (axis == 0), step[1] + sign * (axis == 1))
+                heapq.heappush(front, (float(gap[there]), there, next_step, turned))
+    return steps
+
+
+def _first_basis(pixels: np.ndarray, start: int) -> tuple[tuple[float, float], ...]:
+    """Steps to two neighbours, the second one a quarter turn clockwise (in the image) from the first."""
+    offset = np.delete(pixels - pixels[start], start, 0)
+    near = offset[np.linalg.norm(offset, axis=1).argsort()[:4]]
+    first = near[0]
+    cross = first[0] * near[:, 1] - first[1] * near[:, 0]
+    return tuple(first), tuple(near[cross.argmax()])
+
+
+def _larger_than_neighbours(steps: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """`[N]` bool: dots about as much larger than the dots within two steps as large ones are."""
+    near = np.abs(steps[:, None] - steps).max(-1) <= 2
+    usual = np.array([np.median(radius[row]) for row in near])
+    return (radius > LARGE**0.5 * usual) & (near.sum(1) > 3)
+
+
+def _turned_to_marks(steps: np.ndarray, large: np.ndarray) -> np.ndarray:
+    """The steps, turned and shifted so that the large dots are the board's marks."""
+    quarter = np.array([[0, 1], [-1, 0]])
+    for turn in range(4):
+        turned = steps @ np.linalg.matrix_power(quarter, turn)
+        marks = {tuple(step) for step in turned[large]}
+        for origin in marks:
+            if all((origin[0] + a, origin[1] + b) in marks for a, b in MARKS):
+                return turned - np.array(origin)
+    raise MembraneError(
+        f"the board's three large dots are not recognised ({large.sum()} large dots seen); expected all three in the image"
+    )

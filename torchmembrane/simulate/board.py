@@ -1,0 +1,46 @@
+"""Images of a flat target, also through ports: every sample's ray is followed to the plane. Light is even."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from ..boards import Checkerboard, DotBoard
+from ..camera import Camera
+from .look import blurred, noisy
+
+SAMPLES = 4  # along a pixel's side
+GROUND = 0.4  # reflectance of what is not the board
+
+
+class BoardImages(NamedTuple):
+    """What photographs a board: a camera's rays through all samples of its image, `origin` and `direction [H s, W s, 3]`."""
+
+    origin: np.ndarray
+    direction: np.ndarray
+
+    @classmethod
+    def of(cls, camera: Camera) -> "BoardImages":
+        width, height = camera.image_size
+        u, v = ((np.arange(side * SAMPLES) + 0.5) / SAMPLES - 0.5 for side in (width, height))
+        pixels = torch.from_numpy(np.stack(np.meshgrid(u, v), -1))
+        return cls(*(ray.numpy() for ray in camera.pixel_to_ray(pixels)))
+
+    def image(self, board: Checkerboard | DotBoard, rotation, translation, noise=None, blur=0.6, rng=None) -> np.ndarray:
+        """The board with its point X at `rotation X + translation` in the camera's frame: grey, uint8 `[H, W]`.
+
+        `noise`: white over its standard deviation, dB; `blur`: standard deviation of the defocus, px.
+        """
+        rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
+        origin, direction = (self.origin - translation) @ rotation, self.direction @ rotation
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = -origin[..., 2] / direction[..., 2]
+            x, y = (origin[..., k] + reach * direction[..., k] for k in (0, 1))
+            low, high = board.extent
+            on_board = (reach > 0) & (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+        grey = np.full(x.shape, GROUND)
+        grey[on_board] = board.reflectance(x[on_board], y[on_board])
+        image = F.avg_pool2d(torch.from_numpy(grey)[None], SAMPLES)[0]
+        image = noisy(blurred(image, blur), noise, rng or np.random.default_rng(0))
+        return (255 * image.clamp(0, 1)).round().byte().numpy()
