@@ -10,6 +10,7 @@ import torch
 
 from . import __version__
 from .batch import find_inputs, reconstruct_files
+from .calibrate.command import add_calibrate
 from .check import described, rest_frame
 from .energy import MODELS
 from .errors import MembraneError
@@ -169,6 +170,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _reconstruct_parser(commands)
     add_simulate(commands, _command)
+    add_calibrate(commands, _command)
     _check_parser(commands)
     _view_parser(commands)
     _export_parser(commands)

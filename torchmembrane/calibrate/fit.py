@@ -55,6 +55,15 @@ def fit(residuals: Callable, jacobian: Callable, start: np.ndarray, what: str) -
     return Fit(solution.x, noise**2 * _inverse_gram(solution.jac), solution.fun, noise)
 
 
+def with_common_error(found: Fit, jacobian: np.ndarray, error: np.ndarray) -> Fit:
+    """The fit, its covariance enlarged by an error that all residuals share: `error [m]`, one standard deviation of it.
+
+    `C + (J^+ e) (J^+ e)^T`: unlike noise, it does not average out over many residuals.
+    """
+    shift = np.linalg.lstsq(jacobian, error)[0]
+    return found._replace(covariance=found.covariance + np.outer(shift, shift))
+
+
 def strays(residuals: np.ndarray) -> np.ndarray:
     """Which of the residual vectors `[N, 2]` are mistakes: far beyond the others."""
     length = np.linalg.norm(residuals, axis=-1)

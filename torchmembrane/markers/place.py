@@ -36,11 +36,11 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor) -> PlacedMarkers:
     anchors = vertex_pixels[sensor.membrane.fixed].numpy()
     listed, image = sensor.markers.positions, sensor.markers.rest_image
     if sensor.markers.kind == "texture":
-        centres = choose_patches(image, _membrane_mask(sensor, vertex_pixels))
+        centres = choose_patches(image, rim_mask(sensor, vertex_pixels))
         placed, seen = _place_on_surface(sensor, centres)
         placed.locator = TextureLocator(image, centres[seen], anchors)
     elif listed is None:
-        pattern = find_dots(image, sensor.markers.polarity, _membrane_mask(sensor, vertex_pixels))
+        pattern = find_dots(image, sensor.markers.polarity, rim_mask(sensor, vertex_pixels))
         placed, seen = _place_on_surface(sensor, pattern.pixels)
         pattern = DotPattern(*(field[seen] for field in pattern))
         placed.locator = DotLocator(pattern, sensor.camera.image_size, sensor.markers.polarity, anchors)
@@ -94,7 +94,7 @@ def _unit_dot_shapes(sensor: Sensor, placed: PlacedMarkers) -> np.ndarray:
     return np.stack(columns, -1)
 
 
-def _membrane_mask(sensor: Sensor, vertex_pixels: Tensor) -> np.ndarray:
+def rim_mask(sensor: Sensor, vertex_pixels: Tensor) -> np.ndarray:
     """Pixels inside the rim's outline, `[height, width]` bool."""
     m, n = sensor.membrane.grid
     index = np.arange(m * n).reshape(m, n)

@@ -127,6 +127,20 @@ class Renderer(nn.Module):
         images = images * vignette(torch.stack([u, v], -1).to(images), self.camera, self.look.vignetting)
         return blurred(images, self.look.blur).clamp(0, 1)
 
+    def depth(self, vertices: Tensor) -> Tensor:
+        """Depth images `[..., H, W]`: z along the axis of what is seen at each pixel's centre, NaN beside the membrane."""
+        images = [self._depth(x) for (x,) in _each(self.fine_vertices(vertices))]
+        return torch.stack(images).view(*vertices.shape[:-2], *images[0].shape)
+
+    def _depth(self, x: Tensor) -> Tensor:
+        corners, seen = self._seen(x, samples=1)
+        sample = torch.nonzero(seen.view(-1) >= 0).squeeze(-1)
+        place = torch.stack([sample % seen.shape[1], sample // seen.shape[1]], -1).float()
+        linear = _Linear.of(corners, x[self.surface.triangles][..., 2:])
+        image = torch.full(seen.shape, torch.nan, device=seen.device)
+        image.view(-1)[sample] = linear.at(seen.view(-1)[sample], place).squeeze(-1)
+        return image
+
     def _light(self, x: Tensor) -> Tensor:
         """Grey of a white membrane and of the highlights on it, `[..., W, 2]`."""
         look, inward = self.look, -self.surface.normals(x)

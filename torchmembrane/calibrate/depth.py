@@ -1,0 +1,63 @@
+"""The rest surface from a depth image that is registered to the sensor's camera; dots placed on it."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ..errors import MembraneError
+from ..markers.place import rim_mask
+from ..sensor import Sensor
+from .surface import Correction, correction, feet_and_heights, fine_surface, recalibrated
+from .views import placed_dots
+
+CELL = 24  # px: over such squares depths are averaged
+FEWEST = 8  # depths in a square
+NEAR = 0.1  # of the surface's size: depths farther from the design are of something else
+
+
+class DepthFit(NamedTuple):
+    """The sensor with the surface of a depth image: `Correction` of the design, and what it rests on: places `[N, 3]` on the
+    designed surface, mean heights of the depths over it there `[N]`, and their standard deviations `[N]`, length unit."""
+
+    sensor: Sensor
+    surface: Correction
+    feet: np.ndarray
+    heights: np.ndarray
+    deviations: np.ndarray
+
+
+def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> DepthFit:
+    """Rest surface from `depth [H, W]` (z along the axis, length unit; NaN or 0: none), dots from the rest image `[H, W]`.
+
+    Within the rim's outline, averaged over squares of 24 px, the designed surface is moved along its normals onto the depths.
+    """
+    width, height = sensor.camera.image_size
+    if depth.shape != (height, width):
+        raise MembraneError(f"calibrate depth: the depth image is {list(depth.shape)}; expected [{height}, {width}], the camera's")
+    surface = fine_surface(sensor)
+    points, cells = _points(sensor, depth)
+    feet, heights = feet_and_heights(surface, points)
+    near = np.abs(heights) < NEAR * surface.size
+    square = np.unique(cells[near], return_inverse=True)[1]
+    counts = np.bincount(square)
+    mean = lambda values: np.bincount(square, values) / counts  # noqa: E731
+    foot = np.stack([mean(feet[near, k]) for k in range(3)], -1)
+    height = mean(heights[near])
+    deviations = np.sqrt(mean((heights[near] - height[square]) ** 2) / (counts - 1).clip(1))
+    kept = counts >= FEWEST
+    change = correction(surface, foot[kept], height[kept], deviations[kept] ** 2)
+    vertices = surface.rest.numpy() + change.offsets[:, None] * surface.rest_normals.numpy()
+    dots, sizes = placed_dots(recalibrated(sensor, surface, vertices, None, None, image), image)
+    moved = recalibrated(sensor, surface, vertices, dots, sizes, image)
+    return DepthFit(moved, change, foot[kept], height[kept], deviations[kept])
+
+
+def _points(sensor: Sensor, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points `[N, 3]` of every other pixel within the rim's outline, and the square that each is in `[N]`."""
+    mask = rim_mask(sensor, sensor.camera.point_to_pixel(sensor.membrane.rest)) & np.isfinite(depth) & (depth > 0)
+    mask[1::2] = mask[:, 1::2] = False
+    v, u = np.nonzero(mask)
+    origin, direction = (a.numpy() for a in sensor.camera.pixel_to_ray(torch.from_numpy(np.stack([u, v], -1).astype(float))))
+    reach = (depth[v, u] - origin[:, 2]) / direction[:, 2]
+    return origin + reach[:, None] * direction, (v // CELL) * 10_000 + u // CELL

@@ -1,0 +1,122 @@
+"""From the dot pattern wanted in the image, through the ports, to places on the rest surface: how the paper made its sensor."""
+
+import csv
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ..errors import MembraneError
+from ..markers.place import rim_mask
+from ..sensor import Sensor
+from .surface import fine_surface, frames_at
+
+RADIUS = {"small": 0.16, "large": 0.27}  # of dots, over their spacing
+MARGIN = 0.6  # of a pitch, that a lattice keeps from the rim's outline
+NEWTON_STEPS = 3
+
+
+class MillDots(NamedTuple):
+    """Dots to be made: `positions [D, 3]` in the camera's frame, outward `normals [D, 3]`, `radii [D]`, `sizes`, `pixels [D, 2]`."""
+
+    positions: np.ndarray
+    normals: np.ndarray
+    radii: np.ndarray
+    sizes: list[str]
+    pixels: np.ndarray
+
+
+def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
+    """A square lattice in the image about the principal point, `pitch` px, within the rim: pixels `[D, 2]` and sizes in turns."""
+    if not pitch >= 4:
+        raise MembraneError(f"calibrate pattern: pitch = {pitch}; expected 4 px or more, so that dots can be told apart")
+    width, height = sensor.camera.image_size
+    centre = sensor.camera.centre.numpy()
+    reach = int(max(width, height) / pitch)
+    i, j = (a.ravel() for a in np.mgrid[-reach : reach + 1, -reach : reach + 1])
+    pixels = centre + pitch * np.stack([i, j], -1)
+    mask = rim_mask(sensor, sensor.camera.point_to_pixel(sensor.membrane.rest))
+    margin = MARGIN * pitch * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    around = np.rint(pixels[:, None] + margin).astype(int)
+    inside = ((around >= 0) & (around < [width, height])).all(-1)
+    u, v = np.where(inside[..., None], around, 0).transpose(2, 0, 1)
+    kept = (inside & mask[v, u]).all(1)
+    return pixels[kept], np.where((i + j) % 2 == 0, "large", "small")[kept].tolist()
+
+
+def dots_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> MillDots:
+    """Where the rays of `pixels [D, 2]`, refracted by the ports, meet the rest surface.
+
+    The ray meets the mesh first, then Newton's method takes the point onto the smooth surface: along the ray, by its height
+    over a mesh twice as fine. Raises `MembraneError` for the first pixel whose ray misses the surface.
+    """
+    pixels = np.asarray(pixels, float)
+    surface = fine_surface(sensor)
+    origin, direction = (ray.numpy() for ray in sensor.camera.pixel_to_ray(torch.from_numpy(pixels)))
+    hits = surface.ray_points(np.nan_to_num(origin), np.nan_to_num(direction))
+    missed = ~(np.isfinite(hits.distance) & np.isfinite(direction).all(1))
+    if missed.any():
+        d = int(np.flatnonzero(missed)[0])
+        raise MembraneError(
+            f"calibrate pattern: the ray of pixel {pixels[d].tolist()} (dot {d}) misses the rest surface; expected pixels within "
+            "the rim's outline: leave it out"
+        )
+    finer = sensor.surface.membrane(tuple(2 * side - 1 for side in surface.grid))
+    X = origin + hits.distance[:, None] * direction
+    for _ in range(NEWTON_STEPS):
+        feet = finer.closest_points(X)
+        foot = (finer.rest.numpy()[feet.vertices] * feet.weights[..., None]).sum(1)
+        normals = frames_at(finer, X)[0]
+        X = X + (((foot - X) * normals).sum(1) / (direction * normals).sum(1))[:, None] * direction
+    spacing = (float(surface.rest_area.sum()) / len(X)) ** 0.5
+    radii = spacing * np.array([RADIUS[size] for size in sizes])
+    return MillDots(X, frames_at(finer, X)[0], radii, list(sizes), pixels)
+
+
+def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
+    """A wanted pattern, CSV with the header u,v,size: pixels `[D, 2]` and sizes, small | large."""
+    try:
+        rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row]
+        header, *body = rows
+        right = [cell.strip() for cell in header] == ["u", "v", "size"]
+        pixels = np.array([[float(u), float(v)] for u, v, _ in body])
+        sizes = [size.strip() for _, _, size in body]
+    except (ValueError, OSError, UnicodeDecodeError) as error:
+        raise MembraneError(f"{path}: not readable ({error}); expected CSV with the header u,v,size and a line a dot") from error
+    if not right or not sizes or not set(sizes) <= set(RADIUS) or not np.isfinite(pixels).all():
+        raise MembraneError(f"{path}: expected the header u,v,size, finite pixels, and sizes small or large")
+    return pixels, sizes
+
+
+def write_mill(path: Path, sensor: Sensor, dots: MillDots) -> None:
+    """CSV for a mill, length unit: `dot,x,y,z,nx,ny,nz,radius,size`, origin at the rim's centre, axes parallel to the camera's."""
+    rim = sensor.membrane.rest[sensor.membrane.fixed].mean(0).numpy()
+    lines = ["dot,x,y,z,nx,ny,nz,radius,size"]
+    rows = zip(dots.positions - rim, dots.normals, dots.radii, dots.sizes, strict=True)
+    for d, (x, n, radius, size) in enumerate(rows):
+        lines.append(",".join([str(d), *(f"{value:.5f}" for value in (*x, *n, radius)), size]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_svg(path: Path, sensor: Sensor, dots: MillDots) -> None:
+    """The dots and the rim seen along the axis, one unit a length unit, for printing or looking at."""
+    m, n = sensor.membrane.grid
+    index = np.arange(m * n).reshape(m, n)
+    loop = np.concatenate([index[:-1, 0], index[-1, :-1], index[:0:-1, -1], index[0, :0:-1]])
+    rim = sensor.membrane.rest.numpy()[loop, :2]
+    low, size = rim.min(0) - 2, np.ptp(rim, 0) + 4
+    unit = sensor.length_unit
+    outline = " ".join(f"{x:.3f},{y:.3f}" for x, y in rim)
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{size[0]:.2f}{unit}" height="{size[1]:.2f}{unit}" '
+        f'viewBox="{low[0]:.3f} {low[1]:.3f} {size[0]:.3f} {size[1]:.3f}">',
+        f"<title>{sensor.name}: {len(dots.radii)} dots on the rest surface, seen along the camera's axis</title>",
+        f'<polygon points="{outline}" fill="none" stroke="#0072B2" stroke-width="0.15"/>',
+    ]
+    for (x, y, _), normal, radius in zip(dots.positions, dots.normals, dots.radii, strict=True):
+        short, angle = radius * abs(normal[2]), np.degrees(np.arctan2(normal[1], normal[0]))
+        lines.append(
+            f'<ellipse cx="{x:.3f}" cy="{y:.3f}" rx="{short:.3f}" ry="{radius:.3f}" transform="rotate({angle:.2f} {x:.3f} {y:.3f})"/>'
+        )
+    path.write_text("\n".join([*lines, "</svg>"]) + "\n", encoding="utf-8")
