@@ -1,4 +1,4 @@
-"""Flat targets of known measure: checkerboards and boards of dots. Frame: x right, y down as printed, z = 0 away from the eye."""
+"""Flat targets of known measure: checkerboards and boards of dots. Frame: x right, y down as printed, z away from the eye."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +21,9 @@ class Checkerboard:
     square: float
 
     def __post_init__(self):
-        _expect(self, self.columns >= 3 and self.rows >= 3 and self.square > 0, "3 x 3 inner corners or more, a positive length")
+        _expect(
+            self, self.columns >= 3 and self.rows >= 3 and self.square > 0, "3 x 3 inner corners or more, a positive length"
+        )
 
     @cached_property
     def points(self) -> np.ndarray:

@@ -52,7 +52,7 @@ def lens_from_views(camera: Camera, board: Checkerboard, views: Views) -> Camera
     """
     bare = Camera(camera.model, camera.image_size, camera.focal.tolist(), camera.centre.tolist())
     start, poses = _opencv_lens(bare, board, views)
-    found = _fit_camera(start, board, views, LENS, poses, "calibrate camera")
+    found = _fit_camera(start, board, views, LENS, poses, "calibrate camera", {})
     values = {name: getattr(found.camera, name).tolist() for name in LENS}
     whole = Camera(camera.model, camera.image_size, **values, ports=camera.ports, medium_index=float(camera.medium_index))
     return found._replace(camera=whole)
@@ -74,9 +74,10 @@ def ports_from_views(camera: Camera, board: DotBoard, views: Views, held: Sequen
     return _fit_camera(camera, board, views, free, poses, "calibrate ports", DESIGN)
 
 
-def _fit_camera(camera: Camera, board, views: Views, free: Sequence[str], poses: np.ndarray, what: str, spread=None) -> CameraFit:
+def _fit_camera(
+    camera: Camera, board, views: Views, free: Sequence[str], poses: np.ndarray, what: str, spread: dict
+) -> CameraFit:
     """`spread`: relative standard deviation of the first guess of some names, one more datum each."""
-    spread = spread or {}
     shapes = {name: getattr(camera, name).shape for name in free}
     lengths = [max(1, shape.numel()) for shape in shapes.values()]
     start = np.concatenate([getattr(camera, name).numpy().ravel() for name in free])
@@ -147,7 +148,9 @@ def _opencv_lens(camera: Camera, board: Checkerboard, views: Views) -> tuple[Cam
     pixels = [p[:, None].astype(np.float32) for p in views.pixels]
     try:
         if camera.model == "pinhole":
-            _, K, k, turns, shifts = cv2.calibrateCamera(points, pixels, size, K, np.zeros(5), flags=cv2.CALIB_USE_INTRINSIC_GUESS)
+            _, K, k, turns, shifts = cv2.calibrateCamera(
+                points, pixels, size, K, np.zeros(5), flags=cv2.CALIB_USE_INTRINSIC_GUESS
+            )
         else:
             flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
             points, pixels = ([a.astype(np.float64) for a in arrays] for arrays in (points, pixels))
@@ -164,9 +167,7 @@ def _start_pose(camera: Camera, board: DotBoard, pixels: np.ndarray, filled: boo
     cv2 = opencv()
     seen = np.isfinite(pixels).all(1)
     medium = float(camera.medium_index) if filled else 1.0
-    camera = Camera(
-        camera.model, camera.image_size, *(getattr(camera, name).tolist() for name in LENS), camera.ports, medium
-    )
+    camera = Camera(camera.model, camera.image_size, *(getattr(camera, name).tolist() for name in LENS), camera.ports, medium)
     origin, direction = camera.pixel_to_ray(torch.from_numpy(pixels[seen]))
     usable = (direction[:, 2] > 0.2).numpy()
     flat = (direction[:, :2] / direction[:, 2:]).numpy()[usable]

@@ -39,7 +39,7 @@ and the other way round:
   pattern    from the dots wanted in the image to places on the rest surface, for a mill"""
 EXAMPLES = {
     "camera": "torchmembrane calibrate camera design.toml board/*.png --corners 11,8 --square 2.5 --out lens",
-    "ports": "torchmembrane calibrate ports lens/sensor.toml --air dry/*.png --medium wet/*.png --dots 17,13 --pitch 2 --out ports",
+    "ports": "torchmembrane calibrate ports lens/sensor.toml --air dry/ --medium wet/ --dots 17,13 --pitch 2 --out ports",
     "rest": "torchmembrane calibrate rest ports/sensor.toml rest.png --out rest",
     "views": "torchmembrane calibrate views ports/sensor.toml first.png second.png third.png --motions motions.csv --out rest",
     "depth": "torchmembrane calibrate depth sensor.toml depth.npy --image rest.png --out rest",
@@ -97,7 +97,9 @@ def rest(arguments) -> int:
         f"{np.isfinite(found.pixels).all(1).sum()} of {len(shifts)} dots found; moved along the surface to null what is left: "
         f"{np.sqrt((shifts**2).mean()):.4f} {sensor.length_unit} rms, at most {shifts.max():.4f}"
     ]
-    report = Report.of("rest surface from one image", found.names, units, np.zeros(6), found.fit, found.pixels, found.residuals, notes)
+    report = Report.of(
+        "rest surface from one image", found.names, units, np.zeros(6), found.fit, found.pixels, found.residuals, notes
+    )
     return _done(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size))
 
 
@@ -124,14 +126,13 @@ def depth(arguments) -> int:
     """`torchmembrane calibrate depth`"""
     sensor = _sensor(arguments)
     found = rest_from_depth(sensor, _depth_image(arguments), read_image(arguments.image))
-    unit, none = sensor.length_unit, np.zeros((0, 2))
+    unit = sensor.length_unit
     notes = [
         f"{len(found.feet)} squares of depths, each known to {np.median(found.deviations):.4f} {unit}",
         _moved(found.surface, unit),
         f"{len(found.sensor.markers.positions)} dots placed on the surface",
     ]
-    nothing = np.zeros(0)
-    report = Report("rest surface from a depth image", [], [], nothing, nothing, nothing, np.zeros((0, 0)), none, none, 0.0, notes)
+    report = Report.without_parameters("rest surface from a depth image", notes)
     places = fine_surface(sensor).rest.numpy()
     return _done(arguments, found.sensor, report, surface_figure(report, sensor.camera.image_size, places, found.surface, unit))
 

@@ -34,7 +34,9 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> Dep
     """
     width, height = sensor.camera.image_size
     if depth.shape != (height, width):
-        raise MembraneError(f"calibrate depth: the depth image is {list(depth.shape)}; expected [{height}, {width}], the camera's")
+        raise MembraneError(
+            f"calibrate depth: the depth image is {list(depth.shape)}; expected [{height}, {width}], the camera's"
+        )
     surface = fine_surface(sensor)
     points, cells = _points(sensor, depth)
     feet, heights = feet_and_heights(surface, points)

@@ -18,7 +18,7 @@ NEWTON_STEPS = 3
 
 
 class MillDots(NamedTuple):
-    """Dots to be made: `positions [D, 3]` in the camera's frame, outward `normals [D, 3]`, `radii [D]`, `sizes`, `pixels [D, 2]`."""
+    """Dots to be made: `positions`, outward `normals [D, 3]` in the camera's frame, `radii [D]`, `sizes`, `pixels [D, 2]`."""
 
     positions: np.ndarray
     normals: np.ndarray
@@ -28,7 +28,7 @@ class MillDots(NamedTuple):
 
 
 def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
-    """A square lattice in the image about the principal point, `pitch` px, within the rim: pixels `[D, 2]` and sizes in turns."""
+    """A square lattice in the image about the principal point, `pitch` px, within the rim: `[D, 2]`, and sizes in turns."""
     if not pitch >= 4:
         raise MembraneError(f"calibrate pattern: pitch = {pitch}; expected 4 px or more, so that dots can be told apart")
     width, height = sensor.camera.image_size
@@ -59,8 +59,8 @@ def dots_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> Mil
     if missed.any():
         d = int(np.flatnonzero(missed)[0])
         raise MembraneError(
-            f"calibrate pattern: the ray of pixel {pixels[d].tolist()} (dot {d}) misses the rest surface; expected pixels within "
-            "the rim's outline: leave it out"
+            f"calibrate pattern: the ray of pixel {pixels[d].tolist()} (dot {d}) misses the rest surface; expected pixels "
+            "within the rim's outline: leave it out"
         )
     finer = sensor.surface.membrane(tuple(2 * side - 1 for side in surface.grid))
     X = origin + hits.distance[:, None] * direction
@@ -83,14 +83,16 @@ def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
         pixels = np.array([[float(u), float(v)] for u, v, _ in body])
         sizes = [size.strip() for _, _, size in body]
     except (ValueError, OSError, UnicodeDecodeError) as error:
-        raise MembraneError(f"{path}: not readable ({error}); expected CSV with the header u,v,size and a line a dot") from error
+        raise MembraneError(
+            f"{path}: not readable ({error}); expected CSV with the header u,v,size and a line a dot"
+        ) from error
     if not right or not sizes or not set(sizes) <= set(RADIUS) or not np.isfinite(pixels).all():
         raise MembraneError(f"{path}: expected the header u,v,size, finite pixels, and sizes small or large")
     return pixels, sizes
 
 
 def write_mill(path: Path, sensor: Sensor, dots: MillDots) -> None:
-    """CSV for a mill, length unit: `dot,x,y,z,nx,ny,nz,radius,size`, origin at the rim's centre, axes parallel to the camera's."""
+    """CSV for a mill: `dot,x,y,z,nx,ny,nz,radius,size`, origin at the rim's centre, axes parallel to the camera's."""
     rim = sensor.membrane.rest[sensor.membrane.fixed].mean(0).numpy()
     lines = ["dot,x,y,z,nx,ny,nz,radius,size"]
     rows = zip(dots.positions - rim, dots.normals, dots.radii, dots.sizes, strict=True)
@@ -116,7 +118,6 @@ def write_svg(path: Path, sensor: Sensor, dots: MillDots) -> None:
     ]
     for (x, y, _), normal, radius in zip(dots.positions, dots.normals, dots.radii, strict=True):
         short, angle = radius * abs(normal[2]), np.degrees(np.arctan2(normal[1], normal[0]))
-        lines.append(
-            f'<ellipse cx="{x:.3f}" cy="{y:.3f}" rx="{short:.3f}" ry="{radius:.3f}" transform="rotate({angle:.2f} {x:.3f} {y:.3f})"/>'
-        )
+        turn = f"rotate({angle:.2f} {x:.3f} {y:.3f})"
+        lines.append(f'<ellipse cx="{x:.3f}" cy="{y:.3f}" rx="{short:.3f}" ry="{radius:.3f}" transform="{turn}"/>')
     path.write_text("\n".join([*lines, "</svg>"]) + "\n", encoding="utf-8")

@@ -44,6 +44,12 @@ class Report(NamedTuple):
             pixels[used], residuals[used], fit.noise, list(notes),
         )  # fmt: skip
 
+    @classmethod
+    def without_parameters(cls, title: str, notes=()) -> "Report":
+        """Of a calibration that gives a surface, and no numbers."""
+        numbers, none = np.zeros(0), np.zeros((0, 2))
+        return cls(title, [], [], numbers, numbers, numbers, np.zeros((0, 0)), none, none, 0.0, list(notes))
+
     @property
     def confused(self) -> list[tuple[str, str, float]]:
         """Pairs that the data hardly tell apart, with their correlation."""
@@ -56,7 +62,9 @@ class Report(NamedTuple):
         lines = [f"  {name:<16}{value:>12.5f} ± {sd:<10.2g}{unit:<7} (before: {old:g})" for name, value, sd, unit, old in rows]
         if len(self.residuals):
             rms = float(np.sqrt((self.residuals**2).mean()))
-            lines.append(f"  residuals: {len(self.residuals)} points, {rms:.3f} px rms, at most {np.abs(self.residuals).max():.3f} px")
+            lines.append(
+                f"  residuals: {len(self.residuals)} points, {rms:.3f} px rms, at most {np.abs(self.residuals).max():.3f} px"
+            )
         lines += [f"  hardly told apart: {a} and {b} (correlation {c:+.4f})" for a, b, c in self.confused]
         return [self.title, *lines, *(f"  {note}" for note in self.notes)]
 
@@ -92,9 +100,7 @@ def draw_residuals(axes, report: Report, image_size: tuple[int, int]) -> None:
     width, height = image_size
     typical = np.sqrt((report.residuals**2).sum(-1).mean()) if len(report.residuals) else 1.0
     gain = 10.0 ** np.floor(np.log10(0.03 * width / max(typical, 1e-9)))
-    axes.quiver(
-        *report.pixels.T, *(gain * report.residuals).T, angles="xy", scale_units="xy", scale=1, width=0.002, color=BLUE
-    )
+    axes.quiver(*report.pixels.T, *(gain * report.residuals).T, angles="xy", scale_units="xy", scale=1, width=0.002, color=BLUE)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="u, px", ylabel="v, px")
     axes.set_title(f"measured less modelled, x {gain:g}")
 

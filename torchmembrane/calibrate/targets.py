@@ -60,7 +60,7 @@ def _find_board_dots(image: np.ndarray, board: DotBoard) -> np.ndarray:
 
 
 def _walk(pixels: np.ndarray) -> np.ndarray:
-    """Lattice steps `[N, 2]` of dots `[N, 2]`, from the one nearest to their middle, surest steps first; `FAR_OFF` where not reached."""
+    """Lattice steps `[N, 2]` of dots `[N, 2]`, from the middle one, surest first; `FAR_OFF`: not reached."""
     start = int(np.linalg.norm(pixels - np.median(pixels, 0), axis=1).argmin())
     steps, placed, taken = np.full(pixels.shape, FAR_OFF), set(), set()
     front = [(0.0, start, (0, 0), _first_basis(pixels, start))]

@@ -59,7 +59,7 @@ def rest_from_views(sensor: Sensor, images: Sequence[np.ndarray], motions: np.nd
     """
     if len(images) < 2 or motions.shape != (len(images), 6) or np.abs(motions[0]).max() > 0:
         raise MembraneError(
-            f"calibrate views: {len(images)} images, motions {list(motions.shape)}; expected 2 or more, one line each, the first 0"
+            f"calibrate views: {len(images)} images, motions {list(motions.shape)}; expected 2 or more, [P, 6], first zeros"
         )
     if not np.linalg.norm(motions[1, :3]) > 0:
         raise MembraneError("calibrate views: the second view did not travel; expected that its travel sets the scale")
@@ -120,7 +120,10 @@ def _bundle(sensor, surface, X, sizes, rel, pixels, motions, travel_error, image
     seen[np.nonzero(seen)] = ~wild
     pull = found.noise / travel_error
     found = fit(residuals, jacobian, found.values, "calibrate views")
-    dots, left = found.values[own:].reshape(-1, 3), np.where(seen[..., None], pixels - each(*parts(found.values)).numpy(), np.nan)
+    dots, left = (
+        found.values[own:].reshape(-1, 3),
+        np.where(seen[..., None], pixels - each(*parts(found.values)).numpy(), np.nan),
+    )
     normals = surface.rest_normals.numpy()[surface.closest_points(dots).vertices[:, 0]]
     blocks = np.stack([found.covariance[own + 3 * d : own + 3 * d + 3, own + 3 * d : own + 3 * d + 3] for d in range(D)])
     change = correction(surface, *feet_and_heights(surface, dots), np.einsum("di,dij,dj->d", normals, blocks, normals))

@@ -1,0 +1,317 @@
+"""How well calibration recovers a simulated truth, from noisy rendered images.
+
+python bench/calibration.py [lens ports rest effect views depth pattern] [--seeds 3] [--json FILE] [--figures docs/calibration]
+
+Sensors of this package are seen by the simulator with noise 40 dB below white; the first guess is off. Printed: error, reported
+standard deviation, and the largest error over its deviation; for `effect` the error of the surface at the dots before and after
+the pose was calibrated.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from record import write
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from torchmembrane.boards import Checkerboard, DotBoard
+from torchmembrane.calibrate.boards import Views, lens_from_views, ports_from_views
+from torchmembrane.calibrate.depth import rest_from_depth
+from torchmembrane.calibrate.mill import dots_for_pixels, pixel_lattice
+from torchmembrane.calibrate.report import Report, fit_figure, mill_figure, surface_figure
+from torchmembrane.calibrate.rest import rest_from_image
+from torchmembrane.calibrate.surface import feet_and_heights, fine_surface
+from torchmembrane.calibrate.targets import find_target
+from torchmembrane.calibrate.views import rest_from_views
+from torchmembrane.camera import Camera
+from torchmembrane.errors import MembraneError
+from torchmembrane.images import to_grey
+from torchmembrane.markers.dots import find_dots
+from torchmembrane.presets import preset
+from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.sensor import Markers, Surface
+from torchmembrane.simulate.board import BoardImages
+from torchmembrane.simulate.dataset import stroke_to
+from torchmembrane.simulate.indenters import Plane, Sphere
+from torchmembrane.simulate.look import Look
+from torchmembrane.simulate.simulator import Simulator
+from torchmembrane.view import save
+
+NOISE = 40.0
+LENSES = {
+    "pinhole": ((265.0, 266.0), (322.4, 237.0), (-0.05, 0.01, 0.0005, -0.0003, 0.0)),
+    "fisheye": ((180.0, 180.5), (321.5, 238.2), (-0.012, 0.002, 0.0, 0.0)),
+}
+PORT = {"port_distance": 4.0, "port_thickness": 3.0, "port_index": 1.49, "medium_index": 1.33}
+GUESS = {"port_distance": 4.3, "port_thickness": 2.8, "port_index": 1.53, "medium_index": 1.36}
+TILT = Rotation.from_rotvec(np.deg2rad([0.8, 0.6, 0.0]))  # 1 degree
+OFFSET = np.array([0.0, 0.0, 0.3])
+
+
+def lens(seeds, figures):
+    board = Checkerboard(11, 8, 2.5)
+    for model, truth in LENSES.items():
+        photograph = BoardImages.of(Camera(model, (640, 480), *truth))
+        for seed in range(seeds):
+            pixels = poses_seen(photograph, board, 12, (14, 26), 0.35, np.random.default_rng(seed))
+            guess = Camera(model, (640, 480), (250, 250), (320, 240))
+            found = lens_from_views(guess, board, Views(pixels, np.zeros(len(pixels), bool)))
+            expected = np.concatenate(truth)
+            yield row(f"lens, {model}", seed, found.names, found.fit, expected)
+        title, start = (
+            f"{model}, {len(pixels)} images of a checkerboard",
+            [*guess.focal, *guess.centre, *np.zeros(len(truth[2]))],
+        )
+        draw(figures, f"lens_{model}", Report.of(title, found.names, found.names, start, found.fit, pixels, found.residuals))
+
+
+def ports(seeds, figures):
+    board = DotBoard(17, 13, 2.0)
+    for model, values in LENSES.items():
+        make = lambda p, air=False, model=model, values=values: Camera(  # noqa: E731
+            model, (640, 480), *values, [(p["port_distance"], p["port_thickness"], p["port_index"])],
+            1.0 if air else p["medium_index"],
+        )  # fmt: skip
+        for seed in range(seeds):
+            rng, sets = np.random.default_rng(seed), []
+            for air in (True, False):
+                sets.append(poses_seen(BoardImages.of(make(PORT, air)), board, 6, (14, 22), 0.1, rng))
+            pixels, filled = np.concatenate(sets), np.arange(12) >= 6
+            for label, chosen in (("air", ~filled), ("medium", filled), ("both", filled | True)):
+                views = Views(pixels[chosen], filled[chosen])
+                found = ports_from_views(make(GUESS), board, views)
+                expected = [PORT[name] for name in found.names]
+                yield row(f"ports, {model}, {label}", seed, found.names, found.fit, expected)
+                if seed == seeds - 1:
+                    start = [GUESS[name] for name in found.names]
+                    title = f"{model} through a port, images in {label.replace('both', 'air and medium')}"
+                    report = Report.of(title, found.names, found.names, start, found.fit, pixels[chosen], found.residuals)
+                    draw(figures, f"ports_{model}_{label}", report)
+
+
+def rest(seeds, figures):
+    for name in ("fingertip", "half_cylinder", "bubble"):
+        design = preset(name)
+        for seed in range(seeds):
+            truth = posed(design, TILT, OFFSET)
+            image = rest_image(truth, seed)
+            found = rest_from_image(bare(design), image)
+            record = row(f"rest, {name}", seed, found.names, found.fit, [0.8, 0.6, 0.0, *OFFSET])
+            off = lambda sensor: rms(sensor.markers.positions - truth.markers.positions)  # noqa: B023, E731
+            yield record | dict(dots_before=off(design), dots_after=off(found.sensor))
+        title, start = f"{name}: rest surface from one image", np.zeros(6)
+        report = Report.of(title, found.names, found.names, start, found.fit, found.pixels, found.residuals)
+        draw(figures, f"rest_{name}", report)
+
+
+def effect(seeds, figures):
+    """Error of the dots in space, mm, over all presses, by sensor file and estimator."""
+    for name, radius, depth in (("fingertip", 4.0, 2.0), ("half_cylinder", 4.0, 2.0)):
+        design, truth = preset(name), posed(preset(name), TILT, OFFSET)
+        simulator = Simulator(truth, look=Look(noise=NOISE))
+        image = simulator.rest_image()
+        calibrated = rest_from_image(bare(design), image).sensor
+        sensors = {"design": design, "calibrated": calibrated, "truth": truth}
+        aim = simulator.membrane.rest[simulator.membrane.fixed].mean(0).numpy()
+        frames = []
+        for body, travel in ((Sphere(radius), (0, 0, -1)), (Sphere(radius), (-0.5, 0, -0.87)), (Plane(), (0.2, 0.3, -1))):
+            stroke = stroke_to(simulator, body, aim, travel, depth)
+            (state,) = simulator.presses(stroke, ("push",))
+            frames.append(simulator.frame(state, stroke, np.random.default_rng(0)))
+        for estimator in ("minimum-energy", "force-balance"):
+            for label, sensor in sensors.items():
+                sensor = replace(sensor, markers=replace(sensor.markers, rest_image=image))
+                solver, errors = Reconstructor(sensor, estimator), {"nulled": [], "not nulled": []}
+                for frame in frames:
+                    pixels = torch.from_numpy(frame.truth["uv_deformed"])
+                    with torch.no_grad():
+                        answers = {"nulled": solver(torch.from_numpy(frame.image)), "not nulled": solver.from_pixels(pixels)}
+                    for how, answer in answers.items():
+                        errors[how].append(errors_of(answer, solver, frame.truth))
+                for how, pairs in errors.items():
+                    surface, relative = np.mean(pairs, 0)
+                    print(f"effect, {name}, {estimator}, {label}, {how}: surface {surface:.3f} mm, displacement {relative:.3f}")
+                    record = dict(sensor=name, estimator=estimator, file=label, how=how)
+                    yield record | dict(surface=surface, displacement=relative)
+
+
+def errors_of(answer, solver, truth) -> tuple[float, float]:
+    """Rms distance of the dots from where they are, mm; and of their displacements, over the true ones."""
+    x, u = answer.markers[0].double().numpy(), (answer.markers[0] - solver.rest_markers).double().numpy()
+    true = (truth["dots_deformed"] - truth["dots_nominal"]).astype(float)
+    return rms(x - truth["dots_deformed"]), rms(u - true) / rms(true)
+
+
+def views(seeds, figures):
+    for name, travel in (("fingertip", 1.5), ("half_cylinder", 3.0)):
+        design = preset(name)
+        motions = travel * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0.0]])
+        motions = np.concatenate([motions, np.array([[0, 0, 0], [0, -4, 0], [0, 4, 0], [4, 0, 0], [-4, 0, 0.0]])], 1)
+        truth = posed(design, TILT, OFFSET)
+        for seed in range(seeds):
+            images = [rest_image(seen_from(truth, motion), 10 * seed + k) for k, motion in enumerate(motions)]
+            rough = motions + 0.0
+            rough[1:, 3:] += np.random.default_rng(seed).normal(size=(4, 3)) * 0.3
+            found = rest_from_views(bare(design), images, rough, 0.005)
+            true = np.concatenate([motions[1:, 3:], motions[1:, :3]], 1).ravel()
+            gap, partner = cKDTree(truth.markers.positions).query(found.dots)
+            error = found.dots - truth.markers.positions[partner]
+            record = row(f"views, {name}", seed, found.names, found.fit, true)
+            record |= dict(dots=rms(error), dots_deviation=rms(found.deviations), dots_worst=worst(error, found.deviations))
+            record |= surface_errors(truth, design, found)
+            print({key: value for key, value in record.items() if not isinstance(value, list)})
+            yield record
+        pixels = np.broadcast_to(truth.camera.point_to_pixel(torch.from_numpy(found.dots)).numpy(), found.residuals.shape)
+        title = f"{name}: dots and rest surface from five views"
+        report = Report.of(title, found.names, found.names, true, found.fit, pixels, found.residuals)
+        if figures:
+            places = fine_surface(design).rest.numpy()
+            save(surface_figure(report, design.camera.image_size, places, found.surface, "mm"), figures / f"views_{name}.png")
+
+
+def depth(seeds, figures):
+    for name in ("fingertip", "half_cylinder"):
+        design, truth = preset(name), posed(preset(name), TILT, OFFSET)
+        simulator = Simulator(truth, look=Look(noise=NOISE))
+        exact, image = simulator.renderer.depth(simulator.membrane.rest).numpy(), simulator.rest_image()
+        for seed in range(seeds):
+            noisy = exact + np.random.default_rng(seed).normal(size=exact.shape) * 0.2
+            found = rest_from_depth(bare(design), noisy, image)
+            gap, _ = cKDTree(truth.markers.positions).query(found.sensor.markers.positions)
+            record = dict(what=f"depth, {name}", seed=seed, dots=float(np.sqrt((gap**2).mean())), count=len(gap))
+            record |= surface_errors(truth, design, found)
+            print(record)
+            yield record
+        report = Report.without_parameters(f"{name}: rest surface from a depth image, 0.2 mm noise")
+        if figures:
+            places = fine_surface(design).rest.numpy()
+            save(surface_figure(report, design.camera.image_size, places, found.surface, "mm"), figures / f"depth_{name}.png")
+
+
+def pattern(seeds, figures):
+    for name in ("half_cylinder", "fingertip"):
+        sensor = preset(name)
+        pixels, sizes = pixel_lattice(sensor, 30.0)
+        dots = dots_for_pixels(sensor, pixels, sizes)
+        made = replace(sensor, markers=Markers("dots", "dark", dots.positions, sizes))
+        seen = find_dots(rest_image(made, 0), "dark").pixels
+        gap, _ = cKDTree(seen).query(pixels)
+        record = dict(what=f"pattern, {name}", dots=len(pixels), found=int((gap < 3).sum()), rms=rms(gap[gap < 3]))
+        print(record)
+        yield record
+        if figures:
+            title = f"{name}: {len(pixels)} dots that make a square lattice in the image"
+            save(mill_figure(title, sensor, dots), figures / f"pattern_{name}.png")
+
+
+def poses_seen(photograph: BoardImages, board, count: int, depths, spread: float, rng) -> np.ndarray:
+    """A board in random poses as it was found in its images, `[count, D, 2]` px; poses not wholly seen are drawn again."""
+    found, middle = [], np.append(sum(board.extent) / 2, 0.0)
+    while len(found) < count:
+        rotation = Rotation.from_rotvec(rng.uniform(-1, 1, 3) * [0.5, 0.5, 0.8]).as_matrix()
+        z = rng.uniform(*depths)
+        place = np.append(rng.uniform(-spread, spread, 2) * z, z)
+        image = photograph.image(board, rotation, place - rotation @ middle, NOISE, rng=rng)
+        try:
+            found.append(find_target(to_grey(image), board))
+        except MembraneError:
+            continue
+    return np.stack(found)
+
+
+def posed(design, turn: Rotation, offset: np.ndarray):
+    """The sensor as it really is: its membrane and dots turned about the rim's centre and shifted."""
+    fine = fine_surface(design)
+    rim = fine.rest[fine.fixed].mean(0).numpy()
+    return moved(design, turn, rim + offset - turn.apply(rim))
+
+
+def seen_from(sensor, motion: np.ndarray):
+    """The same membrane in the frame of a camera that moved by (place, turn in degrees)."""
+    back = Rotation.from_rotvec(np.deg2rad(motion[3:])).inv()
+    return moved(sensor, back, -back.apply(motion[:3]))
+
+
+def moved(sensor, turn: Rotation, shift: np.ndarray):
+    fine = sensor.surface.membrane((97, 97))
+    vertices = (turn.apply(fine.rest.numpy()) + shift).reshape(97, 97, 3)
+    surface = Surface("grid", {"vertices": vertices, "fixed": fine.fixed.numpy().reshape(97, 97)})
+    markers = Markers("dots", "dark", turn.apply(sensor.markers.positions) + shift, sensor.markers.sizes)
+    return replace(sensor, membrane=surface.membrane(sensor.membrane.grid), surface=surface, markers=markers)
+
+
+def bare(sensor):
+    return replace(sensor, markers=replace(sensor.markers, rest_image=None))
+
+
+def rest_image(sensor, seed: int) -> np.ndarray:
+    simulator = Simulator(sensor, look=Look(noise=NOISE))
+    return to_grey(simulator.image(simulator.membrane.rest, np.random.default_rng(seed)))
+
+
+def surface_errors(truth, design, found) -> dict[str, float]:
+    """Distances, mm, of the designed and the calibrated surface from the true one, free vertices, and over their deviations."""
+    target = truth.surface.membrane((129, 129))
+    free = ~fine_surface(design).fixed.numpy()
+    before = feet_and_heights(target, fine_surface(design).rest.numpy()[free])[1]
+    after = feet_and_heights(target, found.sensor.surface.values["vertices"].reshape(-1, 3)[free])[1]
+    deviations = found.surface.deviations[free]
+    return dict(
+        surface_before=rms(before), surface_after=rms(after), surface_deviation=rms(deviations),
+        surface_beyond_3=float((np.abs(after) > 3 * deviations).mean()),
+    )  # fmt: skip
+
+
+def row(what: str, seed: int, names, fit, truth) -> dict:
+    n = len(names)
+    error, deviations = fit.values[:n] - np.asarray(truth), fit.deviations[:n]
+    print(f"{what}, seed {seed}: noise {fit.noise:.3f} px, worst error / deviation {worst(error, deviations):.2f}")
+    for name, e, sd in list(zip(names, error, deviations, strict=True))[:9]:
+        print(f"    {name:16s} error {e:+.5f}  deviation {sd:.5f}")
+    return dict(
+        what=what, seed=seed, noise=fit.noise, names=list(names), error=error.tolist(), deviation=deviations.tolist(),
+        worst=worst(error, deviations),
+    )  # fmt: skip
+
+
+def rms(values) -> float:
+    return float(
+        np.sqrt((np.asarray(values, float) ** 2).sum(-1).mean() if np.ndim(values) > 1 else (np.asarray(values) ** 2).mean())
+    )
+
+
+def worst(error, deviations) -> float:
+    return float(np.abs(np.asarray(error) / np.asarray(deviations)).max())
+
+
+def draw(folder: Path | None, name: str, report: Report) -> None:
+    if folder:
+        folder.mkdir(parents=True, exist_ok=True)
+        save(fit_figure(report, (640, 480)), folder / f"{name}.png")
+
+
+PARTS = {part.__name__: part for part in (lens, ports, rest, effect, views, depth, pattern)}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], default=list(PARTS))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--figures", type=Path)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    results = {}
+    for name in args.parts:
+        start = time.perf_counter()
+        results[name] = list(PARTS[name](args.seeds, args.figures))
+        print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+    write(args.json, results)
+
+
+if __name__ == "__main__":
+    main()
