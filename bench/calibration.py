@@ -24,7 +24,7 @@ from torchmembrane.calibrate.depth import rest_from_depth
 from torchmembrane.calibrate.mill import dots_for_pixels, pixel_lattice
 from torchmembrane.calibrate.report import Report, fit_figure, mill_figure, surface_figure
 from torchmembrane.calibrate.rest import rest_from_image
-from torchmembrane.calibrate.surface import feet_and_heights, fine_surface
+from torchmembrane.calibrate.surface import feet_of, fine_surface
 from torchmembrane.calibrate.targets import find_target
 from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera import Camera
@@ -257,8 +257,8 @@ def surface_errors(truth, design, found) -> dict[str, float]:
     """Distances, mm, of the designed and the calibrated surface from the true one, free vertices, and over their deviations."""
     target = truth.surface.membrane((129, 129))
     free = ~fine_surface(design).fixed.numpy()
-    before = feet_and_heights(target, fine_surface(design).rest.numpy()[free])[1]
-    after = feet_and_heights(target, found.sensor.surface.values["vertices"].reshape(-1, 3)[free])[1]
+    before = feet_of(target, fine_surface(design).rest.numpy()[free]).heights
+    after = feet_of(target, found.surface.vertices[free]).heights
     deviations = found.surface.deviations[free]
     return dict(
         surface_before=rms(before), surface_after=rms(after), surface_deviation=rms(deviations),

@@ -83,7 +83,8 @@ def _fit_camera(
     start = np.concatenate([getattr(camera, name).numpy().ravel() for name in free])
     design_precision = np.concatenate([1 / (getattr(camera, name).numpy().ravel() * spread.get(name, np.inf)) for name in free])
     outlines, pixels = torch.from_numpy(board.outlines), torch.from_numpy(views.pixels)
-    filled, seen = torch.from_numpy(views.filled), torch.from_numpy(np.isfinite(views.pixels).all(-1))
+    filled, observed = torch.from_numpy(views.filled), torch.from_numpy(np.isfinite(views.pixels).all(-1))
+    seen = observed.clone()
     count = len(start)
 
     def modelled(shared: Tensor, pose: Tensor, filled: Tensor) -> Tensor:
@@ -116,12 +117,13 @@ def _fit_camera(
         return np.concatenate([rows, J[seen].flatten(0, 1).numpy()])
 
     pull, theta = design_precision * NOISE, np.concatenate([start, poses.ravel()])
+    seen &= all_views(*parts(theta)).isfinite().all(-1)
     for _ in range(ROUNDS):
-        found = fit(residuals, jacobian, theta, what)
-        pixel_residuals, theta = found.residuals[count:].reshape(-1, 2), found.values
-        wild = strays(pixel_residuals)
-        pull = design_precision * np.median(np.abs(pixel_residuals[~wild])) / 0.6745
-        seen[seen.clone()] = torch.from_numpy(~wild)
+        theta = fit(residuals, jacobian, theta, what).values
+        left = (all_views(*parts(theta)) - pixels)[observed].numpy()
+        wild = strays(left)
+        pull = design_precision * np.median(np.abs(left[~wild])) / 0.6745
+        seen[observed] = torch.from_numpy(~wild)
     found = fit(residuals, jacobian, theta, what)
     shared, poses, _ = parts(found.values)
     left = torch.where(seen[..., None], pixels - all_views(shared, poses, filled), torch.nan).numpy()
@@ -163,7 +165,7 @@ def _opencv_lens(camera: Camera, board: Checkerboard, views: Views) -> tuple[Cam
 
 
 def _start_pose(camera: Camera, board: DotBoard, pixels: np.ndarray, filled: bool) -> np.ndarray:
-    """A first pose `[6]`: that in which a central camera with the mean ray origin would see the points so."""
+    """A first pose `[6]`, for the design's ports: the better of the two that a central camera allows."""
     cv2 = opencv()
     seen = np.isfinite(pixels).all(1)
     medium = float(camera.medium_index) if filled else 1.0
@@ -174,8 +176,24 @@ def _start_pose(camera: Camera, board: DotBoard, pixels: np.ndarray, filled: boo
     points = board.points[seen][usable]
     if len(points) < 6:
         raise MembraneError(f"calibrate ports: {len(points)} dots of the board seen in an image; expected at least 6")
-    _, turn, shift = cv2.solvePnP(points, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-    depth = (board.outlines[seen] @ cv2.Rodrigues(turn)[0].T)[..., 2].min() + shift[2, 0] + float(origin[:, 2].mean())
-    face = camera.ports[-1].distance + camera.ports[-1].thickness
-    shift = shift.ravel() + [0, 0, float(origin[:, 2].mean()) + max(0.0, 1.05 * face - depth)]
-    return np.concatenate([turn.ravel(), shift])
+    _, turns, shifts, _ = cv2.solvePnPGeneric(points, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    behind, face = float(origin[:, 2].mean()), camera.ports[-1].distance + camera.ports[-1].thickness
+    fits = []
+    for turn, shift in zip(turns, shifts, strict=True):
+        depth = (board.outlines[seen] @ cv2.Rodrigues(turn)[0].T)[..., 2].min() + shift[2, 0] + behind
+        start = np.concatenate([turn.ravel(), shift.ravel() + [0, 0, behind + max(0.0, 1.05 * face - depth)]])
+        fits.append(_pose(camera, board.points[seen], pixels[seen], start))
+    return min(fits, key=lambda found: found.noise).values
+
+
+def _pose(camera: Camera, points: np.ndarray, pixels: np.ndarray, start: np.ndarray) -> Fit:
+    points, pixels = torch.from_numpy(points), torch.from_numpy(pixels)
+
+    def modelled(pose: Tensor) -> Tensor:
+        return camera.point_to_pixel(points @ rotations(pose[:3]).mT + pose[3:])
+
+    return fit(
+        lambda pose: (modelled(torch.from_numpy(pose)) - pixels).numpy().ravel(),
+        lambda pose: jacfwd(modelled)(torch.from_numpy(pose)).flatten(0, 1).numpy(),
+        start, "calibrate ports",
+    )  # fmt: skip

@@ -128,7 +128,7 @@ def depth(arguments) -> int:
     found = rest_from_depth(sensor, _depth_image(arguments), read_image(arguments.image))
     unit = sensor.length_unit
     notes = [
-        f"{len(found.feet)} squares of depths, each known to {np.median(found.deviations):.4f} {unit}",
+        f"{len(found.deviations)} squares of depths, each known to {np.median(found.deviations):.4f} {unit}",
         _moved(found.surface, unit),
         f"{len(found.sensor.markers.positions)} dots placed on the surface",
     ]
@@ -219,7 +219,7 @@ def _depth_image(arguments) -> np.ndarray:
 
 
 def _moved(surface, unit: str) -> str:
-    rms, sd = (float(np.sqrt((a**2).mean())) for a in surface)
+    rms, sd = (float(np.sqrt((a**2).mean())) for a in (surface.offsets, surface.deviations))
     return f"surface moved along its normals by {rms:.4f} {unit} rms, known to {sd:.4f} {unit} rms"
 
 

@@ -8,7 +8,7 @@ import torch
 from ..errors import MembraneError
 from ..markers.place import rim_mask
 from ..sensor import Sensor
-from .surface import Correction, correction, feet_and_heights, fine_surface, recalibrated
+from .surface import Correction, Feet, correction, feet_of, fine_surface, recalibrated
 from .views import placed_dots
 
 CELL = 24  # px: over such squares depths are averaged
@@ -17,13 +17,12 @@ NEAR = 0.1  # of the surface's size: depths farther from the design are of somet
 
 
 class DepthFit(NamedTuple):
-    """The sensor with the surface of a depth image: `Correction` of the design, and what it rests on: places `[N, 3]` on the
-    designed surface, mean heights of the depths over it there `[N]`, and their standard deviations `[N]`, length unit."""
+    """The sensor with the surface of a depth image: `Correction` of the design, and what it rests on: `Feet [N]` of squares of
+    depths on the designed surface, and the standard deviations of their heights `[N]`, length unit."""
 
     sensor: Sensor
     surface: Correction
-    feet: np.ndarray
-    heights: np.ndarray
+    feet: Feet
     deviations: np.ndarray
 
 
@@ -39,20 +38,22 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> Dep
         )
     surface = fine_surface(sensor)
     points, cells = _points(sensor, depth)
-    feet, heights = feet_and_heights(surface, points)
-    near = np.abs(heights) < NEAR * surface.size
+    feet = feet_of(surface, points)
+    near = np.abs(feet.heights) < NEAR * surface.size
+    feet = Feet(*(values[near] for values in feet))
     square = np.unique(cells[near], return_inverse=True)[1]
     counts = np.bincount(square)
-    mean = lambda values: np.bincount(square, values) / counts  # noqa: E731
-    foot = np.stack([mean(feet[near, k]) for k in range(3)], -1)
-    height = mean(heights[near])
-    deviations = np.sqrt(mean((heights[near] - height[square]) ** 2) / (counts - 1).clip(1))
+    mean = lambda values: np.stack([np.bincount(square, column) for column in values.T], -1) / counts[:, None]  # noqa: E731
+    places, normals, heights = mean(feet.places), mean(feet.normals), mean(feet.heights[:, None])[:, 0]
+    spread = np.bincount(square, (feet.heights - heights[square]) ** 2) / counts
     kept = counts >= FEWEST
-    change = correction(surface, foot[kept], height[kept], deviations[kept] ** 2)
-    vertices = surface.rest.numpy() + change.offsets[:, None] * surface.rest_normals.numpy()
-    dots, sizes = placed_dots(recalibrated(sensor, surface, vertices, None, None, image), image)
-    moved = recalibrated(sensor, surface, vertices, dots, sizes, image)
-    return DepthFit(moved, change, foot[kept], height[kept], deviations[kept])
+    deviations = np.sqrt(spread / (counts - 1).clip(1))[kept]
+    normals = normals[kept] / np.linalg.norm(normals[kept], axis=1, keepdims=True)
+    feet = Feet(places[kept], normals, heights[kept])
+    change = correction(surface, feet, deviations**2)
+    dots, sizes = placed_dots(recalibrated(sensor, surface, change.vertices, None, None, image), image)
+    moved = recalibrated(sensor, surface, change.vertices, dots, sizes, image)
+    return DepthFit(moved, change, feet, deviations)
 
 
 def _points(sensor: Sensor, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

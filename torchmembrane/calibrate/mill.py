@@ -9,12 +9,14 @@ import torch
 
 from ..errors import MembraneError
 from ..markers.place import rim_mask
+from ..membrane import Membrane
 from ..sensor import Sensor
-from .surface import fine_surface, frames_at
+from .fit import outline_centres
+from .surface import dot_outlines, feet_of, fine_surface
 
 RADIUS = {"small": 0.16, "large": 0.27}  # of dots, over their spacing
 MARGIN = 0.6  # of a pitch, that a lattice keeps from the rim's outline
-NEWTON_STEPS = 3
+NEWTON_STEPS, AIMS = 3, 2
 
 
 class MillDots(NamedTuple):
@@ -46,16 +48,28 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
 
 
 def dots_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> MillDots:
-    """Where the rays of `pixels [D, 2]`, refracted by the ports, meet the rest surface.
+    """Dots on the rest surface whose outlines are seen, through the ports, with their centres at `pixels [D, 2]`.
 
-    The ray meets the mesh first, then Newton's method takes the point onto the smooth surface: along the ray, by its height
-    over a mesh twice as fine. Raises `MembraneError` for the first pixel whose ray misses the surface.
+    A dot's own centre is seen beside its outline's, so that the ray aimed at is moved until the outline's is right. Raises
+    `MembraneError` for the first pixel whose ray misses the surface.
     """
-    pixels = np.asarray(pixels, float)
+    wanted = aimed = np.asarray(pixels, float)
     surface = fine_surface(sensor)
+    spacing = (float(surface.rest_area.sum()) / len(wanted)) ** 0.5
+    radii = spacing * np.array([RADIUS[size] for size in sizes])
+    for _ in range(AIMS):
+        X, normals = _ray_hits(sensor, surface, aimed)
+        outlines = sensor.camera.point_to_pixel(torch.from_numpy(dot_outlines(surface, X, radii)))
+        aimed = aimed + (wanted - outline_centres(outlines).numpy())
+    X, normals = _ray_hits(sensor, surface, aimed)
+    return MillDots(X, normals, radii, list(sizes), wanted)
+
+
+def _ray_hits(sensor: Sensor, surface: Membrane, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays meet the surface, and its normals there, `[D, 3]` each: the mesh first, then Newton on one twice as fine."""
     origin, direction = (ray.numpy() for ray in sensor.camera.pixel_to_ray(torch.from_numpy(pixels)))
-    hits = surface.ray_points(np.nan_to_num(origin), np.nan_to_num(direction))
-    missed = ~(np.isfinite(hits.distance) & np.isfinite(direction).all(1))
+    reach = surface.ray_points(np.nan_to_num(origin), np.nan_to_num(direction)).distance
+    missed = ~(np.isfinite(reach) & np.isfinite(direction).all(1))
     if missed.any():
         d = int(np.flatnonzero(missed)[0])
         raise MembraneError(
@@ -63,15 +77,11 @@ def dots_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> Mil
             "within the rim's outline: leave it out"
         )
     finer = sensor.surface.membrane(tuple(2 * side - 1 for side in surface.grid))
-    X = origin + hits.distance[:, None] * direction
+    X = origin + reach[:, None] * direction
     for _ in range(NEWTON_STEPS):
-        feet = finer.closest_points(X)
-        foot = (finer.rest.numpy()[feet.vertices] * feet.weights[..., None]).sum(1)
-        normals = frames_at(finer, X)[0]
-        X = X + (((foot - X) * normals).sum(1) / (direction * normals).sum(1))[:, None] * direction
-    spacing = (float(surface.rest_area.sum()) / len(X)) ** 0.5
-    radii = spacing * np.array([RADIUS[size] for size in sizes])
-    return MillDots(X, frames_at(finer, X)[0], radii, list(sizes), pixels)
+        feet = feet_of(finer, X)
+        X = X - (feet.heights / (direction * feet.normals).sum(1))[:, None] * direction
+    return X, feet_of(finer, X).normals
 
 
 def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:

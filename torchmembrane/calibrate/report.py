@@ -11,6 +11,7 @@ from ..view import BLUE, GREY, VERMILION, save
 
 TOLD_APART = 0.98  # correlation above which two settings are said to be hard to tell apart
 PARAMETERS_DRAWN = 24
+GAINS = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000])
 
 
 class Report(NamedTuple):
@@ -99,7 +100,7 @@ def fit_figure(report: Report, image_size: tuple[int, int]) -> Figure:
 def draw_residuals(axes, report: Report, image_size: tuple[int, int]) -> None:
     width, height = image_size
     typical = np.sqrt((report.residuals**2).sum(-1).mean()) if len(report.residuals) else 1.0
-    gain = 10.0 ** np.floor(np.log10(0.03 * width / max(typical, 1e-9)))
+    gain = max(GAINS[GAINS <= max(1.0, 0.03 * width / max(typical, 1e-9))])
     axes.quiver(*report.pixels.T, *(gain * report.residuals).T, angles="xy", scale_units="xy", scale=1, width=0.002, color=BLUE)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="u, px", ylabel="v, px")
     axes.set_title(f"measured less modelled, x {gain:g}")

@@ -46,7 +46,8 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
     sizes = np.array([size == "large" for size in sensor.markers.sizes], dtype=int)
     outlines, pixels = measured_outlines(sensor, surface, X, sizes, image)
     pivot = surface.rest[surface.fixed].mean(0)
-    used = np.isfinite(pixels).all(1)
+    seen = np.isfinite(pixels).all(1)
+    used = seen.copy()
 
     def modelled(theta, outlines):
         return outline_centres(sensor.camera.point_to_pixel((outlines - pivot) @ rotations(theta[:3]).mT + pivot + theta[3:]))
@@ -67,7 +68,7 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
     move = lambda x: (x - pivot.numpy()) @ turn.T + pivot.numpy() + shift  # noqa: E731
     residuals = pixels - modelled(torch.from_numpy(found), torch.from_numpy(outlines)).numpy()
     _, tangents = frames_at(surface, X)
-    shifts = _nulling(sensor, move(outlines), turn @ tangents, pixels, used)
+    shifts = _nulling(sensor, move(outlines), turn @ tangents, pixels, seen)
     moved = recalibrated(sensor, surface, move(surface.rest.numpy()), move(X) + shifts, sensor.markers.sizes, image)
     return RestFit(moved, NAMES, _in_degrees(result), pixels, residuals, shifts)
 
@@ -90,9 +91,9 @@ def measured_outlines(sensor: Sensor, surface, X: np.ndarray, sizes: np.ndarray,
     return dot_outlines(surface, X, radii), pattern.pixels
 
 
-def _nulling(sensor: Sensor, outlines: np.ndarray, tangents: np.ndarray, pixels: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Shifts `[D, 3]` within the tangent plane after which each used dot is modelled where it is measured; else 0."""
-    outlines, tangents, target = (torch.from_numpy(np.ascontiguousarray(a[used])) for a in (outlines, tangents, pixels))
+def _nulling(sensor: Sensor, outlines: np.ndarray, tangents: np.ndarray, pixels: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Shifts `[D, 3]` within the tangent plane after which each seen dot is modelled where it is measured; else 0."""
+    outlines, tangents, target = (torch.from_numpy(np.ascontiguousarray(a[seen])) for a in (outlines, tangents, pixels))
 
     def modelled(step, outline, tangent):
         return outline_centres(sensor.camera.point_to_pixel(outline + tangent @ step))
@@ -101,8 +102,8 @@ def _nulling(sensor: Sensor, outlines: np.ndarray, tangents: np.ndarray, pixels:
     for _ in range(3):
         left = target - vmap(modelled)(step, outlines, tangents)
         step = step + torch.linalg.solve(vmap(jacfwd(modelled))(step, outlines, tangents), left)
-    shifts = np.zeros((len(used), 3))
-    shifts[used] = (tangents @ step[..., None]).squeeze(-1).numpy()
+    shifts = np.zeros((len(seen), 3))
+    shifts[seen] = (tangents @ step[..., None]).squeeze(-1).numpy()
     return shifts
 
 

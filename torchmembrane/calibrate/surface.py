@@ -15,9 +15,19 @@ from ..sensor import Markers, Sensor, Surface
 FINE = 65  # vertices a side of the surface that is calibrated
 
 
-class Correction(NamedTuple):
-    """Offsets of a surface along its outward normals: `offsets [V]` and their standard deviations `[V]`, length unit."""
+class Feet(NamedTuple):
+    """The closest points of a surface, `places [N, 3]`, its outward `normals [N, 3]` there, and how far outside (positive) or
+    inside it the points are that stand on them, `heights [N]`."""
 
+    places: np.ndarray
+    normals: np.ndarray
+    heights: np.ndarray
+
+
+class Correction(NamedTuple):
+    """A surface moved: `vertices [V, 3]`, by how much along its outward normals `[V]`, and the standard deviations `[V]`."""
+
+    vertices: np.ndarray
     offsets: np.ndarray
     deviations: np.ndarray
 
@@ -37,9 +47,7 @@ def recalibrated(sensor: Sensor, surface: Membrane, vertices: np.ndarray, positi
 
 def frames_at(surface: Membrane, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Outward normals `[D, 3]` and two tangents `[D, 3, 2]` of the surface next to `positions [D, 3]`."""
-    points = surface.closest_points(positions)
-    normals = (surface.rest_normals.numpy()[points.vertices] * points.weights[..., None]).sum(1)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = feet_of(surface, positions).normals
     first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return normals, np.stack([first, np.cross(normals, first)], -1)
@@ -51,7 +59,7 @@ def dot_outlines(surface: Membrane, positions: np.ndarray, radii: np.ndarray) ->
     angle = 2 * np.pi * np.arange(OUTLINE) / OUTLINE
     circle = np.stack([np.cos(angle), np.sin(angle)])
     flat = positions[:, None] + radii[:, None, None] * (tangents @ circle).swapaxes(1, 2)
-    heights = [feet_and_heights(surface, points.reshape(-1, 3))[1] for points in (flat, positions)]
+    heights = [feet_of(surface, points.reshape(-1, 3)).heights for points in (flat, positions)]
     sag = heights[0].reshape(flat.shape[:2]) - heights[1][:, None]
     return flat - sag[..., None] * normals[:, None]
 
@@ -64,22 +72,26 @@ def unit_shapes(camera, outlines: np.ndarray, radii: np.ndarray) -> np.ndarray:
     return np.stack(columns, -1)
 
 
-def correction(surface: Membrane, feet: np.ndarray, heights: np.ndarray, variances: np.ndarray) -> Correction:
-    """The smooth normal offset of the surface that has `heights [N]`, of `variances [N]`, at its points `feet [N, 3]`.
+def correction(surface: Membrane, feet: Feet, variances: np.ndarray) -> Correction:
+    """The smooth displacement of the surface that has the heights of `feet [N]`, of `variances [N]`, along their normals.
 
-    Thin-plate spline (scipy), linear where there are no points; what moves the surface within itself is not seen. Wrong where
-    the rim is far outside the points.
+    Thin-plate splines (scipy) of the heights as vectors, linear where there are no points; what moves the surface within itself
+    is not seen. Wrong where the rim is far outside the points.
     """
-    if len(feet) < 12:
-        raise MembraneError(f"calibrate: {len(feet)} points of the rest surface; expected at least 12")
-    weights = RBFInterpolator(feet, np.eye(len(feet)), kernel="thin_plate_spline", degree=1)(surface.rest.numpy())
-    return Correction(weights @ heights, np.sqrt(weights**2 @ variances))
+    if len(feet.places) < 12:
+        raise MembraneError(f"calibrate: {len(feet.places)} points of the rest surface; expected at least 12")
+    unit = np.eye(len(feet.places))
+    weights = RBFInterpolator(feet.places, unit, kernel="thin_plate_spline", degree=1)(surface.rest.numpy())
+    shift = weights @ (feet.heights[:, None] * feet.normals)
+    offsets = (shift * surface.rest_normals.numpy()).sum(1)
+    return Correction(surface.rest.numpy() + shift, offsets, np.sqrt(weights**2 @ variances))
 
 
-def feet_and_heights(surface: Membrane, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The closest points of the surface `[N, 3]`, and how far `points [N, 3]` are outside it (negative: inside) `[N]`."""
+def feet_of(surface: Membrane, points: np.ndarray) -> Feet:
+    """The feet of `points [N, 3]` on the surface."""
     near = surface.closest_points(points)
-    feet, normals = (
+    places, normals = (
         (values.numpy()[near.vertices] * near.weights[..., None]).sum(1) for values in (surface.rest, surface.rest_normals)
     )
-    return feet, ((points - feet) * normals).sum(1) / np.linalg.norm(normals, axis=1)
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return Feet(places, normals, ((points - places) * normals).sum(1))

@@ -13,7 +13,7 @@ from ..markers.place import rim_mask
 from ..sensor import Sensor
 from .fit import Fit, fit, outline_centres, rotations, strays
 from .rest import measured_outlines
-from .surface import Correction, correction, feet_and_heights, fine_surface, recalibrated
+from .surface import Correction, correction, feet_of, fine_surface, recalibrated
 
 
 class ViewsFit(NamedTuple):
@@ -124,11 +124,10 @@ def _bundle(sensor, surface, X, sizes, rel, pixels, motions, travel_error, image
         found.values[own:].reshape(-1, 3),
         np.where(seen[..., None], pixels - each(*parts(found.values)).numpy(), np.nan),
     )
-    normals = surface.rest_normals.numpy()[surface.closest_points(dots).vertices[:, 0]]
+    feet = feet_of(surface, dots)
     blocks = np.stack([found.covariance[own + 3 * d : own + 3 * d + 3, own + 3 * d : own + 3 * d + 3] for d in range(D)])
-    change = correction(surface, *feet_and_heights(surface, dots), np.einsum("di,dij,dj->d", normals, blocks, normals))
-    vertices = surface.rest.numpy() + change.offsets[:, None] * surface.rest_normals.numpy()
-    moved = recalibrated(sensor, surface, vertices, dots, sizes, image)
+    change = correction(surface, feet, np.einsum("di,dij,dj->d", feet.normals, blocks, feet.normals))
+    moved = recalibrated(sensor, surface, change.vertices, dots, sizes, image)
     names = [f"{name}[{p}]" for p in range(1, P) for name in ("turn_x", "turn_y", "turn_z", "place_x", "place_y", "place_z")]
     scale = np.array(([180 / np.pi] * 3 + [1.0] * 3) * (P - 1) + [1.0] * (3 * D))
     found = found._replace(values=scale * found.values, covariance=scale[:, None] * found.covariance * scale)

@@ -1,0 +1,394 @@
+"""Laws of calibration: what was simulated is found within three reported standard deviations; what cannot be known is said."""
+
+import csv
+import json
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from torchmembrane import MembraneError, cli
+from torchmembrane.boards import Checkerboard, DotBoard
+from torchmembrane.calibrate.boards import Views, lens_from_views, ports_from_views
+from torchmembrane.calibrate.depth import rest_from_depth
+from torchmembrane.calibrate.fit import fit, outline_centres, rotations, with_common_error
+from torchmembrane.calibrate.mill import dots_for_pixels, pixel_lattice
+from torchmembrane.calibrate.rest import rest_from_image
+from torchmembrane.calibrate.targets import find_target
+from torchmembrane.calibrate.views import rest_from_views
+from torchmembrane.camera import Camera
+from torchmembrane.images import to_grey
+from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.sensor import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.simulate.board import BoardImages
+from torchmembrane.simulate.look import Look
+from torchmembrane.simulate.simulator import Simulator
+
+SIZE, NOISE = (320, 240), 40.0
+LENSES = {
+    "pinhole": ((132.0, 133.0), (161.2, 118.5), (-0.05, 0.01, 5e-4, -3e-4, 0.0)),
+    "fisheye": ((90.0, 90.3), (160.8, 119.1), (-0.012, 0.002, 0.0, 0.0)),
+}
+PORT, GUESS = (4.0, 3.0, 1.49, 1.33), (4.3, 2.8, 1.53, 1.36)
+CHECKERS, DOTS = Checkerboard(9, 6, 3.0), DotBoard(11, 8, 2.4)
+TILT, OFFSET = Rotation.from_rotvec(np.deg2rad([0.8, 0.6, 0.0])), np.array([0.05, -0.05, 0.3])  # 1 degree, 0.3 mm
+
+
+def poses(board, count, depths, rng, tilt=0.45):
+    """Random places of a board before a camera, its middle near the axis: rotations and translations."""
+    middle = np.append(sum(board.extent) / 2, 0.0)
+    for _ in range(count):
+        R = Rotation.from_rotvec(rng.uniform(-1, 1, 3) * [tilt, tilt, 0.8]).as_matrix()
+        z = rng.uniform(*depths)
+        yield R, np.append(rng.uniform(-0.1, 0.1, 2) * z, z) - R @ middle
+
+
+def photographed(camera, board, count, depths, rng):
+    """The board's points as found in noisy images of it, `[count, D, 2]`."""
+    photograph, found = BoardImages.of(camera), []
+    for R, t in poses(board, 3 * count, depths, rng):
+        try:
+            found.append(find_target(to_grey(photograph.image(board, R, t, NOISE, rng=rng)), board))
+        except MembraneError:  # not wholly in the image
+            continue
+        if len(found) == count:
+            return np.stack(found)
+
+
+def ported(values, model="fisheye", air=False):
+    distance, thickness, index, medium = values
+    focal, centre, _ = LENSES[model]
+    return Camera(model, SIZE, focal, centre, (), [(distance, thickness, index)], 1.0 if air else medium)
+
+
+def exact_views(camera, count, rng, noise=0.02):
+    """Centres of the dots' outlines as the camera projects them, with noise, px."""
+    pixels = []
+    for R, t in poses(DOTS, count, (13, 20), rng):
+        p = outline_centres(camera.point_to_pixel(torch.from_numpy(DOTS.outlines @ R.T + t))).numpy()
+        pixels.append(p + noise * rng.normal(size=p.shape))
+    return np.stack(pixels)
+
+
+def cap_sensor(camera, spacing=1.9):
+    """A cap with a square pattern of dots in two sizes."""
+    x, y = (a.ravel() for a in np.meshgrid(*2 * [spacing * np.arange(-4, 5)], indexing="ij"))
+    kept = np.hypot(x, y) < 7.0
+    x, y = x[kept], y[kept]
+    surface = Surface("spherical_cap", {"rim_radius": 9.0, "height": 5.0, "base_z": 12.0})
+    radius = (81 + 25) / 10
+    dots = np.stack([x, y, 17 - radius + np.sqrt(radius**2 - x**2 - y**2)], -1)
+    sizes = np.where(np.arange(len(x)) % 3 == 0, "large", "small").tolist()
+    material, markers = Material("neo_hookean", 1.3), Markers("dots", "dark", dots, sizes)
+    return Sensor("cap", "mm", camera, surface.membrane((17, 17)), material, Cavity("liquid"), markers, surface)
+
+
+def moved(sensor, turn, shift):
+    """The sensor's membrane and dots elsewhere before its camera."""
+    fine = sensor.surface.membrane((81, 81))
+    vertices = (turn.apply(fine.rest.numpy()) + shift).reshape(81, 81, 3)
+    surface = Surface("grid", {"vertices": vertices, "fixed": fine.fixed.numpy().reshape(81, 81)})
+    markers = Markers("dots", "dark", turn.apply(sensor.markers.positions) + shift, sensor.markers.sizes)
+    return replace(sensor, membrane=surface.membrane((17, 17)), surface=surface, markers=markers)
+
+
+def assembled(design):
+    """The sensor as it was really put together: turned by 1 degree about the rim's centre, 0.3 mm too far away."""
+    pivot = np.array([0.0, 0.0, 12.0])
+    return moved(design, TILT, pivot + OFFSET - TILT.apply(pivot))
+
+
+def simulator_of(sensor):
+    return Simulator(sensor, look=Look(noise=NOISE))
+
+
+@pytest.fixture(scope="module")
+def design():
+    return cap_sensor(Camera("pinhole", SIZE, (150.0, 150.0), (160.4, 119.2), (), [(3.0, 2.0, 1.49)], 1.33))
+
+
+@pytest.fixture(scope="module")
+def truth(design):
+    return assembled(design)
+
+
+@pytest.fixture(scope="module")
+def image(truth):
+    return simulator_of(truth).rest_image()
+
+
+def assert_within(values, truth, deviations, most):
+    error = np.abs(np.asarray(values) - truth)
+    assert (error < 3 * deviations).all(), (error, error / deviations)
+    assert (deviations < most).all(), deviations
+
+
+# the fit
+
+
+def test_covariance_of_a_line_is_the_textbooks():
+    x = np.linspace(-1, 1, 21)
+    A, noise = np.stack([np.ones_like(x), x], -1), np.random.default_rng(0).normal(size=21)
+    found = fit(lambda theta: A @ theta - (2 + 3 * x + noise), lambda theta: A, np.zeros(2), "line")
+    left = noise - A @ np.linalg.lstsq(A, noise)[0]
+    assert np.allclose(found.deviations**2, (left**2).sum() / 19 / [21, (x**2).sum()], rtol=1e-8)
+    shared = with_common_error(found, A, 0.5 * np.ones(21))
+    assert np.allclose(shared.covariance - found.covariance, [[0.25, 0], [0, 0]], atol=1e-12)
+
+
+def test_what_no_datum_determines_has_a_huge_deviation():
+    A = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
+    found = fit(lambda theta: A @ theta - [1.0, 2.1, 2.9], lambda theta: A, np.zeros(2), "sum")
+    assert found.deviations.min() > 1e3 and found.covariance[0, 1] < 0
+    with pytest.raises(MembraneError, match="2 data for 2 unknowns"):
+        fit(lambda theta: theta, lambda theta: np.eye(2), np.zeros(2), "too little")
+
+
+def test_rotations_are_scipys():
+    vectors = np.array([[0.0, 0, 0], [0.3, -0.2, 1.1], [1e-9, 0, 0]])
+    assert np.allclose(rotations(torch.from_numpy(vectors)), Rotation.from_rotvec(vectors).as_matrix(), atol=1e-14)
+
+
+def test_centre_of_an_outline_is_that_of_its_ellipse():
+    """A circle seen aslant by a pinhole is an ellipse; its centre is the pole of the line at infinity."""
+    R, t, r = Rotation.from_rotvec([0.7, 0.3, 0.0]).as_matrix(), np.array([1.0, -0.5, 6.0]), 1.0
+    H = np.stack([R[:, 0], R[:, 1], t], 1)
+    conic = np.linalg.inv(H).T @ np.diag([1, 1, -(r**2)]) @ np.linalg.inv(H)
+    pole = np.linalg.solve(conic, [0, 0, 1.0])
+    angle = 2 * np.pi * np.arange(8) / 8
+    points = np.stack([r * np.cos(angle), r * np.sin(angle), 0 * angle], -1) @ R.T + t
+    outline = torch.from_numpy(points[:, :2] / points[:, 2:])
+    assert np.allclose(outline_centres(outline), pole[:2] / pole[2], atol=1e-6)
+    assert np.linalg.norm(t[:2] / t[2] - pole[:2] / pole[2]) > 1e-3
+
+
+# boards
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.5, 3.0])
+def test_board_dots_are_named_right_in_any_turn_and_when_cut(turn):
+    camera = Camera("pinhole", SIZE, (150, 150), (160, 120), (-0.1, 0.02))
+    R = Rotation.from_euler("xz", [0.3, turn]).as_matrix()
+    t = np.array([3.0, 1.0, 16.0])
+    image = BoardImages.of(camera).image(DOTS, R, t, NOISE)
+    pixels = find_target(to_grey(image), DOTS)
+    expected = outline_centres(camera.point_to_pixel(torch.from_numpy(DOTS.outlines @ R.T + t))).numpy()
+    seen, inside = np.isfinite(pixels).all(1), ((expected > 8) & (expected < [311, 231])).all(1)
+    assert seen[inside].mean() > 0.97 and seen.sum() < len(seen)
+    assert np.abs(pixels - expected)[seen].max() < 0.12
+
+
+def test_boards_say_what_is_wrong():
+    for make in (lambda: Checkerboard(2, 5, 1.0), lambda: DotBoard(5, 5, 1.0), lambda: DotBoard(9, 9, 1.0, 0.4)):
+        with pytest.raises(MembraneError, match="expected"):
+            make()
+    grey = np.full(SIZE[::-1], 0.5, np.float32)
+    with pytest.raises(MembraneError, match="no checkerboard of 9 x 6"):
+        find_target(grey, CHECKERS)
+
+
+# lens and ports
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_lens_is_found_within_three_deviations(model):
+    focal, centre, distortion = LENSES[model]
+    camera = Camera(model, SIZE, focal, centre, distortion)
+    pixels = photographed(camera, CHECKERS, 7, (15, 24), np.random.default_rng(0))
+    guess = Camera(model, SIZE, (120, 120), (160, 120), (), [PORT[:3]], 1.33)
+    found = lens_from_views(guess, CHECKERS, Views(pixels, np.zeros(7, bool)))
+    values, deviations = found.fit.values[: len(found.names)], found.fit.deviations[: len(found.names)]
+    assert_within(values, np.concatenate([focal, centre, distortion]), deviations, [0.3] * 4 + [np.inf] * len(distortion))
+    assert found.camera.ports == guess.ports and found.camera.focal.tolist() == values[:2].tolist()
+
+
+def test_ports_are_found_from_images_in_air_and_in_the_medium():
+    rng = np.random.default_rng(1)
+    sets = [photographed(ported(PORT, air=air), DOTS, 2, (14, 18), rng) for air in (True, False)]
+    views = Views(np.concatenate(sets), np.arange(4) >= 2)
+    found = ports_from_views(ported(GUESS), DOTS, views)
+    assert found.names == ["port_distance", "port_thickness", "port_index", "medium_index"]
+    assert_within(found.fit.values[:4], PORT, found.fit.deviations[:4], [0.05, 0.05, 0.05 * 1.49, 0.05 * 1.33])
+    assert np.allclose([*found.camera.ports[0], float(found.camera.medium_index)], found.fit.values[:4])
+
+
+def test_in_the_medium_thickness_and_index_cannot_be_told_apart():
+    rng = np.random.default_rng(2)
+    found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT), 5, rng), np.ones(5, bool)))
+    covariance, deviations = found.fit.covariance, found.fit.deviations
+    assert covariance[1, 2] / deviations[1] / deviations[2] < -0.99
+    assert deviations[1] > 0.15 and deviations[0] < 0.05 and deviations[3] < 0.005
+    assert_within(found.fit.values[:4], PORT, deviations[:4], np.inf)
+
+
+def test_in_air_the_distance_of_a_plate_is_not_seen():
+    rng = np.random.default_rng(3)
+    found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT, air=True), 5, rng), np.zeros(5, bool)))
+    assert found.names == ["port_distance", "port_thickness", "port_index"]
+    assert abs(found.fit.values[0] - GUESS[0]) < 1e-3 and found.fit.deviations[0] > 0.15 * GUESS[0]
+    assert_within(found.fit.values[1:3], PORT[1:3], found.fit.deviations[1:3], [0.05, 0.05])
+
+
+def test_a_mistaken_dot_is_left_out_and_what_is_held_stays():
+    rng = np.random.default_rng(4)
+    pixels = exact_views(ported(PORT), 4, rng)
+    pixels[1, 7] += [9.0, -4.0]
+    held = (4.3, 3.0, 1.49, 1.36)
+    views = Views(pixels, np.ones(4, bool))
+    found = ports_from_views(ported(held), DOTS, views, ["port_thickness", "port_index"])
+    assert found.names == ["port_distance", "medium_index"] and found.camera.ports[0][1:] == (3.0, 1.49)
+    assert (
+        np.isnan(found.residuals[1, 7]).all()
+        and np.isfinite(found.residuals).all(-1).sum() == np.isfinite(pixels).all(-1).sum() - 1
+    )
+    assert_within(found.fit.values[:2], [4.0, 1.33], found.fit.deviations[:2], [0.05, 0.05])
+    with pytest.raises(MembraneError, match="'focal' cannot be held"):
+        ports_from_views(ported(held), DOTS, views, ["focal"])
+
+
+# rest surface and dots
+
+
+def test_tilt_and_offset_are_found_from_one_rest_image(design, truth, image):
+    found = rest_from_image(design, image)
+    expected = [*np.rad2deg(TILT.as_rotvec()), *OFFSET]
+    assert_within(found.fit.values, expected, found.fit.deviations, [0.1] * 3 + [0.05] * 3)
+    off = lambda sensor: np.linalg.norm(sensor.markers.positions - truth.markers.positions, axis=1)  # noqa: E731
+    assert off(found.sensor).max() < 0.03 < 0.2 < off(design).min()
+    gap = found.sensor.surface.membrane((17, 17)).closest_points(truth.membrane.rest.numpy()).distance
+    assert gap.max() < 0.03
+
+
+def test_a_calibrated_sensor_reconstructs_its_rest(design, truth, image):
+    """Without nulling in the image, the error of the pose is an error of the surface; with the pose found, it is gone."""
+    pixels = truth.camera.point_to_pixel(torch.from_numpy(truth.markers.positions))
+    off = {}
+    for name, sensor in (("before", design), ("after", rest_from_image(design, image).sensor)):
+        bare = replace(sensor, markers=replace(sensor.markers, rest_image=None))
+        result = Reconstructor(bare).from_pixels(pixels)
+        off[name] = float(
+            (result.markers[0].double() - torch.from_numpy(truth.markers.positions)).norm(dim=-1).square().mean().sqrt()
+        )
+    assert off["before"] > 0.25 and off["after"] < 0.03
+
+
+def test_misplaced_dots_are_nulled(design):
+    shift, wrong = np.array([0.12, -0.08]), [3, 20]
+    dots = design.markers.positions.copy()
+    radius, centre = 10.6, 17 - 10.6
+    dots[wrong, :2] += shift
+    dots[wrong, 2] = centre + np.sqrt(radius**2 - (dots[wrong, :2] ** 2).sum(1))
+    made = replace(design, markers=replace(design.markers, positions=dots))
+    found = rest_from_image(design, simulator_of(made).rest_image())
+    assert np.linalg.norm(found.sensor.markers.positions - dots, axis=1).max() < 0.03
+    assert (np.linalg.norm(found.shifts, axis=1) > 0.1).nonzero()[0].tolist() == wrong
+
+
+def test_unlisted_dots_are_found_from_several_views(design, truth, image):
+    motions = np.array([[0.0, 0, 0, 0, 0, 0], [1.5, 0, 0, 0, -3, 0], [0, -1.5, 0, -3, 0, 0]])
+    images = [image]
+    for motion in motions[1:]:
+        back = Rotation.from_rotvec(np.deg2rad(motion[3:])).inv()
+        images.append(simulator_of(moved(truth, back, -back.apply(motion[:3]))).rest_image())
+    rough = motions + [[0] * 6, [0, 0, 0, 0.3, -0.2, 0.3], [0.03, 0, -0.05, 0.2, 0.3, -0.3]]
+    unlisted = replace(design, markers=Markers("dots", "dark", rest_image=image))
+    found = rest_from_views(unlisted, images, rough, 0.005)
+    true = np.concatenate([motions[1:, 3:], motions[1:, :3]], 1).ravel()
+    assert_within(found.fit.values[:12], true, found.fit.deviations[:12], [0.1, 0.1, 0.1, 0.05, 0.05, 0.05] * 2)
+    partner = cKDTree(truth.markers.positions).query(found.dots)[1]
+    assert len(set(partner)) == len(found.dots) == len(truth.markers.positions)
+    error = np.abs(found.dots - truth.markers.positions[partner])
+    assert (error < 3 * found.deviations).mean() > 0.98
+    inner = np.linalg.norm(found.dots[:, :2], axis=1) < 6
+    assert error[inner].max() < 0.1 and found.sensor.markers.sizes == [truth.markers.sizes[k] for k in partner]
+
+
+def test_rest_surface_and_dots_are_found_from_a_depth_image(design, truth, image):
+    simulator = simulator_of(truth)
+    exact = simulator.renderer.depth(simulator.membrane.rest).numpy()
+    X = simulator.membrane.rest.numpy()[len(simulator.membrane.rest) // 2]
+    u, v = truth.camera.point_to_pixel(torch.from_numpy(X)).round().int().tolist()
+    assert abs(exact[v, u] - X[2]) < 0.02 and np.isnan(exact[0, 0])
+    depth = exact + 0.1 * np.random.default_rng(0).normal(size=exact.shape)
+    found = rest_from_depth(design, depth, image)
+    radius = np.linalg.norm(design.surface.membrane((65, 65)).rest.numpy()[:, :2], axis=1)
+    vertices = found.sensor.surface.values["vertices"].reshape(-1, 3)
+    gap = truth.surface.membrane((129, 129)).closest_points(vertices).distance
+    assert (gap < 3 * found.surface.deviations)[radius < 8].mean() > 0.97
+    assert gap[radius < 8].mean() < 0.02 < 0.15 < np.abs(found.feet.heights).mean()
+    assert cKDTree(truth.markers.positions).query(found.sensor.markers.positions)[0].max() < 0.06
+
+
+# dots for a mill
+
+
+def test_dots_for_a_wanted_pattern_are_seen_where_they_were_wanted(design):
+    pixels, sizes = pixel_lattice(design, 20.0)
+    dots = dots_for_pixels(design, pixels, sizes)
+    x, y, z = dots.positions.T
+    assert np.abs(np.sqrt(x**2 + y**2 + (z - 6.4) ** 2) - 10.6).max() < 2e-3  # on the cap's sphere
+    assert np.abs(dots.normals - (dots.positions - [0, 0, 6.4]) / 10.6).max() < 2e-3
+    assert set(np.diff(np.unique(pixels[:, 0])).round(9)) == {20.0} and len(pixels) > 40
+    made = replace(design, markers=Markers("dots", "dark", dots.positions, sizes))
+    found = rest_from_image(made, simulator_of(made).rest_image())
+    assert np.nanmax(np.abs(found.pixels - pixels)) < 0.12
+    with pytest.raises(MembraneError, match="misses the rest surface"):
+        dots_for_pixels(design, np.array([[5.0, 5.0]]), ["small"])
+
+
+# the command
+
+
+def run(capsys, *arguments):
+    code = cli.main(["calibrate", *map(str, arguments)])
+    return code, *capsys.readouterr()
+
+
+def test_command_rest_writes_a_sensor_a_report_and_a_figure(design, image, tmp_path, capsys):
+    path = design.to_file(tmp_path / "design")
+    Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(tmp_path / "rest.png")
+    code, said, _ = run(capsys, "rest", path, tmp_path / "rest.png", "--out", tmp_path / "out")
+    assert code == 0 and "tilt_x" in said and "±" in said
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    tilt = report["parameters"]["tilt_x"]
+    assert abs(tilt["value"] - 0.8) < 3 * tilt["deviation"] and tilt["unit"] == "degrees"
+    assert Image.open(tmp_path / "out" / "report.png").size[0] > 1000
+    sensor = Sensor.from_file(tmp_path / "out" / "sensor.toml")
+    assert sensor.markers.rest_image is not None and sensor.camera.ports == design.camera.ports
+
+
+def test_command_camera_leaves_out_images_without_a_board(design, tmp_path, capsys):
+    camera = Camera("pinhole", SIZE, (150.0, 150.0), (160.4, 119.2))
+    photograph, rng = BoardImages.of(camera), np.random.default_rng(5)
+    for k, (R, t) in enumerate(poses(CHECKERS, 4, (17, 24), rng)):
+        Image.fromarray(photograph.image(CHECKERS, R, t, NOISE, rng=rng)).save(tmp_path / f"{k}.png")
+    Image.new("L", SIZE, 100).save(tmp_path / "empty.png")
+    options = ("--corners", "9,6", "--square", "3", "--out", tmp_path / "out")
+    code, said, _ = run(capsys, "camera", design.to_file(tmp_path / "design"), tmp_path, *options)
+    assert code == 0 and "empty.png left out" in said and "4 images" in said
+    found = Sensor.from_file(tmp_path / "out" / "sensor.toml").camera
+    assert np.abs(found.focal.numpy() - 150).max() < 1 and len(found.ports) == 1
+
+
+def test_command_pattern_writes_for_mill_and_eye(design, tmp_path, capsys):
+    path = design.to_file(tmp_path / "design")
+    code, said, _ = run(capsys, "pattern", path, "--pitch", 25, "--out", tmp_path / "out")
+    assert code == 0 and "mill.csv" in said
+    made = Sensor.from_file(tmp_path / "out" / "sensor.toml")
+    with (tmp_path / "out" / "mill.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(made.markers.positions)
+    places = np.array([[float(row[key]) for key in "xyz"] for row in rows])
+    assert np.allclose(places + [0, 0, 12.0], made.markers.positions, atol=2e-5)
+    drawing = ElementTree.parse(tmp_path / "out" / "mill.svg").getroot()
+    assert len(drawing.findall("{*}ellipse")) == len(rows) and drawing.get("width").endswith("mm")
+    (tmp_path / "wanted.csv").write_text("u,v,size\n160,120,large\n180,120,tiny\n")
+    code, _, errors = run(capsys, "pattern", path, "--pixels", tmp_path / "wanted.csv", "--out", tmp_path / "no")
+    assert code == 2 and "small or large" in errors
+    code, _, errors = run(capsys, "pattern", path, "--out", tmp_path / "no")
+    assert code == 2 and "--pixels" in errors
