@@ -170,11 +170,11 @@ def test_centre_of_an_outline_is_that_of_its_ellipse():
 # boards
 
 
-@pytest.mark.parametrize("turn", [0.0, 1.5, 3.0])
+@pytest.mark.parametrize("turn", [0.0, 2.0])
 def test_board_dots_are_named_right_in_any_turn_and_when_cut(turn):
     camera = Camera("pinhole", SIZE, (150, 150), (160, 120), (-0.1, 0.02))
     R = Rotation.from_euler("xz", [0.3, turn]).as_matrix()
-    t = np.array([3.0, 1.0, 16.0])
+    t = np.array([5.0, 1.0, 13.0])
     image = BoardImages.of(camera).image(DOTS, R, t, NOISE)
     pixels = find_target(to_grey(image), DOTS)
     expected = outline_centres(camera.point_to_pixel(torch.from_numpy(DOTS.outlines @ R.T + t))).numpy()
@@ -219,16 +219,16 @@ def test_ports_are_found_from_images_in_air_and_in_the_medium():
 
 def test_in_the_medium_thickness_and_index_cannot_be_told_apart():
     rng = np.random.default_rng(2)
-    found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT), 5, rng), np.ones(5, bool)))
+    found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT), 4, rng), np.ones(4, bool)))
     covariance, deviations = found.fit.covariance, found.fit.deviations
-    assert covariance[1, 2] / deviations[1] / deviations[2] < -0.99
+    assert covariance[1, 2] / deviations[1] / deviations[2] < -0.95
     assert deviations[1] > 0.15 and deviations[0] < 0.05 and deviations[3] < 0.005
     assert_within(found.fit.values[:4], PORT, deviations[:4], np.inf)
 
 
 def test_in_air_the_distance_of_a_plate_is_not_seen():
     rng = np.random.default_rng(3)
-    found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT, air=True), 5, rng), np.zeros(5, bool)))
+    found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT, air=True), 4, rng), np.zeros(4, bool)))
     assert found.names == ["port_distance", "port_thickness", "port_index"]
     assert abs(found.fit.values[0] - GUESS[0]) < 1e-3 and found.fit.deviations[0] > 0.15 * GUESS[0]
     assert_within(found.fit.values[1:3], PORT[1:3], found.fit.deviations[1:3], [0.05, 0.05])

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from ..view import BLUE, GREY, VERMILION, save
 
-TOLD_APART = 0.98  # correlation above which two settings are said to be hard to tell apart
+TOLD_APART = 0.95  # correlation above which two settings are said to be hard to tell apart
 PARAMETERS_DRAWN = 24
 GAINS = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000])
 
