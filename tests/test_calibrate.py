@@ -219,7 +219,7 @@ def test_ports_are_found_from_images_in_air_and_in_the_medium():
 
 def test_in_the_medium_thickness_and_index_cannot_be_told_apart():
     rng = np.random.default_rng(2)
-    found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT), 4, rng), np.ones(4, bool)))
+    found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT), 3, rng), np.ones(3, bool)))
     covariance, deviations = found.fit.covariance, found.fit.deviations
     assert covariance[1, 2] / deviations[1] / deviations[2] < -0.95
     assert deviations[1] > 0.15 and deviations[0] < 0.05 and deviations[3] < 0.005
@@ -228,9 +228,9 @@ def test_in_the_medium_thickness_and_index_cannot_be_told_apart():
 
 def test_in_air_the_distance_of_a_plate_is_not_seen():
     rng = np.random.default_rng(3)
-    found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT, air=True), 4, rng), np.zeros(4, bool)))
+    found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT, air=True), 3, rng), np.zeros(3, bool)))
     assert found.names == ["port_distance", "port_thickness", "port_index"]
-    assert abs(found.fit.values[0] - GUESS[0]) < 1e-3 and found.fit.deviations[0] > 0.15 * GUESS[0]
+    assert abs(found.fit.values[0] - GUESS[0]) < 1e-3 and abs(found.fit.deviations[0] / (0.2 * GUESS[0]) - 1) < 0.3
     assert_within(found.fit.values[1:3], PORT[1:3], found.fit.deviations[1:3], [0.05, 0.05])
 
 
