@@ -70,10 +70,10 @@ class MinimumEnergy(nn.Module):
         inverse[free[:, None], free] = torch.linalg.inv(dense)
         return inverse
 
-    def _stiffness_product(self, K: Tensor, y: Tensor) -> Tensor:
+    def _stiffness_product(self, K: Tensor, y: Tensor, stiff: Tensor | float = 1.0) -> Tensor:
         moves, grid = self.moves[:, None], self.membrane.grid
         product = corners_to_vertices(K @ corners(moves * y, grid), grid)
-        return moves * (product + self.smoothing * self._smoother(self._smoother(moves * y)))
+        return moves * (product + self.smoothing * self._smoother(stiff * self._smoother(moves * y)))
 
     def _smoother(self, psi: Tensor) -> Tensor:
         """Grid Laplacian `S` of eq. 28 (symmetric): every vertex against its neighbours along the grid's lines."""
@@ -82,10 +82,13 @@ class MinimumEnergy(nn.Module):
         )
         return 0.5 * corners_to_vertices(ring @ corners(psi, self.membrane.grid), self.membrane.grid)
 
-    def forward(self, origins: Tensor, directions: Tensor) -> Equilibrium:
-        """`origins`, `directions [..., V, 3]`: the ray of every grid vertex now. Returns the `Equilibrium`."""
+    def forward(self, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None) -> Equilibrium:
+        """`origins`, `directions [..., V, 3]`: the ray of every grid vertex now. Returns the `Equilibrium`.
+
+        `relaxed [..., V]` bool: vertices in contact, where the slope may jump: the smoother of eq. 28 leaves them alone.
+        """
         t, pressure = self.start(directions)
-        state = _State(self, origins, directions)
+        state = _State(self, origins, directions, relaxed)
         for _ in range(self.steps):
             t, pressure = self._newton_step(state, t, pressure)
         return self._equilibrium(state, t, pressure)
@@ -112,7 +115,7 @@ class MinimumEnergy(nn.Module):
         rise, v = state.rise(t)
         K = self.energy.stiffness_along(state.surface(t), state.directions)
         solved = conjugate_gradient(
-            lambda y: self._stiffness_product(K, y),
+            lambda y: self._stiffness_product(K, y, state.stiff),
             lambda y: symmetric_product(self.inverse, y),
             torch.stack([state.load(t, pressure), v], -1),
             self.solver_steps,
@@ -127,8 +130,9 @@ class MinimumEnergy(nn.Module):
 class _State:
     """One call's rays, and what depends on the ranges `t [..., V]` along them."""
 
-    def __init__(self, estimator: MinimumEnergy, origins: Tensor, directions: Tensor):
+    def __init__(self, estimator: MinimumEnergy, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None):
         self.estimator, self.origins, self.directions = estimator, origins, directions
+        self.stiff = 1.0 if relaxed is None else (~relaxed)[..., None].to(directions)
         self.start = self._exact_rise(estimator.rest_range.expand(directions.shape[:-1]))
 
     def surface(self, t: Tensor) -> Tensor:
@@ -152,5 +156,5 @@ class _State:
         estimator, x = self.estimator, self.surface(t)
         force = ((estimator.energy.gradient(x) - estimator.rest_load) * self.directions).sum(-1)
         psi = (estimator.moves * (t - estimator.rest_range))[..., None]
-        smooth = estimator.smoothing * estimator._smoother(estimator._smoother(psi)).squeeze(-1)
+        smooth = estimator.smoothing * estimator._smoother(self.stiff * estimator._smoother(psi)).squeeze(-1)
         return estimator.moves * (pressure[..., None] * self.rise(t)[1] - force - smooth)

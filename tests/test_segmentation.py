@@ -1,0 +1,179 @@
+"""Laws of eq. 29 and of the reconstruct / segment loop; contacts of presses simulated on another grid."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchmembrane import MembraneError
+from torchmembrane.camera import Camera
+from torchmembrane.energy import Sheet
+from torchmembrane.flow import FlowInterpolation
+from torchmembrane.minimum_energy import MinimumEnergy
+from torchmembrane.segmentation import PolarAngle, Segmentation, peaks, polar_angle
+from torchmembrane.shapes import half_cylinder, spherical_cap
+from torchmembrane.simulate.indenters import Sphere
+from torchmembrane.simulate.press import carried, press
+
+CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
+FAR, FINE = 15.0, (33, 33)
+
+
+def central(points):
+    return torch.zeros_like(points), torch.nn.functional.normalize(points, dim=-1)
+
+
+def polar(membrane):
+    return PolarAngle(membrane.rest, membrane.rest_normals, *central(membrane.rest))
+
+
+def test_polar_angle_is_the_paper_s():
+    """Eq. 29's arccos of the image point, of a pinhole of focal distance f."""
+    f, u, v = 3.0, torch.tensor([0.3, -2.0, 5.0]), torch.tensor([-0.4, 1.0, 5.0])
+    rays = torch.nn.functional.normalize(torch.stack([u, v, torch.full_like(u, f)], -1), dim=-1)
+    torch.testing.assert_close(polar_angle(rays), torch.arccos(f / (u**2 + v**2 + f**2).sqrt()))
+
+
+@pytest.mark.parametrize(("membrane", "printed_sign"), [
+    (spherical_cap(12, 9, FAR), False),
+    (half_cylinder(10, 30, 80, 4.0), None),
+    (spherical_cap(12, 9, 0.2), True),
+])  # fmt: skip
+def test_an_inward_press_turns_rays_by_the_sign_of_the_geometry(membrane, printed_sign):
+    """`d beta = s n.e / t` to first order; the printed sign holds only above the centre of curvature."""
+    angle, s = polar(membrane), 1e-6
+    oblique = (~membrane.fixed) & (membrane.rest[:, :2].norm(dim=-1) > 2)
+    now = central(membrane.rest - s * membrane.rest_normals)[1]
+    x, y, z = membrane.rest.unbind(-1)
+    planar, t = (x**2 + y**2).sqrt(), membrane.rest.norm(dim=-1)
+    growing = torch.stack([x * z / planar, y * z / planar, -planar], -1) / t[:, None]
+    want = s * (membrane.rest_normals * growing).sum(-1) / t
+    torch.testing.assert_close(angle.change(now)[oblique], want[oblique], rtol=1e-4, atol=1e-14)
+    assert (angle.bulge(now)[oblique] > 0).all()
+    if printed_sign is not None:
+        assert ((angle.change(now)[oblique] < 0) == printed_sign).all()
+
+
+def test_a_line_of_hills_is_cut_where_they_stand_alone():
+    heights = np.array([0, 4, 10, 9, 4, 8, 7.2, 7.5, 1, 0, -3, 0.4, 0])
+    line = [[k - 1, k + 1] for k in range(len(heights))]
+    line[0], line[-1] = [1], [len(heights) - 2]
+    assert peaks(heights, line, 4, 0.5).tolist() == [0, 0, 1, 1, 0, 2, 2, 2, 0, 0, 0, 0, 0]
+    assert peaks(heights, line, 1, 0.5).max() == 1
+    assert (peaks(-np.abs(heights), line, 4, 0.5) == 0).all()
+
+
+def make(base_z, **options):
+    dome = spherical_cap(12, 9, base_z, (17, 17))
+    rays = central(dome.rest)
+    options = {"smoothing": 0.1, **options}
+    return Segmentation(MinimumEnergy(dome, Sheet(dome, "neo_hookean", 1.3), rays, **options), rays)
+
+
+def seen(base_z, *presses):
+    """Rays of the 17 x 17 grid from noisy markers of balls pressed on a 33 x 33 one, and the balls' contact points."""
+    fine, dome = spherical_cap(12, 9, base_z, FINE), spherical_cap(12, 9, base_z, (17, 17))
+    paths = []
+    for direction, depth in presses:
+        travel = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float64), dim=-1)
+        ball = Sphere(3.0, translation=(0, 0, base_z - 3.5)).touching(fine, travel)
+        paths.append([ball, ball.moved(depth * travel)])
+    state = press(fine, Sheet(fine, "neo_hookean", 1.3), paths)
+    dots = spherical_cap(12, 9, base_z, (13, 13)).rest.reshape(13, 13, 3)[1:-1, 1:-1].reshape(-1, 3)
+    pixel = CAMERA.point_to_pixel
+    noise = 0.05 * torch.randn(len(dots), 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    displacement = pixel(carried(state.vertices, fine, dots)) - pixel(dots) + noise
+    flow = FlowInterpolation(dome, dome.closest_points(dots.numpy()))(displacement, torch.ones(len(dots)).double())
+    return CAMERA.pixel_to_ray(pixel(dome.rest) + flow), state.contact_points
+
+
+def batch(rays):
+    return (a[None] for a in rays)
+
+
+@pytest.fixture(scope="module")
+def off_axis():
+    return seen(FAR, ((-0.55, 0.1, -0.83), 3.0))
+
+
+def test_one_contact_off_the_axis(off_axis):
+    """The sign of the geometry finds it, the printed one does not, and the loop comes nearer."""
+    rays, (place,) = off_axis
+    segmentation = make(FAR)
+    got = segmentation(*batch(rays))
+    miss = lambda contacts: float((contacts.points[0, 0] - place).norm())  # noqa: E731
+    assert got.contacts.points[0, 1:].isnan().all() and got.first.points[0, 1:].isnan().all()
+    assert miss(got.contacts) < miss(got.first) < 3
+    segmentation.polar.sign = -segmentation.polar.sign
+    assert miss(segmentation.by_polar_angle(rays.direction[None])) > 10
+    assert got.settled.all() and got.surface.vertices.shape == (1, 289, 3)
+
+
+def test_two_contacts():
+    rays, places = seen(FAR, ((-0.6, 0.0, -0.8), 2.0), ((0.6, 0.0, -0.8), 2.0))
+    got = make(FAR)(*batch(rays)).contacts.points[0]
+    gap = torch.cdist(got[:2], places)
+    assert gap.amin(0).max() < 2.5 and gap.argmin(0).tolist() in ([0, 1], [1, 0])
+    assert got[2:].isnan().all()
+
+
+@pytest.mark.parametrize("base_z", [3.0, 24.0])
+def test_a_press_along_the_axis_is_divergent_flow(base_z, off_axis):
+    rays, (place,) = seen(base_z, ((0.0, 0.0, -1.0), 2.0))
+    segmentation = make(base_z)
+    assert segmentation.divergence(rays.direction[None]) > 0.9
+    first = segmentation.by_polar_angle(rays.direction[None]).points[0]
+    assert first[0, :2].norm() < 0.3 and (first[0] - place).norm() < 2.5 and first[1:].isnan().all()
+    assert make(FAR).divergence(off_axis[0].direction[None]) < 0.8
+
+
+def test_no_flow_is_no_contact_and_a_batch_is_its_frames(off_axis):
+    """Also where another frame goes round in circles: one that has settled stays."""
+    segmentation = make(FAR, smoothing=1.0)
+    still = central(segmentation.membrane.rest)
+    restless, _ = seen(FAR, ((-0.3, 0.2, -0.8), 2.0), ((0.4, 0.0, -0.8), 1.0))
+    both = segmentation(*(torch.stack(three) for three in zip(still, off_axis[0], restless, strict=True)))
+    assert both.contacts.points[0].isnan().all() and (both.contacts.region[0] == 0).all()
+    assert both.settled.tolist() == [True, True, False]
+    alone = segmentation(*batch(off_axis[0]))
+    torch.testing.assert_close(both.contacts.points[1:2], alone.contacts.points, rtol=0, atol=1e-9, equal_nan=True)
+    torch.testing.assert_close(both.surface.vertices[1:2], alone.surface.vertices, rtol=0, atol=1e-9)
+
+
+def test_the_smoother_leaves_contacts_alone(off_axis):
+    """Eq. 28 with the rows of S at a contact struck out, against the dense KKT system."""
+    dome = spherical_cap(12, 9, FAR, (9, 9))
+    rays = central(dome.rest)
+    options = dict(element="quadrilateral", volume="linear", smoothing=2.0, steps=2, solver_steps=200)
+    estimator = MinimumEnergy(dome, Sheet(dome, "harmonic", 1.3), rays, **options)
+    bent = torch.nn.functional.normalize(rays[1] + 0.02 * torch.sin(dome.rest[:, [1, 2, 0]]) * (~dome.fixed)[:, None], dim=-1)
+    relaxed = torch.zeros(len(dome.rest), dtype=torch.bool)
+    relaxed[[30, 31, 40]] = True
+    free, t0 = dome.free, dome.rest.norm(dim=-1)
+    index = torch.arange(81).reshape(9, 9)
+    pairs = torch.cat([torch.stack([index[1:].flatten(), index[:-1].flatten()], -1),
+                       torch.stack([index[:, 1:].flatten(), index[:, :-1].flatten()], -1)])  # fmt: skip
+    weight = 1 - 0.5 * (dome.fixed[pairs].all(-1)).double()
+    S = torch.zeros(81, 81, dtype=torch.float64)
+    for (a, b), w in zip(pairs.tolist(), weight.tolist(), strict=True):
+        for p, q, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
+            S[p, q] += sign * w
+    start = torch.where(dome.fixed[:, None], dome.rest, t0[:, None] * bent)
+    x = lambda t: torch.where(dome.fixed[:, None], dome.rest, t[:, None] * bent)  # noqa: E731
+    Q = estimator.energy.q_matrix(bent)
+    v = (dome.volume_gradient(start) * bent).sum(-1)[free]
+    smooth = estimator.smoothing * S.T @ ((~relaxed).double()[:, None] * S)
+    K = (Q.T @ Q + smooth)[free][:, free]
+    load = ((estimator.rest_load - estimator.energy.gradient(start)) * bent).sum(-1)[free]
+    kkt = torch.cat([torch.cat([K, v[:, None]], 1), torch.cat([v, torch.zeros(1).double()])[None]])
+    psi = torch.linalg.solve(kkt, torch.cat([load, (dome.rest_volume - dome.volume(start))[None]]))[:-1]
+    t = t0.clone()
+    t[free] += psi
+    torch.testing.assert_close(estimator(rays[0], bent, relaxed).vertices, x(t), rtol=0, atol=1e-7)
+    assert (estimator(rays[0], bent).vertices - x(t)).abs().max() > 1e-5
+
+
+def test_no_rounds_are_refused():
+    dome = spherical_cap(12, 9, FAR, (9, 9))
+    estimator = MinimumEnergy(dome, Sheet(dome), central(dome.rest))
+    with pytest.raises(MembraneError, match="rounds = 0; expected at least 1"):
+        Segmentation(estimator, central(dome.rest), rounds=0)
