@@ -62,8 +62,10 @@ def main():
                 median = {key: float(np.median([d[key] for d in draws])) for key in draws[0]}
                 rows.append(dict(experiment=name, material=material, estimator=type(estimator).__name__, **median))
                 print(
-                    "{experiment:28s} {material:11s} {estimator:20s} error {error:.2f}, depth {depth:.2f} of {true_depth:.2f} mm, "
-                    "force off {force:.2f}, pressure {pressure:+.2f}".format(**rows[-1])
+                    "{experiment:28s} {material:11s} {estimator:20s} error {error:.2f}, "
+                    "depth {depth:.2f} of {true_depth:.2f} mm, force off {force:.2f}, pressure {pressure:+.2f}".format(
+                        **rows[-1]
+                    )
                 )
     write(args.json, dict(profile=rows))
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.flow import FlowInterpolation, LocalAffineMaps, affine_fit
+from torchmembrane.flow import FlowInterpolation, LocalAffineMaps, affine_fit, weighted_affine_fit
 from torchmembrane.membrane import SurfacePoints
 from torchmembrane.shapes import heightfield, spherical_cap
 
@@ -137,3 +137,33 @@ def test_an_unknown_kind_of_flow_is_refused():
     cap = spherical_cap(12, 9, 15)
     with pytest.raises(MembraneError, match="expected one of smooth, bilinear"):
         FlowInterpolation(cap, pattern(cap, 5)[1], "cubic")
+
+
+def spd(*shape, seed=0):
+    M = random(*shape, seed=seed)
+    return M @ M.mT + 0.3 * torch.eye(shape[-1], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("batch", [(), (3, 2)])
+def test_one_weight_matrix_for_all_matches_changes_nothing(batch):
+    """Appendix C for points in space: eq. 52 holds for any Q of eq. 46."""
+    p, q, Q = random(*batch, 7, 3), random(*batch, 7, 3, seed=1), spd(*batch, 3, 3, seed=2)
+    got, want = weighted_affine_fit(p, q, Q[..., None, :, :].expand(*batch, 7, 3, 3)), affine_fit(p, q)
+    torch.testing.assert_close(got.A, want.A)
+    torch.testing.assert_close(got.b, want.b)
+
+
+def test_weights_of_their_own_give_the_least_weighted_squares():
+    """Eq. 46 with the uncertainty of each match, against whitened least squares; a doubtful match is passed over."""
+    p, q, Q = random(8, 3), random(8, 3, seed=1), spd(8, 3, 3, seed=2)
+    white = torch.linalg.cholesky(Q).mT
+    one = torch.cat([p, torch.ones(8, 1, dtype=torch.float64)], 1)
+    rows = torch.einsum("nrq,na->nrqa", white, one).reshape(24, 12)
+    want = torch.linalg.lstsq(rows, (white @ q[..., None]).reshape(24, 1)).solution.reshape(3, 4)
+    got = weighted_affine_fit(p, q, Q)
+    torch.testing.assert_close(torch.cat([got.A, got.b[:, None]], 1), want)
+    A, b = random(3, 3, seed=3), random(3, seed=4)
+    images = p @ A.T + b
+    images[0] += 50
+    Q[0] *= 1e-9
+    torch.testing.assert_close(weighted_affine_fit(p, images, Q).A, A, rtol=0, atol=1e-5)

@@ -41,6 +41,21 @@ def affine_fit(points: Tensor, images: Tensor, inverse_moment: Tensor | None = N
     return AffineMap(A, image_mean - (A @ mean[..., None]).squeeze(-1))
 
 
+def weighted_affine_fit(points: Tensor, images: Tensor, weight: Tensor) -> AffineMap:
+    """Affine map that minimises `sum_i e_i.Q_i e_i`, `e_i = A p_i + b - p'_i` (eq. 46, with a weight matrix of each match).
+
+    Arguments: `points [..., n, p]`, `images [..., n, q]`, `weight [..., n, q, q]` symmetric positive definite, the inverse
+    covariances of the matches. One matrix for all changes nothing: eq. 52 does not know Q; then `affine_fit` is enough.
+    Wrong when the points are collinear (in space, coplanar).
+    """
+    homogeneous = torch.cat([points, torch.ones_like(points[..., :1])], -1)
+    normal = torch.einsum("...ia,...ipq,...ib->...paqb", homogeneous, weight, homogeneous)
+    load = torch.einsum("...ia,...ipq,...iq->...pa", homogeneous, weight, images)
+    q, p = images.shape[-1], points.shape[-1]
+    fit = torch.linalg.solve(normal.flatten(-2).flatten(-3, -2), load.flatten(-2)).unflatten(-1, (q, p + 1))
+    return AffineMap(fit[..., :-1], fit[..., -1])
+
+
 class LocalAffineMaps(nn.Module):
     """One affine map for each quadrilateral of a grid of points, with `G^-1` precomputed (section 3.2).
 

@@ -76,11 +76,7 @@ class MinimumEnergy(nn.Module):
         return moves * (product + self.smoothing * self._smoother(stiff * self._smoother(moves * y)))
 
     def _smoother(self, psi: Tensor) -> Tensor:
-        """Grid Laplacian `S` of eq. 28 (symmetric): every vertex against its neighbours along the grid's lines."""
-        ring = torch.tensor(
-            [[2.0, -1, 0, -1], [-1, 2, -1, 0], [0, -1, 2, -1], [-1, 0, -1, 2]], dtype=psi.dtype, device=psi.device
-        )
-        return 0.5 * corners_to_vertices(ring @ corners(psi, self.membrane.grid), self.membrane.grid)
+        return grid_laplacian(psi, self.membrane.grid)
 
     def forward(self, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None) -> Equilibrium:
         """`origins`, `directions [..., V, 3]`: the ray of every grid vertex now. Returns the `Equilibrium`.
@@ -125,6 +121,12 @@ class MinimumEnergy(nn.Module):
             return t + y, pressure
         minimum = constrained_minimum(y, g, v, *self.cavity.condition(rise, pressure))
         return t + minimum.y, pressure - minimum.multiplier
+
+
+def grid_laplacian(psi: Tensor, grid: tuple[int, int]) -> Tensor:
+    """S of eq. 28 for `psi [..., V, C]` (symmetric): every vertex against its neighbours along the grid's lines."""
+    ring = torch.tensor([[2.0, -1, 0, -1], [-1, 2, -1, 0], [0, -1, 2, -1], [-1, 0, -1, 2]], dtype=psi.dtype, device=psi.device)
+    return 0.5 * corners_to_vertices(ring @ corners(psi, grid), grid)
 
 
 class _State:

@@ -1,0 +1,77 @@
+"""Minimum energy at fixed (x, y), the paper's unknowns (Appendix D, eq. 22), against fixed material points.
+
+python bench/monge.py CASES [--json FILE]
+
+CASES as for accuracy.py; sensors whose rest surface is no graph over (x, y) are left out. From exact markers, harmonic sheet.
+Printed for each form: surface error over displacement at the markers, rms distance of its vertices from the material form's with
+exact volume, and its pressure change over the rest pressure.
+"""
+
+import argparse
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+from accuracy import cases_in
+from record import write
+
+from torchmembrane.errors import MembraneError
+from torchmembrane.minimum_energy import MinimumEnergy
+from torchmembrane.monge import MongeMinimumEnergy
+from torchmembrane.reconstruct import Reconstructor
+
+
+def forms(reconstructor: Reconstructor) -> dict:
+    membrane, sheet = reconstructor.estimator.membrane, reconstructor.estimator.energy
+    rest_rays = reconstructor.camera.pixel_to_ray(reconstructor.vertex_pixels)
+    return {
+        "material, exact volume": reconstructor.estimator,
+        "material, linear volume": MinimumEnergy(membrane, sheet, rest_rays, volume="linear"),
+        "fixed x y, once (eq. 22)": MongeMinimumEnergy(membrane, sheet, rest_rays),
+        "fixed x y, five times": MongeMinimumEnergy(membrane, sheet, rest_rays, steps=5),
+    }
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", type=Path)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    rows = []
+    for case in cases_in(args.cases):
+        r = Reconstructor.from_file(args.cases / case["sensor"], model="harmonic", dtype=torch.float64)
+        truth = np.load(args.cases / case["truth"])
+        X, Y = (torch.from_numpy(truth[key].astype(float)) for key in ("dots_nominal", "dots_deformed"))
+        pixels = torch.from_numpy(truth["uv_deformed"].astype(float))[None]
+        try:
+            estimators = forms(r)
+        except MembraneError as error:
+            print(f"{case['case']} {case['folder']}: left out, {str(error).partition(';')[0]}")
+            continue
+        with torch.no_grad():
+            flow = r.flow(pixels - r.rest_pixels, torch.ones(pixels.shape[:2], dtype=torch.float64))[0]
+            seen = r.camera.pixel_to_ray(r.vertex_pixels + flow)
+            for name, estimator in estimators.items():
+                got = estimator(*seen)
+                reference = got.vertices if name == "material, exact volume" else reference
+                moved = (got.vertices - r.estimator.membrane.rest)[r.marker_vertices]
+                markers = r.rest_markers + (r.marker_weights[..., None] * moved).sum(-2)
+                error = float(((markers - Y).square().sum() / (Y - X).square().sum()).sqrt())
+                apart = float((got.vertices - reference).square().sum(-1).mean().sqrt())
+                rise = float(got.pressure / r.estimator.rest_pressure - 1)
+                rows.append(dict(case=case["case"], form=name, error=error, apart=apart, pressure=rise))
+    for name in dict.fromkeys(row["form"] for row in rows):
+        mine = [row for row in rows if row["form"] == name]
+        median = {key: np.median([abs(row[key]) for row in mine]) for key in ("error", "apart", "pressure")}
+        worst = max(row["error"] for row in mine)
+        print(
+            f"{name:26s} {len(mine)} cases: error {median['error']:.3f} in the median, {worst:.3f} at worst; "
+            f"{median['apart']:.3f} from the first; pressure change {median['pressure']:.3f}"
+        )
+    write(args.json, dict(monge=rows))
+
+
+if __name__ == "__main__":
+    main()
