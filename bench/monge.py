@@ -3,8 +3,8 @@
 python bench/monge.py CASES [--json FILE]
 
 CASES as for accuracy.py; sensors whose rest surface is no graph over (x, y) are left out. From exact markers, harmonic sheet.
-Printed for each form: surface error over displacement at the markers, rms distance of its vertices from the material form's with
-exact volume, and its pressure change over the rest pressure.
+Printed for each form: surface error over displacement at the markers, rms distance of its vertices from the first form's, and
+its pressure change over the rest pressure.
 """
 
 import argparse
@@ -53,13 +53,13 @@ def main():
         with torch.no_grad():
             flow = r.flow(pixels - r.rest_pixels, torch.ones(pixels.shape[:2], dtype=torch.float64))[0]
             seen = r.camera.pixel_to_ray(r.vertex_pixels + flow)
+            first = r.estimator(*seen).vertices
             for name, estimator in estimators.items():
                 got = estimator(*seen)
-                reference = got.vertices if name == "material, exact volume" else reference
                 moved = (got.vertices - r.estimator.membrane.rest)[r.marker_vertices]
                 markers = r.rest_markers + (r.marker_weights[..., None] * moved).sum(-2)
                 error = float(((markers - Y).square().sum() / (Y - X).square().sum()).sqrt())
-                apart = float((got.vertices - reference).square().sum(-1).mean().sqrt())
+                apart = float((got.vertices - first).square().sum(-1).mean().sqrt())
                 rise = float(got.pressure / r.estimator.rest_pressure - 1)
                 rows.append(dict(case=case["case"], form=name, error=error, apart=apart, pressure=rise))
     for name in dict.fromkeys(row["form"] for row in rows):

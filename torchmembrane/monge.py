@@ -124,13 +124,13 @@ class MongeMinimumEnergy(nn.Module):
         return Equilibrium(x, pressure, self.membrane.volume(self.surface(psi)), torch.zeros_like(x), step)
 
     def heights(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """`psi` at the free points, the pressure, and the last step over the surface's size (eqs. 22, 27)."""
+        """`psi` at the free points, the pressure, and the last step over the surface's size (eqs. 22, 27 with `v.psi = 0`)."""
         psi, v = torch.zeros_like(self.v), self.v
         for _ in range(self.steps):
             Q, gamma = self._linearised(psi, origins, directions)
             load = Q.T @ gamma + self.rest_load - self.smooth @ psi
             y, z = torch.linalg.solve(Q.T @ Q + self.smooth, torch.stack([load, v], -1)).unbind(-1)
-            pressure = -(v @ psi + v @ y) / (v @ z)
+            pressure = -(v @ y) / (v @ z)
             step = y + pressure * z
             psi = psi + step
         return psi, pressure, step.abs().max() / self.membrane.size
