@@ -1,0 +1,35 @@
+"""Wrong matches: markers whose displacement does not belong with their neighbours'."""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..errors import MembraneError
+from .match import spacing
+from .texture import Neighbourhood
+
+TOLERANCE = 0.2  # of the distance to the nearest marker: what a press may put between a displacement and its neighbours' fit
+FEWEST = 6
+
+
+class MismatchScreen(nn.Module):
+    """Trust in matched markers: 1 where a robust local affine fit to its neighbours bears a displacement out, 0 where not.
+
+    Arguments: rest `pixels [D, 2]` of the markers and `anchors [A, 2]` on the rim, where nothing moves. Calling it with
+    `displacement [B, D, 2]` (px) and `confidence [B, D]` gives the confidence times the trust in each, `[B, D]`; below 0.5 a
+    marker is taken for mismatched.
+    Wrong where a third of a neighbourhood, or all of it alike, is mismatched, and where the flow has a step of more than a
+    fifth of the spacing (a fold).
+    """
+
+    def __init__(self, pixels: np.ndarray, anchors: np.ndarray):
+        super().__init__()
+        pixels = np.asarray(pixels, float)
+        if len(pixels) < FEWEST:
+            raise MembraneError(f"MismatchScreen: {len(pixels)} markers; expected at least {FEWEST}")
+        self.neighbourhood = Neighbourhood(pixels, np.asarray(anchors, float))
+        self.register_buffer("tolerance", torch.from_numpy(TOLERANCE * spacing(pixels)[0])[:, None])
+
+    def forward(self, displacement: Tensor, confidence: Tensor) -> Tensor:
+        flow = torch.where(confidence[..., None] > 0, displacement, 0.0)
+        return confidence * self.neighbourhood(flow, confidence, self.tolerance).trust(flow)
