@@ -1,10 +1,10 @@
-# make demo | make test | make lint | make bench: each sets itself up on a machine with Python 3.11+ only.
+# make demo | make test | make lint | make bench | make figures: each sets itself up on a machine with Python 3.11+ only.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench figures clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -27,6 +27,9 @@ lint: $(READY)
 
 bench: $(READY)
 	$(BIN)/python bench/speed.py --json out/bench/speed.json
+
+figures: $(READY)
+	$(BIN)/python docs/figures.py
 
 clean:
 	rm -rf $(VENV) out build *.egg-info
