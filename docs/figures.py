@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from PIL import Image
 
 from torchmembrane.flow import FlowInterpolation
 from torchmembrane.markers.screen import MismatchScreen
@@ -36,6 +37,7 @@ from torchmembrane.view import BLUE, GREY, VERMILION
 NOISE = 30.0  # dB below white
 ESTIMATORS = {"minimum energy": "minimum-energy", "force balance": "force-balance"}
 MISMATCHED = 0.05
+MAGNIFICATIONS, LONGEST_ARROW = (2, 3, 5, 10), 60  # px
 
 
 class Shown(NamedTuple):
@@ -82,7 +84,7 @@ def reconstructed(sensor: str, strokes, estimator: str) -> Reconstruction:
 
 
 def error_words(shown: Shown, result: Reconstruction) -> str:
-    """Error over displacement in words, and the force where there is one."""
+    """The error at the dots and their displacement, in words."""
     rms = lambda a: float(np.sqrt((a**2).sum(1).mean()))  # noqa: E731
     error, moved = rms(result.markers[0].numpy() - shown.dots), rms(shown.dots - shown.rest_dots)
     return f"error {error:.3f} of {moved:.3f} mm ({100 * error / moved:.0f} %)"
@@ -95,16 +97,18 @@ def draw_image(axes, image, title: str) -> None:
     axes.set_yticks([])
 
 
-def draw_matches(axes, shown: Shown, result: Reconstruction, title="matches, arrows 2 times as long") -> None:
-    """Circles at the dots of the rest image, arrows to where they have gone."""
+def draw_matches(axes, shown: Shown, result: Reconstruction, title="matches") -> None:
+    """Circles at the dots of the rest image, arrows towards where they have gone."""
     r = reconstructor(shown.sensor)
     rest, now = r.rest_pixels.numpy(), result.pixels[0].numpy()
-    draw_image(axes, 0.6 + 0.4 * r.sensor.markers.rest_image, title)
+    flow = now - rest
+    times = max((k for k in MAGNIFICATIONS if k * np.nanmax(np.linalg.norm(flow, axis=1)) < LONGEST_ARROW), default=1)
+    draw_image(axes, 0.6 + 0.4 * r.sensor.markers.rest_image, f"{title}, arrows {times} times as long")
     axes.plot(*rest.T, "o", ms=5, mfc="none", mec=BLUE, mew=0.8)
-    axes.quiver(*rest.T, *(2 * (now - rest)).T, angles="xy", scale_units="xy", scale=1, color=VERMILION, width=0.004)
+    axes.quiver(*rest.T, *(times * flow).T, angles="xy", scale_units="xy", scale=1, color=VERMILION, width=0.004)
 
 
-def draw_surface(axes, shown: Shown, result: Reconstruction, across: int, title: str, words="") -> None:
+def draw_surface(axes, shown: Shown, result: Reconstruction, across: int, title: str) -> None:
     """Crosses at rest, the mesh found, dots where they truly are; seen along x (`across` 1) or y (0)."""
     membrane = reconstructor(shown.sensor).estimator.membrane
     plane = [across, 2]
@@ -112,16 +116,15 @@ def draw_surface(axes, shown: Shown, result: Reconstruction, across: int, title:
     lattice = result.vertices[0].numpy()[:, plane].reshape(m, n, 2)[:: max(1, m // 16), :: max(1, n // 16)]
     axes.plot(*membrane.rest.numpy()[:, plane].T, "+", ms=4, mew=0.6, color=GREY, label="at rest")
     axes.add_collection(LineCollection([*lattice, *lattice.swapaxes(0, 1)], colors=BLUE, linewidths=0.5, label="found"))
-    axes.plot(*shown.dots[:, plane].T, ".", ms=4, color=VERMILION, label="dots, true")
+    axes.plot(*shown.dots[:, plane].T, ".", ms=5, color=VERMILION, label="dots, true")
     axes.set_aspect("equal")
     axes.set_title(title, fontsize=10)
-    axes.set_xlabel(words or error_words(shown, result), fontsize=10)
-    axes.legend(fontsize=7, loc="lower center", frameon=False)
+    axes.set_xlabel(error_words(shown, result), fontsize=10)
 
 
 def reconstruction_rows(name: str, across: int, *rows: tuple[str, tuple]) -> Figure:
     """Image, matches, and both reconstructions, a row for each press."""
-    drawing = Figure(figsize=(15, 4.1 * len(rows)), dpi=100, layout="constrained")
+    drawing = Figure(figsize=(15, 0.8 + 3.2 * len(rows)), dpi=100, layout="constrained")
     drawing.suptitle(name)
     for axes, (sensor, strokes) in zip(drawing.subplots(len(rows), 4, squeeze=False), rows, strict=True):
         shown = pressed(sensor, *strokes)
@@ -130,13 +133,14 @@ def reconstruction_rows(name: str, across: int, *rows: tuple[str, tuple]) -> Fig
             result = reconstructed(sensor, strokes, estimator)
             draw_surface(place, shown, result, across, title)
         draw_matches(axes[1], shown, result)
+    drawing.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower right", ncols=3, frameon=False)
     return drawing
 
 
 TOP = ((1.2, (0, 0, 6), (-0.35, -0.1, -1.0), 2.5),)
 TWO = ((1.5, (0, 0, 6), (-0.7, -0.2, -1.0), 1.8), (1.5, (0, 0, 6), (0.7, 0.3, -1.0), 1.5))
 SIDE = ((3.0, (0, 0, 24), (0.0, -0.8, -0.6), 2.5, (1, 0, 0)),)
-BOTH_SIDES = (*SIDE, (3.0, (0, 0, 24), (0.0, 0.8, -0.6), 2.5, (1, 0, 0)))
+BOTH_SIDES = tuple((3.0, (0, 0, 24), (0.0, side, -0.6), 1.2, (1, 0, 0)) for side in (-0.8, 0.8))
 BUBBLE = ((7.0, (0, 0, 45), (-0.3, 0.2, -1.0), 6.0),)
 
 
@@ -149,7 +153,7 @@ def figure_6() -> Figure:
     (a, b), (c, d) = drawing.subplots(2, 2)
     draw_image(a, r.sensor.markers.rest_image, "(a) undeformed")
     draw_image(b, shown.image, "(b) pressed 2.5 mm by a ball of radius 1.2 mm")
-    draw_matches(c, shown, result, "(c) measured flow, arrows 2 times as long")
+    draw_matches(c, shown, result, "(c) measured flow")
     fine = r.sensor.surface.membrane((16, 16))
     points = fine.closest_points(r.rest_markers.double().numpy())
     moved = (result.pixels[0] - r.rest_pixels).double()
@@ -203,8 +207,9 @@ def figure_8() -> Figure:
     rays, got = segmented(shown, result)
     drawing = Figure(figsize=(15, 4.4), dpi=100, layout="constrained")
     a, b, c = drawing.subplots(1, 3)
-    draw_matches(a, shown, result)
-    polar = PolarAngle(r.rest_markers, torch.zeros_like(r.rest_markers), *r.camera.pixel_to_ray(r.rest_pixels))
+    draw_matches(a, shown, result, "(a) matches")
+    normals = (r.marker_weights[..., None] * r.estimator.membrane.rest_normals[r.marker_vertices]).sum(-2)
+    polar = PolarAngle(r.rest_markers, normals, *r.camera.pixel_to_ray(r.rest_pixels))
     change = np.rad2deg(polar.change(r.camera.pixel_to_ray(result.pixels[0]).direction).numpy())
     draw_image(b, 0.6 + 0.4 * shown.image, "(b) $d\\beta$ of each dot, degrees (red: towards the axis)")
     limit = np.abs(change).max()
@@ -216,7 +221,6 @@ def figure_8() -> Figure:
     draw_contacts(
         c, shown, region, first.points[0].numpy(), "(c) region that bulges in, its centroid on the rest surface", words
     )
-    a.set_title("(a) matches, arrows 2 times as long", fontsize=10)
     other = reconstructed("bubble", BUBBLE, "force-balance")
     drawing.supxlabel(f"minimum energy: {error_words(shown, result)}; force balance: {error_words(shown, other)}", fontsize=10)
     return drawing
@@ -284,6 +288,7 @@ def figure_16() -> Figure:
         title = f"{len(bad)} of {len(rest)} markers mismatched, {lost} flagged"
         draw_matches(axes[0], shown, result._replace(pixels=torch.where(confidence[..., None] > 0.5, wrong, rest)), title)
         axes[0].plot(*rest[confidence[0] < 0.5].T, "x", ms=8, mew=1.6, color="k")
+    drawing.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower right", ncols=3, frameon=False)
     return drawing
 
 
@@ -338,6 +343,7 @@ def main():
     for number in args.only:
         path = args.out / f"figure_{number:02d}.png"
         FIGURES[number]().savefig(path)
+        Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
         print(path, flush=True)
 
 
