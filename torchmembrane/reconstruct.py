@@ -17,15 +17,16 @@ from .flow import FlowInterpolation
 from .force_balance import ForceBalance
 from .images import read_image
 from .markers.place import FEWEST_MARKERS, place_markers
+from .markers.screen import MismatchScreen
 from .minimum_energy import MinimumEnergy
 from .results import CONTACT_POINTS, Reconstruction
 from .sensor import Sensor
 
-ESTIMATORS = ("minimum-energy", "force-balance")
+ESTIMATORS = ("force-balance", "minimum-energy")
 FOUND = 0.5
 """Confidence above which a marker counts as found."""
 FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5
-MARKER_NOISE = 0.1  # px, assumed by force balance: twice the locator's
+MARKER_NOISE = {"dots": 0.1, "texture": 0.2}  # px, assumed by force balance: twice the locator's, and the grid's error
 LEAST_CONTRAST, SATURATED_SHARE = 0.02, 0.98
 
 
@@ -34,7 +35,7 @@ class Reconstructor(nn.Module):
 
     Arguments
         sensor      a `Sensor` (`Reconstructor.from_file` reads one)
-        estimator   "minimum-energy" (the paper's), or "force-balance": finds contacts and their forces too; slower
+        estimator   "force-balance", or "minimum-energy": the paper's; finds no contacts and flattens what is narrow and far
         model       the sheet's energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin"
         element     "triangle", or "quadrilateral": the paper's affine quadrilaterals (harmonic), with `smoothing` (eq. 28)
         volume      "exact", or "linear": the paper's linearised constraint (eq. 21)
@@ -49,7 +50,7 @@ class Reconstructor(nn.Module):
     (0, [1, 289, 3])
     """
 
-    def __init__(self, sensor: Sensor, estimator="minimum-energy", *, model=None, element="triangle", smoothing=None,
+    def __init__(self, sensor: Sensor, estimator="force-balance", *, model=None, element="triangle", smoothing=None,
                  volume="exact", flow="smooth", dtype=torch.float32):  # fmt: skip
         super().__init__()
         if estimator not in ESTIMATORS:
@@ -63,6 +64,7 @@ class Reconstructor(nn.Module):
             )
         markers = place_markers(sensor, vertex_pixels)
         self.locator = markers.locator
+        self.screen = MismatchScreen(markers.model_pixels, vertex_pixels[membrane.fixed].numpy())
         self.finds_contacts = estimator == "force-balance"
         sheet, cavity = self._sheet(membrane, model), self._cavity(membrane)
         if self.finds_contacts:
@@ -70,7 +72,7 @@ class Reconstructor(nn.Module):
                 raise MembraneError(
                     "Reconstructor: force-balance has linear triangles, exact volume, no smoother; leave those options out"
                 )
-            noise = MARKER_NOISE / float(self.camera.focal.mean())
+            noise = MARKER_NOISE[sensor.markers.kind] / float(self.camera.focal.mean())
             self.estimator = ForceBalance(membrane, sheet, markers.points, markers.positions, noise, *cavity)
         else:
             smoothing = (0.1 if element == "quadrilateral" else 0.0) if smoothing is None else smoothing
@@ -128,14 +130,14 @@ class Reconstructor(nn.Module):
             self._check_size(image.shape, f"{path}: ")
         return torch.stack(images)[:, None].to(self.rest_pixels)
 
-    def forward(self, images) -> Reconstruction:
-        """Reconstruct a batch of images.
+    def forward(self, images, previous: Reconstruction | None = None) -> Reconstruction:
+        """Reconstruct a batch of images; `previous`: of the frames before, to start from (force balance): a few steps then do.
 
         Argument: `[B, 1, height, width]` (also `[B, height, width]`, `[height, width]`, or `[B, 3, height, width]` RGB), float
         in 0..1 or uint8. Grey is 0.299 R + 0.587 G + 0.114 B. Raises `MembraneError` for another size; a frame that cannot be
         reconstructed gets a status and NaN, the others are not touched.
         """
-        return self._reconstruct(*self.observe(self._as_batch(images)))
+        return self._reconstruct(*self.observe(self._as_batch(images)), previous)
 
     def observe(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Marker displacements `[B, D, 2]` px, confidence `[B, D]` and status `[B]` of grey images `[B, 1, height, width]`."""
@@ -154,12 +156,17 @@ class Reconstructor(nn.Module):
         return images, torch.where(bad, results.BAD_VALUES, torch.where(blank, results.BLANK, results.OK))
 
     def from_pixels(
-        self, pixels: Tensor, confidence: Tensor | None = None, rest_pixels: Tensor | None = None
+        self,
+        pixels: Tensor,
+        confidence: Tensor | None = None,
+        rest_pixels: Tensor | None = None,
+        previous: Reconstruction | None = None,
     ) -> Reconstruction:
-        """Reconstruct from marker centres located elsewhere.
+        """Reconstruct from marker centres located elsewhere; those that belong with no neighbour get confidence 0.
 
         Arguments: `pixels [B, D, 2]` in the sensor file's order, NaN where lost; `confidence [B, D]` (default: 1 where finite);
-        `rest_pixels [D, 2]`: the same markers located in the rest image (default: the model's rest pixels).
+        `rest_pixels [D, 2]`: the same markers located in the rest image (default: the model's rest pixels); `previous` as for
+        images.
         """
         pixels = torch.as_tensor(pixels).to(self.rest_pixels)
         if pixels.ndim == 2:
@@ -173,13 +180,25 @@ class Reconstructor(nn.Module):
         rest = self.rest_pixels if rest_pixels is None else torch.as_tensor(rest_pixels).to(pixels)
         confidence = torch.where(finite, confidence.expand(finite.shape), 0.0)
         displacement = torch.where(finite[..., None], pixels - rest, 0.0)
-        return self._reconstruct(displacement, confidence, torch.zeros_like(confidence[:, 0], dtype=torch.long))
+        confidence = self.screen(displacement, confidence)
+        status = torch.zeros_like(confidence[:, 0], dtype=torch.long)
+        return self._reconstruct(displacement, confidence, status, previous)
 
-    def _reconstruct(self, displacement: Tensor, confidence: Tensor, status: Tensor) -> Reconstruction:
+    def _reconstruct(self, displacement, confidence, status, previous: Reconstruction | None) -> Reconstruction:
         usable, confidence, status = self.judge(displacement, confidence, status)
         rays = self.rays(usable, confidence)
-        equilibrium = self.estimator(*rays, confidence) if self.finds_contacts else self.estimator(*rays)
-        return self.result(equilibrium, displacement, confidence, status)
+        if not self.finds_contacts:
+            if previous is not None:
+                raise MembraneError("Reconstructor: minimum-energy starts from rest always; leave previous out")
+            return self.result(self.estimator(*rays), displacement, confidence, status)
+        start = None if previous is None else self._start(previous)
+        return self.result(self.estimator(*rays, confidence, start), displacement, confidence, status)
+
+    def _start(self, previous: Reconstruction) -> tuple[Tensor, Tensor]:
+        """Vertices and pressure of the frames before, those of rest where there are none."""
+        x, pressure = previous.vertices, previous.pressure
+        x = torch.where(x.isfinite(), x, self.estimator.membrane.rest)
+        return x, torch.where(pressure.isfinite(), pressure, self.estimator.rest_pressure)
 
     def judge(self, displacement: Tensor, confidence: Tensor, status: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""

@@ -75,7 +75,7 @@ def add_simulate(commands, command) -> None:
     add("--blur", metavar="PX", type=_positive_or_0, default=Look.blur, help=blur)
     add("--dots", metavar="SMALL,LARGE", type=_pair, help="their radii (default: 0.16 and 0.27 of their spacing)")
     add("--missing", metavar="I,J", type=_numbers, default=(), help="dots that are not painted, from 0")
-    add("--grid", metavar="M,N", type=_grid, help="of the equilibrium (default: twice as fine as the sensor's)")
+    add("--grid", metavar="M,N", type=_grid, help="of the equilibrium (default: 38 a side, or finer than the sensor's)")
     add("--increment", metavar="D", type=_length, help="longest motion in one step (default: from the size)")
 
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Sequence
 from itertools import islice
+from math import gcd
 from typing import NamedTuple
 
 import numpy as np
@@ -73,7 +74,7 @@ class Simulator:
 
     Arguments
         sensor     a `Sensor`
-        grid       of the equilibrium; default `2 n + 3` for a solver grid of n, so that it is finer and shares no lines
+        grid       of the equilibrium; default at least 38 a side, finer than the solver's, and no line in common but the rim
         look       light, lens, chip
         radii      of small and large dots, length unit; default as in `Dots.of`
         missing    dots that are not painted
@@ -83,7 +84,7 @@ class Simulator:
 
     def __init__(self, sensor: Sensor, grid=None, look=Look(), radii=None, missing=()):  # noqa: B008
         self.sensor, self.look = sensor, look
-        self.grid = tuple(grid or (2 * n + 3 for n in sensor.membrane.grid))
+        self.grid = tuple(grid or map(_finer, sensor.membrane.grid))
         if any(mine <= solver for mine, solver in zip(self.grid, sensor.membrane.grid, strict=True)):
             raise MembraneError(
                 f"Simulator: grid {list(self.grid)}; expected a finer one than the sensor's, {list(sensor.membrane.grid)}: "
@@ -146,3 +147,11 @@ class Simulator:
         arrays = {key: np.asarray(value) for key, value in truth.items()}
         arrays = {key: a.astype(np.float32) if a.dtype.kind == "f" else a for key, a in arrays.items()}
         return Frame(self.image(state.vertices, rng), arrays | {"stroke": np.array(json.dumps(stroke.described()))})
+
+
+def _finer(count: int) -> int:
+    """Lines of the equilibrium's grid, evenly spaced as the solver's `count`, none in common but the first and the last."""
+    finer = max(38, count + 4)
+    while gcd(count - 1, finer - 1) > 1:
+        finer += 1
+    return finer
