@@ -27,9 +27,9 @@ from .energy import Sheet
 from .membrane import Membrane, SurfacePoints, corners, triangles_of
 from .solve.patches import PatchIndex, PatchSystem
 
-STEPS, TAU = 12, (10.0, 0.5)  # from rest
+STEPS, TAU = 12, (10.0, 0.4)  # from rest
 FINE_STEPS, FINE_TAU = 10, (2.0, 0.4)  # from the coarser grid's solution
-WARM_STEPS, WARM_TAU = 4, (2.0, 0.4)  # from the previous frame's solution
+WARM_STEPS, WARM_TAU = 4, (1.2, 0.4)  # from the previous frame's solution
 FALL = 0.7  # share of the steps over which tau falls
 SPARSITY = 3200.0  # price of the push p0 on the whole surface, while it is quadratic
 FRICTION, SLIP, CONE = 3.75, 0.05, 10.0  # kappa over the price of a push; where |q_t| begins to be linear, over p0; c
