@@ -9,7 +9,7 @@ import torch
 from torchmembrane.camera import Camera
 from torchmembrane.contact import contact_indicator, contact_points
 from torchmembrane.energy import Sheet
-from torchmembrane.force_balance import ForceBalance, Observation, _across
+from torchmembrane.force_balance import CONE, FRICTION, SPARSITY, ForceBalance, Observation, _across
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.shapes import spherical_cap
 from torchmembrane.simulate.indenters import Sphere
@@ -148,10 +148,10 @@ def test_a_press_simulated_on_another_grid_is_recovered_with_its_force_and_place
     rays, positions, moved, truth = pressed
     estimator = make(17)
     result = estimator(*(r[None] for r in rays), torch.ones(1, len(positions), dtype=torch.float64))
-    assert relative(estimator, result, positions, moved) < 0.2
+    assert relative(estimator, result, positions, moved) < 0.15
     force = (result.traction * estimator.membrane.rest_area[:, None]).sum(1)[0]
-    assert (force - truth.force).norm() < 0.25 * truth.force.norm()
-    assert abs(float(result.pressure - estimator.rest_pressure) - (truth.pressure - truth.rest_pressure)) < 0.25 * (
+    assert (force - truth.force).norm() < 0.1 * truth.force.norm()
+    assert abs(float(result.pressure - estimator.rest_pressure) - (truth.pressure - truth.rest_pressure)) < 0.15 * (
         truth.pressure - truth.rest_pressure
     )
     torch.testing.assert_close(result.volume, estimator.membrane.rest_volume[None], rtol=1e-5, atol=0)
@@ -161,12 +161,102 @@ def test_a_press_simulated_on_another_grid_is_recovered_with_its_force_and_place
     assert (point - truth.contact_points[0]).norm() < 1.0
 
 
-def test_pulls_are_forbidden(pressed):
+def test_pulls_stay_within_the_grids_own_error(pressed):
+    """The truth itself, put on such a grid, has tractions of some hundredths of the rest pressure where nothing touches."""
     rays, positions, _, _ = pressed
     estimator = make(17)
     result = estimator(*(r[None] for r in rays), torch.ones(1, len(positions), dtype=torch.float64))
     q_n = (result.traction * estimator.membrane.normals(result.vertices)).sum(-1)
-    assert q_n.max() < 0.05 * -q_n.min()
+    assert q_n.max() < 0.3 * estimator.reference < 0.1 * -q_n.min()
+
+
+def patch_of_pushes(estimator, push, pull_elsewhere=0.0, rub=0.0):
+    """Forces at rest: `push` (over the reference) on the middle of the dome, `rub` along it, `pull_elsewhere` on the rest."""
+    membrane = estimator.membrane
+    X, normal = membrane.rest, membrane.rest_normals
+    middle = X[:, :2].norm(dim=1) < 4.0
+    along = torch.linalg.cross(normal, torch.tensor([0.0, 1.0, 0.0], dtype=X.dtype).expand_as(normal))
+    traction = torch.where(middle[:, None], -push * normal + rub * along, pull_elsewhere * normal) * estimator.reference
+    return (traction * membrane.rest_area[:, None])[None], middle
+
+
+def prices(estimator, force, tau=0.5):
+    """Weight of the normal and of one tangential direction at every vertex, over that of a small push."""
+    W = estimator.force_weights(estimator.membrane.rest[None], force, tau)[0]
+    normal = estimator.membrane.rest_normals
+    along = torch.nn.functional.normalize(
+        torch.linalg.cross(normal, torch.tensor([0.0, 1.0, 0.0], dtype=normal.dtype).expand_as(normal)), dim=-1
+    )
+    scale = SPARSITY / (estimator.reference * estimator.size) ** 2 / estimator.membrane.rest_area
+    return tuple((d[:, None] @ W @ d[..., None]).ravel() / scale for d in (normal, along))
+
+
+def test_large_pushes_get_cheap_small_ones_and_pulls_do_not():
+    estimator = make(17)
+    centre = estimator.membrane.rest[:, :2].norm(dim=1).argmin()
+    for push, tau, low, high in ((1e-3, 0.5, 0.99, 1.01), (4.0, 0.5, 0.0, 0.01), (4.0, 100.0, 0.95, 1.01)):
+        force, _ = patch_of_pushes(estimator, push)
+        assert low < prices(estimator, force, tau)[0][centre] < high
+    force, middle = patch_of_pushes(estimator, 4.0, pull_elsewhere=4.0)
+    torch.testing.assert_close(prices(estimator, force)[0][~middle], torch.ones(int((~middle).sum()), dtype=torch.float64))
+
+
+def test_rubbing_is_dear_but_where_something_pushes():
+    estimator = make(17)
+    centre = estimator.membrane.rest[:, :2].norm(dim=1).argmin()
+    dear, _ = patch_of_pushes(estimator, 1e-6, rub=0.5)
+    cheap, _ = patch_of_pushes(estimator, 4.0, rub=0.5)
+    dear, cheap = (prices(estimator, force)[1][centre] for force in (dear, cheap))
+    assert 0.9 * FRICTION / 0.5 < dear < FRICTION / 0.5 and cheap < dear / (0.9 * CONE * 4)
+
+
+def test_a_lone_push_is_taken_for_error_its_patch_for_a_contact():
+    estimator = make(25)
+    force, middle = patch_of_pushes(estimator, 2.0)
+    centre = estimator.membrane.rest[:, :2].norm(dim=1).argmin()
+    alone = torch.zeros_like(force)
+    alone[0, centre] = force[0, centre]
+    assert prices(estimator, alone)[0][centre] > 1.5 * prices(estimator, force)[0][centre]
+
+
+def test_strays_have_little_say(pressed):
+    """A few markers off by 2 px of 168 px/rad, a fifth of the spacing."""
+    (origins, directions), positions, moved, _ = pressed
+    weight = torch.ones(1, len(positions), dtype=torch.float64)
+    wrong = directions.clone()
+    generator = torch.Generator().manual_seed(1)
+    stray = torch.randperm(len(positions), generator=generator)[:6]
+    wrong[stray] += 2 / 168 * torch.nn.functional.normalize(torch.randn(6, 3, generator=generator, dtype=wrong.dtype), dim=-1)
+    wrong = torch.nn.functional.normalize(wrong, dim=-1)
+    estimator = make(17)
+    clean = relative(estimator, estimator(origins[None], directions[None], weight), positions, moved)
+    spoiled = relative(estimator, estimator(origins[None], wrong[None], weight), positions, moved)
+    assert spoiled < clean + 0.03
+
+
+def test_a_fine_grid_begins_with_the_coarse_ones_solution(pressed):
+    (origins, directions), positions, moved, truth = pressed
+    weight = torch.ones(1, len(positions), dtype=torch.float64)
+    coarse, fine = make(13), make(25)
+    assert coarse.coarse is None and fine.coarse.membrane.grid == (13, 13)
+    result = fine(origins[None], directions[None], weight)
+    assert relative(fine, result, positions, moved) < 0.1
+    force = (result.traction * fine.membrane.rest_area[:, None]).sum(1)[0]
+    assert (force - truth.force).norm() < 0.07 * truth.force.norm()
+
+
+def test_four_steps_from_the_frame_before_follow_a_press(pressed):
+    """From the solution of a slightly different view of the press, to where the cold solution is."""
+    (origins, directions), positions, _, _ = pressed
+    weight = torch.ones(1, len(positions), dtype=torch.float64)
+    estimator = make(17)
+    rest = torch.nn.functional.normalize(estimator.positions, dim=-1)
+    before = torch.nn.functional.normalize(0.1 * rest + 0.9 * directions, dim=-1)
+    cold = estimator(origins[None], directions[None], weight)
+    previous = estimator(origins[None], before[None], weight)
+    warm = estimator(origins[None], directions[None], weight, (previous.vertices, previous.pressure))
+    rms = lambda u: u.square().sum(-1).mean().sqrt()  # noqa: E731
+    assert rms(warm.vertices - cold.vertices) < 0.02 * rms(cold.vertices - estimator.membrane.rest)
 
 
 def test_batch_equals_singles_and_lost_markers_have_no_say(pressed):
@@ -224,4 +314,4 @@ def test_the_example_images_give_shape_force_and_place():
         torch.testing.assert_close(
             result.force[k], (result.traction[k] * reconstructor.estimator.membrane.rest_area[:, None]).sum(0)
         )
-    assert np.median(errors) < 0.35 and max(errors) < 0.6, errors
+    assert np.median(errors) < 0.15 and max(errors) < 0.3, errors

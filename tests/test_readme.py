@@ -12,8 +12,8 @@ def test_the_python_example_runs(monkeypatch):
     names: dict = {}
     exec(compile(code, "README.md", "exec"), names)
     assert names["result"].status.tolist() == [0, 0]
-    assert list(names["result"].vertices.shape) == [2, 289, 3]
-    assert list(names["again"].vertices.shape) == [2, 289, 3]
+    assert list(names["result"].vertices.shape) == [2, 1089, 3]
+    assert list(names["again"].vertices.shape) == [2, 1089, 3]
 
 
 def test_every_linked_file_exists():

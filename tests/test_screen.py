@@ -104,7 +104,8 @@ def test_the_surface_error_grows_by_less_than_a_fifth(pressed, estimator):
     screened = screen(seen - rest, one)
     clean, *spoiled = error(seen, torch.where(screened > 0.5, screened, 0.0))
     assert max(spoiled) < 1.2 * clean
-    assert min(error(seen, one)[1:]) > 1.2 * clean
+    if estimator == "minimum-energy":  # force balance has robust weights of its own
+        assert min(error(seen, one)[1:]) > 1.2 * clean
 
 
 def test_too_few_markers_are_refused():

@@ -112,7 +112,7 @@ def test_reads_what_the_file_says(tmp_path):
     assert sensor.markers.positions.tolist() == [[0, 0, 14], [3, 0, 13.7], [0, 3, 13.7]]
     assert sensor.markers.sizes == ["large", "small", "small"]
     assert sensor.markers.rest_image.shape == (24, 32)
-    assert torch.equal(sensor.membrane.rest, spherical_cap(12.0, 6.0, 8.0).rest)
+    assert torch.equal(sensor.membrane.rest, spherical_cap(12.0, 6.0, 8.0, (25, 25)).rest)
 
 
 @pytest.mark.parametrize("unit, metre", [("mm", 1000.0), ("cm", 100.0), ("m", 1.0)])
@@ -167,7 +167,7 @@ def test_fingerprint_is_of_the_content_not_of_its_place_or_order(tmp_path):
     head, *tables = GOOD.split("\n\n")
     reordered = "\n\n".join([head, *reversed(tables)]).replace('file = "dots.csv"', 'file = "points.csv"')
     reordered = reordered.replace("rim_radius = 12.0\nheight = 6.0", "height = 6 # mm\nrim_radius = 12.0")
-    reordered = reordered.replace("[-0.1]", "[-0.1, 0.0]").replace("base_z = 8.0", "base_z = 8.0\ngrid = [17, 17]")
+    reordered = reordered.replace("[-0.1]", "[-0.1, 0.0]").replace("base_z = 8.0", "base_z = 8.0\ngrid = [25, 25]")
     (moved / "sensor.toml").write_text(reordered)
     assert Sensor.from_file(moved / "sensor.toml").fingerprint == sensor.fingerprint
     assert len(sensor.fingerprint) == 64
@@ -185,7 +185,7 @@ def test_fingerprint_is_of_the_content_not_of_its_place_or_order(tmp_path):
         ("thickness = 0.25\nindex = 1.49", "thickness = 0.26\nindex = 1.49"),
         ("index = 1.33", "index = 1.34"),
         ("height = 6.0", "height = 6.1"),
-        ("base_z = 8.0", "base_z = 8.0\ngrid = [19, 17]"),
+        ("base_z = 8.0", "base_z = 8.0\ngrid = [19, 25]"),
         ("prestretch = 1.2", "prestretch = 1.3"),
         ("c2_ratio = 0.1", "c2_ratio = 0.2"),
         ("shear_modulus = 0.3\n", ""),
@@ -231,7 +231,7 @@ def test_fingerprint_of_a_sensor_made_in_python_is_that_of_its_file(tmp_path):
     assert alike.surface is cap and alike.fingerprint == sensor.fingerprint
 
 
-@pytest.mark.parametrize("count, n", [(3, 17), (169, 19), (196, 19), (225, 21), (361, 27), (2000, 33)])
+@pytest.mark.parametrize("count, n", [(3, 25), (81, 25), (100, 29), (121, 33), (2000, 33)])
 def test_solver_grid_follows_the_number_of_dots(tmp_path, count, n):
     dots = [DOTS[0], *["0.0,0.0,14.0,small"] * count]
     assert Sensor.from_file(write(tmp_path, dots=dots)).membrane.grid == (n, n)
@@ -239,8 +239,8 @@ def test_solver_grid_follows_the_number_of_dots(tmp_path, count, n):
 
 def test_solver_grid_without_listed_dots(tmp_path):
     found = replaced('file = "dots.csv"\n', "")
-    assert Sensor.from_file(write(tmp_path, found)).membrane.grid == (17, 17)
-    assert Sensor.from_file(write(tmp_path, replaced('"dots"', '"texture"', found))).membrane.grid == (33, 33)
+    assert Sensor.from_file(write(tmp_path, found)).membrane.grid == (33, 33)
+    assert Sensor.from_file(write(tmp_path, replaced('"dots"', '"texture"', found))).membrane.grid == (25, 25)
     finer = replaced("base_z = 8.0", "base_z = 8.0\ngrid = [9, 13]")
     assert Sensor.from_file(write(tmp_path, finer)).membrane.grid == (9, 13)
 
@@ -327,7 +327,7 @@ def test_every_mistake_in_the_file_is_named(tmp_path, text, words):
         ([*DOTS, "0,0,fourteen,small"], "line 5: z = 'fourteen'; expected a number"),
         ([*DOTS, "0,nan,14,small"], "line 5: y = nan; expected a finite number"),
         ([*DOTS, "0,0,14,medium"], "line 5: size = 'medium'; expected small or large"),
-        ([*DOTS, "", "0,0,14,small", "0,0,4,small"], "line 7: the dot at [0.0, 0.0, 4.0] is 9.967 off the rest surface"),
+        ([*DOTS, "", "0,0,14,small", "0,0,4,small"], "line 7: the dot at [0.0, 0.0, 4.0] is 9.985 off the rest surface"),
     ],
 )
 def test_every_mistake_in_the_dots_is_named_with_its_line(tmp_path, dots, words):
@@ -379,7 +379,23 @@ def test_a_sensor_made_in_python_is_checked_alike(tmp_path):
 
 def test_a_grid_keeps_its_source_when_the_solver_takes_another(tmp_path):
     sensor = Sensor.from_file(write(tmp_path / "a", replaced(CAP, GRID)))
-    assert sensor.membrane.grid == (17, 17) and sensor.surface.values["vertices"].shape == (9, 7, 3)
+    assert sensor.membrane.grid == (25, 25) and sensor.surface.values["vertices"].shape == (9, 7, 3)
     written = np.load(sensor.to_file(tmp_path / "b").with_name("sensor_grid.npz"))
     assert np.array_equal(written["vertices"], sensor.surface.values["vertices"])
-    assert torch.equal(Surface.of(sensor.membrane).membrane((17, 17)).rest, sensor.membrane.rest)
+    assert torch.equal(Surface.of(sensor.membrane).membrane((25, 25)).rest, sensor.membrane.rest)
+
+
+def test_a_files_own_lines_are_made_even_unless_they_are_asked_for(tmp_path):
+    """Lines crowded at one side of the file's grid, of the size that the solver takes anyway."""
+    x = 12 * np.linspace(-1, 1, 25)
+    crowded = np.sign(x) * (np.abs(x) / 12) ** 0.5 * 12
+    X, Y = np.meshgrid(crowded, x, indexing="ij")
+    vertices = np.stack([X, Y, np.full_like(X, 14.0)], -1)
+    fixed = np.pad(np.zeros((23, 23), bool), 1, constant_values=True)
+    np.savez(tmp_path / "flat.npz", vertices=vertices, fixed=fixed)
+    text = replaced(CAP, 'shape = "grid"\nfile = "flat.npz"\n')
+    sensor = Sensor.from_file(write(tmp_path, text))
+    steps = np.diff(sensor.membrane.rest.reshape(25, 25, 3)[:, 12, 0].numpy())
+    assert steps.max() < 1.05 * steps.min()
+    asked = Sensor.from_file(write(tmp_path, text.replace('file = "flat.npz"', 'file = "flat.npz"\ngrid = [25, 25]')))
+    np.testing.assert_array_equal(asked.membrane.rest.reshape(25, 25, 3).numpy(), vertices)

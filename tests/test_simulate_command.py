@@ -69,7 +69,7 @@ def test_a_press_gives_image_truth_and_the_sensor_as_simulated(sensor_path, tmp_
         assert set(example) <= set(truth)
     image = np.asarray(Image.open(tmp_path / "out" / "one.png"))
     assert image.shape == (60, 80) and image.dtype == np.uint8
-    assert len(truth["vertices_deformed"]) == 17**2  # finer than the solver's 7 x 7
+    assert len(truth["vertices_deformed"]) == 18**2  # finer than the solver's 7 x 7
     assert np.abs(truth["dots_nominal"] - sensor.markers.positions).max() < 1e-5
     seen = sensor.camera.point_to_pixel(torch.from_numpy(truth["dots_deformed"]).double()).numpy()
     assert np.abs(truth["uv_deformed"] - seen).max() < 1e-4 and truth["visible_deformed"].all()

@@ -39,7 +39,7 @@ OUTLIER = 5.0  # R
 LONGEST_STEP = 0.026  # over the surface's size
 COARSEST = 13  # fewest lines of a coarser grid
 NEIGHBOURS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1))
-LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR = 1e-3, 3e-4  # rms of the last step over the size, and volume error, when settled
+LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR = 2e-3, 1e-3  # rms of the last step over the size, and volume error, when settled
 
 
 class Observation(NamedTuple):

@@ -46,7 +46,7 @@ class MinimumEnergy(nn.Module):
         for name, value, known in (("element", element, ELEMENTS), ("volume", volume, VOLUMES)):
             if value not in known:
                 raise MembraneError(f"MinimumEnergy: {name} = {value!r}; expected one of {', '.join(known)}")
-        self.membrane, self.volume_constraint = membrane, volume
+        self.membrane, self.sheet, self.volume_constraint = membrane, sheet, volume
         self.largest_unbalance, self.largest_volume_error = CONVERGED, CONVERGED if volume == "exact" else float("inf")
         quadratic = volume == "linear" and (element == "quadrilateral" or sheet.model == "harmonic") and filling != "gas"
         self.steps = steps or (1 if quadratic else STEPS)

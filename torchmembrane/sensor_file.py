@@ -71,7 +71,12 @@ def write_sensor(sensor: Sensor, path: Path) -> Path:
 
 
 def default_grid(markers: Markers) -> tuple[int, int]:
-    """The solver grid where the file names none: 2.8 times as fine as the dots listed, 25, 29 or 33; 33 where none are listed."""
+    """The solver grid where the file names none: 2.8 times as fine as the dots listed, 25, 29 or 33; 25 for texture.
+
+    33 where dots are still to be found in the rest image.
+    """
+    if markers.kind == "texture":
+        return COARSEST, COARSEST
     if markers.positions is None:
         return FINEST, FINEST
     n = min(max(4 * round(2.8 * math.sqrt(len(markers.positions)) / 4) + 1, COARSEST), FINEST)
@@ -166,14 +171,17 @@ def _read_membrane(table: Table, markers: Markers) -> tuple[Surface, Membrane]:
     shape = table.text("shape", [*SHAPES_BY_ARRAYS, *SHAPES_BY_NUMBERS])
     arrays, numbers = SHAPES_BY_ARRAYS.get(shape), SHAPES_BY_NUMBERS.get(shape, ())
     table.allow(("shape", "grid", *(("file",) if arrays else numbers)), f"for shape {shape}")
-    grid = tuple(table.numbers("grid", 2, required=False, whole=True) or default_grid(markers))
+    named = table.numbers("grid", 2, required=False, whole=True)
+    grid = tuple(named or default_grid(markers))
     if min(grid) < 5:
         raise table.refuse("grid", "5 x 5 vertices or more; 17 x 17 serves about 150 dots")
     if arrays:
         path = table.file("file")
         surface = Surface(shape, _read_arrays(path, arrays))
         with table.naming("file"):
-            return surface, surface.membrane(grid)
+            membrane = surface.membrane(grid)
+            lines = surface.values["vertices" if shape == "grid" else "z"].shape[:2]
+            return surface, membrane.resampled(grid) if lines == grid and not named else membrane  # evenly, unless asked for
     surface = Surface(shape, {key: table.numbers(key, 3) if key == "semi_axes" else table.number(key) for key in numbers})
     with table.naming():
         return surface, surface.membrane(grid)

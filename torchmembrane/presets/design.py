@@ -77,7 +77,7 @@ def _sensor(name, camera, surface, material, positions, sizes, gas=False) -> Sen
 def _overpressure(membrane, material) -> float:
     """What the sheet's tension holds at rest, whole hPa."""
     sheet = Sheet(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
-    return float(round(rest_balance(membrane, sheet)[0] * METRE["mm"] ** 2 / 100))
+    return float(round(float(rest_balance(membrane, sheet)[0]) * METRE["mm"] ** 2 / 100))
 
 
 def _dome_dots(semi_axes, opening: float, base_z: float, spacing: float) -> tuple[np.ndarray, list[str]]:

@@ -74,7 +74,7 @@ class Simulator:
 
     Arguments
         sensor     a `Sensor`
-        grid       of the equilibrium; default at least 38 a side, finer than the solver's, and no line in common but the rim
+        grid       of the equilibrium; default about 38 a side, finer than the solver's, no line in common but the rim
         look       light, lens, chip
         radii      of small and large dots, length unit; default as in `Dots.of`
         missing    dots that are not painted
@@ -151,7 +151,7 @@ class Simulator:
 
 def _finer(count: int) -> int:
     """Lines of the equilibrium's grid, evenly spaced as the solver's `count`, none in common but the first and the last."""
-    finer = max(38, count + 4)
+    finer = min(2 * count + 3, max(38, count + 4))
     while gcd(count - 1, finer - 1) > 1:
         finer += 1
     return finer
