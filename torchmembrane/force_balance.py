@@ -8,7 +8,7 @@ Every vertex carries three equations of equilibrium and one unknown depth. With 
 
 at the cavity's volume. `r_d` is the angle between a marker's ray and its modelled position; its price saturates, so that a
 wrongly matched marker has little say. A convex body without friction pushes with at least the fluid's pressure or not at all: a
-small push is the grid's error or noise, a large one is a contact. So the price `f` of a push is quadratic at first and saturates
+small push is the grid's error or noise, a large one a contact. So the price `f` of a push is quadratic at first and saturates
 beyond `tau` (like s^2 / (1 + s^2 / tau^2)), that of a pull stays quadratic, and what rubs is cheaper where something pushes.
 Whether a vertex is pushed is asked of its surroundings (`REACH`): contacts are patches.
 
@@ -173,7 +173,7 @@ class ForceBalance(nn.Module):
         return x + share[:, None, None] * move, pressure + share * rise
 
     def force_weights(self, x: Tensor, force: Tensor, tau: float) -> Tensor:
-        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, V, 3, 3]`: second derivatives of the price's parabolas in the force."""
+        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, V, 3, 3]`: the parabolas that price a force."""
         area, normal, p0 = self.membrane.rest_area, self.membrane.normals(x), self.reference
         traction = force / area[:, None]
         q_n = (traction * normal).sum(-1)
@@ -214,7 +214,7 @@ def _across(directions: Tensor) -> Tensor:
 
 def _surroundings(membrane: Membrane) -> Tensor:
     """Weights `[V, V]` of a Gaussian mean over the rest surface; column k is that around vertex k."""
-    weight = torch.exp(-torch.cdist(membrane.rest, membrane.rest) ** 2 / (2 * (REACH * membrane.size) ** 2))
+    weight = torch.exp(-(torch.cdist(membrane.rest, membrane.rest) ** 2) / (2 * (REACH * membrane.size) ** 2))
     weight = membrane.rest_area[:, None] * weight
     return weight / weight.sum(0)
 

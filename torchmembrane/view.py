@@ -15,24 +15,29 @@ from .results import OK, STATUS_TEXTS
 from .store import Mesh
 
 BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # told apart with any colour vision
-PRESSED_IN = "RdBu"  # negative (in) red, positive (out) blue
+PRESSED_IN, PUSH = "RdBu", "Oranges"  # negative (in) red, positive (out) blue
+FORCE_ARROW = 0.2  # of the image's width: a force across the optical axis; shorter when it points along it
 MAGNIFICATIONS = (1, 2, 3, 5, 10, 20)
 LONGEST_ARROW, LEAST_SCALE = 0.07, 0.002
 ARROWS_ACROSS, LINES = 22, 16
 
 
 def figure(frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = None, name: str = "") -> Figure:
-    """Flow over the image, side view, and displacement along the rest normals, of one frame (`Reconstruction.frame`).
+    """Flow over the image, side view, displacement along the rest normals and, where forces are known, the push.
 
-    Arguments: the frame; the `Mesh` stored beside it; its image `[height, width]` in 0..1 (default: none is drawn).
+    Arguments: the frame (`Reconstruction.frame`); the `Mesh` stored beside it; its image `[height, width]` in 0..1 (default:
+    none is drawn).
     """
-    drawing, places = _three_panels()
     good = np.isfinite(frame["vertices"]).all()
+    forces = good and np.any(frame["traction"])
+    drawing, places = _panels(4 if forces else 3)
     drawing.suptitle(_title(frame, mesh, name), fontsize=14, color="k" if good else VERMILION)
     draw_flow(drawing.add_subplot(places[0]), frame, mesh, image)
     if good:
         draw_side(drawing.add_subplot(places[1]), frame, mesh)
         draw_map(drawing.add_subplot(places[2]), frame, mesh)
+        if forces:
+            draw_push(drawing.add_subplot(places[3]), frame, mesh)
     else:
         _draw_failure(drawing.add_subplot(places[0, 1:]), frame)
     return drawing
@@ -125,6 +130,31 @@ def draw_map(axes, frame, mesh: Mesh) -> None:
         axes.set_title(f"Not pressed in by {_least(mesh):.1g} {unit} anywhere")
 
 
+def draw_push(axes, frame, mesh: Mesh) -> None:
+    """Inward traction where the rest vertices are seen in the image; contacts x, and the total force along the image's axes."""
+    push, place = -(frame["traction"] * frame["normals"]).sum(1), mesh.vertex_pixels
+    largest = max(push.max(), np.finfo(np.float32).tiny)
+    shades = axes.tricontourf(*place.T, mesh.triangles, push.clip(0), levels=np.linspace(0, 1.001 * largest, 32), cmap=PUSH)
+    axes.plot(*place[_rim(mesh.grid)].T, color="k", lw=1)
+    bar = axes.figure.colorbar(shades, cax=axes.inset_axes([0.05, -0.24, 0.9, 0.04]), orientation="horizontal")
+    bar.ax.tick_params(labelsize=8.5)
+    bar.locator = MaxNLocator(5)
+    bar.update_ticks()
+    relative = mesh.force_unit == "relative"
+    bar.set_label("push on the membrane " + ("(relative)" if relative else f"[{mesh.force_unit}/{mesh.length_unit}²]"))
+    _image_axes(axes, mesh.image_size, None)
+    points = frame["contact_points"][np.isfinite(frame["contact_points"]).all(1)]
+    nearest = np.linalg.norm(frame["vertices"] - points[:, None], axis=2).argmin(1)
+    axes.plot(*place[nearest].T, "x", ms=10, color="k", mew=2)
+    force = frame["force"]
+    size = np.linalg.norm(force)
+    if len(points):
+        arrow = FORCE_ARROW * mesh.image_size[0] * force[:2] / size
+        axes.annotate("", place[nearest[0]] + arrow, place[nearest[0]], arrowprops=dict(arrowstyle="-|>", color=BLUE, lw=2.5))
+    components = ", ".join(f"{c:.3g}" for c in force)
+    axes.set_title(f"Force {size:.3g}" + ("" if relative else f" {mesh.force_unit}") + f" ({components})")
+
+
 def _least(mesh: Mesh) -> float:
     """The displacement under which nothing is marked and the colour scale does not shrink."""
     return LEAST_SCALE * np.ptp(mesh.rest_vertices, 0).max()
@@ -134,9 +164,11 @@ def _is_pressed(mesh: Mesh, frame) -> bool:
     return mesh.normal_displacement(frame).min() < -_least(mesh)
 
 
-def _three_panels():
-    drawing = Figure(figsize=(16, 6), dpi=100)
-    return drawing, drawing.add_gridspec(1, 3, left=0.045, right=0.985, top=0.87, bottom=0.19, wspace=0.2)
+def _panels(count):
+    drawing = Figure(figsize=(16 * count / 3, 6), dpi=100)
+    return drawing, drawing.add_gridspec(
+        1, count, left=0.135 / count, right=1 - 0.045 / count, top=0.87, bottom=0.19, wspace=0.2
+    )
 
 
 def _title(frame, mesh: Mesh, name: str) -> str:
@@ -163,7 +195,7 @@ def sensor_figure(sensor, reconstructor=None, frame=None) -> Figure:
 
     Arguments: a `Sensor`; its `Reconstructor` and its rest image's frame, as far as there are.
     """
-    drawing, places = _three_panels()
+    drawing, places = _panels(3)
     drawing.suptitle(f"Sensor {sensor.name!r}", fontsize=14)
     X, grid = sensor.membrane.rest.numpy(), sensor.membrane.grid
     markers = sensor.markers.positions if reconstructor is None else reconstructor.rest_markers.cpu().numpy()
