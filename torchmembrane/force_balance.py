@@ -23,6 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .cavity import CavityLaw, Equilibrium, rest_balance
+from .deviations import StandardDeviations, standard_deviations
 from .energy import Sheet
 from .membrane import Membrane, SurfacePoints, corners, triangles_of
 from .solve.patches import PatchIndex, PatchSystem
@@ -115,6 +116,19 @@ class ForceBalance(nn.Module):
         u = F.interpolate(u, self.membrane.grid, mode="bilinear", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
         return self._descend(self.membrane.rest + u * self.moves, coarse.pressure, seen, FINE_STEPS, FINE_TAU)
 
+    def standard_deviations(
+        self, equilibrium: Equilibrium, origins: Tensor, directions: Tensor, weight: Tensor, marker_noise: float | Tensor
+    ) -> StandardDeviations:
+        """Of the surface, total force and pressure found from these rays, as the noise of the markers spreads to first order.
+
+        `marker_noise`: standard deviation of every marker's angles, radians; or `[B, D, 2, 3]`, how noise in each of two
+        independent directions turns the rays. Wrong when: noise may change which vertices are pushed, as in the shallowest
+        presses and where two answers compete; the grid's and the material's errors are not in it.
+        """
+        seen = Observation(origins, _across(directions), weight / self.noise**2)
+        noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * seen.across
+        return standard_deviations(self, equilibrium.vertices, equilibrium.pressure, seen, noise, TAU[1], OUTLIER)
+
     def _descend(self, x: Tensor, pressure: Tensor, seen: Observation, steps: int, fall: tuple[float, float]) -> Equilibrium:
         first, last = fall
         for k in range(steps):
@@ -172,18 +186,26 @@ class ForceBalance(nn.Module):
         share = (LONGEST_STEP * self.size / longest.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1.0)
         return x + share[:, None, None] * move, pressure + share * rise
 
-    def force_weights(self, x: Tensor, force: Tensor, tau: float) -> Tensor:
-        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, V, 3, 3]`: the parabolas that price a force."""
+    def force_weights(self, x: Tensor, force: Tensor, tau: float, curvature=False) -> Tensor:
+        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, V, 3, 3]`: the parabolas that price a force.
+
+        With `curvature` those of the price itself, zero where it bends down.
+        """
         area, normal, p0 = self.membrane.rest_area, self.membrane.normals(x), self.reference
         traction = force / area[:, None]
         q_n = (traction * normal).sum(-1)
         q_t = traction - q_n[..., None] * normal
         push2 = (-q_n / p0).clamp_min(0) ** 2 @ self.surroundings
-        w_n = torch.where(q_n < 0, FLOOR + (1 + push2 / tau**2) ** -2, 1.0)
+        ratio = push2 / tau**2
+        pushed = (1 - 3 * ratio).clamp_min(0) / (1 + ratio) ** 3 if curvature else (1 + ratio) ** -2
+        w_n = torch.where(q_n < 0, FLOOR + pushed, 1.0)
         dearer = FRICTION / (1 + CONE * (push2 + SLIP**4).sqrt())
-        w_t = dearer * (q_t.square().sum(-1) / p0**2 + SLIP**2).rsqrt()
+        slip2 = q_t.square().sum(-1) / p0**2 + SLIP**2
+        w_t = dearer * slip2.rsqrt()
         one = torch.eye(3, dtype=x.dtype, device=x.device)
         W = (w_n - w_t)[..., None, None] * normal[..., :, None] * normal[..., None, :] + w_t[..., None, None] * one
+        if curvature:
+            W = W - (w_t / (slip2 * p0**2))[..., None, None] * q_t[..., :, None] * q_t[..., None, :]
         return SPARSITY / (p0 * self.size) ** 2 * W / area[:, None, None]
 
     def _marker_weights(self, angle: Tensor, seen: Observation, outlier: float) -> Tensor:

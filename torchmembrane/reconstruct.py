@@ -10,7 +10,9 @@ from torch import Tensor, nn
 
 from . import results
 from .camera import Rays
+from .cavity import Equilibrium
 from .contact import contact_indicator, contact_points
+from .deviations import StandardDeviations
 from .energy import Sheet
 from .errors import MembraneError
 from .flow import FlowInterpolation
@@ -27,6 +29,7 @@ FOUND = 0.5
 """Confidence above which a marker counts as found."""
 FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5
 MARKER_NOISE = {"dots": 0.1, "texture": 0.2}  # px, assumed by force balance: twice the locator's, and the grid's error
+LOCATOR_NOISE = 0.5  # of MARKER_NOISE: the locator's own, of which standard deviations speak
 LEAST_CONTRAST, SATURATED_SHARE = 0.02, 0.98
 
 
@@ -193,6 +196,20 @@ class Reconstructor(nn.Module):
             return self.result(self.estimator(*rays), displacement, confidence, status)
         start = None if previous is None else self._start(previous)
         return self.result(self.estimator(*rays, confidence, start), displacement, confidence, status)
+
+    def standard_deviations(self, result: Reconstruction) -> StandardDeviations:
+        """Of vertices, total force and pressure of `result`, caused by the locator's noise; NaN where there is no surface."""
+        if not self.finds_contacts:
+            raise MembraneError("Reconstructor: standard deviations of minimum-energy; expected estimator = 'force-balance'")
+        pixels = torch.where(result.pixels.isfinite(), result.pixels, self.rest_pixels)
+        origins, directions = self.camera.pixel_to_ray(pixels)
+        distance = torch.linalg.vector_norm(result.markers - origins, dim=-1)[..., None, None]
+        half = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
+        after, before = (self.camera.pixel_to_ray(pixels[..., None, :] + step) for step in (half, -half))
+        turn = (after.origin - before.origin) / distance + after.direction - before.direction
+        noise = LOCATOR_NOISE * MARKER_NOISE[self.sensor.markers.kind] * turn
+        found = Equilibrium(result.vertices, result.pressure, None, result.traction, None)
+        return self.estimator.standard_deviations(found, origins, directions, result.confidence, noise)
 
     def _start(self, previous: Reconstruction) -> tuple[Tensor, Tensor]:
         """Vertices and pressure of the frames before, those of rest where there are none."""

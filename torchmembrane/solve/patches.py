@@ -66,6 +66,12 @@ class PatchSystem(nn.Module):
             total = total.index_add(1, index.vector, patches.flatten(1))
         return total[:, :-1]
 
+    def columns(self, index: PatchIndex, patches: Tensor) -> Tensor:
+        """Every row of the patch vectors `[B, N, C, 3k]` as a load of its own, `[B, unknowns, N C]`."""
+        places = index.vector.reshape(patches.shape[1], 1, -1).expand(patches.shape)
+        total = patches.new_zeros(*patches.shape[:-1], self.blocks * self.block_size + 1)
+        return total.scatter_add(-1, places, patches)[..., :-1].flatten(1, 2).mT
+
     def from_vertices(self, field: Tensor) -> Tensor:
         """A vertex field `[B, V, 3]` in the system's order."""
         total = field.new_zeros(field.shape[0], self.blocks * self.block_size)
