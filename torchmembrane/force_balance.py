@@ -100,6 +100,14 @@ class ForceBalance(nn.Module):
         sheet = self.sheet.on(membrane)
         return ForceBalance(membrane, sheet, markers, self.positions, self.noise, filling, gas, steps)
 
+    def set_prestretch(self, prestretch: Tensor) -> None:
+        """Another prestretch `[]`, through which gradients flow; rest pressure and load follow, the reference traction stays."""
+        self.sheet.prestretch = prestretch
+        self.rest_pressure, self.rest_load = rest_balance(self.membrane, self.sheet)
+        self.cavity.rest_pressure = self.rest_pressure
+        if self.coarse is not None:
+            self.coarse.set_prestretch(prestretch)
+
     def forward(
         self, origins: Tensor, directions: Tensor, weight: Tensor, start: tuple[Tensor, Tensor] | None = None
     ) -> Equilibrium:
@@ -189,7 +197,7 @@ class ForceBalance(nn.Module):
     def force_weights(self, x: Tensor, force: Tensor, tau: float, curvature=False) -> Tensor:
         """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, V, 3, 3]`: the parabolas that price a force.
 
-        With `curvature` those of the price itself, zero where it bends down.
+        With `curvature` that of the price of a push itself, zero where it bends down.
         """
         area, normal, p0 = self.membrane.rest_area, self.membrane.normals(x), self.reference
         traction = force / area[:, None]
@@ -198,14 +206,11 @@ class ForceBalance(nn.Module):
         push2 = (-q_n / p0).clamp_min(0) ** 2 @ self.surroundings
         ratio = push2 / tau**2
         pushed = (1 - 3 * ratio).clamp_min(0) / (1 + ratio) ** 3 if curvature else (1 + ratio) ** -2
-        w_n = torch.where(q_n < 0, FLOOR + pushed, 1.0)
+        w_n = FLOOR + torch.where(q_n < 0, pushed, 1.0)
         dearer = FRICTION / (1 + CONE * (push2 + SLIP**4).sqrt())
-        slip2 = q_t.square().sum(-1) / p0**2 + SLIP**2
-        w_t = dearer * slip2.rsqrt()
+        w_t = dearer * (q_t.square().sum(-1) / p0**2 + SLIP**2).rsqrt()
         one = torch.eye(3, dtype=x.dtype, device=x.device)
         W = (w_n - w_t)[..., None, None] * normal[..., :, None] * normal[..., None, :] + w_t[..., None, None] * one
-        if curvature:
-            W = W - (w_t / (slip2 * p0**2))[..., None, None] * q_t[..., :, None] * q_t[..., None, :]
         return SPARSITY / (p0 * self.size) ** 2 * W / area[:, None, None]
 
     def _marker_weights(self, angle: Tensor, seen: Observation, outlier: float) -> Tensor:

@@ -77,7 +77,7 @@ class EllipseFit(nn.Module):
         offset = np.stack(np.meshgrid(step, step)).reshape(2, -1)
         offset = offset[:, np.hypot(*offset) <= half + 0.5]
         self.steps, self.size_tolerance, self.half = steps, size_tolerance, half
-        self.levels = [(k, torch.as_tensor(np.flatnonzero(level == k))) for k in np.unique(level)]
+        self.levels = [(int(k), torch.as_tensor(np.flatnonzero(level == k))) for k in np.unique(level)]
         order = np.concatenate([dots for _, dots in self.levels])
         self.register_buffer("order", torch.as_tensor(np.argsort(order)))
         self.register_buffer("offset", torch.as_tensor(offset.astype(float)))

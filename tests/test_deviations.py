@@ -1,0 +1,132 @@
+"""Standard deviations against the scatter of estimates from noisy markers; gradients against finite differences."""
+
+import pytest
+import torch
+
+from torchmembrane import MembraneError
+from torchmembrane.camera import Camera
+from torchmembrane.energy import Sheet
+from torchmembrane.force_balance import ForceBalance, Observation, _across
+from torchmembrane.shapes import ellipsoid_cap, half_cylinder, spherical_cap
+from torchmembrane.simulate.indenters import Sphere
+from torchmembrane.simulate.press import carried, press
+
+NOISE, DRAWS = 0.05, 48  # px
+CAP, FINGER, CYLINDER = (
+    lambda n: spherical_cap(12, 9, 3, (n, n)),
+    lambda n: ellipsoid_cap((10, 8, 12), 3, (n, n)),
+    lambda n: half_cylinder(10, 36, 80, 24, (n, n)),
+)
+FISHEYE = Camera("fisheye", (640, 480), (168, 168), (320, 240))
+PORT = Camera("pinhole", (640, 480), (265, 265), (322.4, 237), ports=[(4, 3, 1.49)], medium_index=1.33)
+PRESSES = {
+    "cap": (CAP, FISHEYE, dict(prestretch=1.3), 4.0, (0.5, 0.0, 0.866), 2.0),
+    "fingertip": (FINGER, FISHEYE, dict(prestretch=1.25), 3.0, (0.3, 0.6, 0.7), 1.5),
+    "half cylinder": (CYLINDER, PORT, dict(model="mooney_rivlin", prestretch=1.2, c2_ratio=0.1), 4.0, (0.0, 0.4, 0.9), 2.0),
+}
+
+
+def observed(name, n, truth_grid=25, **options):
+    """An estimator on `n` x `n` vertices, its camera, and the markers' exact pixels in a press on a finer grid."""
+    shape, camera, material, radius, direction, depth = PRESSES[name]
+    direction = torch.tensor(direction, dtype=torch.float64) / torch.tensor(direction).norm()
+    dome, rest = shape(truth_grid), shape(n)
+    ball = Sphere(radius).touching(dome, -direction)
+    truth = press(dome, Sheet(dome, **material), [[ball, ball.moved(-depth * direction)]])
+    net = shape(33).resampled((13, 13)).rest.reshape(13, 13, 3)
+    positions = net[1:-1, 1:-1].reshape(-1, 3)
+    markers, noise = rest.closest_points(positions.numpy()), 2 * NOISE / float(camera.focal.mean())
+    estimator = ForceBalance(rest, Sheet(rest, **material), markers, positions, noise, **options)
+    return estimator, camera, camera.point_to_pixel(carried(truth.vertices, dome, positions))
+
+
+def estimate(estimator, camera, pixels):
+    rays = camera.pixel_to_ray(pixels)
+    return estimator(*rays, torch.ones_like(pixels[..., 0]))
+
+
+def force_of(estimator, result):
+    return estimator.contact_force(result.vertices, result.pressure).sum(1)
+
+
+def turns(estimator, camera, pixels, vertices):
+    """How the rays to the markers turn by one standard deviation of the pixels, by the camera's inverse: `[B, D, 2, 3]`."""
+    place = estimator.markers(vertices)
+    origins, directions = camera.pixel_to_ray(pixels)
+    across = _across(directions)
+    step = 1e-5
+    moved = camera.point_to_pixel(place[..., None, :] + step * across) - camera.point_to_pixel(place)[..., None, :]
+    distance = torch.linalg.vector_norm(place - origins, dim=-1)[..., None, None]
+    return NOISE * step / distance * torch.linalg.inv(moved) @ across
+
+
+@pytest.mark.parametrize("name", PRESSES)
+def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(name):
+    """48 draws of the markers' noise, each estimated from rest, about the mean of the estimates."""
+    estimator, camera, exact = observed(name, 13)
+    generator = torch.Generator().manual_seed(1)
+    pixels = exact + NOISE * torch.randn(DRAWS, *exact.shape, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        result = estimate(estimator, camera, pixels)
+        noise = turns(estimator, camera, pixels, result.vertices)
+        rays = camera.pixel_to_ray(pixels)
+        deviations = estimator.standard_deviations(result, *rays, torch.ones_like(pixels[..., 0]), noise)
+    free = estimator.membrane.free
+    for values, spread in (
+        (result.vertices[:, free], deviations.vertices[:, free]),
+        (force_of(estimator, result), deviations.force),
+    ):
+        inside = ((values - values.mean(0)).abs() < spread).double().mean()
+        assert 0.60 < inside < 0.76
+
+
+def test_deviations_grow_with_the_noise_and_leave_the_rim_alone():
+    estimator, camera, exact = observed("cap", 9, truth_grid=15, steps=6)
+    result = estimate(estimator, camera, exact[None])
+    rays, weight = camera.pixel_to_ray(exact[None]), torch.ones_like(exact[None, :, 0])
+    once, twice = (estimator.standard_deviations(result, *rays, weight, k * NOISE / 168) for k in (1, 2))
+    for a, b in zip(once, twice, strict=True):
+        torch.testing.assert_close(2 * a, b)
+    assert (once.vertices[:, estimator.membrane.fixed] == 0).all() and (once.force > 0).all()
+    weight[:, 60:] = 0
+    lost = estimator.standard_deviations(result, *rays, weight, NOISE / 168)
+    assert lost.vertices.norm() > 1.2 * once.vertices.norm()
+
+
+def along(function, at, direction, step=1e-5):
+    return (function(at + step * direction) - function(at - step * direction)) / (2 * step)
+
+
+@pytest.mark.parametrize("pressed", [True, False])
+def test_gradients_in_the_pixels_agree_with_finite_differences(pressed):
+    """Of vertices and force, through camera and unrolled steps; at rest too, where forces and angles vanish."""
+    estimator, camera, exact = observed("half cylinder", 9, truth_grid=15, steps=4)
+    pixels = (exact if pressed else camera.point_to_pixel(estimator.positions))[None]
+    generator = torch.Generator().manual_seed(0)
+    direction = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+    weights = torch.randn(estimator.membrane.rest.shape, generator=generator, dtype=torch.float64)
+
+    def answers(pixels):
+        result = estimate(estimator, camera, pixels)
+        return torch.cat([(weights * result.vertices[0]).sum()[None], force_of(estimator, result)[0]])
+
+    given = pixels.clone().requires_grad_()
+    gradients = torch.stack([torch.autograd.grad(a, given, retain_graph=True)[0] for a in answers(given)])
+    expected = along(answers, pixels, direction)
+    torch.testing.assert_close((gradients * direction).flatten(1).sum(1), expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("filling", ["liquid", "open"])
+def test_gradients_in_the_prestretch_agree_with_finite_differences(filling):
+    estimator, camera, exact = observed("cap", 9, truth_grid=15, steps=4, filling=filling)
+    weights = torch.randn(estimator.membrane.rest.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def answers(prestretch):
+        estimator.set_prestretch(prestretch)
+        result = estimate(estimator, camera, exact[None])
+        return torch.cat([(weights * result.vertices[0]).sum()[None], force_of(estimator, result)[0]])
+
+    prestretch = torch.tensor(1.3, dtype=torch.float64)
+    given = prestretch.clone().requires_grad_()
+    gradients = torch.stack([torch.autograd.grad(a, given, retain_graph=True)[0] for a in answers(given)])
+    torch.testing.assert_close(gradients, along(answers, prestretch, torch.ones(())), rtol=1e-6, atol=1e-8)
