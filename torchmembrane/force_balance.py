@@ -213,6 +213,19 @@ class ForceBalance(nn.Module):
         W = (w_n - w_t)[..., None, None] * normal[..., :, None] * normal[..., None, :] + w_t[..., None, None] * one
         return SPARSITY / (p0 * self.size) ** 2 * W / area[:, None, None]
 
+    def price(self, found: Equilibrium, origins: Tensor, directions: Tensor, weight: Tensor) -> Tensor:
+        """What the last steps minimise, `[B]`: the misfit of the markers (given as to `forward`) and the tractions' price."""
+        seen = Observation(origins, _across(directions), weight / self.noise**2)
+        x, area, tau = found.vertices, self.membrane.rest_area, TAU[-1]
+        traction, normal = found.traction / self.reference, self.membrane.normals(x)
+        q_n = (traction * normal).sum(-1)
+        slip2 = (traction - q_n[..., None] * normal).square().sum(-1)
+        push2 = (-q_n).clamp_min(0) ** 2
+        kappa = FRICTION / (1 + CONE * (push2 @ self.surroundings + SLIP**4).sqrt())
+        price = push2 / (2 + 2 * push2 / tau**2) + q_n.clamp_min(0) ** 2 / 2 + kappa * ((slip2 + SLIP**2).sqrt() - SLIP)
+        misfit = seen.weight * self._angles(x, seen)[0].square().sum(-1)
+        return OUTLIER**2 / 2 * (misfit / OUTLIER**2).log1p().sum(-1) + SPARSITY / self.size**2 * price @ area
+
     def _marker_weights(self, angle: Tensor, seen: Observation, outlier: float) -> Tensor:
         return seen.weight / (1 + seen.weight * angle.square().sum(-1) / outlier**2)
 

@@ -1,6 +1,7 @@
 """`torchmembrane calibrate`: sensor files from images, and dots for a mill from a pattern in the image."""
 
 import argparse
+import csv
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,8 +17,9 @@ from ..presets import sensor_file
 from ..sensor import Markers, Sensor
 from .boards import PORTS, CameraFit, Views, lens_from_views, ports_from_views
 from .depth import rest_from_depth
+from .material import material_from_images
 from .mill import dots_for_pixels, pixel_lattice, read_pixels, write_mill, write_svg
-from .report import Report, fit_figure, mill_figure, surface_figure
+from .report import Report, fit_figure, material_figure, mill_figure, surface_figure
 from .rest import rest_from_image
 from .surface import fine_surface
 from .targets import find_target
@@ -35,6 +37,7 @@ A sensor is calibrated in this order, each step starting from the sensor file of
   rest       where the rest surface stands, and its dots, from the rest image, when the dots are listed
   views      the same from several views, when they are not
   depth      the same from a depth image
+  material   prestretch from images of presses; stiffness, where the forces of some are known
 and the other way round:
   pattern    from the dots wanted in the image to places on the rest surface, for a mill"""
 EXAMPLES = {
@@ -43,6 +46,7 @@ EXAMPLES = {
     "rest": "torchmembrane calibrate rest ports/sensor.toml rest.png --out rest",
     "views": "torchmembrane calibrate views ports/sensor.toml first.png second.png third.png --motions motions.csv --out rest",
     "depth": "torchmembrane calibrate depth sensor.toml depth.npy --image rest.png --out rest",
+    "material": "torchmembrane calibrate material rest/sensor.toml press/*.png --forces forces.csv --out material",
     "pattern": "torchmembrane calibrate pattern design.toml --pitch 30 --out mill",
 }
 
@@ -137,6 +141,24 @@ def depth(arguments) -> int:
     return _done(arguments, found.sensor, report, surface_figure(report, sensor.camera.image_size, places, found.surface, unit))
 
 
+def material(arguments) -> int:
+    """`torchmembrane calibrate material`"""
+    sensor, paths = _sensor(arguments), find_inputs(arguments.images).images
+    forces = _forces(arguments.forces, paths) if arguments.forces else None
+    images = torch.from_numpy(np.stack([_image(path, sensor) for path in paths]))[:, None]
+    found = material_from_images(sensor, images, forces)
+    unit, before = sensor.length_unit, [sensor.material.prestretch, sensor.material.modulus]
+    n = len(found.values)
+    report = Report.without_parameters(f"material from {len(paths)} images of presses")._replace(
+        names=["prestretch", "modulus"][:n], units=["", f"N/{unit}"][:n], design=np.array(before[:n]), values=found.values,
+        deviations=found.deviations, correlations=found.covariance / np.outer(found.deviations, found.deviations),
+        notes=[f"{path.name} alone: prestretch {one:.3f} ± {sd:.2g}" for path, (one, sd) in zip(paths, found.each, strict=True)],
+    )  # fmt: skip
+    if n == 2:
+        report.notes.append("modulus: shear modulus x thickness; the sensor file's thickness is kept, or 1 where it has none")
+    return _done(arguments, found.sensor, report, material_figure(report, found, [path.name for path in paths]))
+
+
 def pattern(arguments) -> int:
     """`torchmembrane calibrate pattern`"""
     sensor = _sensor(arguments)
@@ -180,13 +202,18 @@ def _value(camera, name: str) -> float:
     return values[i] if i < len(values) else 0.0
 
 
+def _image(path: Path, sensor: Sensor) -> np.ndarray:
+    image = read_image(path)
+    if image.shape[::-1] != sensor.camera.image_size:
+        raise MembraneError(f"{path}: {image.shape[1]} x {image.shape[0]} px; expected {list(sensor.camera.image_size)}")
+    return image
+
+
 def _targets(images: Sequence[str], sensor: Sensor, board) -> np.ndarray:
     """The board's points in every image that shows it, `[P, D, 2]`; what shows none is said and left out."""
     found = []
     for path in find_inputs(images).images:
-        image = read_image(path)
-        if image.shape[::-1] != sensor.camera.image_size:
-            raise MembraneError(f"{path}: {image.shape[1]} x {image.shape[0]} px; expected {list(sensor.camera.image_size)}")
+        image = _image(path, sensor)
         try:
             found.append(find_target(image, board))
         except MembraneError as error:
@@ -206,6 +233,25 @@ def _motions(path: Path) -> np.ndarray:
     if rows.shape[1] != 6 or not np.isfinite(rows).all():
         raise MembraneError(f"{path}: {rows.shape[1]} columns; expected six finite numbers, x,y,z,turn_x,turn_y,turn_z")
     return rows
+
+
+def _forces(path: Path, images: Sequence[Path]) -> np.ndarray:
+    """Forces of the images `[B, 3]`, or magnitudes `[B, 1]`, NaN where the file has none."""
+    expected = "CSV with the header image,fx,fy,fz or image,force and a line an image, N"
+    try:
+        header, *rows = csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
+        known = {name: [float(value) for value in values] for name, *values in rows}
+    except (OSError, ValueError) as error:
+        raise MembraneError(f"{path}: not readable ({error}); expected {expected}") from error
+    if header not in (["image", "fx", "fy", "fz"], ["image", "force"]):
+        raise MembraneError(f"{path}: the header is {','.join(header)!r}; expected {expected}")
+    if wrong := [name for name, values in known.items() if len(values) != len(header) - 1 or not np.isfinite(values).all()]:
+        raise MembraneError(f"{path}: {wrong[0]} has {known[wrong[0]]}; expected {len(header) - 1} finite numbers")
+    if unknown := known.keys() - {image.name for image in images}:
+        raise MembraneError(f"{path}: {min(unknown)} is none of the images given; expected their names, as {images[0].name}")
+    if not known:
+        raise MembraneError(f"{path}: no forces after the header; expected {expected}")
+    return np.array([known.get(image.name, [np.nan] * (len(header) - 1)) for image in images])
 
 
 def _depth_image(arguments) -> np.ndarray:
@@ -256,6 +302,14 @@ def _depth_options(add) -> None:
     add("--image", metavar="REST.png", required=True, help="the membrane at rest, to find the dots in")
 
 
+def _material_options(add) -> None:
+    add("images", metavar="IMAGES", nargs="+", help="of presses, deep ones: files, globs, folders")
+    where = (
+        "CSV image,fx,fy,fz (on the membrane, in the camera's frame) or image,force (magnitude), N: total force in some images"
+    )
+    add("--forces", metavar="FILE.csv", type=Path, help=where)
+
+
 def _pattern_options(add) -> None:
     add("--pixels", metavar="FILE.csv", type=Path, help="the wanted dots: u,v,size (small | large)")
     add("--pitch", metavar="PX", type=_length, help="a square lattice of this pitch within the rim's outline")
@@ -284,5 +338,6 @@ VERBS = {
     "rest": (rest, "find the rest surface's pose and its dots from one rest image of listed dots", _rest_options),
     "views": (views, "find dots and rest surface from several views", _views_options),
     "depth": (depth, "find rest surface and dots from a depth image", _depth_options),
+    "material": (material, "find prestretch and stiffness from images of presses", _material_options),
     "pattern": (pattern, "turn dots wanted in the image into places on the rest surface", _pattern_options),
 }

@@ -149,6 +149,35 @@ def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarr
     return drawing
 
 
+def material_figure(report: Report, found, names: list[str]) -> Figure:
+    """Prices over the prestretch and the estimate, and forces found and measured where any are, of a `MaterialFit`."""
+    known = np.isfinite(found.forces).all(1)
+    panels = 2 if known.any() else 1
+    drawing = Figure(figsize=(1 + 6 * panels, 4.6), layout="constrained")
+    drawing.suptitle(report.title)
+    axes = drawing.subplots(1, panels, squeeze=False)[0]
+    stretches, prices = found.profile
+    axes[0].plot(stretches, prices - prices.min(0), "-", color=GREY, lw=1, label="each image")
+    axes[0].plot(stretches, prices.sum(1) - prices.sum(1).min(), ".-", color=BLUE, label="all")
+    value, deviation = report.values[0], report.deviations[0]
+    axes[0].axvspan(value - deviation, value + deviation, color=VERMILION, alpha=0.2)
+    axes[0].axvline(value, color=VERMILION, label=f"{value:.3f} ± {deviation:.2g}")
+    axes[0].set(xscale="log", yscale="symlog", xlabel="prestretch", ylabel="price above the lowest")
+    axes[0].set_xticks([1, 1.2, 1.5, 2, 3], ["1", "1.2", "1.5", "2", "3"])
+    axes[0].minorticks_off()
+    handles, labels = axes[0].get_legend_handles_labels()
+    axes[0].legend(handles[-3:], labels[-3:])
+    if known.any():
+        axes[1].plot(*found.forces[known].T, "o", color=BLUE)
+        for name, force in zip(names, found.forces, strict=True):
+            if np.isfinite(force).all():
+                axes[1].annotate(name, force, fontsize=8)
+        top = 1.1 * found.forces[known].max()
+        axes[1].plot([0, top], [0, top], color=GREY, lw=1)
+        axes[1].set(xlabel="force found, N", ylabel="force measured, N", aspect="equal")
+    return drawing
+
+
 def mill_figure(title: str, sensor, dots) -> Figure:
     """The wanted pattern in the image, and its dots on the rest surface, from above and from the side."""
     drawing = Figure(figsize=(15, 4.6), layout="constrained")

@@ -1,0 +1,184 @@
+"""The sheet's prestretch from images of presses, and its stiffness from presses of known force."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.interpolate import PchipInterpolator
+from torch import Tensor
+
+from ..cavity import Equilibrium
+from ..energy import Sheet
+from ..errors import MembraneError
+from ..force_balance import ForceBalance
+from ..membrane import SurfacePoints
+from ..reconstruct import Reconstructor
+from ..results import OK, STATUS_TEXTS
+from ..sensor import Sensor
+
+GRID = (17, 17)  # on finer grids the price is less smooth in the prestretch
+STRETCHES = np.exp(np.linspace(0.01, 1.1, 14))
+BETWEEN = 7  # prestretches tried on either side of the lowest
+PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the price's, alike in all images
+FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known force (docs/calibration.md)
+GAS_ROUNDS = 4
+FINE = 4001  # prestretches over which the probability is summed
+
+
+class Profile(NamedTuple):
+    """The least price at each prestretch: `stretches [S]`, increasing, `prices [S, B]` of every image."""
+
+    stretches: np.ndarray
+    prices: np.ndarray
+
+
+class MaterialFit(NamedTuple):
+    """The sensor with the material found.
+
+    values, covariance: prestretch and, where forces are known, modulus = shear modulus x thickness (N per length unit), `[n]`
+    and `[n, n]`; profile: what the prestretch rests on; each: `[B, 2]` prestretch and deviation from each image alone;
+    forces: `[B, 2]` magnitudes found and measured, NaN where not known.
+    """
+
+    sensor: Sensor
+    values: np.ndarray
+    covariance: np.ndarray
+    profile: Profile
+    each: np.ndarray
+    forces: np.ndarray
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """Standard deviations `[n]`."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def material_from_images(sensor: Sensor, images: Tensor, forces: np.ndarray | None = None) -> MaterialFit:
+    """See `material_from_pixels`; `images [B, 1, height, width]` grey in 0..1. Raises where one shows too few markers."""
+    reconstructor = _reconstructor(sensor)
+    with torch.no_grad():
+        displacement, confidence, status = reconstructor.observe(images.double())
+        displacement, confidence, status = reconstructor.judge(displacement, confidence, status)
+    for i in np.flatnonzero(status != OK):
+        raise MembraneError(f"calibrate material: image {i + 1}: {STATUS_TEXTS[int(status[i])]}; leave it out")
+    return _material(sensor, reconstructor, displacement, confidence, forces)
+
+
+def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | None = None) -> MaterialFit:
+    """Prestretch from presses, and the modulus where their forces are known.
+
+    Arguments: `pixels [B, D, 2]` of the markers in B images of presses (NaN where lost), less what rest images show beside the
+    model; `forces`: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
+
+    Force balance is solved at many prestretches l. What it minimises, in standard deviations of the markers and of tractions in
+    units of the rest pressure, is taken for the negative logarithm of a probability:
+
+        p(log l) ~ exp(-sum over images of min over x, p of price(x, p; l))
+
+    whose mean and deviation are reported, enlarged where the images contradict one another, and by an error that all images
+    share. A sheet with the wrong l needs forces where nothing touches it. Forces are proportional to the modulus, so that each
+    press gives the modulus as force measured / force found at modulus 1; their mean is reported.
+
+    Wrong when: the presses are shallow or the markers miss them (the deviation says so); the sheet is not equally stretched in
+    both directions; the rest surface is wrong. Above a prestretch of about 2 the shape hardly depends on it.
+    """
+    reconstructor = _reconstructor(sensor)
+    pixels = torch.as_tensor(pixels).to(reconstructor.rest_pixels)
+    lost = ~pixels.isfinite().all(-1)
+    displacement = torch.where(lost[..., None], 0.0, pixels - reconstructor.rest_pixels)
+    return _material(sensor, reconstructor, displacement, (~lost).to(pixels), forces)
+
+
+def _material(sensor: Sensor, reconstructor: Reconstructor, displacement, confidence, forces) -> MaterialFit:
+    presses = Presses(reconstructor, displacement, confidence)
+    profile = presses.profile()
+    each = np.array([_log_stretch(profile.stretches, prices[:, None]) for prices in profile.prices.T])
+    log_stretch, deviation = _log_stretch(profile.stretches, profile.prices)
+    variances = each[:, 1] ** 2 + PRESTRETCH_ERROR**2
+    contradiction = ((each[:, 0] - log_stretch) ** 2 / variances).sum() / max(len(each) - 1, 1)
+    deviation = np.hypot(deviation * np.sqrt(max(1.0, contradiction)), PRESTRETCH_ERROR)
+    prestretch = float(np.exp(log_stretch))
+    values, effects = [prestretch], [[prestretch * deviation, 0.0]]
+    material, magnitudes = replace(sensor.material, prestretch=prestretch), np.full((len(each), 2), np.nan)
+    if forces is not None:
+        modulus, scatter, change, magnitudes = presses.modulus(log_stretch, deviation, np.asarray(forces, float))
+        values, effects = [prestretch, modulus], [*effects, [change, scatter]]
+        thickness = material.thickness or 1.0
+        material = replace(material, shear_modulus=modulus / thickness, thickness=thickness)
+    alone = np.exp(each[:, :1]) * np.stack([np.ones(len(each)), np.sqrt(variances)], -1)
+    covariance = np.array(effects) @ np.array(effects).T
+    return MaterialFit(replace(sensor, material=material), np.array(values), covariance, profile, alone, magnitudes)
+
+
+def _reconstructor(sensor: Sensor) -> Reconstructor:
+    if sensor.material.model == "harmonic":
+        raise MembraneError(
+            "calibrate material: a harmonic sheet has one shape at any prestretch; expected neo_hookean or mooney_rivlin"
+        )
+    return Reconstructor(replace(sensor, membrane=sensor.surface.membrane(GRID)), dtype=torch.float64)
+
+
+def _log_stretch(stretches: np.ndarray, prices: np.ndarray) -> tuple[float, float]:
+    """Mean and standard deviation of the logarithm of the prestretch, from prices `[S, B]` at `stretches [S]`."""
+    z = np.log(stretches)
+    fine = np.linspace(z[0], z[-1], FINE)
+    price = PchipInterpolator(z, prices.sum(1))(fine)
+    weight = np.exp(price.min() - price)
+    mean = (weight * fine).sum() / weight.sum()
+    return mean, np.sqrt((weight * (fine - mean) ** 2).sum() / weight.sum())
+
+
+class Presses:
+    """What was seen of B presses, to be explained by one material or another.
+
+    Arguments: the sensor's reconstructor; displacements `[B, D, 2]` px and confidence `[B, D]` of its markers.
+    """
+
+    def __init__(self, reconstructor: Reconstructor, displacement: Tensor, confidence: Tensor):
+        self.reconstructor = reconstructor
+        self.rays, self.confidence = reconstructor.rays(displacement, confidence), confidence
+
+    def explained(self, stretch: float, modulus: float) -> tuple[ForceBalance, Equilibrium]:
+        """The estimator with this material, and what it finds."""
+        r, known = self.reconstructor, self.reconstructor.estimator
+        material, cavity, membrane = r.sensor.material, known.cavity, known.membrane
+        sheet = Sheet(membrane, material.model, stretch, modulus, material.c2_ratio or 0.0)
+        points = SurfacePoints(r.marker_vertices.numpy(), r.marker_weights.numpy(), np.zeros(len(r.rest_markers)))
+        gas = tuple(cavity.gas.tolist())
+        estimator = ForceBalance(membrane, sheet, points, r.rest_markers, known.noise, cavity.filling, gas)
+        with torch.no_grad():
+            return estimator, estimator(*self.rays, self.confidence)
+
+    def profile(self) -> Profile:
+        """The presses' prices at `STRETCHES`, and closer together around the lowest."""
+        prices = {stretch: self._prices(stretch) for stretch in STRETCHES}
+        k = min(max(int(np.argmin([values.sum() for values in prices.values()])), 1), len(STRETCHES) - 2)
+        prices |= {stretch: self._prices(stretch) for stretch in np.geomspace(*STRETCHES[[k - 1, k + 1]], BETWEEN + 2)[1:-1]}
+        stretches = np.array(sorted(prices))
+        return Profile(stretches, np.array([prices[stretch] for stretch in stretches]))
+
+    def _prices(self, stretch: float) -> np.ndarray:
+        estimator, found = self.explained(stretch, self.reconstructor.sensor.material.modulus)
+        return estimator.price(found, *self.rays, self.confidence).numpy()
+
+    def modulus(self, log_stretch: float, deviation: float, forces: np.ndarray) -> tuple[float, float, float, np.ndarray]:
+        """Modulus, its deviation at this prestretch, its change with one deviation of the prestretch, magnitudes `[B, 2]`.
+
+        `forces`: as for `material_from_pixels`. A gas resists in newtons: the presses are explained anew with each modulus.
+        """
+        modulus = self.reconstructor.sensor.material.modulus
+        for _ in range(GAS_ROUNDS if self.reconstructor.estimator.cavity.filling == "gas" else 1):
+            ratios, magnitudes = self._ratios(np.exp(log_stretch), modulus, forces)
+            modulus = float(ratios.mean() * modulus)
+        lower, upper = (self._ratios(np.exp(log_stretch + s * deviation), modulus, forces)[0].mean() for s in (-1, 1))
+        relative = max(FORCE_ERROR, ratios.std(ddof=1) / ratios.mean() if len(ratios) > 1 else 0.0)
+        return modulus, modulus * relative / np.sqrt(len(ratios)), modulus * (upper - lower) / 2, magnitudes
+
+    def _ratios(self, stretch: float, modulus: float, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Forces measured over found of the presses of known force `[F]`, and all magnitudes, found and measured `[B, 2]`."""
+        estimator, found = self.explained(stretch, modulus)
+        found = (found.traction * estimator.membrane.rest_area[:, None]).sum(1).numpy()
+        size, measured = np.linalg.norm(found, axis=1), np.linalg.norm(forces, axis=1)
+        along = (forces * found).sum(1) / size if forces.shape[1] == 3 else measured
+        return (along / size)[np.isfinite(along)], np.stack([size, measured], -1)
