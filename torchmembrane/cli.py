@@ -132,7 +132,7 @@ def export(arguments) -> int:
     energy = arguments.energy or sensor.material.model
     settings = Settings(arguments.estimator, energy, arguments.element, FORMATS[0])
     reconstructor = Reconstructor(sensor, arguments.estimator, model=energy, element=arguments.element)
-    write_model(reconstructor, arguments.out, settings)
+    write_model(reconstructor, arguments.out, settings, arguments.tracking)
     print(f"written: {arguments.out}, {arguments.out.stat().st_size / 1e6:.1f} MB")
     return 0
 
@@ -215,6 +215,7 @@ def _export_parser(commands) -> None:
     add("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="how it is found (default: %(default)s)")
     add("--energy", choices=MODELS, help="the sheet's elastic energy (default: the sensor file's)")
     add("--element", choices=ELEMENTS, default=ELEMENTS[0], help="as for reconstruct (default: %(default)s)")
+    add("--tracking", action="store_true", help="start from the frame before, given with the image (force balance)")
 
 
 def _command(commands, name: str, run, purpose: str, examples: str):

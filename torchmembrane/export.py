@@ -5,7 +5,6 @@ The graph is put together from pieces traced once each: observe, rays, start, st
 
 import json
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,8 @@ from torch import Tensor, nn
 
 from .assembly import Assembly, traced
 from .cavity import Equilibrium
-from .force_balance import DENTS, EPS, FALL, Balance, Observation, _across
+from .errors import MembraneError
+from .force_balance import FINE_STEPS, FINE_TAU, TAU, WARM_STEPS, WARM_TAU, ForceBalance, Observation, schedule
 from .markers.locate import LEVELS, DotLocator
 from .markers.match import SETTLING, WIDTHS, DotMatcher, LocalDeformation
 from .reconstruct import Reconstructor
@@ -24,6 +24,7 @@ from .results import STATUS_TEXTS, Reconstruction
 from .store import Mesh, Settings
 
 FORMAT = 1
+PREVIOUS = ("previous_vertices", "previous_pressure")
 EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
 
 
@@ -68,7 +69,7 @@ class Tracer:
         examples = {name: self.examples[name].clone() for name in inputs}  # one tensor twice would be traced as one input
         with torch.no_grad():
             values = function(owner, *examples.values())
-        key = (function, *inputs)
+        key = (owner, function, *inputs)
         if key not in self.traced:
             self.traced[key] = traced(Piece(owner, function), examples, [f"next {name}" for name in outputs])
         return self.traced[key], values
@@ -78,12 +79,15 @@ class Tracer:
         self.examples |= dict(zip(outputs, values, strict=True))
 
 
-def export(reconstructor: Reconstructor, path: str | Path, settings: Settings) -> onnx.ModelProto:
+def export(reconstructor: Reconstructor, path: str | Path, settings: Settings, tracking: bool = False) -> onnx.ModelProto:
     """Write the reconstructor as one ONNX model to `path`; returns it.
 
-    Input `image [batch, 1, height, width]`, grey in 0..1; outputs as `Reconstruction`. Metadata: `format`, `status_texts` and
-    `mesh` (the fields of `Mesh`), JSON. Standard operators only; float32.
+    Input `image [batch, 1, height, width]`, grey in 0..1; outputs as `Reconstruction`. With `tracking` (force balance) also
+    `previous_vertices [batch, V, 3]` and `previous_pressure [batch]`: outputs of the frames before, NaN to start from rest.
+    Metadata: `format`, `status_texts` and `mesh` (the fields of `Mesh`), JSON. Standard operators only; float32.
     """
+    if tracking and not reconstructor.finds_contacts:
+        raise MembraneError("export: minimum-energy starts from rest always; expected force-balance for tracking")
     width, height = reconstructor.image_size
     tracer = Tracer()
     image = torch.rand(EXAMPLES, 1, height, width, generator=torch.Generator().manual_seed(0))
@@ -97,9 +101,16 @@ def export(reconstructor: Reconstructor, path: str | Path, settings: Settings) -
     seen = ["displacement", "confidence", "status"]
     tracer.piece(reconstructor, Reconstructor.judge, seen, ["usable", "confidence", "status"])
     tracer.piece(reconstructor, Reconstructor.rays, ["usable", "confidence"], ["origins", "directions"])
-    estimate = force_balance if reconstructor.finds_contacts else minimum_energy
     tracer.assembly.part = "solve"
-    estimate(tracer, reconstructor.estimator)
+    if tracking:
+        for name, rest in zip(PREVIOUS, reconstructor.estimator.at_rest(image), strict=True):
+            tracer.given(name, rest)
+        tracer.piece(reconstructor, Reconstructor.start, list(PREVIOUS), ["surface", "pressure"])
+        track(tracer, reconstructor.estimator)
+    elif reconstructor.finds_contacts:
+        force_balance(tracer, reconstructor.estimator)
+    else:
+        minimum_energy(tracer, reconstructor.estimator)
     tracer.assembly.part = "assembly"
     tracer.piece(reconstructor, _result, [*Equilibrium._fields, *seen], list(Reconstruction._fields))
     model = _finished(tracer, reconstructor, settings)
@@ -142,56 +153,34 @@ def minimum_energy(tracer: Tracer, estimator) -> None:
     tracer.piece(estimator, kind.equilibrium, [*state, *rays], list(Equilibrium._fields))
 
 
-def force_balance(tracer: Tracer, estimator) -> None:
-    """From `origins`, `directions` and `confidence` to the fields of `Equilibrium`, by the starts of `ForceBalance`."""
-    first, last = (eps * estimator.reference for eps in EPS)
-    falls = np.minimum(1.0, np.arange(estimator.steps) / (FALL * (estimator.steps - 1)))
-    eps = (first * (last / first) ** falls).astype(np.float32)
-    rays, found = ["origins", "across", "weight"], list(Balance._fields)
-    best = [f"best {name}" for name in found]
-    tracer.piece(estimator, _seen, ["directions", "confidence"], ["across", "weight"])
-    tracer.piece(estimator, _rest, ["confidence"], ["surface", "pressure", "before"])
-    for depth, width in ((None, None), *DENTS):
-        if depth:
-            tracer.piece(estimator, partial(_dented, depth=depth, width=width), best, ["surface", "pressure", "before"])
-        tracer.steps(estimator, _step, ["surface", "pressure", "before"], rays, estimator.steps, eps=eps)
-        tracer.piece(estimator, _balance, ["surface", "pressure", "before", *rays], found)
-        if depth:
-            tracer.piece(estimator, _better, [*best, *found], best)
-        else:
-            tracer.alias(best, found)
-    tracer.piece(estimator, _equilibrium, best, list(Equilibrium._fields))
+def force_balance(tracer: Tracer, estimator: ForceBalance) -> None:
+    """From `origins`, `directions` and `confidence` to the fields of `Equilibrium`, from rest, the coarser grid first."""
+    if estimator.coarse is None:
+        tracer.piece(estimator, ForceBalance.at_rest, ["confidence"], ["surface", "pressure"])
+        descend(tracer, estimator, schedule(estimator.steps, TAU))
+    else:
+        force_balance(tracer, estimator.coarse)
+        tracer.piece(estimator, ForceBalance.refined, ["vertices", "pressure"], ["surface", "pressure"])
+        descend(tracer, estimator, schedule(FINE_STEPS, FINE_TAU))
 
 
-def _seen(estimator, directions, confidence):
-    return _across(directions), confidence / estimator.noise**2
+def track(tracer: Tracer, estimator: ForceBalance) -> None:
+    """As `force_balance`, from `surface` and `pressure` of the frames before."""
+    descend(tracer, estimator, schedule(WARM_STEPS, WARM_TAU))
 
 
-def _rest(estimator, confidence):
-    rest = estimator.membrane.rest.expand(confidence.shape[0], -1, -1)
-    return rest, estimator.rest_pressure.expand(confidence.shape[0]), rest
+def descend(tracer: Tracer, estimator: ForceBalance, falls: list[tuple[float, float]]) -> None:
+    """The steps of a schedule from `surface` and `pressure`."""
+    tau, outlier = np.array(falls, np.float32).T.copy()
+    seen, state = ["marker origins", "across", "weight"], ["surface", "pressure", "before"]
+    tracer.piece(estimator, ForceBalance.observation, ["origins", "directions", "confidence"], seen)
+    tracer.alias(["before"], ["surface"])
+    tracer.steps(estimator, _step, state, seen, len(falls), tau=tau, outlier=outlier)
+    tracer.piece(estimator, ForceBalance.equilibrium, state, list(Equilibrium._fields))
 
 
-def _step(estimator, surface, pressure, before, origins, across, weight, eps):
-    return *estimator.step(surface, pressure, Observation(origins, across, weight), eps), surface
-
-
-def _balance(estimator, surface, pressure, before, origins, across, weight):
-    moved = torch.linalg.vector_norm(surface - before, dim=-1).amax(-1) / estimator.size
-    return tuple(estimator.balance(surface, pressure, Observation(origins, across, weight))._replace(last_step=moved))
-
-
-def _dented(estimator, *best, depth, width):
-    surface = estimator.dented(Balance(*best), depth, width)
-    return surface, estimator.rest_pressure.expand(surface.shape[0]), surface
-
-
-def _better(estimator, *both):
-    return tuple(estimator.better(Balance(*both[: len(both) // 2]), Balance(*both[len(both) // 2 :])))
-
-
-def _equilibrium(estimator, *best):
-    return tuple(estimator.equilibrium(Balance(*best)))
+def _step(estimator, surface, pressure, before, origins, across, weight, tau, outlier):
+    return *estimator.step(surface, pressure, Observation(origins, across, weight), tau, outlier), surface
 
 
 def _result(reconstructor, vertices, pressure, volume, traction, unbalance, displacement, confidence, status):
@@ -201,7 +190,11 @@ def _result(reconstructor, vertices, pressure, volume, traction, unbalance, disp
 
 def _finished(tracer: Tracer, reconstructor: Reconstructor, settings: Settings) -> onnx.ModelProto:
     width, height = reconstructor.image_size
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["batch", 1, height, width])
+    inputs = [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["batch", 1, height, width])]
+    for name in PREVIOUS:
+        if name in tracer.names:
+            shape = ["batch", *tracer.examples[name].shape[1:]]
+            inputs.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, shape))
     outputs = []
     for name in Reconstruction._fields:
         tracer.assembly.named(tracer.names[name], name)
@@ -212,4 +205,4 @@ def _finished(tracer: Tracer, reconstructor: Reconstructor, settings: Settings) 
     texts = {str(code): text for code, text in STATUS_TEXTS.items()}
     metadata = {"format": str(FORMAT), "name": mesh["name"], "length_unit": mesh["length_unit"]}
     metadata |= {"force_unit": mesh["force_unit"], "status_texts": json.dumps(texts), "mesh": json.dumps(plain)}
-    return tracer.assembly.model([image], outputs, metadata)
+    return tracer.assembly.model(inputs, outputs, metadata)

@@ -43,6 +43,13 @@ NEIGHBOURS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1))
 LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR = 2e-3, 1e-3  # rms of the last step over the size, and volume error, when settled
 
 
+def schedule(steps: int, fall: tuple[float, float]) -> list[tuple[float, float]]:
+    """`tau` and the outlier scale `R` of every step, while `tau` falls from first to last."""
+    first, last = fall
+    taus = [first * (last / first) ** min(1.0, k / (FALL * (steps - 1))) for k in range(steps)]
+    return [(tau, OUTLIER * tau / last) for tau in taus]
+
+
 class Observation(NamedTuple):
     """Measured marker rays: `origins [B, D, 3]`, a basis across each ray `[B, D, 2, 3]`, weights over the variance `[B, D]`."""
 
@@ -113,16 +120,13 @@ class ForceBalance(nn.Module):
     ) -> Equilibrium:
         """Arguments: `origins`, `directions [B, D, 3]`, the markers' measured rays; `weight [B, D]`: 0 for a lost one, else up
         to 1; `start`: vertices `[B, V, 3]` and pressure `[B]` near the solution, such as the previous frame's."""
-        seen = Observation(origins, _across(directions), weight / self.noise**2)
+        seen = self.observation(origins, directions, weight)
         if start is not None:
-            return self._descend(*start, seen, WARM_STEPS, WARM_TAU)
+            return self._descend(*start, seen, schedule(WARM_STEPS, WARM_TAU))
         if self.coarse is None:
-            X, rest = self.membrane.rest.expand(weight.shape[0], -1, -1), self.rest_pressure.expand(weight.shape[0])
-            return self._descend(X, rest, seen, self.steps, TAU)
+            return self._descend(*self.at_rest(weight), seen, schedule(self.steps, TAU))
         coarse = self.coarse(origins, directions, weight)
-        u = (coarse.vertices - self.coarse.membrane.rest).unflatten(1, self.coarse.membrane.grid).permute(0, 3, 1, 2)
-        u = F.interpolate(u, self.membrane.grid, mode="bilinear", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
-        return self._descend(self.membrane.rest + u * self.moves, coarse.pressure, seen, FINE_STEPS, FINE_TAU)
+        return self._descend(*self.refined(coarse.vertices, coarse.pressure), seen, schedule(FINE_STEPS, FINE_TAU))
 
     def standard_deviations(
         self, equilibrium: Equilibrium, origins: Tensor, directions: Tensor, weight: Tensor, marker_noise: float | Tensor
@@ -133,16 +137,31 @@ class ForceBalance(nn.Module):
         independent directions turns the rays. Wrong when: noise may change which vertices are pushed, as in the shallowest
         presses and where two answers compete; the grid's and the material's errors are not in it.
         """
-        seen = Observation(origins, _across(directions), weight / self.noise**2)
+        seen = self.observation(origins, directions, weight)
         noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * seen.across
         return standard_deviations(self, equilibrium.vertices, equilibrium.pressure, seen, noise, TAU[1], OUTLIER)
 
-    def _descend(self, x: Tensor, pressure: Tensor, seen: Observation, steps: int, fall: tuple[float, float]) -> Equilibrium:
-        first, last = fall
-        for k in range(steps):
-            tau = first * (last / first) ** min(1.0, k / (FALL * (steps - 1)))
+    def observation(self, origins: Tensor, directions: Tensor, weight: Tensor) -> Observation:
+        return Observation(origins, _across(directions), weight / self.noise**2)
+
+    def at_rest(self, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """The rest surface and pressure, for every row of `weight [B, D]`."""
+        return self.membrane.rest.expand(weight.shape[0], -1, -1), self.rest_pressure.expand(weight.shape[0])
+
+    def refined(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
+        """Surface and pressure of `coarse` on this grid: the displacement is bilinear between its lines."""
+        u = (x - self.coarse.membrane.rest).unflatten(1, self.coarse.membrane.grid).permute(0, 3, 1, 2)
+        u = F.interpolate(u, self.membrane.grid, mode="bilinear", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
+        return self.membrane.rest + u * self.moves, pressure
+
+    def _descend(self, x: Tensor, pressure: Tensor, seen: Observation, schedule: list[tuple[float, float]]) -> Equilibrium:
+        for tau, outlier in schedule:
             before = x
-            x, pressure = self.step(x, pressure, seen, tau, OUTLIER * tau / last)
+            x, pressure = self.step(x, pressure, seen, tau, outlier)
+        return self.equilibrium(x, pressure, before)
+
+    def equilibrium(self, x: Tensor, pressure: Tensor, before: Tensor) -> Equilibrium:
+        """What this surface and pressure amount to; `before`: the surface a step earlier."""
         moved = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
         traction = self.contact_force(x, pressure) / self.membrane.rest_area[:, None]
         return Equilibrium(x, pressure, self.membrane.volume(x), traction, moved)

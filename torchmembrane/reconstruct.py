@@ -194,7 +194,7 @@ class Reconstructor(nn.Module):
             if previous is not None:
                 raise MembraneError("Reconstructor: minimum-energy starts from rest always; leave previous out")
             return self.result(self.estimator(*rays), displacement, confidence, status)
-        start = None if previous is None else self._start(previous)
+        start = None if previous is None else self.start(previous.vertices, previous.pressure)
         return self.result(self.estimator(*rays, confidence, start), displacement, confidence, status)
 
     def standard_deviations(self, result: Reconstruction) -> StandardDeviations:
@@ -211,11 +211,10 @@ class Reconstructor(nn.Module):
         found = Equilibrium(result.vertices, result.pressure, None, result.traction, None)
         return self.estimator.standard_deviations(found, origins, directions, result.confidence, noise)
 
-    def _start(self, previous: Reconstruction) -> tuple[Tensor, Tensor]:
-        """Vertices and pressure of the frames before, those of rest where there are none."""
-        x, pressure = previous.vertices, previous.pressure
-        x = torch.where(x.isfinite(), x, self.estimator.membrane.rest)
-        return x, torch.where(pressure.isfinite(), pressure, self.estimator.rest_pressure)
+    def start(self, vertices: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
+        """Vertices `[B, V, 3]` and pressure `[B]` of the frames before, those of rest where there are none (NaN)."""
+        vertices = torch.where(vertices.isfinite(), vertices, self.estimator.membrane.rest)
+        return vertices, torch.where(pressure.isfinite(), pressure, self.estimator.rest_pressure)
 
     def judge(self, displacement: Tensor, confidence: Tensor, status: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""
