@@ -56,9 +56,11 @@ Without --out a window is opened; without a display, RESULT_view.png is written.
 EXPORT_EXAMPLES = """\
 examples:
   torchmembrane export sensor.toml -o model.onnx
-  torchmembrane export preset:fingertip -o fingertip.onnx --estimator force-balance
+  torchmembrane export preset:fingertip -o fingertip.onnx --estimator minimum-energy
+  torchmembrane export sensor.toml -o video.onnx --tracking
 
-The model takes `image` [batch, 1, height, width], grey in 0..1, and gives the arrays of a NAME.npz, a row a frame. To run it
+The model takes `image` [batch, 1, height, width], grey in 0..1, and gives the arrays of a NAME.npz, a row a frame;
+--tracking, also previous_vertices and previous_pressure: those of the frames before, NaN to start from rest. To run it
 without torch: the package torchmembrane-edge (folder export/). Needs: pip install "torchmembrane[export]"
 
 exit code: 0 written, 2 wrong usage or sensor file"""

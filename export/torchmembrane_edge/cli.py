@@ -23,7 +23,7 @@ def main(argv=None) -> int:
             return watch(session, arguments.camera, arguments.frames)
         if not arguments.images or not arguments.out:
             raise EdgeError("nothing to do; expected IMAGES and --out DIR, or --camera NUMBER")
-        return reconstruct(session, arguments.images, arguments.out, arguments.batch)
+        return reconstruct(session, arguments.images, arguments.out, 1 if session.tracks else arguments.batch)
     except (EdgeError, OSError) as error:
         print(f"torchmembrane-edge: error: {error}", file=sys.stderr)
         return 2
@@ -32,7 +32,7 @@ def main(argv=None) -> int:
 
 
 def reconstruct(session: Session, paths: list, out: Path, batch: int) -> int:
-    """Every image's result as `NAME.npz` in the folder `out`, with `mesh.npz`."""
+    """Every image's result as `NAME.npz` in the folder `out`, with `mesh.npz`; a model that tracks takes them for a video."""
     if find_spec("PIL") is None:
         raise EdgeError('image files need Pillow, which is not installed: pip install "torchmembrane-edge[images]"')
     if len({path.stem for path in paths}) < len(paths):
@@ -40,7 +40,7 @@ def reconstruct(session: Session, paths: list, out: Path, batch: int) -> int:
     if any(path.stem == Path(MESH).stem for path in paths):
         raise EdgeError(f"an image's result would be {MESH}, which holds the mesh: rename the image")
     _write_mesh(out, session.mesh)
-    failed = 0
+    failed, results = 0, None
     for begin in range(0, len(paths), batch):
         frames = []
         for path in paths[begin : begin + batch]:
@@ -51,7 +51,7 @@ def reconstruct(session: Session, paths: list, out: Path, batch: int) -> int:
                 print(f"{path}: {error}", file=sys.stderr)
         if not frames:
             continue
-        results = session.run(np.concatenate([image for _, image in frames]))
+        results = session.run(np.concatenate([image for _, image in frames]), results)
         for i, (path, _) in enumerate(frames):
             _save(out / f"{path.stem}.npz", {key: values[i] for key, values in results.items()})
             status = int(results["status"][i])
@@ -72,14 +72,14 @@ def watch(session: Session, camera: int, frames: int | None) -> int:
     capture = cv2.VideoCapture(camera)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
     capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
-    number = 0
+    number, result = 0, None
     try:
         while frames is None or number < frames:
             taken, image = capture.read()
             if not taken:
                 raise EdgeError(f"camera {camera} gives no image; expected one of {width} x {height} px")
             start = time.perf_counter()
-            result = session.run(image[None, :, :, ::-1])
+            result = session.run(image[None, :, :, ::-1], result)
             milliseconds = 1000 * (time.perf_counter() - start)
             print(f"{number}: {_line(session, result)}, {milliseconds:.1f} ms", flush=True)
             number += 1
@@ -139,9 +139,9 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add = parser.add_argument
     add("model", metavar="MODEL.onnx", help="the exported model of the sensor")
-    add("images", metavar="IMAGES", nargs="*", type=Path, help="image files")
+    add("images", metavar="IMAGES", nargs="*", type=Path, help="image files; to a model that tracks, a video's in order")
     add("--out", metavar="DIR", type=Path, help="folder of the results: NAME.npz and mesh.npz")
-    add("--batch", metavar="N", type=int, default=1, help="images computed at once (default: %(default)s)")
+    add("--batch", metavar="N", type=int, default=1, help="images computed at once (default: %(default)s; tracking: 1)")
     add("--threads", metavar="N", type=int, default=1, help="of onnxruntime (default: %(default)s)")
     add("--providers", metavar="NAME", nargs="+", default=["CPUExecutionProvider"], help="of onnxruntime, in order")
     add("--camera", metavar="NUMBER", type=int, help="instead of images: a camera's, a line printed for each (OpenCV)")

@@ -9,6 +9,7 @@ import onnxruntime
 
 FORMAT = "1"
 GREY = (0.299, 0.587, 0.114)
+SETTLING = 4  # runs of a frame that starts from rest
 WHOLE, FLAGS = ("triangles", "grid", "image_size"), ("fixed",)  # of the mesh; other arrays are float32
 
 
@@ -23,7 +24,7 @@ class Session:
     `providers`, onnxruntime's, in order of preference.
 
     Attributes: `name` of the sensor, `length_unit`, `force_unit`, `status_texts` (code to text), `mesh` (what `mesh.npz`
-    holds: rest_vertices, triangles, fixed ...), `image_size` (width, height).
+    holds: rest_vertices, triangles, fixed ...), `image_size` (width, height), `tracks`: whether a frame starts from another.
     """
 
     def __init__(self, model: str | Path, threads: int = 1, providers: Sequence[str] = ("CPUExecutionProvider",)):
@@ -43,13 +44,16 @@ class Session:
         self.status_texts = {int(code): text for code, text in json.loads(known["status_texts"]).items()}
         self.mesh = {key: _array(key, value) for key, value in json.loads(known["mesh"]).items()}
         self.image_size = tuple(self.mesh["image_size"].tolist())
+        self.tracks = len(self._session.get_inputs()) > 1
         self._outputs = [output.name for output in self._session.get_outputs()]
 
-    def run(self, images) -> dict[str, np.ndarray]:
+    def run(self, images, previous: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
         """Results of a batch, by name, a row a frame: vertices `[B, V, 3]`, ..., status `[B]`.
 
         `images`: `[height, width]` or `[B, height, width]` grey, or `[B, height, width, 3]` RGB; uint8, uint16 or float in
         0..1. A frame that cannot be reconstructed has a status and NaN.
+        `previous`, for a model that tracks: the results of the frames before. Without them, or where a frame had no surface,
+        it starts from rest, and the batch is run `SETTLING` times.
         """
         images = grey(images)
         width, height = self.image_size
@@ -57,7 +61,29 @@ class Session:
             raise EdgeError(
                 f"images of {images.shape[2]} x {images.shape[1]} px; sensor {self.name!r} expects {width} x {height}"
             )
-        return dict(zip(self._outputs, self._session.run(None, {"image": images[:, None]}), strict=True))
+        feed = {"image": images[:, None]}
+        if not self.tracks:
+            return dict(zip(self._outputs, self._session.run(None, feed), strict=True))
+        state = self._rest(len(images)) if previous is None else previous
+        if len(state["pressure"]) != len(images):
+            raise EdgeError(f"{len(images)} images after results of {len(state['pressure'])}; expected as many")
+        for _ in range(1 if np.isfinite(state["pressure"]).all() else SETTLING):
+            feed |= {f"previous_{key}": state[key] for key in ("vertices", "pressure")}
+            state = dict(zip(self._outputs, self._session.run(None, feed), strict=True))
+        return state
+
+    def track(self, images):
+        """Results of a video's images, one after another, each from that before (a generator)."""
+        if not self.tracks:
+            raise EdgeError(f"the model of {self.name!r} does not track; expected one from `torchmembrane export --tracking`")
+        previous = None
+        for image in images:
+            previous = self.run(np.asarray(image)[None], previous)
+            yield previous
+
+    def _rest(self, batch: int) -> dict[str, np.ndarray]:
+        none = np.full((batch, *self.mesh["rest_vertices"].shape), np.nan, np.float32)
+        return {"vertices": none, "pressure": none[:, 0, 0]}
 
 
 def grey(images) -> np.ndarray:
