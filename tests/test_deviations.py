@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from torchmembrane import MembraneError
 from torchmembrane.camera import Camera
 from torchmembrane.energy import Sheet
-from torchmembrane.force_balance import ForceBalance, Observation, _across
+from torchmembrane.force_balance import ForceBalance, _across
 from torchmembrane.shapes import ellipsoid_cap, half_cylinder, spherical_cap
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press

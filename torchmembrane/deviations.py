@@ -6,8 +6,8 @@ At the solution a small change `e` of the measured angles moves surface and pres
     [m' c  0] [dp    ] = [   0   ],    M = A^T W A + J^T w J,
     [n' 0  C] [lambda]   [   0   ]
 
-with `W` the curvature of a push's price (flat where it bends down; what rubs by its parabola), so that noise of covariance S gives the sandwich
-`H^-1 J^T w S w J H^-1`. One load a marker and direction of its noise, all solved with one factor.
+with `W` the curvature of a push's price (flat where it bends down; what rubs by its parabola), so that noise of covariance S
+gives the sandwich `H^-1 J^T w S w J H^-1`. One load a marker and direction of its noise, all solved with one factor.
 """
 
 from typing import TYPE_CHECKING, NamedTuple

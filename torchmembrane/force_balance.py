@@ -108,7 +108,7 @@ class ForceBalance(nn.Module):
         return ForceBalance(membrane, sheet, markers, self.positions, self.noise, filling, gas, steps)
 
     def set_prestretch(self, prestretch: Tensor) -> None:
-        """Another prestretch `[]`, through which gradients flow; rest pressure and load follow, the reference traction stays."""
+        """Another prestretch `[]`, gradients included; rest pressure and load follow, the reference traction stays."""
         self.sheet.prestretch = prestretch
         self.rest_pressure, self.rest_load = rest_balance(self.membrane, self.sheet)
         self.cavity.rest_pressure = self.rest_pressure

@@ -152,7 +152,9 @@ def material(arguments) -> int:
     report = Report.without_parameters(f"material from {len(paths)} images of presses")._replace(
         names=["prestretch", "modulus"][:n], units=["", f"N/{unit}"][:n], design=np.array(before[:n]), values=found.values,
         deviations=found.deviations, correlations=found.covariance / np.outer(found.deviations, found.deviations),
-        notes=[f"{path.name} alone: prestretch {one:.3f} ± {sd:.2g}" for path, (one, sd) in zip(paths, found.each, strict=True)],
+        notes=[
+            f"{path.name} alone: prestretch {one:.3f} ± {sd:.2g}" for path, (one, sd) in zip(paths, found.each, strict=True)
+        ],
     )  # fmt: skip
     if n == 2:
         report.notes.append("modulus: shear modulus x thickness; the sensor file's thickness is kept, or 1 where it has none")
