@@ -40,7 +40,8 @@ def pressed(mesh: Mesh, depth=1.5, flow=4.0) -> dict[str, np.ndarray]:
     return {
         "vertices": mesh.rest_vertices + displacement, "displacement": displacement, "pixels": pixels,
         "confidence": np.isfinite(pixels[:, 0]).astype(np.float32), "pressure_change": np.float32(0.0123),
-        "contact_points": np.full((4, 3), np.nan, np.float32),
+        "contact_points": np.full((4, 3), np.nan, np.float32), "traction": np.zeros_like(displacement),
+        "normals": mesh.rest_normals, "force": np.zeros(3, np.float32),
         "residual": np.float32(0.25), "status": np.int32(results.OK),
     }  # fmt: skip
 
@@ -143,6 +144,26 @@ def test_an_answer_without_convergence_is_drawn_and_named(mesh):
 def test_relative_forces_are_called_relative():
     mesh = cap_mesh(Camera("fisheye", SIZE, (220, 220), (320, 240)), force_unit="relative")
     assert "(relative)" in view.figure(pressed(mesh), mesh).get_suptitle()
+
+
+def test_a_fourth_panel_shows_where_and_how_hard_something_pushes(mesh):
+    frame = pressed(mesh)
+    near = np.exp(-(((mesh.rest_vertices - mesh.rest_vertices[DENT]) ** 2).sum(-1)) / 8)
+    frame |= {"traction": -2.0 * near[:, None] * mesh.rest_normals, "force": np.array([3.0, 0.0, -4.0])}
+    frame["contact_points"][0] = mesh.rest_vertices[DENT]
+    drawing = view.figure(frame, mesh)
+    (panel,) = drawing.axes[3:4]
+    assert len(view.figure(pressed(mesh), mesh).axes) < len(drawing.axes)
+    assert "Force 5 N (3, 0, -4)" in texts(drawing) and "push on the membrane [N/mm²]" in texts(drawing)
+    (mark,) = (line for line in panel.get_lines() if line.get_marker() == "x")
+    np.testing.assert_allclose(np.ravel(mark.get_data()), mesh.vertex_pixels[DENT])
+    (arrow,) = (text for text in panel.texts if text.arrow_patch is not None)
+    step = (
+        np.subtract(arrow.xyann, arrow.xy)
+        if np.allclose(arrow.xy, mesh.vertex_pixels[DENT])
+        else np.subtract(arrow.xy, arrow.xyann)
+    )
+    assert step[0] > 0 and abs(step[1]) < 1e-6
 
 
 def test_saved_as_png_1600_wide_whole_or_not_at_all(mesh, tmp_path):

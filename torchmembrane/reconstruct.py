@@ -50,7 +50,7 @@ class Reconstructor(nn.Module):
     >>> reconstructor = Reconstructor.from_file("examples/sensor.toml")
     >>> result = reconstructor(reconstructor.read("examples/two_contacts.png"))
     >>> int(result.status[0]), list(result.vertices.shape)
-    (0, [1, 289, 3])
+    (0, [1, 1089, 3])
     """
 
     def __init__(self, sensor: Sensor, estimator="force-balance", *, model=None, element="triangle", smoothing=None,
