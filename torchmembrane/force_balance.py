@@ -146,7 +146,7 @@ class ForceBalance(nn.Module):
 
     def at_rest(self, weight: Tensor) -> tuple[Tensor, Tensor]:
         """The rest surface and pressure, for every row of `weight [B, D]`."""
-        return self.membrane.rest.expand(weight.shape[0], -1, -1), self.rest_pressure.expand(weight.shape[0])
+        return self.membrane.rest.repeat(weight.shape[0], 1, 1), self.rest_pressure.repeat(weight.shape[0])
 
     def refined(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
         """Surface and pressure of `coarse` on this grid: the displacement is bilinear between its lines."""
@@ -157,7 +157,7 @@ class ForceBalance(nn.Module):
     def _descend(self, x: Tensor, pressure: Tensor, seen: Observation, schedule: list[tuple[float, float]]) -> Equilibrium:
         for tau, outlier in schedule:
             before = x
-            x, pressure = self.step(x, pressure, seen, tau, outlier)
+            x, pressure = self._compiled_once(x, pressure, seen, x.new_tensor(tau), x.new_tensor(outlier))
         return self.equilibrium(x, pressure, before)
 
     def equilibrium(self, x: Tensor, pressure: Tensor, before: Tensor) -> Equilibrium:
@@ -165,6 +165,11 @@ class ForceBalance(nn.Module):
         moved = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
         traction = self.contact_force(x, pressure) / self.membrane.rest_area[:, None]
         return Equilibrium(x, pressure, self.membrane.volume(x), traction, moved)
+
+    @torch.compiler.nested_compile_region
+    def _compiled_once(self, x: Tensor, pressure: Tensor, seen: Observation, tau: Tensor, outlier: Tensor):
+        """`step`, which `torch.compile` then traces and compiles once, not once a step."""
+        return self.step(x, pressure, seen, tau, outlier)
 
     def contact_force(self, x: Tensor, pressure: Tensor) -> Tensor:
         """Force that something outside must exert on every free vertex, `[B, V, 3]`."""
@@ -193,7 +198,7 @@ class ForceBalance(nn.Module):
         rows = rows.unflatten(1, self.inside.shape) * (self.inside * self.moves)[..., None, None]
         return rows.transpose(2, 3).flatten(-2)
 
-    def step(self, x: Tensor, pressure: Tensor, seen: Observation, tau: float, outlier: float) -> tuple[Tensor, Tensor]:
+    def step(self, x: Tensor, pressure: Tensor, seen: Observation, tau, outlier) -> tuple[Tensor, Tensor]:
         """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped."""
         force, A = self.contact_force(x, pressure), self.force_jacobian(x, pressure)
         v = self.membrane.volume_gradient(x) * self.moves
