@@ -1,0 +1,24 @@
+"""The whole reconstruction compiles to one graph and gives what it gives eagerly."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.sensor import Sensor
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.mark.parametrize("estimator", ["force-balance", "minimum-energy"])
+def test_the_compiled_reconstruction_is_one_graph_and_agrees(estimator):
+    sensor = Sensor.from_file(EXAMPLES / "sensor.toml")
+    reconstructor = Reconstructor(replace(sensor, membrane=sensor.membrane.resampled((9, 9))), estimator)
+    compiled = torch.compile(reconstructor, fullgraph=True, backend="eager")
+    images = reconstructor.read(EXAMPLES / "two_contacts.png")
+    with torch.no_grad():
+        expected, got = reconstructor(images), compiled(images)
+    for key, value in expected._asdict().items():
+        torch.testing.assert_close(got._asdict()[key], value, rtol=1e-4, atol=1e-4, equal_nan=True)
