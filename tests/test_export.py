@@ -11,38 +11,90 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from PIL import Image
 from torch import nn
 
-from torchmembrane import cli
+from torchmembrane import MembraneError, export, force_balance
 from torchmembrane.assembly import Assembly, traced
+from torchmembrane.camera import Camera
 from torchmembrane.export import Piece
 from torchmembrane.images import to_grey
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.results import BAD_VALUES, BLANK, OK, STATUS_TEXTS, TOO_FEW_MARKERS, Reconstruction, load_frame
-from torchmembrane.store import Mesh
+from torchmembrane.sensor import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.simulate.dataset import stroke_to
+from torchmembrane.simulate.indenters import Sphere
+from torchmembrane.simulate.simulator import Simulator
+from torchmembrane.store import Mesh, Settings
 
 ROOT = Path(__file__).parents[1]
-SENSOR = ROOT / "examples" / "sensor.toml"
-IMAGES = [ROOT / "examples" / f"{name}.png" for name in ("press_on_axis", "two_contacts", "flat_plate")]
 
 
 @pytest.fixture(scope="module")
-def model_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("model") / "model.onnx"
-    assert cli.main(["export", str(SENSOR), "-o", str(path)]) == 0
+def folder(tmp_path_factory):
+    """A small cap with 49 dots, an image of 160 x 120 px, and three frames of a press."""
+    surface = Surface("spherical_cap", {"rim_radius": 8.0, "height": 4.0, "base_z": 14.0})
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-5, 5, 7)] * 2))
+    dots = np.stack([x, y, 8 + np.sqrt(100 - x**2 - y**2)], -1)
+    camera, markers = Camera("pinhole", (160, 120), (100, 100), (79, 60)), Markers("dots", "dark", dots)
+    material = Material("neo_hookean", 1.3, shear_modulus=0.3, thickness=0.4)
+    sensor = Sensor("cap", "mm", camera, surface.membrane((9, 9)), material, Cavity("liquid"), markers, surface)
+    path = tmp_path_factory.mktemp("sensor")
+    sensor.to_file(path / "sensor.toml")
+    simulator, rng = Simulator(sensor), np.random.default_rng(0)
+    stroke = stroke_to(simulator, Sphere(3.0), np.array([0.0, 1.0, 18.0]), np.array([-0.3, 0.0, -0.95]), 1.2)
+    for k, press in enumerate(simulator.presses(stroke, ["push"], frames=3)):
+        Image.fromarray(simulator.frame(press, stroke, rng).image).save(path / f"press{k}.png")
     return path
 
 
 @pytest.fixture(scope="module")
-def reconstructor():
-    return Reconstructor.from_file(SENSOR)
+def images(folder):
+    return [folder / f"press{k}.png" for k in range(3)]
+
+
+@pytest.fixture(scope="module")
+def reconstructor(folder):
+    """With a coarser grid, which only finer ones than this would have."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(force_balance, "COARSEST", 5)
+        made = Reconstructor.from_file(folder / "sensor.toml")
+    assert made.estimator.coarse.membrane.grid == (5, 5)
+    return made
+
+
+@pytest.fixture(scope="module")
+def model_files(reconstructor, tmp_path_factory):
+    """From rest, and from the frame before; what they share is traced once."""
+    files = {tracking: tmp_path_factory.mktemp("model") / "model.onnx" for tracking in (False, True)}
+    known, trace = {}, export.traced
+
+    def once(piece, inputs, outputs):
+        key = piece.owner, piece.function, *inputs
+        known[key] = known.get(key) or trace(piece, inputs, outputs)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export, "traced", once)
+        for tracking, path in files.items():
+            export.export(reconstructor, path, Settings("force-balance", "neo_hookean", "triangle", "npz"), tracking)
+    return files
+
+
+@pytest.fixture(scope="module")
+def model_file(model_files):
+    return model_files[False]
+
+
+def opened(model: str | bytes) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
 @pytest.fixture(scope="module")
 def run(model_file):
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(str(model_file), options, providers=["CPUExecutionProvider"])
+    session = opened(str(model_file))
     return lambda images: Reconstruction(*session.run(list(Reconstruction._fields), {"image": images.numpy()}))
 
 
@@ -53,22 +105,62 @@ def agree(result, expected):
         assert (np.isnan(mine) == np.isnan(theirs)).all(), name
         assert np.nanmax(np.abs(mine - theirs), initial=0) < bound, name
     np.testing.assert_allclose(result.pressure, expected.pressure.numpy(), rtol=1e-3)
+    np.testing.assert_allclose(result.force, expected.force.numpy(), atol=1e-3 * np.nanmax(np.abs(expected.force.numpy())))
 
 
-def test_the_model_agrees_with_torch(run, reconstructor):
-    images = reconstructor.read(*IMAGES)
+def test_the_model_agrees_with_torch(run, reconstructor, images):
+    images = reconstructor.read(*images)
     with torch.no_grad():
         together = reconstructor(images)
     assert together.status.tolist() == [OK] * 3
     agree(run(images), together)
+    assert together.displacement[2].norm(dim=-1).max() > 1
     agree(run(images[:1]), Reconstruction(*(field[:1] for field in together)))
 
 
-def test_damaged_images_get_the_same_status(run, reconstructor):
-    good = reconstructor.read(IMAGES[0])[0]
+def test_a_tracking_model_starts_from_the_frames_before(model_files, reconstructor, images):
+    images, session = reconstructor.read(*images), opened(str(model_files[True]))
+    with torch.no_grad():
+        before = reconstructor(images[[0, 1, 1]])
+        before.vertices[2], before.pressure[2] = torch.nan, torch.nan
+        expected = reconstructor(images, before)
+    feed = {"image": images.numpy()}
+    feed |= {"previous_vertices": before.vertices.numpy(), "previous_pressure": before.pressure.numpy()}
+    agree(Reconstruction(*session.run(list(Reconstruction._fields), feed)), expected)
+
+
+def test_minimum_energy_agrees_with_torch(folder):
+    reconstructor = Reconstructor.from_file(folder / "sensor.toml", estimator="minimum-energy")
+    estimator, tracer = reconstructor.estimator, export.Tracer()
+    flow = 3 * torch.rand(3, 1, 2) * reconstructor.estimator.moves[:, None]
+    origins, directions = reconstructor.camera.pixel_to_ray(reconstructor.vertex_pixels + flow)
+    rays = {"origins": origins.expand(directions.shape).contiguous(), "directions": directions}
+    for name, values in rays.items():
+        tracer.given(name, values[:2])
+    export.minimum_energy(tracer, estimator)
+    tracer.assembly.named(tracer.names["vertices"], "surface")
+    value = lambda name: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", 81, 3])  # noqa: E731
+    model = tracer.assembly.model([value(name) for name in rays], [value("surface")], {})
+    session = opened(model.SerializeToString())
+    with torch.no_grad():
+        expected = estimator(**rays).vertices
+    assert (expected - estimator.membrane.rest).norm(dim=-1).max() > 0.1
+    for batch in (1, 3):
+        (found,) = session.run(None, {name: values[:batch].numpy() for name, values in rays.items()})
+        np.testing.assert_allclose(found, expected[:batch].numpy(), rtol=0, atol=1e-4)
+
+
+def test_minimum_energy_does_not_track(folder, tmp_path):
+    reconstructor = Reconstructor.from_file(folder / "sensor.toml", estimator="minimum-energy")
+    with pytest.raises(MembraneError, match="starts from rest always"):
+        export.export(reconstructor, tmp_path / "no.onnx", Settings("minimum-energy", "", "", "npz"), tracking=True)
+
+
+def test_damaged_images_get_the_same_status(run, reconstructor, images):
+    good = reconstructor.read(images[2])[0]
     blank, nan, noise, hidden = torch.zeros_like(good), good.clone(), torch.rand(good.shape), good.clone()
     nan[0, 5, 7] = torch.nan
-    hidden[:, 150:230, 250:330] = 0.5
+    hidden[:, 45:65, 60:80] = 0.5
     images = torch.stack([good, blank, nan, noise, hidden])
     with torch.no_grad():
         expected = reconstructor(images)
@@ -102,16 +194,16 @@ def bare_python(tmp_path_factory):
     return lambda code: subprocess.run([sys.executable, "-I", "-S", "-c", begin + code], capture_output=True, text=True)
 
 
-def test_edge_runs_without_torch(model_file, reconstructor, bare_python, tmp_path):
+def test_edge_runs_without_torch(model_file, reconstructor, images, bare_python, tmp_path):
     for name in ("torch", "kornia", "torchmembrane"):
         assert "ModuleNotFoundError" in bare_python(f"import {name}").stderr
-    arguments = [str(model_file), *map(str, IMAGES), "--out", str(tmp_path), "--batch", "2"]
+    arguments = [str(model_file), *map(str, images), "--out", str(tmp_path), "--batch", "2"]
     done = bare_python(f"from torchmembrane_edge.cli import main; sys.exit(main({arguments!r}))")
     assert done.returncode == 0, done.stderr
     assert "3 reconstructed, 0 failed" in done.stdout
     with torch.no_grad():
-        expected = reconstructor(reconstructor.read(*IMAGES))
-    for i, path in enumerate(IMAGES):
+        expected = reconstructor(reconstructor.read(*images))
+    for i, path in enumerate(images):
         frame = load_frame(tmp_path / f"{path.stem}.npz")
         assert np.abs(frame["vertices"] - expected.vertices[i].numpy()).max() < 1e-3
         assert {key: value.dtype for key, value in frame.items()} == {
@@ -132,10 +224,33 @@ def test_edge_sees_the_same_grey(kind, shape, monkeypatch):
     np.testing.assert_array_equal(grey(image[None])[0], to_grey(image))
 
 
-def test_edge_says_what_is_wrong(model_file, bare_python, tmp_path):
+def test_edge_follows_a_video(model_files, reconstructor, images, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "export")
+    from torchmembrane_edge import EdgeError, Session
+    from torchmembrane_edge.session import SETTLING
+
+    frames = reconstructor.read(*images)[:, 0].numpy()
+    state, found = None, list(Session(model_files[True]).track([*frames[:2], 0 * frames[0], frames[2]]))
+    with torch.no_grad():
+        for frame, k in zip(found, (0, 1, None, 2), strict=True):
+            if k is None:
+                assert frame["status"].tolist() == [BLANK] and np.isnan(frame["vertices"]).all()
+                state = None
+                continue
+            if state is None:
+                rest = reconstructor(reconstructor.read(images[k]))
+                state = rest._replace(vertices=rest.vertices * torch.nan, pressure=rest.pressure * torch.nan)
+                for _ in range(SETTLING - 1):
+                    state = reconstructor(reconstructor.read(images[k]), state)
+            state = reconstructor(reconstructor.read(images[k]), state)
+            assert np.abs(frame["vertices"] - state.vertices.numpy()).max() < 1e-3
+    with pytest.raises(EdgeError, match="does not track"):
+        next(Session(model_files[False]).track(frames))
+
+
+def test_edge_says_what_is_wrong(model_file, images, bare_python, tmp_path):
     (tmp_path / "broken.png").write_bytes(b"no image")
-    images = [str(tmp_path / "broken.png"), str(IMAGES[0])]
-    arguments = [str(model_file), *images, "--out", str(tmp_path)]
+    arguments = [str(model_file), str(tmp_path / "broken.png"), str(images[0]), "--out", str(tmp_path)]
     done = bare_python(f"from torchmembrane_edge.cli import main; sys.exit(main({arguments!r}))")
     assert done.returncode == 1 and "broken.png: not readable" in done.stderr and "1 reconstructed, 1 failed" in done.stdout
     done = bare_python("from torchmembrane_edge.cli import main; sys.exit(main(['nothing.onnx', 'a.png', '--out', 'b']))")

@@ -6,10 +6,23 @@ import numpy as np
 import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
+from onnx_ir import passes
+from onnx_ir.passes import common
+from onnxscript.optimizer import fold_constants_ir
 from torch import Tensor, nn
 
 OPSET, IR_VERSION = 18, 8
 """onnxruntime reads them from 1.14 on."""
+
+TIDY = passes.Sequential(
+    common.RemoveUnusedNodesPass(),
+    common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
+    common.DeduplicateInitializersPass(),
+    common.CommonSubexpressionEliminationPass(),
+    common.OutputFixPass(),
+    common.NameFixPass(),
+)
+"""What torch's exporter does too, but for its patterns, which take most of its time and change next to nothing here."""
 
 
 def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> onnx.ModelProto:
@@ -19,8 +32,13 @@ def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> 
     shapes = tuple({0: batch} if value.ndim else None for value in inputs.values())
     program = torch.onnx.export(
         module.eval(), tuple(inputs.values()), input_names=list(inputs), output_names=outputs, opset_version=OPSET,
-        dynamic_shapes=(shapes,), dynamo=True, external_data=False, verbose=False,
+        dynamic_shapes=(shapes,), dynamo=True, external_data=False, verbose=False, optimize=False,
     )  # fmt: skip
+    common.InlinePass()(program.model)
+    fold_constants_ir(program.model)
+    TIDY(program.model)
+    for value, name in zip(program.model.graph.inputs, inputs, strict=True):  # one that is an output too has lost its name
+        value.name = name
     return program.model_proto
 
 
