@@ -38,7 +38,6 @@ class Variant:
     model: str | None = None
     filling: Callable[[Cavity], Cavity] = lambda cavity: cavity
     grid: int = GRID
-    even: bool = True
     steps: int | None = None
     assumed: float = reconstruct.MARKER_NOISE["dots"]
     noise: float = 0.0
@@ -64,10 +63,9 @@ VARIANTS = [
     *named("friction", "CONE", 0.0),
     *(Variant("energy", model.replace("_", "-"), model=model) for model in ("harmonic", "neo_hookean", "mooney_rivlin")),
     *(Variant("grid", f"{n} x {n}", grid=n) for n in (13, 25)),
-    Variant("grid", f"{GRID} x {GRID}, the file's own lines", even=False),
     *(Variant("steps", f"{n} from rest, {round(n / 1.2)} on the fine grid", steps=n) for n in (6, 8, 20)),
-    *named("surroundings", "REACH", 1e-6, 0.02, 0.08),
-    *named("surroundings", "FLOOR", 0.0, 1e-2, 1e-1),
+    *named("surroundings", "REACH", 1e-6, 0.08),
+    *named("surroundings", "FLOOR", 0.0, 1e-2),
     *(Variant("marker noise", f"assumed {px:g} px", assumed=px) for px in (0.05, 0.2)),
     *(Variant("marker noise", f"{px:g} px added", noise=px) for px in (0.1, 0.2, 0.5)),
     *(Variant("number of dots", f"one in {n}", every=n) for n in (2, 4)),
@@ -89,10 +87,8 @@ def constants_of(variant: Variant):
 
 def reconstructor_of(sensor: Sensor, variant: Variant) -> Reconstructor:
     markers = replace(sensor.markers, rest_image=None)
-    grid = (variant.grid, variant.grid)
-    membrane = sensor.membrane.resampled(grid) if variant.even else sensor.surface.membrane(grid)
-    sensor = replace(sensor, membrane=membrane, cavity=variant.filling(sensor.cavity), markers=markers)
-    changed = Reconstructor(sensor, model=variant.model)
+    membrane, cavity = sensor.surface.membrane((variant.grid, variant.grid)), variant.filling(sensor.cavity)
+    changed = Reconstructor(replace(sensor, membrane=membrane, cavity=cavity, markers=markers), model=variant.model)
     estimator = changed.estimator
     while estimator is not None:
         estimator.noise *= variant.assumed / reconstruct.MARKER_NOISE[markers.kind]

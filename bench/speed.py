@@ -1,18 +1,24 @@
-"""Time a frame: markers, flow, solve, at several batch sizes, beside a per-frame scipy twin of the solve.
+"""Time a frame: markers, flow, solve, at several batch sizes, beside per-frame scipy twins of the solves.
 
 python bench/speed.py [--sensor examples/sensor.toml] [--image examples/two_contacts.png] [--device cpu] [--json FILE]
 
-The twin solves the same constrained harmonic problem (linear triangles, volume linearised once, eq. 22) as one would write it
-for one frame: sparse assembly and factorisation by scipy.
+Minimum energy: the twin solves the same constrained harmonic problem (linear triangles, volume linearised once, eq. 22) as one
+would write it for one frame: sparse assembly and factorisation by scipy. Force balance (17 x 17): cold from rest and warm from
+the solution, beside `balance_twin`, which makes the same steps; processor time, the least of several turns, taken in turn, as
+other programs may share the cores. How accurate that grid is: `ablation.py`, its base row for 17 x 17.
 """
 
 import argparse
+import copy
+import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sparse
 import torch
+from balance_twin import BalanceTwin
 from record import median_seconds, write
 from scipy.sparse.linalg import splu
 
@@ -51,23 +57,12 @@ def scipy_twin(reconstructor):
     return solve
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sensor", default="examples/sensor.toml")
-    parser.add_argument("--image", default="examples/two_contacts.png")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--batches", type=int, nargs="*", default=[1, 16, 64])
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
-    warnings.simplefilter("ignore")
-    torch.set_num_threads(args.threads)
-    rows = []
+def minimum_energy(args):
     for label, options in (
         ("harmonic, linear volume (the paper)", dict(model="harmonic", volume="linear")),
         ("the sensor's material, exact volume", {}),
     ):
-        reconstructor = Reconstructor.from_file(args.sensor, **options).to(args.device)
+        reconstructor = Reconstructor.from_file(args.sensor, "minimum-energy", **options).to(args.device)
         image = reconstructor.read(args.image)
         with torch.no_grad():
             for batch in args.batches:
@@ -83,14 +78,71 @@ def main():
                     whole=lambda images=images, r=reconstructor: r(images),
                 )
                 times = {name: [1000 * t / batch for t in median_seconds(part)] for name, part in parts.items()}
-                rows.append(dict(estimator=label, batch=batch, milliseconds_a_frame=times))
+                yield dict(estimator=label, batch=batch, milliseconds_a_frame=times)
                 print(f"{label}, batch {batch}: " + ", ".join(f"{k} {t[0]:.2f} ms" for k, t in times.items()), flush=True)
             if options and args.device == "cpu":
                 twin, d = scipy_twin(reconstructor), rays[1][0].double().numpy()
                 gap = np.abs(twin(d) - reconstructor.estimator(rays[0][:1], rays[1][:1]).vertices[0].numpy()).max()
                 seconds = median_seconds(lambda twin=twin, d=d: twin(d))
-                rows.append(dict(estimator="scipy twin", batch=1, milliseconds_a_frame=dict(solve=[1000 * s for s in seconds])))
+                yield dict(estimator="scipy twin", batch=1, milliseconds_a_frame=dict(solve=[1000 * s for s in seconds]))
                 print(f"scipy twin of the same solve, a frame: {1000 * seconds[0]:.2f} ms (largest difference {gap:.1e})")
+
+
+def least_milliseconds(functions: dict, turns: int) -> dict[str, float]:
+    """Least processor time of every function, taken in turn, after one warm-up call each."""
+    times = {name: [] for name in functions}
+    for turn in range(turns + 1):
+        for name, function in functions.items():
+            start = time.process_time()
+            function()
+            if turn:
+                times[name].append(1000 * (time.process_time() - start))
+    return {name: min(values) for name, values in times.items()}
+
+
+def force_balance(args):
+    sensor = Reconstructor.from_file(args.sensor).sensor
+    reconstructor = Reconstructor(replace(sensor, membrane=sensor.surface.membrane((17, 17))))
+    estimator, exact = reconstructor.estimator, copy.deepcopy(reconstructor.estimator).double()
+    displacement, confidence, _ = reconstructor.observe(reconstructor.read(args.image))
+    frame = (*reconstructor.rays(displacement, confidence), confidence)
+    twin, single = BalanceTwin(exact), [a[0].double() for a in frame]
+    gap = np.abs(twin(*single)[0] - estimator(*frame).vertices[0].numpy()).max()
+    functions, batches = {"scipy twin, cold": lambda: twin(*single)}, {}
+    for batch in args.batches:
+        frames = [a.expand(batch, *a.shape[1:]).contiguous() for a in frame]
+        start = estimator(*frames)[:2]
+        functions[f"batch {batch}, cold"] = lambda frames=frames: estimator(*frames)
+        functions[f"batch {batch}, warm"] = lambda frames=frames, start=start: estimator(*frames, start)
+        batches |= {f"batch {batch}, cold": batch, f"batch {batch}, warm": batch}
+    times = {name: value / batches.get(name, 1) for name, value in least_milliseconds(functions, 5).items()}
+    for name, value in times.items():
+        ratio = value / times["scipy twin, cold"]
+        print(
+            f"force balance, 17 x 17, {len(single[2])} dots, {name}: {value:.1f} ms a frame, {ratio:.2f} of the twin",
+            flush=True,
+        )
+        yield dict(estimator="force balance", what=name, milliseconds_a_frame=value, of_the_twin=ratio)
+    print(f"largest difference from the twin: {gap:.1e}")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sensor", default="examples/sensor.toml")
+    parser.add_argument("--image", default="examples/two_contacts.png")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--batches", type=int, nargs="*", default=[1, 16, 64])
+    parser.add_argument("--only", choices=("minimum-energy", "force-balance"))
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(args.threads)
+    rows, parts = [], (minimum_energy, force_balance)
+    with torch.no_grad():
+        for part in parts:
+            if args.only in (None, part.__name__.replace("_", "-")):
+                rows += part(args)
     write(args.json, dict(sensor=args.sensor, rows=rows))
 
 
