@@ -22,9 +22,11 @@ from record import write
 from torchmembrane.reconstruct import Reconstructor
 
 ESTIMATORS = {
-    "harmonic, quadrilaterals, linear volume (the paper)": dict(model="harmonic", element="quadrilateral", volume="linear"),
-    "harmonic, triangles": dict(model="harmonic"),
-    "the sensor's material": {},
+    "harmonic, quadrilaterals, linear volume (the paper)": dict(
+        estimator="minimum-energy", model="harmonic", element="quadrilateral", volume="linear"
+    ),
+    "harmonic, triangles": dict(estimator="minimum-energy", model="harmonic"),
+    "the sensor's material": dict(estimator="minimum-energy"),
     "force balance": dict(estimator="force-balance"),
 }
 

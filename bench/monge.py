@@ -41,7 +41,9 @@ def main():
     warnings.simplefilter("ignore")
     rows = []
     for case in cases_in(args.cases):
-        r = Reconstructor.from_file(args.cases / case["sensor"], model="harmonic", dtype=torch.float64)
+        r = Reconstructor.from_file(
+            args.cases / case["sensor"], estimator="minimum-energy", model="harmonic", dtype=torch.float64
+        )
         truth = np.load(args.cases / case["truth"])
         X, Y = (torch.from_numpy(truth[key].astype(float)) for key in ("dots_nominal", "dots_deformed"))
         pixels = torch.from_numpy(truth["uv_deformed"].astype(float))[None]
