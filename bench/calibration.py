@@ -1,13 +1,14 @@
 """How well calibration recovers a simulated truth, from noisy rendered images.
 
-python bench/calibration.py [lens ports rest effect views depth pattern] [--seeds 3] [--json FILE] [--figures docs/calibration]
+python bench/calibration.py [PART ...] [--seeds 3] [--json FILE] [--figures docs/calibration]
 
-Sensors of this package are seen by the simulator with noise 40 dB below white; the first guess is off. Printed: error, reported
+Parts: lens ports rest effect views depth pattern material. Sensors of this package are seen by the simulator with noise 40 dB below white; the first guess is off. Printed: error, reported
 standard deviation, and the largest error over its deviation; for `effect` the error of the surface at the dots before and after
 the pose was calibrated.
 """
 
 import argparse
+import itertools
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from torchmembrane.boards import Checkerboard, DotBoard
 from torchmembrane.calibrate.boards import Views, lens_from_views, ports_from_views
 from torchmembrane.calibrate.depth import rest_from_depth
+from torchmembrane.calibrate.material import material_from_images
 from torchmembrane.calibrate.mill import dots_for_pixels, pixel_lattice
 from torchmembrane.calibrate.report import Report, fit_figure, mill_figure, surface_figure
 from torchmembrane.calibrate.rest import rest_from_image
@@ -33,7 +35,7 @@ from torchmembrane.images import to_grey
 from torchmembrane.markers.dots import find_dots
 from torchmembrane.presets import preset
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor import Markers, Surface
+from torchmembrane.sensor import Markers, Material, Surface
 from torchmembrane.simulate.board import BoardImages
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Plane, Sphere
@@ -144,6 +146,30 @@ def errors_of(answer, solver, truth) -> tuple[float, float]:
     x, u = answer.markers[0].double().numpy(), (answer.markers[0] - solver.rest_markers).double().numpy()
     true = (truth["dots_deformed"] - truth["dots_nominal"]).astype(float)
     return rms(x - truth["dots_deformed"]), rms(u - true) / rms(true)
+
+
+def material(seeds, figures):
+    """Prestretch and modulus from three rendered presses, of which one's force is known, or all."""
+    presses = ((Sphere(3.0), (0, 0, -1), 2.5), (Sphere(4.0), (-0.5, 0, -0.87), 2.0), (Sphere(3.0), (0.3, -0.5, -0.7), 2.0))
+    for name, prestretch in itertools.product(("fingertip", "half_cylinder"), (1.05, 1.15, 1.3, 1.6, 2.0)):
+        design = preset(name)
+        truth = replace(design, material=Material("neo_hookean", prestretch, shear_modulus=0.3, thickness=0.4))
+        simulator = Simulator(truth, look=Look(noise=NOISE))
+        sensor = replace(design, markers=replace(design.markers, rest_image=simulator.rest_image()))
+        aim = simulator.membrane.rest[simulator.membrane.fixed].mean(0).numpy()
+        strokes = [stroke_to(simulator, body, aim, travel, depth) for body, travel, depth in presses]
+        states = [next(simulator.presses(stroke, ("push",))) for stroke in strokes]
+        forces = np.stack([state.force.numpy() for state in states])
+        for seed in range(seeds):
+            images = np.stack([simulator.image(state.vertices, np.random.default_rng(seed)) for state in states]) / 255
+            for known in (1, len(presses)):
+                given = np.where(np.arange(len(presses))[:, None] < known, forces, np.nan)
+                found = material_from_images(sensor, torch.from_numpy(images)[:, None], given)
+                record = dict(sensor=name, prestretch=prestretch, seed=seed, known=known, values=found.values.tolist())
+                record |= dict(deviations=found.deviations.tolist(), each=found.each.tolist())
+                record["worst"] = worst(found.values - [prestretch, 0.12], found.deviations)
+                print("material", record, flush=True)
+                yield record
 
 
 def views(seeds, figures):
@@ -294,7 +320,7 @@ def draw(folder: Path | None, name: str, report: Report) -> None:
         save(fit_figure(report, (640, 480)), folder / f"{name}.png")
 
 
-PARTS = {part.__name__: part for part in (lens, ports, rest, effect, views, depth, pattern)}
+PARTS = {part.__name__: part for part in (lens, ports, rest, effect, views, depth, pattern, material)}
 
 
 def main():

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchmembrane.camera import Camera
+from torchmembrane.cavity import Equilibrium
 from torchmembrane.contact import contact_indicator, contact_points
 from torchmembrane.energy import Sheet
 from torchmembrane.force_balance import CONE, FLOOR, FRICTION, SPARSITY, ForceBalance, Observation, _across
@@ -315,3 +316,21 @@ def test_the_example_images_give_shape_force_and_place():
             result.force[k], (result.traction[k] * reconstructor.estimator.membrane.rest_area[:, None]).sum(0)
         )
     assert np.median(errors) < 0.15 and max(errors) < 0.3, errors
+
+
+def test_price_of_normal_tractions_has_the_slope_that_the_weights_say(monkeypatch):
+    monkeypatch.setattr("torchmembrane.force_balance.FLOOR", 0.0)
+    estimator = make()
+    membrane, p0 = estimator.membrane, estimator.reference
+    estimator.surroundings = torch.eye(len(membrane.rest), dtype=torch.float64)
+    rays = CAMERA.pixel_to_ray(CAMERA.point_to_pixel(estimator.positions))
+    level = p0 * torch.linspace(-1.5, 0.5, len(membrane.rest), dtype=torch.float64)
+    traction = (level[:, None] * membrane.normals(membrane.rest))[None].requires_grad_()
+    rest = Equilibrium(membrane.rest[None], estimator.rest_pressure[None], membrane.rest_volume[None], traction, None)
+    price = estimator.price(rest, *(a[None] for a in rays), torch.ones(1, len(estimator.positions), dtype=torch.float64))
+    (slope,) = torch.autograd.grad(price.sum(), traction)
+    force = traction.detach() * membrane.rest_area[:, None]
+    W = estimator.force_weights(membrane.rest[None], force, 0.4)
+    expected = membrane.rest_area[:, None] * (W @ force[..., None]).squeeze(-1)
+    along = lambda field: (field * membrane.normals(membrane.rest)).sum(-1)  # noqa: E731
+    assert torch.allclose(along(slope), along(expected), rtol=1e-6, atol=1e-9)

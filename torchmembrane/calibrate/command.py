@@ -17,7 +17,7 @@ from ..presets import sensor_file
 from ..sensor import Markers, Sensor
 from .boards import PORTS, CameraFit, Views, lens_from_views, ports_from_views
 from .depth import rest_from_depth
-from .material import material_from_images
+from .material import STRETCHES, material_from_images
 from .mill import dots_for_pixels, pixel_lattice, read_pixels, write_mill, write_svg
 from .report import Report, fit_figure, material_figure, mill_figure, surface_figure
 from .rest import rest_from_image
@@ -156,6 +156,8 @@ def material(arguments) -> int:
             f"{path.name} alone: prestretch {one:.3f} ± {sd:.2g}" for path, (one, sd) in zip(paths, found.each, strict=True)
         ],
     )  # fmt: skip
+    if found.values[0] + found.deviations[0] > STRETCHES[-1]:
+        report.notes.append(f"the prestretch may be larger: {STRETCHES[-1]:g} is the largest that was tried")
     if n == 2:
         report.notes.append("modulus: shear modulus x thickness; the sensor file's thickness is kept, or 1 where it has none")
     return _done(arguments, found.sensor, report, material_figure(report, found, [path.name for path in paths]))

@@ -18,8 +18,8 @@ from ..results import OK, STATUS_TEXTS
 from ..sensor import Sensor
 
 GRID = (17, 17)  # on finer grids the price is less smooth in the prestretch
-STRETCHES = np.exp(np.linspace(0.01, 1.1, 14))
-BETWEEN = 7  # prestretches tried on either side of the lowest
+STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it
+BETWEEN = 5  # prestretches tried on either side of the lowest
 PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the price's, alike in all images
 FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known force (docs/calibration.md)
 GAS_ROUNDS = 4
@@ -81,7 +81,7 @@ def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | No
     press gives the modulus as force measured / force found at modulus 1; their mean is reported.
 
     Wrong when: the presses are shallow or the markers miss them (the deviation says so); the sheet is not equally stretched in
-    both directions; the rest surface is wrong. Above a prestretch of about 2 the shape hardly depends on it.
+    both directions; the rest surface is wrong; the prestretch lies outside `STRETCHES` (then it is found near their end).
     """
     reconstructor = _reconstructor(sensor)
     pixels = torch.as_tensor(pixels).to(reconstructor.rest_pixels)
@@ -165,15 +165,18 @@ class Presses:
     def modulus(self, log_stretch: float, deviation: float, forces: np.ndarray) -> tuple[float, float, float, np.ndarray]:
         """Modulus, its deviation at this prestretch, its change with one deviation of the prestretch, magnitudes `[B, 2]`.
 
+        The change is the larger of those to either side, negative: under more tension at rest a softer sheet presses as hard.
+
         `forces`: as for `material_from_pixels`. A gas resists in newtons: the presses are explained anew with each modulus.
         """
         modulus = self.reconstructor.sensor.material.modulus
         for _ in range(GAS_ROUNDS if self.reconstructor.estimator.cavity.filling == "gas" else 1):
             ratios, magnitudes = self._ratios(np.exp(log_stretch), modulus, forces)
             modulus = float(ratios.mean() * modulus)
-        lower, upper = (self._ratios(np.exp(log_stretch + s * deviation), modulus, forces)[0].mean() for s in (-1, 1))
+        sides = [self._ratios(np.exp(log_stretch + s * deviation), modulus, forces)[0].mean() for s in (-1, 1)]
+        change = -modulus * np.abs(np.array(sides) - 1).max()
         relative = max(FORCE_ERROR, ratios.std(ddof=1) / ratios.mean() if len(ratios) > 1 else 0.0)
-        return modulus, modulus * relative / np.sqrt(len(ratios)), modulus * (upper - lower) / 2, magnitudes
+        return modulus, modulus * relative / np.sqrt(len(ratios)), change, magnitudes
 
     def _ratios(self, stretch: float, modulus: float, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Forces measured over found of the presses of known force `[F]`, and all magnitudes, found and measured `[B, 2]`."""

@@ -163,6 +163,7 @@ def material_figure(report: Report, found, names: list[str]) -> Figure:
     axes[0].axvspan(value - deviation, value + deviation, color=VERMILION, alpha=0.2)
     axes[0].axvline(value, color=VERMILION, label=f"{value:.3f} ± {deviation:.2g}")
     axes[0].set(xscale="log", yscale="symlog", xlabel="prestretch", ylabel="price above the lowest")
+    axes[0].set_ylim(bottom=0)
     axes[0].set_xticks([1, 1.2, 1.5, 2, 3], ["1", "1.2", "1.5", "2", "3"])
     axes[0].minorticks_off()
     handles, labels = axes[0].get_legend_handles_labels()

@@ -1,0 +1,112 @@
+"""Laws of prestretch and stiffness from presses: found within three deviations, and said where the images do not know."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchmembrane import MembraneError, cli
+from torchmembrane.calibrate.material import STRETCHES, Presses, _log_stretch, material_from_pixels
+from torchmembrane.camera import Camera
+from torchmembrane.energy import Sheet
+from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.sensor import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.simulate.indenters import Sphere
+from torchmembrane.simulate.press import carried, press
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+CAP = Surface("spherical_cap", {"rim_radius": 12.0, "height": 9.0, "base_z": 3.0})
+CAMERA = Camera("fisheye", (640, 480), (168.0, 168.0), (320.0, 240.0))
+NOISE, PRESTRETCH, MODULUS = 0.05, 1.2, 0.4
+
+
+def sensor(material):
+    dots = CAP.membrane((33, 33)).rest.reshape(33, 33, 3)[3:-3:3, 3:-3:3].reshape(-1, 3).numpy()
+    return Sensor("cap", "mm", CAMERA, CAP.membrane((9, 9)), material, Cavity("liquid"), Markers("dots", "dark", dots))
+
+
+@pytest.fixture(scope="module")
+def presses():
+    """Pixels of the dots under a ball pressed in two directions, on 31 x 31 vertices, with noise, and its forces."""
+    dome, dots = CAP.membrane((31, 31)), sensor(Material("neo_hookean", 1.5)).markers.positions
+    sheet, pixels, forces = Sheet(dome, "neo_hookean", PRESTRETCH, MODULUS), [], []
+    for direction in ((0.5, 0.0, -0.866), (-0.3, 0.3, -0.906)):
+        direction = torch.tensor(direction, dtype=torch.float64)
+        ball = Sphere(4.0).touching(dome, direction)
+        state = press(dome, sheet, [[ball, ball.moved(2.5 * direction)]])
+        pixels.append(CAMERA.point_to_pixel(carried(state.vertices, dome, dots)))
+        forces.append(state.force.numpy())
+    pixels = torch.stack(pixels)
+    noise = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return pixels + NOISE * noise, np.stack(forces)
+
+
+def test_prices_are_read_as_logarithms_of_a_probability():
+    z = np.log(STRETCHES)
+    mean, deviation = _log_stretch(STRETCHES, np.full((len(z), 2), 7.0))
+    assert abs(mean - z.mean()) < 1e-3 and abs(deviation - (z[-1] - z[0]) / 12**0.5) < 1e-3
+    z = np.linspace(0.01, 1.1, 300)
+    mean, deviation = _log_stretch(np.exp(z), np.stack([((z - 0.3) / 0.1) ** 2 / 2, ((z - 0.4) / 0.1) ** 2 / 2], -1))
+    assert abs(mean - 0.35) < 1e-3 and abs(deviation - 0.1 / 2**0.5) < 1e-3
+
+
+def test_prestretch_and_modulus_are_found_whatever_the_file_says(presses):
+    pixels, forces = presses
+    found = material_from_pixels(sensor(Material("neo_hookean", 1.5, shear_modulus=3.0, thickness=0.5)), pixels, forces)
+    error = np.abs(found.values - [PRESTRETCH, MODULUS])
+    assert (error < 3 * found.deviations).all(), (found.values, found.deviations)
+    assert found.deviations[0] < 0.1 * PRESTRETCH and found.deviations[1] < 0.3 * MODULUS
+    assert found.covariance[0, 1] < 0  # more tension at rest, or a stiffer sheet
+    material = found.sensor.material
+    assert (material.prestretch, material.modulus) == pytest.approx(tuple(found.values))
+    assert material.thickness == 0.5
+    assert np.allclose(found.forces[:, 1], np.linalg.norm(forces, axis=1))
+
+
+def test_modulus_is_proportional_to_the_forces_and_needs_but_one_of_them(presses):
+    pixels, forces = presses
+    reconstructor = Reconstructor(sensor(Material("neo_hookean", 1.5)), dtype=torch.float64)
+    seen = Presses(reconstructor, pixels - reconstructor.rest_pixels, torch.ones(pixels.shape[:2], dtype=torch.float64))
+    lengths = np.linalg.norm(forces, axis=1, keepdims=True) * [[1.0], [np.nan]]
+    one, twice = (np.array(seen.modulus(0.2, 0.05, k * lengths)[:3]) for k in (1, 2))
+    assert np.allclose(twice, 2 * one) and one[0] > 0 > one[2]
+
+
+def test_rest_tells_no_prestretch():
+    plain = sensor(Material("neo_hookean", 1.5))
+    pixels = CAMERA.point_to_pixel(torch.from_numpy(plain.markers.positions))[None]
+    found = material_from_pixels(plain, pixels)
+    assert len(found.values) == 1 and found.deviations[0] > 0.25
+
+
+def test_a_harmonic_sheet_is_refused():
+    with pytest.raises(MembraneError, match="harmonic"):
+        material_from_pixels(sensor(Material("harmonic", 1.5)), torch.zeros(1, 81, 2))
+
+
+def test_command_finds_the_material_of_the_example_images(tmp_path):
+    name = "press_on_axis"
+    truth = np.load(EXAMPLES / f"{name}_truth.npz")
+    (tmp_path / "forces.csv").write_text(f"image,force\n{name}.png,{np.linalg.norm(truth['force'])}\n")
+    arguments = [str(EXAMPLES / "sensor.toml"), str(EXAMPLES / f"{name}.png"), "--forces", str(tmp_path / "forces.csv")]
+    assert cli.main(["calibrate", "material", *arguments, "--out", str(tmp_path / "out")]) == 0
+    design, made = Sensor.from_file(EXAMPLES / "sensor.toml"), Sensor.from_file(tmp_path / "out" / "sensor.toml")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())["parameters"]
+    for key, truth in (("prestretch", design.material.prestretch), ("modulus", design.material.modulus)):
+        assert abs(report[key]["value"] - truth) < 3 * report[key]["deviation"]
+    assert made.material.prestretch == pytest.approx(report["prestretch"]["value"])
+    assert (tmp_path / "out" / "report.png").exists()
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [("image,f\na.png,1\n", "header"), ("image,force\nb.png,1\n", "none of the images"), ("image,force\na.png,x\n", "readable"),
+     ("image,fx,fy,fz\nflat_plate.png,1,2\n", "3 finite"), ("image,force\n", "no forces")],
+)  # fmt: skip
+def test_bad_forces_are_refused(tmp_path, capsys, text, message):
+    (tmp_path / "forces.csv").write_text(text)
+    arguments = [str(EXAMPLES / "sensor.toml"), str(EXAMPLES / "flat_plate.png"), "--forces", str(tmp_path / "forces.csv")]
+    assert cli.main(["calibrate", "material", *arguments, "--out", str(tmp_path / "out")]) != 0
+    assert message in capsys.readouterr().err
