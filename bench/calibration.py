@@ -2,7 +2,8 @@
 
 python bench/calibration.py [PART ...] [--seeds 3] [--json FILE] [--figures docs/calibration]
 
-Parts: lens ports rest effect views depth pattern material. Sensors of this package are seen by the simulator with noise 40 dB below white; the first guess is off. Printed: error, reported
+Parts: lens ports rest effect views depth pattern material.
+Sensors of this package are seen by the simulator with noise 40 dB below white; the first guess is off. Printed: error, reported
 standard deviation, and the largest error over its deviation; for `effect` the error of the surface at the dots before and after
 the pose was calibrated.
 """
