@@ -64,7 +64,9 @@ def main():
                 result = balance.from_pixels(pixels)
             row = dict(case=case["case"], sensor=case["folder"], contacts=len(place))
             for name, options in LOOPS.items():
-                r = Reconstructor.from_file(args.cases / case["sensor"], dtype=torch.float64, **options)
+                r = Reconstructor.from_file(
+                    args.cases / case["sensor"], estimator="minimum-energy", dtype=torch.float64, **options
+                )
                 got = segmented(r, pixels.double(), confidence.double())
                 row["eq. 29"] = contact_error(got.first.points[0].numpy(), place)
                 row[name] = contact_error(got.contacts.points[0].numpy(), place)
