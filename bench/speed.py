@@ -62,7 +62,7 @@ def minimum_energy(args):
         ("harmonic, linear volume (the paper)", dict(model="harmonic", volume="linear")),
         ("the sensor's material, exact volume", {}),
     ):
-        reconstructor = Reconstructor.from_file(args.sensor, "minimum-energy", **options).to(args.device)
+        reconstructor = Reconstructor.from_file(args.sensor, estimator="minimum-energy", **options).to(args.device)
         image = reconstructor.read(args.image)
         with torch.no_grad():
             for batch in args.batches:
