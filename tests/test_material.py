@@ -48,8 +48,11 @@ def test_prices_are_read_as_logarithms_of_a_probability():
     mean, deviation = _log_stretch(STRETCHES, np.full((len(z), 2), 7.0))
     assert abs(mean - z.mean()) < 1e-3 and abs(deviation - (z[-1] - z[0]) / 12**0.5) < 1e-3
     z = np.linspace(0.01, 1.1, 300)
-    mean, deviation = _log_stretch(np.exp(z), np.stack([((z - 0.3) / 0.1) ** 2 / 2, ((z - 0.4) / 0.1) ** 2 / 2], -1))
-    assert abs(mean - 0.35) < 1e-3 and abs(deviation - 0.1 / 2**0.5) < 1e-3
+    one, other, wrong = (((z - centre) / 0.04) ** 2 / 2 for centre in (0.3, 0.34, 0.9))
+    mean, deviation = _log_stretch(np.exp(z), np.stack([one, other], -1))
+    assert abs(mean - 0.32) < 1e-3 and abs(deviation - 0.04 / 2**0.5) < 1e-3
+    mean, deviation = _log_stretch(np.exp(z), np.stack([one, other, wrong], -1))
+    assert abs(mean - 0.32) < 5e-3 and deviation < 0.05
 
 
 def test_prestretch_and_modulus_are_found_whatever_the_file_says(presses):

@@ -21,6 +21,7 @@ GRID = (17, 17)  # on finer grids the price is less smooth in the prestretch
 STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it
 BETWEEN = 5  # prestretches tried on either side of the lowest
 PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the price's, alike in all images
+WRONG = 0.02  # probability that an image is explained wrongly altogether and tells nothing
 FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known force (docs/calibration.md)
 GAS_ROUNDS = 4
 FINE = 4001  # prestretches over which the probability is summed
@@ -74,11 +75,12 @@ def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | No
     Force balance is solved at many prestretches l. What it minimises, in standard deviations of the markers and of tractions in
     units of the rest pressure, is taken for the negative logarithm of a probability:
 
-        p(log l) ~ exp(-sum over images of min over x, p of price(x, p; l))
+        p(log l) ~ product over images of [e + (1 - e) exp(-min over x, p of price(x, p; l)) / mean over l of the same]
 
-    whose mean and deviation are reported, enlarged where the images contradict one another, and by an error that all images
-    share. A sheet with the wrong l needs forces where nothing touches it. Forces are proportional to the modulus, so that each
-    press gives the modulus as force measured / force found at modulus 1; their mean is reported.
+    with e = `WRONG`, for an image that is explained wrongly altogether. Mean and deviation are reported, the latter enlarged
+    where the images contradict one another, and by an error that all images share. A sheet with the wrong l needs forces where
+    nothing touches it. Forces are proportional to the modulus, so that each press gives the modulus as force measured / force
+    found at modulus 1; their mean is reported.
 
     Wrong when: the presses are shallow or the markers miss them (the deviation says so); the sheet is not equally stretched in
     both directions; the rest surface is wrong; the prestretch lies outside `STRETCHES` (then it is found near their end).
@@ -123,8 +125,9 @@ def _log_stretch(stretches: np.ndarray, prices: np.ndarray) -> tuple[float, floa
     """Mean and standard deviation of the logarithm of the prestretch, from prices `[S, B]` at `stretches [S]`."""
     z = np.log(stretches)
     fine = np.linspace(z[0], z[-1], FINE)
-    price = PchipInterpolator(z, prices.sum(1))(fine)
-    weight = np.exp(price.min() - price)
+    price = PchipInterpolator(z, prices)(fine)
+    alone = np.exp(price.min(0) - price)
+    weight = (WRONG + (1 - WRONG) * alone / alone.mean(0)).prod(1)
     mean = (weight * fine).sum() / weight.sum()
     return mean, np.sqrt((weight * (fine - mean) ** 2).sum() / weight.sum())
 
