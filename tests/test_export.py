@@ -164,8 +164,7 @@ def test_damaged_images_get_the_same_status(run, reconstructor, images):
     images = torch.stack([good, blank, nan, noise, hidden])
     with torch.no_grad():
         expected = reconstructor(images)
-    assert expected.status.tolist()[:4] == [OK, BLANK, BAD_VALUES, TOO_FEW_MARKERS]
-    assert expected.vertices[4].isfinite().all()  # settled or not: the answer is kept
+    assert expected.status.tolist() == [OK, BLANK, BAD_VALUES, TOO_FEW_MARKERS, OK]
     agree(run(images), expected)
 
 
