@@ -10,6 +10,7 @@ from scipy.sparse.linalg import splu
 
 from torchmembrane.force_balance import FALL, LONGEST_STEP, OUTLIER, TAU, ForceBalance, Observation, _across
 from torchmembrane.membrane import corners, triangles_of
+from torchmembrane.stencil import bordered, inner
 
 DAMPING = 1e-6
 
@@ -44,10 +45,12 @@ class BalanceTwin:
     def step(self, x, pressure, seen, tau, outlier):
         e, free, count = self.estimator, self.free, self.count
         force = e.contact_force(x, pressure)
-        weights = e.force_weights(x, force, tau)[0].numpy()
+        inner_weights = e.force_weights(*(inner(field, e.membrane.grid) for field in (e.membrane.normals(x), force)), tau)
+        weights = bordered(inner_weights.flatten(-2), e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
         blocks = e.sheet.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)
-        angle, slope = e._angles(x, seen)
-        certainty = np.repeat(e._marker_weights(angle, seen, outlier)[0].numpy(), 2)
+        angle, slope = e.angles(x, seen)
+        slope = slope[..., None, :] * e.marker_weights[:, None, :, None]
+        certainty = np.repeat(e.marker_weights_at(angle, seen, outlier)[0].numpy(), 2)
         v = (e.membrane.volume_gradient(x) * e.moves)[0].numpy().ravel()
         f, r = force[0].numpy().ravel(), angle[0].numpy().ravel()
         A = sparse.csr_matrix((blocks.numpy().ravel(), (self.row, self.column)), shape=(count, count))[free][:, free]

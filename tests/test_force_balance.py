@@ -11,12 +11,12 @@ from torchmembrane.cavity import Equilibrium
 from torchmembrane.contact import contact_indicator, contact_points
 from torchmembrane.energy import Sheet
 from torchmembrane.force_balance import CONE, FLOOR, FRICTION, SPARSITY, ForceBalance, Observation, _across
+from torchmembrane.membrane import Membrane
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.shapes import spherical_cap
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
-from torchmembrane.solve.block_tridiagonal import factor, solve
-from torchmembrane.solve.patches import PatchIndex, PatchSystem
+from torchmembrane.stencil import inner
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
@@ -57,56 +57,75 @@ def bent(membrane, batch=1, size=0.05):
     )
 
 
-def test_block_cholesky_solves_the_dense_system():
-    generator = torch.Generator().manual_seed(0)
-    A = torch.randn(2, 12, 12, generator=generator, dtype=torch.float64)
-    M = A @ A.mT + 5 * torch.eye(12, dtype=torch.float64)
-    M[:, :4, 8:] = M[:, 8:, :4] = 0
-    b = torch.randn(2, 12, 3, generator=generator, dtype=torch.float64)
-    diagonal = torch.stack([M[:, 4 * i : 4 * i + 4, 4 * i : 4 * i + 4] for i in range(3)], 1)
-    upper = torch.stack([M[:, 4 * i : 4 * i + 4, 4 * i + 4 : 4 * i + 8] for i in range(2)], 1)
-    x = solve(factor(diagonal, upper), b.unflatten(1, (3, 4))).flatten(1, 2)
-    torch.testing.assert_close(M @ x, b)
+def dense(matrix):
+    """The dense matrices `[B, n s, n s]` of blocks on and above the diagonal."""
+    diagonal, above = matrix
+    blocks, s = diagonal.shape[1:3]
+    full = diagonal.new_zeros(len(diagonal), blocks, s, blocks, s)
+    for i in range(blocks):
+        full[:, i, :, i] = diagonal[:, i]
+    for i in range(blocks - 1):
+        full[:, i, :, i + 1], full[:, i + 1, :, i] = above[:, i], above[:, i].mT
+    return full.flatten(3).flatten(1, 2)
 
 
-@pytest.mark.parametrize("grid", [(7, 6), (8, 7)])
-def test_patch_sums_solve_as_the_dense_matrix_does(grid):
-    """Patches over vertices up to two grid rows apart, some of them fixed."""
-    m, n = grid
-    generator = torch.Generator().manual_seed(1)
-    fixed = torch.ones(m, n, dtype=torch.bool)
+def slopes_at_inner_vertices(function, x, estimator):
+    """Derivative of `function(x)` in the inner vertices' coordinates, a row for each of its numbers."""
+    jacobian = torch.autograd.functional.jacobian(function, x)
+    return inner(jacobian.flatten(0, -4).squeeze(1), estimator.membrane.grid).flatten(1)
+
+
+def test_linearised_force_and_volume_are_those_and_their_derivatives():
+    estimator = make(9)
+    membrane = estimator.membrane
+    x, p = bent(membrane), torch.tensor([0.3], dtype=torch.float64)
+    at = estimator.linearised(x, p)
+    within = lambda field: inner(field, membrane.grid)  # noqa: E731
+    torch.testing.assert_close(at.force, within(estimator.contact_force(x, p)))
+    torch.testing.assert_close(at.volume, within(membrane.volume_gradient(x)))
+    torch.testing.assert_close(at.normal, within(membrane.normals(x)))
+    exact = slopes_at_inner_vertices(lambda y: within(estimator.contact_force(y, p)), x, estimator)
+    alone = torch.diag_embed(at.slope[0].movedim(0, -1)).movedim(1, -1).movedim(0, 1)  # a row's force, with all others' zero
+    torch.testing.assert_close(estimator.system.vector(alone).flatten(0, 1)[:, : exact.shape[1]], exact)
+
+
+@pytest.mark.parametrize("hole", [False, True])
+def test_normal_equations_are_those_of_the_dense_slopes(hole):
+    """Slopes of all forces and angles by autograd; some vertices inside the rim fixed as well."""
+    fixed = torch.ones(10, 9, dtype=torch.bool)
     fixed[1:-1, 1:-1] = False
-    fixed[2, 2] = True
-    system = PatchSystem(grid, fixed.flatten())
-    corner = torch.arange(m * n).reshape(m, n)[:-2, :-1]
-    vertices = torch.stack([corner, corner + 1, corner + 2 * n], -1).reshape(-1, 3)
-    J = torch.randn(2, len(vertices), 9, 9, generator=generator, dtype=torch.float64)
-    patches = J @ J.mT
-    dense = torch.zeros(2, 3 * m * n, 3 * m * n, dtype=torch.float64)
-    for k, triple in enumerate(vertices):
-        entry = (3 * triple[:, None] + torch.arange(3)).flatten()
-        dense[:, entry[:, None], entry] += patches[:, k]
-    free = (3 * system.free[:, None] + torch.arange(3)).flatten()
-    load = torch.randn(2, m * n, 3, generator=generator, dtype=torch.float64)
-    index = PatchIndex(system, vertices)
-    got = system.solve(system.matrix([(index, patches)]), system.from_vertices(load)[..., None], damping=0.0)[..., 0]
-    want = torch.linalg.solve(dense[:, free[:, None], free], load.flatten(1)[:, free])
-    field = system.to_vertices(got)
-    torch.testing.assert_close(field.flatten(1)[:, free], want)
-    assert (field[:, fixed.flatten()] == 0).all()
+    fixed[4, 3] = hole
+    dome = Membrane(spherical_cap(12, 9, 3, (10, 9)).rest.reshape(10, 9, 3).numpy(), fixed.numpy())
+    positions = dots(spherical_cap(12, 9, 3, (33, 33)))
+    estimator = ForceBalance(dome, Sheet(dome, prestretch=1.3), dome.closest_points(positions.numpy()), positions, 0.1 / 168)
+    x, p = bent(dome), torch.tensor([0.3], dtype=torch.float64)
+    directions = torch.nn.functional.normalize(positions + 0.3, dim=-1)[None]
+    seen = Observation(0.1 * directions, _across(directions), torch.ones(1, len(positions), dtype=torch.float64))
+    at = estimator.linearised(x, p)
+    angle, slope = estimator.angles(x, seen)
+    generator = torch.Generator().manual_seed(3)
+    weight = torch.rand(angle.shape[:2], generator=generator, dtype=torch.float64)
+    root = torch.rand(1, len(at.force[0]), 3, 3, generator=generator, dtype=torch.float64)
+    W = root @ root.mT
+    matrix, load, push, (fWv, vWv) = estimator.normal_equations(at, W, slope, weight, angle)
 
-
-def test_force_jacobian_is_the_derivative_of_the_contact_force():
-    estimator = make(7)
-    x, p = bent(estimator.membrane), torch.tensor([0.3], dtype=torch.float64)
-    exact = torch.autograd.functional.jacobian(lambda y: estimator.contact_force(y, p), x)[0, :, :, 0]
-    A = estimator.force_jacobian(x, p)[0].unflatten(-1, (7, 3))
-    index = estimator.vertex_patches.vector.unflatten(0, (49, 7, 3))
-    unknowns = estimator.system.blocks * estimator.system.block_size
-    dense = torch.zeros(49, 3, unknowns + 1, dtype=torch.float64)
-    for k in range(49):
-        dense[k].index_add_(1, index[k].flatten(), A[k].flatten(-2))
-    torch.testing.assert_close(dense[..., estimator.system.unknowns], exact[:, :, estimator.system.free].flatten(-2))
+    moving = estimator.free.expand(-1, 3).flatten() > 0
+    A = slopes_at_inner_vertices(lambda y: inner(estimator.contact_force(y, p), dome.grid), x, estimator)[:, moving]
+    J = slopes_at_inner_vertices(lambda y: estimator.angles(y, seen)[0], x, estimator)[:, moving]
+    W = torch.block_diag(*W[0])
+    w = torch.diag(weight[0].repeat_interleave(2))
+    unknowns = torch.nonzero(estimator.system.padded(moving.double())).ravel()
+    M = dense(matrix)[0][unknowns[:, None], unknowns]
+    torch.testing.assert_close(M, (A.T @ W @ A + J.T @ w @ J) * (1 + 1e-6 * torch.eye(len(M))))
+    f, v = at.force.flatten(), at.volume.flatten()
+    torch.testing.assert_close(load[0, unknowns], A.T @ W @ f + J.T @ w @ angle.flatten())
+    torch.testing.assert_close(push[0, unknowns], -A.T @ W @ v)
+    torch.testing.assert_close(torch.stack([fWv, vWv], -1)[0], torch.stack([f @ W @ v, v @ W @ v]))
+    loads = torch.zeros(1, len(load[0]), 1, dtype=torch.float64)
+    loads[0, unknowns, 0] = load[0, unknowns]
+    solved = estimator.system.solve(matrix, loads)[0, :, 0]
+    torch.testing.assert_close(solved[unknowns], torch.linalg.solve(M, load[0, unknowns]))
+    assert solved.count_nonzero() == len(unknowns)
 
 
 def test_marker_slopes_are_the_derivative_of_the_angles():
@@ -114,10 +133,11 @@ def test_marker_slopes_are_the_derivative_of_the_angles():
     directions = torch.nn.functional.normalize(estimator.positions + 0.3, dim=-1)[None]
     seen = Observation(0.1 * directions, _across(directions), torch.ones(1, len(directions[0]), dtype=torch.float64))
     x = bent(estimator.membrane)
-    _, slope = estimator._angles(x, seen)
-    exact = torch.autograd.functional.jacobian(lambda y: estimator._angles(y, seen)[0], x)[0, :, :, 0]
+    _, slope = estimator.angles(x, seen)
+    exact = torch.autograd.functional.jacobian(lambda y: estimator.angles(y, seen)[0], x)[0, :, :, 0]
     for d in (0, 17, 60):
-        torch.testing.assert_close(slope[0, d].unflatten(-1, (3, 3)), exact[d][:, estimator.marker_vertices[d]])
+        shares = estimator.marker_weights[d][:, None]
+        torch.testing.assert_close(shares * slope[0, d][:, None], exact[d][:, estimator.marker_vertices[d]])
 
 
 def test_angles_vanish_on_the_rays_and_grow_with_the_distance_across():
@@ -125,7 +145,7 @@ def test_angles_vanish_on_the_rays_and_grow_with_the_distance_across():
     y = estimator.positions
     directions = torch.nn.functional.normalize(y, dim=-1)[None]
     seen = Observation(torch.zeros_like(directions), _across(directions), torch.ones(1, len(y), dtype=torch.float64))
-    angle, _ = estimator._angles(estimator.membrane.rest[None], seen)
+    angle, _ = estimator.angles(estimator.membrane.rest[None], seen)
     assert angle.abs().max() < 1e-12
     identity = seen.across @ seen.across.mT
     torch.testing.assert_close(identity, torch.eye(2, dtype=torch.float64).expand_as(identity))
@@ -171,30 +191,36 @@ def test_pulls_stay_within_the_grids_own_error(pressed):
     assert q_n.max() < 0.3 * estimator.reference < 0.1 * -q_n.min()
 
 
+def at_rest(estimator):
+    """Rest positions and normals of the inner vertices."""
+    return (inner(field, estimator.membrane.grid) for field in (estimator.membrane.rest, estimator.membrane.rest_normals))
+
+
+def along_y(normal):
+    return torch.linalg.cross(normal, torch.tensor([0.0, 1.0, 0.0], dtype=normal.dtype).expand_as(normal))
+
+
 def patch_of_pushes(estimator, push, pull_elsewhere=0.0, rub=0.0):
     """Forces at rest: `push` (over the reference) on the middle of the dome, `rub` along it, `pull_elsewhere` on the rest."""
-    membrane = estimator.membrane
-    X, normal = membrane.rest, membrane.rest_normals
+    X, normal = at_rest(estimator)
     middle = X[:, :2].norm(dim=1) < 4.0
-    along = torch.linalg.cross(normal, torch.tensor([0.0, 1.0, 0.0], dtype=X.dtype).expand_as(normal))
-    traction = torch.where(middle[:, None], -push * normal + rub * along, pull_elsewhere * normal) * estimator.reference
-    return (traction * membrane.rest_area[:, None])[None], middle
+    pushed = -push * normal + rub * along_y(normal)
+    traction = torch.where(middle[:, None], pushed, pull_elsewhere * normal) * estimator.reference
+    return (traction * estimator.area[:, None])[None], middle
 
 
 def prices(estimator, force, tau=0.5):
-    """Weight of the normal and of one tangential direction at every vertex, over that of a small push."""
-    W = estimator.force_weights(estimator.membrane.rest[None], force, tau)[0]
-    normal = estimator.membrane.rest_normals
-    along = torch.nn.functional.normalize(
-        torch.linalg.cross(normal, torch.tensor([0.0, 1.0, 0.0], dtype=normal.dtype).expand_as(normal)), dim=-1
-    )
-    scale = SPARSITY / (estimator.reference * estimator.size) ** 2 / estimator.membrane.rest_area
+    """Weight of the normal and of one tangential direction at every inner vertex, over that of a small push."""
+    _, normal = at_rest(estimator)
+    W = estimator.force_weights(normal, force, tau)[0]
+    along = torch.nn.functional.normalize(along_y(normal), dim=-1)
+    scale = SPARSITY / (estimator.reference * estimator.size) ** 2 / estimator.area
     return tuple((d[:, None] @ W @ d[..., None]).ravel() / scale for d in (normal, along))
 
 
 def test_large_pushes_get_cheap_small_ones_and_pulls_do_not():
     estimator = make(17)
-    centre = estimator.membrane.rest[:, :2].norm(dim=1).argmin()
+    centre = next(at_rest(estimator))[:, :2].norm(dim=1).argmin()
     for push, tau, low, high in ((1e-3, 0.5, 0.99, 1.01), (4.0, 0.5, 0.0, 0.01), (4.0, 100.0, 0.95, 1.01)):
         force, _ = patch_of_pushes(estimator, push)
         assert low < prices(estimator, force, tau)[0][centre] < high
@@ -204,7 +230,7 @@ def test_large_pushes_get_cheap_small_ones_and_pulls_do_not():
 
 def test_rubbing_is_dear_but_where_something_pushes():
     estimator = make(17)
-    centre = estimator.membrane.rest[:, :2].norm(dim=1).argmin()
+    centre = next(at_rest(estimator))[:, :2].norm(dim=1).argmin()
     dear, _ = patch_of_pushes(estimator, 1e-6, rub=0.5)
     cheap, _ = patch_of_pushes(estimator, 4.0, rub=0.5)
     dear, cheap = (prices(estimator, force)[1][centre] for force in (dear, cheap))
@@ -214,7 +240,7 @@ def test_rubbing_is_dear_but_where_something_pushes():
 def test_a_lone_push_is_taken_for_error_its_patch_for_a_contact():
     estimator = make(25)
     force, middle = patch_of_pushes(estimator, 2.0)
-    centre = estimator.membrane.rest[:, :2].norm(dim=1).argmin()
+    centre = next(at_rest(estimator))[:, :2].norm(dim=1).argmin()
     alone = torch.zeros_like(force)
     alone[0, centre] = force[0, centre]
     assert prices(estimator, alone)[0][centre] > 1.5 * prices(estimator, force)[0][centre]
@@ -322,15 +348,16 @@ def test_price_of_normal_tractions_has_the_slope_that_the_weights_say(monkeypatc
     monkeypatch.setattr("torchmembrane.force_balance.FLOOR", 0.0)
     estimator = make()
     membrane, p0 = estimator.membrane, estimator.reference
-    estimator.surroundings = torch.eye(len(membrane.rest), dtype=torch.float64)
+    within = lambda field: inner(field, membrane.grid)  # noqa: E731
+    estimator.surroundings = torch.eye(len(estimator.area), dtype=torch.float64)
     rays = CAMERA.pixel_to_ray(CAMERA.point_to_pixel(estimator.positions))
     level = p0 * torch.linspace(-1.5, 0.5, len(membrane.rest), dtype=torch.float64)
-    traction = (level[:, None] * membrane.normals(membrane.rest))[None].requires_grad_()
+    traction = (level[:, None] * membrane.rest_normals)[None].requires_grad_()
     rest = Equilibrium(membrane.rest[None], estimator.rest_pressure[None], membrane.rest_volume[None], traction, None)
     price = estimator.price(rest, *(a[None] for a in rays), torch.ones(1, len(estimator.positions), dtype=torch.float64))
     (slope,) = torch.autograd.grad(price.sum(), traction)
-    force = traction.detach() * membrane.rest_area[:, None]
-    W = estimator.force_weights(membrane.rest[None], force, 0.4)
-    expected = membrane.rest_area[:, None] * (W @ force[..., None]).squeeze(-1)
-    along = lambda field: (field * membrane.normals(membrane.rest)).sum(-1)  # noqa: E731
-    assert torch.allclose(along(slope), along(expected), rtol=1e-6, atol=1e-9)
+    force, normal = within(traction.detach() * membrane.rest_area[:, None]), within(membrane.rest_normals)
+    W = estimator.force_weights(normal, force, 0.4)
+    expected = estimator.area[:, None] * (W @ force[..., None]).squeeze(-1)
+    along = lambda field: (field * normal).sum(-1)  # noqa: E731
+    assert torch.allclose(along(within(slope)), along(expected), rtol=1e-6, atol=1e-9)

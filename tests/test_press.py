@@ -13,6 +13,7 @@ from torchmembrane.simulate import equilibrium as equilibrium_module
 from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
 from torchmembrane.simulate.indenters import Plane, Sphere, facing
 from torchmembrane.simulate.press import carried, press, presses
+from torchmembrane.stencil import RING, inner
 
 PRESTRETCH = 1.3
 GRIDS = (9, 17, 33)
@@ -84,6 +85,17 @@ def test_flat_square_bulges_like_the_fourier_series():
         middle = float(x[n * n // 2, 2]) - 10
         errors.append(middle * float(sheet.tension) / (pressure * series) - 1)
     errors_fall_quadratically(errors, 0.002)
+
+
+def test_volume_ring_is_the_gradient_and_its_autograd(dome):
+    m, n = dome.grid
+    gradient, blocks = dome.volume_ring(dome.rest)
+    torch.testing.assert_close(gradient, inner(dome.volume_gradient(dome.rest), dome.grid))
+    slope = torch.autograd.functional.jacobian(dome.volume_gradient, dome.rest).transpose(1, 2)
+    i, j = 3, 4
+    for (di, dj), block in zip(RING, blocks[(i - 1) * (n - 2) + j - 1], strict=True):
+        torch.testing.assert_close(block, slope[i * n + j, (i + di) * n + j + dj])
+    assert slope[i * n + j, i * n + j].abs().max() < 1e-12
 
 
 def test_volume_hessian_blocks_are_autograd_of_the_volume(dome):

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from .stencil import bordered
+
 if TYPE_CHECKING:
     from .force_balance import ForceBalance, Observation
 
@@ -33,26 +35,24 @@ def standard_deviations(
     """Arguments: the solution's `x [B, V, 3]`, `pressure [B]`; what it was found from; `noise [B, D, 2, 3]`: how one standard
     deviation of a marker's noise in each of two independent directions turns its ray, radians."""
     system, membrane = estimator.system, estimator.membrane
-    force, A = estimator.contact_force(x, pressure), estimator.force_jacobian(x, pressure)
-    v = membrane.volume_gradient(x) * estimator.moves
-    W = estimator.force_weights(x, force, tau, curvature=True)
-    angle, J = estimator._angles(x, seen)
-    wJ = estimator._marker_weights(angle, seen, outlier)[..., None, None] * J
-    WA = W @ A
-    matrix = system.matrix([(estimator.vertex_patches, A.mT @ WA), (estimator.marker_patches, J.mT @ wJ)])
-    g = system.columns(estimator.marker_patches, noise @ seen.across.mT @ wJ)
-    m = -system.vector([(estimator.vertex_patches, (WA.mT @ v[..., None]).squeeze(-1))])
-    n = system.from_vertices(v)
+    at = estimator.linearised(x, pressure)
+    W = estimator.force_weights(at.normal, at.force, tau, curvature=True)
+    angle, slope = estimator.angles(x, seen)
+    weight = estimator.marker_weights_at(angle, seen, outlier)
+    matrix, _, m, (_, c) = estimator.normal_equations(at, W, slope, weight, angle)
+    loads = noise @ seen.across.mT @ (weight[..., None, None] * slope)
+    g = torch.einsum("bdrc,dn->bncdr", loads, estimator.vertex_shares).flatten(3).flatten(1, 2)
+    g = system.padded(g.mT).mT
+    n = system.padded(at.volume.flatten(1))
     y = system.solve(matrix, torch.cat([g, torch.stack([m, n], -1)], -1))
     dx, dp = y[..., :-2], torch.zeros_like(g[:, 0])
     if estimator.cavity.filling != "open":
         border, borders = y[..., -2:], torch.stack([m, n], 1)
         _, compliance = estimator.cavity.condition(membrane.volume(x) - membrane.rest_volume, pressure)
-        c = (v[..., None, :] @ W @ v[..., None]).sum((1, 2, 3))
         corner = torch.diag_embed(torch.stack([c, compliance], -1)) - borders @ border
         rise = torch.linalg.solve(corner, -borders @ dx)
         dx, dp = dx - border @ rise, rise[:, 0]
-    total = torch.stack([system.vector([(estimator.vertex_patches, row)]) for row in A.unbind(-2)], 1)
-    dF = total @ dx - v.sum(1)[..., None] * dp[:, None]
+    total = system.vector(at.slope.movedim(-2, 1))
+    dF = total @ dx - at.volume.sum(1)[..., None] * dp[:, None]
     spread = lambda change: change.square().sum(-1).sqrt()  # noqa: E731
-    return StandardDeviations(system.to_vertices(spread(dx)), spread(dF), spread(dp))
+    return StandardDeviations(bordered(system.field(spread(dx)), membrane.grid), spread(dF), spread(dp))

@@ -7,16 +7,19 @@ that is already stretched) unless these are given; the prestretch `l` is that of
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from .errors import MembraneError
 from .membrane import Membrane, corners, corners_to_vertices, triangles_of, triangles_to_corners
+from .stencil import pairs_to_ring
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 _FIRST = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 _SECOND = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 _EDGES = ((-1.0, 1.0, 0.0), (-1.0, 0.0, 1.0))
+_BEND = (0.0, 0.0, 1.0, 0.0, -2.0, 0.0, 1.0, 0.0, 0.0)  # second derivatives of g11 g22 - g12^2 in g11, g12, g22
 
 
 class Derivatives(NamedTuple):
@@ -28,6 +31,15 @@ class Derivatives(NamedTuple):
     DD: Tensor
     convex_D: Tensor
     """The part of `D` that comes from terms convex in the metric; the rest is left out of the stiffness (Gauss-Newton)."""
+
+
+class Strain(NamedTuple):
+    """Two edges of every triangle `[..., m-1, n-1, 2, 2, 3]`, the adjugate of their metric `[..., 3]` (11, 12, 22), `W`'s
+    derivatives there."""
+
+    edges: Tensor
+    adjugate: Tensor
+    derivatives: Derivatives
 
 
 class Sheet(nn.Module):
@@ -94,17 +106,24 @@ class Sheet(nn.Module):
         _, I, _, D = self._invariants(x)  # noqa: E741
         return (self.rest_triangle_area * self.density(I, D)).sum((-1, -2, -3))
 
+    def strain(self, x: Tensor) -> "Strain":
+        """What the derivatives of the energy at `x [..., V, 3]` are made of."""
+        edges, I, adj, D = self._invariants(x)  # noqa: E741
+        return Strain(edges, adj, self.derivatives(I, D))
+
     def gradient(self, x: Tensor) -> Tensor:
         """`dU/dx`, `[..., V, 3]`: the sheet's forces with opposite sign."""
-        edges, I, adj, D = self._invariants(x)  # noqa: E741
-        w = self.derivatives(I, D)
-        forces = torch.einsum("...ab,...bc->...ac", _symmetric(self._stress(w, adj)), edges)
+        return self.forces(self.strain(x))
+
+    def forces(self, strain: "Strain") -> Tensor:
+        """As `gradient`."""
+        forces = torch.einsum("...ab,...bc->...ac", _symmetric(self._stress(strain)), strain.edges)
         return _from_edges(forces, self.grid)
 
-    def _stress(self, w: Derivatives, adj: Tensor) -> Tensor:
+    def _stress(self, strain: "Strain") -> Tensor:
         """Stress times area in edge components `[..., 3]` (11, 12, 22): force on edge a is `sum_b S_ab e_b`."""
-        scale = 2 * self.rest_triangle_area[..., None]
-        return scale * (w.I[..., None] * self.inverse_metric + (w.D / self.rest_det)[..., None] * adj)
+        scale, w = 2 * self.rest_triangle_area[..., None], strain.derivatives
+        return scale * (w.I[..., None] * self.inverse_metric + (w.D / self.rest_det)[..., None] * strain.adjugate)
 
     def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
         """Positive semi-definite stiffness of displacements along one direction a vertex.
@@ -113,17 +132,17 @@ class Sheet(nn.Module):
         over quadrilaterals is `K_kl = d_k . H_kl d_l` with `H` the Hessian of `U`: exact where the sheet is in tension (for
         Mooney-Rivlin without the term of `D` that is not convex), and for the harmonic energy `L_kl d_k . d_l` (eq. 64).
         """
-        edges, I, adj, D = self._invariants(x)  # noqa: E741
-        w = self.derivatives(I, D)
+        strain = self.strain(x)
         d = triangles_of(corners(directions, self.grid))
         edge_map = torch.tensor(_EDGES, dtype=x.dtype, device=x.device)
-        S = _symmetric(_tension(self._stress(w, adj)))
+        S = _symmetric(_tension(self._stress(strain)))
         K = torch.einsum("...ab,ak,bl->...kl", S, edge_map, edge_map) * (d @ d.mT)
         if self.model != "harmonic":
-            K = K + self._metric_stiffness(w, edges, adj, d, edge_map)
+            K = K + self._metric_stiffness(strain, d, edge_map)
         return self._quadrilaterals(K)
 
-    def _metric_stiffness(self, w, edges, adj, d, edge_map):
+    def _metric_stiffness(self, strain, d, edge_map):
+        edges, adj, w = strain
         projected = torch.einsum("...ac,...kc->...ak", edges, d)
         d11 = 2 * projected[..., 0, :] * edge_map[0]
         d22 = 2 * projected[..., 1, :] * edge_map[1]
@@ -144,24 +163,35 @@ class Sheet(nn.Module):
         Arguments: `x [..., V, 3]`. Exact; with `positive` the convex part: compression and (Mooney-Rivlin) the term of `D`
         that is not convex are left out, so that every block is positive semi-definite. Vertices as in `TRIANGLE_CORNERS`.
         """
-        edges, I, adj, D = self._invariants(x)  # noqa: E741
-        w = self.derivatives(I, D)
-        e1, e2 = edges.unbind(-2)
-        none = torch.zeros_like(e1)
-        d11, d12, d22 = torch.cat([2 * e1, none], -1), torch.cat([e2, e1], -1), torch.cat([none, 2 * e2], -1)
-        along = lambda G: G[..., 0:1] * d11 + 2 * G[..., 1:2] * d12 + G[..., 2:3] * d22  # noqa: E731
-        outer = lambda p, q: p[..., :, None] * q[..., None, :]  # noqa: E731
-        dI, dD = along(self.inverse_metric), along(adj) / self.rest_det[..., None]
-        scaled = lambda factor: (self.rest_triangle_area * factor)[..., None]  # noqa: E731
-        bend = (w.convex_D if positive else w.D) / self.rest_det
-        H = outer(dD, scaled(w.DD) * dD + scaled(w.ID) * dI) + outer(dI, scaled(w.ID) * dD)
-        H = H + outer(d11, scaled(bend) * d22) + outer(d22, scaled(bend) * d11) - 2 * outer(d12, scaled(bend) * d12)
-        stress = self._stress(w, adj)
-        S = _symmetric(_tension(stress) if positive else stress)
-        H = H.unflatten(-1, (2, 3)).unflatten(-3, (2, 3))
-        H = H + S[..., :, None, :, None] * torch.eye(3, dtype=x.dtype, device=x.device)[:, None, :]
-        rows = torch.cat([-H.sum(-4, keepdim=True), H], -4)
-        return torch.cat([-rows.sum(-2, keepdim=True), rows], -2).flatten(-2).flatten(-3, -2)
+        ab, ac, bc = self._pair_blocks(self.strain(x), positive).unbind(-3)
+        rows = [[-(ab + ac), ab, ac], [ab.mT, -(ab.mT + bc), bc], [ac.mT, bc.mT, -(ac.mT + bc.mT)]]
+        return torch.cat([torch.cat(row, -1) for row in rows], -2)
+
+    def hessian_ring(self, strain: "Strain") -> Tensor:
+        """Second derivatives of the energy in the inner vertices and their six neighbours, `[..., N, 6, 3, 3]`.
+
+        Those in one vertex alone are minus the sum of the six: a shift of all vertices changes no force.
+        """
+        return pairs_to_ring(self._pair_blocks(strain))
+
+    def _pair_blocks(self, strain: "Strain", positive=False) -> Tensor:
+        """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2), `[..., m-1, n-1, 2, 3, 3, 3]`.
+
+        Those in its edges `a`, `b` from vertex 0 are `sum_cd T_cd e_c e_d^T + S_ab 1`, with `S` the stress and `T` from the
+        second derivatives `Q` in the metric.
+        """
+        w, adj, stress = strain.derivatives, strain.adjugate, self._stress(strain)
+        p, q = (g * g.new_tensor([1.0, 2.0, 1.0]) for g in (self.inverse_metric, adj / self.rest_det[..., None]))
+        crossed = (self.rest_triangle_area * w.ID)[..., None]
+        bend = self.rest_triangle_area * (w.convex_D if positive else w.D) / self.rest_det
+        outer = lambda a, b: (a[..., :, None] * b[..., None, :]).flatten(-2)  # noqa: E731
+        Q = outer(q, (self.rest_triangle_area * w.DD)[..., None] * q + crossed * p) + outer(p, crossed * q)
+        Q = Q + bend[..., None] * bend.new_tensor(_BEND)
+        T, S = Q @ Q.new_tensor(_METRIC_TO_PAIRS), (_tension(stress) if positive else stress) @ Q.new_tensor(_STRESS_TO_PAIRS)
+        e = strain.edges
+        products = (e[..., :, None, :, None] * e[..., None, :, None, :]).flatten(-2).flatten(-3, -2)
+        one = torch.eye(3, dtype=e.dtype, device=e.device).flatten()
+        return (T.unflatten(-1, (3, 4)) @ products + S[..., None] * one).unflatten(-1, (3, 3))
 
     @staticmethod
     def _quadrilaterals(K: Tensor) -> Tensor:
@@ -177,8 +207,21 @@ class Sheet(nn.Module):
 
 
 def _edges(x: Tensor, grid) -> Tensor:
-    p = triangles_of(corners(x, grid))
-    return p[..., 1:, :] - p[..., :1, :]
+    a, b, c, d = corners(x, grid).unbind(-2)
+    return torch.stack([b - a, c - a, c - a, d - a], -2).unflatten(-2, (2, 2))
+
+
+def _metric_to_pairs() -> list[list[float]]:
+    """`[9, 12]`: from second derivatives `Q [3, 3]` in g11, g12, g22 to `T_cd` for the vertices (0, 1), (0, 2), (1, 2)."""
+    slopes = np.zeros((2, 3, 2))  # d g / d e_a = sum_c slopes[a, g, c] e_c
+    slopes[0, 0, 0] = slopes[1, 2, 1] = 2.0
+    slopes[0, 1, 1] = slopes[1, 1, 0] = 1.0
+    edges = np.einsum("agc,bhd->abghcd", slopes, slopes)
+    return np.stack([-edges.sum(0)[0], -edges.sum(0)[1], edges[0, 1]], 2).reshape(9, 12).tolist()
+
+
+_METRIC_TO_PAIRS = _metric_to_pairs()
+_STRESS_TO_PAIRS = ((-1.0, 0.0, 0.0), (-1.0, -1.0, 1.0), (0.0, -1.0, 0.0))
 
 
 def _from_edges(forces: Tensor, grid) -> Tensor:

@@ -25,8 +25,9 @@ from torch import Tensor, nn
 from .cavity import CavityLaw, Equilibrium, rest_balance
 from .deviations import StandardDeviations, standard_deviations
 from .energy import Sheet
-from .membrane import Membrane, SurfacePoints, corners, triangles_of
-from .solve.patches import PatchIndex, PatchSystem
+from .membrane import Membrane, SurfacePoints
+from .solve.stencil_system import COLUMNS, NEAR, StencilSystem
+from .stencil import bordered, inner, ring
 
 STEPS, TAU = 12, (10.0, 0.4)  # from rest
 FINE_STEPS, FINE_TAU = 10, (2.0, 0.4)  # from the coarser grid's solution
@@ -39,7 +40,6 @@ FLOOR = 1e-3  # of a push's weight; without it a vertex under a contact has no p
 OUTLIER = 5.0  # R
 LONGEST_STEP = 0.026  # over the surface's size
 COARSEST = 13  # fewest lines of a coarser grid
-NEIGHBOURS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1))
 LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR = 2e-3, 1e-3  # rms of the last step over the size, and volume error, when settled
 
 
@@ -56,6 +56,16 @@ class Observation(NamedTuple):
     origins: Tensor
     across: Tensor
     weight: Tensor
+
+
+class Linearised(NamedTuple):
+    """At the inner vertices: the contact `force [B, N, 3]`, its `slope [B, N, 3, 21]` in its vertices, the gradient of
+    the `volume [B, N, 3]`, the outward `normal [B, N, 3]`. All but the normal zero at, and in, vertices that do not move."""
+
+    force: Tensor
+    slope: Tensor
+    volume: Tensor
+    normal: Tensor
 
 
 class ForceBalance(nn.Module):
@@ -88,13 +98,15 @@ class ForceBalance(nn.Module):
         self.register_buffer("positions", torch.as_tensor(positions, dtype=torch.float64))
         self.register_buffer("marker_vertices", torch.as_tensor(markers.vertices).long())
         self.register_buffer("marker_weights", torch.as_tensor(markers.weights, dtype=torch.float64))
-        self.register_buffer("surroundings", _surroundings(membrane))
-        stencil, scatter, inside = _stencil(membrane)
-        self.register_buffer("scatter", scatter)
-        self.register_buffer("inside", inside)
-        self.system = PatchSystem(membrane.grid, membrane.fixed)
-        self.vertex_patches = PatchIndex(self.system, stencil)
-        self.marker_patches = PatchIndex(self.system, self.marker_vertices)
+        within = lambda field: inner(field, membrane.grid)  # noqa: E731
+        self.register_buffer("area", within(membrane.rest_area[:, None]).squeeze(-1))
+        self.register_buffer("free", within(self.moves))
+        self.register_buffer("free_neighbours", ring(self.moves, membrane.grid)[..., None])
+        self.register_buffer("surroundings", within(within(_surroundings(membrane)).mT).mT)
+        vertex_shares, pair_shares = _shares(membrane, self.marker_vertices, self.marker_weights)
+        self.register_buffer("vertex_shares", vertex_shares)
+        self.register_buffer("pair_shares", pair_shares)
+        self.system = StencilSystem(membrane.grid, self.free[:, 0] > 0, COLUMNS + 2)
         self.coarse = self._coarser(filling, gas, steps)
 
     def _coarser(self, filling, gas, steps) -> "ForceBalance | None":
@@ -176,55 +188,69 @@ class ForceBalance(nn.Module):
         push = pressure[:, None, None] * self.membrane.volume_gradient(x)
         return (self.sheet.gradient(x) - self.rest_load - push) * self.moves
 
+    def linearised(self, x: Tensor, pressure: Tensor) -> "Linearised":
+        """`contact_force` and what it and the volume do when vertices move, at the inner vertices."""
+        grid, strain = self.membrane.grid, self.sheet.strain(x)
+        gradient, volume_ring = self.membrane.volume_ring(x)
+        sheet_ring = self.sheet.hessian_ring(strain)
+        force = inner(self.sheet.forces(strain) - self.rest_load, grid) - pressure[:, None, None] * gradient
+        around = self.free_neighbours * (sheet_ring - pressure[:, None, None, None, None] * volume_ring)
+        blocks = torch.cat([-sheet_ring.sum(-3, keepdim=True), around], -3) * self.free[..., None, None]
+        slope = blocks.transpose(-3, -2).flatten(-2)
+        return Linearised(force * self.free, slope, gradient * self.free, F.normalize(gradient, dim=-1))
+
     def markers(self, x: Tensor) -> Tensor:
         """The markers' positions on the surface `x`, `[B, D, 3]`."""
-        moved = (x - self.membrane.rest)[:, self.marker_vertices.flatten()].unflatten(1, (-1, 3))
+        moved = (x - self.membrane.rest).index_select(1, self.marker_vertices.flatten()).unflatten(1, (-1, 3))
         return self.positions + (self.marker_weights[..., None] * moved).sum(-2)
 
-    def _angles(self, x: Tensor, seen: Observation) -> tuple[Tensor, Tensor]:
-        """Angles across the measured rays `[B, D, 2]` and their derivatives in the markers' three vertices `[B, D, 2, 9]`."""
+    def angles(self, x: Tensor, seen: Observation) -> tuple[Tensor, Tensor]:
+        """Angles across the measured rays `[B, D, 2]` and their derivatives in the markers' positions `[B, D, 2, 3]`."""
         to_marker = self.markers(x) - seen.origins
         distance = torch.linalg.vector_norm(to_marker, dim=-1)[..., None]
         along = to_marker / distance
         angle = (seen.across @ along[..., None]).squeeze(-1)
-        slope = (seen.across - angle[..., None] * along[..., None, :]) / distance[..., None]
-        return angle, (slope[..., None, :] * self.marker_weights[:, None, :, None]).flatten(-2)
-
-    def force_jacobian(self, x: Tensor, pressure: Tensor) -> Tensor:
-        """Derivative of `contact_force` in the seven neighbours of every vertex, `[B, V, 3, 21]`; zero for fixed neighbours."""
-        blocks = self.sheet.hessian_blocks(x) - pressure.reshape(-1, *(1,) * 5) * self.membrane.volume_hessian_blocks(x)
-        pairs = blocks.unflatten(-1, (3, 3)).unflatten(-3, (3, 3)).transpose(-3, -2).flatten(1, 5)
-        rows = pairs.new_zeros(x.shape[0], self.inside.numel(), 3, 3).index_add(1, self.scatter, pairs)
-        rows = rows.unflatten(1, self.inside.shape) * (self.inside * self.moves)[..., None, None]
-        return rows.transpose(2, 3).flatten(-2)
+        return angle, (seen.across - angle[..., None] * along[..., None, :]) / distance[..., None]
 
     def step(self, x: Tensor, pressure: Tensor, seen: Observation, tau, outlier) -> tuple[Tensor, Tensor]:
         """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped."""
-        force, A = self.contact_force(x, pressure), self.force_jacobian(x, pressure)
-        v = self.membrane.volume_gradient(x) * self.moves
-        W = self.force_weights(x, force, tau)
-        angle, J = self._angles(x, seen)
-        marker_weight = self._marker_weights(angle, seen, outlier)
-        AW, Jw = A.mT @ W, J.mT * marker_weight[..., None, None]
-        matrix = self.system.matrix([(self.vertex_patches, AW @ A), (self.marker_patches, Jw @ J)])
-        of_forces, of_fluid = (AW @ torch.stack([force, v], -1)).unbind(-1)
-        of_markers = (Jw @ angle[..., None]).squeeze(-1)
-        g = self.system.vector([(self.vertex_patches, of_forces), (self.marker_patches, of_markers)])
-        m, n = -self.system.vector([(self.vertex_patches, of_fluid)]), self.system.from_vertices(v)
+        at = self.linearised(x, pressure)
+        W = self.force_weights(at.normal, at.force, tau)
+        angle, slope = self.angles(x, seen)
+        matrix, g, m, of_fluid = self.normal_equations(at, W, slope, self.marker_weights_at(angle, seen, outlier), angle)
+        n = self.system.padded(at.volume.flatten(1))
         y = self.system.solve(matrix, torch.stack([g, m, n], -1))
-        move, rise = self._bordered(x, pressure, y, m, n, v, W, force)
-        move = self.system.to_vertices(move)
+        move, rise = self._bordered(x, pressure, y, m, n, *of_fluid)
+        move = self.system.field(move)
         longest = torch.linalg.vector_norm(move, dim=-1).amax(-1)
         share = (LONGEST_STEP * self.size / longest.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1.0)
-        return x + share[:, None, None] * move, pressure + share * rise
+        return x + bordered(share[:, None, None] * move, self.membrane.grid), pressure + share * rise
 
-    def force_weights(self, x: Tensor, force: Tensor, tau: float, curvature=False) -> Tensor:
-        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, V, 3, 3]`: the parabolas that price a force.
+    def normal_equations(self, at: "Linearised", W: Tensor, slope: Tensor, weight: Tensor, angle: Tensor):
+        """The Gauss-Newton matrix and loads of forces weighted by `W [B, N, 3, 3]` and angles by `weight [B, D]`.
 
-        With `curvature` that of the price of a push itself, zero where it bends down.
+        Returns `A^T W A + J^T w J` as the blocks that `system.solve` takes; `A^T W f + J^T w r` and `-A^T W v`,
+        `[B, unknowns]`; `f^T W v` and `v^T W v`, `[B]`.
         """
-        area, normal, p0 = self.membrane.rest_area, self.membrane.normals(x), self.reference
-        traction = force / area[:, None]
+        A = torch.cat([at.slope, at.force[..., None], at.volume[..., None]], -1)
+        products = A.mT @ (W @ A)
+        J = torch.cat([slope, angle[..., None]], -1)
+        of_markers = J.mT @ (weight[..., None, None] * J)
+        near = (of_markers[..., :3, :3].flatten(-2).mT @ self.pair_shares).unflatten(-1, (len(NEAR), -1)).transpose(1, 2)
+        load, push = self.system.vector(products[..., :COLUMNS, COLUMNS:].movedim(-1, 1)).unbind(1)
+        pull = (of_markers[..., :3, 3].mT @ self.vertex_shares).mT.flatten(1)
+        matrix = self.system.matrix(products, near)
+        of_fluid = products[..., COLUMNS:, COLUMNS + 1].sum(1).unbind(-1)
+        return matrix, load + self.system.padded(pull), -push, of_fluid
+
+    def force_weights(self, normal: Tensor, force: Tensor, tau: float, curvature=False) -> Tensor:
+        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, N, 3, 3]`: the parabolas that price a force.
+
+        Arguments: `normal`, `force [B, N, 3]` of the inner vertices. With `curvature` that of the price of a push itself, zero
+        where it bends down.
+        """
+        p0 = self.reference
+        traction = force / self.area[:, None]
         q_n = (traction * normal).sum(-1)
         q_t = traction - q_n[..., None] * normal
         push2 = (-q_n / p0).clamp_min(0) ** 2 @ self.surroundings
@@ -233,36 +259,36 @@ class ForceBalance(nn.Module):
         w_n = FLOOR + torch.where(q_n < 0, pushed, 1.0)
         dearer = FRICTION / (1 + CONE * (push2 + SLIP**4).sqrt())
         w_t = dearer * (q_t.square().sum(-1) / p0**2 + SLIP**2).rsqrt()
-        one = torch.eye(3, dtype=x.dtype, device=x.device)
-        W = (w_n - w_t)[..., None, None] * normal[..., :, None] * normal[..., None, :] + w_t[..., None, None] * one
-        return SPARSITY / (p0 * self.size) ** 2 * W / area[:, None, None]
+        scale = SPARSITY / (p0 * self.size) ** 2 / self.area
+        one = torch.eye(3, dtype=force.dtype, device=force.device)
+        along = (scale * (w_n - w_t))[..., None] * normal
+        return along[..., :, None] * normal[..., None, :] + (scale * w_t)[..., None, None] * one
 
     def price(self, found: Equilibrium, origins: Tensor, directions: Tensor, weight: Tensor) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers (given as to `forward`) and the tractions' price."""
         seen = Observation(origins, _across(directions), weight / self.noise**2)
-        x, area, tau = found.vertices, self.membrane.rest_area, TAU[-1]
-        traction, normal = found.traction / self.reference, self.membrane.normals(x)
+        x, area, tau, grid = found.vertices, self.area, TAU[-1], self.membrane.grid
+        traction, normal = inner(found.traction, grid) / self.reference, inner(self.membrane.normals(x), grid)
         q_n = (traction * normal).sum(-1)
         slip2 = (traction - q_n[..., None] * normal).square().sum(-1)
         push2 = (-q_n).clamp_min(0) ** 2
         kappa = FRICTION / (1 + CONE * (push2 @ self.surroundings + SLIP**4).sqrt())
         price = push2 / (2 + 2 * push2 / tau**2) + q_n.clamp_min(0) ** 2 / 2 + kappa * ((slip2 + SLIP**2).sqrt() - SLIP)
-        misfit = seen.weight * self._angles(x, seen)[0].square().sum(-1)
+        misfit = seen.weight * self.angles(x, seen)[0].square().sum(-1)
         return OUTLIER**2 / 2 * (misfit / OUTLIER**2).log1p().sum(-1) + SPARSITY / self.size**2 * price @ area
 
-    def _marker_weights(self, angle: Tensor, seen: Observation, outlier: float) -> Tensor:
+    def marker_weights_at(self, angle: Tensor, seen: Observation, outlier: float) -> Tensor:
         return seen.weight / (1 + seen.weight * angle.square().sum(-1) / outlier**2)
 
-    def _bordered(self, x, pressure, y, m, n, v, W, force):
+    def _bordered(self, x, pressure, y, m, n, fWv, vWv):
         """Step `d` and rise of the pressure: `M d + m dp + n lambda = -g` with the rows of the pressure and of the volume."""
-        dot = lambda a, b: (a * b).sum((-1, -2)) if a.ndim == 3 else (a * b).sum(-1)  # noqa: E731
+        dot = lambda a, b: (a * b).sum(-1)  # noqa: E731
         Mg, Mm, Mn = y.unbind(-1)
-        Wv = (W @ v[..., None]).squeeze(-1)
         if self.cavity.filling == "open":
             return -Mg, torch.zeros_like(pressure)
         target, compliance = self.cavity.condition(self.membrane.volume(x) - self.membrane.rest_volume, pressure)
-        a11, a12, a22 = dot(v, Wv) - dot(m, Mm), compliance - dot(m, Mn), -dot(n, Mn)
-        b1, b2 = dot(force, Wv) + dot(m, Mg), target + dot(n, Mg)
+        a11, a12, a22 = vWv - dot(m, Mm), compliance - dot(m, Mn), -dot(n, Mn)
+        b1, b2 = fWv + dot(m, Mg), target + dot(n, Mg)
         det = a11 * a22 - a12**2
         rise, multiplier = (b1 * a22 - a12 * b2) / det, (a11 * b2 - a12 * b1) / det
         return -Mg - rise[:, None] * Mm - multiplier[:, None] * Mn, rise
@@ -283,16 +309,11 @@ def _surroundings(membrane: Membrane) -> Tensor:
     return weight / weight.sum(0)
 
 
-def _stencil(membrane: Membrane) -> tuple[Tensor, Tensor, Tensor]:
-    """Neighbours `[V, 7]` of every vertex, where each triangle's pairs of vertices go in them, and which are free `[V, 7]`."""
+def _shares(membrane: Membrane, vertices: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Every marker's share in what is summed at the inner vertices, `[D, N]`, and at them with those at `NEAR`, `[D, 4 N]`."""
     m, n = membrane.grid
-    vertex = torch.arange(m * n)
-    offset = torch.tensor(NEIGHBOURS)
-    i, j = vertex[:, None] // n + offset[:, 0], vertex[:, None] % n + offset[:, 1]
-    exists = (i >= 0) & (i < m) & (j >= 0) & (j < n)
-    neighbour = torch.where(exists, i * n + j, vertex[:, None])
-    triangle = triangles_of(corners(vertex[:, None], (m, n))).reshape(-1, 3)
-    same = neighbour[triangle][:, :, None, :] == triangle[:, None, :, None]
-    slot = (same & exists[triangle][:, :, None, :]).long().argmax(-1)
-    free = exists & ~membrane.fixed[neighbour]
-    return neighbour, (triangle[:, :, None] * len(NEIGHBOURS) + slot).flatten(), free.double()
+    share = torch.zeros(len(vertices), m * n, dtype=torch.float64).scatter_(1, vertices, weights) * ~membrane.fixed
+    share = share.unflatten(1, (m, n))
+    here = share[:, 1:-1, 1:-1]
+    near = [(here * share[:, 1 + i : m - 1 + i, 1 + j : n - 1 + j]).flatten(1) for i, j in NEAR]
+    return here.flatten(1), torch.cat(near, 1)

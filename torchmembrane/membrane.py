@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from .errors import MembraneError
+from .stencil import ring
 
 FINE = 40  # samples a line interval, for arc lengths
 TRIANGLE_CORNERS = ((0, 1, 2), (0, 2, 3))
@@ -80,6 +81,7 @@ class Membrane(nn.Module):
             triangles = triangles[:, [0, 2, 1]]
         self.register_buffer("rest", rest)
         self.register_buffer("volume_third_derivatives", self.outward / 6 * _determinant_derivatives())
+        self.register_buffer("volume_cross_products", self.outward / 6 * _cross_products())
         self.register_buffer("triangles", triangles)
         self.register_buffer("fixed", torch.from_numpy(fixed.ravel().copy()))
         self.register_buffer("free", torch.nonzero(~self.fixed).ravel())
@@ -125,6 +127,14 @@ class Membrane(nn.Module):
     def volume_hessian_blocks(self, x: Tensor) -> Tensor:
         """Second derivatives of every triangle's share of the volume, `[..., V, 3]` to `[..., m-1, n-1, 2, 9, 9]`."""
         return (triangles_of(corners(x, self.grid)).flatten(-2) @ self.volume_third_derivatives).unflatten(-1, (9, 9))
+
+    def volume_ring(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Derivative of `volume` in the inner vertices, `[..., N, 3]`, and the second ones in them and their six neighbours,
+        `[..., N, 6, 3, 3]`; those in one vertex alone are zero."""
+        around = ring(x, self.grid)
+        before, after = around.roll(1, -2), around.roll(-1, -2)
+        gradient = torch.linalg.cross(around, after).sum(-2)
+        return self.outward / 6 * gradient, ((before - after) @ self.volume_cross_products).unflatten(-1, (3, 3))
 
     @property
     def cavity_volume(self) -> float:
@@ -235,10 +245,20 @@ def _orientation(X, triangles, fixed):
     return outward
 
 
+def _levi_civita() -> Tensor:
+    e = torch.zeros(3, 3, 3, dtype=torch.float64)
+    e[[0, 1, 2], [1, 2, 0], [2, 0, 1]], e[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = 1.0, -1.0
+    return e
+
+
+def _cross_products() -> Tensor:
+    """From `u [3]` to the entries `[9]` of the matrix of `u x`."""
+    return _levi_civita().permute(1, 0, 2).reshape(3, 9)
+
+
 def _determinant_derivatives() -> Tensor:
     """Third derivatives `[9, 81]` of `det [a, b, c]` in its nine entries."""
-    levi_civita = torch.zeros(3, 3, 3, dtype=torch.float64)
-    levi_civita[[0, 1, 2], [1, 2, 0], [2, 0, 1]], levi_civita[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = 1.0, -1.0
+    levi_civita = _levi_civita()
     return torch.einsum("uvw,ijk->uivjwk", levi_civita, levi_civita).reshape(9, 81)
 
 

@@ -1,40 +1,27 @@
 """Symmetric positive definite block-tridiagonal systems, batched: Cholesky by blocks."""
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 
-class BlockFactor(NamedTuple):
-    """`L_i` and `L_i^-1 U_i` of `M = [D_0 U_0; U_0^T D_1 U_1; ...]`, each a list of `[..., s, s]`."""
+def solve(diagonal: Tensor, upper: Tensor, b: Tensor) -> Tensor:
+    """Solution `[..., n, s, C]` of `[D_0 U_0; U_0^T D_1 U_1; ...] x = b`.
 
-    lower: list[Tensor]
-    upper: list[Tensor]
-
-
-def factor(diagonal: Tensor, upper: Tensor) -> BlockFactor:
-    """Cholesky factor of the matrix with diagonal blocks `[..., n, s, s]` and blocks above them `[..., n-1, s, s]`."""
-    lower, coupled = [], []
-    pivot = diagonal[..., 0, :, :]
-    for i in range(diagonal.shape[-3]):
+    Arguments: the blocks `[..., n, s, s]` on the diagonal, those above it `[..., n-1, s, s]`, and `b [..., n, s, C]`.
+    """
+    s, last = diagonal.shape[-1], diagonal.shape[-3] - 1
+    lower, reduced = [], []
+    pivot, rhs = diagonal[..., 0, :, :], b[..., 0, :, :]
+    for i in range(last + 1):
         L, _ = torch.linalg.cholesky_ex(pivot)
+        right = torch.cat([upper[..., i, :, :], rhs], -1) if i < last else rhs
+        Y = torch.linalg.solve_triangular(L, right, upper=False)
         lower.append(L)
-        if i + 1 < diagonal.shape[-3]:
-            Y = torch.linalg.solve_triangular(L, upper[..., i, :, :], upper=False)
-            coupled.append(Y)
-            pivot = diagonal[..., i + 1, :, :] - Y.mT @ Y
-    return BlockFactor(lower, coupled)
-
-
-def solve(factored: BlockFactor, b: Tensor) -> Tensor:
-    """`M^-1 b` for `b [..., n, s, C]`."""
-    forward = []
-    for i, L in enumerate(factored.lower):
-        rhs = b[..., i, :, :] - (factored.upper[i - 1].mT @ forward[-1] if i else 0.0)
-        forward.append(torch.linalg.solve_triangular(L, rhs, upper=False))
-    x = []
-    for i in reversed(range(len(factored.lower))):
-        rhs = forward[i] - (factored.upper[i] @ x[-1] if x else 0.0)
-        x.append(torch.linalg.solve_triangular(factored.lower[i].mT, rhs, upper=True))
+        reduced.append(Y)
+        if i < last:
+            product = Y[..., :s].mT @ Y
+            pivot, rhs = diagonal[..., i + 1, :, :] - product[..., :s], b[..., i + 1, :, :] - product[..., s:]
+    x = [torch.linalg.solve_triangular(lower[-1].mT, reduced[-1], upper=True)]
+    for L, Y in zip(lower[-2::-1], reduced[-2::-1], strict=True):
+        x.append(torch.linalg.solve_triangular(L.mT, Y[..., s:] - Y[..., :s] @ x[-1], upper=True))
     return torch.stack(x[::-1], -3)

@@ -4,20 +4,11 @@ An inverse is split into 2 x 2 blocks down to `LEAF` rows, and there iterated, `
 scaled in between so that the eigenvalues of `A X` lie evenly about 1: each step then divides their spread by four.
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 LEAF = 48
 LARGEST_CONDITION = 1e4  # of a leaf, Jacobi-scaled
-
-
-class BlockInverse(NamedTuple):
-    """`P_i^-1` of the pivots `P_i` and `P_i^-1 U_i`, each a list of `[..., s, s]`."""
-
-    pivots: list[Tensor]
-    upper: list[Tensor]
 
 
 def schulz_scales(condition: float, rounding: float) -> list[float]:
@@ -53,27 +44,19 @@ def inverse(matrix: Tensor) -> Tensor:
     return (X + X.mT) / 2
 
 
-def factor(diagonal: Tensor, upper: Tensor) -> BlockInverse:
-    """Block elimination; arguments as for `block_tridiagonal.factor`."""
-    pivots, coupled = [], []
-    pivot = diagonal[..., 0, :, :]
-    for i in range(diagonal.shape[-3]):
+def solve(diagonal: Tensor, upper: Tensor, b: Tensor) -> Tensor:
+    """As `block_tridiagonal.solve`."""
+    s, last = diagonal.shape[-1], diagonal.shape[-3] - 1
+    reduced = []
+    pivot, rhs = diagonal[..., 0, :, :], b[..., 0, :, :]
+    for i in range(last + 1):
         scale = pivot.diagonal(dim1=-2, dim2=-1).rsqrt()
-        pivots.append(inverse(pivot * scale[..., :, None] * scale[..., None, :]) * scale[..., :, None] * scale[..., None, :])
-        if i + 1 < diagonal.shape[-3]:
-            U = upper[..., i, :, :]
-            coupled.append(pivots[-1] @ U)
-            pivot = diagonal[..., i + 1, :, :] - U.mT @ coupled[-1]
-    return BlockInverse(pivots, coupled)
-
-
-def solve(factored: BlockInverse, b: Tensor) -> Tensor:
-    """`M^-1 b` for `b [..., n, s, C]`."""
-    forward = []
-    for i in range(len(factored.pivots)):
-        forward.append(b[..., i, :, :] - (factored.upper[i - 1].mT @ forward[-1] if i else 0.0))
-    x = []
-    for i in reversed(range(len(factored.pivots))):
-        own = factored.pivots[i] @ forward[i]
-        x.append(own - factored.upper[i] @ x[-1] if x else own)
+        own = inverse(pivot * scale[..., :, None] * scale[..., None, :]) * scale[..., :, None] * scale[..., None, :]
+        reduced.append(own @ (torch.cat([upper[..., i, :, :], rhs], -1) if i < last else rhs))
+        if i < last:
+            product = upper[..., i, :, :].mT @ reduced[-1]
+            pivot, rhs = diagonal[..., i + 1, :, :] - product[..., :s], b[..., i + 1, :, :] - product[..., s:]
+    x = [reduced[-1]]
+    for Y in reduced[-2::-1]:
+        x.append(Y[..., s:] - Y[..., :s] @ x[-1])
     return torch.stack(x[::-1], -3)
