@@ -163,19 +163,19 @@ class Sheet(nn.Module):
         Arguments: `x [..., V, 3]`. Exact; with `positive` the convex part: compression and (Mooney-Rivlin) the term of `D`
         that is not convex are left out, so that every block is positive semi-definite. Vertices as in `TRIANGLE_CORNERS`.
         """
-        ab, ac, bc = self._pair_blocks(self.strain(x), positive).unbind(-3)
+        ab, ac, bc = self._pair_blocks(self.strain(x), positive).movedim((-3, -6, -5, -4), (-4, -3, -2, -1)).unbind(-3)
         rows = [[-(ab + ac), ab, ac], [ab.mT, -(ab.mT + bc), bc], [ac.mT, bc.mT, -(ac.mT + bc.mT)]]
         return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
     def hessian_ring(self, strain: "Strain") -> Tensor:
-        """Second derivatives of the energy in the inner vertices and their six neighbours, `[..., N, 6, 3, 3]`.
+        """Second derivatives of the energy in the inner vertices and their six neighbours, `[..., 6, 3, 3, N]`.
 
         Those in one vertex alone are minus the sum of the six: a shift of all vertices changes no force.
         """
         return pairs_to_ring(self._pair_blocks(strain))
 
     def _pair_blocks(self, strain: "Strain", positive=False) -> Tensor:
-        """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2), `[..., m-1, n-1, 2, 3, 3, 3]`.
+        """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2), `[..., 3, 3, 3, 2, m-1, n-1]`.
 
         Those in its edges `a`, `b` from vertex 0 are `sum_cd T_cd e_c e_d^T + S_ab 1`, with `S` the stress and `T` from the
         second derivatives `Q` in the metric.
@@ -187,11 +187,13 @@ class Sheet(nn.Module):
         outer = lambda a, b: (a[..., :, None] * b[..., None, :]).flatten(-2)  # noqa: E731
         Q = outer(q, (self.rest_triangle_area * w.DD)[..., None] * q + crossed * p) + outer(p, crossed * q)
         Q = Q + bend[..., None] * bend.new_tensor(_BEND)
-        T, S = Q @ Q.new_tensor(_METRIC_TO_PAIRS), (_tension(stress) if positive else stress) @ Q.new_tensor(_STRESS_TO_PAIRS)
-        e = strain.edges
-        products = (e[..., :, None, :, None] * e[..., None, :, None, :]).flatten(-2).flatten(-3, -2)
-        one = torch.eye(3, dtype=e.dtype, device=e.device).flatten()
-        return (T.unflatten(-1, (3, 4)) @ products + S[..., None] * one).unflatten(-1, (3, 3))
+        T = _components_first(Q @ Q.new_tensor(_METRIC_TO_PAIRS)).unflatten(-4, (3, 2, 2, 1))
+        S = _components_first((_tension(stress) if positive else stress) @ Q.new_tensor(_STRESS_TO_PAIRS))
+        e = _components_first(strain.edges.flatten(-2)).unflatten(-4, (2, 3))
+        first, second = (T * e[..., None, None, :, :, :, :, :]).sum(-5).unbind(-5)
+        e1, e2 = e[..., None, :, :, None, :, :, :].unbind(-6)
+        one = torch.eye(3, dtype=e.dtype, device=e.device)[:, :, None, None, None]
+        return e1 * first[..., None, :, :, :, :] + e2 * second[..., None, :, :, :, :] + S[..., None, None, :, :, :] * one
 
     @staticmethod
     def _quadrilaterals(K: Tensor) -> Tensor:
@@ -222,6 +224,11 @@ def _metric_to_pairs() -> list[list[float]]:
 
 _METRIC_TO_PAIRS = _metric_to_pairs()
 _STRESS_TO_PAIRS = ((-1.0, 0.0, 0.0), (-1.0, -1.0, 1.0), (0.0, -1.0, 0.0))
+
+
+def _components_first(field: Tensor) -> Tensor:
+    """`[..., m-1, n-1, 2, C]` to `[..., C, 2, m-1, n-1]`."""
+    return field.transpose(-4, -1).transpose(-3, -2).mT.contiguous()
 
 
 def _from_edges(forces: Tensor, grid) -> Tensor:

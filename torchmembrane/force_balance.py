@@ -29,7 +29,7 @@ from .membrane import Membrane, SurfacePoints
 from .solve.stencil_system import COLUMNS, NEAR, StencilSystem
 from .stencil import bordered, inner, ring
 
-STEPS, TAU = 12, (10.0, 0.4)  # from rest
+STEPS, COARSE_STEPS, TAU = 8, 6, (4.0, 0.4)  # from rest, and so where a finer grid follows
 FINE_STEPS, FINE_TAU = 10, (2.0, 0.4)  # from the coarser grid's solution
 WARM_STEPS, WARM_TAU = 4, (1.2, 0.4)  # from the previous frame's solution
 FALL = 0.7  # share of the steps over which tau falls
@@ -76,7 +76,7 @@ class ForceBalance(nn.Module):
         markers            the markers' `SurfacePoints`, and `positions [D, 3]`, their rest positions
         noise              angular noise of a marker, radians; about twice the locator's, to leave room for the grid's own error
         filling, gas       the cavity, as for `MinimumEnergy`
-        steps              from rest, on the coarsest grid
+        steps              from rest; at most `COARSE_STEPS` where a finer grid follows
 
     A grid with an odd number of lines, at least 25, holds the estimator on every second line as `coarse`. The reference
     traction `p0` is the rest pressure, or tension / size where that is larger.
@@ -101,13 +101,13 @@ class ForceBalance(nn.Module):
         within = lambda field: inner(field, membrane.grid)  # noqa: E731
         self.register_buffer("area", within(membrane.rest_area[:, None]).squeeze(-1))
         self.register_buffer("free", within(self.moves))
-        self.register_buffer("free_neighbours", ring(self.moves, membrane.grid)[..., None])
+        self.register_buffer("free_neighbours", ring(self.moves, membrane.grid)[:, None])
         self.register_buffer("surroundings", within(within(_surroundings(membrane)).mT).mT)
         vertex_shares, pair_shares = _shares(membrane, self.marker_vertices, self.marker_weights)
         self.register_buffer("vertex_shares", vertex_shares)
         self.register_buffer("pair_shares", pair_shares)
         self.system = StencilSystem(membrane.grid, self.free[:, 0] > 0, COLUMNS + 2)
-        self.coarse = self._coarser(filling, gas, steps)
+        self.coarse = self._coarser(filling, gas, min(steps, COARSE_STEPS))
 
     def _coarser(self, filling, gas, steps) -> "ForceBalance | None":
         grid = self.membrane.grid
@@ -195,8 +195,8 @@ class ForceBalance(nn.Module):
         sheet_ring = self.sheet.hessian_ring(strain)
         force = inner(self.sheet.forces(strain) - self.rest_load, grid) - pressure[:, None, None] * gradient
         around = self.free_neighbours * (sheet_ring - pressure[:, None, None, None, None] * volume_ring)
-        blocks = torch.cat([-sheet_ring.sum(-3, keepdim=True), around], -3) * self.free[..., None, None]
-        slope = blocks.transpose(-3, -2).flatten(-2)
+        blocks = torch.cat([-sheet_ring.sum(-4, keepdim=True), around], -4) * self.free.mT
+        slope = blocks.permute(0, 4, 2, 1, 3).flatten(-2)
         return Linearised(force * self.free, slope, gradient * self.free, F.normalize(gradient, dim=-1))
 
     def markers(self, x: Tensor) -> Tensor:

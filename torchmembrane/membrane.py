@@ -130,11 +130,11 @@ class Membrane(nn.Module):
 
     def volume_ring(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Derivative of `volume` in the inner vertices, `[..., N, 3]`, and the second ones in them and their six neighbours,
-        `[..., N, 6, 3, 3]`; those in one vertex alone are zero."""
+        `[..., 6, 3, 3, N]`; those in one vertex alone are zero."""
         around = ring(x, self.grid)
-        before, after = around.roll(1, -2), around.roll(-1, -2)
-        gradient = torch.linalg.cross(around, after).sum(-2)
-        return self.outward / 6 * gradient, ((before - after) @ self.volume_cross_products).unflatten(-1, (3, 3))
+        before, after = around.roll(1, -3), around.roll(-1, -3)
+        gradient = torch.linalg.cross(around, after, dim=-2).sum(-3).mT
+        return self.outward / 6 * gradient, (self.volume_cross_products @ (before - after)).unflatten(-2, (3, 3))
 
     @property
     def cavity_volume(self) -> float:
@@ -252,8 +252,8 @@ def _levi_civita() -> Tensor:
 
 
 def _cross_products() -> Tensor:
-    """From `u [3]` to the entries `[9]` of the matrix of `u x`."""
-    return _levi_civita().permute(1, 0, 2).reshape(3, 9)
+    """`[9, 3]`: from `u` to the entries of the matrix of `u x`."""
+    return _levi_civita().transpose(1, 2).reshape(9, 3)
 
 
 def _determinant_derivatives() -> Tensor:

@@ -24,22 +24,26 @@ def bordered(field: Tensor, grid: tuple[int, int]) -> Tensor:
 
 
 def ring(field: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Values at the six neighbours of the inner vertices: `[..., V, C]` to `[..., N, 6, C]`."""
+    """Values at the six neighbours of the inner vertices: `[..., V, C]` to `[..., 6, C, N]`, vertices last for what follows."""
     m, n = grid
-    g = field.unflatten(-2, grid)
-    return torch.stack([g[..., 1 + i : m - 1 + i, 1 + j : n - 1 + j, :] for i, j in RING], -2).flatten(-4, -3)
+    g = field.mT.unflatten(-1, grid)
+    return torch.stack([g[..., 1 + i : m - 1 + i, 1 + j : n - 1 + j] for i, j in RING], -4).flatten(-2)
 
 
 def pairs_to_ring(pairs: Tensor) -> Tensor:
     """Sum over triangles of their blocks between vertices (0, 1), (0, 2), (1, 2), at the six neighbours of the inner vertices.
 
-    `[..., m-1, n-1, 2, 3, 3, 3]`, vertices as in `TRIANGLE_CORNERS`, to `[..., N, 6, 3, 3]`: the block between vertex and
-    neighbour. That between neighbour and vertex is its transpose.
+    `[..., 3, 3, 3, 2, m-1, n-1]` (pair, block, triangle of a quadrilateral), vertices as in `TRIANGLE_CORNERS`, to
+    `[..., 6, 3, 3, N]`: the blocks between vertex and neighbour. Those between neighbour and vertex are their transposes.
     """
-    (ab, ac, bc), (ca, ad, cd) = (triangle.unbind(-3) for triangle in pairs.unbind(-4))
-    down = ab[..., 1:, :, :] + cd[..., :-1, :, :].mT
+    (ab, ac, bc), (ca, ad, cd) = (triangle.unbind(-5) for triangle in pairs.unbind(-3))
+    down = ab[..., 1:] + _transposed(cd[..., :-1])
     diagonal = ac + ca
-    right = ad[..., 1:, :, :, :] + bc[..., :-1, :, :, :]
-    forth = [down[..., 1:, :, :, :], diagonal[..., 1:, 1:, :, :], right[..., 1:, :, :]]
-    back = [down[..., :-1, :, :, :], diagonal[..., :-1, :-1, :, :], right[..., :-1, :, :]]
-    return torch.stack([*forth, *(block.mT for block in back)], -3).flatten(-5, -4)
+    right = ad[..., 1:, :] + bc[..., :-1, :]
+    forth = [down[..., 1:, :], diagonal[..., 1:, 1:], right[..., 1:]]
+    back = [down[..., :-1, :], diagonal[..., :-1, :-1], right[..., :-1]]
+    return torch.stack([*forth, *(_transposed(block) for block in back)], -5).flatten(-2)
+
+
+def _transposed(blocks: Tensor) -> Tensor:
+    return blocks.transpose(-4, -3)
