@@ -20,7 +20,7 @@ from torchmembrane.errors import MembraneError
 
 LEVELS = 3  # pyramid: full, half, quarter resolution
 REACH = 7  # px of the coarsest level searched to each side: 28 px of the image
-RADIUS = (10, 8, 6)  # px of the level, half side of a patch, finest level first
+RADIUS = (8, 8, 6)  # px of the level, half side of a patch, finest level first
 WIDTH = 0.6  # standard deviation of a patch's Gaussian window over its half side
 WARP_DAMPING = 1e-3  # grey^2: keeps weak texture from bending a patch's own affine map with the noise
 NEIGHBOURS = 16
