@@ -1,10 +1,17 @@
 # make demo | make test | make lint | make bench | make figures: each sets itself up on a machine with Python 3.11+ only.
+# make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint bench figures clean
+WEB := export/web
+PAGE := $(WEB)/dist/index.html
+PACKAGES := $(WEB)/node_modules/.package-lock.json
+SENSOR := examples/sensor.toml examples/rest_grid.npz examples/dots.csv examples/rest.png
+IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
+
+.PHONY: demo test lint bench figures web test-web clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -31,5 +38,28 @@ bench: $(READY)
 figures: $(READY)
 	$(BIN)/python docs/figures.py
 
+web: $(PAGE)
+
+test-web: $(PAGE)
+	$(BIN)/python $(WEB)/test/reference.py out/web/sensor.toml out/web/model.onnx $(IMAGES) --out out/web/test
+	CHROMIUM=$$($(WEB)/chromium.sh) && export CHROMIUM && \
+		PYTHON=$(BIN)/python REFERENCE=out/web/test node --test --test-reporter=spec $(WEB)/test/page.test.js
+
+$(PAGE): out/web/model.onnx $(IMAGES) $(PACKAGES) $(WEB)/build.js $(wildcard $(WEB)/src/*)
+	node $(WEB)/build.js out/web/model.onnx $(IMAGES)
+
+out/web/model.onnx: out/web/sensor.toml $(wildcard torchmembrane/*.py torchmembrane/markers/*.py torchmembrane/solve/*.py)
+	$(BIN)/torchmembrane export $< --out $@
+
+out/web/sensor.toml: $(SENSOR) | $(READY)
+	mkdir -p out/web
+	cp $(SENSOR) out/web
+	awk '{ print } /^\[membrane\]/ { print "grid = [17, 17]" }' examples/sensor.toml > $@
+
+$(PACKAGES): $(WEB)/package.json $(WEB)/package-lock.json
+	@node -e 'process.exit(parseInt(process.versions.node) < 20)' && npm --version > /dev/null || \
+		{ echo "Node.js 20 or newer with npm is needed: https://nodejs.org"; exit 1; }
+	cd $(WEB) && npm ci
+
 clean:
-	rm -rf $(VENV) out build *.egg-info
+	rm -rf $(VENV) out build *.egg-info $(WEB)/dist $(WEB)/node_modules

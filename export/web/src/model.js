@@ -1,0 +1,41 @@
+// A model, what it says of its sensor, and images to results.
+import { sensorOf } from "./metadata.js";
+
+export class Model {
+  #worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
+
+  /** The model of a .onnx file's bytes, ready to run; `sensor` as `sensorOf`. */
+  static async open(bytes) {
+    const model = new Model();
+    try {
+      model.sensor = sensorOf(bytes);
+      const [width, height] = model.sensor.mesh.image_size;
+      await model.#ask({ model: { bytes, width, height } });
+    } catch (error) {
+      model.close();
+      throw error;
+    }
+    return model;
+  }
+
+  /** The result of one image `{ grey, width, height }`: `frame`, the outputs by name, and `milliseconds`. */
+  async run(image) {
+    const [width, height] = this.sensor.mesh.image_size;
+    if (image.width !== width || image.height !== height) {
+      throw new Error(`the image is ${image.width} x ${image.height} px, the sensor's are ${width} x ${height}`);
+    }
+    return this.#ask({ image });
+  }
+
+  close() {
+    this.#worker.terminate();
+  }
+
+  #ask(message) {
+    return new Promise((resolve, reject) => {
+      this.#worker.onmessage = ({ data }) => ("error" in data ? reject(new Error(data.error)) : resolve(data.answer));
+      this.#worker.onerror = () => reject(new Error("onnxruntime could not be started; serve the page, do not open it as a file"));
+      this.#worker.postMessage(message);
+    });
+  }
+}
