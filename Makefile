@@ -57,7 +57,7 @@ out/web/sensor.toml: $(SENSOR) | $(READY)
 	awk '{ print } /^\[membrane\]/ { print "grid = [17, 17]" }' examples/sensor.toml > $@
 
 $(PACKAGES): $(WEB)/package.json $(WEB)/package-lock.json
-	@node -e 'process.exit(parseInt(process.versions.node) < 20)' && npm --version > /dev/null || \
+	@node -e 'process.exit(+(parseInt(process.versions.node) < 20))' && npm --version > /dev/null || \
 		{ echo "Node.js 20 or newer with npm is needed: https://nodejs.org"; exit 1; }
 	cd $(WEB) && npm ci
 

@@ -26,6 +26,7 @@ before(async () => {
   origin = `http://127.0.0.1:${port}`;
   browser = await chromium.launch({ executablePath: CHROMIUM, args: FLAGS.split(" ") });
   page = await browser.newPage({ viewport: WIDE });
+  page.setDefaultTimeout(120_000);
   page.on("console", (message) => message.type() === "error" && errors.push(message.text()));
   page.on("pageerror", (error) => errors.push(error.message));
   page.on("request", (request) => new URL(request.url()).origin === origin || elsewhere.push(request.url()));
