@@ -49,7 +49,7 @@ def images(example: Path, out: Path) -> None:
     grey.save(out / "upside_down.jpg", exif=upside_down)
     for name in ("linear.png", "colour.png", "upside_down.jpg"):
         read_image(out / name).tofile(out / f"{name}.f32")
-    grey.resize((320, 240)).save(out / "small.png")
+    grey.crop((0, 0, 320, 480)).save(out / "narrow.png")
     Image.new("L", grey.size, 128).save(out / "blank.png")
     Image.new("LA", grey.size, (128, 100)).save(out / "transparent.png")
 
