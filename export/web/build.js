@@ -18,6 +18,7 @@ await build({
   format: "esm",
   target: "es2022",
   loader: { ".wasm": "file", ".html": "copy" },
+  define: { EXAMPLES: JSON.stringify(examples.map((example) => basename(example))) },
   assetNames: "[name]",
   legalComments: "linked",
   logLevel: "warning",

@@ -4,7 +4,6 @@ import { Model } from "./model.js";
 import { npz } from "./npz.js";
 import { COLOURS, Surface } from "./surface.js";
 
-const EXAMPLES = { "Two contacts": "two_contacts.png", "Press on axis": "press_on_axis.png", "Flat plate": "flat_plate.png" };
 const READINGS = ["force", "pressure", "volume", "displacement", "markers", "time"];
 const at = (id) => document.getElementById(id);
 const surface = new Surface(at("surface"));
@@ -126,9 +125,11 @@ function open(files) {
   for (const file of files) inTurn(file.name, () => (file.name.endsWith(".onnx") ? openModel(file) : openImage(file, file.name)));
 }
 
-for (const [title, name] of Object.entries(EXAMPLES)) {
+// EXAMPLES: the names of the files given to build.js
+for (const name of EXAMPLES) {
+  const words = name.replace(/\.[^.]*$/, "").replaceAll("_", " ");
   const button = document.createElement("button");
-  Object.assign(button, { type: "button", textContent: title });
+  Object.assign(button, { type: "button", textContent: words[0].toUpperCase() + words.slice(1) });
   button.onclick = () => inTurn(name, async () => openImage(await fetched(`examples/${name}`), name));
   at("examples").append(button);
 }

@@ -1,8 +1,8 @@
 // The surface in 3-D: coloured by the push on it, over its grid at rest, with contact points and the total force.
 import {
-  AmbientLight, BufferAttribute, BufferGeometry, Color, ConeGeometry, CylinderGeometry, DirectionalLight, DoubleSide, Group,
-  LineBasicMaterial, LineSegments, Mesh, MeshBasicMaterial, MeshLambertMaterial, PerspectiveCamera, Raycaster, Scene,
-  SphereGeometry, Vector3, WebGLRenderer,
+  AmbientLight, BufferAttribute, BufferGeometry, CanvasTexture, ConeGeometry, CylinderGeometry, DirectionalLight, DoubleSide,
+  Group, LineBasicMaterial, LineSegments, Mesh, MeshBasicMaterial, MeshLambertMaterial, PerspectiveCamera, Raycaster, Scene,
+  SphereGeometry, SRGBColorSpace, Vector3, WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
@@ -15,6 +15,8 @@ const MARGIN = 1.06;
 const KEY_TURN = 0.12; // rad
 const KEY_ZOOM = 0.9;
 const ARROW_LENGTH = 0.5; // of the surface's radius
+
+const SCALE = scale(); // between vertices the value is interpolated, not the colour
 
 /** Shows one sensor's surface in a canvas. */
 export class Surface {
@@ -69,13 +71,13 @@ export class Surface {
     const { rest, triangles, edges } = this.#mesh;
     this.clear();
     const body = geometry(vertices, triangles);
-    body.setAttribute("color", new BufferAttribute(colours(values, most), 3));
+    body.setAttribute("uv", new BufferAttribute(Float32Array.from([...values].flatMap((value) => [value / most, 0])), 2));
     body.computeVertexNormals();
-    const skin = new Mesh(body, new MeshLambertMaterial({ vertexColors: true, side: DoubleSide }));
+    const skin = new Mesh(body, new MeshLambertMaterial({ map: SCALE, side: DoubleSide }));
     Object.assign(skin.material, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 }); // lines stay visible
     this.#shown.add(skin, lines(vertices, edges, "#5b3a24", 0.3), lines(rest, edges, REST, 0.6));
     for (const contact of contacts) {
-      const dot = solid(new SphereGeometry(0.035 * this.#radius), "black");
+      const dot = solid(new SphereGeometry(0.026 * this.#radius), "black");
       dot.position.fromArray(contact);
       this.#shown.add(dot);
     }
@@ -135,6 +137,16 @@ const solid = (shape, color) => new Mesh(shape, new MeshBasicMaterial({ color })
 const lines = (vertices, edges, color, opacity) =>
   new LineSegments(geometry(vertices, edges), new LineBasicMaterial({ color, opacity, transparent: true }));
 
+/** The colour bar as a texture, 0 at its left end. */
+function scale() {
+  const bar = Object.assign(document.createElement("canvas"), { width: 256, height: 1 }).getContext("2d");
+  const gradient = bar.createLinearGradient(0, 0, 256, 0);
+  COLOURS.forEach((colour, k) => gradient.addColorStop(k / (COLOURS.length - 1), colour));
+  bar.fillStyle = gradient;
+  bar.fillRect(0, 0, 256, 1);
+  return Object.assign(new CanvasTexture(bar.canvas), { colorSpace: SRGBColorSpace });
+}
+
 /** Pairs of neighbours on a grid of m x n vertices, row-major. */
 function edges([m, n]) {
   const pairs = [];
@@ -143,17 +155,6 @@ function edges([m, n]) {
     if (k + n < m * n) pairs.push(k, k + n);
   }
   return pairs;
-}
-
-/** Colours [3 V] of values from 0 to `most`. */
-function colours(values, most) {
-  const scale = COLOURS.map((text) => new Color(text));
-  const mixed = new Color();
-  return Float32Array.from([...values].flatMap((value) => {
-    const place = Math.min(Math.max(value / most, 0), 1) * (scale.length - 1);
-    const below = Math.min(Math.floor(place), scale.length - 2);
-    return mixed.lerpColors(scale[below], scale[below + 1], place - below).toArray();
-  }));
 }
 
 /** The mean of the vertices, weighted by the values above 0. */

@@ -161,12 +161,14 @@ test("pixels are those that Python reads", async () => {
   assert.match(await text("#message"), /transparent pixels; expected an opaque one/);
 });
 
-test("a narrow screen needs no scrolling sideways", async () => {
-  await page.setViewportSize({ width: 400, height: 800 });
+test("where less motion is wanted the surface stands still", async () => {
+  await page.emulateMedia({ reducedMotion: "reduce" });
+  await page.reload();
+  await idle();
   await example("Two contacts");
-  assert.equal(await page.evaluate(() => document.documentElement.scrollWidth), 400);
-  if (SCREENSHOTS) await page.screenshot({ path: join(SCREENSHOTS, "narrow.png"), fullPage: true });
-  await page.setViewportSize(WIDE);
+  const still = await picture();
+  await page.waitForTimeout(200);
+  assert.equal(await picture(), still);
 });
 
 test("time per frame", async (t) => {
@@ -176,7 +178,16 @@ test("time per frame", async (t) => {
     times.push(parseFloat(await text("#time")));
   }
   t.diagnostic(`median of 11: ${times.sort((a, b) => a - b)[5]} ms, best ${times[0]} ms`);
+  await page.getByLabel("turn", { exact: true }).check();
   if (SCREENSHOTS) await page.screenshot({ path: join(SCREENSHOTS, "browser.png") });
+});
+
+test("a narrow screen needs no scrolling sideways", async () => {
+  await page.setViewportSize({ width: 400, height: 800 });
+  await example("Two contacts");
+  assert.equal(await page.evaluate(() => document.documentElement.scrollWidth), 400);
+  if (SCREENSHOTS) await page.screenshot({ path: join(SCREENSHOTS, "browser_narrow.png"), fullPage: true });
+  await page.setViewportSize(WIDE);
 });
 
 test("another model takes its place; what is none is refused in words", async () => {
