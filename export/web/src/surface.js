@@ -27,6 +27,7 @@ export class Surface {
   #controls;
   #mesh;
   #radius = 1;
+  #stale = true; // the canvas shows something else than the scene
 
   constructor(canvas) {
     this.#renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
@@ -40,12 +41,14 @@ export class Surface {
     this.#controls.enablePan = false;
     canvas.style.touchAction = "pan-y"; // a finger moved along the page scrolls it, across it turns the surface
     this.#controls.autoRotateSpeed = 1; // a turn a minute
+    this.#controls.addEventListener("change", () => (this.#stale = true));
     canvas.addEventListener("keydown", (event) => this.#key(event));
     new ResizeObserver(() => this.#fit()).observe(canvas);
     let before = 0;
     this.#renderer.setAnimationLoop((now) => {
       this.#controls.update((now - before) / 1000);
-      this.#renderer.render(this.#scene, this.#camera);
+      if (this.#stale) this.#renderer.render(this.#scene, this.#camera);
+      this.#stale = false;
       before = now;
     });
   }
@@ -87,6 +90,7 @@ export class Surface {
   clear() {
     this.#shown.traverse((part) => (part.geometry?.dispose(), part.material?.dispose()));
     this.#shown.clear();
+    this.#stale = true;
   }
 
   /** The total force where its line of action, through the centre of the push, meets the surface from outside. */
@@ -115,6 +119,7 @@ export class Surface {
     Object.assign(this.#camera, { aspect: width / height, near: 0.05 * distance, far: 20 * distance });
     Object.assign(this.#controls, { minDistance: 0.3 * distance, maxDistance: 3 * distance });
     this.#camera.updateProjectionMatrix();
+    this.#stale = true;
   }
 
   #key(event) {
