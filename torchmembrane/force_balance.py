@@ -32,7 +32,7 @@ from .stencil import bordered, inner, ring
 STEPS, COARSE_STEPS, TAU = 8, 6, (4.0, 0.4)  # from rest, and so where a finer grid follows
 FINE_STEPS, FINE_TAU = 10, (2.0, 0.4)  # from the coarser grid's solution
 WARM_STEPS, WARM_TAU = 4, (1.2, 0.4)  # from the previous frame's solution
-FALL = 0.7  # share of the steps over which tau falls
+FALL = 0.6  # share of the steps over which tau falls
 SPARSITY = 3200.0  # price of the push p0 on the whole surface, while it is quadratic
 FRICTION, SLIP, CONE = 3.75, 0.05, 10.0  # kappa over the price of a push; where |q_t| begins to be linear, over p0; c
 REACH = 0.04  # over the surface's size
