@@ -26,8 +26,8 @@ from .cavity import CavityLaw, Equilibrium, rest_balance
 from .deviations import StandardDeviations, standard_deviations
 from .energy import Sheet
 from .membrane import Membrane, SurfacePoints
-from .solve.stencil_system import COLUMNS, NEAR, StencilSystem
-from .stencil import bordered, inner, ring
+from .solve.stencil_system import NEAR, StencilSystem
+from .stencil import STENCIL, bordered, inner, ring
 
 STEPS, COARSE_STEPS, TAU = 8, 6, (4.0, 0.4)  # from rest, and so where a finer grid follows
 FINE_STEPS, FINE_TAU = 10, (2.0, 0.4)  # from the coarser grid's solution
@@ -106,7 +106,7 @@ class ForceBalance(nn.Module):
         vertex_shares, pair_shares = _shares(membrane, self.marker_vertices, self.marker_weights)
         self.register_buffer("vertex_shares", vertex_shares)
         self.register_buffer("pair_shares", pair_shares)
-        self.system = StencilSystem(membrane.grid, self.free[:, 0] > 0, COLUMNS + 2)
+        self.system = StencilSystem(membrane.grid, self.free[:, 0] > 0, len(STENCIL) + 1)
         self.coarse = self._coarser(filling, gas, min(steps, COARSE_STEPS))
 
     def _coarser(self, filling, gas, steps) -> "ForceBalance | None":
@@ -232,15 +232,16 @@ class ForceBalance(nn.Module):
         Returns `A^T W A + J^T w J` as the blocks that `system.solve` takes; `A^T W f + J^T w r` and `-A^T W v`,
         `[B, unknowns]`; `f^T W v` and `v^T W v`, `[B]`.
         """
-        A = torch.cat([at.slope, at.force[..., None], at.volume[..., None]], -1)
+        of_vertices = at.slope.shape[-1]
+        A = torch.cat([at.slope, torch.stack([at.force, at.volume, torch.zeros_like(at.force)], -1)], -1)
         products = A.mT @ (W @ A)
         J = torch.cat([slope, angle[..., None]], -1)
         of_markers = J.mT @ (weight[..., None, None] * J)
-        near = (of_markers[..., :3, :3].flatten(-2).mT @ self.pair_shares).unflatten(-1, (len(NEAR), -1)).transpose(1, 2)
-        load, push = self.system.vector(products[..., :COLUMNS, COLUMNS:].movedim(-1, 1)).unbind(1)
+        near = (of_markers[..., :3, :3].flatten(-2).mT @ self.pair_shares).unflatten(-1, (len(NEAR), -1)).unflatten(1, (3, 3))
+        load, push = self.system.vector(products[..., :of_vertices, of_vertices:-1].movedim(-1, 1)).unbind(1)
         pull = (of_markers[..., :3, 3].mT @ self.vertex_shares).mT.flatten(1)
-        matrix = self.system.matrix(products, near)
-        of_fluid = products[..., COLUMNS:, COLUMNS + 1].sum(1).unbind(-1)
+        matrix = self.system.matrix(products, near.permute(0, 3, 1, 4, 2))
+        of_fluid = products[..., of_vertices:-1, of_vertices + 1].sum(1).unbind(-1)
         return matrix, load + self.system.padded(pull), -push, of_fluid
 
     def force_weights(self, normal: Tensor, force: Tensor, tau: float, curvature=False) -> Tensor:

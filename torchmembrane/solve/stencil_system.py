@@ -1,6 +1,7 @@
 """Symmetric systems on a grid from products of seven-point stencils, solved by elimination over pairs of grid rows."""
 
 from itertools import groupby
+from math import prod
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -13,23 +14,22 @@ from ..stencil import STENCIL
 from . import block_tridiagonal, matrix_products
 
 NEAR = ((0, 0), (0, 1), (1, 0), (1, 1))  # from a vertex to itself and to its neighbours further on
-COLUMNS = 3 * len(STENCIL)
 
 
 class StencilSystem(nn.Module):
     """Three unknowns an inner vertex of an `m x n` grid, those of two grid rows a block; the matrix is block tridiagonal.
 
-    Arguments: `free [N]` bool, the inner vertices that move; `columns`, of the rows over inner vertices `[B, N, ..., columns]`
-    that `matrix` takes: their stencil's 21, then others. Columns of vertices that do not move must be zero.
-    Sums are gathered, not scattered: where an entry comes from is known beforehand.
+    Arguments: `free [N]` bool, the inner vertices that move; `slots`, of the rows over inner vertices `[B, N, ..., 3 slots]`
+    that `matrix` takes: the stencil's 7, then others. Columns of vertices that do not move must be zero.
+    Sums are gathered, not scattered, three numbers at a time: where they come from is known beforehand.
     """
 
-    def __init__(self, grid: tuple[int, int], free: Tensor, columns: int):
+    def __init__(self, grid: tuple[int, int], free: Tensor, slots: int):
         super().__init__()
         m, n = grid
         self.count, self.blocks, self.block_size = (m - 2) * (n - 2), (m - 1) // 2, 6 * (n - 2)
         groups = _ways()
-        sources = [np.stack([_product_sources(grid, way, columns) for way in group], 1) for group in groups]
+        sources = [np.stack([_product_sources(grid, way, slots) for way in group], 1) for group in groups]
         self.sizes = [source.shape for source in sources]
         for name, index in (
             ("row_sources", _row_sources(grid).ravel()),
@@ -37,13 +37,12 @@ class StencilSystem(nn.Module):
             ("places", _places(grid, [way for group in groups for way, _ in group], free.cpu().numpy(), self.blocks).ravel()),
         ):
             self.register_buffer(name, torch.from_numpy(index.astype(np.int32)))
-        self.register_buffer("on_diagonal", torch.eye(3, dtype=torch.float64).reshape(9, 1))
+        self.register_buffer("one", torch.eye(3, dtype=torch.float64))
 
     def vector(self, rows: Tensor) -> Tensor:
         """Sum of stencil rows `[..., N, 21]`, in the system's order `[..., unknowns]`."""
-        flat = rows.flatten(-2)
-        gathered = flat.flatten(0, -2).index_select(1, self.row_sources)
-        return self.padded(gathered.unflatten(-1, (len(STENCIL), -1)).sum(-2).unflatten(0, flat.shape[:-1]))
+        chunks = rows.reshape(-1, self.count * len(STENCIL), 3).index_select(1, self.row_sources)
+        return self.padded(chunks.unflatten(1, (len(STENCIL), -1)).sum(1).reshape(*rows.shape[:-2], 3 * self.count))
 
     def padded(self, unknowns: Tensor) -> Tensor:
         """Unknowns of the inner vertices `[..., 3 N]` in the system's order `[..., unknowns]`."""
@@ -56,17 +55,19 @@ class StencilSystem(nn.Module):
     def matrix(self, products: Tensor, near: Tensor, damping: float = 1e-6) -> tuple[Tensor, Tensor]:
         """Blocks on the diagonal `[B, blocks, s, s]` and above it `[B, blocks - 1, s, s]`.
 
-        Arguments: `products [B, N, columns, columns]` of every row's columns with each other; `near [B, 4, 9, N]`, further
+        Arguments: `products [B, N, 3 slots, 3 slots]` of every row's columns with each other; `near [B, 4, 3, N, 3]`, further
         blocks between the vertices and those at `NEAR` from them; `damping`, a share of the diagonal.
         """
-        gathered = products.flatten(1).index_select(1, self.product_sources).split([np.prod(size) for size in self.sizes], 1)
-        entries = [part.unflatten(1, size).sum(1) for part, size in zip(gathered, self.sizes, strict=True)]
-        entries[0] = (entries[0] + near[:, :1]) * (1 + damping * self.on_diagonal)
-        entries[1] = entries[1] + near[:, 1:]
-        one = torch.ones_like(near[:, 0, 0, :1])
+        chunks = products.unflatten(-1, (-1, 3)).flatten(1, 3).index_select(1, self.product_sources)
+        parts = chunks.split([prod(size) for size in self.sizes], 1)
+        own, beside, *further = (part.unflatten(1, size).sum(1) for part, size in zip(parts, self.sizes, strict=True))
+        own = (own + near[:, :1]) * (1 + damping * self.one[:, None])
+        blocks = torch.cat([own, beside + near[:, 1:], *further], 1)
+        one = self.one.to(blocks).expand(len(blocks), 3, 3)
+        entries = torch.cat([blocks.flatten(1, 3), blocks.transpose(2, 4).flatten(1, 3), one], 1)
         s = self.block_size
-        blocks = torch.cat([*(entry.flatten(1) for entry in entries), one], 1).index_select(1, self.places)
-        return blocks.unflatten(1, (-1, s, s)).split([self.blocks, self.blocks - 1], 1)
+        matrix = entries.index_select(1, self.places).flatten(1).unflatten(1, (-1, s, s))
+        return matrix.split([self.blocks, self.blocks - 1], 1)
 
     def solve(self, matrix: tuple[Tensor, Tensor], loads: Tensor) -> Tensor:
         """Solutions `[B, unknowns, C]` for `loads` of that shape."""
@@ -108,44 +109,44 @@ _ZERO = STENCIL.index((-1, -1))  # the first inner vertex's column for this neig
 
 
 def _row_sources(grid) -> np.ndarray:
-    """For every slot, where in rows `[N, 21]` a vertex `[N]` and component `[3]` is the slot's neighbour: `[7, N, 3]`."""
-    inner, component = _Inner.of(grid), np.arange(3)
-    sources = []
+    """For every slot, where in rows `[N, 7]` a vertex `[N]` is the slot's neighbour: `[7, N]`."""
+    inner, sources = _Inner.of(grid), []
     for slot, (i, j) in enumerate(STENCIL):
-        row = inner.at(inner.row - i, inner.column - j)[:, None]
-        sources.append(np.where(row >= 0, row * COLUMNS + 3 * slot + component, 3 * _ZERO))
+        row = inner.at(inner.row - i, inner.column - j)
+        sources.append(np.where(row >= 0, row * len(STENCIL) + slot, _ZERO))
     return np.stack(sources)
 
 
-def _product_sources(grid, way, columns) -> np.ndarray:
-    """Where in products `[N, columns, columns]` the block between a vertex and that on its `way` has its parts: `[K, 9, N]`."""
-    inner, (first, second) = _Inner.of(grid), np.divmod(np.arange(9)[:, None], 3)
+def _product_sources(grid, way, slots) -> np.ndarray:
+    """Where in products `[N, 3 slots, slots]` the rows of the block between a vertex and that on its `way` have their parts:
+    `[K, 3, N]`."""
+    inner, component = _Inner.of(grid), np.arange(3)[:, None]
     (di, dj), pairs = way
     sources = []
     for a, b in pairs:
         i, j = STENCIL[a]
         row, other = inner.at(inner.row - i, inner.column - j), inner.at(inner.row + di, inner.column + dj)
-        place = (row * columns + 3 * a + first) * columns + 3 * b + second
-        sources.append(np.where((row >= 0) & (other >= 0), place, 3 * _ZERO * (columns + 1)))
+        place = (row * 3 * slots + 3 * a + component) * slots + b
+        sources.append(np.where((row >= 0) & (other >= 0), place, 3 * _ZERO * slots + _ZERO))
     return np.stack(sources)
 
 
 def _places(grid, ways, free, blocks) -> np.ndarray:
-    """Where in the entries `[ways, 9, N]`, then a one, every entry of the matrix is: `[2 blocks - 1, s, s]`."""
+    """Where three neighbouring entries of the matrix are, `[2 blocks - 1, s, s / 3]`: in the blocks' rows `[ways, 3, N]`, followed
+    by their columns `[ways, 3, N]` and a one's rows."""
     inner, N, s = _Inner.of(grid), len(free), 6 * (grid[1] - 2)
     number = np.full((5, 5), -1)
     for k, way in enumerate(ways):
         number[way] = k  # negative indices wrap: the way back has its own place
     unknown = np.arange(blocks * s).reshape(blocks, s)
-    row = np.concatenate([unknown, unknown[:-1]])[:, :, None]
-    column = np.concatenate([unknown, unknown[1:]])[:, None, :]
-    (p, c), (q, d) = np.divmod(row, 3), np.divmod(column, 3)
+    p, c = np.divmod(np.concatenate([unknown, unknown[:-1]])[:, :, None], 3)
+    q = np.concatenate([unknown, unknown[1:]])[:, None, ::3] // 3
     used = [(vertex < N) & free[vertex.clip(max=N - 1)] for vertex in (p, q)]
     i, j = (index[q.clip(max=N - 1)] - index[p.clip(max=N - 1)] for index in (inner.row, inner.column))
     close = used[0] & used[1] & (abs(i) <= 2) & (abs(j) <= 2)
     i, j = np.where(close, i, 0), np.where(close, j, 0)
     forth, back = number[i, j], number[-i, -j]
-    entry = np.where(forth >= 0, (forth * 9 + 3 * c + d) * N + p, (back * 9 + 3 * d + c) * N + q)
-    zero, one = (ways.index((2, 2)) * 9 + 1) * N - 1, len(ways) * 9 * N
+    entry = np.where(forth >= 0, (3 * forth + c) * N + p, (3 * (len(ways) + back) + c) * N + q)
+    zero, one = (3 * ways.index((2, 2)) + 1) * N - 1, 6 * len(ways) * N + c
     entry = np.where(close & ((forth >= 0) | (back >= 0)), entry, zero)
-    return np.where((row == column) & ~used[0], one, entry)
+    return np.where((p == q) & ~used[0], one, entry)
