@@ -195,7 +195,7 @@ class ForceBalance(nn.Module):
         sheet_ring = self.sheet.hessian_ring(strain)
         force = inner(self.sheet.forces(strain) - self.rest_load, grid) - pressure[:, None, None] * gradient
         around = self.free_neighbours * (sheet_ring - pressure[:, None, None, None, None] * volume_ring)
-        blocks = torch.cat([-sheet_ring.sum(-4, keepdim=True), around], -4) * self.free.mT
+        blocks = torch.cat([-sheet_ring.sum(-4, keepdim=True), around], -4) * self.free.transpose(0, 1)
         slope = blocks.permute(0, 4, 2, 1, 3).flatten(-2)
         return Linearised(force * self.free, slope, gradient * self.free, F.normalize(gradient, dim=-1))
 

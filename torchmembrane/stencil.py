@@ -26,7 +26,7 @@ def bordered(field: Tensor, grid: tuple[int, int]) -> Tensor:
 def ring(field: Tensor, grid: tuple[int, int]) -> Tensor:
     """Values at the six neighbours of the inner vertices: `[..., V, C]` to `[..., 6, C, N]`, vertices last for what follows."""
     m, n = grid
-    g = field.mT.unflatten(-1, grid)
+    g = field.transpose(-2, -1).unflatten(-1, grid)
     return torch.stack([g[..., 1 + i : m - 1 + i, 1 + j : n - 1 + j] for i, j in RING], -4).flatten(-2)
 
 

@@ -132,8 +132,8 @@ def _product_sources(grid, way, slots) -> np.ndarray:
 
 
 def _places(grid, ways, free, blocks) -> np.ndarray:
-    """Where three neighbouring entries of the matrix are, `[2 blocks - 1, s, s / 3]`: in the blocks' rows `[ways, 3, N]`, followed
-    by their columns `[ways, 3, N]` and a one's rows."""
+    """Where three neighbouring entries of the matrix are, `[2 blocks - 1, s, s / 3]`: in the blocks' rows `[ways, 3, N]`, their
+    columns `[ways, 3, N]`, a one's rows, one after another."""
     inner, N, s = _Inner.of(grid), len(free), 6 * (grid[1] - 2)
     number = np.full((5, 5), -1)
     for k, way in enumerate(ways):
