@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from torchmembrane.solve import block_tridiagonal, matrix_products
+from torchmembrane.solve.anderson import accelerated, first
 from torchmembrane.solve.conjugate_gradient import conjugate_gradient
 from torchmembrane.solve.kkt import constrained_minimum
 
@@ -85,3 +86,15 @@ def test_inverse_by_products(size):
     matrix = q @ torch.diag(torch.logspace(-3, 0, size, dtype=torch.float64)) @ q.mT
     one = torch.eye(size, dtype=torch.float64)
     assert (matrix_products.inverse(matrix) @ matrix - one).abs().max() < 1e-9
+
+
+def test_anderson_solves_a_linear_fixed_point_in_two_unknowns_at_the_third_evaluation():
+    """Though `x <- x + move(x)` alone diverges; and where nothing moves it stays."""
+    A = torch.tensor([[2.5, 0.4], [-0.3, 0.2]], dtype=torch.float64)
+    solution = torch.tensor([[1.0, -2.0], [3.0, 0.5], [0.0, 0.0]], dtype=torch.float64)
+    move = lambda x: (solution - x) @ A.T  # noqa: E731
+    state = first(torch.zeros_like(solution), move(torch.zeros_like(solution)))
+    for _ in range(2):
+        state = accelerated(state[0], move(state[0]), *state[1:])
+    torch.testing.assert_close(state[0], solution, rtol=0, atol=1e-9)
+    assert (state[0][2] == 0).all()

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from .errors import MembraneError
+from .incidence import Incidence
 from .membrane import Membrane, corners, corners_to_vertices, triangles_of, triangles_to_corners
 from .stencil import pairs_to_ring
 
@@ -66,6 +67,23 @@ class Sheet(nn.Module):
         self.register_buffer("inverse_metric", torch.stack([g22, -g12, g11], -1) / det[..., None])
         self.register_buffer("rest_det", det)
         self.register_buffer("rest_triangle_area", det.sqrt() / 2)
+        self._register_sides(membrane)
+
+    def _register_sides(self, membrane: Membrane) -> None:
+        """The triangles' sides: their ends, where they meet, and `I` as a sum over their squared lengths."""
+        index, V = torch.arange(len(membrane.rest))[:, None], len(membrane.rest)
+        of_triangles = triangles_of(corners(index, self.grid)).flatten(0, 2).squeeze(-1).numpy()  # [T, 3]
+        ends = np.sort(of_triangles[:, [[0, 1], [0, 2], [1, 2]]], -1).reshape(-1, 2)
+        (start, end), side = (a.T for a in np.unique(ends, axis=0, return_inverse=True))
+        side, E = side.reshape(-1, 3).T.ravel(), len(start)
+        ones, every = np.ones(E), np.arange(E)
+        self.register_buffer("start", torch.from_numpy(start.copy()))
+        self.register_buffer("end", torch.from_numpy(end.copy()))
+        self.register_buffer("side", torch.from_numpy(side.copy()))
+        self.on_sides = Incidence(side, np.arange(len(side)), np.ones(len(side)), E, 1)
+        self.on_vertices = Incidence(np.append(start, end), np.append(every, every), np.append(ones, -ones), V, 3)
+        G = self.inverse_metric.flatten(0, 2)
+        self.register_buffer("first", torch.stack([G[:, 0] + G[:, 1], G[:, 2] + G[:, 1], -G[:, 1]])[..., None])
 
     def on(self, membrane: Membrane) -> "Sheet":
         """The same material on another membrane or grid."""
@@ -92,6 +110,9 @@ class Sheet(nn.Module):
         if self.model == "harmonic":
             zero = torch.zeros_like(I)
             return Derivatives(c1 * l2 + zero, zero, zero, zero, zero)
+        if self.model == "neo_hookean":
+            zero, w_D = torch.zeros_like(I), -c1 / l2**2 / (D * D)
+            return Derivatives(c1 * l2, w_D, zero, -2 * w_D / D, w_D)
         convex_D = -c1 / (l2**2 * D**2) - c2 * I / (l2 * D**2)
         return Derivatives(
             c1 * l2 + c2 / (l2 * D),
@@ -112,11 +133,22 @@ class Sheet(nn.Module):
         return Strain(edges, adj, self.derivatives(I, D))
 
     def gradient(self, x: Tensor) -> Tensor:
-        """`dU/dx`, `[..., V, 3]`: the sheet's forces with opposite sign."""
-        return self.forces(self.strain(x))
+        """`dU/dx`, `[..., V, 3]`: the sheet's forces with opposite sign, `2 dU/dl (x_a - x_b)` along every side `a b`.
+
+        `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron).
+        """
+        side = x.index_select(-2, self.start) - x.index_select(-2, self.end)
+        squared = (side * side).sum(-1, keepdim=True).index_select(-2, self.side).unflatten(-2, (3, -1))  # [..., 3, T, 1]
+        det, area = (a.reshape(1, -1, 1) for a in (self.rest_det, self.rest_triangle_area))
+        I = (self.first * squared).sum(-3, keepdim=True)  # noqa: E741
+        slope = squared.sum(-3, keepdim=True) * (0.5 / det) - squared / det  # dD/dl
+        D = (squared * slope).sum(-3, keepdim=True) / 2
+        w = self.derivatives(I, D)
+        pull = (2 * area * self.first) * w.I + (2 * area * w.D) * slope
+        return self.on_vertices(self.on_sides(pull.flatten(-3, -2)) * side)
 
     def forces(self, strain: "Strain") -> Tensor:
-        """As `gradient`."""
+        """As `gradient`, from a strain that is known."""
         forces = torch.einsum("...ab,...bc->...ac", _symmetric(self._stress(strain)), strain.edges)
         return _from_edges(forces, self.grid)
 

@@ -19,6 +19,7 @@ from .errors import MembraneError
 from .force_balance import FINE_STEPS, FINE_TAU, TAU, WARM_STEPS, WARM_TAU, ForceBalance, Observation, schedule
 from .markers.locate import LEVELS, DotLocator
 from .markers.match import SETTLING, WIDTHS, DotMatcher, LocalDeformation
+from .minimum_energy import STEPS
 from .reconstruct import Reconstructor
 from .results import STATUS_TEXTS, Reconstruction
 from .store import Mesh, Settings
@@ -147,10 +148,11 @@ def _displacement(reconstructor, pixels):
 def minimum_energy(tracer: Tracer, estimator) -> None:
     """From `origins` and `directions` to the fields of `Equilibrium`."""
     kind = type(estimator)
-    tracer.piece(estimator, kind.start, ["directions"], ["range", "pressure"])
-    rays, state = ["origins", "directions"], ["range", "pressure"]
-    tracer.steps(estimator, kind.step, state, rays, estimator.steps)
-    tracer.piece(estimator, kind.equilibrium, [*state, *rays], list(Equilibrium._fields))
+    rays, state = ["origins", "directions"], ["range", "before", "moves"]
+    tracer.piece(estimator, kind.start, rays, [*state, *rays])
+    for _ in range((estimator.steps or STEPS) - 1):
+        tracer.piece(estimator, kind.step, [*state, *rays], state)
+    tracer.piece(estimator, kind.equilibrium, ["range", *rays], list(Equilibrium._fields))
 
 
 def force_balance(tracer: Tracer, estimator: ForceBalance) -> None:

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from .errors import MembraneError
+from .incidence import Incidence
 from .stencil import ring
 
 FINE = 40  # samples a line interval, for arc lengths
@@ -83,6 +84,12 @@ class Membrane(nn.Module):
         self.register_buffer("volume_third_derivatives", self.outward / 6 * _determinant_derivatives())
         self.register_buffer("volume_cross_products", self.outward / 6 * _cross_products())
         self.register_buffer("triangles", triangles)
+        at, following, last = (triangles.T.roll(-k, 0).flatten() for k in range(3))
+        self.register_buffer("following", following)
+        self.register_buffer("last", last)
+        self.register_buffer("yzx_zxy", torch.tensor([1, 2, 0, 2, 0, 1]))
+        self.register_buffer("zxy_yzx", torch.tensor([2, 0, 1, 1, 2, 0]))
+        self.on_vertices = Incidence(at.numpy(), np.arange(len(at)), np.full(len(at), 1 / 6), m * n, 6)
         self.register_buffer("fixed", torch.from_numpy(fixed.ravel().copy()))
         self.register_buffer("free", torch.nonzero(~self.fixed).ravel())
         self.register_buffer("rest_area", self.vertex_area(rest))
@@ -114,15 +121,14 @@ class Membrane(nn.Module):
         Positive for outward triangles: vertices run clockwise seen from the origin (the paper says counterclockwise).
         With a fixed rim the apex adds a constant.
         """
-        a, b, c = triangles_of(corners(x, self.grid)).unbind(-2)
-        return self.outward / 6 * (a * torch.linalg.cross(b, c)).sum((-1, -2, -3, -4))
+        return (x * self.volume_gradient(x)).sum((-1, -2)) / 3
 
     def volume_gradient(self, x: Tensor) -> Tensor:
         """Derivative of `volume` in the vertices, `[..., V, 3]`; the transposed cofactors of eq. 20."""
-        a, b, c = triangles_of(corners(x, self.grid)).unbind(-2)
-        cross = torch.linalg.cross
-        cofactors = torch.stack([cross(b, c), cross(c, a), cross(a, b)], -2)
-        return self.outward / 6 * corners_to_vertices(triangles_to_corners(cofactors), self.grid)
+        following = x.index_select(-1, self.yzx_zxy).index_select(-2, self.following)
+        last = x.index_select(-1, self.zxy_yzx).index_select(-2, self.last)
+        plus, minus = self.on_vertices(following * last).split(3, -1)  # of the cross products of the other two corners
+        return plus - minus
 
     def volume_hessian_blocks(self, x: Tensor) -> Tensor:
         """Second derivatives of every triangle's share of the volume, `[..., V, 3]` to `[..., m-1, n-1, 2, 9, 9]`."""
