@@ -4,6 +4,7 @@ import logging
 
 import numpy as np
 import onnx
+import onnx_ir as ir
 import torch
 from onnx import TensorProto, helper, numpy_helper
 from onnx_ir import passes
@@ -36,10 +37,25 @@ def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> 
     )  # fmt: skip
     common.InlinePass()(program.model)
     fold_constants_ir(program.model)
+    _plain_reshapes(program.model.graph)
     TIDY(program.model)
     for value, name in zip(program.model.graph.inputs, inputs, strict=True):  # one that is an output too has lost its name
         value.name = name
     return program.model_proto
+
+
+def _plain_reshapes(graph: ir.Graph) -> None:
+    """Shapes of which one length depends on the batch, put together at every run, become constants with -1 for it."""
+    for node in list(graph):
+        shape = node.inputs[1].producer() if node.op_type == "Reshape" else None
+        if shape is None or shape.op_type != "Concat":
+            continue
+        lengths = [ir.convenience.get_const_tensor(part) for part in shape.inputs]
+        if sum(length is None for length in lengths) == 1:
+            known = np.concatenate([[-1] if length is None else length.numpy() for length in lengths])
+            constant = ir.node("Constant", [], {"value": ir.tensor(known)})
+            graph.insert_before(node, constant)
+            node.replace_input_with(1, constant.outputs[0])
 
 
 class Assembly:
