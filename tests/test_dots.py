@@ -356,7 +356,7 @@ def test_windows_hold_the_pixels_around_each_dot_at_their_places(radius):
     pixels = np.random.default_rng(0).uniform(60, 180, (7, 2))
     fit = EllipseFit(pixels, np.broadcast_to(radius * np.eye(2), (7, 2, 2)), SIZE, 0.45).double()
     values, middle = fit.windows(pyramid(batch(u + 1000 * v, dtype=torch.float64)), torch.tensor(pixels)[None])
-    place = middle[..., None] + fit.stride[:, None, None] * fit.offset
+    place = middle[..., None] + fit.stride[:, None, None] * fit.linear[1:]
     torch.testing.assert_close(values, place[..., 0, :] + 1000 * place[..., 1, :])
     assert (middle - torch.tensor(pixels)).abs().max() <= 0.5 * fit.stride.max() + 1e-9
 

@@ -8,13 +8,13 @@ from scipy.spatial import Delaunay, cKDTree
 from torch import nn
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.markers.match import Coherence, DotMatcher, inverse_2x2, spacing
+from torchmembrane.markers.match import Coherence, DotMatcher, inverse_2x2, spacing, square_distance
 
 SOFTNESS = 0.6  # px, logistic scale of a dot's blurred outline
 RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level
 FINEST = 2.0  # a dot's short half axis on its level of the pyramid is at least this, where it can be
 LEVELS = 3
-RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, its slope, depth, shift, growth
+RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, its slope over the dot, depth, shift, growth
 STRAY = 0.5  # from where its neighbours predict it, pitches: a dot so far off is half trusted
 FEWEST = 0.2  # mean confidence of a frame that is half trusted
 FINEST_SIGMA = 1.1  # of the blob detector on a level of the pyramid, pixels of the level
@@ -40,6 +40,11 @@ def pyramid(image):
     for _ in range(LEVELS - 1):
         levels.append(F.avg_pool2d(levels[-1], 2))
     return levels
+
+
+def mapped(matrix, vector):
+    """`matrix [..., 2, 2] @ vector [..., 2]`, as a sum: products of so small matrices are slow."""
+    return (matrix * vector[..., None, :]).sum(-1)
 
 
 def solve_positive(system):
@@ -71,7 +76,7 @@ class EllipseFit(nn.Module):
         sizes = np.array([(height // 2**k, width // 2**k) for k in range(LEVELS)])
         gap = (0.85 * spacing(pixels)[0] - 2 * long) / stride
         ring = np.clip(0.7 * gap, 1.5, RING) * stride
-        half = int(np.ceil(((1.25 * long + ring) / stride).max()))
+        half = int(np.round(((long + ring) / stride).max()))
         half = min(half, (min(sizes[level].min(0)) - 1) // 2)
         step = np.arange(-half, half + 1)
         offset = np.stack(np.meshgrid(step, step)).reshape(2, -1)
@@ -80,7 +85,9 @@ class EllipseFit(nn.Module):
         self.levels = [(int(k), torch.as_tensor(np.flatnonzero(level == k))) for k in np.unique(level)]
         order = np.concatenate([dots for _, dots in self.levels])
         self.register_buffer("order", torch.as_tensor(np.argsort(order)))
-        self.register_buffer("offset", torch.as_tensor(offset.astype(float)))
+        u, v = offset.astype(float)
+        self.register_buffer("linear", torch.as_tensor(np.stack([np.ones_like(u), u, v])))
+        self.register_buffer("moments", torch.as_tensor(np.stack([u**0, u, v, u, u * u, u * v, v, u * v, v * v], -1)))
         for k, dots in self.levels:
             self.register_buffer(f"dots{k}", dots)
             self.register_buffer(f"step{k}", torch.as_tensor(offset[1] * sizes[k, 1] + offset[0]))
@@ -91,6 +98,7 @@ class EllipseFit(nn.Module):
         self.register_buffer("size", torch.as_tensor(size))
         self.register_buffer("softness", torch.as_tensor(SOFTNESS * np.sqrt(stride)))
         ridge = np.diag(RIDGE)[..., None] * np.ones(len(size))
+        ridge[1:3, 1:3] = RIDGE[1] * np.moveaxis(shapes @ shapes.swapaxes(1, 2) / stride[:, None, None] ** 2, 0, -1)
         ridge[4:6] *= size**2
         self.register_buffer("ridge", torch.as_tensor(np.concatenate([ridge, np.zeros((7, 1, len(size)))], 1))[:, :, None])
 
@@ -110,6 +118,10 @@ class EllipseFit(nn.Module):
         values = values[0] if len(values) == 1 else torch.cat(values, 1)[:, self.order]
         return values, pixel * stride + (stride - 1) / 2
 
+    def on_windows(self, maps):
+        """Both components, `[B, D, P]` each, of the affine maps `[B, D, 2, 3]` of the pixels' offsets."""
+        return tuple(rows @ self.linear for rows in maps.unbind(-2))
+
     def forward(self, levels, centre, shape):
         """`levels` of `pyramid` with dark dots, `centre [B, D, 2]`, `shape [B, D, 2, 2]` to begin with.
 
@@ -120,39 +132,44 @@ class EllipseFit(nn.Module):
         mean = values.mean(-1, keepdim=True)
         values = values - mean
         inverse = inverse_2x2(shape)
-        spread_out = (inverse * self.stride[:, None, None]) @ self.offset
         softness, sharpness = 1 / self.softness[:, None], 2 / self.stride[:, None]
         size = torch.linalg.vector_norm(shape, dim=(-2, -1)) / 2**0.5
-        start, growth, trust, one = centre, torch.zeros_like(size), 1.0, torch.ones_like(values)
+        to_unit = inverse * self.stride[:, None, None]
+        to_normal = inverse.mT @ to_unit
+        start, growth, trust, one = centre, torch.zeros_like(size), 1.0, torch.ones_like(size)[..., None]
         for k in range(self.steps):
-            y = spread_out + inverse @ (middle - centre)[..., None]  # [B, D, 2, P]
-            normal = inverse.mT @ y
-            rho = (y.square().sum(-2) + 1e-12).sqrt()
-            along = (normal.square().sum(-2) + 1e-12).rsqrt()
-            depth = (1 - rho) * rho * along + growth[..., None]  # inside the outline, px
+            off = (middle - centre) / self.stride[:, None]
+            y, normal = (self.on_windows(torch.cat([mapped(map, off)[..., None], map], -1)) for map in (to_unit, to_normal))
+            rho, steepness = ((u * u + v * v + 1e-12).sqrt() for u, v in (y, normal))
+            depth = (1 - rho) * rho / steepness + growth[..., None]  # inside the outline, px
             template = torch.sigmoid(depth * softness)
             outside = 1 - template
             edge = template * outside * softness
             weight = trust * torch.sigmoid((depth + self.ring[:, None]) * sharpness)
-            shift = (edge * along)[:, :, None] * y
-            one_row = lambda x: x[..., None, :]  # noqa: E731
-            basis = torch.cat([one_row(one), y, one_row(template), shift, one_row(edge), one_row(values)], -2)
-            gram = ((basis * one_row(weight)) @ basis.mT).movedim((-2, -1), (0, 1))
+            shift = edge / steepness
+            basis = torch.stack([template, shift * y[0], shift * y[1], edge, values], -2)  # and 1, u, v
+            weighed = basis * weight[..., None, :]
+            plain, mixed, own = weight @ self.moments, weighed @ self.linear.mT, weighed @ basis.mT
+            gram = torch.cat([torch.cat([plain.unflatten(-1, (3, 3)), mixed.mT], -1), torch.cat([mixed, own], -1)], -2)
+            gram = gram.movedim((-2, -1), (0, 1))
             fit = solve_positive(gram[:7] + self.ridge)  # [7, B, D]
-            excess = (torch.cat([fit, -one[None, ..., 0]]).movedim(0, -1)[..., None, :] @ basis).squeeze(-2)
+            miss = torch.cat([fit.movedim(0, -1), -one], -1)
             amplitude = -fit[3]
             gain = amplitude / (amplitude**2 + 1e-6)
             reach = 0.5 * size + 0.5
-            towards = (shape @ fit[4:6].movedim(0, -1)[..., None]).squeeze(-1)
+            towards = mapped(shape, fit[4:6].movedim(0, -1))
             centre = centre + reach[..., None] * torch.tanh(towards * (-gain / reach)[..., None])
             centre = start + torch.maximum(torch.minimum(centre - start, size[..., None] + 1), -size[..., None] - 1)
             growth = (growth + 0.5 * size * torch.tanh(-2 * fit[6] * gain / size)).clamp(-0.5 * size, 0.8 * size)
             if k + 1 < self.steps:
-                intruder = outside * (excess * (gain / 0.35)[..., None]).clamp(0, 10).square().square()
-                trust = 1 / (1 + intruder)
+                background, excess = miss[..., :3] @ self.linear, (miss[..., None, 3:] @ basis).squeeze(-2)
+                intruder = ((background + excess) * (gain / 0.35)[..., None]).clamp(0, 10).square().square()
+                trust = 1 / (1 + outside * intruder)
         spread = gram[7, 7] - gram[0, 7].square() / gram[0, 0].clamp_min(1)
-        explained = 1 - (weight * excess.square()).sum(-1) / (spread.clamp_min(0) + 1e-6)
-        contrast = amplitude / (fit[0] + mean[..., 0]).clamp_min(1e-2)
+        miss = miss.movedim(-1, 0)
+        explained = 1 - ((gram * miss).sum(1) * miss).sum(0) / (spread.clamp_min(0) + 1e-6)
+        background = (fit[1:3].movedim(0, -1) * off).sum(-1)
+        contrast = amplitude / (fit[0] - background + mean[..., 0]).clamp_min(1e-2)
         quality = torch.sigmoid(12 * (explained - 0.6)) * torch.sigmoid(40 * (contrast - 0.12))
         grown = torch.minimum(*(torch.log((size + growth) / usual).square() for usual in (size, self.size)))
         return centre, growth, quality * torch.exp(-grown / (2 * self.size_tolerance) ** 2)
@@ -207,6 +224,7 @@ class BlobDetector(nn.Module):
             for on, side in zip(lit, sides, strict=True)
         ]
         (v0, v1), (u0, u1) = self.box
+        self.parts = {}
         self.register_buffer("log_radii", torch.as_tensor(np.log(radii)))
         self.register_buffer("inside", (F.avg_pool2d(inside[..., v0:v1, u0:u1], self.cell) > 0.5).double())
         for axis, ((begin, end), side) in enumerate(zip(self.box, sides, strict=True)):
@@ -223,10 +241,16 @@ class BlobDetector(nn.Module):
             self._matrix("background", axis, linear_rows(coarse // 2, places) @ smooth)
 
     def _matrix(self, name, axis, matrix):
-        self.register_buffer(f"{name}_{'vu'[axis]}", torch.as_tensor(matrix if axis == 0 else matrix.T.copy()))
+        """Keep `matrix` for `apply`, without the columns of pixels that it does not look at."""
+        used = np.flatnonzero(matrix.any(0))
+        part = slice(int(used[0]), int(used[-1]) + 1)
+        self.parts.setdefault(name, [])[axis:] = [part]
+        matrix = matrix[:, part] if axis == 0 else matrix[:, part].T
+        self.register_buffer(f"{name}_{'vu'[axis]}", torch.as_tensor(matrix.copy()))
 
     def apply(self, name, image):
-        return getattr(self, f"{name}_v") @ image @ getattr(self, f"{name}_u")
+        v, u = self.parts[name]
+        return getattr(self, f"{name}_v") @ image[..., v, u] @ getattr(self, f"{name}_u")
 
     def response(self, levels, i):
         """`sigma^4 det Hessian` where the image is darkest, else 0, `[B, 1, rows, columns]` of the cells."""
@@ -237,10 +261,10 @@ class BlobDetector(nn.Module):
         vv = blurred[..., 2:, 1:-1] + blurred[..., :-2, 1:-1] - middle
         across = blurred[..., 2:] - blurred[..., :-2]
         uv = 0.25 * (across[..., 2:, :] - across[..., :-2, :])
-        response = sigma**4 * torch.where(uu + vv > 0, uu * vv - uv * uv, 0.0).clamp_min(0)
+        response = (uu.relu() * vv.relu() - uv * uv).relu()  # uu and vv have one sign where the determinant is positive
         if 2**k > self.cell:
-            return self.apply(f"spread{i}", response)
-        return response if 2**k == self.cell else F.max_pool2d(response, 2)
+            response = self.apply(f"spread{i}", response)
+        return sigma**4 * (F.max_pool2d(response, 2) if 2**k < self.cell else response)
 
     def forward(self, levels):
         """`levels` of `pyramid` with dark dots -> blobs `[B, K, 2]` px, log radius `[B, K]`, strength `[B, K]`."""
@@ -349,7 +373,7 @@ class DotLocator(nn.Module):
         """The levels of the pyramid, and the blobs: places `[B, K, 2]`, log radius `[B, K]`, and how surely one is a dot."""
         levels, rest = pyramid(1 - image if self.polarity == "light" else image), self.rest
         blobs, log_radius, strength = self.detect(levels)
-        nearest = (blobs[:, :, None] - rest).square().sum(-1).argmin(-1)
+        nearest = square_distance(blobs - self.match.origin, self.match.pixels).argmin(-1)
         relative = strength / self.strength[nearest]
         level = relative[:, : rest.shape[0] // 2].mean(1, keepdim=True)
         valid = torch.sigmoid(20 * (relative / (level + 1e-3) - 0.4))

@@ -17,6 +17,12 @@ CLAIM = 0.35  # a blob so near to a dot is the dot's, pitches
 RIVAL = 0.05  # a blob left over is as near to the prediction as the dot's own, pitches
 SUPPORT = 0.8  # sure nodes, weighed by distance, that a prediction needs
 FAR = 1e6
+MINORS = (  # adjugate [9] of a symmetric matrix from its entries 00 01 02 11 12 22: products a b - c d
+    (3, 4, 1, 4, 0, 1, 1, 1, 0),
+    (5, 2, 4, 2, 5, 2, 4, 2, 3),
+    (4, 1, 3, 1, 2, 0, 3, 0, 1),
+    (4, 5, 2, 5, 2, 4, 2, 4, 1),
+)
 
 
 def spacing(pixels):
@@ -77,7 +83,7 @@ class LocalDeformation(nn.Module):
 
     def begin(self, blobs, valid):
         """A first gradient; the dots around `[B, M, 2, K]`, the blobs beside `[B, 12, 2, K]` and their validity, in
-        pitches; how near all blobs are to each other `[B, K, K]`.
+        pitches; how near all blobs (columns) have the others `[B, K, K]`.
         """
         middle = self.pixels.mean(0)
         local = self.table[square_distance(blobs - middle, self.pixels - middle).argmin(-1)].mT
@@ -88,7 +94,7 @@ class LocalDeformation(nn.Module):
         beside = known.gather(2, index.mT.flatten(1)[:, None].expand(-1, 3, -1)).unflatten(2, (-1, blobs.shape[1]))
         others = ((beside[:, :2] - blobs.mT[:, :, None]) / pitch[:, None, None]).transpose(1, 2)  # [B, 12, 2, K]
         there = beside[:, 2]
-        nearby = torch.exp(-apart / (2 * (0.8 * pitch[..., None]) ** 2)) * valid[:, None]
+        nearby = torch.exp(-apart / (2 * (0.8 * pitch[:, None]) ** 2)) * valid[..., None]
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
         ratio = others[:, :4].square().sum(2).clamp_min(1e-12).sqrt().mean(1).clamp(0.4, 2.0)
         return ratio[:, None, None] * eye, around, others, there, nearby
@@ -109,7 +115,7 @@ class LocalDeformation(nn.Module):
         fitted = ((cross + 0.2 * gradient)[:, :, :, None] * adjugate[:, None]).sum(2).flatten(1, 2)
         quality = (valid * weight.mean(1).square())[:, None]
         scaled = fitted * (quality / (a * d - b * b)[:, None])
-        average = torch.cat([scaled, quality], 1) @ nearby.mT + 1e-6 * eye.new_tensor([1, 0, 0, 1, 1])[:, None]
+        average = torch.cat([scaled, quality], 1) @ nearby + 1e-6 * eye.new_tensor([1, 0, 0, 1, 1])[:, None]
         return ((average[:, :4] / average[:, 4:]).unflatten(1, (2, 2)),)
 
 
@@ -128,8 +134,12 @@ class LocalFlow(nn.Module):
         self.kernel[np.arange(count), np.arange(count)] = 0
         u, v = y[..., 0], y[..., 1]
         moments = self.kernel * np.stack([np.ones_like(u), u, v, u * u, u * v, v * v])  # [6, N, D]
-        self.register_buffer("moments", torch.as_tensor(np.moveaxis(moments[:, :count], 0, 1).reshape(count, -1).copy()))
+        moments_of_dots = np.moveaxis(moments[:, :count], 0, 1)
+        self.register_buffer("moments", torch.as_tensor(moments_of_dots.reshape(count, -1).copy()))
+        self.register_buffer("first_moments", torch.as_tensor(moments_of_dots[:, :3].reshape(count, -1).copy()))
         self.register_buffer("still", torch.as_tensor(moments[:, count:].sum(1)))
+        self.register_buffer("raised", self.still + torch.tensor([1e-3, 0, 0, RIDGE, 0, RIDGE])[:, None])
+        self.register_buffer("minors", torch.tensor(MINORS))
         self.register_buffer("h", torch.as_tensor(h))
 
     def rings(self, weight):
@@ -143,26 +153,24 @@ class LocalFlow(nn.Module):
 
     def gradient(self, weight, flow, prior):
         """Gradient `[B, 2, 2, D]` of the least-squares affine flow, drawn to `prior` where neighbours do not fix it."""
-        rows = weight[:, None] * torch.cat([torch.ones_like(weight)[:, None], flow], 1)
+        weight = weight[:, None]
+        rows = torch.cat([weight, weight * flow], 1)
         sums = (rows @ self.moments).unflatten(-1, (6, -1))  # [B, 3, 6, D]
-        s, su, sv, suu, suv, svv = (sums[:, 0] + self.still).unbind(1)
         load = torch.cat([sums[:, 1:, :1], sums[:, 1:, 1:3] + RIDGE * self.h * prior], 2)
-        suu, svv, s1 = suu + RIDGE, svv + RIDGE, s + 1e-3
-        # adjugate of the symmetric 3 x 3 normal matrix
-        c00, c01, c02 = suu * svv - suv**2, suv * sv - su * svv, su * suv - suu * sv
-        c11, c12, c22 = s1 * svv - sv**2, su * sv - s1 * suv, s1 * suu - su**2
-        adjugate = torch.stack([c01, c11, c12, c02, c12, c22], 1).unflatten(1, (2, 3))
-        determinant = (s1 * c00 + su * c01 + sv * c02) * self.h
-        return (load[:, :, None] * adjugate[:, None]).sum(3) / determinant[:, None, None]
+        normal = sums[:, 0] + self.raised  # of the symmetric 3 x 3 matrix: 00 01 02 11 12 22
+        entry = lambda which: normal.index_select(1, which)  # noqa: E731
+        a, b, c, d = self.minors
+        adjugate = (entry(a) * entry(b) - entry(c) * entry(d)).unflatten(1, (3, 3))
+        determinant = (normal[:, :3] * adjugate[:, 0]).sum(1) * self.h
+        return (load[:, :, None] * adjugate[:, None, 1:]).sum(3) / determinant[:, None, None]
 
     def along(self, weight, flow, gradient):
         """Flow `f_d = mean_n f_n + (J_n + J_d) / 2 (x_d - x_n)` where the gradient is known at the dots, and the support
         `[B, D]`; anchors take the gradient of the dot.
         """
-        one = torch.ones_like(weight)[:, None]
-        rows = weight[:, None] * torch.cat([one, flow, gradient.flatten(1, 2) / 2], 1)
-        count = self.h.numel()
-        sums = (rows @ self.moments[:, : 3 * count]).unflatten(-1, (3, count))  # [B, 7, 3, D]
+        weight = weight[:, None]
+        rows = torch.cat([weight, weight * torch.cat([flow, gradient.flatten(1, 2) / 2], 1)], 1)
+        sums = (rows @ self.first_moments).unflatten(-1, (3, -1))  # [B, 7, 3, D]
         support = sums[:, 0, 0] + self.still[0]
         own = sums[:, 0, 1:] / 2 + self.still[1:3]
         theirs = sums[:, 3::2, 1] + sums[:, 4::2, 2]
@@ -193,6 +201,7 @@ class Coherence(nn.Module):
         self.register_buffer("share", torch.as_tensor(kernel / kernel.sum(0)))
         self.register_buffer("total", torch.as_tensor(kernel.sum(0)))
         self.register_buffer("reach", torch.as_tensor(SEAM * mean))
+        self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
         self.register_buffer("nearest", torch.as_tensor(nearest))
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
 
@@ -201,19 +210,21 @@ class Coherence(nn.Module):
         `DotMatcher` -> `[B, D]` in 0..1.
         """
         sure = torch.sigmoid(20 * (confidence - 0.5))
-        square = (blobs[:, :, None] - pixels[:, None]).square().sum(-1)  # [B, K, D]
+        blobs, pixels, predicted = (x - self.origin for x in (blobs, pixels, predicted))
+        square = square_distance(blobs, pixels)  # [B, K, D]
         claimed = ((square < (CLAIM * self.nearest) ** 2) * sure[:, None]).amax(-1)
         misfit = (log_radius - self.log_radius[square.argmin(-1)]) / self.size_tolerance
         left = valid * torch.exp(-0.5 * misfit.square()) * (1 - claimed)
         own = (pixels - predicted).square().sum(-1).clamp_min(1e-12).sqrt()
-        other = (blobs[:, :, None] - predicted[:, None]).square().sum(-1).clamp_min(1e-12).sqrt()
+        other = square_distance(blobs, predicted).clamp_min(1e-12).sqrt()
         margin = (other - own[:, None]) / self.nearest
         alone = 1 - (left[..., None] * torch.sigmoid(20 * (RIVAL - margin))).amax(1)
         left = (left[:, None] @ torch.exp(-square / (2 * self.reach**2))).squeeze(1) / self.total
         lost = (1 - sure) @ self.share
-        ends = (gradient[:, self.near] + gradient[:, :, None]) / 2
-        change = pixels[:, self.near] - pixels[:, :, None] - self.step - (ends @ self.step[..., None]).squeeze(-1)
-        pair = sure[:, self.near] * sure[:, :, None]
+        at_neighbours = lambda x: x.index_select(1, self.near.flatten()).unflatten(1, self.near.shape)  # noqa: E731
+        ends = (at_neighbours(gradient) + gradient[:, :, None]) / 2
+        change = at_neighbours(pixels) - pixels[:, :, None] - self.step - (ends * self.step[:, :, None]).sum(-1)
+        pair = at_neighbours(sure) * sure[:, :, None]
         error = (pair * change.square().sum(-1).clamp_min(1e-12).sqrt() / self.length).sum(-1) @ self.share
         error = error / (pair.sum(-1) @ self.share + 1e-3)
         tear = torch.minimum(lost, left).clamp_min(1e-12).sqrt() * error
@@ -262,7 +273,8 @@ class DotMatcher(nn.Module):
         expected = self.pixels.mT + predicted
         alone = expected.square().sum(1) * self.stiffness + FAR * (support < SUPPORT)
         cost = (-2 * self.stiffness * expected).mT @ blobs[:, :2] + base + alone[..., None]
-        best, chosen = cost.min(-1)
+        chosen = cost.argmin(-1)
+        best = cost.gather(-1, chosen[..., None]).squeeze(-1)
         mutual = best <= cost.amin(1).gather(1, chosen) + 1e-6 * best.abs()
         weight = torch.exp(-0.5 * best) * mutual * (support / (support + 0.5))
         found, strain = blobs.gather(2, chosen[:, None].expand(-1, 6, -1)).split([2, 4], 1)
