@@ -80,9 +80,9 @@ class FlowInterpolation(nn.Module):
 
     Minimises `sum_d c_d |W_d f - s_d|^2 + alpha |Laplace f|^2` over grid flows `f` that vanish on the rim, with `c_d` the
     confidence, `W_d` the marker's barycentric weights and the rest surface's own Laplacian. With all markers found this is a
-    constant operator; lost markers are a change of low rank, so a few conjugate-gradient steps preconditioned by the
-    constant inverse solve it for any confidences. With `kind = "bilinear"` (the paper's) the flow is bilinear between the dots
-    instead; a lost dot then has the smooth flow.
+    constant operator, `f = R s`; for any confidences it is `f = R (c s + (1 - c) z)`, where `z` is `f` at the markers:
+    `z = H (c s + (1 - c) z)`, `H = W R`. Only lost markers are unknowns, so a few conjugate-gradient steps solve it. With
+    `kind = "bilinear"` (the paper's) the flow is bilinear between the dots instead; a lost dot then has the smooth flow.
 
     Arguments: membrane, the markers' `SurfacePoints`, `kind`. Calling it with `displacement [..., D, 2]` (px) and
     `confidence [..., D]` gives the flow `[..., V, 2]` (px).
@@ -96,35 +96,45 @@ class FlowInterpolation(nn.Module):
         D, V = len(markers.vertices), len(membrane.rest)
         if D < 3:
             raise MembraneError(f"FlowInterpolation: {D} markers; expected at least 3")
-        W = torch.zeros(D, V, dtype=torch.float64)
-        W.scatter_add_(1, torch.from_numpy(markers.vertices.astype(np.int64)), torch.from_numpy(markers.weights.copy()))
-        spacing2 = membrane.rest_area.sum() / D
-        alpha = (2 * SMOOTHING_LENGTH * spacing2.sqrt() / (2 * torch.pi)) ** 4 / spacing2
-        L = _laplacian(membrane)
-        bending = alpha * L @ (L / membrane.rest_area[:, None])
+        W, bending = weights(markers, V), roughness(membrane, D)
         free = membrane.free
         normal = (W.T @ W + bending)[free][:, free]
         inverse = torch.zeros(V, V, dtype=torch.float64)
         inverse[free[:, None], free] = torch.linalg.inv(normal)
-        self.register_buffer("bending", bending * (~membrane.fixed).double()[:, None] * (~membrane.fixed).double())
-        self.register_buffer("inverse", inverse)
-        self.register_buffer("weights", W * (~membrane.fixed).double())
+        at_markers = W @ inverse
+        self.register_buffer("spread", at_markers.T.contiguous())
+        self.register_buffer("influence", at_markers @ W.T)
         if kind == "bilinear":
             self.register_buffer("bilinear", torch.from_numpy(bilinear_matrix(membrane, markers)))
 
     def forward(self, displacement: Tensor, confidence: Tensor) -> Tensor:
-        W, c = self.weights, confidence[..., None]
-        at_markers = lambda f: (f.mT @ W.mT).mT  # noqa: E731
-        to_vertices = lambda s: (s.mT @ W).mT  # noqa: E731
-        smooth = conjugate_gradient(
-            lambda f: to_vertices(c * at_markers(f)) + symmetric_product(self.bending, f),
-            lambda f: symmetric_product(self.inverse, f),
-            to_vertices(c * torch.where(c > 0, displacement, 0.0)),
+        c = confidence[..., None]
+        H, lost = self.influence, (1 - c).clamp_min(1e-12).sqrt()
+        told = c * torch.where(c > 0, displacement, 0.0)
+        filled = conjugate_gradient(
+            lambda y: y - lost * symmetric_product(H, lost * y),
+            lambda y: y,
+            lost * symmetric_product(H, told),
             self.steps,
         )
+        complete = told + lost * filled
         if self.kind == "smooth":
-            return smooth
-        return (torch.where(c > 0, displacement, at_markers(smooth)).mT @ self.bilinear.mT).mT
+            return self.spread @ complete
+        return self.bilinear @ torch.where(c > 0, displacement, symmetric_product(H, complete))
+
+
+def weights(markers: SurfacePoints, count: int) -> Tensor:
+    """`W [D, V]`: values at markers from those at the grid's vertices."""
+    W = torch.zeros(len(markers.vertices), count, dtype=torch.float64)
+    return W.scatter_add_(1, torch.from_numpy(markers.vertices.astype(np.int64)), torch.from_numpy(markers.weights.copy()))
+
+
+def roughness(membrane: Membrane, markers: int) -> Tensor:
+    """`alpha |Laplace f|^2` as a matrix `[V, V]`, for so many markers on the membrane."""
+    spacing2 = membrane.rest_area.sum() / markers
+    alpha = (2 * SMOOTHING_LENGTH * spacing2.sqrt() / (2 * torch.pi)) ** 4 / spacing2
+    L = _laplacian(membrane)
+    return alpha * L @ (L / membrane.rest_area[:, None])
 
 
 def _laplacian(membrane: Membrane) -> Tensor:
