@@ -16,7 +16,7 @@ from .solve.kkt import constrained_minimum
 
 ELEMENTS = ("triangle", "quadrilateral")
 VOLUMES = ("exact", "linear")
-STEPS, RELAXED_STEPS = 10, 60
+STEPS, RELAXED_STEPS = 12, 60
 CONVERGED = 1e-5  # largest unbalance, and volume error where the volume is exact, of a converged surface
 
 
@@ -31,7 +31,7 @@ class MinimumEnergy(nn.Module):
         filling     "liquid" (volume kept), "gas" (pressure x volume kept), "open" (pressure stays at rest)
         gas         for a gas: absolute pressure at rest (force / length^2) and volume (length^3)
         volume      "exact", or "linear": linearised once, at the rest ranges (eq. 21)
-        steps       of the solve, default 10; 60 where the smoother is relaxed, which the constant inverse knows nothing of
+        steps       of the solve, default 12; 60 where the smoother is relaxed, which the constant inverse knows nothing of
         rest_rays   unit directions `[V, 3]` of the rest rays and their origins `[V, 3]`
 
     The rest load `h = grad U(X) - p0 grad V(X)` is subtracted, so that zero flow gives exactly zero displacement.

@@ -1,0 +1,71 @@
+"""How many steps minimum energy needs.
+
+python bench/energy_steps.py CASES [--grid 17] [--steps 6 8 10 12] [--json FILE]
+
+CASES as for accuracy.py; rays from the exact markers of every press. Printed for each material (the sensor's, harmonic),
+precision and number of steps: worst and median over the presses of the surface's error against 60 steps in float64, over its
+displacement (rms both), and the largest unbalance, by which a result counts as converged.
+"""
+
+import argparse
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from accuracy import cases_in
+from record import write
+
+from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.sensor import Sensor
+
+CONVERGED = 60
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", type=Path)
+    parser.add_argument("--grid", type=int, default=17)
+    parser.add_argument("--steps", type=int, nargs="*", default=[6, 8, 10, 12])
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(1)
+    cases, found, rows = cases_in(args.cases), {}, []
+    for name in sorted({case["sensor"] for case in cases}):
+        sensor = Sensor.from_file(args.cases / name)
+        sensor = replace(sensor, membrane=sensor.surface.membrane((args.grid, args.grid)))
+        pixels = [np.load(args.cases / case["truth"])["uv_deformed"] for case in cases if case["sensor"] == name]
+        for model in (None, "harmonic"):
+            reconstructor = Reconstructor(sensor, "minimum-energy", model=model, dtype=torch.float64)
+            for key, values in errors(reconstructor, torch.from_numpy(np.array(pixels, float)), args.steps).items():
+                found.setdefault((model or "the sensor's", *key), []).append(values)
+    for (model, precision, steps), values in found.items():
+        error, unbalance = torch.cat(values, 1)
+        row = dict(material=model, precision=precision, steps=steps, worst=float(error.max()), median=float(error.median()))
+        rows.append(row | dict(unbalance=float(unbalance.max())))
+        print("{material:12s} {precision} {steps:2d} steps: {worst:.1e} ({median:.1e}), {unbalance:.1e}".format(**rows[-1]))
+    write(args.json, dict(rows=rows))
+
+
+@torch.no_grad()
+def errors(reconstructor: Reconstructor, pixels: torch.Tensor, counts: list[int]) -> dict:
+    """`[2, presses]` error and unbalance for each precision and number of steps."""
+    origins, directions = reconstructor.rays(pixels - reconstructor.rest_pixels, torch.ones_like(pixels[..., 0]))
+    origins, estimator, found = origins.expand(directions.shape), reconstructor.estimator, {}
+    rms = lambda x: x.norm(dim=-1).square().mean(-1).sqrt()  # noqa: E731
+    estimator.steps = CONVERGED
+    exact = estimator(origins, directions).vertices
+    displacement = rms(exact - estimator.membrane.rest)
+    for dtype in (torch.float64, torch.float32):
+        estimator.to(dtype)
+        for estimator.steps in counts:
+            got = estimator(origins.to(dtype), directions.to(dtype))
+            error = rms(got.vertices.double() - exact) / displacement
+            found[str(dtype)[6:], estimator.steps] = torch.stack([error, got.unbalance.double()])
+    return found
+
+
+if __name__ == "__main__":
+    main()
