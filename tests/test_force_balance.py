@@ -109,7 +109,7 @@ def test_normal_equations_are_those_of_the_dense_slopes(hole):
     W = root @ root.mT
     matrix, load, push, (fWv, vWv) = estimator.normal_equations(at, W, slope, weight, angle)
 
-    moving = estimator.free.expand(-1, 3).flatten() > 0
+    moving = estimator.free.repeat_interleave(3) > 0
     A = slopes_at_inner_vertices(lambda y: inner(estimator.contact_force(y, p), dome.grid), x, estimator)[:, moving]
     J = slopes_at_inner_vertices(lambda y: estimator.angles(y, seen)[0], x, estimator)[:, moving]
     W = torch.block_diag(*W[0])

@@ -13,14 +13,12 @@ from torch import Tensor, nn
 
 from .errors import MembraneError
 from .incidence import Incidence
-from .membrane import Membrane, corners, corners_to_vertices, triangles_of, triangles_to_corners
+from .membrane import Membrane, corners, corners_to_vertices, triangles_of
 from .stencil import pairs_to_ring
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 _FIRST = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 _SECOND = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-_EDGES = ((-1.0, 1.0, 0.0), (-1.0, 0.0, 1.0))
-_BEND = (0.0, 0.0, 1.0, 0.0, -2.0, 0.0, 1.0, 0.0, 0.0)  # second derivatives of g11 g22 - g12^2 in g11, g12, g22
 
 
 class Derivatives(NamedTuple):
@@ -35,12 +33,13 @@ class Derivatives(NamedTuple):
 
 
 class Strain(NamedTuple):
-    """Two edges of every triangle `[..., m-1, n-1, 2, 2, 3]`, the adjugate of their metric `[..., 3]` (11, 12, 22), `W`'s
-    derivatives there."""
+    """Of every triangle, `T` standing for `2, m-1, n-1`: the two edges from its first vertex `[..., 2, 3, T]`, the adjugate of
+    their metric `[..., 3, T]` (11, 12, 22), the invariants `I` and `D` `[..., T]`."""
 
     edges: Tensor
     adjugate: Tensor
-    derivatives: Derivatives
+    I: Tensor  # noqa: E741
+    D: Tensor
 
 
 class Sheet(nn.Module):
@@ -62,17 +61,19 @@ class Sheet(nn.Module):
         c2 = modulus / 2 * c2_ratio / (1 + c2_ratio) if model == "mooney_rivlin" else 0.0
         for name, value in (("prestretch", prestretch), ("c1", modulus / 2 - c2), ("c2", c2)):
             self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
-        g11, g12, g22 = _metric(_edges(membrane.rest, self.grid))
-        det = g11 * g22 - g12**2
-        self.register_buffer("inverse_metric", torch.stack([g22, -g12, g11], -1) / det[..., None])
+        metric = _metric(_edges(membrane.rest, self.grid))
+        det = _determinant(metric)
+        self.register_buffer("inverse_metric", _adjugate(metric) / det)
         self.register_buffer("rest_det", det)
         self.register_buffer("rest_triangle_area", det.sqrt() / 2)
+        for name, constant in _metric_constants().items():
+            self.register_buffer(name, constant)
         self._register_sides(membrane)
 
     def _register_sides(self, membrane: Membrane) -> None:
         """The triangles' sides: their ends, where they meet, and `I` as a sum over their squared lengths."""
         index, V = torch.arange(len(membrane.rest))[:, None], len(membrane.rest)
-        of_triangles = triangles_of(corners(index, self.grid)).flatten(0, 2).squeeze(-1).numpy()  # [T, 3]
+        of_triangles = triangles_of(corners(index, self.grid)).movedim(2, 0).reshape(-1, 3).numpy()
         ends = np.sort(of_triangles[:, [[0, 1], [0, 2], [1, 2]]], -1).reshape(-1, 2)
         (start, end), side = (a.T for a in np.unique(ends, axis=0, return_inverse=True))
         side, E = side.reshape(-1, 3).T.ravel(), len(start)
@@ -82,20 +83,20 @@ class Sheet(nn.Module):
         self.register_buffer("side", torch.from_numpy(side.copy()))
         self.on_sides = Incidence(side, np.arange(len(side)), np.ones(len(side)), E, 1)
         self.on_vertices = Incidence(np.append(start, end), np.append(every, every), np.append(ones, -ones), V, 3)
-        G = self.inverse_metric.flatten(0, 2)
-        self.register_buffer("first", torch.stack([G[:, 0] + G[:, 1], G[:, 2] + G[:, 1], -G[:, 1]])[..., None])
+        G = self.inverse_metric.flatten(1)
+        self.register_buffer("first", torch.stack([G[0] + G[1], G[2] + G[1], -G[1]])[..., None])
 
     def on(self, membrane: Membrane) -> "Sheet":
         """The same material on another membrane or grid."""
         modulus = 2 * float(self.c1 + self.c2)
         return Sheet(membrane, self.model, float(self.prestretch), modulus, float(self.c2 / self.c1))
 
-    def _invariants(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def strain(self, x: Tensor) -> Strain:
+        """The strain of `x [..., V, 3]`."""
         edges = _edges(x, self.grid)
-        g11, g12, g22 = _metric(edges)
-        G = self.inverse_metric
-        first = G[..., 0] * g11 + 2 * G[..., 1] * g12 + G[..., 2] * g22
-        return edges, first, torch.stack([g22, -g12, g11], -1), (g11 * g22 - g12**2) / self.rest_det
+        metric = _metric(edges)
+        first = (self.inverse_metric * self.twice_12 * metric).sum(-4)
+        return Strain(edges, _adjugate(metric), first, _determinant(metric) / self.rest_det)
 
     def density(self, I: Tensor, D: Tensor) -> Tensor:  # noqa: E741
         """Energy per rest area `W(I, D)`."""
@@ -124,13 +125,8 @@ class Sheet(nn.Module):
 
     def energy(self, x: Tensor) -> Tensor:
         """`U(x)`, `[..., V, 3]` to `[...]`."""
-        _, I, _, D = self._invariants(x)  # noqa: E741
+        _, _, I, D = self.strain(x)  # noqa: E741
         return (self.rest_triangle_area * self.density(I, D)).sum((-1, -2, -3))
-
-    def strain(self, x: Tensor) -> "Strain":
-        """What the derivatives of the energy at `x [..., V, 3]` are made of."""
-        edges, I, adj, D = self._invariants(x)  # noqa: E741
-        return Strain(edges, adj, self.derivatives(I, D))
 
     def gradient(self, x: Tensor) -> Tensor:
         """`dU/dx`, `[..., V, 3]`: the sheet's forces with opposite sign, `2 dU/dl (x_a - x_b)` along every side `a b`.
@@ -147,16 +143,6 @@ class Sheet(nn.Module):
         pull = (2 * area * self.first) * w.I + (2 * area * w.D) * slope
         return self.on_vertices(self.on_sides(pull.flatten(-3, -2)) * side)
 
-    def forces(self, strain: "Strain") -> Tensor:
-        """As `gradient`, from a strain that is known."""
-        forces = torch.einsum("...ab,...bc->...ac", _symmetric(self._stress(strain)), strain.edges)
-        return _from_edges(forces, self.grid)
-
-    def _stress(self, strain: "Strain") -> Tensor:
-        """Stress times area in edge components `[..., 3]` (11, 12, 22): force on edge a is `sum_b S_ab e_b`."""
-        scale, w = 2 * self.rest_triangle_area[..., None], strain.derivatives
-        return scale * (w.I[..., None] * self.inverse_metric + (w.D / self.rest_det)[..., None] * strain.adjugate)
-
     def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
         """Positive semi-definite stiffness of displacements along one direction a vertex.
 
@@ -164,30 +150,9 @@ class Sheet(nn.Module):
         over quadrilaterals is `K_kl = d_k . H_kl d_l` with `H` the Hessian of `U`: exact where the sheet is in tension (for
         Mooney-Rivlin without the term of `D` that is not convex), and for the harmonic energy `L_kl d_k . d_l` (eq. 64).
         """
-        strain = self.strain(x)
+        H = self.hessian_blocks(x, positive=True).unflatten(-1, (3, 3)).unflatten(-3, (3, 3))
         d = triangles_of(corners(directions, self.grid))
-        edge_map = torch.tensor(_EDGES, dtype=x.dtype, device=x.device)
-        S = _symmetric(_tension(self._stress(strain)))
-        K = torch.einsum("...ab,ak,bl->...kl", S, edge_map, edge_map) * (d @ d.mT)
-        if self.model != "harmonic":
-            K = K + self._metric_stiffness(strain, d, edge_map)
-        return self._quadrilaterals(K)
-
-    def _metric_stiffness(self, strain, d, edge_map):
-        edges, adj, w = strain
-        projected = torch.einsum("...ac,...kc->...ak", edges, d)
-        d11 = 2 * projected[..., 0, :] * edge_map[0]
-        d22 = 2 * projected[..., 1, :] * edge_map[1]
-        d12 = projected[..., 0, :] * edge_map[1] + projected[..., 1, :] * edge_map[0]
-        G, det = self.inverse_metric, self.rest_det[..., None]
-        dI = G[..., 0:1] * d11 + 2 * G[..., 1:2] * d12 + G[..., 2:3] * d22
-        dD = (adj[..., 0:1] * d11 + 2 * adj[..., 1:2] * d12 + adj[..., 2:3] * d22) / det
-        outer = lambda p, q: p[..., :, None] * q[..., None, :]  # noqa: E731
-        area = self.rest_triangle_area
-        K = (area * w.DD)[..., None, None] * outer(dD, dD)
-        K = K + (area * w.ID)[..., None, None] * (outer(dI, dD) + outer(dD, dI))
-        bilinear = outer(d11, d22) + outer(d22, d11) - 2 * outer(d12, d12)
-        return K + (area * w.convex_D / self.rest_det)[..., None, None] * bilinear
+        return self._quadrilaterals(torch.einsum("...kilj,...ki,...lj->...kl", H, d, d))
 
     def hessian_blocks(self, x: Tensor, positive=False) -> Tensor:
         """Second derivatives of every triangle's energy in its nine vertex coordinates, `[..., m-1, n-1, 2, 9, 9]`.
@@ -195,37 +160,42 @@ class Sheet(nn.Module):
         Arguments: `x [..., V, 3]`. Exact; with `positive` the convex part: compression and (Mooney-Rivlin) the term of `D`
         that is not convex are left out, so that every block is positive semi-definite. Vertices as in `TRIANGLE_CORNERS`.
         """
-        ab, ac, bc = self._pair_blocks(self.strain(x), positive).movedim((-3, -6, -5, -4), (-4, -3, -2, -1)).unbind(-3)
+        blocks, stress = self._pairs(self.strain(x), positive)
+        blocks = blocks + stress * torch.eye(3, dtype=x.dtype, device=x.device)[:, :, None, None, None]
+        ab, ac, bc = blocks.movedim((-3, -6, -5, -4), (-4, -3, -2, -1)).unbind(-3)
         rows = [[-(ab + ac), ab, ac], [ab.mT, -(ab.mT + bc), bc], [ac.mT, bc.mT, -(ac.mT + bc.mT)]]
         return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
-    def hessian_ring(self, strain: "Strain") -> Tensor:
-        """Second derivatives of the energy in the inner vertices and their six neighbours, `[..., 6, 3, 3, N]`.
+    def ring(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """What inner vertices' forces and slopes are made of, at their six neighbours: `s [..., 6, N]`, `H [..., 6, 3, 3, N]`.
 
-        Those in one vertex alone are minus the sum of the six: a shift of all vertices changes no force.
+        The force (as `gradient`) is `sum_i s_i (x_i - x_k)` over the six neighbours; its derivative in neighbour `i` is `H_i`,
+        in the vertex itself minus the sum of the six.
         """
-        return pairs_to_ring(self._pair_blocks(strain))
+        blocks, stress = (pairs_to_ring(pairs) for pairs in self._pairs(self.strain(x)))
+        return stress.flatten(-4, -2), blocks + stress * torch.eye(3, dtype=x.dtype, device=x.device)[..., None]
 
-    def _pair_blocks(self, strain: "Strain", positive=False) -> Tensor:
-        """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2), `[..., 3, 3, 3, 2, m-1, n-1]`.
+    def _pairs(self, strain: Strain, positive=False) -> tuple[Tensor, Tensor]:
+        """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2): `B [..., 3, 3, 3, T]` and `S [..., 3, 1, 1, T]`
+        of `B + S 1`.
 
-        Those in its edges `a`, `b` from vertex 0 are `sum_cd T_cd e_c e_d^T + S_ab 1`, with `S` the stress and `T` from the
-        second derivatives `Q` in the metric.
+        Those in its edges `a`, `b` from vertex 0 are `sum_cd T_cd e_c e_d^T + S_ab 1`: `S` is the stress, force on edge a is
+        `sum_b S_ab e_b`, and `T` comes from the second derivatives `Q` in the metric.
         """
-        w, adj, stress = strain.derivatives, strain.adjugate, self._stress(strain)
-        p, q = (g * g.new_tensor([1.0, 2.0, 1.0]) for g in (self.inverse_metric, adj / self.rest_det[..., None]))
-        crossed = (self.rest_triangle_area * w.ID)[..., None]
-        bend = self.rest_triangle_area * (w.convex_D if positive else w.D) / self.rest_det
-        outer = lambda a, b: (a[..., :, None] * b[..., None, :]).flatten(-2)  # noqa: E731
-        Q = outer(q, (self.rest_triangle_area * w.DD)[..., None] * q + crossed * p) + outer(p, crossed * q)
-        Q = Q + bend[..., None] * bend.new_tensor(_BEND)
-        T = _components_first(Q @ Q.new_tensor(_METRIC_TO_PAIRS)).unflatten(-4, (3, 2, 2, 1))
-        S = _components_first((_tension(stress) if positive else stress) @ Q.new_tensor(_STRESS_TO_PAIRS))
-        e = _components_first(strain.edges.flatten(-2)).unflatten(-4, (2, 3))
+        e, adjugate, I, D = strain  # noqa: E741
+        w, area, det = self.derivatives(I, D), self.rest_triangle_area, self.rest_det
+        every = lambda field: field[..., None, :, :, :]  # noqa: E731
+        stress = 2 * area * (every(w.I * torch.ones_like(D)) * self.inverse_metric + every(w.D / det) * adjugate)
+        p, q = self.twice_12 * self.inverse_metric, self.twice_12 * adjugate / det
+        outer = lambda a, b: (a[..., :, None, :, :, :] * b[..., None, :, :, :, :]).flatten(-5, -4)  # noqa: E731
+        crossed = every(area * w.ID)
+        Q = outer(q, every(area * w.DD) * q + crossed * p) + outer(p, crossed * q)
+        Q = Q + every(area * (w.convex_D if positive else w.D) / det) * self.bend
+        T = _combined(self.metric_to_pairs, Q).unflatten(-4, (3, 2, 2, 1))
+        S = _combined(self.stress_to_pairs, _tension(stress) if positive else stress).unflatten(-4, (3, 1, 1))
         first, second = (T * e[..., None, None, :, :, :, :, :]).sum(-5).unbind(-5)
         e1, e2 = e[..., None, :, :, None, :, :, :].unbind(-6)
-        one = torch.eye(3, dtype=e.dtype, device=e.device)[:, :, None, None, None]
-        return e1 * first[..., None, :, :, :, :] + e2 * second[..., None, :, :, :, :] + S[..., None, None, :, :, :] * one
+        return e1 * first[..., None, :, :, :, :] + e2 * second[..., None, :, :, :, :], S
 
     @staticmethod
     def _quadrilaterals(K: Tensor) -> Tensor:
@@ -241,51 +211,59 @@ class Sheet(nn.Module):
 
 
 def _edges(x: Tensor, grid) -> Tensor:
-    a, b, c, d = corners(x, grid).unbind(-2)
-    return torch.stack([b - a, c - a, c - a, d - a], -2).unflatten(-2, (2, 2))
+    g = x.transpose(-2, -1).unflatten(-1, grid)
+    a, b, c, d = g[..., :-1, :-1], g[..., 1:, :-1], g[..., 1:, 1:], g[..., :-1, 1:]
+    ac = c - a
+    return torch.stack([torch.stack([b - a, ac], -3), torch.stack([ac, d - a], -3)], -5)
 
 
-def _metric_to_pairs() -> list[list[float]]:
-    """`[9, 12]`: from second derivatives `Q [3, 3]` in g11, g12, g22 to `T_cd` for the vertices (0, 1), (0, 2), (1, 2)."""
+def _metric(edges: Tensor) -> Tensor:
+    e1, e2 = edges.unbind(-5)
+    return torch.stack([(e1 * e1).sum(-4), (e1 * e2).sum(-4), (e2 * e2).sum(-4)], -4)
+
+
+def _adjugate(metric: Tensor) -> Tensor:
+    g11, g12, g22 = metric.unbind(-4)
+    return torch.stack([g22, -g12, g11], -4)
+
+
+def _determinant(metric: Tensor) -> Tensor:
+    g11, g12, g22 = metric.unbind(-4)
+    return g11 * g22 - g12**2
+
+
+def _combined(matrix: Tensor, components: Tensor) -> Tensor:
+    """Linear combinations of fields over triangles, `[..., C, T]`."""
+    return (matrix @ components.flatten(-3)).unflatten(-1, components.shape[-3:])
+
+
+def _metric_constants() -> dict[str, Tensor]:
+    """What is constant in second derivatives by the metric's entries 11, 12, 22.
+
+    `twice_12 [3]`; `bend [9]`, those of the determinant; `metric_to_pairs [12, 9]`, from any such to `T_cd` of `Sheet._pairs`;
+    `stress_to_pairs [3, 3]`, likewise for the stress.
+    """
     slopes = np.zeros((2, 3, 2))  # d g / d e_a = sum_c slopes[a, g, c] e_c
     slopes[0, 0, 0] = slopes[1, 2, 1] = 2.0
     slopes[0, 1, 1] = slopes[1, 1, 0] = 1.0
-    edges = np.einsum("agc,bhd->abghcd", slopes, slopes)
-    return np.stack([-edges.sum(0)[0], -edges.sum(0)[1], edges[0, 1]], 2).reshape(9, 12).tolist()
-
-
-_METRIC_TO_PAIRS = _metric_to_pairs()
-_STRESS_TO_PAIRS = ((-1.0, 0.0, 0.0), (-1.0, -1.0, 1.0), (0.0, -1.0, 0.0))
-
-
-def _components_first(field: Tensor) -> Tensor:
-    """`[..., m-1, n-1, 2, C]` to `[..., C, 2, m-1, n-1]`."""
-    return field.transpose(-4, -1).transpose(-3, -2).mT.contiguous()
-
-
-def _from_edges(forces: Tensor, grid) -> Tensor:
-    first = -forces.sum(-2, keepdim=True)
-    return corners_to_vertices(triangles_to_corners(torch.cat([first, forces], -2)), grid)
-
-
-def _metric(edges: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    e1, e2 = edges.unbind(-2)
-    return (e1 * e1).sum(-1), (e1 * e2).sum(-1), (e2 * e2).sum(-1)
-
-
-def _symmetric(components: Tensor) -> Tensor:
-    s11, s12, s22 = components.unbind(-1)
-    return torch.stack([torch.stack([s11, s12], -1), torch.stack([s12, s22], -1)], -2)
+    edges = np.einsum("agc,bhd->abcdgh", slopes, slopes).reshape(2, 2, 4, 9)
+    to_pairs = np.stack([-edges.sum(0)[0], -edges.sum(0)[1], edges[0, 1]]).reshape(12, 9)
+    return dict(
+        twice_12=torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)[:, None, None, None],
+        bend=torch.tensor([0.0, 0, 1, 0, -2, 0, 1, 0, 0], dtype=torch.float64)[:, None, None, None],
+        metric_to_pairs=torch.from_numpy(to_pairs),
+        stress_to_pairs=torch.tensor([[-1.0, -1, 0], [0, -1, -1], [0, 1, 0]], dtype=torch.float64),
+    )
 
 
 def _tension(stress: Tensor) -> Tensor:
-    """The positive semi-definite part of a symmetric 2 x 2 matrix given as (11, 12, 22)."""
-    s11, s12, s22 = stress.unbind(-1)
+    """The positive semi-definite part of symmetric 2 x 2 matrices given as (11, 12, 22), `[..., 3, T]`."""
+    s11, s12, s22 = stress.unbind(-4)
     mean, half = (s11 + s22) / 2, (s11 - s22) / 2
     radius = (half**2 + s12**2).clamp_min(torch.finfo(stress.dtype).tiny).sqrt()
     high, low = (mean + radius).clamp_min(0), (mean - radius).clamp_min(0)
     centre, slope = (high + low) / 2, (high - low) / (2 * radius)
-    return torch.stack([centre + slope * half, slope * s12, centre - slope * half], -1)
+    return torch.stack([centre + slope * half, slope * s12, centre - slope * half], -4)
 
 
 class AffineQuadrilaterals(nn.Module):

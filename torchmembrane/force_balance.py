@@ -100,13 +100,13 @@ class ForceBalance(nn.Module):
         self.register_buffer("marker_weights", torch.as_tensor(markers.weights, dtype=torch.float64))
         within = lambda field: inner(field, membrane.grid)  # noqa: E731
         self.register_buffer("area", within(membrane.rest_area[:, None]).squeeze(-1))
-        self.register_buffer("free", within(self.moves))
+        self.register_buffer("free", within(self.moves).squeeze(-1))
         self.register_buffer("free_neighbours", ring(self.moves, membrane.grid)[:, None])
         self.register_buffer("surroundings", within(within(_surroundings(membrane)).mT).mT)
         vertex_shares, pair_shares = _shares(membrane, self.marker_vertices, self.marker_weights)
         self.register_buffer("vertex_shares", vertex_shares)
         self.register_buffer("pair_shares", pair_shares)
-        self.system = StencilSystem(membrane.grid, self.free[:, 0] > 0, len(STENCIL) + 1)
+        self.system = StencilSystem(membrane.grid, self.free > 0, len(STENCIL) + 1)
         self.coarse = self._coarser(filling, gas, min(steps, COARSE_STEPS))
 
     def _coarser(self, filling, gas, steps) -> "ForceBalance | None":
@@ -190,14 +190,15 @@ class ForceBalance(nn.Module):
 
     def linearised(self, x: Tensor, pressure: Tensor) -> "Linearised":
         """`contact_force` and what it and the volume do when vertices move, at the inner vertices."""
-        grid, strain = self.membrane.grid, self.sheet.strain(x)
-        gradient, volume_ring = self.membrane.volume_ring(x)
-        sheet_ring = self.sheet.hessian_ring(strain)
-        force = inner(self.sheet.forces(strain) - self.rest_load, grid) - pressure[:, None, None] * gradient
-        around = self.free_neighbours * (sheet_ring - pressure[:, None, None, None, None] * volume_ring)
-        blocks = torch.cat([-sheet_ring.sum(-4, keepdim=True), around], -4) * self.free.transpose(0, 1)
+        grid, around = self.membrane.grid, ring(x, self.membrane.grid)
+        gradient, volume_ring = self.membrane.volume_ring(around)
+        stress, sheet_ring = self.sheet.ring(x)
+        here, load = inner(x, grid).mT, inner(self.rest_load, grid).mT
+        force = (stress[:, :, None] * (around - here[:, None])).sum(1) - load - pressure[:, None, None] * gradient
+        beside = self.free_neighbours * (sheet_ring - pressure[:, None, None, None, None] * volume_ring)
+        blocks = torch.cat([-sheet_ring.sum(1, keepdim=True), beside], 1) * self.free
         slope = blocks.permute(0, 4, 2, 1, 3).flatten(-2)
-        return Linearised(force * self.free, slope, gradient * self.free, F.normalize(gradient, dim=-1))
+        return Linearised((force * self.free).mT, slope, (gradient * self.free).mT, F.normalize(gradient, dim=1).mT)
 
     def markers(self, x: Tensor) -> Tensor:
         """The markers' positions on the surface `x`, `[B, D, 3]`."""

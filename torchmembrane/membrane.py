@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from .errors import MembraneError
 from .incidence import Incidence
-from .stencil import ring
 
 FINE = 40  # samples a line interval, for arc lengths
 TRIANGLE_CORNERS = ((0, 1, 2), (0, 2, 3))
@@ -134,12 +133,11 @@ class Membrane(nn.Module):
         """Second derivatives of every triangle's share of the volume, `[..., V, 3]` to `[..., m-1, n-1, 2, 9, 9]`."""
         return (triangles_of(corners(x, self.grid)).flatten(-2) @ self.volume_third_derivatives).unflatten(-1, (9, 9))
 
-    def volume_ring(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivative of `volume` in the inner vertices, `[..., N, 3]`, and the second ones in them and their six neighbours,
-        `[..., 6, 3, 3, N]`; those in one vertex alone are zero."""
-        around = ring(x, self.grid)
+    def volume_ring(self, around: Tensor) -> tuple[Tensor, Tensor]:
+        """Derivative of `volume` in the inner vertices, `[..., 3, N]`, and the second ones in them and their six neighbours,
+        `[..., 6, 3, 3, N]`; those in one vertex alone are zero. `around [..., 6, 3, N]`: the `ring` of the vertices."""
         before, after = around.roll(1, -3), around.roll(-1, -3)
-        gradient = torch.linalg.cross(around, after, dim=-2).sum(-3).mT
+        gradient = torch.linalg.cross(around, after, dim=-2).sum(-3)
         return self.outward / 6 * gradient, (self.volume_cross_products @ (before - after)).unflatten(-2, (3, 3))
 
     @property
