@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from .errors import MembraneError
-from .incidence import Incidence
 
 FINE = 40  # samples a line interval, for arc lengths
 TRIANGLE_CORNERS = ((0, 1, 2), (0, 2, 3))
@@ -83,12 +82,6 @@ class Membrane(nn.Module):
         self.register_buffer("volume_third_derivatives", self.outward / 6 * _determinant_derivatives())
         self.register_buffer("volume_cross_products", self.outward / 6 * _cross_products())
         self.register_buffer("triangles", triangles)
-        at, following, last = (triangles.T.roll(-k, 0).flatten() for k in range(3))
-        self.register_buffer("following", following)
-        self.register_buffer("last", last)
-        self.register_buffer("yzx_zxy", torch.tensor([1, 2, 0, 2, 0, 1]))
-        self.register_buffer("zxy_yzx", torch.tensor([2, 0, 1, 1, 2, 0]))
-        self.on_vertices = Incidence(at.numpy(), np.arange(len(at)), np.full(len(at), 1 / 6), m * n, 6)
         self.register_buffer("fixed", torch.from_numpy(fixed.ravel().copy()))
         self.register_buffer("free", torch.nonzero(~self.fixed).ravel())
         self.register_buffer("rest_area", self.vertex_area(rest))
@@ -120,14 +113,22 @@ class Membrane(nn.Module):
         Positive for outward triangles: vertices run clockwise seen from the origin (the paper says counterclockwise).
         With a fixed rim the apex adds a constant.
         """
-        return (x * self.volume_gradient(x)).sum((-1, -2)) / 3
+        a, across, c = self._quadrilaterals(x)
+        return self.outward / 6 * (c * torch.linalg.cross(a, across, dim=-3)).sum((-1, -2, -3))
 
     def volume_gradient(self, x: Tensor) -> Tensor:
         """Derivative of `volume` in the vertices, `[..., V, 3]`; the transposed cofactors of eq. 20."""
-        following = x.index_select(-1, self.yzx_zxy).index_select(-2, self.following)
-        last = x.index_select(-1, self.zxy_yzx).index_select(-2, self.last)
-        plus, minus = self.on_vertices(following * last).split(3, -1)  # of the cross products of the other two corners
-        return plus - minus
+        a, across, c = self._quadrilaterals(x)
+        cross = lambda u, v: torch.linalg.cross(u, v, dim=-3)  # noqa: E731
+        at_b = cross(c, a)
+        total = F.pad(cross(across, c), (0, 1, 0, 1)) + F.pad(cross(a, across), (1, 0, 1, 0))
+        total = total + F.pad(at_b, (0, 1, 1, 0)) - F.pad(at_b, (1, 0, 0, 1))
+        return self.outward / 6 * total.flatten(-2).mT
+
+    def _quadrilaterals(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Corners a, b - d, c of all quadrilaterals, `[..., 3, m-1, n-1]`: shares of the volume are `det [a, b - d, c] / 6`."""
+        g = x.transpose(-2, -1).unflatten(-1, self.grid)
+        return g[..., :-1, :-1], g[..., 1:, :-1] - g[..., :-1, 1:], g[..., 1:, 1:]
 
     def volume_hessian_blocks(self, x: Tensor) -> Tensor:
         """Second derivatives of every triangle's share of the volume, `[..., V, 3]` to `[..., m-1, n-1, 2, 9, 9]`."""
