@@ -45,18 +45,33 @@ def inverse(matrix: Tensor) -> Tensor:
 
 
 def solve(diagonal: Tensor, upper: Tensor, b: Tensor) -> Tensor:
-    """As `block_tridiagonal.solve`."""
-    s, last = diagonal.shape[-1], diagonal.shape[-3] - 1
+    """As `block_tridiagonal.solve`; eliminated from both ends at once, two blocks a product."""
+    s, n = diagonal.shape[-1], diagonal.shape[-3]
+    D, U, b = (list(blocks.unbind(-3)) for blocks in (diagonal, upper, b))
+    pair = lambda first, last: torch.stack([first, last], -3)  # noqa: E731
     reduced = []
-    pivot, rhs = diagonal[..., 0, :, :], b[..., 0, :, :]
-    for i in range(last + 1):
-        scale = pivot.diagonal(dim1=-2, dim2=-1).rsqrt()
-        own = inverse(pivot * scale[..., :, None] * scale[..., None, :]) * scale[..., :, None] * scale[..., None, :]
-        reduced.append(own @ (torch.cat([upper[..., i, :, :], rhs], -1) if i < last else rhs))
-        if i < last:
-            product = upper[..., i, :, :].mT @ reduced[-1]
-            pivot, rhs = diagonal[..., i + 1, :, :] - product[..., :s], b[..., i + 1, :, :] - product[..., s:]
-    x = [reduced[-1]]
-    for Y in reduced[-2::-1]:
-        x.append(Y[..., s:] - Y[..., :s] @ x[-1])
-    return torch.stack(x[::-1], -3)
+    for i in range((n - 1) // 2):
+        j = n - 1 - i
+        coupled = pair(U[i], U[j - 1].mT)
+        Y = _inverse_scaled(pair(D[i], D[j])) @ torch.cat([coupled, pair(b[i], b[j])], -1)
+        for k, product in zip((i + 1, j - 1), (coupled.mT @ Y).unbind(-3), strict=True):
+            D[k], b[k] = D[k] - product[..., :s], b[k] - product[..., s:]
+        reduced.append(Y)
+    k, x = (n - 1) // 2, [None] * n
+    if n % 2 == 0:
+        Y = _inverse_scaled(D[k]) @ torch.cat([U[k], b[k]], -1)
+        product = U[k].mT @ Y
+        x[k + 1] = _inverse_scaled(D[k + 1] - product[..., :s]) @ (b[k + 1] - product[..., s:])
+        x[k] = Y[..., s:] - Y[..., :s] @ x[k + 1]
+    else:
+        x[k] = _inverse_scaled(D[k]) @ b[k]
+    for i in reversed(range(k)):
+        j = n - 1 - i
+        x[i], x[j] = (reduced[i][..., s:] - reduced[i][..., :s] @ pair(x[i + 1], x[j - 1])).unbind(-3)
+    return torch.stack(x, -3)
+
+
+def _inverse_scaled(matrix: Tensor) -> Tensor:
+    scale = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()
+    scale = scale[..., :, None] * scale[..., None, :]
+    return inverse(matrix * scale) * scale

@@ -63,7 +63,7 @@ class StencilSystem(nn.Module):
         own, beside, *further = (part.unflatten(1, size).sum(1) for part, size in zip(parts, self.sizes, strict=True))
         own = (own + near[:, :1]) * (1 + damping * self.one[:, None])
         blocks = torch.cat([own, beside + near[:, 1:], *further], 1)
-        one = self.one.to(blocks).expand(len(blocks), 3, 3)
+        one = self.one.to(blocks).expand(blocks.shape[0], 3, 3)
         entries = torch.cat([blocks.flatten(1, 3), blocks.transpose(2, 4).flatten(1, 3), one], 1)
         s = self.block_size
         matrix = entries.index_select(1, self.places).flatten(1).unflatten(1, (-1, s, s))
