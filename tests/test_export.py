@@ -160,7 +160,7 @@ def test_damaged_images_get_the_same_status(run, reconstructor, images):
     good = reconstructor.read(images[1])[0]
     blank, nan, noise, hidden = torch.zeros_like(good), good.clone(), torch.rand(good.shape), good.clone()
     nan[0, 5, 7] = torch.nan
-    hidden[:, 45:65, 60:80] = 0.5
+    hidden[:, 75:95, 60:80] = 0.5
     images = torch.stack([good, blank, nan, noise, hidden])
     with torch.no_grad():
         expected = reconstructor(images)
