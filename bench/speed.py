@@ -5,7 +5,8 @@ python bench/speed.py [--sensor examples/sensor.toml] [--image examples/two_cont
 Minimum energy: the twin solves the same constrained harmonic problem (linear triangles, volume linearised once, eq. 22) as one
 would write it for one frame: sparse assembly and factorisation by scipy. Force balance (17 x 17): cold from rest and warm from
 the solution, beside `balance_twin`, which makes the same steps; processor time, the least of several turns, taken in turn, as
-other programs may share the cores. How accurate that grid is: `ablation.py`, its base row for 17 x 17.
+other programs may share the cores. How accurate that grid is: `ablation.py`, its base row for 17 x 17. With 2000000000 as the
+environment's MALLOC_TRIM_THRESHOLD_ and MALLOC_MMAP_THRESHOLD_ glibc keeps freed memory: a quarter less time in batches.
 """
 
 import argparse
@@ -115,6 +116,11 @@ def force_balance(args):
         functions[f"batch {batch}, cold"] = lambda frames=frames: estimator(*frames)
         functions[f"batch {batch}, warm"] = lambda frames=frames, start=start: estimator(*frames, start)
         batches |= {f"batch {batch}, cold": batch, f"batch {batch}, warm": batch}
+        if args.compiled:
+            compiled = torch.compile(estimator, fullgraph=True)
+            functions[f"batch {batch}, compiled, cold"] = lambda frames=frames, f=compiled: f(*frames)
+            functions[f"batch {batch}, compiled, warm"] = lambda frames=frames, start=start, f=compiled: f(*frames, start)
+            batches |= {f"batch {batch}, compiled, cold": batch, f"batch {batch}, compiled, warm": batch}
     times = {name: value / batches.get(name, 1) for name, value in least_milliseconds(functions, 5).items()}
     for name, value in times.items():
         ratio = value / times["scipy twin, cold"]
@@ -134,6 +140,7 @@ def main():
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--batches", type=int, nargs="*", default=[1, 16, 64])
     parser.add_argument("--only", choices=("minimum-energy", "force-balance"))
+    parser.add_argument("--compiled", action="store_true", help="force balance by torch.compile as well: minutes")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
