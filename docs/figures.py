@@ -20,10 +20,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from torchmembrane.flow import FlowInterpolation
-from torchmembrane.markers.screen import MismatchScreen
 from torchmembrane.presets import preset_file
 from torchmembrane.profile import ForceBalanceProfile, MinimumEnergyProfile
-from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.reconstruct import FOUND, Reconstructor
 from torchmembrane.results import Reconstruction
 from torchmembrane.segmentation import PolarAngle, Segmentation
 from torchmembrane.simulate.indenters import Cylinder, Sphere
@@ -38,6 +37,7 @@ NOISE = 30.0  # dB below white
 ESTIMATORS = {"minimum energy": "minimum-energy", "force balance": "force-balance"}
 MISMATCHED = 0.05
 MAGNIFICATIONS, LONGEST_ARROW = (2, 3, 5, 10), 60  # px
+WIDTHS = {"width_ratios": (1, 1, 1.4, 1.4)}
 
 
 class Shown(NamedTuple):
@@ -97,15 +97,23 @@ def draw_image(axes, image, title: str) -> None:
     axes.set_yticks([])
 
 
-def draw_matches(axes, shown: Shown, result: Reconstruction, title="matches") -> None:
-    """Circles at the dots of the rest image, arrows towards where they have gone."""
-    r = reconstructor(shown.sensor)
-    rest, now = r.rest_pixels.numpy(), result.pixels[0].numpy()
-    flow = now - rest
+def draw_flow(axes, image, places, flow, title: str, width: float) -> None:
+    """Arrows of `flow [D, 2]` px from `places`, as many times as long as fits."""
     times = max((k for k in MAGNIFICATIONS if k * np.nanmax(np.linalg.norm(flow, axis=1)) < LONGEST_ARROW), default=1)
-    draw_image(axes, 0.6 + 0.4 * r.sensor.markers.rest_image, f"{title}, arrows {times} times as long")
+    draw_image(axes, image, title + (f", arrows {times} times as long" if times > 1 else ""))
+    axes.quiver(*places.T, *(times * flow).T, angles="xy", scale_units="xy", scale=1, color=VERMILION, width=width)
+
+
+def draw_matches(axes, shown: Shown, flow: torch.Tensor, title="matches") -> None:
+    """Circles at the dots of the rest image, arrows `flow [D, 2]` px towards where they have gone."""
+    r = reconstructor(shown.sensor)
+    rest = r.rest_pixels.numpy()
+    draw_flow(axes, 0.6 + 0.4 * r.sensor.markers.rest_image, rest, flow.numpy(), title, 0.004)
     axes.plot(*rest.T, "o", ms=5, mfc="none", mec=BLUE, mew=0.8)
-    axes.quiver(*rest.T, *(times * flow).T, angles="xy", scale_units="xy", scale=1, color=VERMILION, width=0.004)
+
+
+def measured_flow(shown: Shown, result: Reconstruction) -> torch.Tensor:
+    return result.pixels[0] - reconstructor(shown.sensor).rest_pixels
 
 
 def draw_surface(axes, shown: Shown, result: Reconstruction, across: int, title: str) -> None:
@@ -113,26 +121,28 @@ def draw_surface(axes, shown: Shown, result: Reconstruction, across: int, title:
     membrane = reconstructor(shown.sensor).estimator.membrane
     plane = [across, 2]
     m, n = membrane.grid
-    lattice = result.vertices[0].numpy()[:, plane].reshape(m, n, 2)[:: max(1, m // 16), :: max(1, n // 16)]
+    found = result.vertices[0].numpy()[:, plane].reshape(m, n, 2)
+    lattice = [*found[:: max(1, m // 16)], *found.swapaxes(0, 1)[:: max(1, n // 16)]]
     axes.plot(*membrane.rest.numpy()[:, plane].T, "+", ms=4, mew=0.6, color=GREY, label="at rest")
-    axes.add_collection(LineCollection([*lattice, *lattice.swapaxes(0, 1)], colors=BLUE, linewidths=0.5, label="found"))
+    axes.add_collection(LineCollection(lattice, colors=BLUE, linewidths=0.5, label="found"))
     axes.plot(*shown.dots[:, plane].T, ".", ms=5, color=VERMILION, label="dots, true")
     axes.set_aspect("equal")
     axes.set_title(title, fontsize=10)
-    axes.set_xlabel(error_words(shown, result), fontsize=10)
+    axes.set_xlabel(f"{'xy'[across]}, mm\n{error_words(shown, result)}", fontsize=10)
+    axes.set_ylabel("z, mm", fontsize=10)
 
 
 def reconstruction_rows(name: str, across: int, *rows: tuple[str, tuple]) -> Figure:
     """Image, matches, and both reconstructions, a row for each press."""
-    drawing = Figure(figsize=(15, 0.8 + 3.2 * len(rows)), dpi=100, layout="constrained")
+    drawing = Figure(figsize=(16, 0.8 + 3.9 * len(rows)), dpi=100, layout="constrained")
     drawing.suptitle(name)
-    for axes, (sensor, strokes) in zip(drawing.subplots(len(rows), 4, squeeze=False), rows, strict=True):
+    for axes, (sensor, strokes) in zip(drawing.subplots(len(rows), 4, squeeze=False, gridspec_kw=WIDTHS), rows, strict=True):
         shown = pressed(sensor, *strokes)
         draw_image(axes[0], shown.image, "deformed image")
         for place, (title, estimator) in zip(axes[2:], ESTIMATORS.items(), strict=True):
             result = reconstructed(sensor, strokes, estimator)
             draw_surface(place, shown, result, across, title)
-        draw_matches(axes[1], shown, result)
+        draw_matches(axes[1], shown, measured_flow(shown, result))
     drawing.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower right", ncols=3, frameon=False)
     return drawing
 
@@ -153,14 +163,13 @@ def figure_6() -> Figure:
     (a, b), (c, d) = drawing.subplots(2, 2)
     draw_image(a, r.sensor.markers.rest_image, "(a) undeformed")
     draw_image(b, shown.image, "(b) pressed 2.5 mm by a ball of radius 1.2 mm")
-    draw_matches(c, shown, result, "(c) measured flow")
+    draw_matches(c, shown, measured_flow(shown, result), "(c) measured flow")
     fine = r.sensor.surface.membrane((16, 16))
     points = fine.closest_points(r.rest_markers.double().numpy())
-    moved = (result.pixels[0] - r.rest_pixels).double()
+    moved = measured_flow(shown, result).double()
     flow = FlowInterpolation(fine, points, "bilinear")(moved, torch.ones(len(moved)).double()).numpy()
     place = r.sensor.camera.point_to_pixel(fine.rest).numpy()
-    draw_image(d, np.ones_like(shown.image), "(d) on a 16 x 16 grid, bilinear, arrows 2 times as long")
-    d.quiver(*place.T, *(2 * flow).T, angles="xy", scale_units="xy", scale=1, color=VERMILION, width=0.003)
+    draw_flow(d, np.ones_like(shown.image), place, flow, "(d) on a 16 x 16 grid, bilinear", 0.003)
     words = "; ".join(f"{title}: {error_words(shown, got)}" for title, got in results.items())
     drawing.supxlabel(words, fontsize=10)
     return drawing
@@ -180,7 +189,7 @@ def contact_words(found: np.ndarray, true: np.ndarray) -> str:
     if not len(found):
         return "none found"
     gap = np.linalg.norm(found[:, None] - true, axis=2)
-    return f"{len(found)} found; contact error {max(gap.min(0).mean(), gap.min(1).mean()):.2f} mm"
+    return f"{len(found)} found; in space {max(gap.min(0).mean(), gap.min(1).mean()):.2f} mm from the true"
 
 
 def draw_contacts(axes, shown: Shown, values, points, title: str, words: str, symmetric=True) -> None:
@@ -196,7 +205,7 @@ def draw_contacts(axes, shown: Shown, values, points, title: str, words: str, sy
     pixel = lambda xyz: camera.point_to_pixel(torch.as_tensor(np.asarray(xyz), dtype=torch.float64)).numpy()  # noqa: E731
     axes.plot(*pixel(points).T, "x", ms=11, mew=2.5, color="k", label="found")
     axes.plot(*pixel(shown.contacts).T, "o", ms=14, mew=2, mfc="none", mec="k", label="true")
-    axes.legend(fontsize=8, loc="lower left")
+    axes.legend(fontsize=8, loc="lower left", labelspacing=1.4, borderpad=0.9)
     axes.set_xlabel(words, fontsize=10)
 
 
@@ -207,7 +216,7 @@ def figure_8() -> Figure:
     rays, got = segmented(shown, result)
     drawing = Figure(figsize=(15, 4.4), dpi=100, layout="constrained")
     a, b, c = drawing.subplots(1, 3)
-    draw_matches(a, shown, result, "(a) matches")
+    draw_matches(a, shown, measured_flow(shown, result), "(a) matches")
     normals = (r.marker_weights[..., None] * r.estimator.membrane.rest_normals[r.marker_vertices]).sum(-2)
     polar = PolarAngle(r.rest_markers, normals, *r.camera.pixel_to_ray(r.rest_pixels))
     change = np.rad2deg(polar.change(r.camera.pixel_to_ray(result.pixels[0]).direction).numpy())
@@ -269,27 +278,33 @@ def figure_15() -> Figure:
 def figure_16() -> Figure:
     """5 % of the markers matched to a neighbour: what it does, and what the screen saves."""
     shown, r = pressed("fingertip", *TOP), reconstructor("fingertip")
-    found = reconstructed("fingertip", TOP, "minimum-energy").pixels
+    right = measured_flow(shown, reconstructed("fingertip", TOP, "minimum-energy"))
     rest, rng = r.rest_pixels, np.random.default_rng(2)
     bad = rng.choice(len(rest), max(3, round(MISMATCHED * len(rest))), replace=False)
-    near = torch.cdist(rest[bad], rest).argsort(1)[:, 1:5]
-    wrong = found.clone()
-    wrong[0, bad] = found[0, near[np.arange(len(bad)), rng.integers(0, 4, len(bad))]]
-    screen = MismatchScreen(rest.numpy(), r.vertex_pixels[r.estimator.membrane.fixed].numpy()).float()
-    one = torch.ones(wrong.shape[:2])
-    rows = {"believed": one, "screened": screen(wrong - rest, one)}
-    drawing = Figure(figsize=(15, 8.6), dpi=100, layout="constrained")
-    for axes, (name, confidence) in zip(drawing.subplots(2, 3), rows.items(), strict=True):
+    near = torch.cdist(rest[bad], rest).argsort(1)[:, 1:5][np.arange(len(bad)), rng.integers(0, 4, len(bad))]
+    flow = right.clone()
+    flow[bad] = rest[near] + right[near] - rest[bad]
+    believed = torch.ones(1, len(rest))
+    trusts = {"believed": believed, "screened": r.screen(flow[None], believed)}
+    drawing = Figure(figsize=(16, 8.6), dpi=100, layout="constrained")
+    for axes, (name, trust) in zip(drawing.subplots(2, 3), trusts.items(), strict=True):
+        kept = trust[0] > FOUND
         for place, (title, estimator) in zip(axes[1:], ESTIMATORS.items(), strict=True):
-            with torch.no_grad():
-                result = reconstructor("fingertip", estimator).from_pixels(wrong, confidence)
+            result = from_flow(reconstructor("fingertip", estimator), flow[None], trust)
             draw_surface(place, shown, result, 0, f"{title}, mismatches {name}")
-        lost = int((confidence < 0.5).sum())
-        title = f"{len(bad)} of {len(rest)} markers mismatched, {lost} flagged"
-        draw_matches(axes[0], shown, result._replace(pixels=torch.where(confidence[..., None] > 0.5, wrong, rest)), title)
-        axes[0].plot(*rest[confidence[0] < 0.5].T, "x", ms=8, mew=1.6, color="k")
+        title = f"{len(bad)} of {len(rest)} markers mismatched, {int((~kept).sum())} flagged"
+        draw_matches(axes[0], shown, torch.where(kept[:, None], flow, 0.0), title)
+        axes[0].plot(*rest[~kept].T, "x", ms=8, mew=1.6, color="k")
     drawing.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower right", ncols=3, frameon=False)
     return drawing
+
+
+def from_flow(r: Reconstructor, flow: torch.Tensor, trust: torch.Tensor) -> Reconstruction:
+    """Displacements `[B, D, 2]` px and confidence `[B, D]`, as they are given: no screen."""
+    with torch.no_grad():
+        usable, trust, status = r.judge(flow, trust, torch.zeros(len(flow), dtype=torch.long))
+        given = (trust,) if r.finds_contacts else ()
+        return r.result(r.estimator(*r.rays(usable, trust), *given), flow, trust, status)
 
 
 def profile_figure(name: str, discs: list[Disc], radius=15.0, noise=2e-4) -> Figure:
@@ -316,7 +331,8 @@ def profile_figure(name: str, discs: list[Disc], radius=15.0, noise=2e-4) -> Fig
             axes.fill(*outline.T, color="0.8", zorder=0)
         axes.set_aspect("equal")
         axes.set(title=title, xlim=(-1.25 * radius, 1.25 * radius), ylim=(-0.5, 1.35 * radius))
-        axes.set_xlabel(f"error {error:.3f} of {moved:.3f} mm ({100 * error / moved:.0f} %)", fontsize=10)
+        axes.set_ylabel("mm", fontsize=10)
+        axes.set_xlabel(f"mm\nerror {error:.3f} of {moved:.3f} mm ({100 * error / moved:.0f} %)", fontsize=10)
         axes.legend(fontsize=8, loc="lower center", frameon=False)
     return drawing
 

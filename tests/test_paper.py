@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from torchmembrane.calibrate.command import VERBS
+
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "paper.md").read_text()
 NAMED_TESTS = sorted(set(re.findall(r"`(test_\w+)::(test_\w+)`", TEXT)))
@@ -44,6 +46,16 @@ def test_every_named_function_exists(name):
     parts = name.split(".")
     depth = next(k for k in range(len(parts), 0, -1) if (ROOT / "torchmembrane" / Path(*parts[:k])).with_suffix(".py").exists())
     assert reduce(getattr, parts[depth:], importlib.import_module("torchmembrane." + ".".join(parts[:depth])))
+
+
+def test_every_row_names_a_test():
+    tables = TEXT[: TEXT.index("## Measured")]
+    rows = [row for row in re.findall(r"^\| .*", tables, re.M) if not re.match(r"\| (paper|where) \|", row)]
+    assert [row for row in rows if not re.search(r"`test_\w+::test_\w+` \|$", row)] == []
+
+
+def test_calibration_names_every_step_and_no_other():
+    assert set(re.findall(r"`torchmembrane calibrate (\w+)`", TEXT)) == set(VERBS)
 
 
 def test_every_named_bench_and_figure_is_made():
