@@ -1,6 +1,7 @@
 """One ONNX graph from pieces, each traced once: a step that is repeated is neither traced nor stored again."""
 
 import logging
+import warnings
 
 import numpy as np
 import onnx
@@ -31,10 +32,12 @@ def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> 
     batch = torch.export.Dim("batch")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     shapes = tuple({0: batch} if value.ndim else None for value in inputs.values())
-    program = torch.onnx.export(
-        module.eval(), tuple(inputs.values()), input_names=list(inputs), output_names=outputs, opset_version=OPSET,
-        dynamic_shapes=(shapes,), dynamo=True, external_data=False, verbose=False, optimize=False,
-    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the exporter about itself
+        program = torch.onnx.export(
+            module.eval(), tuple(inputs.values()), input_names=list(inputs), output_names=outputs, opset_version=OPSET,
+            dynamic_shapes=(shapes,), dynamo=True, external_data=False, verbose=False, optimize=False,
+        )  # fmt: skip
     common.InlinePass()(program.model)
     fold_constants_ir(program.model)
     _plain_reshapes(program.model.graph)
