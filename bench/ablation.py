@@ -64,6 +64,7 @@ VARIANTS = [
     *(Variant("energy", model.replace("_", "-"), model=model) for model in ("harmonic", "neo_hookean", "mooney_rivlin")),
     *(Variant("grid", f"{n} x {n}", grid=n) for n in (13, 25)),
     *(Variant("steps", f"{n} from rest, {round(n / 1.2)} on the fine grid", steps=n) for n in (6, 8, 20)),
+    *(Variant("steps", f"{n} from rest on 17 x 17, no finer grid", grid=17, steps=n) for n in (6, 20)),
     *named("surroundings", "REACH", 1e-6, 0.08),
     *named("surroundings", "FLOOR", 0.0, 1e-2),
     *(Variant("marker noise", f"assumed {px:g} px", assumed=px) for px in (0.05, 0.2)),

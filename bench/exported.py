@@ -1,6 +1,6 @@
 """Exported models against torch on cases, and their speed in onnxruntime with one thread.
 
-python bench/exported.py CASES [--estimator force-balance] [--only SENSOR ...] [--threads 1] [--json FILE]
+python bench/exported.py CASES [--estimator force-balance] [--tracking] [--only SENSOR ...] [--threads 1] [--json FILE]
 
 CASES as for bench/accuracy.py. For each sensor the model is exported (seconds, MB, nodes), loaded, and run on every image in
 batches of 1, 3 and 16. Printed: the largest difference of vertices (length unit), markers (length unit), pixels (px) and force
@@ -22,7 +22,7 @@ import torch
 from accuracy import cases_in
 from record import write
 
-from torchmembrane.export import export
+from torchmembrane.export import PREVIOUS, export
 from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
 from torchmembrane.results import Reconstruction
 from torchmembrane.store import Settings
@@ -34,6 +34,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", type=Path)
     parser.add_argument("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0])
+    parser.add_argument("--tracking", action="store_true", help="every frame from its own result, as if it came again")
     parser.add_argument("--only", nargs="*", help="sensors to take, by parts of their file names")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", type=Path)
@@ -45,26 +46,27 @@ def main():
         if args.only and not any(part in sensor for part in args.only):
             continue
         images = [args.cases / image for case in cases if case["sensor"] == sensor for image in case["images"]]
-        rows.append(dict(sensor=sensor, **measure(args.cases / sensor, images, args.estimator, args.threads)))
+        rows.append(dict(sensor=sensor, **measure(args.cases / sensor, images, args.estimator, args.tracking, args.threads)))
         print(json.dumps(rows[-1]), flush=True)
     write(args.json, dict(estimator=args.estimator, rows=rows))
 
 
-def measure(sensor: Path, files: list[Path], estimator: str, threads: int) -> dict:
+def measure(sensor: Path, files: list[Path], estimator: str, tracking: bool, threads: int) -> dict:
     reconstructor = Reconstructor.from_file(sensor, estimator=estimator)
     with tempfile.TemporaryDirectory() as folder:
         path, start = Path(folder) / "model.onnx", time.perf_counter()
-        model = export(reconstructor, path, Settings(estimator, reconstructor.sensor.material.model, "triangle", "npz"))
+        settings = Settings(estimator, reconstructor.sensor.material.model, "triangle", "npz")
+        model = export(reconstructor, path, settings, tracking)
         row = dict(export_seconds=time.perf_counter() - start, megabytes=path.stat().st_size / 1e6, nodes=count(model.graph))
         start = time.perf_counter()
         session = open_session(path, threads)
         row["load_seconds"] = time.perf_counter() - start
         images = reconstructor.read(*files)
-        row |= differences(reconstructor, session, images)
+        row |= differences(reconstructor, session, images, tracking)
         for batch in (1, 16):
-            feed = {"image": images[:1].expand(batch, -1, -1, -1).contiguous().numpy()}
+            feed, _ = given(reconstructor, images[:1].expand(batch, -1, -1, -1).contiguous(), tracking)
             row[f"milliseconds_{batch}"] = seconds(lambda feed=feed: session.run(None, feed), 1000 / batch)
-        row["parts"] = parts(path, folder, images[:1].numpy(), threads)
+        row["parts"] = parts(path, folder, given(reconstructor, images[:1], tracking)[0], threads)
     return row
 
 
@@ -91,7 +93,18 @@ def seconds(call, scale: float, repeats: int = 20) -> dict[str, float]:
     return dict(best=min(times), median=float(np.median(times)))
 
 
-def differences(reconstructor, session, images) -> dict:
+def given(reconstructor, images, tracking: bool) -> tuple[dict[str, np.ndarray], Reconstruction | None]:
+    """A model's inputs, and the result that it starts from."""
+    if not tracking:
+        return {"image": images.numpy()}, None
+    with torch.no_grad():
+        before = reconstructor(images)
+    return dict(
+        zip(("image", *PREVIOUS), (images.numpy(), before.vertices.numpy(), before.pressure.numpy()), strict=True)
+    ), before
+
+
+def differences(reconstructor, session, images, tracking: bool) -> dict:
     """Largest differences over all images and batches, damaged ones among them."""
     black, bad = torch.zeros_like(images[:1]), images[:1].clone()
     bad[..., 9, 9] = torch.nan
@@ -99,9 +112,10 @@ def differences(reconstructor, session, images) -> dict:
     largest, statuses_equal = Counter(), True
     for batch in BATCHES:
         for part in images.repeat(-(-batch // len(images)), 1, 1, 1).split(batch):
+            feed, before = given(reconstructor, part, tracking)
             with torch.no_grad():
-                expected = reconstructor(part)
-            got = Reconstruction(*session.run(list(Reconstruction._fields), {"image": part.numpy()}))
+                expected = reconstructor(part, before) if tracking else reconstructor(part)
+            got = Reconstruction(*session.run(list(Reconstruction._fields), feed))
             statuses_equal &= got.status.tolist() == expected.status.tolist()
             for name in ("vertices", "markers", "pixels", "force"):
                 mine, theirs = getattr(got, name), getattr(expected, name).numpy()
@@ -111,11 +125,11 @@ def differences(reconstructor, session, images) -> dict:
     return dict(differences=dict(largest), statuses_equal=statuses_equal)
 
 
-def parts(path: Path, folder: str, image: np.ndarray, threads: int, repeats: int = 20) -> dict[str, float]:
+def parts(path: Path, folder: str, feed: dict[str, np.ndarray], threads: int, repeats: int = 20) -> dict[str, float]:
     """Milliseconds a frame by part, which the nodes' names begin with; what profiling itself costs is in them."""
     session = open_session(path, threads, enable_profiling=True, profile_file_prefix=f"{folder}/profile")
     for _ in range(repeats):
-        session.run(None, {"image": image})
+        session.run(None, feed)
     events = json.loads(Path(session.end_profiling()).read_text())
     total = Counter()
     for event in events:

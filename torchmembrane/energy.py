@@ -113,7 +113,7 @@ class Sheet(nn.Module):
             return Derivatives(c1 * l2 + zero, zero, zero, zero, zero)
         if self.model == "neo_hookean":
             zero, w_D = torch.zeros_like(I), -c1 / l2**2 / (D * D)
-            return Derivatives(c1 * l2, w_D, zero, -2 * w_D / D, w_D)
+            return Derivatives(c1 * l2 + zero, w_D, zero, -2 * w_D / D, w_D)
         convex_D = -c1 / (l2**2 * D**2) - c2 * I / (l2 * D**2)
         return Derivatives(
             c1 * l2 + c2 / (l2 * D),
@@ -185,7 +185,7 @@ class Sheet(nn.Module):
         e, adjugate, I, D = strain  # noqa: E741
         w, area, det = self.derivatives(I, D), self.rest_triangle_area, self.rest_det
         every = lambda field: field[..., None, :, :, :]  # noqa: E731
-        stress = 2 * area * (every(w.I * torch.ones_like(D)) * self.inverse_metric + every(w.D / det) * adjugate)
+        stress = 2 * area * (every(w.I) * self.inverse_metric + every(w.D / det) * adjugate)
         p, q = self.twice_12 * self.inverse_metric, self.twice_12 * adjugate / det
         outer = lambda a, b: (a[..., :, None, :, :, :] * b[..., None, :, :, :, :]).flatten(-5, -4)  # noqa: E731
         crossed = every(area * w.ID)
