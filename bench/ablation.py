@@ -30,7 +30,7 @@ GRID = 33
 
 @dataclass
 class Variant:
-    """The base with one change: `constants` of `force_balance`, what the sensor's file says, how many steps, which markers."""
+    """The base with one change: `constants` of `force_balance`, what the sensor's file says, which markers."""
 
     group: str
     label: str
@@ -38,7 +38,6 @@ class Variant:
     model: str | None = None
     filling: Callable[[Cavity], Cavity] = lambda cavity: cavity
     grid: int = GRID
-    steps: int | None = None
     assumed: float = reconstruct.MARKER_NOISE["dots"]
     noise: float = 0.0
     every: int = 1
@@ -63,8 +62,10 @@ VARIANTS = [
     *named("friction", "CONE", 0.0),
     *(Variant("energy", model.replace("_", "-"), model=model) for model in ("harmonic", "neo_hookean", "mooney_rivlin")),
     *(Variant("grid", f"{n} x {n}", grid=n) for n in (13, 25)),
-    *(Variant("steps", f"{n} from rest, {round(n / 1.2)} on the fine grid", steps=n) for n in (6, 8, 20)),
-    *(Variant("steps", f"{n} from rest on 17 x 17, no finer grid", grid=17, steps=n) for n in (6, 20)),
+    *(Variant("steps", f"{n} from rest on 9 x 9", dict(COARSE_STEPS=n)) for n in (3, 6)),
+    *(Variant("steps", f"{n} on 17 x 17 and on 33 x 33", dict(FINE_STEPS=n, FINER_STEPS=n)) for n in (3, 6, 20)),
+    *(Variant("steps", f"{n} on 17 x 17, no finer grid", dict(FINE_STEPS=n), grid=17) for n in (3, 4, 20)),
+    *(Variant("steps", f"{n} from rest on 17 x 17, no other grid", dict(COARSEST=17, STEPS=n), grid=17) for n in (6, 8)),
     *named("surroundings", "REACH", 1e-6, 0.08),
     *named("surroundings", "FLOOR", 0.0, 1e-2),
     *(Variant("marker noise", f"assumed {px:g} px", assumed=px) for px in (0.05, 0.2)),
@@ -75,11 +76,8 @@ VARIANTS = [
 
 @contextmanager
 def constants_of(variant: Variant):
-    changed = dict(variant.constants)
-    if variant.steps:
-        changed["FINE_STEPS"] = round(variant.steps / 1.2)
-    before = {name: getattr(force_balance, name) for name in changed}
-    for name, value in changed.items():
+    before = {name: getattr(force_balance, name) for name in variant.constants}
+    for name, value in variant.constants.items():
         setattr(force_balance, name, value)
     yield
     for name, value in before.items():
@@ -93,7 +91,6 @@ def reconstructor_of(sensor: Sensor, variant: Variant) -> Reconstructor:
     estimator = changed.estimator
     while estimator is not None:
         estimator.noise *= variant.assumed / reconstruct.MARKER_NOISE[markers.kind]
-        estimator.steps = variant.steps or estimator.steps
         estimator = estimator.coarse
     return changed
 

@@ -8,7 +8,7 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import splu
 
-from torchmembrane.force_balance import FALL, LONGEST_STEP, OUTLIER, TAU, ForceBalance, Observation, _across
+from torchmembrane.force_balance import LONGEST_STEP, ForceBalance, Observation, _across
 from torchmembrane.membrane import corners, triangles_of
 from torchmembrane.stencil import bordered, inner
 
@@ -20,10 +20,11 @@ def dofs(vertices: np.ndarray) -> np.ndarray:
 
 
 class BalanceTwin:
-    """Surface and pressure from one frame's rays `[D, 3]` and weights `[D]`, from rest; `estimator` in float64, not coarse."""
+    """Surface and pressure from one frame's rays `[D, 3]` and weights `[D]`, from rest; `estimator` in float64."""
 
     def __init__(self, estimator: ForceBalance):
         self.estimator, grid = estimator, estimator.membrane.grid
+        self.coarse = None if estimator.coarse is None else BalanceTwin(estimator.coarse)
         index = torch.arange(grid[0] * grid[1])[:, None]
         triangle = dofs(triangles_of(corners(index, grid)).reshape(-1, 3).numpy())
         self.row, self.column = np.repeat(triangle, 9, 1).ravel(), np.tile(triangle, (1, 9)).ravel()
@@ -36,10 +37,13 @@ class BalanceTwin:
     def __call__(self, origins, directions, weight) -> tuple[np.ndarray, float]:
         e = self.estimator
         seen = Observation(origins[None], _across(directions[None]), weight[None] / e.noise**2)
-        x, pressure = e.membrane.rest[None].clone(), e.rest_pressure[None].clone()
-        for k in range(e.steps):
-            tau = TAU[0] * (TAU[1] / TAU[0]) ** min(1.0, k / (FALL * (e.steps - 1)))
-            x, pressure = self.step(x, pressure, seen, tau, OUTLIER * tau / TAU[1])
+        if self.coarse is None:
+            x, pressure = e.at_rest(weight[None])
+        else:
+            surface, pressure = self.coarse(origins, directions, weight)
+            x, pressure = e.refined(torch.from_numpy(surface)[None], torch.tensor([pressure]).double())
+        for tau, outlier in e.falls():
+            x, pressure = self.step(x, pressure, seen, tau, outlier)
         return x[0].numpy(), float(pressure)
 
     def step(self, x, pressure, seen, tau, outlier):

@@ -104,7 +104,6 @@ def least_milliseconds(functions: dict, turns: int) -> dict[str, float]:
 def force_balance(args):
     sensor = Reconstructor.from_file(args.sensor).sensor
     reconstructor = Reconstructor(replace(sensor, membrane=sensor.surface.membrane((17, 17))))
-    reconstructor.estimator.steps = args.steps or reconstructor.estimator.steps
     estimator, exact = reconstructor.estimator, copy.deepcopy(reconstructor.estimator).double()
     displacement, confidence, _ = reconstructor.observe(reconstructor.read(args.image))
     frame = (*reconstructor.rays(displacement, confidence), confidence)
@@ -141,7 +140,6 @@ def main():
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--batches", type=int, nargs="*", default=[1, 16, 64])
     parser.add_argument("--only", choices=("minimum-energy", "force-balance"))
-    parser.add_argument("--steps", type=int, help="of force balance from rest")
     parser.add_argument("--compiled", action="store_true", help="force balance by torch.compile as well: minutes")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()

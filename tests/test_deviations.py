@@ -10,7 +10,7 @@ from torchmembrane.shapes import ellipsoid_cap, half_cylinder, spherical_cap
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
 
-NOISE, DRAWS = 0.05, 48  # px
+NOISE, DRAWS = 0.05, 192  # px
 CAP, FINGER, CYLINDER = (
     lambda n: spherical_cap(12, 9, 3, (n, n)),
     lambda n: ellipsoid_cap((10, 8, 12), 3, (n, n)),
@@ -61,7 +61,7 @@ def turns(estimator, camera, pixels, vertices):
 
 @pytest.mark.parametrize("name", PRESSES)
 def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(name):
-    """48 draws of the markers' noise, each estimated from the solution without noise, about the mean of the estimates."""
+    """Draws of the markers' noise, each estimated from the solution without noise, about the mean of the estimates."""
     estimator, camera, exact = observed(name, 17, truth_grid=31)
     generator = torch.Generator().manual_seed(1)
     pixels = exact + NOISE * torch.randn(DRAWS, *exact.shape, generator=generator, dtype=torch.float64)

@@ -58,7 +58,9 @@ def reconstructor(folder):
     """With a coarser grid, which only finer ones than this would have."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(force_balance, "COARSEST", 5)
+        patch.setattr(force_balance, "COARSEST_WARM", 5)
         made = Reconstructor.from_file(folder / "sensor.toml")
+    made.estimator.steps = 8
     assert made.estimator.coarse.membrane.grid == (5, 5)
     return made
 

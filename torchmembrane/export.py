@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from .assembly import Assembly, traced
 from .cavity import Equilibrium
 from .errors import MembraneError
-from .force_balance import FINE_STEPS, FINE_TAU, TAU, WARM_STEPS, WARM_TAU, ForceBalance, Observation, schedule
+from .force_balance import ForceBalance, Observation
 from .markers.locate import LEVELS, DotLocator
 from .markers.match import SETTLING, WIDTHS, DotMatcher, LocalDeformation
 from .minimum_energy import STEPS
@@ -159,16 +159,19 @@ def force_balance(tracer: Tracer, estimator: ForceBalance) -> None:
     """From `origins`, `directions` and `confidence` to the fields of `Equilibrium`, from rest, the coarser grid first."""
     if estimator.coarse is None:
         tracer.piece(estimator, ForceBalance.at_rest, ["confidence"], ["surface", "pressure"])
-        descend(tracer, estimator, schedule(estimator.steps, TAU))
     else:
         force_balance(tracer, estimator.coarse)
         tracer.piece(estimator, ForceBalance.refined, ["vertices", "pressure"], ["surface", "pressure"])
-        descend(tracer, estimator, schedule(FINE_STEPS, FINE_TAU))
+    descend(tracer, estimator, estimator.falls())
 
 
 def track(tracer: Tracer, estimator: ForceBalance) -> None:
     """As `force_balance`, from `surface` and `pressure` of the frames before."""
-    descend(tracer, estimator, schedule(WARM_STEPS, WARM_TAU))
+    if estimator.passes_on_starts:
+        tracer.piece(estimator, ForceBalance.coarsened, ["surface", "pressure"], ["surface", "pressure"])
+        track(tracer, estimator.coarse)
+        tracer.piece(estimator, ForceBalance.refined, ["vertices", "pressure"], ["surface", "pressure"])
+    descend(tracer, estimator, estimator.falls(warm=True))
 
 
 def descend(tracer: Tracer, estimator: ForceBalance, falls: list[tuple[float, float]]) -> None:

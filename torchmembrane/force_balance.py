@@ -13,7 +13,8 @@ beyond `tau` (like s^2 / (1 + s^2 / tau^2)), that of a pull stays quadratic, and
 Whether a vertex is pushed is asked of its surroundings (`REACH`): contacts are patches.
 
 Reweighted Gauss-Newton steps while `tau` falls from where everything is quadratic (graduated non-convexity): no start but the
-rest surface is needed. A fine grid starts from the solution on every second of its lines.
+rest surface is needed. A fine grid starts from the solution on every second of its lines, that one from one coarser still: it
+takes few vertices to find the basin.
 """
 
 from typing import NamedTuple
@@ -29,17 +30,17 @@ from .membrane import Membrane, SurfacePoints
 from .solve.stencil_system import NEAR, StencilSystem
 from .stencil import STENCIL, bordered, inner, ring
 
-STEPS, COARSE_STEPS, TAU = 8, 6, (4.0, 0.4)  # from rest, and so where a finer grid follows
-FINE_STEPS, FINE_TAU = 10, (2.0, 0.4)  # from the coarser grid's solution
+STEPS, COARSE_STEPS, TAU = 8, 4, (4.0, 0.4)  # from rest, and so where a finer grid follows
+FINE_STEPS, FINER_STEPS, FINE_TAU = 5, 4, (0.8, 0.4)  # from the coarsest grid's solution, from a finer one's
 WARM_STEPS, WARM_TAU = 4, (1.2, 0.4)  # from the previous frame's solution
 FALL = 0.6  # share of the steps over which tau falls
 SPARSITY = 3200.0  # price of the push p0 on the whole surface, while it is quadratic
-FRICTION, SLIP, CONE = 3.75, 0.05, 10.0  # kappa over the price of a push; where |q_t| begins to be linear, over p0; c
+FRICTION, SLIP, CONE = 3.75, 0.05, 15.0  # kappa over the price of a push; where |q_t| begins to be linear, over p0; c
 REACH = 0.04  # over the surface's size
 FLOOR = 1e-3  # of a push's weight; without it a vertex under a contact has no place of its own
 OUTLIER = 5.0  # R
 LONGEST_STEP = 0.026  # over the surface's size
-COARSEST = 13  # fewest lines of a coarser grid
+COARSEST, COARSEST_WARM = 9, 13  # fewest lines of a coarser grid, of one that is given the previous frame's solution
 LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR = 2e-3, 1e-3  # rms of the last step over the size, and volume error, when settled
 
 
@@ -76,17 +77,17 @@ class ForceBalance(nn.Module):
         markers            the markers' `SurfacePoints`, and `positions [D, 3]`, their rest positions
         noise              angular noise of a marker, radians; about twice the locator's, to leave room for the grid's own error
         filling, gas       the cavity, as for `MinimumEnergy`
-        steps              from rest; at most `COARSE_STEPS` where a finer grid follows
+        steps              on this grid, without a start; default as the constants above
 
-    A grid with an odd number of lines, at least 25, holds the estimator on every second line as `coarse`. The reference
+    A grid with an odd number of lines, at least 17, holds the estimator on every second line as `coarse`. The reference
     traction `p0` is the rest pressure, or tension / size where that is larger.
     Wrong when: the press is so shallow that its tractions drown in noise; two contacts lie within `REACH`.
     """
 
     def __init__(self, membrane: Membrane, sheet: Sheet, markers: SurfacePoints, positions: Tensor, noise: float,
-                 filling="liquid", gas: tuple[float, float] | None = None, steps=STEPS):  # fmt: skip
+                 filling="liquid", gas: tuple[float, float] | None = None, steps: int | None = None):  # fmt: skip
         super().__init__()
-        self.membrane, self.sheet, self.noise, self.steps = membrane, sheet, noise, steps
+        self.membrane, self.sheet, self.noise = membrane, sheet, noise
         self.largest_unbalance, self.largest_volume_error = LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR
         rest_pressure, rest_load = rest_balance(membrane, sheet)
         self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
@@ -107,9 +108,12 @@ class ForceBalance(nn.Module):
         self.register_buffer("vertex_shares", vertex_shares)
         self.register_buffer("pair_shares", pair_shares)
         self.system = StencilSystem(membrane.grid, self.free > 0, len(STENCIL) + 1)
-        self.coarse = self._coarser(filling, gas, min(steps, COARSE_STEPS))
+        self.coarse = self._coarser(filling, gas)
+        self.passes_on_starts = self.coarse is not None and min(self.coarse.membrane.grid) >= COARSEST_WARM
+        usual = STEPS if self.coarse is None else FINE_STEPS if self.coarse.coarse is None else FINER_STEPS
+        self.steps = steps or usual
 
-    def _coarser(self, filling, gas, steps) -> "ForceBalance | None":
+    def _coarser(self, filling, gas) -> "ForceBalance | None":
         grid = self.membrane.grid
         if any(count % 2 == 0 or count < 2 * COARSEST - 1 for count in grid):
             return None
@@ -117,7 +121,9 @@ class ForceBalance(nn.Module):
         membrane = Membrane(every_second(self.membrane.rest), every_second(self.membrane.fixed))
         markers = membrane.closest_points(self.positions.numpy())
         sheet = self.sheet.on(membrane)
-        return ForceBalance(membrane, sheet, markers, self.positions, self.noise, filling, gas, steps)
+        coarse = ForceBalance(membrane, sheet, markers, self.positions, self.noise, filling, gas)
+        coarse.steps = COARSE_STEPS if coarse.coarse is None else coarse.steps
+        return coarse
 
     def set_prestretch(self, prestretch: Tensor) -> None:
         """Another prestretch `[]`, gradients included; rest pressure and load follow, the reference traction stays."""
@@ -133,12 +139,18 @@ class ForceBalance(nn.Module):
         """Arguments: `origins`, `directions [B, D, 3]`, the markers' measured rays; `weight [B, D]`: 0 for a lost one, else up
         to 1; `start`: vertices `[B, V, 3]` and pressure `[B]` near the solution, such as the previous frame's."""
         seen = self.observation(origins, directions, weight)
-        if start is not None:
-            return self._descend(*start, seen, schedule(WARM_STEPS, WARM_TAU))
-        if self.coarse is None:
-            return self._descend(*self.at_rest(weight), seen, schedule(self.steps, TAU))
-        coarse = self.coarse(origins, directions, weight)
-        return self._descend(*self.refined(coarse.vertices, coarse.pressure), seen, schedule(FINE_STEPS, FINE_TAU))
+        if start is None and self.coarse is None:
+            return self._descend(*self.at_rest(weight), seen, self.falls())
+        if start is not None and not self.passes_on_starts:
+            return self._descend(*start, seen, self.falls(warm=True))
+        coarse = self.coarse(origins, directions, weight, None if start is None else self.coarsened(*start))
+        return self._descend(*self.refined(coarse.vertices, coarse.pressure), seen, self.falls(start is not None))
+
+    def falls(self, warm=False) -> list[tuple[float, float]]:
+        """The schedule on this grid, `warm`: with a start."""
+        if warm and not self.passes_on_starts:
+            return schedule(WARM_STEPS, WARM_TAU)
+        return schedule(self.steps, TAU if self.coarse is None else FINE_TAU)
 
     def standard_deviations(
         self, equilibrium: Equilibrium, origins: Tensor, directions: Tensor, weight: Tensor, marker_noise: float | Tensor
@@ -159,6 +171,10 @@ class ForceBalance(nn.Module):
     def at_rest(self, weight: Tensor) -> tuple[Tensor, Tensor]:
         """The rest surface and pressure, for every row of `weight [B, D]`."""
         return self.membrane.rest.repeat(weight.shape[0], 1, 1), self.rest_pressure.repeat(weight.shape[0])
+
+    def coarsened(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
+        """Surface and pressure on the grid of `coarse`."""
+        return x.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure
 
     def refined(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
         """Surface and pressure of `coarse` on this grid: the displacement is bilinear between its lines."""
