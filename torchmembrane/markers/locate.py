@@ -356,6 +356,7 @@ class DotLocator(nn.Module):
         self.detect = BlobDetector(radii, spacing(pixels)[0].min(), int(1.2 * len(pixels)) + 16, inside)
         drawn = pyramid(draw(pixels, shapes, image_size))
         blobs, log_radius, strength = (x[0].numpy() for x in self.detect.double()(drawn))
+        blobs, log_radius, strength = (x[strength > 1e-6] for x in (blobs, log_radius, strength))  # the rest fill up the count
         own = cKDTree(blobs).query(pixels)[1]
         self.match = DotMatcher(pixels, log_radius[own], tolerance, anchors)
         self.coherence = Coherence(pixels, log_radius[own], tolerance)
