@@ -264,19 +264,21 @@ def test_strays_have_little_say(pressed):
 def test_a_fine_grid_begins_with_the_coarse_ones_solution(pressed):
     (origins, directions), positions, moved, truth = pressed
     weight = torch.ones(1, len(positions), dtype=torch.float64)
-    coarse, fine = make(13), make(25)
-    assert coarse.coarse is None and fine.coarse.membrane.grid == (13, 13)
+    fine = make(33)
+    assert fine.coarse.membrane.grid == (17, 17) and fine.coarse.coarse.membrane.grid == (9, 9)
+    assert fine.coarse.coarse.coarse is None and make(16).coarse is None
     result = fine(origins[None], directions[None], weight)
     assert relative(fine, result, positions, moved) < 0.1
     force = (result.traction * fine.membrane.rest_area[:, None]).sum(1)[0]
     assert (force - truth.force).norm() < 0.07 * truth.force.norm()
 
 
-def test_four_steps_from_the_frame_before_follow_a_press(pressed):
+@pytest.mark.parametrize("n", [17, 25, 33])
+def test_four_steps_from_the_frame_before_follow_a_press(pressed, n):
     """From the solution of a slightly different view of the press, to where the cold solution is."""
     (origins, directions), positions, _, _ = pressed
     weight = torch.ones(1, len(positions), dtype=torch.float64)
-    estimator = make(17)
+    estimator = make(n)
     rest = torch.nn.functional.normalize(estimator.positions, dim=-1)
     before = torch.nn.functional.normalize(0.1 * rest + 0.9 * directions, dim=-1)
     cold = estimator(origins[None], directions[None], weight)

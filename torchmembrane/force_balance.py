@@ -35,7 +35,8 @@ FINE_STEPS, FINER_STEPS, FINE_TAU = 5, 4, (0.8, 0.4)  # from the coarsest grid's
 WARM_STEPS, WARM_TAU = 4, (1.2, 0.4)  # from the previous frame's solution
 FALL = 0.6  # share of the steps over which tau falls
 SPARSITY = 3200.0  # price of the push p0 on the whole surface, while it is quadratic
-FRICTION, SLIP, CONE = 3.75, 0.05, 15.0  # kappa over the price of a push; where |q_t| begins to be linear, over p0; c
+FRICTION, SLIP = 3.75, 0.05  # kappa over the price of a push; where |q_t| begins to be linear, over p0
+CONE, COARSE_CONE = 15.0, 5.0  # c, and on the coarsest grid, whose own error looks like friction under a push
 REACH = 0.04  # over the surface's size
 FLOOR = 1e-3  # of a push's weight; without it a vertex under a contact has no place of its own
 OUTLIER = 5.0  # R
@@ -91,7 +92,7 @@ class ForceBalance(nn.Module):
         self.largest_unbalance, self.largest_volume_error = LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR
         rest_pressure, rest_load = rest_balance(membrane, sheet)
         self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
-        self.size = membrane.size
+        self.size, self.cone = membrane.size, CONE
         self.reference = max(float(rest_pressure), float(sheet.tension) / self.size, float(sheet.c1 + sheet.c2) / self.size)
         self.register_buffer("rest_pressure", rest_pressure)
         self.register_buffer("rest_load", rest_load)
@@ -122,7 +123,8 @@ class ForceBalance(nn.Module):
         markers = membrane.closest_points(self.positions.numpy())
         sheet = self.sheet.on(membrane)
         coarse = ForceBalance(membrane, sheet, markers, self.positions, self.noise, filling, gas)
-        coarse.steps = COARSE_STEPS if coarse.coarse is None else coarse.steps
+        if coarse.coarse is None:
+            coarse.steps, coarse.cone = COARSE_STEPS, COARSE_CONE
         return coarse
 
     def set_prestretch(self, prestretch: Tensor) -> None:
@@ -275,7 +277,7 @@ class ForceBalance(nn.Module):
         ratio = push2 / tau**2
         pushed = (1 - 3 * ratio).clamp_min(0) / (1 + ratio) ** 3 if curvature else (1 + ratio) ** -2
         w_n = FLOOR + torch.where(q_n < 0, pushed, 1.0)
-        dearer = FRICTION / (1 + CONE * (push2 + SLIP**4).sqrt())
+        dearer = FRICTION / (1 + self.cone * (push2 + SLIP**4).sqrt())
         w_t = dearer * (q_t.square().sum(-1) / p0**2 + SLIP**2).rsqrt()
         scale = SPARSITY / (p0 * self.size) ** 2 / self.area
         one = torch.eye(3, dtype=force.dtype, device=force.device)
@@ -290,7 +292,7 @@ class ForceBalance(nn.Module):
         q_n = (traction * normal).sum(-1)
         slip2 = (traction - q_n[..., None] * normal).square().sum(-1)
         push2 = (-q_n).clamp_min(0) ** 2
-        kappa = FRICTION / (1 + CONE * (push2 @ self.surroundings + SLIP**4).sqrt())
+        kappa = FRICTION / (1 + self.cone * (push2 @ self.surroundings + SLIP**4).sqrt())
         price = push2 / (2 + 2 * push2 / tau**2) + q_n.clamp_min(0) ** 2 / 2 + kappa * ((slip2 + SLIP**2).sqrt() - SLIP)
         misfit = seen.weight * self.angles(x, seen)[0].square().sum(-1)
         return OUTLIER**2 / 2 * (misfit / OUTLIER**2).log1p().sum(-1) + SPARSITY / self.size**2 * price @ area
