@@ -36,7 +36,7 @@ from torchmembrane.images import to_grey
 from torchmembrane.markers.dots import find_dots
 from torchmembrane.presets import preset
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor import Markers, Material, Surface
+from torchmembrane.sensor import Markers, Surface
 from torchmembrane.simulate.board import BoardImages
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Plane, Sphere
@@ -154,7 +154,7 @@ def material(seeds, figures):
     presses = ((Sphere(3.0), (0, 0, -1), 2.5), (Sphere(4.0), (-0.5, 0, -0.87), 2.0), (Sphere(3.0), (0.3, -0.5, -0.7), 2.0))
     for name, prestretch in itertools.product(("fingertip", "half_cylinder"), (1.05, 1.15, 1.3, 1.6, 2.0)):
         design = preset(name)
-        truth = replace(design, material=Material("neo_hookean", prestretch, shear_modulus=0.3, thickness=0.4))
+        truth = replace(design, material=replace(design.material, prestretch=prestretch, shear_modulus=0.3, thickness=0.4))
         simulator = Simulator(truth, look=Look(noise=NOISE))
         sensor = replace(design, markers=replace(design.markers, rest_image=simulator.rest_image()))
         aim = simulator.membrane.rest[simulator.membrane.fixed].mean(0).numpy()
