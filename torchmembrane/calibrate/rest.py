@@ -61,9 +61,8 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
     result = fit(residuals, jacobian, np.zeros(6), "calibrate rest")
     used[used] = ~strays(result.residuals.reshape(-1, 2))
     result = fit(residuals, jacobian, result.values, "calibrate rest")
-    found, outwards = result.values, pixels[used] - sensor.camera.centre.numpy()
-    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True).clip(1)
-    result = with_common_error(result, jacobian(found), BIAS * outwards.ravel())
+    found = result.values
+    result = with_common_error(result, jacobian(found), shading_bias(sensor, pixels[used]).ravel())
     turn, shift = rotations(torch.from_numpy(found[:3])).numpy(), found[3:]
     move = lambda x: (x - pivot.numpy()) @ turn.T + pivot.numpy() + shift  # noqa: E731
     residuals = pixels - modelled(torch.from_numpy(found), torch.from_numpy(outlines)).numpy()
@@ -71,6 +70,12 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
     shifts = _nulling(sensor, move(outlines), turn @ tangents, pixels, seen)
     moved = recalibrated(sensor, surface, move(surface.rest.numpy()), move(X) + shifts, sensor.markers.sizes, image)
     return RestFit(moved, NAMES, _in_degrees(result), pixels, residuals, shifts)
+
+
+def shading_bias(sensor: Sensor, pixels: np.ndarray) -> np.ndarray:
+    """One standard deviation of the error that dots located at `pixels [..., 2]` share, `[..., 2]` px."""
+    outwards = pixels - sensor.camera.centre.numpy()
+    return BIAS * outwards / np.linalg.norm(outwards, axis=-1, keepdims=True).clip(1)
 
 
 def measured_outlines(sensor: Sensor, surface, X: np.ndarray, sizes: np.ndarray, image: np.ndarray, camera_points=None):
