@@ -74,7 +74,8 @@ def main():
         mine = [row for row in rows if row["estimator"] == estimator]
         clean, noise, spoiled, screened = (np.array([row[key] for row in mine]) for key in list(mine[0])[2:])
         print(f"{estimator}: medians {np.median(clean):.3f} clean, {np.median(spoiled):.3f} mismatched, "
-              f"{np.median(screened):.3f} screened; of {screened.size}, growth")  # fmt: skip
+              f"{np.median(screened):.3f} screened; means {np.append(clean[:, None], noise, 1).mean():.3f} without mismatches, "
+              f"{screened.mean():.3f} screened; of {screened.size}, growth")  # fmt: skip
         for what, errors in {"mismatched": spoiled, "screened": screened, "other noise": noise}.items():
             print(f"    {what}: {grown(errors, clean)}")
     print("{2} mismatched markers, {0} missed; {1} right ones distrusted".format(*counts))
