@@ -16,7 +16,7 @@ from torchmembrane import MembraneError, cli
 from torchmembrane.boards import Checkerboard, DotBoard
 from torchmembrane.calibrate.boards import Views, lens_from_views, ports_from_views
 from torchmembrane.calibrate.depth import rest_from_depth
-from torchmembrane.calibrate.fit import fit, outline_centres, rotations, with_common_error
+from torchmembrane.calibrate.fit import fit, outline_centres, rotations, with_common_errors
 from torchmembrane.calibrate.mill import dots_for_pixels, pixel_lattice
 from torchmembrane.calibrate.rest import rest_from_image
 from torchmembrane.calibrate.targets import find_target
@@ -137,8 +137,8 @@ def test_covariance_of_a_line_is_the_textbooks():
     found = fit(lambda theta: A @ theta - (2 + 3 * x + noise), lambda theta: A, np.zeros(2), "line")
     left = noise - A @ np.linalg.lstsq(A, noise)[0]
     assert np.allclose(found.deviations**2, (left**2).sum() / 19 / [21, (x**2).sum()], rtol=1e-8)
-    shared = with_common_error(found, A, 0.5 * np.ones(21))
-    assert np.allclose(shared.covariance - found.covariance, [[0.25, 0], [0, 0]], atol=1e-12)
+    shared = with_common_errors(found, A, np.stack([0.5 * np.ones(21), 0.2 * A[:, 1]], 1))  # of the height, of the slope
+    assert np.allclose(shared.covariance - found.covariance, [[0.25, 0], [0, 0.04]], atol=1e-12)
 
 
 def test_what_no_datum_determines_has_a_huge_deviation():

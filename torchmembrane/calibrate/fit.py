@@ -55,13 +55,13 @@ def fit(residuals: Callable, jacobian: Callable, start: np.ndarray, what: str) -
     return Fit(solution.x, noise**2 * _inverse_gram(solution.jac), solution.fun, noise)
 
 
-def with_common_error(found: Fit, jacobian: np.ndarray, error: np.ndarray) -> Fit:
-    """The fit, its covariance enlarged by an error that all residuals share: `error [m]`, one standard deviation of it.
+def with_common_errors(found: Fit, jacobian: np.ndarray, errors: np.ndarray) -> Fit:
+    """The fit, its covariance enlarged by K errors that residuals share: `errors [m, K]`, one standard deviation of each.
 
-    `C + (J^+ e) (J^+ e)^T`: unlike noise, it does not average out over many residuals.
+    `C + (J^+ E) (J^+ E)^T`: unlike noise, they do not average out over many residuals.
     """
-    shift = np.linalg.lstsq(jacobian, error)[0]
-    return found._replace(covariance=found.covariance + np.outer(shift, shift))
+    shifts = np.linalg.lstsq(jacobian, errors)[0]
+    return found._replace(covariance=found.covariance + shifts @ shifts.T)
 
 
 def strays(residuals: np.ndarray) -> np.ndarray:

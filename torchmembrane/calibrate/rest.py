@@ -9,7 +9,7 @@ from torch.func import jacfwd, vmap
 from ..errors import MembraneError
 from ..markers.dots import measure_dots
 from ..sensor import Sensor
-from .fit import Fit, fit, outline_centres, rotations, strays, with_common_error
+from .fit import Fit, fit, outline_centres, rotations, strays, with_common_errors
 from .surface import dot_outlines, fine_surface, frames_at, recalibrated, unit_shapes
 
 NAMES = ["tilt_x", "tilt_y", "tilt_z", "offset_x", "offset_y", "offset_z"]
@@ -62,7 +62,7 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
     used[used] = ~strays(result.residuals.reshape(-1, 2))
     result = fit(residuals, jacobian, result.values, "calibrate rest")
     found = result.values
-    result = with_common_error(result, jacobian(found), shading_bias(sensor, pixels[used]).ravel())
+    result = with_common_errors(result, jacobian(found), shading_bias(sensor, pixels[used]).reshape(-1, 1))
     turn, shift = rotations(torch.from_numpy(found[:3])).numpy(), found[3:]
     move = lambda x: (x - pivot.numpy()) @ turn.T + pivot.numpy() + shift  # noqa: E731
     residuals = pixels - modelled(torch.from_numpy(found), torch.from_numpy(outlines)).numpy()

@@ -11,7 +11,7 @@ from ..errors import MembraneError
 from ..markers.dots import find_dots
 from ..markers.place import rim_mask
 from ..sensor import Sensor
-from .fit import Fit, fit, outline_centres, rotations, strays, with_common_error
+from .fit import Fit, fit, outline_centres, rotations, strays, with_common_errors
 from .rest import measured_outlines, shading_bias
 from .surface import Correction, correction, feet_of, fine_surface, recalibrated
 
@@ -122,10 +122,11 @@ def _bundle(sensor, surface, X, sizes, rel, pixels, motions, travel_error, image
     seen[np.nonzero(seen)] = ~wild
     pull = found.noise / travel_error
     found = fit(residuals, jacobian, found.values, "calibrate views")
-    J, view = jacobian(found.values), np.nonzero(seen)[0]
-    for bias in (shading_bias(sensor, pixels[seen]), [SIDEWAYS, 0.0], [0.0, SIDEWAYS]):
-        for p in range(P):
-            found = with_common_error(found, J, np.append(bias * (view == p)[:, None], 0.0))
+    sideways = np.broadcast_to(SIDEWAYS * np.eye(2)[:, None], (2, seen.sum(), 2))
+    biases = np.concatenate([shading_bias(sensor, pixels[seen])[None], sideways])  # [3, N, 2], of every view for itself
+    of_view = np.nonzero(seen)[0][:, None] == np.arange(P)
+    errors = np.einsum("knc,np->nckp", biases, of_view).reshape(-1, 3 * P)
+    found = with_common_errors(found, jacobian(found.values), np.pad(errors, ((0, 1), (0, 0))))
     dots, left = (
         found.values[own:].reshape(-1, 3),
         np.where(seen[..., None], pixels - each(*parts(found.values)).numpy(), np.nan),
