@@ -60,7 +60,7 @@ def reconstructor(folder):
         patch.setattr(force_balance, "COARSEST", 5)
         patch.setattr(force_balance, "COARSEST_WARM", 5)
         made = Reconstructor.from_file(folder / "sensor.toml")
-    made.estimator.steps = 8
+    made.estimator.steps = 12  # on so coarse grids the default does not settle beside lost markers
     assert made.estimator.coarse.membrane.grid == (5, 5)
     return made
 
@@ -162,7 +162,7 @@ def test_damaged_images_get_the_same_status(run, reconstructor, images):
     good = reconstructor.read(images[1])[0]
     blank, nan, noise, hidden = torch.zeros_like(good), good.clone(), torch.rand(good.shape), good.clone()
     nan[0, 5, 7] = torch.nan
-    hidden[:, 75:95, 60:80] = 0.5
+    hidden[:, 45:65, 60:80] = 0.5
     images = torch.stack([good, blank, nan, noise, hidden])
     with torch.no_grad():
         expected = reconstructor(images)

@@ -267,6 +267,8 @@ def test_a_fine_grid_begins_with_the_coarse_ones_solution(pressed):
     fine = make(33)
     assert fine.coarse.membrane.grid == (17, 17) and fine.coarse.coarse.membrane.grid == (9, 9)
     assert fine.coarse.coarse.coarse is None and make(16).coarse is None
+    surface = bent(fine.coarse.membrane), torch.ones(1)
+    torch.testing.assert_close(fine.coarsened(*fine.refined(*surface)), surface)
     result = fine(origins[None], directions[None], weight)
     assert relative(fine, result, positions, moved) < 0.1
     force = (result.traction * fine.membrane.rest_area[:, None]).sum(1)[0]

@@ -140,16 +140,18 @@ class ForceBalance(nn.Module):
     ) -> Equilibrium:
         """Arguments: `origins`, `directions [B, D, 3]`, the markers' measured rays; `weight [B, D]`: 0 for a lost one, else up
         to 1; `start`: vertices `[B, V, 3]` and pressure `[B]` near the solution, such as the previous frame's."""
-        seen = self.observation(origins, directions, weight)
-        if start is None and self.coarse is None:
-            return self._descend(*self.at_rest(weight), seen, self.falls())
-        if start is not None and not self.passes_on_starts:
-            return self._descend(*start, seen, self.falls(warm=True))
-        coarse = self.coarse(origins, directions, weight, None if start is None else self.coarsened(*start))
-        return self._descend(*self.refined(coarse.vertices, coarse.pressure), seen, self.falls(start is not None))
+        warm = start is not None
+        if warm and not self.passes_on_starts:
+            begin = start
+        elif self.coarse is None:
+            begin = self.at_rest(weight)
+        else:
+            coarse = self.coarse(origins, directions, weight, self.coarsened(*start) if warm else None)
+            begin = self.refined(coarse.vertices, coarse.pressure)
+        return self._descend(*begin, self.observation(origins, directions, weight), self.falls(warm))
 
     def falls(self, warm=False) -> list[tuple[float, float]]:
-        """The schedule on this grid, `warm`: with a start."""
+        """`tau` and `R` of every step on this grid; `warm`: with a start."""
         if warm and not self.passes_on_starts:
             return schedule(WARM_STEPS, WARM_TAU)
         return schedule(self.steps, TAU if self.coarse is None else FINE_TAU)
@@ -175,7 +177,7 @@ class ForceBalance(nn.Module):
         return self.membrane.rest.repeat(weight.shape[0], 1, 1), self.rest_pressure.repeat(weight.shape[0])
 
     def coarsened(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
-        """Surface and pressure on the grid of `coarse`."""
+        """Vertices `[B, V, 3]` and pressure `[B]` on the grid of `coarse`: every second line's."""
         return x.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure
 
     def refined(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:

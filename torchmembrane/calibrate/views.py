@@ -15,7 +15,7 @@ from .fit import Fit, fit, outline_centres, rotations, strays, with_common_error
 from .rest import measured_outlines, shading_bias
 from .surface import Correction, correction, feet_of, fine_surface, recalibrated
 
-SIDEWAYS = 0.015  # px: a turned view is shaded to one side, and its located dots share a shift (0.023 px at 4 degrees)
+SIDEWAYS = 0.015  # px: a turned view is shaded to one side, and its located dots share a shift (0.024 px at 4 degrees)
 
 
 class ViewsFit(NamedTuple):
