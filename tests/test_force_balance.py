@@ -85,8 +85,9 @@ def test_linearised_force_and_volume_are_those_and_their_derivatives():
     torch.testing.assert_close(at.volume, within(membrane.volume_gradient(x)))
     torch.testing.assert_close(at.normal, within(membrane.normals(x)))
     exact = slopes_at_inner_vertices(lambda y: within(estimator.contact_force(y, p)), x, estimator)
-    alone = torch.diag_embed(at.slope[0].movedim(0, -1)).movedim(1, -1).movedim(0, 1)  # a row's force, with all others' zero
-    torch.testing.assert_close(estimator.system.vector(alone).flatten(0, 1)[:, : exact.shape[1]], exact)
+    rows, count = at.slope[0].mT, len(at.slope[0])
+    alone = torch.eye(count, dtype=torch.float64)[:, None, :, None] * rows[:, :, None]  # a force, with all others' zero
+    torch.testing.assert_close(estimator.system.vector(alone.flatten(2)[None])[0, : exact.shape[1]].T, exact)
 
 
 @pytest.mark.parametrize("hole", [False, True])
@@ -107,25 +108,31 @@ def test_normal_equations_are_those_of_the_dense_slopes(hole):
     weight = torch.rand(angle.shape[:2], generator=generator, dtype=torch.float64)
     root = torch.rand(1, len(at.force[0]), 3, 3, generator=generator, dtype=torch.float64)
     W = root @ root.mT
-    matrix, load, push, (fWv, vWv) = estimator.normal_equations(at, W, slope, weight, angle)
+    normal = estimator.normal_equations(at, W, slope, weight)
+    loads, (fWv, vWv) = estimator.loads(normal, at, W, angle)
+    matrix, (load, push, volume) = estimator.matrix(normal), loads.unbind(-1)
 
     moving = estimator.free.repeat_interleave(3) > 0
     A = slopes_at_inner_vertices(lambda y: inner(estimator.contact_force(y, p), dome.grid), x, estimator)[:, moving]
     J = slopes_at_inner_vertices(lambda y: estimator.angles(y, seen)[0], x, estimator)[:, moving]
     W = torch.block_diag(*W[0])
     w = torch.diag(weight[0].repeat_interleave(2))
-    unknowns = torch.nonzero(estimator.system.padded(moving.double())).ravel()
+    unknowns = torch.nonzero(estimator.system.padded(moving.double()[None, :, None])[0, :, 0]).ravel()
     M = dense(matrix)[0][unknowns[:, None], unknowns]
     torch.testing.assert_close(M, (A.T @ W @ A + J.T @ w @ J) * (1 + 1e-6 * torch.eye(len(M))))
     f, v = at.force.flatten(), at.volume.flatten()
     torch.testing.assert_close(load[0, unknowns], A.T @ W @ f + J.T @ w @ angle.flatten())
     torch.testing.assert_close(push[0, unknowns], -A.T @ W @ v)
     torch.testing.assert_close(torch.stack([fWv, vWv], -1)[0], torch.stack([f @ W @ v, v @ W @ v]))
-    loads = torch.zeros(1, len(load[0]), 1, dtype=torch.float64)
-    loads[0, unknowns, 0] = load[0, unknowns]
-    solved = estimator.system.solve(matrix, loads)[0, :, 0]
-    torch.testing.assert_close(solved[unknowns], torch.linalg.solve(M, load[0, unknowns]))
-    assert solved.count_nonzero() == len(unknowns)
+    torch.testing.assert_close(volume[0, unknowns], v[moving])
+    solved = estimator.system.substitute(estimator.system.factor(matrix), loads)[0]
+    torch.testing.assert_close(solved[unknowns], torch.linalg.solve(M, loads[0, unknowns]))
+    assert (solved.count_nonzero(0) == len(unknowns)).all()
+    moved = torch.zeros_like(loads)
+    moved[0, unknowns] = torch.rand(len(unknowns), 3, generator=generator, dtype=torch.float64)
+    product = estimator.product(normal, moved)[0]
+    torch.testing.assert_close(product[unknowns], (A.T @ W @ A + J.T @ w @ J) @ moved[0, unknowns])
+    assert (product.count_nonzero(0) == len(unknowns)).all()
 
 
 def test_marker_slopes_are_the_derivative_of_the_angles():

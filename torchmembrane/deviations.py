@@ -37,22 +37,22 @@ def standard_deviations(
     system, membrane = estimator.system, estimator.membrane
     at = estimator.linearised(x, pressure)
     W = estimator.force_weights(at.normal, at.force, tau, curvature=True)
-    angle, slope = estimator.angles(x, seen)
+    angle, sight = estimator.angles(x, seen)
     weight = estimator.marker_weights_at(angle, seen, outlier)
-    matrix, _, m, (_, c) = estimator.normal_equations(at, W, slope, weight, angle)
-    loads = noise @ seen.across.mT @ (weight[..., None, None] * slope)
-    g = torch.einsum("bdrc,dn->bncdr", loads, estimator.vertex_shares).flatten(3).flatten(1, 2)
-    g = system.padded(g.mT).mT
-    n = system.padded(at.volume.flatten(1))
-    y = system.solve(matrix, torch.cat([g, torch.stack([m, n], -1)], -1))
+    normal = estimator.normal_equations(at, W, sight, weight)
+    loads, (_, c) = estimator.loads(normal, at, W, angle)
+    borders = loads[..., 1:]
+    turns = noise @ seen.across.mT @ normal.weighted_sight
+    g = torch.einsum("bdrc,dn->bncdr", turns, estimator.vertex_shares).flatten(3).flatten(1, 2)
+    y = system.substitute(system.factor(estimator.matrix(normal)), torch.cat([system.padded(g), borders], -1))
     dx, dp = y[..., :-2], torch.zeros_like(g[:, 0])
     if estimator.cavity.filling != "open":
-        border, borders = y[..., -2:], torch.stack([m, n], 1)
+        border = y[..., -2:]
         _, compliance = estimator.cavity.condition(membrane.volume(x) - membrane.rest_volume, pressure)
-        corner = torch.diag_embed(torch.stack([c, compliance], -1)) - borders @ border
-        rise = torch.linalg.solve(corner, -borders @ dx)
+        corner = torch.diag_embed(torch.stack([c, compliance], -1)) - borders.mT @ border
+        rise = torch.linalg.solve(corner, -borders.mT @ dx)
         dx, dp = dx - border @ rise, rise[:, 0]
-    total = system.vector(at.slope.movedim(-2, 1))
-    dF = total @ dx - at.volume.sum(1)[..., None] * dp[:, None]
+    total = system.vector(at.slope.mT)
+    dF = total.mT @ dx - at.volume.sum(1)[..., None] * dp[:, None]
     spread = lambda change: change.square().sum(-1).sqrt()  # noqa: E731
     return StandardDeviations(bordered(system.field(spread(dx)), membrane.grid), spread(dF), spread(dp))

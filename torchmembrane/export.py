@@ -62,6 +62,9 @@ class Tracer:
         names = {name: self.names[name] for name in [*state, *given]}
         self._keep(state, self.assembly.repeat(model, names, count, tables), values)
 
+    def constant(self, name: str, value: float) -> None:
+        self.examples[name], self.names[name] = torch.tensor(value), self.assembly.constant(np.array(value, np.float32))
+
     def alias(self, names: list[str], known: list[str]) -> None:
         """Further names of values."""
         self._keep(names, {name: self.names[name] for name in known}, [self.examples[name] for name in known])
@@ -171,21 +174,36 @@ def track(tracer: Tracer, estimator: ForceBalance) -> None:
         tracer.piece(estimator, ForceBalance.coarsened, ["surface", "pressure"], ["surface", "pressure"])
         track(tracer, estimator.coarse)
         tracer.piece(estimator, ForceBalance.refined, ["vertices", "pressure"], ["surface", "pressure"])
-    descend(tracer, estimator, estimator.falls(warm=True))
+        descend(tracer, estimator, estimator.falls(warm=True))
+    else:
+        descend(tracer, estimator, estimator.falls(warm=True), one_factor=True)
 
 
-def descend(tracer: Tracer, estimator: ForceBalance, falls: list[tuple[float, float]]) -> None:
-    """The steps of a schedule from `surface` and `pressure`."""
-    tau, outlier = np.array(falls, np.float32).T.copy()
+def descend(tracer: Tracer, estimator: ForceBalance, falls: list[tuple[float, float]], one_factor=False) -> None:
+    """The steps of a schedule from `surface` and `pressure`; `one_factor`: all with that of the first."""
     seen, state = ["marker origins", "across", "weight"], ["surface", "pressure", "before"]
     tracer.piece(estimator, ForceBalance.observation, ["origins", "directions", "confidence"], seen)
     tracer.alias(["before"], ["surface"])
+    if one_factor:
+        for name, value in zip(("tau", "outlier"), falls[0], strict=True):
+            tracer.constant(name, value)
+        factor = ["pivots", "couplings"]
+        tracer.piece(estimator, _first_step, [*state, *seen, "tau", "outlier"], [*state, *factor])
+        seen, falls = [*seen, *factor], falls[1:]
+    tau, outlier = np.array(falls, np.float32).T.copy()
     tracer.steps(estimator, _step, state, seen, len(falls), tau=tau, outlier=outlier)
     tracer.piece(estimator, ForceBalance.equilibrium, state, list(Equilibrium._fields))
 
 
-def _step(estimator, surface, pressure, before, origins, across, weight, tau, outlier):
-    return *estimator.step(surface, pressure, Observation(origins, across, weight), tau, outlier), surface
+def _step(estimator, surface, pressure, before, origins, across, weight, *factor_and_scales):
+    *factor, tau, outlier = factor_and_scales
+    seen = Observation(origins, across, weight)
+    return *estimator.step(surface, pressure, seen, tau, outlier, factor or None)[:2], surface
+
+
+def _first_step(estimator, surface, pressure, before, origins, across, weight, tau, outlier):
+    x, pressure, factor = estimator.step(surface, pressure, Observation(origins, across, weight), tau, outlier)
+    return x, pressure, surface, *factor
 
 
 def _result(reconstructor, vertices, pressure, volume, traction, unbalance, displacement, confidence, status):

@@ -14,7 +14,8 @@ Whether a vertex is pushed is asked of its surroundings (`REACH`): contacts are 
 
 Reweighted Gauss-Newton steps while `tau` falls from where everything is quadratic (graduated non-convexity): no start but the
 rest surface is needed. A fine grid starts from the solution on every second of its lines, that one from one coarser still: it
-takes few vertices to find the basin.
+takes few vertices to find the basin. From the solution of the previous frame the first step's factor does for all: with it,
+two conjugate-gradient steps solve the others' equations well enough.
 """
 
 from typing import NamedTuple
@@ -27,12 +28,14 @@ from .cavity import CavityLaw, Equilibrium, rest_balance
 from .deviations import StandardDeviations, standard_deviations
 from .energy import Sheet
 from .membrane import Membrane, SurfacePoints
+from .solve.conjugate_gradient import conjugate_gradient
 from .solve.stencil_system import NEAR, StencilSystem
-from .stencil import STENCIL, bordered, inner, ring
+from .stencil import bordered, inner, ring
 
 STEPS, COARSE_STEPS, TAU = 8, 4, (4.0, 0.4)  # from rest, and so where a finer grid follows
 FINE_STEPS, FINER_STEPS, FINE_TAU = 5, 4, (0.8, 0.4)  # from the coarsest grid's solution, from a finer one's
 WARM_STEPS, WARM_TAU = 4, (1.2, 0.4)  # from the previous frame's solution
+CONJUGATE_STEPS = 2  # of a step that has the factor of another
 FALL = 0.6  # share of the steps over which tau falls
 SPARSITY = 3200.0  # price of the push p0 on the whole surface, while it is quadratic
 FRICTION, SLIP = 3.75, 0.05  # kappa over the price of a push; where |q_t| begins to be linear, over p0
@@ -58,6 +61,15 @@ class Observation(NamedTuple):
     origins: Tensor
     across: Tensor
     weight: Tensor
+
+
+class NormalEquations(NamedTuple):
+    """`M = A^T W A + J^T w J`: the forces' slope `A [B, N, 3, 21]` and `W A`, the angles' `J [B, D, 2, 3]` and `w J`."""
+
+    slope: Tensor
+    weighted_slope: Tensor
+    sight: Tensor
+    weighted_sight: Tensor
 
 
 class Linearised(NamedTuple):
@@ -108,7 +120,7 @@ class ForceBalance(nn.Module):
         vertex_shares, pair_shares = _shares(membrane, self.marker_vertices, self.marker_weights)
         self.register_buffer("vertex_shares", vertex_shares)
         self.register_buffer("pair_shares", pair_shares)
-        self.system = StencilSystem(membrane.grid, self.free > 0, len(STENCIL) + 1)
+        self.system = StencilSystem(membrane.grid, self.free > 0)
         self.coarse = self._coarser(filling, gas)
         self.passes_on_starts = self.coarse is not None and min(self.coarse.membrane.grid) >= COARSEST_WARM
         usual = STEPS if self.coarse is None else FINE_STEPS if self.coarse.coarse is None else FINER_STEPS
@@ -140,15 +152,13 @@ class ForceBalance(nn.Module):
     ) -> Equilibrium:
         """Arguments: `origins`, `directions [B, D, 3]`, the markers' measured rays; `weight [B, D]`: 0 for a lost one, else up
         to 1; `start`: vertices `[B, V, 3]` and pressure `[B]` near the solution, such as the previous frame's."""
-        warm = start is not None
+        seen, warm = self.observation(origins, directions, weight), start is not None
         if warm and not self.passes_on_starts:
-            begin = start
-        elif self.coarse is None:
-            begin = self.at_rest(weight)
-        else:
-            coarse = self.coarse(origins, directions, weight, self.coarsened(*start) if warm else None)
-            begin = self.refined(coarse.vertices, coarse.pressure)
-        return self._descend(*begin, self.observation(origins, directions, weight), self.falls(warm))
+            return self._descend(*start, seen, self.falls(warm), one_factor=True)
+        if self.coarse is None:
+            return self._descend(*self.at_rest(weight), seen, self.falls())
+        coarse = self.coarse(origins, directions, weight, self.coarsened(*start) if warm else None)
+        return self._descend(*self.refined(coarse.vertices, coarse.pressure), seen, self.falls())
 
     def falls(self, warm=False) -> list[tuple[float, float]]:
         """`tau` and `R` of every step on this grid; `warm`: with a start."""
@@ -186,10 +196,14 @@ class ForceBalance(nn.Module):
         u = F.interpolate(u, self.membrane.grid, mode="bilinear", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
         return self.membrane.rest + u * self.moves, pressure
 
-    def _descend(self, x: Tensor, pressure: Tensor, seen: Observation, schedule: list[tuple[float, float]]) -> Equilibrium:
+    def _descend(
+        self, x: Tensor, pressure: Tensor, seen: Observation, schedule: list[tuple[float, float]], one_factor=False
+    ) -> Equilibrium:
+        factor = None
         for tau, outlier in schedule:
             before = x
-            x, pressure = self._compiled_once(x, pressure, seen, x.new_tensor(tau), x.new_tensor(outlier))
+            x, pressure, found = self._compiled_once(x, pressure, seen, x.new_tensor(tau), x.new_tensor(outlier), factor)
+            factor = found if one_factor else None
         return self.equilibrium(x, pressure, before)
 
     def equilibrium(self, x: Tensor, pressure: Tensor, before: Tensor) -> Equilibrium:
@@ -199,9 +213,9 @@ class ForceBalance(nn.Module):
         return Equilibrium(x, pressure, self.membrane.volume(x), traction, moved)
 
     @torch.compiler.nested_compile_region
-    def _compiled_once(self, x: Tensor, pressure: Tensor, seen: Observation, tau: Tensor, outlier: Tensor):
+    def _compiled_once(self, x: Tensor, pressure: Tensor, seen: Observation, tau: Tensor, outlier: Tensor, factor):
         """`step`, which `torch.compile` then traces and compiles once, not once a step."""
-        return self.step(x, pressure, seen, tau, outlier)
+        return self.step(x, pressure, seen, tau, outlier, factor)
 
     def contact_force(self, x: Tensor, pressure: Tensor) -> Tensor:
         """Force that something outside must exert on every free vertex, `[B, V, 3]`."""
@@ -233,37 +247,60 @@ class ForceBalance(nn.Module):
         angle = (seen.across @ along[..., None]).squeeze(-1)
         return angle, (seen.across - angle[..., None] * along[..., None, :]) / distance[..., None]
 
-    def step(self, x: Tensor, pressure: Tensor, seen: Observation, tau, outlier) -> tuple[Tensor, Tensor]:
-        """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped."""
+    def step(
+        self, x: Tensor, pressure: Tensor, seen: Observation, tau, outlier, factor: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+        """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped.
+
+        Also returns the factor of its matrix, with which another step near it can be solved by conjugate gradients: `factor`.
+        """
         at = self.linearised(x, pressure)
         W = self.force_weights(at.normal, at.force, tau)
-        angle, slope = self.angles(x, seen)
-        matrix, g, m, of_fluid = self.normal_equations(at, W, slope, self.marker_weights_at(angle, seen, outlier), angle)
-        n = self.system.padded(at.volume.flatten(1))
-        y = self.system.solve(matrix, torch.stack([g, m, n], -1))
-        move, rise = self._bordered(x, pressure, y, m, n, *of_fluid)
+        angle, sight = self.angles(x, seen)
+        weight = self.marker_weights_at(angle, seen, outlier)
+        normal = self.normal_equations(at, W, sight, weight)
+        loads, of_fluid = self.loads(normal, at, W, angle)
+        if factor is None:
+            factor = self.system.factor(self.matrix(normal))
+            y = self.system.substitute(factor, loads)
+        else:
+            y = conjugate_gradient(
+                lambda u: self.product(normal, u), lambda r: self.system.substitute(factor, r), loads, CONJUGATE_STEPS
+            )
+        move, rise = self._bordered(x, pressure, y, loads, of_fluid)
         move = self.system.field(move)
         longest = torch.linalg.vector_norm(move, dim=-1).amax(-1)
         share = (LONGEST_STEP * self.size / longest.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1.0)
-        return x + bordered(share[:, None, None] * move, self.membrane.grid), pressure + share * rise
+        return x + bordered(share[:, None, None] * move, self.membrane.grid), pressure + share * rise, factor
 
-    def normal_equations(self, at: "Linearised", W: Tensor, slope: Tensor, weight: Tensor, angle: Tensor):
-        """The Gauss-Newton matrix and loads of forces weighted by `W [B, N, 3, 3]` and angles by `weight [B, D]`.
+    def normal_equations(self, at: "Linearised", W: Tensor, sight: Tensor, weight: Tensor) -> NormalEquations:
+        """Of forces weighted by `W [B, N, 3, 3]` and angles by `weight [B, D]`, `sight` being these angles' slope."""
+        return NormalEquations(at.slope, W @ at.slope, sight, weight[..., None, None] * sight)
 
-        Returns `A^T W A + J^T w J` as the blocks that `system.solve` takes; `A^T W f + J^T w r` and `-A^T W v`,
-        `[B, unknowns]`; `f^T W v` and `v^T W v`, `[B]`.
-        """
-        of_vertices = at.slope.shape[-1]
-        A = torch.cat([at.slope, torch.stack([at.force, at.volume, torch.zeros_like(at.force)], -1)], -1)
-        products = A.mT @ (W @ A)
-        J = torch.cat([slope, angle[..., None]], -1)
-        of_markers = J.mT @ (weight[..., None, None] * J)
-        near = (of_markers[..., :3, :3].flatten(-2).mT @ self.pair_shares).unflatten(-1, (len(NEAR), -1)).unflatten(1, (3, 3))
-        load, push = self.system.vector(products[..., :of_vertices, of_vertices:-1].movedim(-1, 1)).unbind(1)
-        pull = (of_markers[..., :3, 3].mT @ self.vertex_shares).mT.flatten(1)
-        matrix = self.system.matrix(products, near.permute(0, 3, 1, 4, 2))
-        of_fluid = products[..., of_vertices:-1, of_vertices + 1].sum(1).unbind(-1)
-        return matrix, load + self.system.padded(pull), -push, of_fluid
+    def loads(self, normal: NormalEquations, at: "Linearised", W: Tensor, angle: Tensor):
+        """`A^T W f + J^T w r`, `-A^T W v` and `v`, `[B, unknowns, 3]`; `f^T W v` and `v^T W v`, `[B]`."""
+        forces = torch.stack([at.force, -at.volume], -1)
+        push = self.system.vector(normal.weighted_slope.mT @ forces)
+        pull = self.vertex_shares.mT @ (normal.weighted_sight.mT @ angle[..., None]).squeeze(-1)
+        g = push[..., 0] + self.system.padded(pull.flatten(1)[..., None]).squeeze(-1)
+        loads = torch.stack([g, push[..., 1], self.system.padded(at.volume.flatten(1)[..., None]).squeeze(-1)], -1)
+        fWv, vWv = ((W @ at.volume[..., None]) * torch.stack([at.force, at.volume], -1)).sum((1, 2)).unbind(-1)
+        return loads, (fWv, vWv)
+
+    def matrix(self, normal: NormalEquations) -> tuple[Tensor, Tensor]:
+        """`M` as the blocks that `system.factor` takes."""
+        products = normal.slope.mT @ normal.weighted_slope
+        of_markers = (normal.sight.mT @ normal.weighted_sight).flatten(-2).mT @ self.pair_shares
+        near = of_markers.unflatten(-1, (len(NEAR), -1)).unflatten(1, (3, 3))
+        return self.system.matrix(products, near.permute(0, 3, 1, 4, 2))
+
+    def product(self, normal: NormalEquations, u: Tensor) -> Tensor:
+        """`M u` for `u [B, unknowns, C]`, without the matrix."""
+        of_forces = self.system.vector(normal.slope.mT @ (normal.weighted_slope @ self.system.rows(u)))
+        at_markers = (self.vertex_shares @ self.system.field(u).flatten(2)).unflatten(-1, (3, -1))
+        pulls = normal.sight.mT @ (normal.weighted_sight @ at_markers)
+        of_markers = (self.vertex_shares.mT @ pulls.flatten(2)).unflatten(-1, (3, -1)).flatten(1, 2)
+        return of_forces + self.system.padded(of_markers)
 
     def force_weights(self, normal: Tensor, force: Tensor, tau: float, curvature=False) -> Tensor:
         """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, N, 3, 3]`: the parabolas that price a force.
@@ -302,10 +339,10 @@ class ForceBalance(nn.Module):
     def marker_weights_at(self, angle: Tensor, seen: Observation, outlier: float) -> Tensor:
         return seen.weight / (1 + seen.weight * angle.square().sum(-1) / outlier**2)
 
-    def _bordered(self, x, pressure, y, m, n, fWv, vWv):
+    def _bordered(self, x, pressure, y, loads, of_fluid):
         """Step `d` and rise of the pressure: `M d + m dp + n lambda = -g` with the rows of the pressure and of the volume."""
         dot = lambda a, b: (a * b).sum(-1)  # noqa: E731
-        Mg, Mm, Mn = y.unbind(-1)
+        (_, m, n), (Mg, Mm, Mn), (fWv, vWv) = loads.unbind(-1), y.unbind(-1), of_fluid
         if self.cavity.filling == "open":
             return -Mg, torch.zeros_like(pressure)
         target, compliance = self.cavity.condition(self.membrane.volume(x) - self.membrane.rest_volume, pressure)

@@ -1,4 +1,4 @@
-"""The solves of `block_tridiagonal` by matrix products alone, for runtimes that have no Cholesky factor: ONNX.
+"""What `block_tridiagonal` does by matrix products alone, for runtimes that have no Cholesky factor: ONNX.
 
 An inverse is split into 2 x 2 blocks down to `LEAF` rows, and there iterated, `X <- X (2 I - A X)` (Schulz 1933), with `X`
 scaled in between so that the eigenvalues of `A X` lie evenly about 1: each step then divides their spread by four.
@@ -44,31 +44,48 @@ def inverse(matrix: Tensor) -> Tensor:
     return (X + X.mT) / 2
 
 
-def solve(diagonal: Tensor, upper: Tensor, b: Tensor) -> Tensor:
-    """As `block_tridiagonal.solve`; eliminated from both ends at once, two blocks a product."""
-    s, n = diagonal.shape[-1], diagonal.shape[-3]
-    D, U, b = (list(blocks.unbind(-3)) for blocks in (diagonal, upper, b))
-    pair = lambda first, last: torch.stack([first, last], -3)  # noqa: E731
-    reduced = []
-    for i in range((n - 1) // 2):
-        j = n - 1 - i
-        coupled = pair(U[i], U[j - 1].mT)
-        Y = _inverse_scaled(pair(D[i], D[j])) @ torch.cat([coupled, pair(b[i], b[j])], -1)
-        for k, product in zip((i + 1, j - 1), (coupled.mT @ Y).unbind(-3), strict=True):
-            D[k], b[k] = D[k] - product[..., :s], b[k] - product[..., s:]
-        reduced.append(Y)
-    k, x = (n - 1) // 2, [None] * n
+def factor(diagonal: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    """As `block_tridiagonal.factor`; eliminated from both ends at once, two blocks a product."""
+    n = diagonal.shape[-3]
+    D, U, inverses, couplings = list(diagonal.split(1, -3)), upper.split(1, -3), [], []
+    for i, j in _pairs(n):
+        coupled = torch.cat([U[i], U[j - 1].mT], -3)
+        inverses.append(_inverse_scaled(torch.cat([D[i], D[j]], -3)))
+        couplings.append(inverses[-1] @ coupled)
+        for k, change in zip((i + 1, j - 1), (coupled.mT @ couplings[-1]).split(1, -3), strict=True):
+            D[k] = D[k] - change
+    for k in range((n - 1) // 2, n // 2 + 1):
+        inverses.append(_inverse_scaled(D[k]))
+        if k < n // 2:
+            couplings.append(inverses[-1] @ U[k])
+            D[k + 1] = D[k + 1] - U[k].mT @ couplings[-1]
+    return torch.cat(inverses, -3), torch.cat(couplings, -3) if couplings else upper
+
+
+def substitute(factor: tuple[Tensor, Tensor], b: Tensor) -> Tensor:
+    """As `block_tridiagonal.substitute`."""
+    n = b.shape[-3]
+    sizes = [2] * len(_pairs(n)) + [1] * (2 - n % 2)
+    inverses, couplings = factor[0].split(sizes, -3), factor[1].split(sizes[:-1], -3)
+    b, ends, k = list(b.split(1, -3)), [], (n - 1) // 2
+    for (i, j), Y in zip(_pairs(n), couplings, strict=False):
+        ends.append(torch.cat([b[i], b[j]], -3))
+        for inward, change in zip((i + 1, j - 1), (Y.mT @ ends[-1]).split(1, -3), strict=True):
+            b[inward] = b[inward] - change
     if n % 2 == 0:
-        Y = _inverse_scaled(D[k]) @ torch.cat([U[k], b[k]], -1)
-        product = U[k].mT @ Y
-        x[k + 1] = _inverse_scaled(D[k + 1] - product[..., :s]) @ (b[k + 1] - product[..., s:])
-        x[k] = Y[..., s:] - Y[..., :s] @ x[k + 1]
+        b[k + 1] = inverses[-1] @ (b[k + 1] - couplings[-1].mT @ b[k])
+        b[k] = inverses[-2] @ b[k] - couplings[-1] @ b[k + 1]
     else:
-        x[k] = _inverse_scaled(D[k]) @ b[k]
-    for i in reversed(range(k)):
-        j = n - 1 - i
-        x[i], x[j] = (reduced[i][..., s:] - reduced[i][..., :s] @ pair(x[i + 1], x[j - 1])).unbind(-3)
-    return torch.stack(x, -3)
+        b[k] = inverses[-1] @ b[k]
+    for i, j in reversed(_pairs(n)):
+        x = inverses[i] @ ends[i] - couplings[i] @ torch.cat([b[i + 1], b[j - 1]], -3)
+        b[i], b[j] = x.split(1, -3)
+    return torch.cat(b, -3)
+
+
+def _pairs(n: int) -> list[tuple[int, int]]:
+    """Blocks that are eliminated together: the outermost, those next to them, ..."""
+    return [(i, n - 1 - i) for i in range((n - 1) // 2)]
 
 
 def _inverse_scaled(matrix: Tensor) -> Tensor:

@@ -19,19 +19,19 @@ NEAR = ((0, 0), (0, 1), (1, 0), (1, 1))  # from a vertex to itself and to its ne
 class StencilSystem(nn.Module):
     """Three unknowns an inner vertex of an `m x n` grid, those of two grid rows a block; the matrix is block tridiagonal.
 
-    Arguments: `free [N]` bool, the inner vertices that move; `slots`, of the rows over inner vertices `[B, N, ..., 3 slots]`
-    that `matrix` takes: the stencil's 7, then others. Columns of vertices that do not move must be zero.
+    Arguments: the grid and `free [N]` bool, the inner vertices that move. Columns of those that do not must be zero.
     Sums are gathered, not scattered, three numbers at a time: where they come from is known beforehand.
     """
 
-    def __init__(self, grid: tuple[int, int], free: Tensor, slots: int):
+    def __init__(self, grid: tuple[int, int], free: Tensor):
         super().__init__()
         m, n = grid
         self.count, self.blocks, self.block_size = (m - 2) * (n - 2), (m - 1) // 2, 6 * (n - 2)
         groups = _ways()
-        sources = [np.stack([_product_sources(grid, way, slots) for way in group], 1) for group in groups]
+        sources = [np.stack([_product_sources(grid, way) for way in group], 1) for group in groups]
         self.sizes = [source.shape for source in sources]
         for name, index in (
+            ("neighbours", _neighbours(grid).ravel()),
             ("row_sources", _row_sources(grid).ravel()),
             ("product_sources", np.concatenate([source.ravel() for source in sources])),
             ("places", _places(grid, [way for group in groups for way, _ in group], free.cpu().numpy(), self.blocks).ravel()),
@@ -40,22 +40,27 @@ class StencilSystem(nn.Module):
         self.register_buffer("one", torch.eye(3, dtype=torch.float64))
 
     def vector(self, rows: Tensor) -> Tensor:
-        """Sum of stencil rows `[..., N, 21]`, in the system's order `[..., unknowns]`."""
-        chunks = rows.reshape(-1, self.count * len(STENCIL), 3).index_select(1, self.row_sources)
-        return self.padded(chunks.unflatten(1, (len(STENCIL), -1)).sum(1).reshape(*rows.shape[:-2], 3 * self.count))
+        """Sum of stencil rows `[B, N, 21, C]`, in the system's order `[B, unknowns, C]`."""
+        chunks = rows.unflatten(2, (len(STENCIL), 3)).flatten(1, 2).flatten(2).index_select(1, self.row_sources)
+        sums = chunks.unflatten(1, (len(STENCIL), -1)).sum(1)
+        return self.padded(sums.unflatten(2, (3, -1)).flatten(1, 2))
+
+    def rows(self, vector: Tensor) -> Tensor:
+        """Values `[B, N, 21, C]` around every inner vertex of a vector `[B, unknowns, C]`: the adjoint of `vector` where free."""
+        return self.field(vector).index_select(1, self.neighbours).unflatten(1, (-1, len(STENCIL))).flatten(2, 3)
 
     def padded(self, unknowns: Tensor) -> Tensor:
-        """Unknowns of the inner vertices `[..., 3 N]` in the system's order `[..., unknowns]`."""
-        return F.pad(unknowns, (0, self.blocks * self.block_size - 3 * self.count))
+        """Unknowns of the inner vertices `[B, 3 N, C]` in the system's order `[B, unknowns, C]`."""
+        return F.pad(unknowns, (0, 0, 0, self.blocks * self.block_size - 3 * self.count))
 
     def field(self, vector: Tensor) -> Tensor:
-        """The inner vertices' field `[..., N, 3]` of a vector in the system's order."""
-        return vector[..., : 3 * self.count].unflatten(-1, (self.count, 3))
+        """The inner vertices' field `[B, N, 3, ...]` of a vector `[B, unknowns, ...]` in the system's order."""
+        return vector[:, : 3 * self.count].unflatten(1, (self.count, 3))
 
     def matrix(self, products: Tensor, near: Tensor, damping: float = 1e-6) -> tuple[Tensor, Tensor]:
         """Blocks on the diagonal `[B, blocks, s, s]` and above it `[B, blocks - 1, s, s]`.
 
-        Arguments: `products [B, N, 3 slots, 3 slots]` of every row's columns with each other; `near [B, 4, 3, N, 3]`, further
+        Arguments: `products [B, N, 21, 21]` of every stencil row's columns with each other; `near [B, 4, 3, N, 3]`, further
         blocks between the vertices and those at `NEAR` from them; `damping`, a share of the diagonal.
         """
         chunks = products.unflatten(-1, (-1, 3)).flatten(1, 3).index_select(1, self.product_sources)
@@ -69,10 +74,17 @@ class StencilSystem(nn.Module):
         matrix = entries.index_select(1, self.places).flatten(1).unflatten(1, (-1, s, s))
         return matrix.split([self.blocks, self.blocks - 1], 1)
 
-    def solve(self, matrix: tuple[Tensor, Tensor], loads: Tensor) -> Tensor:
+    def factor(self, matrix: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """What `substitute` needs of the matrix."""
+        return _elimination().factor(*matrix)
+
+    def substitute(self, factor: tuple[Tensor, Tensor], loads: Tensor) -> Tensor:
         """Solutions `[B, unknowns, C]` for `loads` of that shape."""
-        elimination = matrix_products if torch.compiler.is_exporting() else block_tridiagonal
-        return elimination.solve(*matrix, loads.unflatten(1, (self.blocks, self.block_size))).flatten(1, 2)
+        return _elimination().substitute(factor, loads.unflatten(1, (self.blocks, self.block_size))).flatten(1, 2)
+
+
+def _elimination():
+    return matrix_products if torch.compiler.is_exporting() else block_tridiagonal
 
 
 class _Inner(NamedTuple):
@@ -108,6 +120,12 @@ def _ways() -> list[list[tuple[tuple[int, int], list[tuple[int, int]]]]]:
 _ZERO = STENCIL.index((-1, -1))  # the first inner vertex's column for this neighbour, on the border, is zero
 
 
+def _neighbours(grid) -> np.ndarray:
+    """The inner vertices `[N, 7]` around each; some vertex, whose column is zero, for those on the border."""
+    inner = _Inner.of(grid)
+    return np.stack([inner.at(inner.row + i, inner.column + j).clip(min=0) for i, j in STENCIL], 1)
+
+
 def _row_sources(grid) -> np.ndarray:
     """For every slot, where in rows `[N, 7]` a vertex `[N]` is the slot's neighbour: `[7, N]`."""
     inner, sources = _Inner.of(grid), []
@@ -117,10 +135,10 @@ def _row_sources(grid) -> np.ndarray:
     return np.stack(sources)
 
 
-def _product_sources(grid, way, slots) -> np.ndarray:
-    """Where in products `[N, 3 slots, slots]` the rows of the block between a vertex and that on its `way` have their parts:
+def _product_sources(grid, way) -> np.ndarray:
+    """Where in products `[N, 21, 7]` the rows of the block between a vertex and that on its `way` have their parts:
     `[K, 3, N]`."""
-    inner, component = _Inner.of(grid), np.arange(3)[:, None]
+    inner, component, slots = _Inner.of(grid), np.arange(3)[:, None], len(STENCIL)
     (di, dj), pairs = way
     sources = []
     for a, b in pairs:
