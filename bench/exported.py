@@ -22,7 +22,7 @@ import torch
 from accuracy import cases_in
 from record import write
 
-from torchmembrane.export import PREVIOUS, export
+from torchmembrane.export import export, previous_of
 from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
 from torchmembrane.results import Reconstruction
 from torchmembrane.store import Settings
@@ -99,9 +99,8 @@ def given(reconstructor, images, tracking: bool) -> tuple[dict[str, np.ndarray],
         return {"image": images.numpy()}, None
     with torch.no_grad():
         before = reconstructor(images)
-    return dict(
-        zip(("image", *PREVIOUS), (images.numpy(), before.vertices.numpy(), before.pressure.numpy()), strict=True)
-    ), before
+    state = {name: getattr(before, name.removeprefix("previous_")).numpy() for name in previous_of(reconstructor)}
+    return {"image": images.numpy()} | state, before
 
 
 def differences(reconstructor, session, images, tracking: bool) -> dict:

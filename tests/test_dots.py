@@ -182,6 +182,36 @@ def test_follows_a_smooth_flow_of_one_and_a_half_pitches(arrangement, two_sizes,
         assert error.max() < 0.5 and np.median(error) < 0.06 and np.percentile(error, 95) < 0.2, k
 
 
+@pytest.mark.parametrize("arrangement, two_sizes", PATTERNS)
+def test_dots_followed_from_the_frame_before_are_those_searched_for(arrangement, two_sizes):
+    """Whether they moved little, or so far that they can no longer be followed; dots that were lost are found again."""
+    s = scene(arrangement, two_sizes)
+    locate = DotLocator(measured(s), SIZE, "dark", s.rim)
+    before, _ = locate(batch(render(*deform(s, slide, 0.2), seed=1)))
+    before[0, ::9] = torch.nan
+    moves = (0.2, 0.4, 0.8, 1.1, 1.4)
+    frames = [deform(s, slide, pitches) for pitches in moves]
+    images = batch(*(render(*frame, seed=k) for k, frame in enumerate(frames)))
+    pixels, confidence = locate(images, before.expand(len(frames), -1, -1))
+    expected, sure = locate(images)
+    torch.testing.assert_close(confidence, sure, atol=0.02, rtol=0)
+    torch.testing.assert_close(pixels, expected, atol=0.03, rtol=0)
+    assert confidence.min() > 0.5
+    _, blobs, log_radius, valid = locate.begin(images)[-4:]
+    *_, kept = locate.match.follow(before.expand(len(frames), -1, -1), blobs, log_radius, valid)
+    assert kept[:2].all() and not kept[-1]
+
+
+def test_dots_are_searched_for_where_the_frame_before_says_nothing_or_is_another(two):
+    s, locate = two
+    image = batch(render(*deform(s, dent, 0.8)))
+    expected = locate(image)
+    one_off = torch.as_tensor(s.pixels + [PITCH, 0], dtype=torch.float32)[None]
+    for before in (torch.full_like(one_off, torch.nan), one_off):
+        for got, want in zip(locate(image, before), expected, strict=True):
+            assert torch.equal(got, want)
+
+
 def test_removed_dots_are_lost_and_no_neighbour_takes_their_place(two):
     s, locate = two
     truth, shapes = deform(s, dent, 0.8)

@@ -127,7 +127,7 @@ def test_a_tracking_model_starts_from_the_frames_before(model_files, reconstruct
         before.vertices[2], before.pressure[2] = torch.nan, torch.nan
         expected = reconstructor(images, before)
     feed = {"image": images.numpy()}
-    feed |= {"previous_vertices": before.vertices.numpy(), "previous_pressure": before.pressure.numpy()}
+    feed |= {name: getattr(before, name.removeprefix("previous_")).numpy() for name in export.previous_of(reconstructor)}
     agree(Reconstruction(*session.run(list(Reconstruction._fields), feed)), expected)
 
 

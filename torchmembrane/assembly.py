@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from contextlib import contextmanager
 
 import numpy as np
 import onnx
@@ -122,6 +123,25 @@ class Assembly:
         trips = [self.constant(np.array(steps)), self.constant(np.array(True))]
         self.nodes.append(helper.make_node("Loop", [*trips, *(names[name] for name in state)], list(last.values()), body=body))
         return last
+
+    @contextmanager
+    def unless(self, condition: str, names: dict[str, str]):
+        """Pieces appended inside run where `condition` (bool) is false only.
+
+        `names` of float values here; inside they are to be given the names of what replaces them. On leaving they become those
+        of the one or the other.
+        """
+        k, before, outside = f"{self.part}/{self.pieces}", dict(names), self.nodes
+        self.nodes = []
+        yield
+        described = lambda names: [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in names]  # noqa: E731
+        same = [helper.make_node("Identity", [name], [f"{k}/{i}/same"]) for i, name in enumerate(before.values())]
+        branches = dict(
+            then_branch=helper.make_graph(same, "then", [], described(node.output[0] for node in same)),
+            else_branch=helper.make_graph(self.nodes, "else", [], described(names.values())),
+        )
+        names |= {name: f"{k}/{i}/either" for i, name in enumerate(names)}
+        self.nodes = [*outside, helper.make_node("If", [condition], list(names.values()), **branches)]
 
     def model(self, inputs, outputs, metadata: dict[str, str]) -> onnx.ModelProto:
         """The whole as a checked model; `inputs` and `outputs` are ONNX value descriptions."""

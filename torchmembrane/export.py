@@ -5,6 +5,7 @@ The graph is put together from pieces traced once each: observe, rays, start, st
 
 import json
 from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from .results import STATUS_TEXTS, Reconstruction
 from .store import Mesh, Settings
 
 FORMAT = 1
-PREVIOUS = ("previous_vertices", "previous_pressure")
+PREVIOUS = ("previous_vertices", "previous_pressure", "previous_pixels")
 EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
 
 
@@ -62,6 +63,15 @@ class Tracer:
         names = {name: self.names[name] for name in [*state, *given]}
         self._keep(state, self.assembly.repeat(model, names, count, tables), values)
 
+    @contextmanager
+    def unless(self, condition: str, names: list[str]):
+        """What is appended inside runs only where `condition`, a bool, is false; it gives `names` other values."""
+        names = {name: self.names[name] for name in names}
+        with self.assembly.unless(self.names[condition], names):
+            yield
+            names |= {name: self.names[name] for name in names}
+        self.names |= names
+
     def constant(self, name: str, value: float) -> None:
         self.examples[name], self.names[name] = torch.tensor(value), self.assembly.constant(np.array(value, np.float32))
 
@@ -87,7 +97,8 @@ def export(reconstructor: Reconstructor, path: str | Path, settings: Settings, t
     """Write the reconstructor as one ONNX model to `path`; returns it.
 
     Input `image [batch, 1, height, width]`, grey in 0..1; outputs as `Reconstruction`. With `tracking` (force balance) also
-    `previous_vertices [batch, V, 3]` and `previous_pressure [batch]`: outputs of the frames before, NaN to start from rest.
+    `previous_vertices [batch, V, 3]`, `previous_pressure [batch]` and, of dots, `previous_pixels [batch, D, 2]`: outputs of the
+    frames before, NaN to start from rest.
     Metadata: `format`, `status_texts` and `mesh` (the fields of `Mesh`), JSON. Standard operators only; float32.
     """
     if tracking and not reconstructor.finds_contacts:
@@ -96,10 +107,19 @@ def export(reconstructor: Reconstructor, path: str | Path, settings: Settings, t
     tracer = Tracer()
     image = torch.rand(EXAMPLES, 1, height, width, generator=torch.Generator().manual_seed(0))
     tracer.given("image", image.to(reconstructor.rest_pixels))
+    if tracking:
+        rest = *reconstructor.estimator.at_rest(image), reconstructor.rest_pixels.repeat(EXAMPLES, 1, 1)
+        for name, value in zip(PREVIOUS, rest, strict=True):
+            if name in previous_of(reconstructor):
+                tracer.given(name, value)
     tracer.assembly.part = "markers"
     tracer.piece(reconstructor, Reconstructor.check, ["image"], ["image", "status"])
-    locate = dots if isinstance(reconstructor.locator, DotLocator) else texture
-    locate(tracer, reconstructor.locator)
+    if not reconstructor.follows:
+        tracer.piece(reconstructor.locator, type(reconstructor.locator).forward, ["image"], ["pixels", "confidence"])
+    else:
+        if tracking:
+            tracer.piece(reconstructor, _located, [PREVIOUS[2]], ["dots before"])
+        dots(tracer, reconstructor.locator, tracking)
     tracer.piece(reconstructor, _displacement, ["pixels"], ["displacement"])
     tracer.assembly.part = "assembly"
     seen = ["displacement", "confidence", "status"]
@@ -107,9 +127,7 @@ def export(reconstructor: Reconstructor, path: str | Path, settings: Settings, t
     tracer.piece(reconstructor, Reconstructor.rays, ["usable", "confidence"], ["origins", "directions"])
     tracer.assembly.part = "solve"
     if tracking:
-        for name, rest in zip(PREVIOUS, reconstructor.estimator.at_rest(image), strict=True):
-            tracer.given(name, rest)
-        tracer.piece(reconstructor, Reconstructor.start, list(PREVIOUS), ["surface", "pressure"])
+        tracer.piece(reconstructor, Reconstructor.start, list(PREVIOUS[:2]), ["surface", "pressure"])
         track(tracer, reconstructor.estimator)
     elif reconstructor.finds_contacts:
         force_balance(tracer, reconstructor.estimator)
@@ -122,26 +140,49 @@ def export(reconstructor: Reconstructor, path: str | Path, settings: Settings, t
     return model
 
 
-def dots(tracer: Tracer, locator: DotLocator) -> None:
-    """From `image` to `pixels` and `confidence`."""
-    match, deformation = locator.match, locator.match.deformation
+def previous_of(reconstructor: Reconstructor) -> tuple[str, ...]:
+    """A tracking model's further inputs: `previous_` and the field of `Reconstruction` that they continue."""
+    return PREVIOUS if reconstructor.follows else PREVIOUS[:2]
+
+
+def dots(tracer: Tracer, locator: DotLocator, tracking: bool) -> None:
+    """From `image`, and `dots before` where tracking, to `pixels` and `confidence`."""
+    match = locator.match
     levels, blobs = [f"level {k}" for k in range(LEVELS)], ["blobs", "log radius", "valid"]
     tracer.piece(locator, DotLocator.begin, ["image"], [*levels, *blobs])
-    scene = ["around", "others", "there", "nearby"]
-    tracer.piece(deformation, LocalDeformation.begin, ["blobs", "valid"], ["deformation", *scene])
+    state, placed = ["weight", "flow", "strain"], ["place", "certainty", "dot strain"]
+    if tracking:
+        tracer.piece(match, DotMatcher.follow, ["dots before", *blobs], [*state, "kept"])
+        tracer.alias([f"followed {name}" for name in state], state)
+        tracer.piece(match, _all, ["kept"], ["all kept"])
+        with tracer.unless("all kept", state):
+            search(tracer, match, state, blobs)
+            tracer.piece(match, DotMatcher.either, ["kept", *(f"followed {name}" for name in state), *state], state)
+    else:
+        search(tracer, match, state, blobs)
+    tracer.piece(match, DotMatcher.end, state, placed)
+    tracer.piece(locator, DotLocator.end, [*levels, *blobs, *placed], ["pixels", "confidence"])
+
+
+def search(tracer: Tracer, match: DotMatcher, state: list[str], blobs: list[str]) -> None:
+    """As `DotMatcher.search`."""
+    scene, known = ["around", "others", "there", "nearby"], ["known", "base"]
+    tracer.piece(match.deformation, LocalDeformation.begin, ["blobs", "valid"], ["deformation", *scene])
     widths = np.array(WIDTHS, np.float32)
-    tracer.steps(deformation, LocalDeformation.refine, ["deformation"], [*scene, "valid"], len(widths), width=widths)
-    state, known = ["weight", "flow", "strain"], ["known", "base"]
-    tracer.piece(match, DotMatcher.begin, ["deformation", *blobs], [*state, *known])
+    tracer.steps(match.deformation, LocalDeformation.refine, ["deformation"], [*scene, "valid"], len(widths), width=widths)
+    tracer.piece(match, DotMatcher.scene, ["deformation", *blobs], known)
+    tracer.piece(match, DotMatcher.begin, known, [*known, *state])
     tracer.steps(match, DotMatcher.grow, state, known, match.steps)
     tracer.steps(match, DotMatcher.settle, state, known, SETTLING)
-    tracer.piece(match, DotMatcher.end, state, ["place", "certainty", "strain"])
-    tracer.piece(locator, DotLocator.end, [*levels, *blobs, "place", "certainty", "strain"], ["pixels", "confidence"])
+    tracer.piece(match, DotMatcher.best, state, state)
 
 
-def texture(tracer: Tracer, locator) -> None:
-    """From `image` to `pixels` and `confidence`."""
-    tracer.piece(locator, type(locator).forward, ["image"], ["pixels", "confidence"])
+def _all(_, kept):
+    return (kept.all(),)
+
+
+def _located(reconstructor, pixels):
+    return (reconstructor.located(pixels),)
 
 
 def _displacement(reconstructor, pixels):

@@ -18,6 +18,7 @@ from .errors import MembraneError
 from .flow import FlowInterpolation
 from .force_balance import ForceBalance
 from .images import read_image
+from .markers.locate import DotLocator
 from .markers.place import FEWEST_MARKERS, place_markers
 from .markers.screen import MismatchScreen
 from .minimum_energy import MinimumEnergy
@@ -141,13 +142,27 @@ class Reconstructor(nn.Module):
         in 0..1 or uint8. Grey is 0.299 R + 0.587 G + 0.114 B. Raises `MembraneError` for another size; a frame that cannot be
         reconstructed gets a status and NaN, the others are not touched.
         """
-        return self._reconstruct(*self.observe(self._as_batch(images)), previous)
+        seen = self.observe(self._as_batch(images), None if previous is None else previous.pixels)
+        return self._reconstruct(*seen, previous)
 
-    def observe(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Marker displacements `[B, D, 2]` px, confidence `[B, D]` and status `[B]` of grey images `[B, 1, height, width]`."""
+    def observe(self, images: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Marker displacements `[B, D, 2]` px, confidence `[B, D]` and status `[B]` of grey images `[B, 1, height, width]`.
+
+        `previous [B, D, 2]`: `pixels` of the frames before, from which dots are followed where that is possible.
+        """
         images, status = self.check(images)
-        pixels, confidence = self.locator(images)
+        before = () if previous is None or not self.follows else (self.located(previous),)
+        pixels, confidence = self.locator(images, *before)
         return pixels - self.measured_rest, confidence, status
+
+    @property
+    def follows(self) -> bool:
+        """Whether markers are followed from frame to frame: dots are."""
+        return isinstance(self.locator, DotLocator)
+
+    def located(self, pixels: Tensor) -> Tensor:
+        """`pixels` of a result as the locator found them."""
+        return pixels - self.rest_pixels + self.measured_rest
 
     def check(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """The images, black where they hold bad values, and their status."""

@@ -44,7 +44,9 @@ class Session:
         self.status_texts = {int(code): text for code, text in json.loads(known["status_texts"]).items()}
         self.mesh = {key: _array(key, value) for key, value in json.loads(known["mesh"]).items()}
         self.image_size = tuple(self.mesh["image_size"].tolist())
-        self.tracks = len(self._session.get_inputs()) > 1
+        inputs = [given.name for given in self._session.get_inputs()]
+        self._state = [name.removeprefix("previous_") for name in inputs if name.startswith("previous_")]
+        self.tracks = bool(self._state)
         self._outputs = [output.name for output in self._session.get_outputs()]
 
     def run(self, images, previous: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
@@ -68,7 +70,7 @@ class Session:
         if len(state["pressure"]) != len(images):
             raise EdgeError(f"{len(images)} images after results of {len(state['pressure'])}; expected as many")
         for _ in range(1 if np.isfinite(state["pressure"]).all() else SETTLING):
-            feed |= {f"previous_{key}": state[key] for key in ("vertices", "pressure")}
+            feed |= {f"previous_{key}": state[key] for key in self._state}
             state = dict(zip(self._outputs, self._session.run(None, feed), strict=True))
         return state
 
@@ -82,8 +84,8 @@ class Session:
             yield previous
 
     def _rest(self, batch: int) -> dict[str, np.ndarray]:
-        none = np.full((batch, *self.mesh["rest_vertices"].shape), np.nan, np.float32)
-        return {"vertices": none, "pressure": none[:, 0, 0]}
+        shapes = {given.name: given.shape[1:] for given in self._session.get_inputs()}
+        return {key: np.full((batch, *shapes[f"previous_{key}"]), np.nan, np.float32) for key in self._state}
 
 
 def grey(images) -> np.ndarray:

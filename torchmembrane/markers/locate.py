@@ -365,10 +365,13 @@ class DotLocator(nn.Module):
         self.register_buffer("shapes", torch.as_tensor(shapes))
         self.float()
 
-    def forward(self, image):
-        """`image [B, 1, H, W]` in 0..1 -> pixels `[B, D, 2]`, confidence `[B, D]` in 0..1."""
+    def forward(self, image, previous=None):
+        """`image [B, 1, H, W]` in 0..1 -> pixels `[B, D, 2]`, confidence `[B, D]` in 0..1.
+
+        `previous [B, D, 2]`: pixels in the frames before, NaN where lost, to follow the dots from.
+        """
         *levels, blobs, log_radius, valid = self.begin(image)
-        return self.end(*levels, blobs, log_radius, valid, *self.match(blobs, log_radius, valid))
+        return self.end(*levels, blobs, log_radius, valid, *self.match(blobs, log_radius, valid, previous))
 
     def begin(self, image):
         """The levels of the pyramid, and the blobs: places `[B, K, 2]`, log radius `[B, K]`, and how surely one is a dot."""

@@ -6,6 +6,8 @@ from scipy.spatial import cKDTree
 from torch import nn
 
 SETTLING = 6  # steps after the growth has reached every dot
+FOLLOWING = 1  # steps after dots are taken from where the frame before had them
+KEPT, MISSED = 0.3, 0.02  # certainty of a dot that is followed; share of all dots that may not be
 WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
 WIDTH = 1.1  # of the local average, pitches
 RIDGE = 0.5  # pulls the flow's gradient to the one measured, where neighbours do not fix it
@@ -281,28 +283,68 @@ class DotMatcher(nn.Module):
         flow = torch.where(weight[:, None] > 0.02, found - self.pixels.mT, predicted)
         return weight, flow, strain.unflatten(1, (2, 2))
 
-    def forward(self, blobs, log_radius, valid):
+    def forward(self, blobs, log_radius, valid, previous=None):
         """`blobs [B, K, 2]`, `log_radius`, `valid [B, K]` -> positions `[B, D, 2]`, certainty `[B, D]` in 0..1 and strain
-        `[B, D, 2, 2]`."""
-        *state, known, base = self.begin(self.deformation(blobs, valid), blobs, log_radius, valid)
+        `[B, D, 2, 2]`.
+
+        `previous [B, D, 2]`: where the dots were in the frames before, NaN where lost. They are followed from there; in a
+        frame in which more than `MISSED` of them cannot be, all are looked for as if there were none.
+        """
+        state = self.search(blobs, log_radius, valid)
+        if previous is not None:
+            *followed, kept = self.follow(previous, blobs, log_radius, valid)
+            state = self.either(kept, *followed, *state)
+        return self.end(*state)
+
+    def search(self, blobs, log_radius, valid):
+        """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""
+        known, base = self.scene(self.deformation(blobs, valid), blobs, log_radius, valid)
+        known, base, *state = self.begin(known, base)
         for _ in range(self.steps):
             state = self.grow(*state, known, base)
         for _ in range(SETTLING):
             state = self.settle(*state, known, base)
-        return self.end(*state)
+        return self.best(*state)
 
-    def begin(self, deformation, blobs, log_radius, valid):
-        """Weight, flow and strain of the dots before the first step; what `choose` needs to know of the blobs."""
+    def follow(self, previous, blobs, log_radius, valid):
+        """As `search`, from the frames before; and in which frames `[B]` the dots could be followed."""
+        found = previous.isfinite().all(-1)
+        weight = found.to(blobs.dtype)
+        flow = torch.where(found[..., None], previous - self.pixels - self.origin, 0.0).mT
+        strain = torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1)
+        for _ in range(2):  # the second time next to nothing draws it to zero
+            strain = self.local.gradient(weight, flow, strain)
+        predicted, support = self.local.along(weight, flow, strain)
+        own = square_distance(blobs - self.origin, self.pixels + predicted.mT).argmin(-1)
+        at_blobs = strain.flatten(1, 2).gather(2, own[:, None].expand(-1, 4, -1)).unflatten(1, (2, 2))
+        eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
+        known, base = self.scene(at_blobs + eye, blobs, log_radius, valid)
+        state = self.choose(predicted, support, known, base)
+        for _ in range(FOLLOWING):
+            state = self.settle(*state, known, base)
+        missed = found & (state[0] < KEPT)
+        return *state, (weight.mean(-1) >= 0.5) & (missed.to(weight.dtype).mean(-1) <= MISSED)
+
+    def either(self, kept, weight, flow, strain, *searched):
+        """The dots followed in the frames `kept [B]`, those searched in the others."""
+        followed = (weight, flow, strain)
+        return tuple(torch.where(kept.reshape(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in zip(followed, searched, strict=True))
+
+    def scene(self, deformation, blobs, log_radius, valid):
+        """What `choose` needs to know of the blobs: `[B, 6, K]`, `[B, D, K]`."""
         strain = deformation - torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
         known = torch.cat([(blobs - self.origin).mT, strain.flatten(1, 2)], 1)
         misfit = ((self.log_radius[:, None] - (log_radius + 3 * (1 - valid))[:, None]) / self.size_tolerance).square()
-        base = misfit + self.stiffness[:, None] * known[:, :2].square().sum(1, keepdim=True)
+        return known, misfit + self.stiffness[:, None] * known[:, :2].square().sum(1, keepdim=True)
+
+    def begin(self, known, base):
+        """The scene of every start; weight, flow and strain of the dots before the first step."""
         starts = self.starts.shape[0]
         if starts > 1:
             known, base = (x[:, None].expand(-1, starts, -1, -1).flatten(0, 1) for x in (known, base))
         flow = torch.zeros_like(self.pixels.mT).expand(known.shape[0], -1, -1)
         weight, flow, strain = self.choose(flow, FAR + flow[:, 0], known, base)
-        return (weight.unflatten(0, (-1, starts)) * self.starts).flatten(0, 1), flow, strain, known, base
+        return known, base, (weight.unflatten(0, (-1, starts)) * self.starts).flatten(0, 1), flow, strain
 
     def grow(self, weight, flow, strain, known, base):
         """One step outwards along the strain measured."""
@@ -313,12 +355,16 @@ class DotMatcher(nn.Module):
         gradient = self.local.gradient(weight, flow, strain)
         return self.choose(*self.local.along(weight, flow, gradient), known, base)
 
-    def end(self, weight, flow, strain):
-        """Positions, certainty and strain, of the best start."""
+    def best(self, weight, flow, strain):
+        """The best start's."""
         starts = self.starts.shape[0]
         if starts > 1:
             weight, flow, strain = (x.unflatten(0, (-1, starts)) for x in (weight, flow, strain))
             best = weight.sum(-1).argmax(-1)[:, None]
             take = lambda x: torch.take_along_dim(x, best.reshape(-1, *(1,) * (x.ndim - 1)), 1).squeeze(1)  # noqa: E731
             weight, flow, strain = take(weight), take(flow), take(strain)
+        return weight, flow, strain
+
+    def end(self, weight, flow, strain):
+        """Positions, certainty and strain."""
         return self.pixels + self.origin + flow.mT, weight, strain.movedim(-1, 1)
