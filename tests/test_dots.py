@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from torchmembrane.errors import MembraneError
 from torchmembrane.markers.dots import DotPattern, find_dots, measure_dots
-from torchmembrane.markers.locate import DotLocator, EllipseFit, blur_rows, pyramid
-from torchmembrane.markers.match import Coherence
+from torchmembrane.markers.locate import DotLocator, EllipseFit, blur_rows, metric_of, pyramid
+from torchmembrane.markers.match import Coherence, mapping
 
 SIZE, CENTRE, RADIUS, PITCH = (320, 240), np.array([158.3, 119.6]), 112.0, 22.0
 PATTERNS = [("square", True), ("square", False), ("hexagonal", True), ("hexagonal", False)]
@@ -389,6 +389,20 @@ def test_windows_hold_the_pixels_around_each_dot_at_their_places(radius):
     place = middle[..., None] + fit.stride[:, None, None] * fit.linear[1:]
     torch.testing.assert_close(values, place[..., 0, :] + 1000 * place[..., 1, :])
     assert (middle - torch.tensor(pixels)).abs().max() <= 0.5 * fit.stride.max() + 1e-9
+
+
+def test_the_metric_is_the_length_in_unit_circles():
+    shape, x = (torch.randn(5, 2, n, dtype=torch.float64, generator=torch.Generator().manual_seed(n)) for n in (2, 3))
+    torch.testing.assert_close(x.mT @ metric_of(shape) @ x, torch.linalg.solve(shape, x).mT @ torch.linalg.solve(shape, x))
+
+
+def test_the_mapping_takes_monomials_of_a_point_to_its_image():
+    A, x = (torch.randn(2, n, dtype=torch.float64, generator=torch.Generator().manual_seed(n)) for n in (2, 3))
+    (a, b), (c, d), (u, v), one = *A, x, torch.ones(3, dtype=torch.float64)
+    entries = torch.stack([a, b, c, d, a * a + c * c, a * b + c * d, b * b + d * d, one[0]])
+    y = A @ x
+    got = (entries @ mapping()).reshape(4, 6) @ torch.stack([u, v, u * u, u * v, v * v, one])
+    torch.testing.assert_close(got, torch.stack([*y, y.square().sum(0), one]))
 
 
 def test_the_fit_does_not_run_off_to_a_neighbour():

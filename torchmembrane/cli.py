@@ -60,8 +60,8 @@ examples:
   torchmembrane export sensor.toml -o video.onnx --tracking
 
 The model takes `image` [batch, 1, height, width], grey in 0..1, and gives the arrays of a NAME.npz, a row a frame;
---tracking, also previous_vertices, previous_pressure and (dots) previous_pixels: those of the frames before, NaN to start from rest. To run it
-without torch: the package torchmembrane-edge (folder export/). Needs: pip install "torchmembrane[export]"
+--tracking, also previous_vertices, previous_pressure and (dots) previous_pixels: those of the frames before, NaN to start from
+rest. To run it without torch: the package torchmembrane-edge (folder export/). Needs: pip install "torchmembrane[export]"
 
 exit code: 0 written, 2 wrong usage or sensor file"""
 

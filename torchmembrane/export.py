@@ -166,7 +166,7 @@ def dots(tracer: Tracer, locator: DotLocator, tracking: bool) -> None:
 
 def search(tracer: Tracer, match: DotMatcher, state: list[str], blobs: list[str]) -> None:
     """As `DotMatcher.search`."""
-    scene, known = ["around", "others", "there", "nearby"], ["known", "base"]
+    scene, known = ["around", "away", "beside", "nearby"], ["known", "base"]
     tracer.piece(match.deformation, LocalDeformation.begin, ["blobs", "valid"], ["deformation", *scene])
     widths = np.array(WIDTHS, np.float32)
     tracer.steps(match.deformation, LocalDeformation.refine, ["deformation"], [*scene, "valid"], len(widths), width=widths)

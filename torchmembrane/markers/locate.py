@@ -8,7 +8,7 @@ from scipy.spatial import Delaunay, cKDTree
 from torch import nn
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.markers.match import Coherence, DotMatcher, inverse_2x2, spacing, square_distance
+from torchmembrane.markers.match import Coherence, DotMatcher, spacing, square_distance
 
 SOFTNESS = 0.6  # px, logistic scale of a dot's blurred outline
 RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level
@@ -47,6 +47,13 @@ def mapped(matrix, vector):
     return (matrix * vector[..., None, :]).sum(-1)
 
 
+def metric_of(shape):
+    """`(S S^T)^-1 [..., 2, 2]` of `shape [..., 2, 2]`: `x^T (S S^T)^-1 x = |S^-1 x|^2`."""
+    a, b, c, d = shape.flatten(-2).unbind(-1)
+    uv, area = -(a * c + b * d), a * d - b * c
+    return torch.stack([c * c + d * d, uv, uv, a * a + b * b], -1).unflatten(-1, (2, 2)) / (area * area)[..., None, None]
+
+
 def solve_positive(system):
     """`x [n, ...]` with `matrix x = load` from `system = [matrix, load] [n, n + 1, ...]`: Gauss-Jordan without pivoting.
 
@@ -63,8 +70,9 @@ def solve_positive(system):
 class EllipseFit(nn.Module):
     """Least-squares fit of a blurred ellipse on sloping background, `I = b_0 + b . y - a T(x - c)`, to every dot.
 
-    Gauss-Newton steps on windows of the level of the pyramid that suits the dot's size. What is dark outside the
-    outline, a neighbour or the world beyond the rim, loses its weight.
+    Gauss-Newton steps on windows of the level of the pyramid that suits the dot's size, in pixels of that level; the first
+    step sees a quarter of the pixels. What is dark outside the outline, a neighbour or the world beyond the rim, loses its
+    weight.
     """
 
     def __init__(self, pixels, shapes, image_size, size_tolerance, steps=3):
@@ -81,7 +89,10 @@ class EllipseFit(nn.Module):
         step = np.arange(-half, half + 1)
         offset = np.stack(np.meshgrid(step, step)).reshape(2, -1)
         offset = offset[:, np.hypot(*offset) <= half + 0.5]
+        sparse = (offset % 2 == 0).all(0)
+        offset = offset[:, np.argsort(~sparse, kind="stable")]
         self.steps, self.size_tolerance, self.half = steps, size_tolerance, half
+        self.counts = [int(sparse.sum())] + [len(sparse)] * (steps - 1)
         self.levels = [(int(k), torch.as_tensor(np.flatnonzero(level == k))) for k in np.unique(level)]
         order = np.concatenate([dots for _, dots in self.levels])
         self.register_buffer("order", torch.as_tensor(np.argsort(order)))
@@ -93,14 +104,13 @@ class EllipseFit(nn.Module):
             self.register_buffer(f"step{k}", torch.as_tensor(offset[1] * sizes[k, 1] + offset[0]))
         self.register_buffer("limit", torch.as_tensor(sizes[level][:, ::-1].copy() - 1 - half))
         self.register_buffer("stride", torch.as_tensor(stride.astype(float)))
-        self.register_buffer("ring", torch.as_tensor(ring))
-        size = np.linalg.norm(shapes, axis=(1, 2)) / 2**0.5
-        self.register_buffer("size", torch.as_tensor(size))
-        self.register_buffer("softness", torch.as_tensor(SOFTNESS * np.sqrt(stride)))
-        ridge = np.diag(RIDGE)[..., None] * np.ones(len(size))
+        self.register_buffer("ring", torch.as_tensor(ring / stride))
+        self.register_buffer("size", torch.as_tensor(np.linalg.norm(shapes, axis=(1, 2)) / 2**0.5 / stride))
+        self.register_buffer("sharpness", torch.as_tensor(np.sqrt(stride) / SOFTNESS))
+        ridge = np.diag(RIDGE)[..., None] * np.ones(len(stride))
         ridge[1:3, 1:3] = RIDGE[1] * np.moveaxis(shapes @ shapes.swapaxes(1, 2) / stride[:, None, None] ** 2, 0, -1)
-        ridge[4:6] *= size**2
-        self.register_buffer("ridge", torch.as_tensor(np.concatenate([ridge, np.zeros((7, 1, len(size)))], 1))[:, :, None])
+        ridge[4:] *= stride**2
+        self.register_buffer("ridge", torch.as_tensor(np.concatenate([ridge, np.zeros((7, 1, len(stride)))], 1))[:, :, None])
 
     def windows(self, levels, centre):
         """Values `[B, D, P]` of the pixels of a disc about `centre [B, D, 2]`, and the disc's middle `[B, D, 2]` px.
@@ -118,61 +128,59 @@ class EllipseFit(nn.Module):
         values = values[0] if len(values) == 1 else torch.cat(values, 1)[:, self.order]
         return values, pixel * stride + (stride - 1) / 2
 
-    def on_windows(self, maps):
-        """Both components, `[B, D, P]` each, of the affine maps `[B, D, 2, 3]` of the pixels' offsets."""
-        return tuple(rows @ self.linear for rows in maps.unbind(-2))
-
     def forward(self, levels, centre, shape):
         """`levels` of `pyramid` with dark dots, `centre [B, D, 2]`, `shape [B, D, 2, 2]` to begin with.
 
         Returns centre `[B, D, 2]`, growth of the outline `[B, D]` px, and quality `[B, D]` in 0..1, from the share of
         the window's variance explained, the contrast `a / b_0`, and the size against that of `shape` or at rest.
         """
+        stride, pixel = self.stride[:, None], 1 / self.stride
         values, middle = self.windows(levels, centre)
         mean = values.mean(-1, keepdim=True)
         values = values - mean
-        inverse = inverse_2x2(shape)
-        softness, sharpness = 1 / self.softness[:, None], 2 / self.stride[:, None]
+        shape = shape / stride[..., None]
         size = torch.linalg.vector_norm(shape, dim=(-2, -1)) / 2**0.5
-        to_unit = inverse * self.stride[:, None, None]
-        to_normal = inverse.mT @ to_unit
-        start, growth, trust, one = centre, torch.zeros_like(size), 1.0, torch.ones_like(size)[..., None]
-        for k in range(self.steps):
-            off = (middle - centre) / self.stride[:, None]
-            y, normal = (self.on_windows(torch.cat([mapped(map, off)[..., None], map], -1)) for map in (to_unit, to_normal))
-            rho, steepness = ((u * u + v * v + 1e-12).sqrt() for u, v in (y, normal))
-            depth = (1 - rho) * rho / steepness + growth[..., None]  # inside the outline, px
-            template = torch.sigmoid(depth * softness)
+        reach, farthest = 0.5 * (size + pixel)[..., None], (size + pixel)[..., None]
+        metric = metric_of(shape)
+        start = (middle - centre) / stride
+        moved, growth = torch.zeros_like(start), torch.zeros_like(size)
+        for k, count in enumerate(self.counts):
+            off, linear, seen = start - moved, self.linear[:, :count], values[..., :count]
+            normal = torch.cat([mapped(metric, off)[..., None], metric], -1)
+            n_u, n_v = (rows @ linear for rows in normal.unbind(-2))
+            square = (linear[1] + off[..., :1]) * n_u + (linear[2] + off[..., 1:]) * n_v + 1e-12
+            slack = 1 / (n_u * n_u + n_v * n_v + 1e-12).sqrt()
+            depth = (square.sqrt() - square) * slack + growth[..., None]  # inside the outline
+            template = torch.sigmoid(depth * self.sharpness[:, None])
             outside = 1 - template
-            edge = template * outside * softness
-            weight = trust * torch.sigmoid((depth + self.ring[:, None]) * sharpness)
-            shift = edge / steepness
-            basis = torch.stack([template, shift * y[0], shift * y[1], edge, values], -2)  # and 1, u, v
+            edge = template * outside * self.sharpness[:, None]
+            weight = torch.sigmoid(2 * (depth + self.ring[:, None]))
+            if k > 0:
+                intruder = fit[:3].movedim(0, -1) @ linear + fit[3][..., None] * template - seen
+                intruder = (intruder * (gain / 0.35)[..., None]).clamp(0, 10)
+                intruder = intruder * intruder
+                weight = weight / (1 + outside * (intruder * intruder))
+            shift = edge * slack
+            basis = torch.stack([template, shift * n_u, shift * n_v, edge, seen], -2)  # and 1, u, v
             weighed = basis * weight[..., None, :]
-            plain, mixed, own = weight @ self.moments, weighed @ self.linear.mT, weighed @ basis.mT
+            plain, mixed, own = weight @ self.moments[:count], weighed @ linear.mT, weighed @ basis.mT
             gram = torch.cat([torch.cat([plain.unflatten(-1, (3, 3)), mixed.mT], -1), torch.cat([mixed, own], -1)], -2)
             gram = gram.movedim((-2, -1), (0, 1))
             fit = solve_positive(gram[:7] + self.ridge)  # [7, B, D]
-            miss = torch.cat([fit.movedim(0, -1), -one], -1)
             amplitude = -fit[3]
             gain = amplitude / (amplitude**2 + 1e-6)
-            reach = 0.5 * size + 0.5
-            towards = mapped(shape, fit[4:6].movedim(0, -1))
-            centre = centre + reach[..., None] * torch.tanh(towards * (-gain / reach)[..., None])
-            centre = start + torch.maximum(torch.minimum(centre - start, size[..., None] + 1), -size[..., None] - 1)
+            moved = moved + reach * torch.tanh(fit[4:6].movedim(0, -1) * (-gain[..., None] / reach))
+            moved = torch.maximum(torch.minimum(moved, farthest), -farthest)
             growth = (growth + 0.5 * size * torch.tanh(-2 * fit[6] * gain / size)).clamp(-0.5 * size, 0.8 * size)
-            if k + 1 < self.steps:
-                background, excess = miss[..., :3] @ self.linear, (miss[..., None, 3:] @ basis).squeeze(-2)
-                intruder = ((background + excess) * (gain / 0.35)[..., None]).clamp(0, 10).square().square()
-                trust = 1 / (1 + outside * intruder)
+        miss = torch.cat([fit, -torch.ones_like(fit[:1])])
         spread = gram[7, 7] - gram[0, 7].square() / gram[0, 0].clamp_min(1)
-        miss = miss.movedim(-1, 0)
         explained = 1 - ((gram * miss).sum(1) * miss).sum(0) / (spread.clamp_min(0) + 1e-6)
         background = (fit[1:3].movedim(0, -1) * off).sum(-1)
         contrast = amplitude / (fit[0] - background + mean[..., 0]).clamp_min(1e-2)
         quality = torch.sigmoid(12 * (explained - 0.6)) * torch.sigmoid(40 * (contrast - 0.12))
         grown = torch.minimum(*(torch.log((size + growth) / usual).square() for usual in (size, self.size)))
-        return centre, growth, quality * torch.exp(-grown / (2 * self.size_tolerance) ** 2)
+        quality = quality * torch.exp(-grown / (2 * self.size_tolerance) ** 2)
+        return centre + stride * moved, self.stride * growth, quality
 
 
 def blur_rows(size, sigma, rows):

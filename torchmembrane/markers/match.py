@@ -19,6 +19,7 @@ CLAIM = 0.35  # a blob so near to a dot is the dot's, pitches
 RIVAL = 0.05  # a blob left over is as near to the prediction as the dot's own, pitches
 SUPPORT = 0.8  # sure nodes, weighed by distance, that a prediction needs
 FAR = 1e6
+FADED = 30.0  # exponent of a weight that no longer counts; subnormal numbers are slow
 MINORS = (  # adjugate [9] of a symmetric matrix from its entries 00 01 02 11 12 22: products a b - c d
     (3, 4, 1, 4, 0, 1, 1, 1, 0),
     (5, 2, 4, 2, 5, 2, 4, 2, 3),
@@ -50,14 +51,18 @@ def sectors(pixels):
     return (part == np.arange(7)[:, None]).astype(float)
 
 
-def inverse_2x2(matrix):
-    a, b, c, d = matrix.flatten(-2).unbind(-1)
-    return torch.stack([d, -b, -c, a], -1).unflatten(-1, (2, 2)) / (a * d - b * c)[..., None, None]
-
-
 def square_distance(x, y):
     """`[..., K, D]` between the points `x [..., K, 2]` and `y [..., D, 2]`."""
     return (x.square().sum(-1)[..., None] + y.square().sum(-1)[..., None, :] - 2 * x @ y.mT).clamp_min(0)
+
+
+def mapping():
+    """`[8, 24]`: of `A = [[a, b], [c, d]]`, `a b c d a^2+c^2 ab+cd b^2+d^2 1` to the matrix `[4, 6]` that takes monomials
+    `u v uu uv vv 1` of `x` to `A x`, `|A x|^2` and 1.
+    """
+    matrix = np.zeros((8, 4, 6))
+    matrix[np.arange(8), [0, 0, 1, 1, 2, 2, 2, 3], [0, 1, 0, 1, 2, 3, 4, 5]] = [1, 1, 1, 1, 1, 2, 1, 1]
+    return torch.as_tensor(matrix.reshape(8, 24))
 
 
 class LocalDeformation(nn.Module):
@@ -74,7 +79,10 @@ class LocalDeformation(nn.Module):
         pitch = spacing(pixels)[1]
         around = (pixels[near] - pixels[:, None]) / pitch[:, None, None]
         self.register_buffer("pixels", torch.as_tensor(pixels))
-        self.register_buffer("table", torch.as_tensor(np.column_stack([around.reshape(len(pixels), -1), pitch])))
+        u, v = np.moveaxis(around, -1, 0)
+        self.register_buffer("around", torch.as_tensor(np.stack([u, v, u * u, u * v, v * v, np.ones_like(u)], 1)))
+        self.register_buffer("pitch", torch.as_tensor(pitch))
+        self.register_buffer("mapping", mapping())
 
     def forward(self, blobs, valid):
         """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, 2, 2, K]`."""
@@ -84,40 +92,40 @@ class LocalDeformation(nn.Module):
         return gradient
 
     def begin(self, blobs, valid):
-        """A first gradient; the dots around `[B, M, 2, K]`, the blobs beside `[B, 12, 2, K]` and their validity, in
-        pitches; how near all blobs (columns) have the others `[B, K, K]`.
+        """A first gradient; monomials `[B, K, 6, M]` of the dots around; of the blobs beside, in pitches, what their square
+        distance needs `[B, K, 4, 12]`, and places and validity `[B, K, 3, 12]`; how near all blobs (columns) have the others
+        `[B, K, K]`.
         """
         middle = self.pixels.mean(0)
-        local = self.table[square_distance(blobs - middle, self.pixels - middle).argmin(-1)].mT
-        around, pitch = local[:, :-1].unflatten(1, (-1, 2)), local[:, -1]  # [B, M, 2, K]
+        own = square_distance(blobs - middle, self.pixels - middle).argmin(-1)
+        around, pitch = self.around[own], self.pitch[own]
         apart = square_distance(blobs - middle, blobs - middle)
         index = (apart + FAR * (1 - valid[:, None])).topk(min(13, blobs.shape[1]), largest=False).indices[..., 1:]
-        known = torch.cat([blobs.mT, valid[:, None]], 1)
-        beside = known.gather(2, index.mT.flatten(1)[:, None].expand(-1, 3, -1)).unflatten(2, (-1, blobs.shape[1]))
-        others = ((beside[:, :2] - blobs.mT[:, :, None]) / pitch[:, None, None]).transpose(1, 2)  # [B, 12, 2, K]
-        there = beside[:, 2]
-        nearby = torch.exp(-apart / (2 * (0.8 * pitch[:, None]) ** 2)) * valid[..., None]
+        known = torch.cat([blobs.mT, valid[:, None]], 1).gather(2, index.flatten(1)[:, None].expand(-1, 3, -1))
+        place, there = known.unflatten(2, index.shape[1:]).split([2, 1], 1)
+        others = (place - blobs.mT[..., None]) / pitch[:, None, :, None]  # [B, 2, K, 12]
+        square = others.square().sum(1, keepdim=True)
+        away = torch.cat([-2 * others, torch.ones_like(square), square], 1)
+        beside = torch.cat([others * there, there], 1)
+        nearby = torch.exp((apart / (-2 * (0.8 * pitch[:, None]) ** 2)).clamp_min(-FADED)) * valid[..., None]
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
-        ratio = others[:, :4].square().sum(2).clamp_min(1e-12).sqrt().mean(1).clamp(0.4, 2.0)
-        return ratio[:, None, None] * eye, around, others, there, nearby
+        ratio = square[:, 0, :, :4].clamp_min(1e-12).sqrt().mean(-1).clamp(0.4, 2.0)
+        return ratio[:, None, None] * eye, around, away.transpose(1, 2), beside.transpose(1, 2), nearby
 
-    def refine(self, gradient, around, others, there, nearby, valid, width):
+    def refine(self, gradient, around, away, beside, nearby, valid, width):
         """The gradient after another fit, with blobs believed up to about `width` pitches off."""
-        eye = torch.eye(2, dtype=gradient.dtype, device=gradient.device)[..., None]
-        mapped = (gradient[:, None] * around[:, :, None]).sum(3)
-        square = (mapped[:, :, None] - others[:, None]).square().sum(3)  # [B, M, 12, K]
-        likely = torch.exp(square * (-0.5 / width**2)) * there[:, None]
-        total = likely.sum(2)
-        target = (likely[:, :, :, None] * others[:, None]).sum(2) / (total + 1e-9)[:, :, None]
-        weight = total / (total + 0.1)
-        weighted = around * weight[:, :, None]
-        moment, cross = (torch.cat([around, target], 2)[:, :, :, None] * weighted[:, :, None]).sum(1).split(2, 1)
-        a, b, _, d = (moment + 0.2 * eye).flatten(1, 2).unbind(1)
-        adjugate = torch.stack([d, -b, -b, a], 1).unflatten(1, (2, 2))
-        fitted = ((cross + 0.2 * gradient)[:, :, :, None] * adjugate[:, None]).sum(2).flatten(1, 2)
-        quality = (valid * weight.mean(1).square())[:, None]
-        scaled = fitted * (quality / (a * d - b * b)[:, None])
-        average = torch.cat([scaled, quality], 1) @ nearby + 1e-6 * eye.new_tensor([1, 0, 0, 1, 1])[:, None]
+        a, b, c, d = gradient.flatten(1, 2).unbind(1)
+        entries = torch.stack([a, b, c, d, a * a + c * c, a * b + c * d, b * b + d * d, torch.ones_like(a)], -1)
+        mapped = (entries * (-0.5 / width**2) @ self.mapping).unflatten(-1, (4, 6)) @ around
+        target = beside @ torch.exp((away.mT @ mapped).clamp_min(-FADED))
+        target = target / (target[:, :, 2:] + 0.1)  # weight times place, weight: [B, K, 3, M]
+        sums = (target @ around.mT).flatten(-2).mT.unflatten(1, (3, 6))
+        load = sums[:, :2, :2] + 0.2 * gradient
+        uu, uv, vv, weight = (sums[:, 2, 2:] + sums.new_tensor([0.2, 0, 0.2, 0])[:, None]).unbind(1)
+        fitted = load * torch.stack([vv, uu], 1)[:, None] - load.flip(2) * uv[:, None, None]
+        quality = valid * (weight / around.shape[-1]).square()
+        scaled = fitted.flatten(1, 2) * (quality / (uu * vv - uv * uv))[:, None]
+        average = torch.cat([scaled, quality[:, None]], 1) @ nearby + sums.new_tensor([1e-6, 0, 0, 1e-6, 1e-6])[:, None]
         return ((average[:, :4] / average[:, 4:]).unflatten(1, (2, 2)),)
 
 

@@ -46,7 +46,7 @@ class StencilSystem(nn.Module):
         return self.padded(sums.unflatten(2, (3, -1)).flatten(1, 2))
 
     def rows(self, vector: Tensor) -> Tensor:
-        """Values `[B, N, 21, C]` around every inner vertex of a vector `[B, unknowns, C]`: the adjoint of `vector` where free."""
+        """Values `[B, N, 21, C]` around the inner vertices of a vector `[B, unknowns, C]`: `vector`'s adjoint where free."""
         return self.field(vector).index_select(1, self.neighbours).unflatten(1, (-1, len(STENCIL))).flatten(2, 3)
 
     def padded(self, unknowns: Tensor) -> Tensor:
