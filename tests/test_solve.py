@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchmembrane.solve import block_tridiagonal, matrix_products
-from torchmembrane.solve.anderson import accelerated, first
+from torchmembrane.solve.anderson import DEPTH, accelerated, first
 from torchmembrane.solve.conjugate_gradient import conjugate_gradient
 from torchmembrane.solve.kkt import constrained_minimum
 
@@ -98,3 +98,13 @@ def test_anderson_solves_a_linear_fixed_point_in_two_unknowns_at_the_third_evalu
         state = accelerated(state[0], move(state[0]), *state[1:])
     torch.testing.assert_close(state[0], solution, rtol=0, atol=1e-9)
     assert (state[0][2] == 0).all()
+
+
+def test_anderson_solves_as_many_linear_unknowns_as_it_keeps_changes_one_evaluation_later():
+    rates = torch.linspace(0.2, 3.0, DEPTH, dtype=torch.float64)
+    turn, _ = torch.linalg.qr(spd(DEPTH))
+    move = lambda x: (1 - x) @ (turn * rates) @ turn.mT  # noqa: E731
+    state = first(torch.zeros(2, DEPTH, dtype=torch.float64), move(torch.zeros(2, DEPTH, dtype=torch.float64)))
+    for _ in range(DEPTH):
+        state = accelerated(state[0], move(state[0]), *state[1:])
+    torch.testing.assert_close(state[0], torch.ones_like(state[0]), rtol=0, atol=1e-6)

@@ -192,7 +192,7 @@ def _displacement(reconstructor, pixels):
 def minimum_energy(tracer: Tracer, estimator) -> None:
     """From `origins` and `directions` to the fields of `Equilibrium`."""
     kind = type(estimator)
-    rays, state = ["origins", "directions"], ["range", "before", "moves"]
+    rays, state = ["origins", "directions"], ["range", "latest", "changes"]
     tracer.piece(estimator, kind.start, rays, [*state, *rays])
     for _ in range((estimator.steps or STEPS) - 1):
         tracer.piece(estimator, kind.step, [*state, *rays], state)

@@ -16,7 +16,7 @@ from .solve.kkt import constrained_minimum
 
 ELEMENTS = ("triangle", "quadrilateral")
 VOLUMES = ("exact", "linear")
-STEPS, RELAXED_STEPS = 12, 60
+STEPS, RELAXED_STEPS = 10, 60
 CONVERGED = 1e-5  # largest unbalance, and volume error where the volume is exact, of a converged surface
 
 
@@ -31,7 +31,7 @@ class MinimumEnergy(nn.Module):
         filling     "liquid" (volume kept), "gas" (pressure x volume kept), "open" (pressure stays at rest)
         gas         for a gas: absolute pressure at rest (force / length^2) and volume (length^3)
         volume      "exact", or "linear": linearised once, at the rest ranges (eq. 21)
-        steps       of the solve, default 12; 60 where the smoother is relaxed, which the constant inverse knows nothing of
+        steps       of the solve, default 10; 60 where the smoother is relaxed, which the constant inverse knows nothing of
         rest_rays   unit directions `[V, 3]` of the rest rays and their origins `[V, 3]`
 
     The rest load `h = grad U(X) - p0 grad V(X)` is subtracted, so that zero flow gives exactly zero displacement.
@@ -90,10 +90,10 @@ class MinimumEnergy(nn.Module):
         t = self.rest_range.expand(directions.shape[:-1])
         return *first(t, self._move(t, origins, directions, relaxed)[0]), origins, directions
 
-    def step(self, t: Tensor, before: Tensor, moves: Tensor, origins: Tensor, directions: Tensor, relaxed=None):
-        """One step in the ranges `t [..., V]`; `before` and `moves [..., 2, V]` are the two steps before this."""
+    def step(self, t: Tensor, latest: Tensor, changes: Tensor, origins: Tensor, directions: Tensor, relaxed=None):
+        """One step in the ranges `t [..., V]`; `latest` and `changes` as `accelerated` has them."""
         move, _ = self._move(t, origins, directions, relaxed)
-        return accelerated(t, move, before, moves)
+        return accelerated(t, move, latest, changes)
 
     def equilibrium(self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None) -> Equilibrium:
         """What these ranges amount to, and how far they are from a solution."""
