@@ -12,9 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from .errors import MembraneError
-from .incidence import Incidence
 from .membrane import Membrane, corners, corners_to_vertices, triangles_of
-from .stencil import pairs_to_ring
+from .stencil import combined, pairs_to_ring, taps
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 _FIRST = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -68,23 +67,26 @@ class Sheet(nn.Module):
         self.register_buffer("rest_triangle_area", det.sqrt() / 2)
         for name, constant in _metric_constants().items():
             self.register_buffer(name, constant)
-        self._register_sides(membrane)
+        self._register_ring(membrane)
 
-    def _register_sides(self, membrane: Membrane) -> None:
-        """The triangles' sides: their ends, where they meet, and `I` as a sum over their squared lengths."""
-        index, V = torch.arange(len(membrane.rest))[:, None], len(membrane.rest)
-        of_triangles = triangles_of(corners(index, self.grid)).movedim(2, 0).reshape(-1, 3).numpy()
-        ends = np.sort(of_triangles[:, [[0, 1], [0, 2], [1, 2]]], -1).reshape(-1, 2)
-        (start, end), side = (a.T for a in np.unique(ends, axis=0, return_inverse=True))
-        side, E = side.reshape(-1, 3).T.ravel(), len(start)
-        ones, every = np.ones(E), np.arange(E)
-        self.register_buffer("start", torch.from_numpy(start.copy()))
-        self.register_buffer("end", torch.from_numpy(end.copy()))
-        self.register_buffer("side", torch.from_numpy(side.copy()))
-        self.on_sides = Incidence(side, np.arange(len(side)), np.ones(len(side)), E, 1)
-        self.on_vertices = Incidence(np.append(start, end), np.append(every, every), np.append(ones, -ones), V, 3)
-        G = self.inverse_metric.flatten(1)
-        self.register_buffer("first", torch.stack([G[0] + G[1], G[2] + G[1], -G[1]])[..., None])
+    def _register_ring(self, membrane: Membrane) -> None:
+        """Of the six triangles around every vertex, `[6 V]` in all: sides (two from the vertex, the one across) and constants."""
+        own, ring = taps()[:1], taps()[1:]
+        following = ring.roll(-1, 0)
+        self.register_buffer("sides", torch.cat([ring - own, following - own, following - ring]))
+        sides = lambda x: combined(x, self.sides, self.grid).unflatten(-1, (3, -1))  # noqa: E731
+        missing = (sides(torch.ones_like(membrane.rest)) != 0).any(0).any(0)
+        e1, e2, _ = sides(membrane.rest).unbind(-2)
+        g11, g12, g22 = (e1 * e1).sum(0), (e1 * e2).sum(0), (e2 * e2).sum(0)
+        det = torch.where(missing, 1.0, g11 * g22 - g12**2)
+        twice_area = torch.where(missing, 0.0, det.sqrt())
+        self.register_buffer("first", torch.stack([g22 - g12, g11 - g12, g12]) / det)  # I is their sum over the sides' squares
+        self.register_buffer("missing", missing.double())
+        self.register_buffer("half_over_det", torch.where(missing, 0.0, 0.5 / det))
+        self.register_buffer("pull_of_first", -twice_area * self.first[:2])
+        self.register_buffer("pull_of_slope", -twice_area / det)
+        self.register_buffer("heron", 0.5 - torch.eye(3, dtype=torch.float64))
+        self.register_buffer("total", torch.ones(1, 3, dtype=torch.float64))
 
     def on(self, membrane: Membrane) -> "Sheet":
         """The same material on another membrane or grid."""
@@ -105,22 +107,28 @@ class Sheet(nn.Module):
             return c1 * l2 * (I - 2)
         return c1 * (l2 * I + 1 / (l2**2 * D) - 3) + c2 * (l2**2 * D + I / (l2 * D) - 3)
 
+    def slopes(self, I: Tensor, D: Tensor) -> tuple[Tensor, Tensor]:  # noqa: E741
+        """First derivatives of `density` in `I` and `D`; what is constant is a scalar."""
+        l2, c1, c2 = self.prestretch**2, self.c1, self.c2
+        if self.model == "harmonic":
+            return c1 * l2, torch.zeros_like(l2)
+        w_D = -c1 / l2**2 / (D * D)
+        if self.model == "neo_hookean":
+            return c1 * l2, w_D
+        inverse = 1 / D
+        return c1 * l2 + c2 / l2 * inverse, w_D - c2 / l2 * I * inverse * inverse + c2 * l2**2
+
     def derivatives(self, I: Tensor, D: Tensor) -> Derivatives:  # noqa: E741
         """First and second derivatives of `density`."""
         l2, c1, c2 = self.prestretch**2, self.c1, self.c2
+        zero = torch.zeros_like(I)
+        w_I, w_D = (slope + zero for slope in self.slopes(I, D))
         if self.model == "harmonic":
-            zero = torch.zeros_like(I)
-            return Derivatives(c1 * l2 + zero, zero, zero, zero, zero)
+            return Derivatives(w_I, w_D, zero, zero, zero)
         if self.model == "neo_hookean":
-            zero, w_D = torch.zeros_like(I), -c1 / l2**2 / (D * D)
-            return Derivatives(c1 * l2 + zero, w_D, zero, -2 * w_D / D, w_D)
-        convex_D = -c1 / (l2**2 * D**2) - c2 * I / (l2 * D**2)
+            return Derivatives(w_I, w_D, zero, -2 * w_D / D, w_D)
         return Derivatives(
-            c1 * l2 + c2 / (l2 * D),
-            convex_D + c2 * l2**2,
-            -c2 / (l2 * D**2),
-            2 * c1 / (l2**2 * D**3) + 2 * c2 * I / (l2 * D**3),
-            convex_D,
+            w_I, w_D, -c2 / (l2 * D**2), 2 * c1 / (l2**2 * D**3) + 2 * c2 * I / (l2 * D**3), w_D - c2 * l2**2
         )
 
     def energy(self, x: Tensor) -> Tensor:
@@ -129,19 +137,18 @@ class Sheet(nn.Module):
         return (self.rest_triangle_area * self.density(I, D)).sum((-1, -2, -3))
 
     def gradient(self, x: Tensor) -> Tensor:
-        """`dU/dx`, `[..., V, 3]`: the sheet's forces with opposite sign, `2 dU/dl (x_a - x_b)` along every side `a b`.
+        """`dU/dx`, `[..., V, 3]`: the sheet's forces with opposite sign, at every vertex from the six triangles around it.
 
         `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron).
         """
-        side = x.index_select(-2, self.start) - x.index_select(-2, self.end)
-        squared = (side * side).sum(-1, keepdim=True).index_select(-2, self.side).unflatten(-2, (3, -1))  # [..., 3, T, 1]
-        det, area = (a.reshape(1, -1, 1) for a in (self.rest_det, self.rest_triangle_area))
-        I = (self.first * squared).sum(-3, keepdim=True)  # noqa: E741
-        slope = squared.sum(-3, keepdim=True) * (0.5 / det) - squared / det  # dD/dl
-        D = (squared * slope).sum(-3, keepdim=True) / 2
-        w = self.derivatives(I, D)
-        pull = (2 * area * self.first) * w.I + (2 * area * w.D) * slope
-        return self.on_vertices(self.on_sides(pull.flatten(-3, -2)) * side)
+        batch, V = x.shape[:-2], x.shape[-2]
+        e = combined(x, self.sides, self.grid)
+        squared = (self.total @ (e * e)).reshape(*batch, 3, 6 * V)
+        slope = self.heron @ squared  # det dD/dl
+        D = self.total @ (squared * slope) * self.half_over_det + self.missing
+        w_I, w_D = self.slopes(self.total @ (self.first * squared), D)
+        pull = self.pull_of_first * w_I + self.pull_of_slope * w_D * slope[..., :2, :]
+        return (e[..., : 12 * V].reshape(*batch, 3, 12, V) * pull.reshape(*batch, 1, 12, V)).sum(-2).mT
 
     def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
         """Positive semi-definite stiffness of displacements along one direction a vertex.

@@ -8,7 +8,7 @@ from torch import Tensor
 
 DEPTH = 8  # changes kept
 RIDGE = 30.0  # of a change's squared length, in roundings
-TINY = 1e-30
+TINY = 1e-30  # where nothing is known yet and nothing moves
 
 
 def first(x: Tensor, move: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -23,13 +23,13 @@ def accelerated(x: Tensor, move: Tensor, latest: Tensor, changes: Tensor) -> tup
 
     Arguments: `x`, `move [..., N]`; `latest [..., 1, 2 N]`, `(move, x + move)` at the iterate before; `changes [..., DEPTH, 2 N]`
     of it, latest first, orthonormal in the move. Of all combinations of `(move, x + move)` and the changes, taken is the one
-    whose move, were it linear in `x`, is shortest.
+    whose move, were it linear in `x`, is shortest; changes of no more than `x`'s rounding count for nothing.
     """
     N = x.shape[-1]
     now = torch.cat([move, x + move], -1)[..., None, :]
-    change, known = now - latest, changes[..., :N]
-    fresh = change - change[..., :N] @ known.mT @ changes
-    ridge = RIDGE * torch.finfo(x.dtype).eps * _square(change[..., :N]) + TINY
+    change, rounding = now - latest, torch.finfo(x.dtype).eps
+    fresh = change - change[..., :N] @ changes[..., :N].mT @ changes
+    ridge = RIDGE * rounding * _square(change[..., :N]) + rounding**2 * _square(now) + TINY
     changes = torch.cat([fresh / (_square(fresh[..., :N]) + ridge).sqrt(), changes[..., :-1, :]], -2)
     shortest = now - now[..., :N] @ changes[..., :N].mT @ changes
     return shortest[..., 0, N:], now, changes
