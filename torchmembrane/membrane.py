@@ -83,6 +83,7 @@ class Membrane(nn.Module):
         p = taps()[1:]
         around = torch.stack([self.outward / 6 * (p[2] - p[0]), self.outward / 6 * (p[4] - p[0]), p[3] - p[1], p[5] - p[3]])
         self.register_buffer("around", around)
+        self.register_buffer("beyond", combined(torch.ones(m * n, 1).double(), around, self.grid).flatten())
         self.register_buffer("turns", torch.tensor([[1, 2, 0], [2, 0, 1]]))
         self.register_buffer("volume_third_derivatives", self.outward / 6 * _determinant_derivatives())
         self.register_buffer("volume_cross_products", self.outward / 6 * _cross_products())
@@ -110,7 +111,8 @@ class Membrane(nn.Module):
 
     def normals(self, x: Tensor) -> Tensor:
         """Unit outward normals at the vertices, `[..., V, 3]`: of the summed area vectors, as the volume gradient's."""
-        return F.normalize(self._thirds_to_vertices(self.area_vectors(x)), dim=-1)
+        p = combined(x, self.around, self.grid) - self.beyond * torch.cat([x.mT] * 4, -1)  # a neighbour beyond is the vertex
+        return F.normalize(self._turns(p), dim=-1)
 
     def volume(self, x: Tensor) -> Tensor:
         """Volume between the surface and the camera centre, `[...]` (eq. 19): `1/6 sum det [x_a, x_b, x_c]`.
@@ -118,23 +120,19 @@ class Membrane(nn.Module):
         Positive for outward triangles: vertices run clockwise seen from the origin (the paper says counterclockwise).
         With a fixed rim the apex adds a constant.
         """
-        a, across, c = self._quadrilaterals(x)
-        return self.outward / 6 * (c * torch.linalg.cross(a, across, dim=-3)).sum((-1, -2, -3))
+        return (self.volume_gradient(x) * x).sum((-1, -2)) / 3
 
     def volume_gradient(self, x: Tensor) -> Tensor:
         """Derivative of `volume` in the vertices, `[..., V, 3]`; the transposed cofactors of eq. 20.
 
         The six neighbours `p` in turn give `sum p_i x p_i+1 = (p_2 - p_0) x (p_3 - p_1) + (p_4 - p_0) x (p_5 - p_3)`.
         """
-        u, v = combined(x, self.around, self.grid).chunk(2, -1)
-        first, second = ([a.index_select(-2, turn) for turn in self.turns] for a in (u, v))
-        products = first[0] * second[1] - first[1] * second[0]
-        return sum(products.chunk(2, -1)).mT
+        return self._turns(combined(x, self.around, self.grid))
 
-    def _quadrilaterals(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Corners a, b - d, c of all quadrilaterals, `[..., 3, m-1, n-1]`: shares of the volume are `det [a, b - d, c] / 6`."""
-        g = x.transpose(-2, -1).unflatten(-1, self.grid)
-        return g[..., :-1, :-1], g[..., 1:, :-1] - g[..., :-1, 1:], g[..., 1:, 1:]
+    def _turns(self, p: Tensor) -> Tensor:
+        """A sixth of `sum p_i x p_i+1` at every vertex, outwards; `p [..., 3, 4 V]` as `around` has them."""
+        (u1, u2), (v1, v2) = ([a.index_select(-2, turn) for turn in self.turns] for a in p.chunk(2, -1))
+        return sum((u1 * v2 - u2 * v1).chunk(2, -1)).mT
 
     def volume_hessian_blocks(self, x: Tensor) -> Tensor:
         """Second derivatives of every triangle's share of the volume, `[..., V, 3]` to `[..., m-1, n-1, 2, 9, 9]`."""
