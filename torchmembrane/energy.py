@@ -127,9 +127,7 @@ class Sheet(nn.Module):
             return Derivatives(w_I, w_D, zero, zero, zero)
         if self.model == "neo_hookean":
             return Derivatives(w_I, w_D, zero, -2 * w_D / D, w_D)
-        return Derivatives(
-            w_I, w_D, -c2 / (l2 * D**2), 2 * c1 / (l2**2 * D**3) + 2 * c2 * I / (l2 * D**3), w_D - c2 * l2**2
-        )
+        return Derivatives(w_I, w_D, -c2 / (l2 * D**2), 2 * c1 / (l2**2 * D**3) + 2 * c2 * I / (l2 * D**3), w_D - c2 * l2**2)
 
     def energy(self, x: Tensor) -> Tensor:
         """`U(x)`, `[..., V, 3]` to `[...]`."""

@@ -7,7 +7,7 @@ from torch import nn
 
 SETTLING = 6  # steps after the growth has reached every dot
 FOLLOWING = 1  # steps after dots are taken from where the frame before had them
-KEPT, MISSED = 0.3, 0.02  # certainty of a dot that is followed; share of all dots that may not be
+KEPT = 0.3  # certainty of a dot that could be followed
 WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
 WIDTH = 1.1  # of the local average, pitches
 RIDGE = 0.5  # pulls the flow's gradient to the one measured, where neighbours do not fix it
@@ -296,7 +296,7 @@ class DotMatcher(nn.Module):
         `[B, D, 2, 2]`.
 
         `previous [B, D, 2]`: where the dots were in the frames before, NaN where lost. They are followed from there; in a
-        frame in which more than `MISSED` of them cannot be, all are looked for as if there were none.
+        frame in which one of them cannot be, or half of the dots were lost before, all are searched for.
         """
         state = self.search(blobs, log_radius, valid)
         if previous is not None:
@@ -315,7 +315,7 @@ class DotMatcher(nn.Module):
         return self.best(*state)
 
     def follow(self, previous, blobs, log_radius, valid):
-        """As `search`, from the frames before; and in which frames `[B]` the dots could be followed."""
+        """As `search`, from the frames before; and in which frames `[B]` all dots could be followed."""
         found = previous.isfinite().all(-1)
         weight = found.to(blobs.dtype)
         flow = torch.where(found[..., None], previous - self.pixels - self.origin, 0.0).mT
@@ -330,8 +330,7 @@ class DotMatcher(nn.Module):
         state = self.choose(predicted, support, known, base)
         for _ in range(FOLLOWING):
             state = self.settle(*state, known, base)
-        missed = found & (state[0] < KEPT)
-        return *state, (weight.mean(-1) >= 0.5) & (missed.to(weight.dtype).mean(-1) <= MISSED)
+        return *state, (weight.mean(-1) > 0.5) & ~(found & (state[0] < KEPT)).any(-1)
 
     def either(self, kept, weight, flow, strain, *searched):
         """The dots followed in the frames `kept [B]`, those searched in the others."""
