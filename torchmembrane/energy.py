@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from .errors import MembraneError
 from .membrane import Membrane, corners, corners_to_vertices, triangles_of
-from .stencil import combined, pairs_to_ring, taps
+from .stencil import combined, ring_edges, taps
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 _FIRST = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -31,9 +31,18 @@ class Derivatives(NamedTuple):
     """The part of `D` that comes from terms convex in the metric; the rest is left out of the stiffness (Gauss-Newton)."""
 
 
+class Rest(NamedTuple):
+    """Of `T` triangles at rest: inverse metric `[3, T]` (11, 12, 22) of the two edges from the first vertex, the metric's
+    determinant and the area `[1, T]`."""
+
+    inverse_metric: Tensor
+    det: Tensor
+    area: Tensor
+
+
 class Strain(NamedTuple):
-    """Of every triangle, `T` standing for `2, m-1, n-1`: the two edges from its first vertex `[..., 2, 3, T]`, the adjugate of
-    their metric `[..., 3, T]` (11, 12, 22), the invariants `I` and `D` `[..., T]`."""
+    """Of `T` triangles: the two edges from the first vertex `[..., 3, 2, T]`, the adjugate of their metric `[..., 3, T]`
+    (11, 12, 22), the invariants `I` and `D` `[..., 1, T]`."""
 
     edges: Tensor
     adjugate: Tensor
@@ -60,14 +69,20 @@ class Sheet(nn.Module):
         c2 = modulus / 2 * c2_ratio / (1 + c2_ratio) if model == "mooney_rivlin" else 0.0
         for name, value in (("prestretch", prestretch), ("c1", modulus / 2 - c2), ("c2", c2)):
             self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
-        metric = _metric(_edges(membrane.rest, self.grid))
-        det = _determinant(metric)
-        self.register_buffer("inverse_metric", _adjugate(metric) / det)
-        self.register_buffer("rest_det", det)
-        self.register_buffer("rest_triangle_area", det.sqrt() / 2)
+        self._register_rest("", _edges(membrane.rest, self.grid))
+        self._register_rest("around_", combined(membrane.rest, ring_edges(), self.grid, border=False).unflatten(-1, (2, -1)))
         for name, constant in _metric_constants().items():
             self.register_buffer(name, constant)
         self._register_ring(membrane)
+
+    def _register_rest(self, which: str, edges: Tensor) -> None:
+        metric = _metric(edges)
+        det = _determinant(metric)
+        for name, value in Rest(_adjugate(metric) / det, det, det.sqrt() / 2)._asdict().items():
+            self.register_buffer(f"{which}{name}", value)
+
+    def _rest(self, which: str = "") -> Rest:
+        return Rest(*(getattr(self, f"{which}{name}") for name in Rest._fields))
 
     def _register_ring(self, membrane: Membrane) -> None:
         """Of the six triangles around every vertex, `[6 V]` in all: sides (two from the vertex, the one across) and constants."""
@@ -94,11 +109,13 @@ class Sheet(nn.Module):
         return Sheet(membrane, self.model, float(self.prestretch), modulus, float(self.c2 / self.c1))
 
     def strain(self, x: Tensor) -> Strain:
-        """The strain of `x [..., V, 3]`."""
-        edges = _edges(x, self.grid)
+        """The strain of `x [..., V, 3]`: of all triangles, `T = 2 (m-1) (n-1)`."""
+        return self._strain(_edges(x, self.grid), self._rest())
+
+    def _strain(self, edges: Tensor, rest: Rest) -> Strain:
         metric = _metric(edges)
-        first = (self.inverse_metric * self.twice_12 * metric).sum(-4)
-        return Strain(edges, _adjugate(metric), first, _determinant(metric) / self.rest_det)
+        first = (self.twice_12 * rest.inverse_metric * metric).sum(-2, keepdim=True)
+        return Strain(edges, _adjugate(metric), first, _determinant(metric) / rest.det)
 
     def density(self, I: Tensor, D: Tensor) -> Tensor:  # noqa: E741
         """Energy per rest area `W(I, D)`."""
@@ -119,10 +136,9 @@ class Sheet(nn.Module):
         return c1 * l2 + c2 / l2 * inverse, w_D - c2 / l2 * I * inverse * inverse + c2 * l2**2
 
     def derivatives(self, I: Tensor, D: Tensor) -> Derivatives:  # noqa: E741
-        """First and second derivatives of `density`."""
+        """First and second derivatives of `density`; what is constant is a scalar."""
         l2, c1, c2 = self.prestretch**2, self.c1, self.c2
-        zero = torch.zeros_like(I)
-        w_I, w_D = (slope + zero for slope in self.slopes(I, D))
+        zero, (w_I, w_D) = torch.zeros_like(l2), self.slopes(I, D)
         if self.model == "harmonic":
             return Derivatives(w_I, w_D, zero, zero, zero)
         if self.model == "neo_hookean":
@@ -132,7 +148,7 @@ class Sheet(nn.Module):
     def energy(self, x: Tensor) -> Tensor:
         """`U(x)`, `[..., V, 3]` to `[...]`."""
         _, _, I, D = self.strain(x)  # noqa: E741
-        return (self.rest_triangle_area * self.density(I, D)).sum((-1, -2, -3))
+        return (self.area * self.density(I, D)).sum((-1, -2))
 
     def gradient(self, x: Tensor) -> Tensor:
         """`dU/dx`, `[..., V, 3]`: the sheet's forces with opposite sign, at every vertex from the six triangles around it.
@@ -165,42 +181,47 @@ class Sheet(nn.Module):
         Arguments: `x [..., V, 3]`. Exact; with `positive` the convex part: compression and (Mooney-Rivlin) the term of `D`
         that is not convex are left out, so that every block is positive semi-definite. Vertices as in `TRIANGLE_CORNERS`.
         """
-        blocks, stress = self._pairs(self.strain(x), positive)
-        blocks = blocks + stress * torch.eye(3, dtype=x.dtype, device=x.device)[:, :, None, None, None]
+        blocks, stress = self._pairs(self.strain(x), self._rest(), positive)
+        blocks = (blocks + stress * torch.eye(3, dtype=x.dtype, device=x.device)[..., None]).unflatten(
+            -1, (2, *_cells(self.grid))
+        )
         ab, ac, bc = blocks.movedim((-3, -6, -5, -4), (-4, -3, -2, -1)).unbind(-3)
         rows = [[-(ab + ac), ab, ac], [ab.mT, -(ab.mT + bc), bc], [ac.mT, bc.mT, -(ac.mT + bc.mT)]]
         return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
-    def ring(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """What inner vertices' forces and slopes are made of, at their six neighbours: `s [..., 6, N]`, `H [..., 6, 3, 3, N]`.
+    def ring(self, edges: Tensor) -> tuple[Tensor, Tensor]:
+        """What inner vertices' forces and slopes are made of, at their six neighbours: `s [..., 6, N]`, `H [..., 3, 3, 6, N]`.
 
         The force (as `gradient`) is `sum_i s_i (x_i - x_k)` over the six neighbours; its derivative in neighbour `i` is `H_i`,
-        in the vertex itself minus the sum of the six.
+        in the vertex itself minus the sum of the six. `edges [..., 3, 2, 6 N]`, from `ring_edges`. A neighbour is the second
+        vertex of the triangle with its number, and the third of that before.
         """
-        blocks, stress = (pairs_to_ring(pairs) for pairs in self._pairs(self.strain(x)))
-        return stress.flatten(-4, -2), blocks + stress * torch.eye(3, dtype=x.dtype, device=x.device)[..., None]
+        rest = self._rest("around_")
+        blocks, stress = (a.unflatten(-1, (6, -1)) for a in self._pairs(self._strain(edges, rest), rest, count=2))
+        blocks, stress = (second + third.roll(1, -2) for second, third in (a.unbind(-5) for a in (blocks, stress)))
+        one = torch.eye(3, dtype=edges.dtype, device=edges.device)[..., None, None]
+        return stress[..., 0, 0, :, :], blocks + stress * one
 
-    def _pairs(self, strain: Strain, positive=False) -> tuple[Tensor, Tensor]:
-        """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2): `B [..., 3, 3, 3, T]` and `S [..., 3, 1, 1, T]`
-        of `B + S 1`.
+    def _pairs(self, strain: Strain, rest: Rest, positive=False, count=3) -> tuple[Tensor, Tensor]:
+        """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2), or the first `count` of these pairs:
+        `B [..., count, 3, 3, T]` and `S [..., count, 1, 1, T]` of `B + S 1`.
 
         Those in its edges `a`, `b` from vertex 0 are `sum_cd T_cd e_c e_d^T + S_ab 1`: `S` is the stress, force on edge a is
         `sum_b S_ab e_b`, and `T` comes from the second derivatives `Q` in the metric.
         """
         e, adjugate, I, D = strain  # noqa: E741
-        w, area, det = self.derivatives(I, D), self.rest_triangle_area, self.rest_det
-        every = lambda field: field[..., None, :, :, :]  # noqa: E731
-        stress = 2 * area * (every(w.I) * self.inverse_metric + every(w.D / det) * adjugate)
-        p, q = self.twice_12 * self.inverse_metric, self.twice_12 * adjugate / det
-        outer = lambda a, b: (a[..., :, None, :, :, :] * b[..., None, :, :, :, :]).flatten(-5, -4)  # noqa: E731
-        crossed = every(area * w.ID)
-        Q = outer(q, every(area * w.DD) * q + crossed * p) + outer(p, crossed * q)
-        Q = Q + every(area * (w.convex_D if positive else w.D) / det) * self.bend
-        T = _combined(self.metric_to_pairs, Q).unflatten(-4, (3, 2, 2, 1))
-        S = _combined(self.stress_to_pairs, _tension(stress) if positive else stress).unflatten(-4, (3, 1, 1))
-        first, second = (T * e[..., None, None, :, :, :, :, :]).sum(-5).unbind(-5)
-        e1, e2 = e[..., None, :, :, None, :, :, :].unbind(-6)
-        return e1 * first[..., None, :, :, :, :] + e2 * second[..., None, :, :, :, :], S
+        w, q = self.derivatives(I, D), self.twice_12 / rest.det * adjugate
+        outer = lambda a, b: (a[..., :, None, :] * b[..., None, :, :]).flatten(-3, -2)  # noqa: E731
+        stress = 2 * rest.area * rest.inverse_metric * w.I + 2 * rest.area / rest.det * w.D * adjugate
+        Q = outer(q, rest.area * w.DD * q) + rest.area / rest.det * (w.convex_D if positive else w.D) * self.bend
+        if self.model == "mooney_rivlin":
+            p = rest.area * w.ID * self.twice_12 * rest.inverse_metric
+            Q = Q + outer(p, q) + outer(q, p)
+        T = (self.metric_to_pairs[: 4 * count] @ Q).unflatten(-2, (count, 2, 1, 2))
+        S = (self.stress_to_pairs[:count] @ (_tension(stress) if positive else stress))[..., None, None, :]
+        first, second = (T * e[..., None, None, :, :, :]).sum(-2).unbind(-3)
+        e1, e2 = e[..., None, :, None, :, :].unbind(-2)
+        return e1 * first[..., None, :, :] + e2 * second[..., None, :, :], S
 
     @staticmethod
     def _quadrilaterals(K: Tensor) -> Tensor:
@@ -215,31 +236,30 @@ class Sheet(nn.Module):
         return 2 * (w.I + w.D)
 
 
+def _cells(grid) -> tuple[int, int]:
+    return grid[0] - 1, grid[1] - 1
+
+
 def _edges(x: Tensor, grid) -> Tensor:
     g = x.transpose(-2, -1).unflatten(-1, grid)
     a, b, c, d = g[..., :-1, :-1], g[..., 1:, :-1], g[..., 1:, 1:], g[..., :-1, 1:]
     ac = c - a
-    return torch.stack([torch.stack([b - a, ac], -3), torch.stack([ac, d - a], -3)], -5)
+    return torch.stack([torch.stack([b - a, ac], -3), torch.stack([ac, d - a], -3)], -4).flatten(-3)
 
 
 def _metric(edges: Tensor) -> Tensor:
-    e1, e2 = edges.unbind(-5)
-    return torch.stack([(e1 * e1).sum(-4), (e1 * e2).sum(-4), (e2 * e2).sum(-4)], -4)
+    e1, e2 = edges.split(1, -2)
+    return (torch.cat([e1, e1, e2], -2) * torch.cat([e1, e2, e2], -2)).sum(-3)
 
 
 def _adjugate(metric: Tensor) -> Tensor:
-    g11, g12, g22 = metric.unbind(-4)
-    return torch.stack([g22, -g12, g11], -4)
+    g11, g12, g22 = metric.split(1, -2)
+    return torch.cat([g22, -g12, g11], -2)
 
 
 def _determinant(metric: Tensor) -> Tensor:
-    g11, g12, g22 = metric.unbind(-4)
-    return g11 * g22 - g12**2
-
-
-def _combined(matrix: Tensor, components: Tensor) -> Tensor:
-    """Linear combinations of fields over triangles, `[..., C, T]`."""
-    return (matrix @ components.flatten(-3)).unflatten(-1, components.shape[-3:])
+    g11, g12, g22 = metric.split(1, -2)
+    return g11 * g22 - g12 * g12
 
 
 def _metric_constants() -> dict[str, Tensor]:
@@ -254,8 +274,8 @@ def _metric_constants() -> dict[str, Tensor]:
     edges = np.einsum("agc,bhd->abcdgh", slopes, slopes).reshape(2, 2, 4, 9)
     to_pairs = np.stack([-edges.sum(0)[0], -edges.sum(0)[1], edges[0, 1]]).reshape(12, 9)
     return dict(
-        twice_12=torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)[:, None, None, None],
-        bend=torch.tensor([0.0, 0, 1, 0, -2, 0, 1, 0, 0], dtype=torch.float64)[:, None, None, None],
+        twice_12=torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)[:, None],
+        bend=torch.tensor([0.0, 0, 1, 0, -2, 0, 1, 0, 0], dtype=torch.float64)[:, None],
         metric_to_pairs=torch.from_numpy(to_pairs),
         stress_to_pairs=torch.tensor([[-1.0, -1, 0], [0, -1, -1], [0, 1, 0]], dtype=torch.float64),
     )
@@ -263,12 +283,12 @@ def _metric_constants() -> dict[str, Tensor]:
 
 def _tension(stress: Tensor) -> Tensor:
     """The positive semi-definite part of symmetric 2 x 2 matrices given as (11, 12, 22), `[..., 3, T]`."""
-    s11, s12, s22 = stress.unbind(-4)
+    s11, s12, s22 = stress.split(1, -2)
     mean, half = (s11 + s22) / 2, (s11 - s22) / 2
     radius = (half**2 + s12**2).clamp_min(torch.finfo(stress.dtype).tiny).sqrt()
     high, low = (mean + radius).clamp_min(0), (mean - radius).clamp_min(0)
     centre, slope = (high + low) / 2, (high - low) / (2 * radius)
-    return torch.stack([centre + slope * half, slope * s12, centre - slope * half], -4)
+    return torch.cat([centre + slope * half, slope * s12, centre - slope * half], -2)
 
 
 class AffineQuadrilaterals(nn.Module):

@@ -30,7 +30,7 @@ from .energy import Sheet
 from .membrane import Membrane, SurfacePoints
 from .solve.conjugate_gradient import conjugate_gradient
 from .solve.stencil_system import NEAR, StencilSystem
-from .stencil import bordered, inner, ring
+from .stencil import bordered, combined, inner, ring_edges, taps
 
 STEPS, COARSE_STEPS, TAU = 8, 4, (4.0, 0.4)  # from rest, and so where a finer grid follows
 FINE_STEPS, FINER_STEPS, FINE_TAU = 5, 4, (0.8, 0.4)  # from the coarsest grid's solution, from a finer one's
@@ -115,7 +115,8 @@ class ForceBalance(nn.Module):
         within = lambda field: inner(field, membrane.grid)  # noqa: E731
         self.register_buffer("area", within(membrane.rest_area[:, None]).squeeze(-1))
         self.register_buffer("free", within(self.moves).squeeze(-1))
-        self.register_buffer("free_neighbours", ring(self.moves, membrane.grid)[:, None])
+        self.register_buffer("edges", ring_edges())
+        self.register_buffer("free_neighbours", combined(self.moves, taps()[1:], membrane.grid, border=False).reshape(6, -1))
         self.register_buffer("surroundings", within(within(_surroundings(membrane)).mT).mT)
         vertex_shares, pair_shares = _shares(membrane, self.marker_vertices, self.marker_weights)
         self.register_buffer("vertex_shares", vertex_shares)
@@ -224,14 +225,15 @@ class ForceBalance(nn.Module):
 
     def linearised(self, x: Tensor, pressure: Tensor) -> "Linearised":
         """`contact_force` and what it and the volume do when vertices move, at the inner vertices."""
-        grid, around = self.membrane.grid, ring(x, self.membrane.grid)
-        gradient, volume_ring = self.membrane.volume_ring(around)
-        stress, sheet_ring = self.sheet.ring(x)
-        here, load = inner(x, grid).mT, inner(self.rest_load, grid).mT
-        force = (stress[:, :, None] * (around - here[:, None])).sum(1) - load - pressure[:, None, None] * gradient
+        grid = self.membrane.grid
+        edges = combined(x, self.edges, grid, border=False).unflatten(-1, (2, -1))
+        gradient, volume_ring = self.membrane.volume_ring(edges)
+        stress, sheet_ring = self.sheet.ring(edges)
+        pull = (stress[:, None] * edges[:, :, 0].unflatten(-1, (6, -1))).sum(2)
+        force = pull - inner(self.rest_load, grid).mT - pressure[:, None, None] * gradient
         beside = self.free_neighbours * (sheet_ring - pressure[:, None, None, None, None] * volume_ring)
-        blocks = torch.cat([-sheet_ring.sum(1, keepdim=True), beside], 1) * self.free
-        slope = blocks.permute(0, 4, 2, 1, 3).flatten(-2)
+        blocks = torch.cat([-sheet_ring.sum(3, keepdim=True), beside], 3) * self.free
+        slope = blocks.permute(0, 4, 1, 3, 2).flatten(-2)
         return Linearised((force * self.free).mT, slope, (gradient * self.free).mT, F.normalize(gradient, dim=1).mT)
 
     def markers(self, x: Tensor) -> Tensor:

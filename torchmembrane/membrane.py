@@ -138,12 +138,14 @@ class Membrane(nn.Module):
         """Second derivatives of every triangle's share of the volume, `[..., V, 3]` to `[..., m-1, n-1, 2, 9, 9]`."""
         return (triangles_of(corners(x, self.grid)).flatten(-2) @ self.volume_third_derivatives).unflatten(-1, (9, 9))
 
-    def volume_ring(self, around: Tensor) -> tuple[Tensor, Tensor]:
+    def volume_ring(self, edges: Tensor) -> tuple[Tensor, Tensor]:
         """Derivative of `volume` in the inner vertices, `[..., 3, N]`, and the second ones in them and their six neighbours,
-        `[..., 6, 3, 3, N]`; those in one vertex alone are zero. `around [..., 6, 3, N]`: the `ring` of the vertices."""
-        before, after = around.roll(1, -3), around.roll(-1, -3)
-        gradient = torch.linalg.cross(around, after, dim=-2).sum(-3)
-        return self.outward / 6 * gradient, (self.volume_cross_products @ (before - after)).unflatten(-2, (3, 3))
+        `[..., 3, 3, 6, N]`; those in one vertex alone are zero. `edges [..., 3, 2, 6 N]`, from `ring_edges`."""
+        first, second = edges.unbind(-2)
+        gradient = torch.linalg.cross(first, second, dim=-2).unflatten(-1, (6, -1)).sum(-2)
+        before = first.unflatten(-1, (6, -1)).roll(1, -2).flatten(-2)
+        turned = (self.volume_cross_products @ (before - second)).unflatten(-2, (3, 3))
+        return self.outward / 6 * gradient, turned.unflatten(-1, (6, -1))
 
     @property
     def cavity_volume(self) -> float:

@@ -1,7 +1,7 @@
 """The seven-point stencil of a grid of triangles: every vertex inside the border and the six around it.
 
 Fields over the inner vertices are `[..., N, C]`, `N = (m - 2) (n - 2)`, row by row. The six are in turn, so that `k`, `RING[i]`
-and `RING[i + 1]` are a triangle. Slices and pads, as in `membrane`: no index arithmetic.
+and `RING[i + 1]` are a triangle. Convolutions, slices and pads: no index arithmetic.
 """
 
 import torch
@@ -20,14 +20,22 @@ def taps() -> Tensor:
     return picks
 
 
-def combined(field: Tensor, weights: Tensor, grid: tuple[int, int]) -> Tensor:
+def ring_edges() -> Tensor:
+    """Weights for `combined`: of the six triangles around a vertex the edges from it, all first ones before all second ones."""
+    own, ring = taps()[:1], taps()[1:]
+    return torch.cat([ring - own, ring.roll(-1, 0) - own])
+
+
+def combined(field: Tensor, weights: Tensor, grid: tuple[int, int], border=True) -> Tensor:
     """Combinations of the values around every vertex, zero beyond the border: `[..., V, C]` to `[..., C, W V]`.
 
-    `weights [W, 3, 3]`. One convolution, many times faster in exported models than differences of slices.
+    `weights [W, 3, 3]`; without `border` around the inner vertices only, `[..., C, W N]`. One convolution, many times faster in
+    exported models than differences of slices.
     """
     *batch, V, C = field.shape
+    count = V if border else (grid[0] - 2) * (grid[1] - 2)
     planes = field.mT.reshape(-1, 1, *grid)
-    return F.conv2d(planes, weights[:, None], padding=1).reshape(*batch, C, len(weights) * V)
+    return F.conv2d(planes, weights[:, None], padding=int(border)).reshape(*batch, C, len(weights) * count)
 
 
 def inner(field: Tensor, grid: tuple[int, int]) -> Tensor:
@@ -39,29 +47,3 @@ def bordered(field: Tensor, grid: tuple[int, int]) -> Tensor:
     """Adjoint of `inner`: zero on the border."""
     m, n = grid
     return F.pad(field.unflatten(-2, (m - 2, n - 2)), (0, 0, 1, 1, 1, 1)).flatten(-3, -2)
-
-
-def ring(field: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Values at the six neighbours of the inner vertices: `[..., V, C]` to `[..., 6, C, N]`, vertices last for what follows."""
-    m, n = grid
-    g = field.transpose(-2, -1).unflatten(-1, grid)
-    return torch.stack([g[..., 1 + i : m - 1 + i, 1 + j : n - 1 + j] for i, j in RING], -4).flatten(-2)
-
-
-def pairs_to_ring(pairs: Tensor) -> Tensor:
-    """Sum over triangles of their blocks between vertices (0, 1), (0, 2), (1, 2), at the six neighbours of the inner vertices.
-
-    `[..., 3, 3, 3, 2, m-1, n-1]` (pair, block, triangle of a quadrilateral), vertices as in `TRIANGLE_CORNERS`, to
-    `[..., 6, 3, 3, N]`: the blocks between vertex and neighbour. Those between neighbour and vertex are their transposes.
-    """
-    (ab, ac, bc), (ca, ad, cd) = (triangle.unbind(-5) for triangle in pairs.unbind(-3))
-    down = ab[..., 1:] + _transposed(cd[..., :-1])
-    diagonal = ac + ca
-    right = ad[..., 1:, :] + bc[..., :-1, :]
-    forth = [down[..., 1:, :], diagonal[..., 1:, 1:], right[..., 1:]]
-    back = [down[..., :-1, :], diagonal[..., :-1, :-1], right[..., :-1]]
-    return torch.stack([*forth, *(_transposed(block) for block in back)], -5).flatten(-2)
-
-
-def _transposed(blocks: Tensor) -> Tensor:
-    return blocks.transpose(-4, -3)
