@@ -85,7 +85,7 @@ class Sheet(nn.Module):
         return Rest(*(getattr(self, f"{which}{name}") for name in Rest._fields))
 
     def _register_ring(self, membrane: Membrane) -> None:
-        """Of the six triangles around every vertex, `[6 V]` in all: sides (two from the vertex, the one across) and constants."""
+        """Of the six triangles around every vertex, `[6 V]` in all: sides (two from the vertex, the one across), constants."""
         own, ring = taps()[:1], taps()[1:]
         following = ring.roll(-1, 0)
         self.register_buffer("sides", torch.cat([ring - own, following - own, following - ring]))

@@ -84,7 +84,7 @@ class Membrane(nn.Module):
         around = torch.stack([self.outward / 6 * (p[2] - p[0]), self.outward / 6 * (p[4] - p[0]), p[3] - p[1], p[5] - p[3]])
         self.register_buffer("around", around)
         self.register_buffer("beyond", combined(torch.ones(m * n, 1).double(), around, self.grid).flatten())
-        self.register_buffer("turns", torch.tensor([[1, 2, 0], [2, 0, 1]]))
+        self.register_buffer("turns", torch.tensor([1, 2, 0, 2, 0, 1]))
         self.register_buffer("volume_third_derivatives", self.outward / 6 * _determinant_derivatives())
         self.register_buffer("volume_cross_products", self.outward / 6 * _cross_products())
         self.register_buffer("triangles", triangles)
@@ -111,8 +111,8 @@ class Membrane(nn.Module):
 
     def normals(self, x: Tensor) -> Tensor:
         """Unit outward normals at the vertices, `[..., V, 3]`: of the summed area vectors, as the volume gradient's."""
-        p = combined(x, self.around, self.grid) - self.beyond * torch.cat([x.mT] * 4, -1)  # a neighbour beyond is the vertex
-        return F.normalize(self._turns(p), dim=-1)
+        beyond = self.beyond * torch.cat([x.transpose(-2, -1)] * 4, -1)  # neighbours beyond the border are the vertex itself
+        return F.normalize(self._turns(combined(x, self.around, self.grid) - beyond), dim=-1)
 
     def volume(self, x: Tensor) -> Tensor:
         """Volume between the surface and the camera centre, `[...]` (eq. 19): `1/6 sum det [x_a, x_b, x_c]`.
@@ -131,7 +131,7 @@ class Membrane(nn.Module):
 
     def _turns(self, p: Tensor) -> Tensor:
         """A sixth of `sum p_i x p_i+1` at every vertex, outwards; `p [..., 3, 4 V]` as `around` has them."""
-        (u1, u2), (v1, v2) = ([a.index_select(-2, turn) for turn in self.turns] for a in p.chunk(2, -1))
+        (u1, u2), (v1, v2) = (a.chunk(2, -2) for a in p.index_select(-2, self.turns).chunk(2, -1))
         return sum((u1 * v2 - u2 * v1).chunk(2, -1)).mT
 
     def volume_hessian_blocks(self, x: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ def combined(field: Tensor, weights: Tensor, grid: tuple[int, int], border=True)
     """
     *batch, V, C = field.shape
     count = V if border else (grid[0] - 2) * (grid[1] - 2)
-    planes = field.mT.reshape(-1, 1, *grid)
+    planes = field.transpose(-2, -1).reshape(-1, 1, *grid)
     return F.conv2d(planes, weights[:, None], padding=int(border)).reshape(*batch, C, len(weights) * count)
 
 

@@ -21,9 +21,9 @@ def first(x: Tensor, move: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def accelerated(x: Tensor, move: Tensor, latest: Tensor, changes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The iterate after `x`, and the history after it.
 
-    Arguments: `x`, `move [..., N]`; `latest [..., 1, 2 N]`, `(move, x + move)` at the iterate before; `changes [..., DEPTH, 2 N]`
-    of it, latest first, orthonormal in the move. Of all combinations of `(move, x + move)` and the changes, taken is the one
-    whose move, were it linear in `x`, is shortest; changes of no more than `x`'s rounding count for nothing.
+    Arguments: `x`, `move [..., N]`; `latest [..., 1, 2 N]`, `(move, x + move)` before; `changes [..., DEPTH, 2 N]`
+    up to there, latest first, orthonormal in the move. Of all combinations of `(move, x + move)` and the changes, taken is the
+    one whose move, were it linear in `x`, is shortest; changes of no more than `x`'s rounding count for nothing.
     """
     N = x.shape[-1]
     now = torch.cat([move, x + move], -1)[..., None, :]
