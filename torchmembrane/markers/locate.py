@@ -143,7 +143,7 @@ class EllipseFit(nn.Module):
         reach, farthest = 0.5 * (size + pixel)[..., None], (size + pixel)[..., None]
         metric = metric_of(shape)
         start = (middle - centre) / stride
-        moved, growth = torch.zeros_like(start), torch.zeros_like(size)
+        moved, growth, fit, gain = torch.zeros_like(start), torch.zeros_like(size), None, None
         for k, count in enumerate(self.counts):
             off, linear, seen = start - moved, self.linear[:, :count], values[..., :count]
             normal = torch.cat([mapped(metric, off)[..., None], metric], -1)

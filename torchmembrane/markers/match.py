@@ -278,16 +278,17 @@ class DotMatcher(nn.Module):
         """Each dot's blob: its certainty `[B, D]`, the flow to it `[B, 2, D]` (the prediction where lost), its strain
         `[B, 2, 2, D]`.
 
-        `blobs [B, 6, K]`: positions and strains; `base [B, D, K]`: what of the cost does not depend on the prediction.
+        `blobs [B, 7, K]`: 1, positions and strains; `base [B, D, K]`: what of the cost does not depend on the prediction.
         """
         expected = self.pixels.mT + predicted
-        alone = expected.square().sum(1) * self.stiffness + FAR * (support < SUPPORT)
-        cost = (-2 * self.stiffness * expected).mT @ blobs[:, :2] + base + alone[..., None]
-        chosen = cost.argmin(-1)
-        best = cost.gather(-1, chosen[..., None]).squeeze(-1)
-        mutual = best <= cost.amin(1).gather(1, chosen) + 1e-6 * best.abs()
+        alone = (expected * expected).sum(1) * self.stiffness + FAR * (support < SUPPORT)
+        cost = torch.cat([alone[:, None], -2 * self.stiffness * expected], 1).mT @ blobs[:, :3] + base
+        best = cost.amin(-1)
+        chosen = (cost <= best[..., None]).to(cost.dtype)
+        taken = torch.cat([blobs, cost.amin(1, keepdim=True)], 1) @ chosen.mT
+        found, strain, rival = (taken[:, 1:] / taken[:, :1]).split([2, 4, 1], 1)
+        mutual = best <= rival[:, 0] + 1e-6 * best.abs()
         weight = torch.exp(-0.5 * best) * mutual * (support / (support + 0.5))
-        found, strain = blobs.gather(2, chosen[:, None].expand(-1, 6, -1)).split([2, 4], 1)
         flow = torch.where(weight[:, None] > 0.02, found - self.pixels.mT, predicted)
         return weight, flow, strain.unflatten(1, (2, 2))
 
@@ -338,11 +339,12 @@ class DotMatcher(nn.Module):
         return tuple(torch.where(kept.reshape(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in zip(followed, searched, strict=True))
 
     def scene(self, deformation, blobs, log_radius, valid):
-        """What `choose` needs to know of the blobs: `[B, 6, K]`, `[B, D, K]`."""
+        """What `choose` needs to know of the blobs: `[B, 7, K]`, `[B, D, K]`."""
         strain = deformation - torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
-        known = torch.cat([(blobs - self.origin).mT, strain.flatten(1, 2)], 1)
+        place = (blobs - self.origin).mT
+        known = torch.cat([torch.ones_like(place[:, :1]), place, strain.flatten(1, 2)], 1)
         misfit = ((self.log_radius[:, None] - (log_radius + 3 * (1 - valid))[:, None]) / self.size_tolerance).square()
-        return known, misfit + self.stiffness[:, None] * known[:, :2].square().sum(1, keepdim=True)
+        return known, misfit + self.stiffness[:, None] * place.square().sum(1, keepdim=True)
 
     def begin(self, known, base):
         """The scene of every start; weight, flow and strain of the dots before the first step."""
