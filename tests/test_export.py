@@ -163,10 +163,11 @@ def test_damaged_images_get_the_same_status(run, reconstructor, images):
     blank, nan, noise, hidden = torch.zeros_like(good), good.clone(), torch.rand(good.shape), good.clone()
     nan[0, 5, 7] = torch.nan
     hidden[:, 45:65, 60:80] = 0.5
-    images = torch.stack([good, blank, nan, noise, hidden])
+    filled = [torch.full_like(good, value) for value in (torch.nan, torch.inf, -1e30)]
+    images = torch.stack([good, blank, nan, noise, hidden, *filled])
     with torch.no_grad():
         expected = reconstructor(images)
-    assert expected.status.tolist() == [OK, BLANK, BAD_VALUES, TOO_FEW_MARKERS, OK]
+    assert expected.status.tolist() == [OK, BLANK, BAD_VALUES, TOO_FEW_MARKERS, OK, *[BAD_VALUES] * 3]
     agree(run(images), expected)
 
 

@@ -123,6 +123,19 @@ def test_colour_and_integer_images_are_the_same_image(reconstructor, images):
     torch.testing.assert_close(colour.pixels, grey.pixels, rtol=0, atol=1e-3)
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf, 1e30, -2.0])
+@pytest.mark.parametrize("part", [np.s_[:], np.s_[200:280, 300:340], np.s_[10, 10]], ids=["whole", "patch", "pixel"])
+def test_bad_values_do_no_harm(reconstructor, images, value, part):
+    bad = images[:2].clone()
+    bad[0, 0][part] = value
+    with torch.no_grad():
+        displacement, confidence, status = reconstructor.observe(bad)
+        _, expected, _ = reconstructor.observe(images[1:2])
+    assert status.tolist() == [results.BAD_VALUES, results.OK]
+    assert (displacement[0] == 0).all() and (confidence[0] == 0).all()
+    torch.testing.assert_close(confidence[1], expected[0], rtol=0, atol=1e-4)
+
+
 def test_bad_frames_get_a_status_and_the_others_an_answer(reconstructor, images, result):
     noise = torch.rand(480, 640, generator=torch.Generator().manual_seed(0))
     nan = images[0, 0].clone()

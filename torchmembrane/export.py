@@ -113,14 +113,14 @@ def export(reconstructor: Reconstructor, path: str | Path, settings: Settings, t
             if name in previous_of(reconstructor):
                 tracer.given(name, value)
     tracer.assembly.part = "markers"
-    tracer.piece(reconstructor, Reconstructor.check, ["image"], ["image", "status"])
+    tracer.piece(reconstructor, _check, ["image"], ["status"])
     if not reconstructor.follows:
         tracer.piece(reconstructor.locator, type(reconstructor.locator).forward, ["image"], ["pixels", "confidence"])
     else:
         if tracking:
             tracer.piece(reconstructor, _located, [PREVIOUS[2]], ["dots before"])
         dots(tracer, reconstructor.locator, tracking)
-    tracer.piece(reconstructor, _displacement, ["pixels"], ["displacement"])
+    tracer.piece(reconstructor, Reconstructor.seen, ["pixels", "confidence", "status"], ["displacement", "confidence"])
     tracer.assembly.part = "assembly"
     seen = ["displacement", "confidence", "status"]
     tracer.piece(reconstructor, Reconstructor.judge, seen, ["usable", "confidence", "status"])
@@ -185,8 +185,8 @@ def _located(reconstructor, pixels):
     return (reconstructor.located(pixels),)
 
 
-def _displacement(reconstructor, pixels):
-    return (pixels - reconstructor.measured_rest,)
+def _check(reconstructor, image):
+    return (reconstructor.check(image),)
 
 
 def minimum_energy(tracer: Tracer, estimator) -> None:

@@ -150,10 +150,9 @@ class Reconstructor(nn.Module):
 
         `previous [B, D, 2]`: `pixels` of the frames before, from which dots are followed where that is possible.
         """
-        images, status = self.check(images)
+        status = self.check(images)
         before = () if previous is None or not self.follows else (self.located(previous),)
-        pixels, confidence = self.locator(images, *before)
-        return pixels - self.measured_rest, confidence, status
+        return *self.seen(*self.locator(images, *before), status), status
 
     @property
     def follows(self) -> bool:
@@ -164,15 +163,20 @@ class Reconstructor(nn.Module):
         """`pixels` of a result as the locator found them."""
         return pixels - self.rest_pixels + self.measured_rest
 
-    def check(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """The images, black where they hold bad values, and their status."""
+    def seen(self, pixels: Tensor, confidence: Tensor, status: Tensor) -> tuple[Tensor, Tensor]:
+        """Displacements and confidence from what the locator makes of images; zero where these hold bad values."""
+        bad = (status == results.BAD_VALUES)[:, None]
+        displacement = torch.where(bad[..., None], 0.0, pixels - self.measured_rest)
+        return displacement, torch.where(bad, 0.0, confidence)
+
+    def check(self, images: Tensor) -> Tensor:
+        """Status `[B]` of images."""
         flat, sparse = images.flatten(1), images[..., ::SPARSE, ::SPARSE].flatten(1)
         mean, low, high = flat.mean(1), flat.amin(1), flat.amax(1)
         bad = ~(mean.isfinite() & (low > -1e-3) & (high < 1.001))  # one value that is not finite makes the mean so
-        images = torch.where(bad[:, None, None, None], 0.0, images)
         saturated = ((sparse - 0.5).abs() > 0.495).to(sparse.dtype).mean(1)
         blank = (high - low < LEAST_CONTRAST) | ((saturated > SATURATED_SHARE) & (mean > 0.5))
-        return images, torch.where(bad, results.BAD_VALUES, torch.where(blank, results.BLANK, results.OK))
+        return torch.where(bad, results.BAD_VALUES, torch.where(blank, results.BLANK, results.OK))
 
     def from_pixels(
         self,

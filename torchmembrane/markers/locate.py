@@ -17,7 +17,7 @@ LEVELS = 3
 RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, its slope over the dot, depth, shift, growth
 STRAY = 0.5  # from where its neighbours predict it, pitches: a dot so far off is half trusted
 FEWEST = 0.2  # mean confidence of a frame that is half trusted
-FINEST_SIGMA = 1.1  # of the blob detector on a level of the pyramid, pixels of the level
+FINEST_SIGMA = 0.9  # of the blob detector on a level of the pyramid, pixels of the level
 SCALE_STEP = 1.6  # ratio of neighbouring scales of the blob detector at most
 
 
@@ -118,8 +118,8 @@ class EllipseFit(nn.Module):
         Near the image's border the disc stops where its last pixel meets the border.
         """
         stride = self.stride[:, None]
-        middle = ((centre.detach() - (stride - 1) / 2) / stride).round()
-        pixel = torch.minimum(middle.clamp_min(self.half).to(torch.int64), self.limit)
+        middle = ((centre.detach() - (stride - 1) / 2) / stride).round().to(torch.int64)
+        pixel = torch.minimum(middle.clamp_min(self.half), self.limit)  # of integers: also where the centre is NaN
         values = []
         for k, _ in self.levels:
             at = pixel[:, getattr(self, f"dots{k}")]
@@ -264,12 +264,12 @@ class BlobDetector(nn.Module):
         """`sigma^4 det Hessian` where the image is darkest, else 0, `[B, 1, rows, columns]` of the cells."""
         k, sigma = self.scales[i]
         blurred = self.apply(f"blur{i}", levels[k])
-        middle = 2 * blurred[..., 1:-1, 1:-1]
-        uu = blurred[..., 1:-1, 2:] + blurred[..., 1:-1, :-2] - middle
-        vv = blurred[..., 2:, 1:-1] + blurred[..., :-2, 1:-1] - middle
-        across = blurred[..., 2:] - blurred[..., :-2]
-        uv = 0.25 * (across[..., 2:, :] - across[..., :-2, :])
-        response = (uu.relu() * vv.relu() - uv * uv).relu()  # uu and vv have one sign where the determinant is positive
+        above, middle, below = blurred[..., :-2, :], blurred[..., 1:-1, :], blurred[..., 2:, :]
+        uu = middle[..., 2:] + middle[..., :-2] - 2 * middle[..., 1:-1]
+        vv = (below + above - 2 * middle)[..., 1:-1]
+        along = below - above
+        uv = along[..., 2:] - along[..., :-2]
+        response = (uu.relu() * vv.relu() - uv * uv / 16).relu()  # uu and vv have one sign where the determinant is positive
         if 2**k > self.cell:
             response = self.apply(f"spread{i}", response)
         return sigma**4 * (F.max_pool2d(response, 2) if 2**k < self.cell else response)
