@@ -228,7 +228,7 @@ def descend(tracer: Tracer, estimator: ForceBalance, falls: list[tuple[float, fl
     if one_factor:
         for name, value in zip(("tau", "outlier"), falls[0], strict=True):
             tracer.constant(name, value)
-        factor = ["pivots", "couplings"]
+        factor = ["scale", "pivots", "couplings"]
         tracer.piece(estimator, _first_step, [*state, *seen, "tau", "outlier"], [*state, *factor])
         seen, falls = [*seen, *factor], falls[1:]
     tau, outlier = np.array(falls, np.float32).T.copy()

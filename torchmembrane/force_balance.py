@@ -250,8 +250,8 @@ class ForceBalance(nn.Module):
         return angle, (seen.across - angle[..., None] * along[..., None, :]) / distance[..., None]
 
     def step(
-        self, x: Tensor, pressure: Tensor, seen: Observation, tau, outlier, factor: tuple[Tensor, Tensor] | None = None
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+        self, x: Tensor, pressure: Tensor, seen: Observation, tau, outlier, factor: tuple[Tensor, ...] | None = None
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
         """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped.
 
         Also returns the factor of its matrix, with which another step near it can be solved by conjugate gradients: `factor`.

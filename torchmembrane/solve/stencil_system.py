@@ -74,13 +74,18 @@ class StencilSystem(nn.Module):
         matrix = entries.index_select(1, self.places).flatten(1).unflatten(1, (-1, s, s))
         return matrix.split([self.blocks, self.blocks - 1], 1)
 
-    def factor(self, matrix: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """What `substitute` needs of the matrix."""
-        return _elimination().factor(*matrix)
+    def factor(self, matrix: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
+        """What `substitute` needs of the matrix: how it is scaled to a diagonal of 1, and its elimination then."""
+        diagonal, upper = matrix
+        scale = diagonal.diagonal(dim1=-2, dim2=-1).rsqrt()[..., None]
+        diagonal, upper = scale * diagonal * scale.mT, scale[:, :-1] * upper * scale[:, 1:].mT
+        return scale, *_elimination().factor(diagonal, upper)
 
-    def substitute(self, factor: tuple[Tensor, Tensor], loads: Tensor) -> Tensor:
+    def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
         """Solutions `[B, unknowns, C]` for `loads` of that shape."""
-        return _elimination().substitute(factor, loads.unflatten(1, (self.blocks, self.block_size))).flatten(1, 2)
+        scale, *elimination = factor
+        scaled = scale * loads.unflatten(1, (self.blocks, self.block_size))
+        return (scale * _elimination().substitute(elimination, scaled)).flatten(1, 2)
 
 
 def _elimination():
