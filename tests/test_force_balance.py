@@ -110,7 +110,7 @@ def test_normal_equations_are_those_of_the_dense_slopes(hole):
     W = root @ root.mT
     normal = estimator.normal_equations(at, W, slope, weight)
     loads, (fWv, vWv) = estimator.loads(normal, at, W, angle)
-    matrix, (load, push, volume) = estimator.matrix(normal), loads.unbind(-1)
+    matrix, (volume, load, push) = estimator.matrix(normal), loads.unbind(-1)
 
     moving = estimator.free.repeat_interleave(3) > 0
     A = slopes_at_inner_vertices(lambda y: inner(estimator.contact_force(y, p), dome.grid), x, estimator)[:, moving]

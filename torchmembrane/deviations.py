@@ -41,7 +41,7 @@ def standard_deviations(
     weight = estimator.marker_weights_at(angle, seen, outlier)
     normal = estimator.normal_equations(at, W, sight, weight)
     loads, (_, c) = estimator.loads(normal, at, W, angle)
-    borders = loads[..., 1:]
+    borders = loads[..., [2, 0]]
     turns = noise @ seen.across.mT @ normal.weighted_sight
     g = torch.einsum("bdrc,dn->bncdr", turns, estimator.vertex_shares).flatten(3).flatten(1, 2)
     y = system.substitute(system.factor(estimator.matrix(normal)), torch.cat([system.padded(g), borders], -1))

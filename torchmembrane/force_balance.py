@@ -280,14 +280,12 @@ class ForceBalance(nn.Module):
         return NormalEquations(at.slope, W @ at.slope, sight, weight[..., None, None] * sight)
 
     def loads(self, normal: NormalEquations, at: "Linearised", W: Tensor, angle: Tensor):
-        """`A^T W f + J^T w r`, `-A^T W v` and `v`, `[B, unknowns, 3]`; `f^T W v` and `v^T W v`, `[B]`."""
-        forces = torch.stack([at.force, -at.volume], -1)
-        push = self.system.vector(normal.weighted_slope.mT @ forces)
+        """`v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, unknowns, 3]`; `f^T W v` and `v^T W v`, `[B]`."""
+        push = self.system.vector(normal.weighted_slope.mT @ F.pad(torch.stack([at.force, -at.volume], -1), (1, 0)))
         pull = self.vertex_shares.mT @ (normal.weighted_sight.mT @ angle[..., None]).squeeze(-1)
-        g = push[..., 0] + self.system.padded(pull.flatten(1)[..., None]).squeeze(-1)
-        loads = torch.stack([g, push[..., 1], self.system.padded(at.volume.flatten(1)[..., None]).squeeze(-1)], -1)
-        fWv, vWv = ((W @ at.volume[..., None]) * torch.stack([at.force, at.volume], -1)).sum((1, 2)).unbind(-1)
-        return loads, (fWv, vWv)
+        own = F.pad(torch.stack([at.volume, pull], -1), (0, 1)).flatten(1, 2)
+        of_fluid = ((W @ at.volume[..., None]) * torch.stack([at.force, at.volume], -1)).sum((1, 2)).unbind(-1)
+        return push + self.system.padded(own), of_fluid
 
     def matrix(self, normal: NormalEquations) -> tuple[Tensor, Tensor]:
         """`M` as the blocks that `system.factor` takes."""
@@ -342,17 +340,21 @@ class ForceBalance(nn.Module):
         return seen.weight / (1 + seen.weight * angle.square().sum(-1) / outlier**2)
 
     def _bordered(self, x, pressure, y, loads, of_fluid):
-        """Step `d` and rise of the pressure: `M d + m dp + n lambda = -g` with the rows of the pressure and of the volume."""
-        dot = lambda a, b: (a * b).sum(-1)  # noqa: E731
-        (_, m, n), (Mg, Mm, Mn), (fWv, vWv) = loads.unbind(-1), y.unbind(-1), of_fluid
+        """Step `d` and rise of the pressure: `M d + m dp + n lambda = -g` with the rows of the pressure and of the volume.
+
+        `loads` are `n, g, m`, and `y` is `M^-1` of them.
+        """
         if self.cavity.filling == "open":
-            return -Mg, torch.zeros_like(pressure)
+            return -y[..., 1], torch.zeros_like(pressure)
+        (fWv, vWv), products = of_fluid, (loads.mT @ y).flatten(1).unbind(-1)
+        nMn, nMg, nMm, mMg, mMm = *products[:3], *products[7:]
         target, compliance = self.cavity.condition(self.membrane.volume(x) - self.membrane.rest_volume, pressure)
-        a11, a12, a22 = vWv - dot(m, Mm), compliance - dot(m, Mn), -dot(n, Mn)
-        b1, b2 = fWv + dot(m, Mg), target + dot(n, Mg)
-        det = a11 * a22 - a12**2
+        a11, a12, a22 = vWv - mMm, compliance - nMm, -nMn
+        b1, b2 = fWv + mMg, target + nMg
+        det = a11 * a22 - a12 * a12
         rise, multiplier = (b1 * a22 - a12 * b2) / det, (a11 * b2 - a12 * b1) / det
-        return -Mg - rise[:, None] * Mm - multiplier[:, None] * Mn, rise
+        step = y @ torch.stack([-multiplier, -torch.ones_like(rise), -rise], -1)[..., None]
+        return step.squeeze(-1), rise
 
 
 def _across(directions: Tensor) -> Tensor:
