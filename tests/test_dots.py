@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from torchmembrane.errors import MembraneError
 from torchmembrane.markers.dots import DotPattern, find_dots, measure_dots
-from torchmembrane.markers.locate import DotLocator, EllipseFit, blur_rows, metric_of, pyramid
+from torchmembrane.markers.locate import DotLocator, EllipseFit, bands, blur_rows, metric_of, pyramid
 from torchmembrane.markers.match import Coherence, mapping
 
 SIZE, CENTRE, RADIUS, PITCH = (320, 240), np.array([158.3, 119.6]), 112.0, 22.0
@@ -378,6 +378,14 @@ def test_the_products_are_the_gaussian_of_a_part_of_the_image(sigma):
     whole = gaussian_blur2d(image, (side, side), (sigma, sigma), border_type="replicate")
     expected = whole[..., rows.clip(0, 29)[:, None], columns.clip(0, 40)]
     torch.testing.assert_close(left @ image @ right.T, expected)
+
+
+@pytest.mark.parametrize("size", [12, 90, 130])
+def test_the_bands_are_the_matrix(size):
+    matrix, x = blur_rows(size, 1.3, np.arange(-1, size - 3)), np.random.default_rng(0).normal(size=(size, 4))
+    blocks, columns = bands(matrix)
+    assert blocks.shape[-1] < 45
+    np.testing.assert_allclose((blocks @ x[columns]).reshape(-1, 4)[: len(matrix)], matrix @ x, atol=1e-12)
 
 
 @pytest.mark.parametrize("radius", [2.5, 4.5, 9.0])

@@ -1,5 +1,7 @@
 """Locating dots in a batch of frames: blobs at the pattern's scales, matched, then fitted to sub-pixel accuracy."""
 
+from functools import reduce
+
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -18,6 +20,7 @@ RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, i
 STRAY = 0.5  # from where its neighbours predict it, pitches: a dot so far off is half trusted
 FEWEST = 0.2  # mean confidence of a frame that is half trusted
 FINEST_SIGMA = 0.9  # of the blob detector on a level of the pyramid, pixels of the level
+BLOCK = 32  # rows of a band matrix that are multiplied at once
 SCALE_STEP = 1.6  # ratio of neighbouring scales of the blob detector at most
 
 
@@ -209,11 +212,20 @@ def halves(size):
     return np.kron(np.eye(size // 2, dtype=float), [0.5, 0.5]) if size % 2 == 0 else np.pad(halves(size - 1), ((0, 0), (0, 1)))
 
 
+def bands(matrix):
+    """A narrow band `matrix [m, n]` by blocks of rows `[N, BLOCK, width]`, zero beyond `m`, and their columns `[N, width]`."""
+    blocks = np.pad(matrix, ((0, -len(matrix) % BLOCK), (0, 0))).reshape(-1, BLOCK, matrix.shape[1])
+    ends = np.array([np.flatnonzero(block.any(0))[[0, -1]] for block in blocks])
+    width = (ends[:, 1] - ends[:, 0]).max() + 1
+    columns = np.minimum(ends[:, :1], matrix.shape[1] - width) + np.arange(width)
+    return np.take_along_axis(blocks, columns[:, None], 2), columns
+
+
 class BlobDetector(nn.Module):
     """The strongest `count` dark blobs: maxima over place and scale of the normalised Hessian's determinant.
 
-    Only the box that holds the membrane is looked at. A Gaussian over it is two products with constant matrices, on the
-    level of the pyramid that suits the scale; maxima are looked for on cells of 2 x 2 pixels of the finest of them.
+    Only the box that holds the membrane is looked at. A Gaussian over it is two products with constant band matrices, on
+    the level of the pyramid that suits the scale; maxima are looked for on cells of 2 x 2 pixels of the finest of them.
     """
 
     def __init__(self, radii, pitch, count, inside):
@@ -239,7 +251,9 @@ class BlobDetector(nn.Module):
             cells = (np.arange(begin, end, self.cell) + (self.cell - 1) / 2) / 2 ** (LEVELS - 1)
             for i, (k, sigma) in enumerate(self.scales):
                 rows = np.arange(begin // 2**k - 1, end // 2**k + 1)
-                self._matrix(f"blur{i}", axis, blur_rows(side // 2**k, sigma, rows))
+                blocks, columns = bands(blur_rows(side // 2**k, sigma, rows))
+                self.register_buffer(f"blur{i}_{'vu'[axis]}", torch.as_tensor(blocks))
+                self.register_buffer(f"seen{i}_{'vu'[axis]}", torch.as_tensor(columns))
                 if 2**k > self.cell:
                     places = (np.arange(begin, end, self.cell) + (self.cell - 1) / 2 - (2**k - 1) / 2) / 2**k
                     self._matrix(f"spread{i}", axis, linear_rows(len(rows) - 2, places - begin // 2**k))
@@ -262,13 +276,18 @@ class BlobDetector(nn.Module):
 
     def response(self, levels, i):
         """`sigma^4 det Hessian` where the image is darkest, else 0, `[B, 1, rows, columns]` of the cells."""
-        k, sigma = self.scales[i]
-        blurred = self.apply(f"blur{i}", levels[k])
-        above, middle, below = blurred[..., :-2, :], blurred[..., 1:-1, :], blurred[..., 2:, :]
-        uu = middle[..., 2:] + middle[..., :-2] - 2 * middle[..., 1:-1]
-        vv = (below + above - 2 * middle)[..., 1:-1]
+        (k, sigma), blurred = self.scales[i], levels[self.scales[i][0]]
+        for axis in "vu":
+            seen = getattr(self, f"seen{i}_{axis}")
+            blocks = blurred.index_select(-2, seen.flatten()).unflatten(-2, seen.shape)
+            blurred = (getattr(self, f"blur{i}_{axis}") @ blocks).flatten(-3, -2).mT
+        rows, columns = ((end - begin) // 2**k for begin, end in self.box)
+        above, middle, below = (blurred[..., n : n + rows, :] for n in range(3))
+        left, centre, right = (slice(n, n + columns) for n in range(3))
+        uu = middle[..., right] + middle[..., left] - 2 * middle[..., centre]
+        vv = (below + above - 2 * middle)[..., centre]
         along = below - above
-        uv = along[..., 2:] - along[..., :-2]
+        uv = along[..., right] - along[..., left]
         response = (uu.relu() * vv.relu() - uv * uv / 16).relu()  # uu and vv have one sign where the determinant is positive
         if 2**k > self.cell:
             response = self.apply(f"spread{i}", response)
@@ -277,8 +296,8 @@ class BlobDetector(nn.Module):
     def forward(self, levels):
         """`levels` of `pyramid` with dark dots -> blobs `[B, K, 2]` px, log radius `[B, K]`, strength `[B, K]`."""
         background = self.apply("background", levels[-1]) + 0.05
-        scales = torch.cat([self.response(levels, i) for i in range(len(self.scales))], 1)
-        peak = scales.amax(1, keepdim=True) / background.square() * self.inside
+        scales = [self.response(levels, i) for i in range(len(self.scales))]
+        peak = reduce(torch.maximum, scales) / background.square() * self.inside
         reach = self.reach
         highest = F.max_pool2d(peak, (1, 2 * reach + 1), 1, (0, reach))
         highest = F.max_pool2d(highest, (2 * reach + 1, 1), 1, (reach, 0))
@@ -292,7 +311,7 @@ class BlobDetector(nn.Module):
         before, after = beside.unbind(-1)
         shift = 0.5 * (after - before) / (2 * strength[..., None] - after - before).clamp_min(1e-12)
         place = torch.stack([cell % columns, cell // columns], -1) + shift.clamp(-0.5, 0.5)
-        scale = scales.flatten(2).gather(2, cell[:, None].expand(-1, len(self.scales), -1)).square()
+        scale = torch.cat(scales, 1).flatten(2).gather(2, cell[:, None].expand(-1, len(self.scales), -1)).square()
         log_radius = (scale * self.log_radii[:, None]).sum(1) / scale.sum(1).clamp_min(1e-20)
         (v0, _), (u0, _) = self.box
         place = place * self.cell + (self.cell - 1) / 2 + place.new_tensor([u0, v0])
