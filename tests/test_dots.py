@@ -198,7 +198,7 @@ def test_dots_followed_from_the_frame_before_are_those_searched_for(arrangement,
     torch.testing.assert_close(pixels, expected, atol=0.03, rtol=0)
     assert confidence.min() > 0.5
     _, blobs, log_radius, valid = locate.begin(images)[-4:]
-    *_, kept = locate.match.follow(before.expand(len(frames), -1, -1), blobs, log_radius, valid)
+    *_, kept = locate.match.follow(blobs, log_radius, valid, before.expand(len(frames), -1, -1))
     assert kept[:2].all() and not kept[-1]
 
 

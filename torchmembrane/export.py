@@ -151,15 +151,13 @@ def dots(tracer: Tracer, locator: DotLocator, tracking: bool) -> None:
     levels, blobs = [f"level {k}" for k in range(LEVELS)], ["blobs", "log radius", "valid"]
     tracer.piece(locator, DotLocator.begin, ["image"], [*levels, *blobs])
     state, placed = ["weight", "flow", "strain"], ["place", "certainty", "dot strain"]
-    if tracking:
-        tracer.piece(match, DotMatcher.follow, ["dots before", *blobs], [*state, "kept"])
-        tracer.alias([f"followed {name}" for name in state], state)
-        tracer.piece(match, _all, ["kept"], ["all kept"])
-        with tracer.unless("all kept", state):
-            search(tracer, match, state, blobs)
-            tracer.piece(match, DotMatcher.either, ["kept", *(f"followed {name}" for name in state), *state], state)
-    else:
+    before = ["dots before"] if tracking else []
+    tracer.piece(match, DotMatcher.follow, [*blobs, *before], [*state, "kept"])
+    tracer.alias([f"followed {name}" for name in state], state)
+    tracer.piece(match, _all, ["kept"], ["all kept"])
+    with tracer.unless("all kept", state):
         search(tracer, match, state, blobs)
+        tracer.piece(match, DotMatcher.either, ["kept", *(f"followed {name}" for name in state), *state], state)
     tracer.piece(match, DotMatcher.end, state, placed)
     tracer.piece(locator, DotLocator.end, [*levels, *blobs, *placed], ["pixels", "confidence"])
 

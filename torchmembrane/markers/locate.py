@@ -395,7 +395,7 @@ class DotLocator(nn.Module):
     def forward(self, image, previous=None):
         """`image [B, 1, H, W]` in 0..1 -> pixels `[B, D, 2]`, confidence `[B, D]` in 0..1.
 
-        `previous [B, D, 2]`: pixels in the frames before, NaN where lost, to follow the dots from.
+        `previous [B, D, 2]`: pixels in the frames before, NaN where lost, from which the dots are followed (else from rest).
         """
         *levels, blobs, log_radius, valid = self.begin(image)
         return self.end(*levels, blobs, log_radius, valid, *self.match(blobs, log_radius, valid, previous))

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from torch import nn
 
 SETTLING = 6  # steps after the growth has reached every dot
-FOLLOWING = 1  # steps after dots are taken from where the frame before had them
+FOLLOWING = 1  # steps after dots are followed from where they were
 KEPT = 0.3  # certainty of a dot that could be followed
 WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
 WIDTH = 1.1  # of the local average, pitches
@@ -296,14 +296,11 @@ class DotMatcher(nn.Module):
         """`blobs [B, K, 2]`, `log_radius`, `valid [B, K]` -> positions `[B, D, 2]`, certainty `[B, D]` in 0..1 and strain
         `[B, D, 2, 2]`.
 
-        `previous [B, D, 2]`: where the dots were in the frames before, NaN where lost. They are followed from there; in a
-        frame in which one of them cannot be, or half of the dots were lost before, all are searched for.
+        The dots are followed from where they were in the frames before, `previous [B, D, 2]`, NaN where lost; from rest
+        without it, or where half of them were lost. In a frame in which one cannot be followed all are searched for.
         """
-        state = self.search(blobs, log_radius, valid)
-        if previous is not None:
-            *followed, kept = self.follow(previous, blobs, log_radius, valid)
-            state = self.either(kept, *followed, *state)
-        return self.end(*state)
+        *followed, kept = self.follow(blobs, log_radius, valid, previous)
+        return self.end(*self.either(kept, *followed, *self.search(blobs, log_radius, valid)))
 
     def search(self, blobs, log_radius, valid):
         """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""
@@ -315,23 +312,28 @@ class DotMatcher(nn.Module):
             state = self.settle(*state, known, base)
         return self.best(*state)
 
-    def follow(self, previous, blobs, log_radius, valid):
-        """As `search`, from the frames before; and in which frames `[B]` all dots could be followed."""
-        found = previous.isfinite().all(-1)
-        weight = found.to(blobs.dtype)
-        flow = torch.where(found[..., None], previous - self.pixels - self.origin, 0.0).mT
+    def follow(self, blobs, log_radius, valid, previous=None):
+        """As `search`, from the frames before; and in which frames `[B]` all dots that were found could be followed."""
+        found, flow = torch.ones_like(self.nearest[None]) > 0, torch.zeros_like(self.pixels[None])
+        if previous is not None:
+            finite = previous.isfinite().all(-1)
+            enough = finite.to(blobs.dtype).mean(-1, keepdim=True) > 0.5
+            flow = torch.where((finite & enough)[..., None], previous - self.pixels - self.origin, flow)
+            found = finite | ~enough
+        weight, flow = found.to(blobs.dtype), flow.mT
         strain = torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1)
         for _ in range(2):  # the second time next to nothing draws it to zero
             strain = self.local.gradient(weight, flow, strain)
         predicted, support = self.local.along(weight, flow, strain)
         own = square_distance(blobs - self.origin, self.pixels + predicted.mT).argmin(-1)
-        at_blobs = strain.flatten(1, 2).gather(2, own[:, None].expand(-1, 4, -1)).unflatten(1, (2, 2))
+        strain = strain.flatten(1, 2).expand(own.shape[0], -1, -1)
+        at_blobs = strain.gather(2, own[:, None].expand(-1, 4, -1)).unflatten(1, (2, 2))
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
         known, base = self.scene(at_blobs + eye, blobs, log_radius, valid)
         state = self.choose(predicted, support, known, base)
         for _ in range(FOLLOWING):
             state = self.settle(*state, known, base)
-        return *state, (weight.mean(-1) > 0.5) & ~(found & (state[0] < KEPT)).any(-1)
+        return *state, ~(found & ~(state[0] >= KEPT)).any(-1)
 
     def either(self, kept, weight, flow, strain, *searched):
         """The dots followed in the frames `kept [B]`, those searched in the others."""
