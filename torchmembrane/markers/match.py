@@ -320,20 +320,14 @@ class DotMatcher(nn.Module):
             enough = finite.to(blobs.dtype).mean(-1, keepdim=True) > 0.5
             flow = torch.where((finite & enough)[..., None], previous - self.pixels - self.origin, flow)
             found = finite | ~enough
-        weight, flow = found.to(blobs.dtype), flow.mT
-        strain = torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1)
-        for _ in range(2):  # the second time next to nothing draws it to zero
-            strain = self.local.gradient(weight, flow, strain)
-        predicted, support = self.local.along(weight, flow, strain)
-        own = square_distance(blobs - self.origin, self.pixels + predicted.mT).argmin(-1)
-        strain = strain.flatten(1, 2).expand(own.shape[0], -1, -1)
-        at_blobs = strain.gather(2, own[:, None].expand(-1, 4, -1)).unflatten(1, (2, 2))
-        eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
-        known, base = self.scene(at_blobs + eye, blobs, log_radius, valid)
-        state = self.choose(predicted, support, known, base)
+        weight, flow, eye = found.to(blobs.dtype), flow.mT, torch.eye(2, dtype=blobs.dtype, device=blobs.device)
+        known, base = self.scene(eye[..., None].expand(*valid.shape[:1], 2, 2, valid.shape[1]), blobs, log_radius, valid)
+        state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), known, base)
         for _ in range(FOLLOWING):
             state = self.settle(*state, known, base)
-        return *state, ~(found & ~(state[0] >= KEPT)).any(-1)
+        weight, flow, strain = state
+        followed = ~(found & ~(weight >= KEPT)).any(-1)
+        return weight, flow, self.local.gradient(weight, flow, strain), followed
 
     def either(self, kept, weight, flow, strain, *searched):
         """The dots followed in the frames `kept [B]`, those searched in the others."""
