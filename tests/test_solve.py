@@ -66,17 +66,21 @@ def test_block_cholesky_solves_the_dense_system():
     M[:, :4, 8:] = M[:, 8:, :4] = 0
     diagonal = torch.stack([M[:, 4 * i : 4 * i + 4, 4 * i : 4 * i + 4] for i in range(3)], 1)
     upper = torch.stack([M[:, 4 * i : 4 * i + 4, 4 * i + 4 : 4 * i + 8] for i in range(2)], 1)
-    x = block_tridiagonal.substitute(block_tridiagonal.factor(diagonal, upper), b.unflatten(1, (3, 4))).flatten(1, 2)
-    torch.testing.assert_close(M @ x, b)
+    x, factor = block_tridiagonal.solve(diagonal, upper, b.unflatten(1, (3, 4)))
+    torch.testing.assert_close(M @ x.flatten(1, 2), b)
+    again = block_tridiagonal.substitute([torch.cat(blocks, 1) for blocks in factor], b.unflatten(1, (3, 4)))
+    torch.testing.assert_close(again, x)
 
 
 @pytest.mark.parametrize("dtype, bound", [(torch.float64, 1e-9), (torch.float32, 2e-4)])
 @pytest.mark.parametrize("blocks, size", [(1, 9), (2, 9), (3, 9), (4, 42), (7, 90)])
 def test_elimination_by_products_agrees_with_cholesky(blocks, size, dtype, bound):
     diagonal, upper, b = _grid_system(blocks, size, dtype)
-    ours = matrix_products.substitute(matrix_products.factor(diagonal, upper), b)
-    theirs = block_tridiagonal.substitute(block_tridiagonal.factor(diagonal.double(), upper.double()), b.double())
+    ours, factor = matrix_products.solve(diagonal, upper, b)
+    theirs, _ = block_tridiagonal.solve(diagonal.double(), upper.double(), b.double())
     assert (ours - theirs).norm() / theirs.norm() < bound
+    if blocks > 1:
+        assert torch.equal(matrix_products.substitute([torch.cat(part, 1) for part in factor], b), ours)
 
 
 @pytest.mark.parametrize("size", [3, 47, 96])

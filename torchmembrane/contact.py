@@ -27,6 +27,7 @@ def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, size: f
     """
     distance2 = ((rest[:, None] - rest) ** 2).sum(-1)
     near = torch.exp(-distance2 / (2 * (PATCH * size) ** 2))
+    remains = 1 - torch.exp(-distance2 / (2 * (2 * PATCH * size) ** 2))
     load, points, strengths = inward_force, [], []
     for _ in range(count):
         peak = (load @ near).argmax(-1)
@@ -34,7 +35,7 @@ def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, size: f
         strength = weight.sum(-1, keepdim=True)
         points.append((weight[..., None] * vertices).sum(1) / strength.clamp_min(torch.finfo(load.dtype).tiny))
         strengths.append(strength)
-        load = load * (1 - torch.exp(-distance2[peak] / (2 * (2 * PATCH * size) ** 2)))
+        load = load * remains[peak]
     points, strengths = torch.stack(points, 1), torch.stack(strengths, 1)
     present = (strengths > LEAST * strengths[:, :1]) & (strengths > 0)
     return torch.where(present, points, torch.nan)

@@ -44,7 +44,7 @@ def standard_deviations(
     borders = loads[..., [2, 0]]
     turns = noise @ seen.across.mT @ normal.weighted_sight
     g = torch.einsum("bdrc,dn->bncdr", turns, estimator.vertex_shares).flatten(3).flatten(1, 2)
-    y = system.substitute(system.factor(estimator.matrix(normal)), torch.cat([system.padded(g), borders], -1))
+    y, _ = system.solve(estimator.matrix(normal), torch.cat([system.padded(g), borders], -1))
     dx, dp = y[..., :-2], torch.zeros_like(g[:, 0])
     if estimator.cavity.filling != "open":
         border = y[..., -2:]

@@ -202,9 +202,8 @@ class ForceBalance(nn.Module):
     ) -> Equilibrium:
         factor = None
         for tau, outlier in schedule:
-            before = x
-            x, pressure, found = self._compiled_once(x, pressure, seen, x.new_tensor(tau), x.new_tensor(outlier), factor)
-            factor = found if one_factor else None
+            before, scales = x, (x.new_tensor(tau), x.new_tensor(outlier))
+            x, pressure, factor = self._compiled_once(x, pressure, seen, *scales, factor, one_factor)
         return self.equilibrium(x, pressure, before)
 
     def equilibrium(self, x: Tensor, pressure: Tensor, before: Tensor) -> Equilibrium:
@@ -214,9 +213,9 @@ class ForceBalance(nn.Module):
         return Equilibrium(x, pressure, self.membrane.volume(x), traction, moved)
 
     @torch.compiler.nested_compile_region
-    def _compiled_once(self, x: Tensor, pressure: Tensor, seen: Observation, tau: Tensor, outlier: Tensor, factor):
+    def _compiled_once(self, x: Tensor, pressure: Tensor, seen: Observation, tau: Tensor, outlier: Tensor, factor, keep):
         """`step`, which `torch.compile` then traces and compiles once, not once a step."""
-        return self.step(x, pressure, seen, tau, outlier, factor)
+        return self.step(x, pressure, seen, tau, outlier, factor, keep)
 
     def contact_force(self, x: Tensor, pressure: Tensor) -> Tensor:
         """Force that something outside must exert on every free vertex, `[B, V, 3]`."""
@@ -250,11 +249,11 @@ class ForceBalance(nn.Module):
         return angle, (seen.across - angle[..., None] * along[..., None, :]) / distance[..., None]
 
     def step(
-        self, x: Tensor, pressure: Tensor, seen: Observation, tau, outlier, factor: tuple[Tensor, ...] | None = None
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+        self, x: Tensor, pressure: Tensor, seen: Observation, tau, outlier, factor: tuple[Tensor, ...] | None = None, keep=False
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...] | None]:
         """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped.
 
-        Also returns the factor of its matrix, with which another step near it can be solved by conjugate gradients: `factor`.
+        With `keep` also returns the factor of its matrix, with which, as `factor`, a step near this one needs none of its own.
         """
         at = self.linearised(x, pressure)
         W = self.force_weights(at.normal, at.force, tau)
@@ -263,8 +262,7 @@ class ForceBalance(nn.Module):
         normal = self.normal_equations(at, W, sight, weight)
         loads, of_fluid = self.loads(normal, at, W, angle)
         if factor is None:
-            factor = self.system.factor(self.matrix(normal))
-            y = self.system.substitute(factor, loads)
+            y, factor = self.system.solve(self.matrix(normal), loads, keep)
         else:
             y = conjugate_gradient(
                 lambda u: self.product(normal, u), lambda r: self.system.substitute(factor, r), loads, CONJUGATE_STEPS
@@ -287,8 +285,8 @@ class ForceBalance(nn.Module):
         of_fluid = ((W @ at.volume[..., None]) * torch.stack([at.force, at.volume], -1)).sum((1, 2)).unbind(-1)
         return push + self.system.padded(own), of_fluid
 
-    def matrix(self, normal: NormalEquations) -> tuple[Tensor, Tensor]:
-        """`M` as the blocks that `system.factor` takes."""
+    def matrix(self, normal: NormalEquations) -> tuple[Tensor, Tensor, Tensor]:
+        """`M` as `system.solve` takes it."""
         products = normal.slope.mT @ normal.weighted_slope
         of_markers = (normal.sight.mT @ normal.weighted_sight).flatten(-2).mT @ self.pair_shares
         near = of_markers.unflatten(-1, (len(NEAR), -1)).unflatten(1, (3, 3))

@@ -7,6 +7,8 @@ scaled in between so that the eigenvalues of `A X` lie evenly about 1: each step
 import torch
 from torch import Tensor
 
+from .block_tridiagonal import Factor
+
 LEAF = 48
 LARGEST_CONDITION = 1e4  # of a leaf, Jacobi-scaled
 
@@ -44,8 +46,8 @@ def inverse(matrix: Tensor, largest: Tensor) -> Tensor:
     return X
 
 
-def factor(diagonal: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-    """As `block_tridiagonal.factor`; eliminated from both ends at once, two blocks a product. Diagonal best about 1."""
+def solve(diagonal: Tensor, upper: Tensor, b: Tensor) -> tuple[Tensor, Factor]:
+    """As `block_tridiagonal.solve`; eliminated from both ends at once, two blocks a product. Diagonal best about 1."""
     n, largest = diagonal.shape[-3], diagonal.abs().sum(-1).amax((-1, -2))[..., None, None, None]
     D, U, inverses, couplings = list(diagonal.split(1, -3)), upper.split(1, -3), [], []
     for i, j in _pairs(n):
@@ -59,14 +61,18 @@ def factor(diagonal: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
         if k < n // 2:
             couplings.append(inverses[-1] @ U[k])
             D[k + 1] = D[k + 1] - U[k].mT @ couplings[-1]
-    return torch.cat(inverses, -3), torch.cat(couplings, -3) if couplings else upper
+    return _substituted(inverses, couplings, b), (inverses, couplings)
 
 
 def substitute(factor: tuple[Tensor, Tensor], b: Tensor) -> Tensor:
     """As `block_tridiagonal.substitute`."""
     n = b.shape[-3]
     sizes = [2] * len(_pairs(n)) + [1] * (2 - n % 2)
-    inverses, couplings = factor[0].split(sizes, -3), factor[1].split(sizes[:-1], -3)
+    return _substituted(factor[0].split(sizes, -3), factor[1].split(sizes[:-1], -3), b)
+
+
+def _substituted(inverses, couplings, b: Tensor) -> Tensor:
+    n = b.shape[-3]
     b, ends, k = list(b.split(1, -3)), [], (n - 1) // 2
     for (i, j), Y in zip(_pairs(n), couplings, strict=False):
         ends.append(torch.cat([b[i], b[j]], -3))

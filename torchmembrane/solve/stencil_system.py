@@ -28,16 +28,19 @@ class StencilSystem(nn.Module):
         m, n = grid
         self.count, self.blocks, self.block_size = (m - 2) * (n - 2), (m - 1) // 2, 6 * (n - 2)
         groups = _ways()
+        ways = [way for group in groups for way, _ in group]
         sources = [np.stack([_product_sources(grid, way) for way in group], 1) for group in groups]
         self.sizes = [source.shape for source in sources]
         for name, index in (
             ("neighbours", _neighbours(grid).ravel()),
             ("row_sources", _row_sources(grid).ravel()),
             ("product_sources", np.concatenate([source.ravel() for source in sources])),
-            ("places", _places(grid, [way for group in groups for way, _ in group], free.cpu().numpy(), self.blocks).ravel()),
+            ("places", _places(grid, ways, free.cpu().numpy(), self.blocks).ravel()),
+            ("ends", np.concatenate([_Inner.of(grid).beside(way) for way in ways])),
         ):
             self.register_buffer(name, torch.from_numpy(index.astype(np.int32)))
         self.register_buffer("one", torch.eye(3, dtype=torch.float64))
+        self.register_buffer("fixed", (~free).double()[:, None])
 
     def vector(self, rows: Tensor) -> Tensor:
         """Sum of stencil rows `[B, N, 21, C]`, in the system's order `[B, unknowns, C]`."""
@@ -57,8 +60,9 @@ class StencilSystem(nn.Module):
         """The inner vertices' field `[B, N, 3, ...]` of a vector `[B, unknowns, ...]` in the system's order."""
         return vector[:, : 3 * self.count].unflatten(1, (self.count, 3))
 
-    def matrix(self, products: Tensor, near: Tensor, damping: float = 1e-6) -> tuple[Tensor, Tensor]:
-        """Blocks on the diagonal `[B, blocks, s, s]` and above it `[B, blocks - 1, s, s]`.
+    def matrix(self, products: Tensor, near: Tensor, damping: float = 1e-6) -> tuple[Tensor, Tensor, Tensor]:
+        """Blocks on the diagonal `[B, blocks, s, s]` and above it `[B, blocks - 1, s, s]`, scaled from both sides to a diagonal
+        of 1; by what, `[B, unknowns, 1]`.
 
         Arguments: `products [B, N, 21, 21]` of every stencil row's columns with each other; `near [B, 4, 3, N, 3]`, further
         blocks between the vertices and those at `NEAR` from them; `damping`, a share of the diagonal.
@@ -67,25 +71,30 @@ class StencilSystem(nn.Module):
         parts = chunks.split([prod(size) for size in self.sizes], 1)
         own, beside, *further = (part.unflatten(1, size).sum(1) for part, size in zip(parts, self.sizes, strict=True))
         own = (own + near[:, :1]) * (1 + damping * self.one[:, None])
-        blocks = torch.cat([own, beside + near[:, 1:], *further], 1)
+        scale = (own.diagonal(dim1=2, dim2=4).squeeze(1) + self.fixed).rsqrt()
+        there = scale.index_select(1, self.ends).unflatten(1, (-1, 1, self.count))
+        blocks = torch.cat([own, beside + near[:, 1:], *further], 1) * scale.mT[:, None, :, :, None] * there
         one = self.one.to(blocks).expand(blocks.shape[0], 3, 3)
         entries = torch.cat([blocks.flatten(1, 3), blocks.transpose(2, 4).flatten(1, 3), one], 1)
         s = self.block_size
         matrix = entries.index_select(1, self.places).flatten(1).unflatten(1, (-1, s, s))
-        return matrix.split([self.blocks, self.blocks - 1], 1)
+        return *matrix.split([self.blocks, self.blocks - 1], 1), self.padded(scale.flatten(1)[..., None])
 
-    def factor(self, matrix: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
-        """What `substitute` needs of the matrix: how it is scaled to a diagonal of 1, and its elimination then."""
-        diagonal, upper = matrix
-        scale = diagonal.diagonal(dim1=-2, dim2=-1).rsqrt()[..., None]
-        diagonal, upper = scale * diagonal * scale.mT, scale[:, :-1] * upper * scale[:, 1:].mT
-        return scale, *_elimination().factor(diagonal, upper)
+    def solve(
+        self, matrix: tuple[Tensor, Tensor, Tensor], loads: Tensor, keep=False
+    ) -> tuple[Tensor, tuple[Tensor, ...] | None]:
+        """Solutions `[B, unknowns, C]` for `loads` of that shape; with `keep` also what `substitute` needs to find others."""
+        diagonal, upper, scale = matrix
+        x, factor = _elimination().solve(diagonal, upper, self._in_blocks(scale * loads))
+        return scale * x.flatten(1, 2), (*(torch.cat(blocks, 1) for blocks in factor), scale) if keep else None
 
     def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
-        """Solutions `[B, unknowns, C]` for `loads` of that shape."""
-        scale, *elimination = factor
-        scaled = scale * loads.unflatten(1, (self.blocks, self.block_size))
-        return (scale * _elimination().substitute(elimination, scaled)).flatten(1, 2)
+        """Solutions for other loads, with what `solve` kept."""
+        *elimination, scale = factor
+        return scale * _elimination().substitute(elimination, self._in_blocks(scale * loads)).flatten(1, 2)
+
+    def _in_blocks(self, vector: Tensor) -> Tensor:
+        return vector.unflatten(1, (self.blocks, self.block_size))
 
 
 def _elimination():
@@ -108,6 +117,10 @@ class _Inner(NamedTuple):
         inside = (row >= 0) & (row < self.size[0]) & (column >= 0) & (column < self.size[1])
         return np.where(inside, row * self.size[1] + column, -1)
 
+    def beside(self, way):
+        """The number of every vertex' neighbour on its way; of some vertex where there is none."""
+        return self.at(self.row + way[0], self.column + way[1]).clip(min=0)
+
 
 def _ways() -> list[list[tuple[tuple[int, int], list[tuple[int, int]]]]]:
     """Ways between two vertices of a stencil, none beside its reverse, and the pairs of slots they join, grouped by how many.
@@ -126,9 +139,8 @@ _ZERO = STENCIL.index((-1, -1))  # the first inner vertex's column for this neig
 
 
 def _neighbours(grid) -> np.ndarray:
-    """The inner vertices `[N, 7]` around each; some vertex, whose column is zero, for those on the border."""
-    inner = _Inner.of(grid)
-    return np.stack([inner.at(inner.row + i, inner.column + j).clip(min=0) for i, j in STENCIL], 1)
+    """The inner vertices `[N, 7]` around each."""
+    return np.stack([_Inner.of(grid).beside(way) for way in STENCIL], 1)
 
 
 def _row_sources(grid) -> np.ndarray:
