@@ -115,12 +115,15 @@ class Membrane(nn.Module):
         return F.normalize(self._turns(combined(x, self.around, self.grid) - beyond), dim=-1)
 
     def volume(self, x: Tensor) -> Tensor:
-        """Volume between the surface and the camera centre, `[...]` (eq. 19): `1/6 sum det [x_a, x_b, x_c]`.
+        """Volume between the surface and the camera centre, `[...]` (eq. 19): `1/6 sum det [x_a, x_b, x_c]`, of the two
+        triangles of a quadrilateral `det [a, b - d, c]`.
 
         Positive for outward triangles: vertices run clockwise seen from the origin (the paper says counterclockwise).
         With a fixed rim the apex adds a constant.
         """
-        return (self.volume_gradient(x) * x).sum((-1, -2)) / 3
+        g = x.transpose(-2, -1).unflatten(-1, self.grid)
+        a, b, c, d = g[..., :-1, :-1], g[..., 1:, :-1], g[..., 1:, 1:], g[..., :-1, 1:]
+        return self.outward / 6 * (torch.linalg.cross(a, b - d, dim=-3) * c).sum((-1, -2, -3))
 
     def volume_gradient(self, x: Tensor) -> Tensor:
         """Derivative of `volume` in the vertices, `[..., V, 3]`; the transposed cofactors of eq. 20.
