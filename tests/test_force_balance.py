@@ -10,12 +10,13 @@ from torchmembrane.camera import Camera
 from torchmembrane.cavity import Equilibrium
 from torchmembrane.contact import contact_indicator, contact_points
 from torchmembrane.energy import Sheet
-from torchmembrane.force_balance import CONE, FLOOR, FRICTION, SPARSITY, ForceBalance, Observation, _across
+from torchmembrane.force_balance import CONE, FLOOR, FRICTION, OUTLIER, SPARSITY, TAU, ForceBalance, Observation, _across
 from torchmembrane.membrane import Membrane
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.shapes import spherical_cap
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
+from torchmembrane.solve import block_tridiagonal, matrix_products
 from torchmembrane.stencil import inner
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -297,6 +298,26 @@ def test_four_steps_from_the_frame_before_follow_a_press(pressed, n):
     warm = estimator(origins[None], directions[None], weight, (previous.vertices, previous.pressure))
     rms = lambda u: u.square().sum(-1).mean().sqrt()  # noqa: E731
     assert rms(warm.vertices - cold.vertices) < 0.02 * rms(cold.vertices - estimator.membrane.rest)
+
+
+def test_elimination_by_products_rounds_a_contacts_system_as_cholesky_does(pressed):
+    """Weights of forces a thousandfold apart, in float32."""
+    (origins, directions), *_ = pressed
+    estimator = make(33)
+    weight = torch.ones(1, len(directions), dtype=torch.float64)
+    seen = estimator.observation(origins[None], directions[None], weight)
+    found = estimator(origins[None], directions[None], weight)
+    at = estimator.linearised(found.vertices, found.pressure)
+    angle, sight = estimator.angles(found.vertices, seen)
+    W = estimator.force_weights(at.normal, at.force, TAU[1])
+    normal = estimator.normal_equations(at, W, sight, estimator.marker_weights_at(angle, seen, OUTLIER))
+    loads, _ = estimator.loads(normal, at, W, angle)
+    diagonal, upper, scale = estimator.matrix(normal)
+    b = (scale * loads).unflatten(1, diagonal.shape[1:3])
+    exact, _ = block_tridiagonal.solve(diagonal, upper, b)
+    error = lambda x: (x - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))  # noqa: E731
+    single = [a.float() for a in (diagonal, upper, b)]
+    assert (error(matrix_products.solve(*single)[0]) < 10 * error(block_tridiagonal.solve(*single)[0])).all()
 
 
 def test_batch_equals_singles_and_lost_markers_have_no_say(pressed):

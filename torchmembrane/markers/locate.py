@@ -65,7 +65,7 @@ def solve_positive(system):
     n = system.shape[0]
     unit = torch.eye(n, dtype=system.dtype, device=system.device).reshape(n, n, *(1,) * (system.ndim - 2))
     for i in range(n):
-        column, rest = system[:, :1], system[:, 1:]
+        column, rest = system.split([1, system.shape[1] - 1], 1)
         system = rest - (column - unit[:, i : i + 1]) * (rest[i : i + 1] / column[i : i + 1])
     return system[:, 0]
 

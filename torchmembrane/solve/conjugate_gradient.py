@@ -23,7 +23,7 @@ def conjugate_gradient(
     tiny = torch.finfo(b.dtype).tiny
     ratio = lambda p, q: p / q.clamp_min(tiny)  # noqa: E731
     dot = lambda p, q: (p * q).sum(-2, keepdim=True)  # noqa: E731
-    x, residual = torch.zeros_like(b), b
+    x, residual = 0, b
     z = precondition(residual)
     direction, rho = z, dot(residual, z)
     for _ in range(steps):

@@ -22,42 +22,42 @@ def schulz_scales(condition: float, rounding: float) -> list[float]:
     return [*scales, 1.0]
 
 
-def inverse(matrix: Tensor, largest: Tensor) -> Tensor:
+def inverse(matrix: Tensor) -> Tensor:
     """Inverse of symmetric positive definite `[..., n, n]`, best with a diagonal of about 1.
 
-    `largest [..., 1, 1]`: bound of its eigenvalues. Wrong when they go down to `LARGEST_CONDITION` times less in a leaf: the
-    smallest are then too small in the inverse.
+    Wrong when a leaf's condition exceeds `LARGEST_CONDITION`: its smallest eigenvalues are then too small in the inverse.
     """
     n = matrix.shape[-1]
     if n > LEAF:
         k = n // 2
         A, B, C = matrix[..., :k, :k], matrix[..., :k, k:], matrix[..., k:, k:]
-        P = inverse(A, largest)
+        P = inverse(A)
         PB = P @ B
-        Q = inverse(C - B.mT @ PB, largest)
+        Q = inverse(C - B.mT @ PB)
         R = PB @ Q
         return torch.cat([torch.cat([P + R @ PB.mT, -R], -1), torch.cat([-R.mT, Q], -1)], -2)
     two = 2 * torch.eye(n, dtype=matrix.dtype, device=matrix.device)
+    largest = matrix.abs().sum(-1).amax(-1)[..., None, None]
     first, *scales = schulz_scales(LARGEST_CONDITION, torch.finfo(matrix.dtype).eps)
     X = (first / largest) * (two - (first / largest) * matrix)
     for scale in scales:
         X = scale * X
         X = X @ (two - matrix @ X)
-    return X
+    return (X + X.mT) / 2
 
 
 def solve(diagonal: Tensor, upper: Tensor, b: Tensor) -> tuple[Tensor, Factor]:
     """As `block_tridiagonal.solve`; eliminated from both ends at once, two blocks a product. Diagonal best about 1."""
-    n, largest = diagonal.shape[-3], diagonal.abs().sum(-1).amax((-1, -2))[..., None, None, None]
+    n = diagonal.shape[-3]
     D, U, inverses, couplings = list(diagonal.split(1, -3)), upper.split(1, -3), [], []
     for i, j in _pairs(n):
         coupled = torch.cat([U[i], U[j - 1].mT], -3)
-        inverses.append(inverse(torch.cat([D[i], D[j]], -3), largest))
+        inverses.append(inverse(torch.cat([D[i], D[j]], -3)))
         couplings.append(inverses[-1] @ coupled)
         for k, change in zip((i + 1, j - 1), (coupled.mT @ couplings[-1]).split(1, -3), strict=True):
             D[k] = D[k] - change
     for k in range((n - 1) // 2, n // 2 + 1):
-        inverses.append(inverse(D[k], largest))
+        inverses.append(inverse(D[k]))
         if k < n // 2:
             couplings.append(inverses[-1] @ U[k])
             D[k + 1] = D[k + 1] - U[k].mT @ couplings[-1]
