@@ -203,7 +203,8 @@ class ForceBalance(nn.Module):
         factor = None
         for tau, outlier in schedule:
             before, scales = x, (x.new_tensor(tau), x.new_tensor(outlier))
-            x, pressure, factor = self._compiled_once(x, pressure, seen, *scales, factor, one_factor)
+            x, pressure, kept = self._compiled_once(x, pressure, seen, *scales, factor, one_factor)
+            factor = factor or kept
         return self.equilibrium(x, pressure, before)
 
     def equilibrium(self, x: Tensor, pressure: Tensor, before: Tensor) -> Equilibrium:
@@ -253,7 +254,7 @@ class ForceBalance(nn.Module):
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...] | None]:
         """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped.
 
-        With `keep` also returns the factor of its matrix, with which, as `factor`, a step near this one needs none of its own.
+        With `keep` also returns the factor of its matrix, if it made one; with that as `factor` a step near this one makes none.
         """
         at = self.linearised(x, pressure)
         W = self.force_weights(at.normal, at.force, tau)
@@ -261,8 +262,9 @@ class ForceBalance(nn.Module):
         weight = self.marker_weights_at(angle, seen, outlier)
         normal = self.normal_equations(at, W, sight, weight)
         loads, of_fluid = self.loads(normal, at, W, angle)
+        kept = None
         if factor is None:
-            y, factor = self.system.solve(self.matrix(normal), loads, keep)
+            y, kept = self.system.solve(self.matrix(normal), loads, keep)
         else:
             y = conjugate_gradient(
                 lambda u: self.product(normal, u), lambda r: self.system.substitute(factor, r), loads, CONJUGATE_STEPS
@@ -271,7 +273,7 @@ class ForceBalance(nn.Module):
         move = self.system.field(move)
         longest = torch.linalg.vector_norm(move, dim=-1).amax(-1)
         share = (LONGEST_STEP * self.size / longest.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1.0)
-        return x + bordered(share[:, None, None] * move, self.membrane.grid), pressure + share * rise, factor
+        return x + bordered(share[:, None, None] * move, self.membrane.grid), pressure + share * rise, kept
 
     def normal_equations(self, at: "Linearised", W: Tensor, sight: Tensor, weight: Tensor) -> NormalEquations:
         """Of forces weighted by `W [B, N, 3, 3]` and angles by `weight [B, D]`, `sight` being these angles' slope."""
@@ -280,7 +282,7 @@ class ForceBalance(nn.Module):
     def loads(self, normal: NormalEquations, at: "Linearised", W: Tensor, angle: Tensor):
         """`v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, unknowns, 3]`; `f^T W v` and `v^T W v`, `[B]`."""
         push = self.system.vector(normal.weighted_slope.mT @ F.pad(torch.stack([at.force, -at.volume], -1), (1, 0)))
-        pull = self.vertex_shares.mT @ (normal.weighted_sight.mT @ angle[..., None]).squeeze(-1)
+        pull = self.vertex_shares.transpose(0, 1) @ (normal.weighted_sight.mT @ angle[..., None]).squeeze(-1)
         own = F.pad(torch.stack([at.volume, pull], -1), (0, 1)).flatten(1, 2)
         of_fluid = ((W @ at.volume[..., None]) * torch.stack([at.force, at.volume], -1)).sum((1, 2)).unbind(-1)
         return push + self.system.padded(own), of_fluid
@@ -297,7 +299,7 @@ class ForceBalance(nn.Module):
         of_forces = self.system.vector(normal.slope.mT @ (normal.weighted_slope @ self.system.rows(u)))
         at_markers = (self.vertex_shares @ self.system.field(u).flatten(2)).unflatten(-1, (3, -1))
         pulls = normal.sight.mT @ (normal.weighted_sight @ at_markers)
-        of_markers = (self.vertex_shares.mT @ pulls.flatten(2)).unflatten(-1, (3, -1)).flatten(1, 2)
+        of_markers = (self.vertex_shares.transpose(0, 1) @ pulls.flatten(2)).unflatten(-1, (3, -1)).flatten(1, 2)
         return of_forces + self.system.padded(of_markers)
 
     def force_weights(self, normal: Tensor, force: Tensor, tau: float, curvature=False) -> Tensor:

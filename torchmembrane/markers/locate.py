@@ -351,8 +351,8 @@ def draw(pixels, shapes, image_size):
 class DotLocator(nn.Module):
     """Pixels of the pattern's dots in each frame of a batch, with a confidence.
 
-    Blobs at the pattern's scales, matched along the smooth flow inwards from the rim, then a least-squares fit of a
-    blurred ellipse on sloping background. A lost dot has confidence 0 and its predicted pixel.
+    Blobs at the pattern's scales, matched from where the dots were or else along the smooth flow inwards from the rim, then
+    a least-squares fit of a blurred ellipse on sloping background. A lost dot has confidence 0 and its predicted pixel.
 
     pattern: `DotPattern`, the markers in the rest image; image_size: width, height; polarity: "dark" or "light";
     anchors: `[A, 2]` pixels of the rim, where nothing moves, closer together than the dots; without them the pattern's

@@ -244,10 +244,11 @@ class Coherence(nn.Module):
 class DotMatcher(nn.Module):
     """Assigns blobs of a frame to the dots of the rest image.
 
-    The flow is smooth and, where `anchors` are given, zero at them. Starting there, each of a fixed number of steps
-    predicts every dot from the sure nodes around it and the local deformation, takes the blob nearest to the prediction
-    and of its size, and keeps it where the choice is mutual. Without anchors each part of the pattern in turn is held
-    to have moved least, and the start that matches most is kept.
+    The flow is smooth and, where `anchors` are given, zero at them. Dots are followed from where they were, or else, where
+    one cannot be, searched for from the anchors on: each of a fixed number of steps predicts every dot from the sure nodes
+    around it and the local deformation, takes the blob nearest to the prediction and of its size, and keeps it where the
+    choice is mutual. Without anchors each part of the pattern in turn is held to have moved least, and the start that
+    matches most is kept.
     """
 
     def __init__(self, pixels, log_radius, size_tolerance, anchors=None):
