@@ -254,7 +254,7 @@ class ForceBalance(nn.Module):
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...] | None]:
         """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped.
 
-        With `keep` also returns the factor of its matrix, if it made one; with that as `factor` a step near this one makes none.
+        With `keep` also returns the factor of its matrix if it made one; with that as `factor` a step near this one makes none.
         """
         at = self.linearised(x, pressure)
         W = self.force_weights(at.normal, at.force, tau)
