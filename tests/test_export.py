@@ -152,6 +152,19 @@ def test_minimum_energy_agrees_with_torch(folder):
         np.testing.assert_allclose(found, expected[:batch].numpy(), rtol=0, atol=1e-4)
 
 
+def test_what_runs_unless_a_condition_holds_runs_only_then():
+    tracer, none = export.Tracer(), nn.Module()
+    tracer.given("x", torch.ones(2, 3))
+    tracer.piece(none, lambda _, x: ((x > 0).all(), 2 * x), ["x"], ["positive", "y"])
+    with tracer.unless("positive", ["y"]):
+        tracer.piece(none, lambda _, y: (y - 1,), ["y"], ["y"])
+    tracer.assembly.named(tracer.names["y"], "result")
+    value = lambda name: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", 3])  # noqa: E731
+    session = opened(tracer.assembly.model([value("x")], [value("result")], {}).SerializeToString())
+    for x in (np.ones((3, 3), np.float32), -np.ones((1, 3), np.float32)):
+        np.testing.assert_array_equal(session.run(None, {"x": x})[0], 2 * x if (x > 0).all() else 2 * x - 1)
+
+
 def test_minimum_energy_does_not_track(folder, tmp_path):
     reconstructor = Reconstructor.from_file(folder / "sensor.toml", estimator="minimum-energy")
     with pytest.raises(MembraneError, match="starts from rest always"):

@@ -27,15 +27,14 @@ def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, size: f
     """
     distance2 = ((rest[:, None] - rest) ** 2).sum(-1)
     near = torch.exp(-distance2 / (2 * (PATCH * size) ** 2))
-    remains = 1 - torch.exp(-distance2 / (2 * (2 * PATCH * size) ** 2))
     load, points, strengths = inward_force, [], []
     for _ in range(count):
-        peak = (load @ near).argmax(-1)
-        weight = load * near[peak]
+        patch = near[(load @ near).argmax(-1)]
+        weight = load * patch
         strength = weight.sum(-1, keepdim=True)
         points.append((weight[..., None] * vertices).sum(1) / strength.clamp_min(torch.finfo(load.dtype).tiny))
         strengths.append(strength)
-        load = load * remains[peak]
+        load = load * (1 - patch.sqrt().sqrt())  # a Gaussian twice as wide
     points, strengths = torch.stack(points, 1), torch.stack(strengths, 1)
     present = (strengths > LEAST * strengths[:, :1]) & (strengths > 0)
     return torch.where(present, points, torch.nan)

@@ -94,7 +94,7 @@ class EllipseFit(nn.Module):
         offset = offset[:, np.hypot(*offset) <= half + 0.5]
         sparse = (offset % 2 == 0).all(0)
         offset = offset[:, np.argsort(~sparse, kind="stable")]
-        self.steps, self.size_tolerance, self.half = steps, size_tolerance, half
+        self.size_tolerance, self.half = size_tolerance, half
         self.counts = [int(sparse.sum())] + [len(sparse)] * (steps - 1)
         self.levels = [(int(k), torch.as_tensor(np.flatnonzero(level == k))) for k in np.unique(level)]
         order = np.concatenate([dots for _, dots in self.levels])
