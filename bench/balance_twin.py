@@ -8,7 +8,7 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import splu
 
-from torchmembrane.force_balance import LONGEST_STEP, ForceBalance, Observation, _across
+from torchmembrane.force_balance import LONGEST_STEP, ForceBalance
 from torchmembrane.membrane import corners, triangles_of
 from torchmembrane.stencil import bordered, inner
 
@@ -28,7 +28,8 @@ class BalanceTwin:
         index = torch.arange(grid[0] * grid[1])[:, None]
         triangle = dofs(triangles_of(corners(index, grid)).reshape(-1, 3).numpy())
         self.row, self.column = np.repeat(triangle, 9, 1).ravel(), np.tile(triangle, (1, 9)).ravel()
-        marker = dofs(estimator.marker_vertices.numpy())
+        points = estimator.membrane.closest_points(estimator.positions.numpy())
+        self.marker_weights, marker = points.weights, dofs(points.vertices)
         self.marker_row = np.repeat(np.arange(2 * len(marker)), 9)
         self.marker_column = np.repeat(marker, 2, 0).ravel()
         self.free = dofs(estimator.membrane.free.numpy()[:, None]).ravel()
@@ -36,7 +37,7 @@ class BalanceTwin:
 
     def __call__(self, origins, directions, weight) -> tuple[np.ndarray, float]:
         e = self.estimator
-        seen = Observation(origins[None], _across(directions[None]), weight[None] / e.noise**2)
+        seen = e.observation(origins[None], directions[None], weight[None])
         if self.coarse is None:
             x, pressure = e.at_rest(weight[None])
         else:
@@ -49,16 +50,16 @@ class BalanceTwin:
     def step(self, x, pressure, seen, tau, outlier):
         e, free, count = self.estimator, self.free, self.count
         force = e.contact_force(x, pressure)
-        inner_weights = e.force_weights(*(inner(field, e.membrane.grid) for field in (e.membrane.normals(x), force)), tau)
-        weights = bordered(inner_weights.flatten(-2), e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
+        inner_weights = e.force_weights(*(inner(field, e.membrane.grid).mT for field in (e.membrane.normals(x), force)), tau)
+        weights = bordered(inner_weights.flatten(1, 2).mT, e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
         blocks = e.sheet.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)
         angle, slope = e.angles(x, seen)
-        slope = slope[..., None, :] * e.marker_weights[:, None, :, None]
+        slope = slope.movedim(-1, 1).numpy()[..., None, :] * self.marker_weights[:, None, :, None]
         certainty = np.repeat(e.marker_weights_at(angle, seen, outlier)[0].numpy(), 2)
         v = (e.membrane.volume_gradient(x) * e.moves)[0].numpy().ravel()
-        f, r = force[0].numpy().ravel(), angle[0].numpy().ravel()
+        f, r = force[0].numpy().ravel(), angle[0].mT.numpy().ravel()
         A = sparse.csr_matrix((blocks.numpy().ravel(), (self.row, self.column)), shape=(count, count))[free][:, free]
-        J = sparse.csr_matrix((slope.numpy().ravel(), (self.marker_row, self.marker_column)), shape=(len(r), count))[:, free]
+        J = sparse.csr_matrix((slope.ravel(), (self.marker_row, self.marker_column)), shape=(len(r), count))[:, free]
         W = sparse.bsr_matrix((weights, np.arange(count // 3), np.arange(count // 3 + 1))).tocsr()[free][:, free]
         AW, Jw = A.T @ W, J.T @ sparse.diags(certainty)
         M = AW @ A + Jw @ J

@@ -52,7 +52,7 @@ def turns(estimator, camera, pixels, vertices):
     """How the rays to the markers turn by one standard deviation of the pixels, by the camera's inverse: `[B, D, 2, 3]`."""
     place = estimator.markers(vertices)
     origins, directions = camera.pixel_to_ray(pixels)
-    across = _across(directions)
+    across = _across(directions.mT).movedim(-1, 1)
     step = 1e-5
     moved = camera.point_to_pixel(place[..., None, :] + step * across) - camera.point_to_pixel(place)[..., None, :]
     distance = torch.linalg.vector_norm(place - origins, dim=-1)[..., None, None]

@@ -58,16 +58,22 @@ def bent(membrane, batch=1, size=0.05):
     )
 
 
-def dense(matrix):
-    """The dense matrices `[B, n s, n s]` of scaled blocks on and above the diagonal, and their scale."""
-    diagonal, above, scale = matrix
-    blocks, s = diagonal.shape[1:3]
-    full = diagonal.new_zeros(len(diagonal), blocks, s, blocks, s)
-    for i in range(blocks):
-        full[:, i, :, i] = diagonal[:, i]
-    for i in range(blocks - 1):
-        full[:, i, :, i + 1], full[:, i + 1, :, i] = above[:, i], above[:, i].mT
-    return full.flatten(3).flatten(1, 2) / (scale * scale.mT)
+def dense(system, matrix):
+    """The dense matrix `[3 N, 3 N]` of one frame's scaled blocks on and beside the diagonal."""
+    diagonal, beside, scale = (a[0] for a in matrix)
+    blocks, s = diagonal.shape[:2]
+    full = diagonal.new_zeros(blocks, s, blocks, s)
+    for k, block in zip(block_tridiagonal.inwards(blocks), diagonal, strict=True):
+        full[k, :, k] = block
+    for (k, further_in), block in zip(block_tridiagonal.coupled(blocks), beside, strict=True):
+        full[k, :, further_in], full[further_in, :, k] = block, block.mT
+    places = system.in_blocks(torch.eye(scale.shape[1], dtype=scale.dtype)[None])[0][system.place].movedim(0, 1).flatten(1)
+    return places @ full.flatten(2).flatten(0, 1) @ places.T / (scale * scale.T)
+
+
+def by_component(values):
+    """Rows over vertices and components, `[..., N 3]`, as the system has them, `[..., 3 N]`."""
+    return values.unflatten(-1, (-1, 3)).mT.flatten(-2)
 
 
 def slopes_at_inner_vertices(function, x, estimator):
@@ -82,13 +88,14 @@ def test_linearised_force_and_volume_are_those_and_their_derivatives():
     x, p = bent(membrane), torch.tensor([0.3], dtype=torch.float64)
     at = estimator.linearised(x, p)
     within = lambda field: inner(field, membrane.grid)  # noqa: E731
-    torch.testing.assert_close(at.force, within(estimator.contact_force(x, p)))
-    torch.testing.assert_close(at.volume, within(membrane.volume_gradient(x)))
-    torch.testing.assert_close(at.normal, within(membrane.normals(x)))
-    exact = slopes_at_inner_vertices(lambda y: within(estimator.contact_force(y, p)), x, estimator)
-    rows, count = at.slope[0].mT, len(at.slope[0])
-    alone = torch.eye(count, dtype=torch.float64)[:, None, :, None] * rows[:, :, None]  # a force, with all others' zero
-    torch.testing.assert_close(estimator.system.vector(alone.flatten(2)[None])[0, : exact.shape[1]].T, exact)
+    torch.testing.assert_close(at.force.mT, within(estimator.contact_force(x, p)))
+    torch.testing.assert_close(at.volume.mT, within(membrane.volume_gradient(x)))
+    torch.testing.assert_close(at.normal.mT, within(membrane.normals(x)))
+    exact = by_component(slopes_at_inner_vertices(lambda y: within(estimator.contact_force(y, p)).mT, x, estimator))
+    single_moves = torch.eye(len(exact), dtype=torch.float64).unflatten(-1, (3, -1))[None]
+    slope = estimator.along(at.slope, single_moves).flatten(2)[0].T
+    torch.testing.assert_close(slope, exact)
+    torch.testing.assert_close(slope, slope.T)
 
 
 @pytest.mark.parametrize("hole", [False, True])
@@ -102,62 +109,61 @@ def test_normal_equations_are_those_of_the_dense_slopes(hole):
     estimator = ForceBalance(dome, Sheet(dome, prestretch=1.3), dome.closest_points(positions.numpy()), positions, 0.1 / 168)
     x, p = bent(dome), torch.tensor([0.3], dtype=torch.float64)
     directions = torch.nn.functional.normalize(positions + 0.3, dim=-1)[None]
-    seen = Observation(0.1 * directions, _across(directions), torch.ones(1, len(positions), dtype=torch.float64))
+    seen = Observation(0.1 * directions.mT, _across(directions.mT), torch.ones(1, len(positions), dtype=torch.float64))
     at = estimator.linearised(x, p)
     angle, slope = estimator.angles(x, seen)
     generator = torch.Generator().manual_seed(3)
-    weight = torch.rand(angle.shape[:2], generator=generator, dtype=torch.float64)
-    root = torch.rand(1, len(at.force[0]), 3, 3, generator=generator, dtype=torch.float64)
-    W = root @ root.mT
+    weight = torch.rand(1, len(positions), generator=generator, dtype=torch.float64)
+    root = torch.rand(1, at.force.shape[-1], 3, 3, generator=generator, dtype=torch.float64)
+    W = (root @ root.mT).movedim(1, -1)
     normal = estimator.normal_equations(at, W, slope, weight)
-    loads, (fWv, vWv) = estimator.loads(normal, at, W, angle)
-    matrix, (volume, load, push) = estimator.matrix(normal), loads.unbind(-1)
+    loads, (fWv, vWv) = estimator.loads(normal, at, angle)
+    matrix, (volume, load, push) = estimator.matrix(normal), loads.unbind(1)
 
-    moving = estimator.free.repeat_interleave(3) > 0
-    A = slopes_at_inner_vertices(lambda y: inner(estimator.contact_force(y, p), dome.grid), x, estimator)[:, moving]
-    J = slopes_at_inner_vertices(lambda y: estimator.angles(y, seen)[0], x, estimator)[:, moving]
-    W = torch.block_diag(*W[0])
-    w = torch.diag(weight[0].repeat_interleave(2))
-    unknowns = torch.nonzero(estimator.system.padded(moving.double()[None, :, None])[0, :, 0]).ravel()
-    M = dense(matrix)[0][unknowns[:, None], unknowns]
+    moving = estimator.free.repeat(3) > 0
+    unknowns = torch.nonzero(moving).ravel()
+    A = slopes_at_inner_vertices(lambda y: inner(estimator.contact_force(y, p), dome.grid).mT, x, estimator)
+    J = slopes_at_inner_vertices(lambda y: estimator.angles(y, seen)[0], x, estimator)
+    A, J = (by_component(rows)[:, unknowns] for rows in (A, J))
+    W = torch.diag_embed(W[0]).movedim(2, 1).flatten(2).flatten(0, 1)
+    w = torch.diag(weight[0].repeat(2))
+    M = dense(estimator.system, matrix)[unknowns[:, None], unknowns]
     torch.testing.assert_close(M, (A.T @ W @ A + J.T @ w @ J) * (1 + 1e-6 * torch.eye(len(M))))
     f, v = at.force.flatten(), at.volume.flatten()
     torch.testing.assert_close(load[0, unknowns], A.T @ W @ f + J.T @ w @ angle.flatten())
     torch.testing.assert_close(push[0, unknowns], -A.T @ W @ v)
     torch.testing.assert_close(torch.stack([fWv, vWv], -1)[0], torch.stack([f @ W @ v, v @ W @ v]))
     torch.testing.assert_close(volume[0, unknowns], v[moving])
-    solved, factor = estimator.system.solve(matrix, loads, keep=True)
-    torch.testing.assert_close(estimator.system.substitute(factor, loads), solved)
-    solved = solved[0]
-    torch.testing.assert_close(solved[unknowns], torch.linalg.solve(M, loads[0, unknowns]))
+    solved = estimator.system.substitute(estimator.system.factor(matrix), loads)[0].T
+    torch.testing.assert_close(solved[unknowns], torch.linalg.solve(M, loads[0].T[unknowns]))
     assert (solved.count_nonzero(0) == len(unknowns)).all()
     moved = torch.zeros_like(loads)
-    moved[0, unknowns] = torch.rand(len(unknowns), 3, generator=generator, dtype=torch.float64)
-    product = estimator.product(normal, moved)[0]
-    torch.testing.assert_close(product[unknowns], (A.T @ W @ A + J.T @ w @ J) @ moved[0, unknowns])
+    moved[..., unknowns] = torch.rand(3, len(unknowns), generator=generator, dtype=torch.float64)
+    product = estimator.product(normal, moved)[0].T
+    torch.testing.assert_close(product[unknowns], (A.T @ W @ A + J.T @ w @ J) @ moved[0].T[unknowns])
     assert (product.count_nonzero(0) == len(unknowns)).all()
 
 
 def test_marker_slopes_are_the_derivative_of_the_angles():
     estimator = make(7)
     directions = torch.nn.functional.normalize(estimator.positions + 0.3, dim=-1)[None]
-    seen = Observation(0.1 * directions, _across(directions), torch.ones(1, len(directions[0]), dtype=torch.float64))
+    seen = Observation(0.1 * directions.mT, _across(directions.mT), torch.ones(1, len(directions[0]), dtype=torch.float64))
     x = bent(estimator.membrane)
     _, slope = estimator.angles(x, seen)
     exact = torch.autograd.functional.jacobian(lambda y: estimator.angles(y, seen)[0], x)[0, :, :, 0]
-    for d in (0, 17, 60):
-        shares = estimator.marker_weights[d][:, None]
-        torch.testing.assert_close(shares * slope[0, d][:, None], exact[d][:, estimator.marker_vertices[d]])
+    expected = torch.einsum("acd,dn->adnc", slope[0], estimator.vertex_shares)
+    torch.testing.assert_close(inner(exact, estimator.membrane.grid), expected)
 
 
 def test_angles_vanish_on_the_rays_and_grow_with_the_distance_across():
     estimator = make(7)
     y = estimator.positions
     directions = torch.nn.functional.normalize(y, dim=-1)[None]
-    seen = Observation(torch.zeros_like(directions), _across(directions), torch.ones(1, len(y), dtype=torch.float64))
+    seen = Observation(torch.zeros_like(directions.mT), _across(directions.mT), torch.ones(1, len(y), dtype=torch.float64))
     angle, _ = estimator.angles(estimator.membrane.rest[None], seen)
     assert angle.abs().max() < 1e-12
-    identity = seen.across @ seen.across.mT
+    across = seen.across.movedim(-1, 1)
+    identity = across @ across.mT
     torch.testing.assert_close(identity, torch.eye(2, dtype=torch.float64).expand_as(identity))
 
 
@@ -222,7 +228,7 @@ def patch_of_pushes(estimator, push, pull_elsewhere=0.0, rub=0.0):
 def prices(estimator, force, tau=0.5):
     """Weight of the normal and of one tangential direction at every inner vertex, over that of a small push."""
     _, normal = at_rest(estimator)
-    W = estimator.force_weights(normal, force, tau)[0]
+    W = estimator.force_weights(normal.mT, force.mT, tau)[0].movedim(-1, 0)
     along = torch.nn.functional.normalize(along_y(normal), dim=-1)
     scale = SPARSITY / (estimator.reference * estimator.size) ** 2 / estimator.area
     return tuple((d[:, None] @ W @ d[..., None]).ravel() / scale for d in (normal, along))
@@ -311,13 +317,14 @@ def test_elimination_by_products_rounds_a_contacts_system_as_cholesky_does(press
     angle, sight = estimator.angles(found.vertices, seen)
     W = estimator.force_weights(at.normal, at.force, TAU[1])
     normal = estimator.normal_equations(at, W, sight, estimator.marker_weights_at(angle, seen, OUTLIER))
-    loads, _ = estimator.loads(normal, at, W, angle)
-    diagonal, upper, scale = estimator.matrix(normal)
-    b = (scale * loads).unflatten(1, diagonal.shape[1:3])
-    exact, _ = block_tridiagonal.solve(diagonal, upper, b)
-    error = lambda x: (x - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))  # noqa: E731
-    single = [a.float() for a in (diagonal, upper, b)]
-    assert (error(matrix_products.solve(*single)[0]) < 10 * error(block_tridiagonal.solve(*single)[0])).all()
+    loads, _ = estimator.loads(normal, at, angle)
+    *blocks, scale = estimator.matrix(normal)
+    b = estimator.system.in_blocks(scale * loads)
+    solved = lambda kind, *given: kind.substitute(kind.factor(*given[:2]), given[2])  # noqa: E731
+    exact = solved(block_tridiagonal, *blocks, b)
+    error = lambda x: (x - exact).norm(dim=(1, 3)) / exact.norm(dim=(1, 3))  # noqa: E731
+    single = [a.float() for a in (*blocks, b)]
+    assert (error(solved(matrix_products, *single)) < 10 * error(solved(block_tridiagonal, *single))).all()
 
 
 def test_batch_equals_singles_and_lost_markers_have_no_say(pressed):
@@ -391,7 +398,7 @@ def test_price_of_normal_tractions_has_the_slope_that_the_weights_say(monkeypatc
     price = estimator.price(rest, *(a[None] for a in rays), torch.ones(1, len(estimator.positions), dtype=torch.float64))
     (slope,) = torch.autograd.grad(price.sum(), traction)
     force, normal = within(traction.detach() * membrane.rest_area[:, None]), within(membrane.rest_normals)
-    W = estimator.force_weights(normal, force, 0.4)
+    W = estimator.force_weights(normal.mT, force.mT, 0.4).movedim(-1, 1)
     expected = estimator.area[:, None] * (W @ force[..., None]).squeeze(-1)
     along = lambda field: (field * normal).sum(-1)  # noqa: E731
     assert torch.allclose(along(within(slope)), along(expected), rtol=1e-6, atol=1e-9)

@@ -40,19 +40,19 @@ def standard_deviations(
     angle, sight = estimator.angles(x, seen)
     weight = estimator.marker_weights_at(angle, seen, outlier)
     normal = estimator.normal_equations(at, W, sight, weight)
-    loads, (_, c) = estimator.loads(normal, at, W, angle)
-    borders = loads[..., [2, 0]]
-    turns = noise @ seen.across.mT @ normal.weighted_sight
-    g = torch.einsum("bdrc,dn->bncdr", turns, estimator.vertex_shares).flatten(3).flatten(1, 2)
-    y, _ = system.solve(estimator.matrix(normal), torch.cat([system.padded(g), borders], -1))
-    dx, dp = y[..., :-2], torch.zeros_like(g[:, 0])
+    loads, (_, c) = estimator.loads(normal, at, angle)
+    borders = loads[:, [2, 0]]
+    turns = torch.einsum("bdrj,bajd,bacd->bdrc", noise, seen.across, normal.weighted_sight)
+    g = torch.einsum("bdrc,dn->bdrcn", turns, estimator.vertex_shares).flatten(3).flatten(1, 2)
+    y = system.substitute(system.factor(estimator.matrix(normal)), torch.cat([g, borders], 1))
+    dx, dp = y[:, :-2], torch.zeros_like(g[..., 0])
     if estimator.cavity.filling != "open":
-        border = y[..., -2:]
+        border = y[:, -2:]
         _, compliance = estimator.cavity.condition(membrane.volume(x) - membrane.rest_volume, pressure)
-        corner = torch.diag_embed(torch.stack([c, compliance], -1)) - borders.mT @ border
-        rise = torch.linalg.solve(corner, -borders.mT @ dx)
-        dx, dp = dx - border @ rise, rise[:, 0]
-    total = system.vector(at.slope.mT)
-    dF = total.mT @ dx - at.volume.sum(1)[..., None] * dp[:, None]
-    spread = lambda change: change.square().sum(-1).sqrt()  # noqa: E731
-    return StandardDeviations(bordered(system.field(spread(dx)), membrane.grid), spread(dF), spread(dp))
+        corner = torch.diag_embed(torch.stack([c, compliance], -1)) - borders @ border.mT
+        rise = torch.linalg.solve(corner, -borders @ dx.mT)
+        dx, dp = dx - rise.mT @ border, rise[:, 0]
+    total = estimator.along(at.slope, torch.eye(3).to(x)[None, ..., None].expand(1, 3, 3, len(estimator.free))).flatten(2)
+    dF = dx @ total.mT - dp[..., None] * at.volume.sum(-1)[:, None]
+    spread = lambda change: change.square().sum(1).sqrt()  # noqa: E731
+    return StandardDeviations(bordered(spread(dx).unflatten(-1, (3, -1)).mT, membrane.grid), spread(dF), spread(dp))

@@ -226,7 +226,7 @@ def descend(tracer: Tracer, estimator: ForceBalance, falls: list[tuple[float, fl
     if one_factor:
         for name, value in zip(("tau", "outlier"), falls[0], strict=True):
             tracer.constant(name, value)
-        factor = ["pivots", "couplings", "scale"]
+        factor = [f"factor {k}" for k in range(2 * (estimator.system.blocks // 2) + 2)]
         tracer.piece(estimator, _first_step, [*state, *seen, "tau", "outlier"], [*state, *factor])
         seen, falls = [*seen, *factor], falls[1:]
     tau, outlier = np.array(falls, np.float32).T.copy()
@@ -241,7 +241,7 @@ def _step(estimator, surface, pressure, before, origins, across, weight, *factor
 
 
 def _first_step(estimator, surface, pressure, before, origins, across, weight, tau, outlier):
-    x, pressure, factor = estimator.step(surface, pressure, Observation(origins, across, weight), tau, outlier, keep=True)
+    x, pressure, factor = estimator.step(surface, pressure, Observation(origins, across, weight), tau, outlier)
     return x, pressure, surface, *factor
 
 

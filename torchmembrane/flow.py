@@ -10,7 +10,7 @@ from .bilinear import bilinear_matrix
 from .energy import Sheet
 from .errors import MembraneError
 from .membrane import Membrane, SurfacePoints, corners, corners_to_vertices
-from .solve.conjugate_gradient import conjugate_gradient, symmetric_product
+from .solve.conjugate_gradient import conjugate_gradient
 
 KINDS = ("smooth", "bilinear")
 SMOOTHING_LENGTH = 0.45
@@ -102,25 +102,20 @@ class FlowInterpolation(nn.Module):
         inverse = torch.zeros(V, V, dtype=torch.float64)
         inverse[free[:, None], free] = torch.linalg.inv(normal)
         at_markers = W @ inverse
-        self.register_buffer("spread", at_markers.T.contiguous())
+        self.register_buffer("spread", at_markers)
         self.register_buffer("influence", at_markers @ W.T)
         if kind == "bilinear":
             self.register_buffer("bilinear", torch.from_numpy(bilinear_matrix(membrane, markers)))
 
     def forward(self, displacement: Tensor, confidence: Tensor) -> Tensor:
-        c = confidence[..., None]
-        H, lost = self.influence, (1 - c).clamp_min(1e-12).sqrt()
+        c, displacement = confidence[..., None, :], displacement.mT
+        H, lost = self.influence, (1 - c).clamp_min(1e-12).sqrt()  # H is symmetric
         told = c * torch.where(c > 0, displacement, 0.0)
-        filled = conjugate_gradient(
-            lambda y: y - lost * symmetric_product(H, lost * y),
-            lambda y: y,
-            lost * symmetric_product(H, told),
-            self.steps,
-        )
+        filled = conjugate_gradient(lambda y: y - lost * ((lost * y) @ H), lambda y: y, lost * (told @ H), self.steps)
         complete = told + lost * filled
-        if self.kind == "smooth":
-            return self.spread @ complete
-        return self.bilinear @ torch.where(c > 0, displacement, symmetric_product(H, complete))
+        if self.kind == "bilinear":
+            return (torch.where(c > 0, displacement, complete @ H) @ self.bilinear.mT).mT
+        return (complete @ self.spread).mT
 
 
 def weights(markers: SurfacePoints, count: int) -> Tensor:

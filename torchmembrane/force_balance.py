@@ -30,7 +30,7 @@ from .energy import Sheet
 from .membrane import Membrane, SurfacePoints
 from .solve.conjugate_gradient import conjugate_gradient
 from .solve.stencil_system import NEAR, StencilSystem
-from .stencil import bordered, combined, inner, ring_edges, taps
+from .stencil import around, bordered, combined, inner, ring_edges, taps
 
 STEPS, COARSE_STEPS, TAU = 8, 4, (4.0, 0.4)  # from rest, and so where a finer grid follows
 FINE_STEPS, FINER_STEPS, FINE_TAU = 5, 4, (0.8, 0.4)  # from the coarsest grid's solution, from a finer one's
@@ -56,7 +56,7 @@ def schedule(steps: int, fall: tuple[float, float]) -> list[tuple[float, float]]
 
 
 class Observation(NamedTuple):
-    """Measured marker rays: `origins [B, D, 3]`, a basis across each ray `[B, D, 2, 3]`, weights over the variance `[B, D]`."""
+    """Measured marker rays: `origins [B, 3, D]`, a basis across each ray `[B, 2, 3, D]`, weights over the variance `[B, D]`."""
 
     origins: Tensor
     across: Tensor
@@ -64,17 +64,19 @@ class Observation(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """`M = A^T W A + J^T w J`: the forces' slope `A [B, N, 3, 21]` and `W A`, the angles' `J [B, D, 2, 3]` and `w J`."""
+    """`M = A^T W A + J^T w J`: the forces' slope `A [B, 3, 3, 7, N]` and weights `W [B, 3, 3, N]`; the angles' weighted slope
+    `w J [B, 2, 3, D]` and `J^T w J [B, 3, 3, D]`, in the markers' positions."""
 
     slope: Tensor
-    weighted_slope: Tensor
-    sight: Tensor
+    weights: Tensor
     weighted_sight: Tensor
+    springs: Tensor
 
 
 class Linearised(NamedTuple):
-    """At the inner vertices: the contact `force [B, N, 3]`, its `slope [B, N, 3, 21]` in its vertices, the gradient of
-    the `volume [B, N, 3]`, the outward `normal [B, N, 3]`. All but the normal zero at, and in, vertices that do not move."""
+    """At the inner vertices: the contact `force [B, 3, N]`, its `slope [B, 3, 3, 7, N]` (of a component, in one, of a vertex of
+    the stencil), the gradient of the `volume [B, 3, N]`, the outward `normal [B, 3, N]`. All but the normal zero at, and in,
+    vertices that do not move. The slope is the Hessian of an energy: symmetric."""
 
     force: Tensor
     slope: Tensor
@@ -110,15 +112,14 @@ class ForceBalance(nn.Module):
         self.register_buffer("rest_load", rest_load)
         self.register_buffer("moves", (~membrane.fixed).double()[:, None])
         self.register_buffer("positions", torch.as_tensor(positions, dtype=torch.float64))
-        self.register_buffer("marker_vertices", torch.as_tensor(markers.vertices).long())
-        self.register_buffer("marker_weights", torch.as_tensor(markers.weights, dtype=torch.float64))
         within = lambda field: inner(field, membrane.grid)  # noqa: E731
         self.register_buffer("area", within(membrane.rest_area[:, None]).squeeze(-1))
         self.register_buffer("free", within(self.moves).squeeze(-1))
         self.register_buffer("edges", ring_edges())
+        self.register_buffer("taps", taps())
         self.register_buffer("free_neighbours", combined(self.moves, taps()[1:], membrane.grid, border=False).reshape(6, -1))
         self.register_buffer("surroundings", within(within(_surroundings(membrane)).mT).mT)
-        vertex_shares, pair_shares = _shares(membrane, self.marker_vertices, self.marker_weights)
+        vertex_shares, pair_shares = _shares(membrane, markers)
         self.register_buffer("vertex_shares", vertex_shares)
         self.register_buffer("pair_shares", pair_shares)
         self.system = StencilSystem(membrane.grid, self.free > 0)
@@ -177,11 +178,11 @@ class ForceBalance(nn.Module):
         presses and where two answers compete; the grid's and the material's errors are not in it.
         """
         seen = self.observation(origins, directions, weight)
-        noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * seen.across
+        noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * seen.across.movedim(-1, 1)
         return standard_deviations(self, equilibrium.vertices, equilibrium.pressure, seen, noise, TAU[1], OUTLIER)
 
     def observation(self, origins: Tensor, directions: Tensor, weight: Tensor) -> Observation:
-        return Observation(origins, _across(directions), weight / self.noise**2)
+        return Observation(origins.mT, _across(directions.mT), weight / self.noise**2)
 
     def at_rest(self, weight: Tensor) -> tuple[Tensor, Tensor]:
         """The rest surface and pressure, for every row of `weight [B, D]`."""
@@ -203,8 +204,8 @@ class ForceBalance(nn.Module):
         factor = None
         for tau, outlier in schedule:
             before, scales = x, (x.new_tensor(tau), x.new_tensor(outlier))
-            x, pressure, kept = self._compiled_once(x, pressure, seen, *scales, factor, one_factor)
-            factor = factor or kept
+            x, pressure, made = self._compiled_once(x, pressure, seen, *scales, factor)
+            factor = (factor or made) if one_factor else None
         return self.equilibrium(x, pressure, before)
 
     def equilibrium(self, x: Tensor, pressure: Tensor, before: Tensor) -> Equilibrium:
@@ -214,9 +215,9 @@ class ForceBalance(nn.Module):
         return Equilibrium(x, pressure, self.membrane.volume(x), traction, moved)
 
     @torch.compiler.nested_compile_region
-    def _compiled_once(self, x: Tensor, pressure: Tensor, seen: Observation, tau: Tensor, outlier: Tensor, factor, keep):
+    def _compiled_once(self, x: Tensor, pressure: Tensor, seen: Observation, tau: Tensor, outlier: Tensor, factor):
         """`step`, which `torch.compile` then traces and compiles once, not once a step."""
-        return self.step(x, pressure, seen, tau, outlier, factor, keep)
+        return self.step(x, pressure, seen, tau, outlier, factor)
 
     def contact_force(self, x: Tensor, pressure: Tensor) -> Tensor:
         """Force that something outside must exert on every free vertex, `[B, V, 3]`."""
@@ -232,100 +233,104 @@ class ForceBalance(nn.Module):
         pull = (stress[:, None] * edges[:, :, 0].unflatten(-1, (6, -1))).sum(2)
         force = pull - inner(self.rest_load, grid).mT - pressure[:, None, None] * gradient
         beside = self.free_neighbours * (sheet_ring - pressure[:, None, None, None, None] * volume_ring)
-        blocks = torch.cat([-sheet_ring.sum(3, keepdim=True), beside], 3) * self.free
-        slope = blocks.permute(0, 4, 1, 3, 2).flatten(-2)
-        return Linearised((force * self.free).mT, slope, (gradient * self.free).mT, F.normalize(gradient, dim=1).mT)
+        slope = torch.cat([-sheet_ring.sum(3, keepdim=True), beside], 3) * self.free
+        return Linearised(force * self.free, slope, gradient * self.free, F.normalize(gradient, dim=1))
 
     def markers(self, x: Tensor) -> Tensor:
         """The markers' positions on the surface `x`, `[B, D, 3]`."""
-        moved = (x - self.membrane.rest).index_select(1, self.marker_vertices.flatten()).unflatten(1, (-1, 3))
-        return self.positions + (self.marker_weights[..., None] * moved).sum(-2)
+        return self.positions + self.vertex_shares @ inner(x - self.membrane.rest, self.membrane.grid)
 
     def angles(self, x: Tensor, seen: Observation) -> tuple[Tensor, Tensor]:
-        """Angles across the measured rays `[B, D, 2]` and their derivatives in the markers' positions `[B, D, 2, 3]`."""
-        to_marker = self.markers(x) - seen.origins
-        distance = torch.linalg.vector_norm(to_marker, dim=-1)[..., None]
-        along = to_marker / distance
-        angle = (seen.across @ along[..., None]).squeeze(-1)
-        return angle, (seen.across - angle[..., None] * along[..., None, :]) / distance[..., None]
+        """Angles across the measured rays `[B, 2, D]` and their derivatives in the markers' positions `[B, 2, 3, D]`."""
+        to_marker = self.markers(x).mT - seen.origins
+        distance = torch.linalg.vector_norm(to_marker, dim=1, keepdim=True)
+        along = (to_marker / distance)[:, None]
+        angle = (seen.across * along).sum(2, keepdim=True)
+        return angle.squeeze(2), (seen.across - angle * along) / distance[:, None]
 
     def step(
-        self, x: Tensor, pressure: Tensor, seen: Observation, tau, outlier, factor: tuple[Tensor, ...] | None = None, keep=False
+        self, x: Tensor, pressure: Tensor, seen: Observation, tau, outlier, factor: tuple[Tensor, ...] | None = None
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...] | None]:
         """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped.
 
-        With `keep` also returns the factor of its matrix if it made one; with that as `factor` a step near this one makes none.
+        Also returns the factor of its matrix if it made one: with the `factor` of a step near this one it makes none.
         """
         at = self.linearised(x, pressure)
         W = self.force_weights(at.normal, at.force, tau)
         angle, sight = self.angles(x, seen)
         weight = self.marker_weights_at(angle, seen, outlier)
         normal = self.normal_equations(at, W, sight, weight)
-        loads, of_fluid = self.loads(normal, at, W, angle)
-        kept = None
+        loads, of_fluid = self.loads(normal, at, angle)
+        made = None
         if factor is None:
-            y, kept = self.system.solve(self.matrix(normal), loads, keep)
+            made = self.system.factor(self.matrix(normal))
+            y = self.system.substitute(made, loads)
         else:
             y = conjugate_gradient(
                 lambda u: self.product(normal, u), lambda r: self.system.substitute(factor, r), loads, CONJUGATE_STEPS
             )
         move, rise = self._bordered(x, pressure, y, loads, of_fluid)
-        move = self.system.field(move)
+        move = move.unflatten(-1, (3, -1)).mT
         longest = torch.linalg.vector_norm(move, dim=-1).amax(-1)
         share = (LONGEST_STEP * self.size / longest.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1.0)
-        return x + bordered(share[:, None, None] * move, self.membrane.grid), pressure + share * rise, kept
+        return x + bordered(share[:, None, None] * move, self.membrane.grid), pressure + share * rise, made
 
     def normal_equations(self, at: "Linearised", W: Tensor, sight: Tensor, weight: Tensor) -> NormalEquations:
-        """Of forces weighted by `W [B, N, 3, 3]` and angles by `weight [B, D]`, `sight` being these angles' slope."""
-        return NormalEquations(at.slope, W @ at.slope, sight, weight[..., None, None] * sight)
+        """Of forces weighted by `W [B, 3, 3, N]` and angles by `weight [B, D]`, `sight` being these angles' slope."""
+        weighted = weight[:, None, None] * sight
+        return NormalEquations(at.slope, W, weighted, (sight[:, :, :, None] * weighted[:, :, None]).sum(1))
 
-    def loads(self, normal: NormalEquations, at: "Linearised", W: Tensor, angle: Tensor):
-        """`v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, unknowns, 3]`; `f^T W v` and `v^T W v`, `[B]`."""
-        push = self.system.vector(normal.weighted_slope.mT @ F.pad(torch.stack([at.force, -at.volume], -1), (1, 0)))
-        pull = self.vertex_shares.transpose(0, 1) @ (normal.weighted_sight.mT @ angle[..., None]).squeeze(-1)
-        own = F.pad(torch.stack([at.volume, pull], -1), (0, 1)).flatten(1, 2)
-        of_fluid = ((W @ at.volume[..., None]) * torch.stack([at.force, at.volume], -1)).sum((1, 2)).unbind(-1)
-        return push + self.system.padded(own), of_fluid
+    def loads(self, normal: NormalEquations, at: "Linearised", angle: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """`v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, 3, 3 N]`; `f^T W v` and `v^T W v`, `[B]`."""
+        W, v = normal.weights, at.volume
+        weighted = torch.stack([_weighed(W, at.force), -_weighed(W, v)], 1)
+        of_forces, of_fluid = self.along(at.slope, weighted).split(1, 1)
+        of_markers = (normal.weighted_sight * angle[:, :, None]).sum(1) @ self.vertex_shares
+        loads = torch.cat([v[:, None], of_forces + of_markers[:, None], of_fluid], 1).flatten(2)
+        return loads, tuple((field * v).sum((1, 2)) for field in (weighted[:, 0], -weighted[:, 1]))
 
     def matrix(self, normal: NormalEquations) -> tuple[Tensor, Tensor, Tensor]:
-        """`M` as `system.solve` takes it."""
-        products = normal.slope.mT @ normal.weighted_slope
-        of_markers = (normal.sight.mT @ normal.weighted_sight).flatten(-2).mT @ self.pair_shares
-        near = of_markers.unflatten(-1, (len(NEAR), -1)).unflatten(1, (3, 3))
-        return self.system.matrix(products, near.permute(0, 3, 1, 4, 2))
+        """`M` as `system.factor` takes it."""
+        A = normal.slope.transpose(2, 3).flatten(2, 3).movedim(-1, 1)
+        near = (normal.springs @ self.pair_shares).unflatten(-1, (len(NEAR), -1)).permute(0, 3, 1, 4, 2)
+        return self.system.matrix(A.mT @ (normal.weights.movedim(-1, 1) @ A), near)
 
     def product(self, normal: NormalEquations, u: Tensor) -> Tensor:
-        """`M u` for `u [B, unknowns, C]`, without the matrix."""
-        of_forces = self.system.vector(normal.slope.mT @ (normal.weighted_slope @ self.system.rows(u)))
-        at_markers = (self.vertex_shares @ self.system.field(u).flatten(2)).unflatten(-1, (3, -1))
-        pulls = normal.sight.mT @ (normal.weighted_sight @ at_markers)
-        of_markers = (self.vertex_shares.transpose(0, 1) @ pulls.flatten(2)).unflatten(-1, (3, -1)).flatten(1, 2)
-        return of_forces + self.system.padded(of_markers)
+        """`M u` for `u [B, C, 3 N]`, without the matrix."""
+        u = u.unflatten(-1, (3, -1))
+        of_forces = self.along(normal.slope, _weighed(normal.weights[:, None], self.along(normal.slope, u)))
+        of_markers = _weighed(normal.springs[:, None], u @ self.vertex_shares.transpose(0, 1)) @ self.vertex_shares
+        return (of_forces + of_markers).flatten(2)
+
+    def along(self, slope: Tensor, move: Tensor) -> Tensor:
+        """How forces change, `A u [B, C, 3, N]`, when the inner vertices make moves `u` of that shape."""
+        moves = around(move, self.taps, self.membrane.grid).flatten(2, 3)
+        return (slope.flatten(2, 3)[:, None] * moves[:, :, None]).sum(3)
 
     def force_weights(self, normal: Tensor, force: Tensor, tau: float, curvature=False) -> Tensor:
-        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, N, 3, 3]`: the parabolas that price a force.
+        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, 3, 3, N]`: the parabolas that price a force.
 
-        Arguments: `normal`, `force [B, N, 3]` of the inner vertices. With `curvature` that of the price of a push itself, zero
+        Arguments: `normal`, `force [B, 3, N]` of the inner vertices. With `curvature` that of the price of a push itself, zero
         where it bends down.
         """
         p0 = self.reference
-        traction = force / self.area[:, None]
-        q_n = (traction * normal).sum(-1)
-        q_t = traction - q_n[..., None] * normal
+        traction = force / self.area
+        q_n = (traction * normal).sum(1)
+        q_t = traction - q_n[:, None] * normal
         push2 = (-q_n / p0).clamp_min(0) ** 2 @ self.surroundings
         ratio = push2 / tau**2
         pushed = (1 - 3 * ratio).clamp_min(0) / (1 + ratio) ** 3 if curvature else (1 + ratio) ** -2
         w_n = FLOOR + torch.where(q_n < 0, pushed, 1.0)
         dearer = FRICTION / (1 + self.cone * (push2 + SLIP**4).sqrt())
-        w_t = dearer * (q_t.square().sum(-1) / p0**2 + SLIP**2).rsqrt()
+        w_t = dearer * (q_t.square().sum(1) / p0**2 + SLIP**2).rsqrt()
         scale = SPARSITY / (p0 * self.size) ** 2 / self.area
-        one = torch.eye(3, dtype=force.dtype, device=force.device)
-        along = (scale * (w_n - w_t))[..., None] * normal
-        return along[..., :, None] * normal[..., None, :] + (scale * w_t)[..., None, None] * one
+        one = torch.eye(3, dtype=force.dtype, device=force.device)[..., None]
+        along = (scale * (w_n - w_t))[:, None] * normal
+        return along[:, :, None] * normal[..., None, :, :] + (scale * w_t)[:, None, None] * one
 
     def price(self, found: Equilibrium, origins: Tensor, directions: Tensor, weight: Tensor) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers (given as to `forward`) and the tractions' price."""
-        seen = Observation(origins, _across(directions), weight / self.noise**2)
+        seen = self.observation(origins, directions, weight)
         x, area, tau, grid = found.vertices, self.area, TAU[-1], self.membrane.grid
         traction, normal = inner(found.traction, grid) / self.reference, inner(self.membrane.normals(x), grid)
         q_n = (traction * normal).sum(-1)
@@ -333,11 +338,11 @@ class ForceBalance(nn.Module):
         push2 = (-q_n).clamp_min(0) ** 2
         kappa = FRICTION / (1 + self.cone * (push2 @ self.surroundings + SLIP**4).sqrt())
         price = push2 / (2 + 2 * push2 / tau**2) + q_n.clamp_min(0) ** 2 / 2 + kappa * ((slip2 + SLIP**2).sqrt() - SLIP)
-        misfit = seen.weight * self.angles(x, seen)[0].square().sum(-1)
+        misfit = seen.weight * self.angles(x, seen)[0].square().sum(1)
         return OUTLIER**2 / 2 * (misfit / OUTLIER**2).log1p().sum(-1) + SPARSITY / self.size**2 * price @ area
 
     def marker_weights_at(self, angle: Tensor, seen: Observation, outlier: float) -> Tensor:
-        return seen.weight / (1 + seen.weight * angle.square().sum(-1) / outlier**2)
+        return seen.weight / (1 + seen.weight * angle.square().sum(1) / outlier**2)
 
     def _bordered(self, x, pressure, y, loads, of_fluid):
         """Step `d` and rise of the pressure: `M d + m dp + n lambda = -g` with the rows of the pressure and of the volume.
@@ -345,24 +350,30 @@ class ForceBalance(nn.Module):
         `loads` are `n, g, m`, and `y` is `M^-1` of them.
         """
         if self.cavity.filling == "open":
-            return -y[..., 1], torch.zeros_like(pressure)
-        (fWv, vWv), products = of_fluid, (loads.mT @ y).flatten(1).unbind(-1)
+            return -y[:, 1], torch.zeros_like(pressure)
+        (fWv, vWv), products = of_fluid, (loads @ y.mT).flatten(1).unbind(-1)
         nMn, nMg, nMm, mMg, mMm = *products[:3], *products[7:]
         target, compliance = self.cavity.condition(self.membrane.volume(x) - self.membrane.rest_volume, pressure)
         a11, a12, a22 = vWv - mMm, compliance - nMm, -nMn
         b1, b2 = fWv + mMg, target + nMg
         det = a11 * a22 - a12 * a12
         rise, multiplier = (b1 * a22 - a12 * b2) / det, (a11 * b2 - a12 * b1) / det
-        step = y @ torch.stack([-multiplier, -torch.ones_like(rise), -rise], -1)[..., None]
-        return step.squeeze(-1), rise
+        volume, load, push = y.unbind(1)
+        return -(multiplier[:, None] * volume + load + rise[:, None] * push), rise
+
+
+def _weighed(blocks: Tensor, field: Tensor) -> Tensor:
+    """Blocks `[..., 3, 3, N]` times a field `[..., 3, N]`."""
+    return (blocks * field[..., None, :, :]).sum(-2)
 
 
 def _across(directions: Tensor) -> Tensor:
-    """Two unit vectors across each unit direction, `[..., 3]` to `[..., 2, 3]`."""
-    x, z = directions.new_tensor([1.0, 0.0, 0.0]), directions.new_tensor([0.0, 0.0, 1.0])
-    least = torch.where(directions[..., 2:].abs() < 0.9, z, x)
-    first = F.normalize(torch.linalg.cross(directions, least), dim=-1)
-    return torch.stack([first, torch.linalg.cross(directions, first)], -2)
+    """Two unit vectors across each unit direction, `[B, 3, D]` to `[B, 2, 3, D]`."""
+    x, y, z = directions.unbind(1)
+    none = torch.zeros_like(x)
+    first = torch.where((z.abs() < 0.9)[:, None], torch.stack([y, -x, none], 1), torch.stack([none, z, -y], 1))
+    first = F.normalize(first, dim=1)
+    return torch.stack([first, torch.linalg.cross(directions, first, dim=1)], 1)
 
 
 def _surroundings(membrane: Membrane) -> Tensor:
@@ -372,9 +383,10 @@ def _surroundings(membrane: Membrane) -> Tensor:
     return weight / weight.sum(0)
 
 
-def _shares(membrane: Membrane, vertices: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def _shares(membrane: Membrane, markers: SurfacePoints) -> tuple[Tensor, Tensor]:
     """Every marker's share in what is summed at the inner vertices, `[D, N]`, and at them with those at `NEAR`, `[D, 4 N]`."""
     m, n = membrane.grid
+    vertices, weights = torch.as_tensor(markers.vertices).long(), torch.as_tensor(markers.weights, dtype=torch.float64)
     share = torch.zeros(len(vertices), m * n, dtype=torch.float64).scatter_(1, vertices, weights) * ~membrane.fixed
     share = share.unflatten(1, (m, n))
     here = share[:, 1:-1, 1:-1]

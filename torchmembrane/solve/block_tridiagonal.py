@@ -1,42 +1,75 @@
-"""Symmetric positive definite block-tridiagonal systems, batched: Cholesky by blocks."""
+"""Symmetric positive definite block-tridiagonal systems, batched: elimination from both ends inwards, two blocks at a time.
+
+Blocks come in the order of their elimination: the first, the last, the second, the last but one, and so on. They are eliminated
+in pairs, then the one or two in the middle, one after the other. Here by Cholesky factors.
+"""
 
 import torch
 from torch import Tensor
 
 Factor = tuple[list[Tensor], list[Tensor]]
-"""Of the pivots and of what couples them, blocks `[..., k, s, s]` in the order of their elimination."""
+"""Of the pivots and of what couples them to the next ones, blocks `[..., 1 or 2, s, s]` in the order of their elimination."""
 
 
-def solve(diagonal: Tensor, upper: Tensor, b: Tensor) -> tuple[Tensor, Factor]:
-    """Solution `[..., n, s, C]` of `[D_0 U_0; U_0^T D_1 U_1; ...] x = b`, and what `substitute` needs to solve for others.
+def inwards(n: int) -> list[int]:
+    """`n` blocks, counted along the diagonal, in the order of their elimination."""
+    return [n - 1 - k // 2 if k % 2 else k // 2 for k in range(n)]
 
-    Arguments: the blocks `[..., n, s, s]` on the diagonal, those above it `[..., n-1, s, s]`, and `b [..., n, s, C]`.
+
+def coupled(n: int) -> list[tuple[int, int]]:
+    """All but the last of `inwards(n)`, each with the block next to it further in."""
+    order = inwards(n)
+    return [(order[k], order[min(k + 2, n - 1)]) for k in range(n - 1)]
+
+
+def parts(n: int) -> list[int]:
+    """How many blocks are eliminated at a time."""
+    return [2] * ((n - 1) // 2) + [1] * (2 - n % 2)
+
+
+def factor(diagonal: Tensor, coupling: Tensor) -> Factor:
+    """What `substitute` needs to solve `M x = b`.
+
+    Arguments: of `M` the blocks `[..., n, s, s]` on the diagonal and those of the pairs `coupled`, `[..., n-1, s, s]`, in the
+    order of elimination.
     """
-    s, D, U, b = diagonal.shape[-1], diagonal.split(1, -3), upper.split(1, -3), b.split(1, -3)
-    pivot, rhs, lower, couplings, reduced = D[0], b[0], [], [], []
-    for i in range(len(D)):
-        lower.append(torch.linalg.cholesky_ex(pivot).L)
-        right = torch.cat([U[i], rhs], -1) if i + 1 < len(D) else rhs
-        Y = torch.linalg.solve_triangular(lower[-1], right, upper=False)
-        reduced.append(Y[..., -rhs.shape[-1] :])
-        if i + 1 < len(D):
-            couplings.append(Y[..., :s])
-            product = couplings[-1].mT @ Y
-            pivot, rhs = D[i + 1] - product[..., :s], b[i + 1] - product[..., s:]
-    return _back(lower, couplings, reduced), (lower, couplings)
+    sizes = parts(diagonal.shape[-3])
+    pivots, couplings = list(diagonal.split(sizes, -3)), list(coupling.split(sizes[:-1], -3))
+    for k in range(len(sizes)):
+        pivots[k] = torch.linalg.cholesky_ex(pivots[k]).L
+        if k < len(couplings):
+            couplings[k] = torch.linalg.solve_triangular(pivots[k], couplings[k], upper=False)
+            subtract_further_in(pivots, k, couplings[k].mT @ couplings[k])
+    return pivots, couplings
 
 
-def substitute(factor: tuple[Tensor, Tensor], b: Tensor) -> Tensor:
-    """Solution for another `b`; `factor`: that of `solve`, its blocks one after another."""
-    (lower, couplings), rest = (blocks.split(1, -3) for blocks in factor), b.split(1, -3)
-    reduced = [torch.linalg.solve_triangular(lower[0], rest[0], upper=False)]
-    for L, Y, r in zip(lower[1:], couplings, rest[1:], strict=True):
-        reduced.append(torch.linalg.solve_triangular(L, r - Y.mT @ reduced[-1], upper=False))
-    return _back(lower, couplings, reduced)
+def substitute(factor: Factor, b: Tensor) -> Tensor:
+    """Solutions for the rows of `b [..., n, C, s]`, blocks in the order of elimination."""
+    pivots, couplings = factor
+    transposed = lambda block: block.transpose(-2, -1)  # noqa: E731  `mT` of a region's input would be a second, aliased one
+    x = list(b.split(parts(b.shape[-3]), -3))
+    for k, L in enumerate(pivots):
+        x[k] = torch.linalg.solve_triangular(transposed(L), x[k], upper=True, left=False)
+        if k < len(couplings):
+            subtract_further_in(x, k, x[k] @ couplings[k])
+    for k in reversed(range(len(pivots))):
+        if k < len(couplings):
+            x[k] = x[k] - further_in(x, k) @ transposed(couplings[k])
+        x[k] = torch.linalg.solve_triangular(pivots[k], x[k], upper=False, left=False)
+    return torch.cat(x, -3)
 
 
-def _back(lower, couplings, reduced) -> Tensor:
-    x = [torch.linalg.solve_triangular(lower[-1].mT, reduced[-1], upper=True)]
-    for L, Y, r in zip(lower[-2::-1], couplings[::-1], reduced[-2::-1], strict=True):
-        x.append(torch.linalg.solve_triangular(L.mT, r - Y @ x[-1], upper=True))
-    return torch.cat(x[::-1], -3)
+def subtract_further_in(blocks: list[Tensor], k: int, change: Tensor) -> None:
+    """Subtract from the blocks that part `k` is coupled to what its elimination changes there."""
+    if change.shape[-3] == blocks[k + 1].shape[-3]:
+        blocks[k + 1] = blocks[k + 1] - change
+    elif k + 2 < len(blocks):
+        blocks[k + 1 :] = [block - part for block, part in zip(blocks[k + 1 :], change.split(1, -3), strict=True)]
+    else:
+        blocks[k + 1] = blocks[k + 1] - change.sum(-3, keepdim=True)
+
+
+def further_in(blocks: list[Tensor], k: int) -> Tensor:
+    """The blocks that part `k` is coupled to; one alone where both of a pair are coupled to it."""
+    two_in_the_middle = k + 3 == len(blocks) and blocks[k].shape[-3] > blocks[k + 1].shape[-3]
+    return torch.cat(blocks[k + 1 :], -3) if two_in_the_middle else blocks[k + 1]

@@ -6,23 +6,18 @@ import torch
 from torch import Tensor
 
 
-def symmetric_product(matrix: Tensor, columns: Tensor) -> Tensor:
-    """`A y` for one symmetric `A [N, N]` and many `y [..., N, C]`: one matrix product over batch and columns together."""
-    return (columns.mT @ matrix).mT
-
-
 def conjugate_gradient(
     apply: Callable[[Tensor], Tensor], precondition: Callable[[Tensor], Tensor], b: Tensor, steps: int
 ) -> Tensor:
-    """Solve `A x = b` for symmetric positive definite `A`, column by column.
+    """Solve `A x = b` for symmetric positive definite `A`, each row of `b` by itself.
 
-    Arguments: `apply` and `precondition` map `[..., N, C]` to `[..., N, C]` (`A` and an approximate inverse, both symmetric
-    positive definite); `b [..., N, C]`; `steps` is fixed, so that the graph is static. Returns `x [..., N, C]`.
+    Arguments: `apply` and `precondition` map `[..., N]` to `[..., N]` (`A` and an approximate inverse, both symmetric
+    positive definite); `b [..., N]`; `steps` is fixed, so that the graph is static. Returns `x [..., N]`.
     Steps after convergence change nothing (a zero residual gives a zero step). Hestenes and Stiefel 1952.
     """
     tiny = torch.finfo(b.dtype).tiny
     ratio = lambda p, q: p / q.clamp_min(tiny)  # noqa: E731
-    dot = lambda p, q: (p * q).sum(-2, keepdim=True)  # noqa: E731
+    dot = lambda p, q: (p * q).sum(-1, keepdim=True)  # noqa: E731
     x, residual = 0, b
     z = precondition(residual)
     direction, rho = z, dot(residual, z)

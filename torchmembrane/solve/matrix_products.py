@@ -7,7 +7,7 @@ scaled in between so that the eigenvalues of `A X` lie evenly about 1: each step
 import torch
 from torch import Tensor
 
-from .block_tridiagonal import Factor
+from .block_tridiagonal import Factor, further_in, parts, subtract_further_in
 
 LEAF = 48
 LARGEST_CONDITION = 1e4  # of a leaf, Jacobi-scaled
@@ -46,49 +46,25 @@ def inverse(matrix: Tensor) -> Tensor:
     return (X + X.mT) / 2
 
 
-def solve(diagonal: Tensor, upper: Tensor, b: Tensor) -> tuple[Tensor, Factor]:
-    """As `block_tridiagonal.solve`; eliminated from both ends at once, two blocks a product. Diagonal best about 1."""
-    n = diagonal.shape[-3]
-    D, U, inverses, couplings = list(diagonal.split(1, -3)), upper.split(1, -3), [], []
-    for i, j in _pairs(n):
-        coupled = torch.cat([U[i], U[j - 1].mT], -3)
-        inverses.append(inverse(torch.cat([D[i], D[j]], -3)))
-        couplings.append(inverses[-1] @ coupled)
-        for k, change in zip((i + 1, j - 1), (coupled.mT @ couplings[-1]).split(1, -3), strict=True):
-            D[k] = D[k] - change
-    for k in range((n - 1) // 2, n // 2 + 1):
-        inverses.append(inverse(D[k]))
-        if k < n // 2:
-            couplings.append(inverses[-1] @ U[k])
-            D[k + 1] = D[k + 1] - U[k].mT @ couplings[-1]
-    return _substituted(inverses, couplings, b), (inverses, couplings)
+def factor(diagonal: Tensor, coupling: Tensor) -> Factor:
+    """As `block_tridiagonal.factor`. Diagonal best about 1."""
+    sizes = parts(diagonal.shape[-3])
+    pivots, couplings = list(diagonal.split(sizes, -3)), list(coupling.split(sizes[:-1], -3))
+    for k in range(len(sizes)):
+        pivots[k] = inverse(pivots[k])
+        if k < len(couplings):
+            coupled, couplings[k] = couplings[k], pivots[k] @ couplings[k]
+            subtract_further_in(pivots, k, coupled.mT @ couplings[k])
+    return pivots, couplings
 
 
-def substitute(factor: tuple[Tensor, Tensor], b: Tensor) -> Tensor:
+def substitute(factor: Factor, b: Tensor) -> Tensor:
     """As `block_tridiagonal.substitute`."""
-    n = b.shape[-3]
-    sizes = [2] * len(_pairs(n)) + [1] * (2 - n % 2)
-    return _substituted(factor[0].split(sizes, -3), factor[1].split(sizes[:-1], -3), b)
-
-
-def _substituted(inverses, couplings, b: Tensor) -> Tensor:
-    n = b.shape[-3]
-    b, ends, k = list(b.split(1, -3)), [], (n - 1) // 2
-    for (i, j), Y in zip(_pairs(n), couplings, strict=False):
-        ends.append(torch.cat([b[i], b[j]], -3))
-        for inward, change in zip((i + 1, j - 1), (Y.mT @ ends[-1]).split(1, -3), strict=True):
-            b[inward] = b[inward] - change
-    if n % 2 == 0:
-        b[k + 1] = inverses[-1] @ (b[k + 1] - couplings[-1].mT @ b[k])
-        b[k] = inverses[-2] @ b[k] - couplings[-1] @ b[k + 1]
-    else:
-        b[k] = inverses[-1] @ b[k]
-    for i, j in reversed(_pairs(n)):
-        x = inverses[i] @ ends[i] - couplings[i] @ torch.cat([b[i + 1], b[j - 1]], -3)
-        b[i], b[j] = x.split(1, -3)
-    return torch.cat(b, -3)
-
-
-def _pairs(n: int) -> list[tuple[int, int]]:
-    """Blocks that are eliminated together: the outermost, those next to them, ..."""
-    return [(i, n - 1 - i) for i in range((n - 1) // 2)]
+    pivots, couplings = factor
+    x = list(b.split(parts(b.shape[-3]), -3))
+    for k, Y in enumerate(couplings):
+        subtract_further_in(x, k, x[k] @ Y)
+    x[-1] = x[-1] @ pivots[-1]
+    for k in reversed(range(len(couplings))):
+        x[k] = x[k] @ pivots[k] - further_in(x, k) @ couplings[k].mT
+    return torch.cat(x, -3)

@@ -20,7 +20,8 @@ class StencilSystem(nn.Module):
     """Three unknowns an inner vertex of an `m x n` grid, those of two grid rows a block; the matrix is block tridiagonal.
 
     Arguments: the grid and `free [N]` bool, the inner vertices that move. Columns of those that do not must be zero.
-    Sums are gathered, not scattered, three numbers at a time: where they come from is known beforehand.
+    Vectors are fields `[3, N]` over the inner vertices, flattened. Sums are gathered, not scattered, three numbers at a time:
+    where they come from is known beforehand.
     """
 
     def __init__(self, grid: tuple[int, int], free: Tensor):
@@ -32,8 +33,8 @@ class StencilSystem(nn.Module):
         sources = [np.stack([_product_sources(grid, way) for way in group], 1) for group in groups]
         self.sizes = [source.shape for source in sources]
         for name, index in (
-            ("neighbours", _neighbours(grid).ravel()),
-            ("row_sources", _row_sources(grid).ravel()),
+            ("order", np.array(block_tridiagonal.inwards(self.blocks))),
+            ("place", np.argsort(block_tridiagonal.inwards(self.blocks))),
             ("product_sources", np.concatenate([source.ravel() for source in sources])),
             ("places", _places(grid, ways, free.cpu().numpy(), self.blocks).ravel()),
             ("ends", np.concatenate([_Inner.of(grid).beside(way) for way in ways])),
@@ -42,27 +43,9 @@ class StencilSystem(nn.Module):
         self.register_buffer("one", torch.eye(3, dtype=torch.float64))
         self.register_buffer("fixed", (~free).double()[:, None])
 
-    def vector(self, rows: Tensor) -> Tensor:
-        """Sum of stencil rows `[B, N, 21, C]`, in the system's order `[B, unknowns, C]`."""
-        chunks = rows.unflatten(2, (len(STENCIL), 3)).flatten(1, 2).flatten(2).index_select(1, self.row_sources)
-        sums = chunks.unflatten(1, (len(STENCIL), -1)).sum(1)
-        return self.padded(sums.unflatten(2, (3, -1)).flatten(1, 2))
-
-    def rows(self, vector: Tensor) -> Tensor:
-        """Values `[B, N, 21, C]` around the inner vertices of a vector `[B, unknowns, C]`: `vector`'s adjoint where free."""
-        return self.field(vector).index_select(1, self.neighbours).unflatten(1, (-1, len(STENCIL))).flatten(2, 3)
-
-    def padded(self, unknowns: Tensor) -> Tensor:
-        """Unknowns of the inner vertices `[B, 3 N, C]` in the system's order `[B, unknowns, C]`."""
-        return F.pad(unknowns, (0, 0, 0, self.blocks * self.block_size - 3 * self.count))
-
-    def field(self, vector: Tensor) -> Tensor:
-        """The inner vertices' field `[B, N, 3, ...]` of a vector `[B, unknowns, ...]` in the system's order."""
-        return vector[:, : 3 * self.count].unflatten(1, (self.count, 3))
-
     def matrix(self, products: Tensor, near: Tensor, damping: float = 1e-6) -> tuple[Tensor, Tensor, Tensor]:
-        """Blocks on the diagonal `[B, blocks, s, s]` and above it `[B, blocks - 1, s, s]`, scaled from both sides to a diagonal
-        of 1; by what, `[B, unknowns, 1]`.
+        """Blocks on the diagonal `[B, blocks, s, s]` and beside it `[B, blocks - 1, s, s]`, as `block_tridiagonal.factor` takes
+        them, scaled from both sides to a diagonal of 1; by what, `[B, 1, 3 N]`.
 
         Arguments: `products [B, N, 21, 21]` of every stencil row's columns with each other; `near [B, 4, 3, N, 3]`, further
         blocks between the vertices and those at `NEAR` from them; `damping`, a share of the diagonal.
@@ -78,23 +61,31 @@ class StencilSystem(nn.Module):
         entries = torch.cat([blocks.flatten(1, 3), blocks.transpose(2, 4).flatten(1, 3), one], 1)
         s = self.block_size
         matrix = entries.index_select(1, self.places).flatten(1).unflatten(1, (-1, s, s))
-        return *matrix.split([self.blocks, self.blocks - 1], 1), self.padded(scale.flatten(1)[..., None])
+        return *matrix.split([self.blocks, self.blocks - 1], 1), scale.mT.flatten(1)[:, None]
 
-    def solve(
-        self, matrix: tuple[Tensor, Tensor, Tensor], loads: Tensor, keep=False
-    ) -> tuple[Tensor, tuple[Tensor, ...] | None]:
-        """Solutions `[B, unknowns, C]` for `loads` of that shape; with `keep` also what `substitute` needs to find others."""
-        diagonal, upper, scale = matrix
-        x, factor = _elimination().solve(diagonal, upper, self._in_blocks(scale * loads))
-        return scale * x.flatten(1, 2), (*(torch.cat(blocks, 1) for blocks in factor), scale) if keep else None
+    def factor(self, matrix: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, ...]:
+        """What `substitute` needs, from what `matrix` gives."""
+        diagonal, coupling, scale = matrix
+        pivots, couplings = _elimination().factor(diagonal, coupling)
+        return *pivots, *couplings, scale
 
     def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
-        """Solutions for other loads, with what `solve` kept."""
-        *elimination, scale = factor
-        return scale * _elimination().substitute(elimination, self._in_blocks(scale * loads)).flatten(1, 2)
+        """Solutions `[B, C, 3 N]` for `loads` of that shape."""
+        *blocks, scale = factor
+        pivots = len(blocks) // 2 + 1  # and a coupling between two
+        x = _elimination().substitute((blocks[:pivots], blocks[pivots:]), self.in_blocks(scale * loads))
+        return scale * self.from_blocks(x)
 
-    def _in_blocks(self, vector: Tensor) -> Tensor:
-        return vector.unflatten(1, (self.blocks, self.block_size))
+    def in_blocks(self, vector: Tensor) -> Tensor:
+        """Vectors `[B, C, 3 N]` as blocks `[B, blocks, C, s]` in the order of their elimination."""
+        unknowns = vector.unflatten(-1, (3, -1)).mT.flatten(-2)
+        padded = F.pad(unknowns, (0, self.blocks * self.block_size - 3 * self.count))
+        return padded.unflatten(-1, (self.blocks, self.block_size)).transpose(1, 2).index_select(1, self.order)
+
+    def from_blocks(self, blocks: Tensor) -> Tensor:
+        """`in_blocks` undone."""
+        unknowns = blocks.index_select(1, self.place).transpose(1, 2).flatten(-2)[..., : 3 * self.count]
+        return unknowns.unflatten(-1, (-1, 3)).mT.flatten(-2)
 
 
 def _elimination():
@@ -138,20 +129,6 @@ def _ways() -> list[list[tuple[tuple[int, int], list[tuple[int, int]]]]]:
 _ZERO = STENCIL.index((-1, -1))  # the first inner vertex's column for this neighbour, on the border, is zero
 
 
-def _neighbours(grid) -> np.ndarray:
-    """The inner vertices `[N, 7]` around each."""
-    return np.stack([_Inner.of(grid).beside(way) for way in STENCIL], 1)
-
-
-def _row_sources(grid) -> np.ndarray:
-    """For every slot, where in rows `[N, 7]` a vertex `[N]` is the slot's neighbour: `[7, N]`."""
-    inner, sources = _Inner.of(grid), []
-    for slot, (i, j) in enumerate(STENCIL):
-        row = inner.at(inner.row - i, inner.column - j)
-        sources.append(np.where(row >= 0, row * len(STENCIL) + slot, _ZERO))
-    return np.stack(sources)
-
-
 def _product_sources(grid, way) -> np.ndarray:
     """Where in products `[N, 21, 7]` the rows of the block between a vertex and that on its `way` have their parts:
     `[K, 3, N]`."""
@@ -167,15 +144,16 @@ def _product_sources(grid, way) -> np.ndarray:
 
 
 def _places(grid, ways, free, blocks) -> np.ndarray:
-    """Where three neighbouring entries of the matrix are, `[2 blocks - 1, s, s / 3]`: in the blocks' rows `[ways, 3, N]`, their
-    columns `[ways, 3, N]`, a one's rows, one after another."""
+    """Where three neighbouring entries of the blocks on the diagonal, then of those beside it, are, `[2 blocks - 1, s, s / 3]`:
+    in the blocks' rows `[ways, 3, N]`, their columns `[ways, 3, N]`, a one's rows, one after another."""
     inner, N, s = _Inner.of(grid), len(free), 6 * (grid[1] - 2)
     number = np.full((5, 5), -1)
     for k, way in enumerate(ways):
         number[way] = k  # negative indices wrap: the way back has its own place
     unknown = np.arange(blocks * s).reshape(blocks, s)
-    p, c = np.divmod(np.concatenate([unknown, unknown[:-1]])[:, :, None], 3)
-    q = np.concatenate([unknown, unknown[1:]])[:, None, ::3] // 3
+    rows, columns = np.array([(k, k) for k in block_tridiagonal.inwards(blocks)] + block_tridiagonal.coupled(blocks)).T
+    p, c = np.divmod(unknown[rows][:, :, None], 3)
+    q = unknown[columns][:, None, ::3] // 3
     used = [(vertex < N) & free[vertex.clip(max=N - 1)] for vertex in (p, q)]
     i, j = (index[q.clip(max=N - 1)] - index[p.clip(max=N - 1)] for index in (inner.row, inner.column))
     close = used[0] & used[1] & (abs(i) <= 2) & (abs(j) <= 2)
