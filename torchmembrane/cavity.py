@@ -42,9 +42,10 @@ class CavityLaw(nn.Module):
         self.register_buffer("gas", torch.tensor(gas if gas else (1.0, 1.0), dtype=torch.float64))
 
     def condition(self, rise: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
-        """Target `c` and compliance `C` of a step, `v.y + C (pressure step) = c`, at volume `rise` above that at rest."""
+        """Target `c [...]` and compliance `C` (a liquid's `[]`) of a step, `v.y + C (pressure step) = c`, at volume `rise [...]`
+        above that at rest."""
         if self.filling == "liquid":
-            return -rise, torch.zeros_like(rise)
+            return -rise, rise.new_zeros(())
         absolute, volume = self.gas.unbind()
         ratio = volume / (volume + rise)
         compliance = volume / (absolute * ratio**2)

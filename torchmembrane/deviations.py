@@ -49,7 +49,7 @@ def standard_deviations(
     if estimator.cavity.filling != "open":
         border = y[:, -2:]
         _, compliance = estimator.cavity.condition(membrane.volume(x) - membrane.rest_volume, pressure)
-        corner = torch.diag_embed(torch.stack([c, compliance], -1)) - borders @ border.mT
+        corner = torch.diag_embed(torch.stack([c, compliance.expand_as(c)], -1)) - borders @ border.mT
         rise = torch.linalg.solve(corner, -borders @ dx.mT)
         dx, dp = dx - rise.mT @ border, rise[:, 0]
     total = estimator.along(at.slope, torch.eye(3).to(x)[None, ..., None].expand(1, 3, 3, len(estimator.free))).flatten(2)

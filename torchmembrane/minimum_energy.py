@@ -84,10 +84,10 @@ class MinimumEnergy(nn.Module):
         return self.equilibrium(state[0], origins, directions, relaxed)
 
     def start(self, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None) -> tuple[Tensor, ...]:
-        """Ranges `[..., V]` and history after the first step, from rest, and rays on which the rim stays: `d = 0` there."""
-        fixed = self.membrane.fixed[:, None]
-        origins, directions = torch.where(fixed, self.membrane.rest, origins), torch.where(fixed, 0.0, directions)
-        t = self.rest_range.expand(directions.shape[:-1])
+        """Ranges `[..., V]` and history after the first step, from rest, and rays `[..., 3, V]` on which the rim stays: `d = 0`."""
+        fixed = self.membrane.fixed
+        origins, directions = torch.where(fixed, self.membrane.rest.mT, origins.mT), torch.where(fixed, 0.0, directions.mT)
+        t = self.rest_range.expand(directions[..., 0, :].shape)
         return *first(t, self._move(t, origins, directions, relaxed)[0]), origins, directions
 
     def step(self, t: Tensor, latest: Tensor, changes: Tensor, origins: Tensor, directions: Tensor, relaxed=None):
@@ -97,17 +97,16 @@ class MinimumEnergy(nn.Module):
 
     def equilibrium(self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None) -> Equilibrium:
         """What these ranges amount to, and how far they are from a solution."""
-        x = origins + t[..., None] * directions
+        x = (origins + t[..., None, :] * directions).mT
         move, pressure = self._move(t, origins, directions, relaxed)
         error = move.abs().amax(-1) / self.membrane.rest_area.sum().sqrt()
         return Equilibrium(x, pressure, self.membrane.volume(x), torch.zeros_like(x), error)
 
     def _move(self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None) -> tuple[Tensor, Tensor]:
         """Where the rest's stiffness would have the ranges go, `[..., V]`: zero at the solution; and the pressure `[...]`."""
-        x = origins + t[..., None] * directions
-        along = lambda force: (force * directions).sum(-1)  # noqa: E731
+        x = origins + t[..., None, :] * directions
         rise, v = self._rise(t, x, origins, directions)
-        load = self.rest_pressure * v + along(self.rest_load - self.energy.gradient(x))
+        load = self.rest_pressure * v + ((self.rest_load - self.energy.gradient(x.mT)).mT * directions).sum(-2)
         if self.smooths:
             load = load - self._smoothing_force(t, relaxed)
         y, g = (torch.stack([load, v], -2) @ self.inverse).unbind(-2)
@@ -119,9 +118,9 @@ class MinimumEnergy(nn.Module):
     def _rise(self, t: Tensor, x: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Volume above that at rest `[...]` and its derivative `v [..., V]`: exact, or linear about the rest ranges."""
         linear = self.volume_constraint == "linear"
-        x = origins + self.rest_range[:, None] * directions if linear else x
-        gradient = self.membrane.volume_gradient(x)
-        v, rise = (gradient * directions).sum(-1), (gradient * x).sum((-1, -2)) / 3 - self.membrane.rest_volume
+        x = origins + self.rest_range * directions if linear else x
+        gradient = self.membrane.volume_gradient(x.mT).mT
+        v, rise = (gradient * directions).sum(-2), (gradient * x).sum((-1, -2)) / 3 - self.membrane.rest_volume
         return (rise + (v * (t - self.rest_range)).sum(-1) if linear else rise), v
 
     def _smoothing_force(self, t: Tensor, relaxed: Tensor | None) -> Tensor:

@@ -200,14 +200,14 @@ class Coherence(nn.Module):
     def __init__(self, pixels, log_radius, size_tolerance):
         super().__init__()
         self.size_tolerance = size_tolerance
-        near = cKDTree(pixels).query(pixels, k=min(NEIGHBOURS - 1, len(pixels)))[1][:, 1:]
-        step = pixels[near] - pixels[:, None]
+        near = cKDTree(pixels).query(pixels, k=min(NEIGHBOURS - 1, len(pixels)))[1][:, 1:].T.copy()
+        step = np.moveaxis(pixels[near] - pixels, -1, 0).copy()
         nearest, mean = spacing(pixels)
         square = ((pixels[:, None] - pixels) ** 2).sum(-1)
         kernel = np.exp(-square / (2 * (SEAM * mean) ** 2))  # [from, to]
         self.register_buffer("near", torch.as_tensor(near))
         self.register_buffer("step", torch.as_tensor(step))
-        self.register_buffer("length", torch.as_tensor(np.linalg.norm(step, axis=-1)))
+        self.register_buffer("length", torch.as_tensor(np.linalg.norm(step, axis=0)))
         self.register_buffer("share", torch.as_tensor(kernel / kernel.sum(0)))
         self.register_buffer("total", torch.as_tensor(kernel.sum(0)))
         self.register_buffer("reach", torch.as_tensor(SEAM * mean))
@@ -231,12 +231,14 @@ class Coherence(nn.Module):
         alone = 1 - (left[..., None] * torch.sigmoid(20 * (RIVAL - margin))).amax(1)
         left = (left[:, None] @ torch.exp(-square / (2 * self.reach**2))).squeeze(1) / self.total
         lost = (1 - sure) @ self.share
-        at_neighbours = lambda x: x.index_select(1, self.near.flatten()).unflatten(1, self.near.shape)  # noqa: E731
-        ends = (at_neighbours(gradient) + gradient[:, :, None]) / 2
-        change = at_neighbours(pixels) - pixels[:, :, None] - self.step - (ends * self.step[:, :, None]).sum(-1)
-        pair = at_neighbours(sure) * sure[:, :, None]
-        error = (pair * change.square().sum(-1).clamp_min(1e-12).sqrt() / self.length).sum(-1) @ self.share
-        error = error / (pair.sum(-1) @ self.share + 1e-3)
+        here = torch.cat([gradient.flatten(2), pixels, sure[..., None]], -1)
+        there = here.index_select(1, self.near.flatten()).mT.unflatten(-1, self.near.shape)  # [B, 7, neighbours, D]
+        here = here.mT[:, :, None]
+        ends = (there[:, :4] + here[:, :4]).unflatten(1, (2, 2)) / 2
+        change = there[:, 4:6] - here[:, 4:6] - self.step - (ends * self.step).sum(2)
+        pair = there[:, 6] * here[:, 6]
+        error = (pair * change.square().sum(1).clamp_min(1e-12).sqrt() / self.length).sum(1) @ self.share
+        error = error / (pair.sum(1) @ self.share + 1e-3)
         tear = torch.minimum(lost, left).clamp_min(1e-12).sqrt() * error
         return alone * torch.sigmoid(8 * (1 - tear / TEAR))
 
