@@ -401,7 +401,8 @@ def test_windows_hold_the_pixels_around_each_dot_at_their_places(radius):
 
 def test_the_metric_is_the_length_in_unit_circles():
     shape, x = (torch.randn(5, 2, n, dtype=torch.float64, generator=torch.Generator().manual_seed(n)) for n in (2, 3))
-    torch.testing.assert_close(x.mT @ metric_of(shape) @ x, torch.linalg.solve(shape, x).mT @ torch.linalg.solve(shape, x))
+    metric = metric_of(shape).movedim(-1, 0)
+    torch.testing.assert_close(x.mT @ metric @ x, torch.linalg.solve(shape, x).mT @ torch.linalg.solve(shape, x))
 
 
 def test_the_mapping_takes_monomials_of_a_point_to_its_image():

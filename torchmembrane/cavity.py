@@ -42,8 +42,10 @@ class CavityLaw(nn.Module):
         self.register_buffer("gas", torch.tensor(gas if gas else (1.0, 1.0), dtype=torch.float64))
 
     def condition(self, rise: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
-        """Target `c [...]` and compliance `C` (a liquid's `[]`) of a step, `v.y + C (pressure step) = c`, at volume `rise [...]`
-        above that at rest."""
+        """Target `c [...]` and compliance `C` (a liquid's `[]`) of a step, `v.y + C (pressure step) = c`.
+
+        Arguments: the volume's `rise [...]` above that at rest, the pressure `[...]` there.
+        """
         if self.filling == "liquid":
             return -rise, rise.new_zeros(())
         absolute, volume = self.gas.unbind()

@@ -84,7 +84,7 @@ class MinimumEnergy(nn.Module):
         return self.equilibrium(state[0], origins, directions, relaxed)
 
     def start(self, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None) -> tuple[Tensor, ...]:
-        """Ranges `[..., V]` and history after the first step, from rest, and rays `[..., 3, V]` on which the rim stays: `d = 0`."""
+        """Ranges `[..., V]` and history after the first step, from rest; rays `[..., 3, V]` on which the rim stays: `d = 0`."""
         fixed = self.membrane.fixed
         origins, directions = torch.where(fixed, self.membrane.rest.mT, origins.mT), torch.where(fixed, 0.0, directions.mT)
         t = self.rest_range.expand(directions[..., 0, :].shape)

@@ -45,16 +45,11 @@ def pyramid(image):
     return levels
 
 
-def mapped(matrix, vector):
-    """`matrix [..., 2, 2] @ vector [..., 2]`, as a sum: products of so small matrices are slow."""
-    return (matrix * vector[..., None, :]).sum(-1)
-
-
 def metric_of(shape):
-    """`(S S^T)^-1 [..., 2, 2]` of `shape [..., 2, 2]`: `x^T (S S^T)^-1 x = |S^-1 x|^2`."""
-    a, b, c, d = shape.flatten(-2).unbind(-1)
-    uv, area = -(a * c + b * d), a * d - b * c
-    return torch.stack([c * c + d * d, uv, uv, a * a + b * b], -1).unflatten(-1, (2, 2)) / (area * area)[..., None, None]
+    """`(S S^T)^-1 [2, 2, ...]` of `shape [..., 2, 2]`: `x^T (S S^T)^-1 x = |S^-1 x|^2`."""
+    a, b, c, d = shape.flatten(-2).movedim(-1, 0).split(1)
+    uv, area = a * c + b * d, a * d - b * c
+    return torch.cat([c * c + d * d, -uv, -uv, a * a + b * b]).unflatten(0, (2, 2)) / (area * area)
 
 
 def solve_positive(system):
@@ -105,6 +100,7 @@ class EllipseFit(nn.Module):
         for k, dots in self.levels:
             self.register_buffer(f"dots{k}", dots)
             self.register_buffer(f"step{k}", torch.as_tensor(offset[1] * sizes[k, 1] + offset[0]))
+        self.register_buffer("place", torch.as_tensor(np.stack([np.ones_like(level), sizes[level, 1]], -1)))
         self.register_buffer("limit", torch.as_tensor(sizes[level][:, ::-1].copy() - 1 - half))
         self.register_buffer("stride", torch.as_tensor(stride.astype(float)))
         self.register_buffer("ring", torch.as_tensor(ring / stride))
@@ -123,10 +119,9 @@ class EllipseFit(nn.Module):
         stride = self.stride[:, None]
         middle = ((centre.detach() - (stride - 1) / 2) / stride).round().to(torch.int64)
         pixel = torch.minimum(middle.clamp_min(self.half), self.limit)  # of integers: also where the centre is NaN
-        values = []
+        first, values = (pixel * self.place).sum(-1, keepdim=True), []
         for k, _ in self.levels:
-            at = pixel[:, getattr(self, f"dots{k}")]
-            index = (at[..., 1] * levels[k].shape[-1] + at[..., 0])[..., None] + getattr(self, f"step{k}")
+            index = first.index_select(1, getattr(self, f"dots{k}")) + getattr(self, f"step{k}")
             values.append(levels[k].flatten(1).gather(1, index.flatten(1)).unflatten(1, index.shape[1:]))
         values = values[0] if len(values) == 1 else torch.cat(values, 1)[:, self.order]
         return values, pixel * stride + (stride - 1) / 2
@@ -137,30 +132,32 @@ class EllipseFit(nn.Module):
         Returns centre `[B, D, 2]`, growth of the outline `[B, D]` px, and quality `[B, D]` in 0..1, from the share of
         the window's variance explained, the contrast `a / b_0`, and the size against that of `shape` or at rest.
         """
-        stride, pixel = self.stride[:, None], 1 / self.stride
         values, middle = self.windows(levels, centre)
         mean = values.mean(-1, keepdim=True)
         values = values - mean
-        shape = shape / stride[..., None]
+        shape = shape / self.stride[:, None, None]
         size = torch.linalg.vector_norm(shape, dim=(-2, -1)) / 2**0.5
-        reach, farthest = 0.5 * (size + pixel)[..., None], (size + pixel)[..., None]
+        far = size + 1 / self.stride
+        reach = torch.stack([0.5 * far, 0.5 * far, 0.5 * size])  # of a step, in place and growth
+        lowest, highest = torch.stack([-far, -far, -0.5 * size]), torch.stack([far, far, 0.8 * size])
         metric = metric_of(shape)
-        start = (middle - centre) / stride
-        moved, growth, fit, gain = torch.zeros_like(start), torch.zeros_like(size), None, None
+        start = ((middle - centre) / self.stride[:, None]).movedim(-1, 0)
+        change, fit, gain = torch.zeros_like(reach), None, None  # of place and growth, [3, B, D]
         for k, count in enumerate(self.counts):
-            off, linear, seen = start - moved, self.linear[:, :count], values[..., :count]
-            normal = torch.cat([mapped(metric, off)[..., None], metric], -1)
-            n_u, n_v = (rows @ linear for rows in normal.unbind(-2))
-            square = (linear[1] + off[..., :1]) * n_u + (linear[2] + off[..., 1:]) * n_v + 1e-12
+            off, linear, seen = start - change[:2], self.linear[:, :count], values[..., :count]
+            normal = torch.cat([(metric * off).sum(1, keepdim=True), metric], 1).movedim(1, -1)
+            n_u, n_v = (rows @ linear for rows in normal)
+            off_u, off_v, growth = torch.cat([off, change[2:]]).movedim(0, -1).split(1, -1)
+            square = (linear[1] + off_u) * n_u + (linear[2] + off_v) * n_v + 1e-12
             slack = 1 / (n_u * n_u + n_v * n_v + 1e-12).sqrt()
-            depth = (square.sqrt() - square) * slack + growth[..., None]  # inside the outline
+            depth = (square.sqrt() - square) * slack + growth  # inside the outline
             template = torch.sigmoid(depth * self.sharpness[:, None])
             outside = 1 - template
             edge = template * outside * self.sharpness[:, None]
             weight = torch.sigmoid(2 * (depth + self.ring[:, None]))
             if k > 0:
                 intruder = fit[:3].movedim(0, -1) @ linear + fit[3][..., None] * template - seen
-                intruder = (intruder * (gain / 0.35)[..., None]).clamp(0, 10)
+                intruder = (intruder * (-gain / 0.35)[..., None]).clamp(0, 10)
                 intruder = intruder * intruder
                 weight = weight / (1 + outside * (intruder * intruder))
             shift = edge * slack
@@ -170,20 +167,19 @@ class EllipseFit(nn.Module):
             gram = torch.cat([torch.cat([plain.unflatten(-1, (3, 3)), mixed.mT], -1), torch.cat([mixed, own], -1)], -2)
             gram = gram.movedim((-2, -1), (0, 1))
             fit = solve_positive(gram[:7] + self.ridge)  # [7, B, D]
-            amplitude = -fit[3]
-            gain = amplitude / (amplitude**2 + 1e-6)
-            moved = moved + reach * torch.tanh(fit[4:6].movedim(0, -1) * (-gain[..., None] / reach))
-            moved = torch.maximum(torch.minimum(moved, farthest), -farthest)
-            growth = (growth + 0.5 * size * torch.tanh(-2 * fit[6] * gain / size)).clamp(-0.5 * size, 0.8 * size)
+            gain = fit[3] / (fit[3] * fit[3] + 1e-6)
+            change = change + reach * torch.tanh(fit[4:] * gain / reach)
+            change = torch.maximum(torch.minimum(change, highest), lowest)
+        moved, growth, amplitude = change[:2].movedim(0, -1), change[2], -fit[3]
         miss = torch.cat([fit, -torch.ones_like(fit[:1])])
         spread = gram[7, 7] - gram[0, 7].square() / gram[0, 0].clamp_min(1)
         explained = 1 - ((gram * miss).sum(1) * miss).sum(0) / (spread.clamp_min(0) + 1e-6)
-        background = (fit[1:3].movedim(0, -1) * off).sum(-1)
+        background = (fit[1:3] * off).sum(0)
         contrast = amplitude / (fit[0] - background + mean[..., 0]).clamp_min(1e-2)
         quality = torch.sigmoid(12 * (explained - 0.6)) * torch.sigmoid(40 * (contrast - 0.12))
         grown = torch.minimum(*(torch.log((size + growth) / usual).square() for usual in (size, self.size)))
         quality = quality * torch.exp(-grown / (2 * self.size_tolerance) ** 2)
-        return centre + stride * moved, self.stride * growth, quality
+        return centre + self.stride[:, None] * moved, self.stride * growth, quality
 
 
 def blur_rows(size, sigma, rows):
