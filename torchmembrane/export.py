@@ -23,6 +23,7 @@ from .markers.match import SETTLING, WIDTHS, DotMatcher, LocalDeformation
 from .minimum_energy import STEPS
 from .reconstruct import Reconstructor
 from .results import STATUS_TEXTS, Reconstruction
+from .solve.block_tridiagonal import parts
 from .store import Mesh, Settings
 
 FORMAT = 1
@@ -226,7 +227,7 @@ def descend(tracer: Tracer, estimator: ForceBalance, falls: list[tuple[float, fl
     if one_factor:
         for name, value in zip(("tau", "outlier"), falls[0], strict=True):
             tracer.constant(name, value)
-        factor = [f"factor {k}" for k in range(2 * (estimator.system.blocks // 2) + 2)]
+        factor = [f"factor {k}" for k in range(2 * len(parts(estimator.system.blocks)))]
         tracer.piece(estimator, _first_step, [*state, *seen, "tau", "outlier"], [*state, *factor])
         seen, falls = [*seen, *factor], falls[1:]
     tau, outlier = np.array(falls, np.float32).T.copy()
