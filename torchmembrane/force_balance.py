@@ -303,7 +303,7 @@ class ForceBalance(nn.Module):
         return (of_forces + of_markers).flatten(2)
 
     def along(self, slope: Tensor, move: Tensor) -> Tensor:
-        """How forces change, `A u [B, C, 3, N]`, when the inner vertices make moves `u` of that shape."""
+        """How forces change, `A u [B, C, 3, N]`, when the inner vertices make moves `u` of that shape: `A^T u` as well."""
         moves = around(move, self.taps, self.membrane.grid).flatten(2, 3)
         return (slope.flatten(2, 3)[:, None] * moves[:, :, None]).sum(3)
 
