@@ -1,8 +1,8 @@
 """The seven-point stencil of a grid of triangles: every vertex inside the border and the six around it.
 
-Fields over all `V` vertices are `[..., V, C]`; over the `N = (m - 2) (n - 2)` inner ones, row by row, `[..., N, C]` or, components
-first, `[..., C, N]`. The six are in turn, so that `k`, `RING[i]` and `RING[i + 1]` are a triangle. Convolutions, slices and pads: no
-index arithmetic.
+Fields over all `V` vertices are `[..., V, C]`; over the `N = (m - 2) (n - 2)` inner ones, row by row, `[..., N, C]` or,
+components first, `[..., C, N]`. The six are in turn: `k`, `RING[i]` and `RING[i + 1]` are a triangle. Convolutions, slices and
+pads: no index arithmetic.
 """
 
 import torch
