@@ -30,7 +30,7 @@ from .energy import Sheet
 from .membrane import Membrane, SurfacePoints
 from .solve.conjugate_gradient import conjugate_gradient
 from .solve.stencil_system import NEAR, StencilSystem
-from .stencil import around, bordered, combined, inner, ring_edges, taps
+from .stencil import bordered, combined, inner, ring_edges, taps
 
 STEPS, COARSE_STEPS, TAU = 8, 4, (4.0, 0.4)  # from rest, and so where a finer grid follows
 FINE_STEPS, FINER_STEPS, FINE_TAU = 5, 4, (0.8, 0.4)  # from the coarsest grid's solution, from a finer one's
@@ -304,7 +304,8 @@ class ForceBalance(nn.Module):
 
     def along(self, slope: Tensor, move: Tensor) -> Tensor:
         """How forces change, `A u [B, C, 3, N]`, when the inner vertices make moves `u` of that shape: `A^T u` as well."""
-        moves = around(move, self.taps, self.membrane.grid).flatten(2, 3)
+        m, n = self.membrane.grid
+        moves = combined(move.mT, self.taps, (m - 2, n - 2)).unflatten(-1, (len(self.taps), -1)).flatten(2, 3)
         return (slope.flatten(2, 3)[:, None] * moves[:, :, None]).sum(3)
 
     def force_weights(self, normal: Tensor, force: Tensor, tau: float, curvature=False) -> Tensor:

@@ -39,12 +39,6 @@ def combined(field: Tensor, weights: Tensor, grid: tuple[int, int], border=True)
     return F.conv2d(planes, weights[:, None], padding=int(border)).reshape(*batch, C, len(weights) * count)
 
 
-def around(field: Tensor, taps: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Values `[..., 7, N]` at the vertices of the stencil around every inner one, of a field `[..., N]` that is zero beyond."""
-    *batch, N = field.shape
-    return F.conv2d(field.reshape(-1, 1, grid[0] - 2, grid[1] - 2), taps[:, None], padding=1).reshape(*batch, len(taps), N)
-
-
 def inner(field: Tensor, grid: tuple[int, int]) -> Tensor:
     """A vertex field `[..., V, C]` at the inner vertices, `[..., N, C]`."""
     return field.unflatten(-2, grid)[..., 1:-1, 1:-1, :].flatten(-3, -2)

@@ -100,7 +100,7 @@ class EllipseFit(nn.Module):
         for k, dots in self.levels:
             self.register_buffer(f"dots{k}", dots)
             self.register_buffer(f"step{k}", torch.as_tensor(offset[1] * sizes[k, 1] + offset[0]))
-        self.register_buffer("place", torch.as_tensor(np.stack([np.ones_like(level), sizes[level, 1]], -1)))
+        self.register_buffer("pixel_steps", torch.as_tensor(np.stack([np.ones_like(level), sizes[level, 1]], -1)))
         self.register_buffer("limit", torch.as_tensor(sizes[level][:, ::-1].copy() - 1 - half))
         self.register_buffer("stride", torch.as_tensor(stride.astype(float)))
         self.register_buffer("ring", torch.as_tensor(ring / stride))
@@ -119,7 +119,7 @@ class EllipseFit(nn.Module):
         stride = self.stride[:, None]
         middle = ((centre.detach() - (stride - 1) / 2) / stride).round().to(torch.int64)
         pixel = torch.minimum(middle.clamp_min(self.half), self.limit)  # of integers: also where the centre is NaN
-        first, values = (pixel * self.place).sum(-1, keepdim=True), []
+        first, values = (pixel * self.pixel_steps).sum(-1, keepdim=True), []
         for k, _ in self.levels:
             index = first.index_select(1, getattr(self, f"dots{k}")) + getattr(self, f"step{k}")
             values.append(levels[k].flatten(1).gather(1, index.flatten(1)).unflatten(1, index.shape[1:]))
