@@ -48,7 +48,7 @@ test-web: $(PAGE)
 $(PAGE): out/web/model.onnx $(IMAGES) $(PACKAGES) $(WEB)/build.js $(wildcard $(WEB)/src/*)
 	node $(WEB)/build.js out/web/model.onnx $(IMAGES)
 
-out/web/model.onnx: out/web/sensor.toml $(wildcard torchmembrane/*.py torchmembrane/markers/*.py torchmembrane/solve/*.py)
+out/web/model.onnx: out/web/sensor.toml $(wildcard torchmembrane/*.py torchmembrane/*/*.py)
 	$(BIN)/torchmembrane export $< --out $@
 
 out/web/sensor.toml: $(SENSOR) | $(READY)

@@ -20,10 +20,11 @@ import torch
 from accuracy import cases_in, contact_errors
 from record import write
 
-from torchmembrane import force_balance, reconstruct
-from torchmembrane.force_balance import FRICTION, SPARSITY
+from torchmembrane import reconstruct
+from torchmembrane.estimators import force_balance
+from torchmembrane.estimators.force_balance import FRICTION, SPARSITY
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor import Cavity, Sensor
+from torchmembrane.sensor.model import Cavity, Sensor
 
 GRID = 33
 

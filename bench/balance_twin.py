@@ -8,9 +8,9 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import splu
 
-from torchmembrane.force_balance import LONGEST_STEP, ForceBalance
-from torchmembrane.membrane import corners, triangles_of
-from torchmembrane.stencil import bordered, inner
+from torchmembrane.estimators.force_balance import LONGEST_STEP, ForceBalance
+from torchmembrane.surface.membrane import corners, triangles_of
+from torchmembrane.surface.stencil import bordered, inner
 
 DAMPING = 1e-6
 

@@ -20,29 +20,29 @@ from record import write
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from torchmembrane.boards import Checkerboard, DotBoard
 from torchmembrane.calibrate.boards import Views, lens_from_views, ports_from_views
 from torchmembrane.calibrate.depth import rest_from_depth
 from torchmembrane.calibrate.material import material_from_images
 from torchmembrane.calibrate.mill import dots_for_pixels, pixel_lattice
-from torchmembrane.calibrate.report import Report, fit_figure, mill_figure, surface_figure
 from torchmembrane.calibrate.rest import rest_from_image
 from torchmembrane.calibrate.surface import feet_of, fine_surface
 from torchmembrane.calibrate.targets import find_target
 from torchmembrane.calibrate.views import rest_from_views
-from torchmembrane.camera import Camera
+from torchmembrane.camera.model import Camera
 from torchmembrane.errors import MembraneError
-from torchmembrane.images import to_grey
+from torchmembrane.io.images import to_grey
 from torchmembrane.markers.dots import find_dots
+from torchmembrane.plot.calibration import Report, fit_figure, mill_figure, surface_figure
+from torchmembrane.plot.frames import save
 from torchmembrane.presets import preset
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor import Markers, Surface
+from torchmembrane.sensor.model import Markers, Surface
 from torchmembrane.simulate.board import BoardImages
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Plane, Sphere
 from torchmembrane.simulate.look import Look
 from torchmembrane.simulate.simulator import Simulator
-from torchmembrane.view import save
+from torchmembrane.targets import Checkerboard, DotBoard
 
 NOISE = 40.0
 LENSES = {

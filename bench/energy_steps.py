@@ -18,7 +18,7 @@ from accuracy import cases_in
 from record import write
 
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor import Sensor
+from torchmembrane.sensor.model import Sensor
 
 CONVERGED = 60
 

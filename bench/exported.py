@@ -22,10 +22,10 @@ import torch
 from accuracy import cases_in
 from record import write
 
-from torchmembrane.export import export, previous_of
+from torchmembrane.io.results import Reconstruction
+from torchmembrane.io.store import Settings
+from torchmembrane.onnx.export import export, previous_of
 from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
-from torchmembrane.results import Reconstruction
-from torchmembrane.store import Settings
 
 BATCHES = (1, 3, 16)
 

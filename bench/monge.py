@@ -17,8 +17,8 @@ from accuracy import cases_in
 from record import write
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.minimum_energy import MinimumEnergy
-from torchmembrane.monge import MongeMinimumEnergy
+from torchmembrane.estimators.minimum_energy import MinimumEnergy
+from torchmembrane.paper.monge import MongeMinimumEnergy
 from torchmembrane.reconstruct import Reconstructor
 
 

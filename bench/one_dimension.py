@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from record import write
 
-from torchmembrane.profile import ForceBalanceProfile, MinimumEnergyProfile, Profile
-from torchmembrane.simulate.profile import Disc, PressedStrip
-from torchmembrane.strip import Strip
+from torchmembrane.paper.pressed_strip import Disc, PressedStrip
+from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile, Profile
+from torchmembrane.paper.strip import Strip
 
 RADIUS, NODES, MARKERS, NOISE, DRAWS = 15.0, 61, 31, 2e-4, 8
 STRIPS = {"neo-Hookean": Strip("neo_hookean", 1.2), "harmonic": Strip("harmonic", 1.2)}

@@ -16,8 +16,8 @@ import torch
 from accuracy import cases_in
 from record import write
 
+from torchmembrane.estimators.segmentation import Segmentation
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.segmentation import Segmentation
 
 NOISE, NONE_FOUND = 0.05, 10.0
 LOOPS = {

@@ -18,16 +18,16 @@ import torch
 from record import write
 
 from torchmembrane import MembraneError
-from torchmembrane.energy import Sheet
+from torchmembrane.mechanics.hyperelastic import Sheet
 from torchmembrane.presets import NAMES, preset
-from torchmembrane.sensor import Sensor
-from torchmembrane.shapes import ellipsoid_cap, half_cylinder, heightfield, spherical_cap
+from torchmembrane.sensor.model import Sensor
 from torchmembrane.simulate.dataset import Plan, random_frame, stroke_to
 from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
 from torchmembrane.simulate.indenters import Cylinder, Plane, Sphere, facing
 from torchmembrane.simulate.look import Look
 from torchmembrane.simulate.press import carried, press
 from torchmembrane.simulate.simulator import Simulator
+from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, heightfield, spherical_cap
 
 PRESTRETCH, GRIDS = 1.3, (17, 33, 65)
 SHAPES = {

@@ -23,9 +23,9 @@ from balance_twin import BalanceTwin
 from record import median_seconds, write
 from scipy.sparse.linalg import splu
 
-from torchmembrane.energy import Sheet
-from torchmembrane.membrane import corners
+from torchmembrane.mechanics.hyperelastic import Sheet
 from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.surface.membrane import corners
 
 
 def scipy_twin(reconstructor):

@@ -19,19 +19,19 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
-from torchmembrane.flow import FlowInterpolation
+from torchmembrane.estimators.flow import FlowInterpolation
+from torchmembrane.estimators.segmentation import PolarAngle, Segmentation
+from torchmembrane.io.results import Reconstruction
+from torchmembrane.paper.pressed_strip import Disc, PressedStrip
+from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile
+from torchmembrane.paper.strip import Strip
+from torchmembrane.plot.frames import BLUE, GREY, VERMILION
 from torchmembrane.presets import preset_file
-from torchmembrane.profile import ForceBalanceProfile, MinimumEnergyProfile
 from torchmembrane.reconstruct import FOUND, Reconstructor
-from torchmembrane.results import Reconstruction
-from torchmembrane.segmentation import PolarAngle, Segmentation
 from torchmembrane.simulate.indenters import Cylinder, Sphere
 from torchmembrane.simulate.look import Look
 from torchmembrane.simulate.press import press
-from torchmembrane.simulate.profile import Disc, PressedStrip
 from torchmembrane.simulate.simulator import Simulator
-from torchmembrane.strip import Strip
-from torchmembrane.view import BLUE, GREY, VERMILION
 
 NOISE = 30.0  # dB below white
 ESTIMATORS = {"minimum energy": "minimum-energy", "force balance": "force-balance"}

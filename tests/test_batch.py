@@ -14,13 +14,13 @@ import pytest
 import torch
 from PIL import Image
 
-from torchmembrane import results, store
-from torchmembrane.batch import find_inputs, reconstruct_files
 from torchmembrane.errors import MembraneError
-from torchmembrane.images import read_image
-from torchmembrane.shapes import spherical_cap
-from torchmembrane.store import Mesh, Settings, read_results
-from torchmembrane.summary import UNREADABLE
+from torchmembrane.io import results, store
+from torchmembrane.io.images import read_image
+from torchmembrane.io.store import Mesh, Settings, read_results
+from torchmembrane.io.summary import UNREADABLE
+from torchmembrane.jobs.local import find_inputs, reconstruct_files
+from torchmembrane.surface.shapes import spherical_cap
 
 WIDTH, HEIGHT = 16, 12
 NPZ = Settings("minimum-energy", "neo_hookean", "triangle", "npz")

@@ -12,8 +12,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from torchmembrane import MembraneError, cli
-from torchmembrane.boards import Checkerboard, DotBoard
+from torchmembrane import MembraneError
 from torchmembrane.calibrate.boards import Views, lens_from_views, ports_from_views
 from torchmembrane.calibrate.depth import rest_from_depth
 from torchmembrane.calibrate.fit import fit, outline_centres, rotations, with_common_errors
@@ -21,13 +20,15 @@ from torchmembrane.calibrate.mill import dots_for_pixels, pixel_lattice
 from torchmembrane.calibrate.rest import rest_from_image
 from torchmembrane.calibrate.targets import find_target
 from torchmembrane.calibrate.views import rest_from_views
-from torchmembrane.camera import Camera
-from torchmembrane.images import to_grey
+from torchmembrane.camera.model import Camera
+from torchmembrane.cli import main as cli
+from torchmembrane.io.images import to_grey
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
 from torchmembrane.simulate.board import BoardImages
 from torchmembrane.simulate.look import Look
 from torchmembrane.simulate.simulator import Simulator
+from torchmembrane.targets import Checkerboard, DotBoard
 
 SIZE, NOISE = (320, 240), 40.0
 LENSES = {

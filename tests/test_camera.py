@@ -8,9 +8,9 @@ import torch
 from scipy.optimize import minimize, minimize_scalar
 from torch.func import functional_call
 
-from torchmembrane.camera import Camera, paper_image_point
+from torchmembrane.camera.distortion import distort
+from torchmembrane.camera.model import Camera, paper_image_point
 from torchmembrane.errors import MembraneError
-from torchmembrane.lens import distort
 
 PORTS = {"air": [], "port": [(2.0, 3.0, 1.49)], "stack": [(2.0, 1.0, 1.49), (3.5, 0.5, 1.52), (4.0, 1.0, 1.4)]}
 LENSES = {

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchmembrane import __version__, cli
+from torchmembrane import __version__
+from torchmembrane.cli import main as cli
 from torchmembrane.errors import MembraneError
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor import Sensor
+from torchmembrane.sensor.model import Sensor
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SENSOR = str(EXAMPLES / "sensor.toml")

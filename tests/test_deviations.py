@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from torchmembrane.camera import Camera
-from torchmembrane.energy import Sheet
-from torchmembrane.force_balance import ForceBalance, _across
-from torchmembrane.shapes import ellipsoid_cap, half_cylinder, spherical_cap
+from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.force_balance import ForceBalance, _across
+from torchmembrane.mechanics.hyperelastic import Sheet
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
+from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
 
 NOISE, DRAWS = 0.05, 192  # px
 CAP, FINGER, CYLINDER = (

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.energy import MODELS, AffineQuadrilaterals, Sheet, _metric
-from torchmembrane.membrane import Membrane, corners, corners_to_vertices, triangles_of
-from torchmembrane.shapes import ellipsoid_cap, half_cylinder, spherical_cap
+from torchmembrane.mechanics.hyperelastic import MODELS, AffineQuadrilaterals, Sheet, _metric
+from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices, triangles_of
+from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
 
 ELASTIC = dict(prestretch=1.2, modulus=0.7, c2_ratio=0.15)
 

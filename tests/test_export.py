@@ -14,18 +14,20 @@ import torch
 from PIL import Image
 from torch import nn
 
-from torchmembrane import MembraneError, export, force_balance
-from torchmembrane.assembly import Assembly, traced
-from torchmembrane.camera import Camera
-from torchmembrane.export import Piece
-from torchmembrane.images import to_grey
+from torchmembrane import MembraneError
+from torchmembrane.camera.model import Camera
+from torchmembrane.estimators import force_balance
+from torchmembrane.io.images import to_grey
+from torchmembrane.io.results import BAD_VALUES, BLANK, OK, STATUS_TEXTS, TOO_FEW_MARKERS, Reconstruction, load_frame
+from torchmembrane.io.store import Mesh, Settings
+from torchmembrane.onnx import export
+from torchmembrane.onnx.export import Piece
+from torchmembrane.onnx.graph import Assembly, traced
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.results import BAD_VALUES, BLANK, OK, STATUS_TEXTS, TOO_FEW_MARKERS, Reconstruction, load_frame
-from torchmembrane.sensor import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.simulator import Simulator
-from torchmembrane.store import Mesh, Settings
 
 ROOT = Path(__file__).parents[1]
 

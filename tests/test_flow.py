@@ -5,9 +5,16 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.flow import FlowInterpolation, LocalAffineMaps, affine_fit, roughness, weighted_affine_fit, weights
-from torchmembrane.membrane import SurfacePoints
-from torchmembrane.shapes import heightfield, spherical_cap
+from torchmembrane.estimators.flow import (
+    FlowInterpolation,
+    LocalAffineMaps,
+    affine_fit,
+    roughness,
+    weighted_affine_fit,
+    weights,
+)
+from torchmembrane.surface.membrane import SurfacePoints
+from torchmembrane.surface.shapes import heightfield, spherical_cap
 
 
 def random(*shape, seed=0):

@@ -6,18 +6,28 @@ import numpy as np
 import pytest
 import torch
 
-from torchmembrane.camera import Camera
-from torchmembrane.cavity import Equilibrium
-from torchmembrane.contact import contact_indicator, contact_points
-from torchmembrane.energy import Sheet
-from torchmembrane.force_balance import CONE, FLOOR, FRICTION, OUTLIER, SPARSITY, TAU, ForceBalance, Observation, _across
-from torchmembrane.membrane import Membrane
+from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.contact_patches import contact_indicator, contact_points
+from torchmembrane.estimators.force_balance import (
+    CONE,
+    FLOOR,
+    FRICTION,
+    OUTLIER,
+    SPARSITY,
+    TAU,
+    ForceBalance,
+    Observation,
+    _across,
+)
+from torchmembrane.mechanics.cavity import Equilibrium
+from torchmembrane.mechanics.hyperelastic import Sheet
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.shapes import spherical_cap
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
 from torchmembrane.solve import block_tridiagonal, matrix_products
-from torchmembrane.stencil import inner
+from torchmembrane.surface.membrane import Membrane
+from torchmembrane.surface.shapes import spherical_cap
+from torchmembrane.surface.stencil import inner
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
@@ -386,7 +396,7 @@ def test_the_example_images_give_shape_force_and_place():
 
 
 def test_price_of_normal_tractions_has_the_slope_that_the_weights_say(monkeypatch):
-    monkeypatch.setattr("torchmembrane.force_balance.FLOOR", 0.0)
+    monkeypatch.setattr("torchmembrane.estimators.force_balance.FLOOR", 0.0)
     estimator = make()
     membrane, p0 = estimator.membrane, estimator.reference
     within = lambda field: inner(field, membrane.grid)  # noqa: E731

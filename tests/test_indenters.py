@@ -7,8 +7,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from torchmembrane import MembraneError
-from torchmembrane.shapes import spherical_cap
 from torchmembrane.simulate.indenters import Box, Cylinder, Mesh, Plane, Sphere, Union, Wedge, facing
+from torchmembrane.surface.shapes import spherical_cap
 
 ICOSAHEDRON = trimesh.creation.icosahedron()
 EVERY = {

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from torchmembrane import MembraneError, cli
+from torchmembrane import MembraneError
 from torchmembrane.calibrate.material import STRETCHES, Presses, _log_stretch, material_from_pixels
-from torchmembrane.camera import Camera
-from torchmembrane.energy import Sheet
+from torchmembrane.camera.model import Camera
+from torchmembrane.cli import main as cli
+from torchmembrane.mechanics.hyperelastic import Sheet
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.membrane import Membrane, corners, corners_to_vertices, triangles_of, triangles_to_corners
-from torchmembrane.shapes import disc_grid, ellipsoid_cap, half_cylinder, heightfield, spherical_cap
+from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices, triangles_of, triangles_to_corners
+from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, half_cylinder, heightfield, spherical_cap
 
 SHAPES = {
     "spherical_cap": lambda n: spherical_cap(12, 9, 15, (n, n)),

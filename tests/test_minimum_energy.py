@@ -6,10 +6,10 @@ import torch
 from axisymmetric import harmonic, least_energy, neo_hookean
 
 from torchmembrane import MembraneError
-from torchmembrane.energy import AffineQuadrilaterals, Sheet
-from torchmembrane.membrane import Membrane, corners, corners_to_vertices
-from torchmembrane.minimum_energy import MinimumEnergy
-from torchmembrane.shapes import disc_grid, ellipsoid_cap, spherical_cap
+from torchmembrane.estimators.minimum_energy import MinimumEnergy
+from torchmembrane.mechanics.hyperelastic import AffineQuadrilaterals, Sheet
+from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices
+from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, spherical_cap
 
 
 def rest_rays(membrane):

@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.energy import Sheet
-from torchmembrane.membrane import corners, triangles_of
-from torchmembrane.minimum_energy import MinimumEnergy
-from torchmembrane.monge import MongeMinimumEnergy, adjugate, coefficients, form_matrix, metric
-from torchmembrane.shapes import ellipsoid_cap, heightfield, spherical_cap
+from torchmembrane.estimators.minimum_energy import MinimumEnergy
+from torchmembrane.mechanics.hyperelastic import Sheet
+from torchmembrane.paper.monge import MongeMinimumEnergy, adjugate, coefficients, form_matrix, metric
+from torchmembrane.surface.membrane import corners, triangles_of
+from torchmembrane.surface.shapes import ellipsoid_cap, heightfield, spherical_cap
 
 
 def random(*shape, seed=0):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from torchmembrane.calibrate.command import VERBS
+from torchmembrane.cli.calibrate import VERBS
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "paper.md").read_text()

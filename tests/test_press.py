@@ -5,15 +5,15 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.cavity import rest_balance
-from torchmembrane.energy import Sheet
-from torchmembrane.membrane import Membrane, corners, triangles_of
-from torchmembrane.shapes import half_cylinder, heightfield, spherical_cap
+from torchmembrane.mechanics.cavity import rest_balance
+from torchmembrane.mechanics.hyperelastic import Sheet
 from torchmembrane.simulate import equilibrium as equilibrium_module
 from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
 from torchmembrane.simulate.indenters import Plane, Sphere, facing
 from torchmembrane.simulate.press import carried, press, presses
-from torchmembrane.stencil import RING, combined, inner, ring_edges
+from torchmembrane.surface.membrane import Membrane, corners, triangles_of
+from torchmembrane.surface.shapes import half_cylinder, heightfield, spherical_cap
+from torchmembrane.surface.stencil import RING, combined, inner, ring_edges
 
 PRESTRETCH = 1.3
 GRIDS = (9, 17, 33)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from torchmembrane import MembraneError, results
+from torchmembrane import MembraneError
+from torchmembrane.io import results
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor import Cavity, Sensor
+from torchmembrane.sensor.model import Cavity, Sensor
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PAPERS = "minimum-energy"

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.camera import Camera
-from torchmembrane.sensor import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.camera.model import Camera
+from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
 from torchmembrane.simulate.look import Look, blurred, noisy, scattered
 from torchmembrane.simulate.pattern import Dots, Painted, Speckle, pattern_of
 from torchmembrane.simulate.raster import seen_triangles

@@ -6,15 +6,15 @@ import torch
 from scipy.spatial import cKDTree
 
 from torchmembrane import MembraneError
-from torchmembrane.camera import Camera
-from torchmembrane.energy import Sheet
-from torchmembrane.flow import FlowInterpolation
-from torchmembrane.force_balance import ForceBalance
+from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.flow import FlowInterpolation
+from torchmembrane.estimators.force_balance import ForceBalance
+from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.markers.screen import MismatchScreen
-from torchmembrane.minimum_energy import MinimumEnergy
-from torchmembrane.shapes import spherical_cap
+from torchmembrane.mechanics.hyperelastic import Sheet
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
+from torchmembrane.surface.shapes import spherical_cap
 
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
 SHARE = 0.05

@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.camera import Camera
-from torchmembrane.energy import Sheet
-from torchmembrane.flow import FlowInterpolation
-from torchmembrane.minimum_energy import MinimumEnergy
-from torchmembrane.segmentation import PolarAngle, Segmentation, peaks, polar_angle
-from torchmembrane.shapes import half_cylinder, spherical_cap
+from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.flow import FlowInterpolation
+from torchmembrane.estimators.minimum_energy import MinimumEnergy
+from torchmembrane.estimators.segmentation import PolarAngle, Segmentation, peaks, polar_angle
+from torchmembrane.mechanics.hyperelastic import Sheet
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
+from torchmembrane.surface.shapes import half_cylinder, spherical_cap
 
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
 FAR, FINE = 15.0, (33, 33)

@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.sensor import Cavity, Markers, Material, Sensor, Surface
-from torchmembrane.shapes import spherical_cap
+from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.surface.shapes import spherical_cap
 
 GOOD = """format = 1
 name = "fingertip"

@@ -9,11 +9,12 @@ import pytest
 import torch
 from PIL import Image
 
-from torchmembrane import MembraneError, cli
-from torchmembrane.camera import Camera
+from torchmembrane import MembraneError
+from torchmembrane.camera.model import Camera
+from torchmembrane.cli import main as cli
 from torchmembrane.presets import NAMES, design, preset, preset_file, sensor_file
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
 from torchmembrane.simulate import dataset
 from torchmembrane.simulate.frames import Frames, FrameTable
 from torchmembrane.simulate.indenters import Sphere

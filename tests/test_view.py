@@ -5,11 +5,12 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
-from torchmembrane import results, view
-from torchmembrane.camera import Camera
-from torchmembrane.sensor import Cavity, Markers, Material, Sensor
-from torchmembrane.shapes import spherical_cap
-from torchmembrane.store import Mesh
+from torchmembrane.camera.model import Camera
+from torchmembrane.io import results
+from torchmembrane.io.store import Mesh
+from torchmembrane.plot import frames as view
+from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor
+from torchmembrane.surface.shapes import spherical_cap
 
 GRID = (15, 15)
 DENT = 7 * 15 + 10

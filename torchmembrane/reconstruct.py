@@ -8,22 +8,22 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from . import results
-from .camera import Rays
-from .cavity import Equilibrium
-from .contact import contact_indicator, contact_points
-from .deviations import StandardDeviations
-from .energy import Sheet
+from .camera.model import Rays
 from .errors import MembraneError
-from .flow import FlowInterpolation
-from .force_balance import ForceBalance
-from .images import read_image
+from .estimators.contact_patches import contact_indicator, contact_points
+from .estimators.covariance import StandardDeviations
+from .estimators.flow import FlowInterpolation
+from .estimators.force_balance import ForceBalance
+from .estimators.minimum_energy import MinimumEnergy
+from .io import results
+from .io.images import read_image
+from .io.results import CONTACT_POINTS, Reconstruction
 from .markers.locate import DotLocator
 from .markers.place import FEWEST_MARKERS, place_markers
 from .markers.screen import MismatchScreen
-from .minimum_energy import MinimumEnergy
-from .results import CONTACT_POINTS, Reconstruction
-from .sensor import Sensor
+from .mechanics.cavity import Equilibrium
+from .mechanics.hyperelastic import Sheet
+from .sensor.model import Sensor
 
 ESTIMATORS = ("force-balance", "minimum-energy")
 FOUND = 0.5

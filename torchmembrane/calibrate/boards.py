@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from torch.func import functional_call, jacfwd, vmap
 
-from ..boards import Checkerboard, DotBoard
-from ..camera import COEFFICIENTS, Camera
+from ..camera.model import COEFFICIENTS, Camera
 from ..errors import MembraneError
+from ..targets import Checkerboard, DotBoard
 from .fit import Fit, fit, outline_centres, rotations, strays
 from .targets import opencv
 

@@ -8,14 +8,14 @@ import torch
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
-from ..cavity import Equilibrium
-from ..energy import Sheet
 from ..errors import MembraneError
-from ..force_balance import ForceBalance
-from ..membrane import SurfacePoints
+from ..estimators.force_balance import ForceBalance
+from ..io.results import OK, STATUS_TEXTS
+from ..mechanics.cavity import Equilibrium
+from ..mechanics.hyperelastic import Sheet
 from ..reconstruct import Reconstructor
-from ..results import OK, STATUS_TEXTS
-from ..sensor import Sensor
+from ..sensor.model import Sensor
+from ..surface.membrane import SurfacePoints
 
 GRID = (17, 17)  # on finer grids the price is less smooth in the prestretch
 STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it

@@ -9,8 +9,8 @@ import torch
 
 from ..errors import MembraneError
 from ..markers.place import rim_mask
-from ..membrane import Membrane
-from ..sensor import Sensor
+from ..sensor.model import Sensor
+from ..surface.membrane import Membrane
 from .fit import outline_centres
 from .surface import dot_outlines, feet_of, fine_surface
 

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from scipy.interpolate import RBFInterpolator
 
-from ..boards import OUTLINE
 from ..errors import MembraneError
-from ..membrane import Membrane
-from ..sensor import Markers, Sensor, Surface
+from ..sensor.model import Markers, Sensor, Surface
+from ..surface.membrane import Membrane
+from ..targets import OUTLINE
 
 FINE = 65  # vertices a side of the surface that is calibrated
 

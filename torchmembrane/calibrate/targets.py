@@ -4,9 +4,9 @@ import heapq
 
 import numpy as np
 
-from ..boards import LARGE, MARKS, Checkerboard, DotBoard
 from ..errors import MembraneError
 from ..markers.dots import find_dots
+from ..targets import LARGE, MARKS, Checkerboard, DotBoard
 
 WINDOW = 0.35  # of the shortest side of a square, in which a corner is fitted
 FAR_OFF = 10**6

@@ -7,9 +7,9 @@ import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from torchmembrane.errors import MembraneError
-from torchmembrane.markers.locate import STRAY, EllipseFit, pyramid, size_tolerance
-from torchmembrane.markers.match import DotMatcher
+from ..errors import MembraneError
+from .locate import STRAY, EllipseFit, pyramid, size_tolerance
+from .match import DotMatcher
 
 SCALES = 1.25  # ratio of neighbouring scales
 SMALLEST = 1.2  # px, radius of the smallest dot looked for

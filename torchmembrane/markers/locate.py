@@ -9,8 +9,8 @@ from scipy import ndimage
 from scipy.spatial import Delaunay, cKDTree
 from torch import nn
 
-from torchmembrane.errors import MembraneError
-from torchmembrane.markers.match import Coherence, DotMatcher, spacing, square_distance
+from ..errors import MembraneError
+from .match import Coherence, DotMatcher, spacing, square_distance
 
 SOFTNESS = 0.6  # px, logistic scale of a dot's blurred outline
 RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level

@@ -6,8 +6,8 @@ from PIL import Image, ImageDraw
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from ..membrane import SurfacePoints
-from ..sensor import Sensor
+from ..sensor.model import Sensor
+from ..surface.membrane import SurfacePoints
 from .dots import DotPattern, find_dots, measure_dots
 from .locate import DotLocator
 from .texture import TextureLocator, choose_patches

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from torchmembrane.errors import MembraneError
+from ..errors import MembraneError
 
 LEVELS = 3  # pyramid: full, half, quarter resolution
 REACH = 7  # px of the coarsest level searched to each side: 28 px of the image

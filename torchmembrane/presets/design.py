@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from ..camera import Camera
-from ..cavity import rest_balance
-from ..energy import Sheet
-from ..images import to_grey
-from ..sensor import METRE, Cavity, Markers, Material, Sensor, Surface
-from ..sensor_file import default_grid
+from ..camera.model import Camera
+from ..io.images import to_grey
+from ..mechanics.cavity import rest_balance
+from ..mechanics.hyperelastic import Sheet
+from ..sensor.model import METRE, Cavity, Markers, Material, Sensor, Surface
+from ..sensor.toml import default_grid
 from ..simulate.look import Look, noisy
 from ..simulate.render import Renderer
 from . import NAMES

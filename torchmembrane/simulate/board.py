@@ -6,8 +6,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ..boards import Checkerboard, DotBoard
-from ..camera import Camera
+from ..camera.model import Camera
+from ..targets import Checkerboard, DotBoard
 from .look import blurred, noisy
 
 SAMPLES = 4  # along a pixel's side

@@ -13,9 +13,9 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..energy import Sheet
 from ..errors import MembraneError
-from ..membrane import Membrane, corners, triangles_of
+from ..mechanics.hyperelastic import Sheet
+from ..surface.membrane import Membrane, corners, triangles_of
 from .contact import Contact
 
 FORCE_TOLERANCE = 1e-9  # over modulus x edge length

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ..batch import load_pyav
 from ..errors import MembraneError
-from ..results import save_frame
-from ..sensor import Sensor
-from ..store import load_pyarrow
+from ..io.results import save_frame
+from ..io.store import load_pyarrow
+from ..jobs.local import load_pyav
+from ..sensor.model import Sensor
 from .simulator import Frame, Simulator
 
 SENSOR, SETTINGS, REST = "sensor.toml", "simulation.json", "rest_truth.npz"

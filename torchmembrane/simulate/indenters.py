@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..membrane import Membrane
+from ..surface.membrane import Membrane
 
 APPROACH_STEPS = 10_000
 

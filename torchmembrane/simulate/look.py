@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..camera import Camera
+from ..camera.model import Camera
 from ..errors import MembraneError
-from ..membrane import Membrane
+from ..surface.membrane import Membrane
 
 RING, RING_RADIUS = 4, 0.3  # default lights around the camera's centre, radius over the rim's mean distance from the axis
 BRIGHT = 0.95  # the quantile of the rest surface that is exposed as asked

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..cavity import rest_balance
-from ..energy import Sheet
 from ..errors import MembraneError
-from ..membrane import Membrane, SurfacePoints
+from ..mechanics.cavity import rest_balance
+from ..mechanics.hyperelastic import Sheet
+from ..surface.membrane import Membrane, SurfacePoints
 from .contact import Contact
 from .equilibrium import Equilibrium, Gas, Liquid, Open
 from .indenters import Indenter

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from ..sensor import Sensor
+from ..sensor.model import Sensor
 from .look import BRIGHT, Look, blurred, mirrored, scattered, vignette
 from .pattern import Canvas, Dots, Painted, Speckle, pattern_of
 from .raster import seen_triangles

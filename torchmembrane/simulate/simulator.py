@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ..energy import Sheet
 from ..errors import MembraneError
-from ..images import to_grey
-from ..sensor import Sensor
+from ..io.images import to_grey
+from ..mechanics.hyperelastic import Sheet
+from ..sensor.model import Sensor
 from .indenters import Indenter
 from .look import Look, noisy
 from .pattern import pattern_of

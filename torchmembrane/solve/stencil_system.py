@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..stencil import STENCIL
+from ..surface.stencil import STENCIL
 from . import block_tridiagonal, matrix_products
 
 NEAR = ((0, 0), (0, 1), (1, 0), (1, 1))  # from a vertex to itself and to its neighbours further on

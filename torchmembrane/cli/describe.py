@@ -1,0 +1,129 @@
+"""What a sensor file means, in words."""
+
+import numpy as np
+import torch
+
+from ..io.results import STATUS_TEXTS
+from ..sensor.model import METRE
+
+LISTED = 12
+"""Missing markers that are named one by one."""
+FILLINGS = {
+    "liquid": "liquid: its volume is kept",
+    "gas": "gas: absolute pressure x volume is kept",
+    "open": "open: the pressure stays at rest, the volume is free",
+}
+
+
+def rest_frame(reconstructor) -> dict[str, np.ndarray] | None:
+    """The frame of the sensor's own rest image, None where there is none."""
+    image = reconstructor.sensor.markers.rest_image
+    if image is None:
+        return None
+    with torch.no_grad():
+        return reconstructor(torch.from_numpy(image)).frame(0)
+
+
+def described(sensor, reconstructor=None, frame=None) -> list[str]:
+    """Lines that say what was understood of a `Sensor`; more of them with its `Reconstructor` and rest frame."""
+    lines = {
+        "sensor": [f"{sensor.name!r}, fingerprint {sensor.fingerprint[:12]}, lengths in {sensor.length_unit}"],
+        "camera": _camera(sensor.camera, sensor.length_unit),
+        "membrane": _membrane(sensor),
+        "material": _material(sensor, reconstructor),
+        "cavity": _cavity(sensor),
+        "markers": _markers(sensor, reconstructor, frame),
+    }
+    return [f"{key if i == 0 else '':<10}{line}" for key, block in lines.items() for i, line in enumerate(block)]
+
+
+def _camera(camera, unit: str) -> list[str]:
+    width, height = camera.image_size
+    per = "px" if camera.model == "pinhole" else "px/rad"
+    bent = camera.distortion.tolist()
+    distortion = f"distortion {_listed(bent)}" if any(bent) else "no distortion"
+    lines = [
+        f"{camera.model}, {width} x {height} px, focal {_listed(camera.focal.tolist())} {per}, "
+        f"centre {_listed(camera.centre.tolist())} px, {distortion}",
+        f"field of view {_opening(camera, 0):.0f} x {_opening(camera, 1):.0f} degrees",
+    ]
+    for port in camera.ports:
+        lines.append(f"port at {port.distance:g} {unit}, {port.thickness:g} {unit} thick, index {port.index:g}")
+    lines.append(f"medium of index {float(camera.medium_index):g} behind" if camera.ports else "no ports")
+    return lines
+
+
+def _opening(camera, axis: int) -> float:
+    """Degrees seen along the image's row (axis 0) or column (axis 1) through the centre."""
+    pixels = camera.centre.repeat(401, 1)
+    pixels[:, axis] = torch.linspace(-0.5, camera.image_size[axis] - 0.5, 401, dtype=pixels.dtype)
+    direction = camera.pixel_to_ray(pixels).direction.numpy()
+    return float(np.ptp(np.degrees(np.arctan2(direction[:, axis], direction[:, 2]))[np.isfinite(direction[:, 2])]))
+
+
+def _membrane(sensor) -> list[str]:
+    membrane, unit = sensor.membrane, sensor.length_unit
+    X = membrane.rest.numpy()
+    sides = ", ".join(f"{a} {low:.4g} to {high:.4g}" for a, low, high in zip("xyz", X.min(0), X.max(0), strict=True))
+    return [
+        f"{sensor.surface.shape}, {sides} {unit}",
+        f"area {float(membrane.rest_area.sum()):.4g} {unit}², volume over the rim {membrane.cavity_volume:.4g} {unit}³",
+        f"grid {membrane.grid[0]} x {membrane.grid[1]}: {len(X)} vertices, {int(membrane.fixed.sum())} of them fixed",
+    ]
+
+
+def _material(sensor, reconstructor) -> list[str]:
+    material, unit = sensor.material, sensor.length_unit
+    known = {
+        "C2 / C1": (material.c2_ratio, ""),
+        "shear modulus": (material.shear_modulus, f" N/{unit}²"),
+        "thickness": (material.thickness, f" {unit}"),
+    }
+    words = [f"{key} {value:g}{per}" for key, (value, per) in known.items() if value is not None]
+    lines = [", ".join([material.model, f"prestretch {material.prestretch:g}", *words])]
+    relative = sensor.force_unit == "relative"
+    if relative:
+        lines.append("without shear_modulus and thickness forces are relative, in units of their product")
+    if reconstructor is not None:
+        tension, pressure = float(reconstructor.estimator.sheet.tension), float(reconstructor.estimator.rest_pressure)
+        hectopascal = pressure * METRE[unit] ** 2 / 100
+        units = ("(relative)",) * 2 if relative else (f"N/{unit}", f"N/{unit}² = {hectopascal:.4g} hPa")
+        lines.append(f"at rest: tension {tension:.4g} {units[0]}, pressure difference {pressure:.4g} {units[1]}")
+    return lines
+
+
+def _cavity(sensor) -> list[str]:
+    cavity, words = sensor.cavity, [FILLINGS[sensor.cavity.filling]]
+    if cavity.filling == "gas":
+        volume = cavity.volume or sensor.membrane.cavity_volume
+        words.append(f"{cavity.pressure:g} hPa, {volume:.4g} {sensor.length_unit}³")
+        if sensor.force_unit == "relative":
+            words.append("acts as a liquid, as forces are relative")
+    return ["; ".join(words)]
+
+
+def _markers(sensor, reconstructor, frame) -> list[str]:
+    markers = sensor.markers
+    lines = [f"{markers.kind}, {markers.polarity}"]
+    if markers.positions is not None:
+        large = sum(size == "large" for size in markers.sizes)
+        lines[0] += f", {len(markers.positions)} listed: {large} large, {len(markers.sizes) - large} small"
+    if reconstructor is not None and markers.positions is None:
+        lines[0] += f", {len(reconstructor.rest_pixels)} placed on the rest surface from the rest image"
+    if frame is None:
+        return [*lines, "no rest image" if markers.rest_image is None else "not looked for in the rest image"]
+    found = frame["confidence"] > 0
+    lines.append(f"{found.sum()} of {found.size} found in the rest image")
+    missing = np.flatnonzero(~found)
+    model = reconstructor.rest_pixels.cpu().numpy()
+    lines += [f"  not found: marker {d} (from 0), expected at pixel {_listed(model[d])}" for d in missing[:LISTED]]
+    lines += [f"  and {len(missing) - LISTED} more"] * (len(missing) > LISTED)
+    off = np.linalg.norm(reconstructor.measured_rest.cpu().numpy() - model, axis=1)[found]
+    if len(off):
+        rms = np.sqrt((off**2).mean())
+        lines.append(f"they lie {rms:.2f} px (rms; at most {off.max():.2f} px) from where the model has them")
+    return [*lines, f"the rest image reconstructed: {STATUS_TEXTS[int(frame['status'])]}"]
+
+
+def _listed(values) -> str:
+    return ", ".join(f"{value:.5g}" for value in values)

@@ -1,0 +1,1 @@
+"""From marker rays to the surface."""

@@ -1,0 +1,1 @@
+"""Elastic energies of the membrane, and the cavity it encloses."""

@@ -1,0 +1,74 @@
+"""What the fluid asks of the enclosed volume: kept (liquid), pressure x volume kept (gas), or free at rest pressure (open)."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..errors import MembraneError
+from ..surface.membrane import Membrane
+
+
+class Equilibrium(NamedTuple):
+    """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`
+    (zero for minimum energy), and `unbalance [...]`, how far from settled: a displacement over the surface's size."""
+
+    vertices: Tensor
+    pressure: Tensor
+    volume: Tensor
+    traction: Tensor
+    unbalance: Tensor
+
+
+FILLINGS = ("liquid", "gas", "open")
+
+
+class CavityLaw(nn.Module):
+    """The cavity's law, linearised for one step of a solve.
+
+    Arguments: membrane; the pressure difference at rest `[]`; `filling`; for a gas its absolute pressure at rest
+    (force / length^2) and volume (length^3).
+    """
+
+    def __init__(self, membrane: Membrane, rest_pressure: Tensor, filling="liquid", gas: tuple[float, float] | None = None):
+        super().__init__()
+        if filling not in FILLINGS:
+            raise MembraneError(f"CavityLaw: filling = {filling!r}; expected one of {', '.join(FILLINGS)}")
+        if filling == "gas" and gas is None:
+            raise MembraneError("CavityLaw: filling = 'gas' without gas = (pressure, volume); pass both")
+        self.filling = filling
+        self.register_buffer("rest_pressure", rest_pressure)
+        self.register_buffer("rest_volume", membrane.rest_volume.clone())
+        self.register_buffer("gas", torch.tensor(gas if gas else (1.0, 1.0), dtype=torch.float64))
+
+    def condition(self, rise: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
+        """Target `c [...]` and compliance `C` (a liquid's `[]`) of a step, `v.y + C (pressure step) = c`.
+
+        Arguments: the volume's `rise [...]` above that at rest, the pressure `[...]` there.
+        """
+        if self.filling == "liquid":
+            return -rise, rise.new_zeros(())
+        absolute, volume = self.gas.unbind()
+        ratio = volume / (volume + rise)
+        compliance = volume / (absolute * ratio**2)
+        return compliance * (self.rest_pressure + absolute * (ratio - 1) - pressure), compliance
+
+    def target_volume(self, volume: Tensor, pressure: Tensor) -> Tensor:
+        """The volume that the law asks for at this pressure, `[...]` (an open cavity: any)."""
+        if self.filling == "liquid":
+            return self.rest_volume.expand(volume.shape)
+        if self.filling == "open":
+            return volume
+        absolute, gas = self.gas.unbind()
+        return self.rest_volume + gas * (absolute / (absolute + pressure - self.rest_pressure) - 1)
+
+
+def rest_balance(membrane: Membrane, energy) -> tuple[Tensor, Tensor]:
+    """Rest pressure `p0 []` and rest load `h = grad U(X) - p0 grad V(X)` of the free vertices, `[V, 3]`, zero on the rim.
+
+    `p0` weights both with the normals, so spurious tangential parts have no say; `energy`: a `Sheet` or the paper's element.
+    """
+    force, push = energy.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
+    normal, free = membrane.rest_normals, membrane.free
+    p0 = (force * normal)[free].sum() / (push * normal)[free].sum()
+    return p0, torch.where(membrane.fixed[:, None], 0.0, force - p0 * push)

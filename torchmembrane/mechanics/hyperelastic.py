@@ -1,0 +1,350 @@
+"""Elastic energy of the sheet on linear triangles: harmonic, neo-Hookean, Mooney-Rivlin; the paper's affine quadrilaterals.
+
+With the rest metric `G` and the deformed metric `g` of a triangle's edges, `I = tr(G^-1 g)` and `D = det g / det G` are the
+invariants of `C = F^T F`; the energy per rest area is `W(I, D)`. Everything is in units of shear modulus x thickness (at rest,
+that is already stretched) unless these are given; the prestretch `l` is that of the rest state.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..errors import MembraneError
+from ..surface.membrane import Membrane, corners, corners_to_vertices, triangles_of
+from ..surface.stencil import combined, ring_edges, taps
+
+MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
+_FIRST = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+_SECOND = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+class Derivatives(NamedTuple):
+    """Derivatives of `W(I, D)`."""
+
+    I: Tensor  # noqa: E741
+    D: Tensor
+    ID: Tensor
+    DD: Tensor
+    convex_D: Tensor
+    """The part of `D` that comes from terms convex in the metric; the rest is left out of the stiffness (Gauss-Newton)."""
+
+
+class Rest(NamedTuple):
+    """Of `T` triangles at rest: inverse metric `[3, T]` (11, 12, 22) of the two edges from the first vertex, the metric's
+    determinant and the area `[1, T]`."""
+
+    inverse_metric: Tensor
+    det: Tensor
+    area: Tensor
+
+
+class Strain(NamedTuple):
+    """Of `T` triangles: the two edges from the first vertex `[..., 3, 2, T]`, the adjugate of their metric `[..., 3, T]`
+    (11, 12, 22), the invariants `I` and `D` `[..., 1, T]`."""
+
+    edges: Tensor
+    adjugate: Tensor
+    I: Tensor  # noqa: E741
+    D: Tensor
+
+
+class Sheet(nn.Module):
+    """The sheet's elastic energy `U(x)`, its gradient, and its stiffness along given directions.
+
+    Arguments: the membrane; `model` harmonic | neo_hookean | mooney_rivlin; `prestretch` l; `modulus` = shear modulus x
+    thickness at rest (force / length); `c2_ratio` = C2 / C1.
+
+    harmonic       `W = mu/2 l^2 (I - 2)` (eq. 11 with the 1/2 and the area element that the printed formula lacks)
+    neo_hookean    `W = mu/2 (l^2 I + 1 / (l^4 D) - 3)`
+    mooney_rivlin  `W = C1 (I1 - 3) + C2 (I2 - 3)`, `I1 = l^2 I + 1 / (l^4 D)`, `I2 = l^4 D + I / (l^2 D)`, `2 (C1 + C2) = mu`
+    """
+
+    def __init__(self, membrane: Membrane, model="neo_hookean", prestretch=1.0, modulus=1.0, c2_ratio=0.0):
+        super().__init__()
+        if model not in MODELS:
+            raise MembraneError(f"Sheet: model = {model!r}; expected one of {', '.join(MODELS)}")
+        self.model, self.grid = model, membrane.grid
+        c2 = modulus / 2 * c2_ratio / (1 + c2_ratio) if model == "mooney_rivlin" else 0.0
+        for name, value in (("prestretch", prestretch), ("c1", modulus / 2 - c2), ("c2", c2)):
+            self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
+        self._register_rest("", _edges(membrane.rest, self.grid))
+        self._register_rest("around_", combined(membrane.rest, ring_edges(), self.grid, border=False).unflatten(-1, (2, -1)))
+        for name, constant in _metric_constants().items():
+            self.register_buffer(name, constant)
+        self._register_ring(membrane)
+
+    def _register_rest(self, which: str, edges: Tensor) -> None:
+        metric = _metric(edges)
+        det = _determinant(metric)
+        for name, value in Rest(_adjugate(metric) / det, det, det.sqrt() / 2)._asdict().items():
+            self.register_buffer(f"{which}{name}", value)
+
+    def _rest(self, which: str = "") -> Rest:
+        return Rest(*(getattr(self, f"{which}{name}") for name in Rest._fields))
+
+    def _register_ring(self, membrane: Membrane) -> None:
+        """Of the six triangles around every vertex, `[6 V]` in all: sides (two from the vertex, the one across), constants."""
+        own, ring = taps()[:1], taps()[1:]
+        following = ring.roll(-1, 0)
+        self.register_buffer("sides", torch.cat([ring - own, following - own, following - ring]))
+        sides = lambda x: combined(x, self.sides, self.grid).unflatten(-1, (3, -1))  # noqa: E731
+        missing = (sides(torch.ones_like(membrane.rest)) != 0).any(0).any(0)
+        e1, e2, _ = sides(membrane.rest).unbind(-2)
+        g11, g12, g22 = (e1 * e1).sum(0), (e1 * e2).sum(0), (e2 * e2).sum(0)
+        det = torch.where(missing, 1.0, g11 * g22 - g12**2)
+        twice_area = torch.where(missing, 0.0, det.sqrt())
+        self.register_buffer("first", torch.stack([g22 - g12, g11 - g12, g12]) / det)  # I is their sum over the sides' squares
+        self.register_buffer("missing", missing.double())
+        self.register_buffer("half_over_det", torch.where(missing, 0.0, 0.5 / det))
+        self.register_buffer("pull_of_first", -twice_area * self.first[:2])
+        self.register_buffer("pull_of_slope", -twice_area / det)
+        self.register_buffer("heron", 0.5 - torch.eye(3, dtype=torch.float64))
+        self.register_buffer("total", torch.ones(1, 3, dtype=torch.float64))
+
+    def on(self, membrane: Membrane) -> "Sheet":
+        """The same material on another membrane or grid."""
+        modulus = 2 * float(self.c1 + self.c2)
+        return Sheet(membrane, self.model, float(self.prestretch), modulus, float(self.c2 / self.c1))
+
+    def strain(self, x: Tensor) -> Strain:
+        """The strain of `x [..., V, 3]`: of all triangles, `T = 2 (m-1) (n-1)`."""
+        return self._strain(_edges(x, self.grid), self._rest())
+
+    def _strain(self, edges: Tensor, rest: Rest) -> Strain:
+        metric = _metric(edges)
+        first = (self.twice_12 * rest.inverse_metric * metric).sum(-2, keepdim=True)
+        return Strain(edges, _adjugate(metric), first, _determinant(metric) / rest.det)
+
+    def density(self, I: Tensor, D: Tensor) -> Tensor:  # noqa: E741
+        """Energy per rest area `W(I, D)`."""
+        l2, c1, c2 = self.prestretch**2, self.c1, self.c2
+        if self.model == "harmonic":
+            return c1 * l2 * (I - 2)
+        return c1 * (l2 * I + 1 / (l2**2 * D) - 3) + c2 * (l2**2 * D + I / (l2 * D) - 3)
+
+    def slopes(self, I: Tensor, D: Tensor) -> tuple[Tensor, Tensor]:  # noqa: E741
+        """First derivatives of `density` in `I` and `D`; what is constant is a scalar."""
+        l2, c1, c2 = self.prestretch**2, self.c1, self.c2
+        if self.model == "harmonic":
+            return c1 * l2, torch.zeros_like(l2)
+        w_D = -c1 / l2**2 / (D * D)
+        if self.model == "neo_hookean":
+            return c1 * l2, w_D
+        inverse = 1 / D
+        return c1 * l2 + c2 / l2 * inverse, w_D - c2 / l2 * I * inverse * inverse + c2 * l2**2
+
+    def derivatives(self, I: Tensor, D: Tensor) -> Derivatives:  # noqa: E741
+        """First and second derivatives of `density`; what is constant is a scalar."""
+        l2, c1, c2 = self.prestretch**2, self.c1, self.c2
+        zero, (w_I, w_D) = torch.zeros_like(l2), self.slopes(I, D)
+        if self.model == "harmonic":
+            return Derivatives(w_I, w_D, zero, zero, zero)
+        if self.model == "neo_hookean":
+            return Derivatives(w_I, w_D, zero, -2 * w_D / D, w_D)
+        return Derivatives(w_I, w_D, -c2 / (l2 * D**2), 2 * c1 / (l2**2 * D**3) + 2 * c2 * I / (l2 * D**3), w_D - c2 * l2**2)
+
+    def energy(self, x: Tensor) -> Tensor:
+        """`U(x)`, `[..., V, 3]` to `[...]`."""
+        _, _, I, D = self.strain(x)  # noqa: E741
+        return (self.area * self.density(I, D)).sum((-1, -2))
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """`dU/dx`, `[..., V, 3]`: the sheet's forces with opposite sign, at every vertex from the six triangles around it.
+
+        `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron).
+        """
+        batch, V = x.shape[:-2], x.shape[-2]
+        e = combined(x, self.sides, self.grid)
+        squared = (self.total @ (e * e)).reshape(*batch, 3, 6 * V)
+        slope = self.heron @ squared  # det dD/dl
+        D = self.total @ (squared * slope) * self.half_over_det + self.missing
+        w_I, w_D = self.slopes(self.total @ (self.first * squared), D)
+        pull = self.pull_of_first * w_I + self.pull_of_slope * w_D * slope[..., :2, :]
+        return (e[..., : 12 * V].reshape(*batch, 3, 12, V) * pull.reshape(*batch, 1, 12, V)).sum(-2).mT
+
+    def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
+        """Positive semi-definite stiffness of displacements along one direction a vertex.
+
+        Arguments: `x [..., V, 3]`, `directions [..., V, 3]`. Returns the corner matrices `[..., m-1, n-1, 4, 4]`, whose sum
+        over quadrilaterals is `K_kl = d_k . H_kl d_l` with `H` the Hessian of `U`: exact where the sheet is in tension (for
+        Mooney-Rivlin without the term of `D` that is not convex), and for the harmonic energy `L_kl d_k . d_l` (eq. 64).
+        """
+        H = self.hessian_blocks(x, positive=True).unflatten(-1, (3, 3)).unflatten(-3, (3, 3))
+        d = triangles_of(corners(directions, self.grid))
+        return self._quadrilaterals(torch.einsum("...kilj,...ki,...lj->...kl", H, d, d))
+
+    def hessian_blocks(self, x: Tensor, positive=False) -> Tensor:
+        """Second derivatives of every triangle's energy in its nine vertex coordinates, `[..., m-1, n-1, 2, 9, 9]`.
+
+        Arguments: `x [..., V, 3]`. Exact; with `positive` the convex part: compression and (Mooney-Rivlin) the term of `D`
+        that is not convex are left out, so that every block is positive semi-definite. Vertices as in `TRIANGLE_CORNERS`.
+        """
+        blocks, stress = self._pairs(self.strain(x), self._rest(), positive)
+        blocks = (blocks + stress * torch.eye(3, dtype=x.dtype, device=x.device)[..., None]).unflatten(
+            -1, (2, *_cells(self.grid))
+        )
+        ab, ac, bc = blocks.movedim((-3, -6, -5, -4), (-4, -3, -2, -1)).unbind(-3)
+        rows = [[-(ab + ac), ab, ac], [ab.mT, -(ab.mT + bc), bc], [ac.mT, bc.mT, -(ac.mT + bc.mT)]]
+        return torch.cat([torch.cat(row, -1) for row in rows], -2)
+
+    def ring(self, edges: Tensor) -> tuple[Tensor, Tensor]:
+        """What inner vertices' forces and slopes are made of, at their six neighbours: `s [..., 6, N]`, `H [..., 3, 3, 6, N]`.
+
+        The force (as `gradient`) is `sum_i s_i (x_i - x_k)` over the six neighbours; its derivative in neighbour `i` is `H_i`,
+        in the vertex itself minus the sum of the six. `edges [..., 3, 2, 6 N]`, from `ring_edges`. A neighbour is the second
+        vertex of the triangle with its number, and the third of that before.
+        """
+        rest = self._rest("around_")
+        blocks, stress = (a.unflatten(-1, (6, -1)) for a in self._pairs(self._strain(edges, rest), rest, count=2))
+        blocks, stress = (second + third.roll(1, -2) for second, third in (a.unbind(-5) for a in (blocks, stress)))
+        one = torch.eye(3, dtype=edges.dtype, device=edges.device)[..., None, None]
+        return stress[..., 0, 0, :, :], blocks + stress * one
+
+    def _pairs(self, strain: Strain, rest: Rest, positive=False, count=3) -> tuple[Tensor, Tensor]:
+        """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2), or the first `count` of these pairs:
+        `B [..., count, 3, 3, T]` and `S [..., count, 1, 1, T]` of `B + S 1`.
+
+        Those in its edges `a`, `b` from vertex 0 are `sum_cd T_cd e_c e_d^T + S_ab 1`: `S` is the stress, force on edge a is
+        `sum_b S_ab e_b`, and `T` comes from the second derivatives `Q` in the metric.
+        """
+        e, adjugate, I, D = strain  # noqa: E741
+        w, q = self.derivatives(I, D), self.twice_12 / rest.det * adjugate
+        outer = lambda a, b: (a[..., :, None, :] * b[..., None, :, :]).flatten(-3, -2)  # noqa: E731
+        stress = 2 * rest.area * rest.inverse_metric * w.I + 2 * rest.area / rest.det * w.D * adjugate
+        Q = outer(q, rest.area * w.DD * q) + rest.area / rest.det * (w.convex_D if positive else w.D) * self.bend
+        if self.model == "mooney_rivlin":
+            p = rest.area * w.ID * self.twice_12 * rest.inverse_metric
+            Q = Q + outer(p, q) + outer(q, p)
+        T = (self.metric_to_pairs[: 4 * count] @ Q).unflatten(-2, (count, 2, 1, 2))
+        S = (self.stress_to_pairs[:count] @ (_tension(stress) if positive else stress))[..., None, None, :]
+        first, second = (T * e[..., None, None, :, :, :]).sum(-2).unbind(-3)
+        e1, e2 = e[..., None, :, None, :, :].unbind(-2)
+        return e1 * first[..., None, :, :] + e2 * second[..., None, :, :], S
+
+    @staticmethod
+    def _quadrilaterals(K: Tensor) -> Tensor:
+        first, second = (torch.tensor(t, dtype=K.dtype, device=K.device) for t in (_FIRST, _SECOND))
+        return first.T @ K[..., 0, :, :] @ first + second.T @ K[..., 1, :, :] @ second
+
+    @property
+    def tension(self) -> Tensor:
+        """Rest tension (force / length): the isotropic stress resultant at `x = X`."""
+        two, one = self.prestretch.new_tensor(2.0), self.prestretch.new_tensor(1.0)
+        w = self.derivatives(two, one)
+        return 2 * (w.I + w.D)
+
+
+def _cells(grid) -> tuple[int, int]:
+    return grid[0] - 1, grid[1] - 1
+
+
+def _edges(x: Tensor, grid) -> Tensor:
+    g = x.transpose(-2, -1).unflatten(-1, grid)
+    a, b, c, d = g[..., :-1, :-1], g[..., 1:, :-1], g[..., 1:, 1:], g[..., :-1, 1:]
+    ac = c - a
+    return torch.stack([torch.stack([b - a, ac], -3), torch.stack([ac, d - a], -3)], -4).flatten(-3)
+
+
+def _metric(edges: Tensor) -> Tensor:
+    e1, e2 = edges.split(1, -2)
+    return (torch.cat([e1, e1, e2], -2) * torch.cat([e1, e2, e2], -2)).sum(-3)
+
+
+def _adjugate(metric: Tensor) -> Tensor:
+    g11, g12, g22 = metric.split(1, -2)
+    return torch.cat([g22, -g12, g11], -2)
+
+
+def _determinant(metric: Tensor) -> Tensor:
+    g11, g12, g22 = metric.split(1, -2)
+    return g11 * g22 - g12 * g12
+
+
+def _metric_constants() -> dict[str, Tensor]:
+    """What is constant in second derivatives by the metric's entries 11, 12, 22.
+
+    `twice_12 [3]`; `bend [9]`, those of the determinant; `metric_to_pairs [12, 9]`, from any such to `T_cd` of `Sheet._pairs`;
+    `stress_to_pairs [3, 3]`, likewise for the stress.
+    """
+    slopes = np.zeros((2, 3, 2))  # d g / d e_a = sum_c slopes[a, g, c] e_c
+    slopes[0, 0, 0] = slopes[1, 2, 1] = 2.0
+    slopes[0, 1, 1] = slopes[1, 1, 0] = 1.0
+    edges = np.einsum("agc,bhd->abcdgh", slopes, slopes).reshape(2, 2, 4, 9)
+    to_pairs = np.stack([-edges.sum(0)[0], -edges.sum(0)[1], edges[0, 1]]).reshape(12, 9)
+    return dict(
+        twice_12=torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)[:, None],
+        bend=torch.tensor([0.0, 0, 1, 0, -2, 0, 1, 0, 0], dtype=torch.float64)[:, None],
+        metric_to_pairs=torch.from_numpy(to_pairs),
+        stress_to_pairs=torch.tensor([[-1.0, -1, 0], [0, -1, -1], [0, 1, 0]], dtype=torch.float64),
+    )
+
+
+def _tension(stress: Tensor) -> Tensor:
+    """The positive semi-definite part of symmetric 2 x 2 matrices given as (11, 12, 22), `[..., 3, T]`."""
+    s11, s12, s22 = stress.split(1, -2)
+    mean, half = (s11 + s22) / 2, (s11 - s22) / 2
+    radius = (half**2 + s12**2).clamp_min(torch.finfo(stress.dtype).tiny).sqrt()
+    high, low = (mean + radius).clamp_min(0), (mean - radius).clamp_min(0)
+    centre, slope = (high + low) / 2, (high - low) / (2 * radius)
+    return torch.cat([centre + slope * half, slope * s12, centre - slope * half], -2)
+
+
+class AffineQuadrilaterals(nn.Module):
+    """The paper's element: one affine map fitted to the four corners (eqs. 15-18), linear in the corner positions.
+
+    The map is fitted in the plane of the quadrilateral (spanned by its diagonals; in space G of eq. 16 is singular), so that
+    `A [3, 2] = sum_k x_k g_k^T` with constant `g_k`, and `E = 1/2 tension sum area tr(A^T A)` (eq. 12 with its 1/2).
+    It is blind to the hourglass mode: use it with the smoother (eq. 28).
+    """
+
+    def __init__(self, membrane: Membrane, tension: float = 1.0):
+        super().__init__()
+        self.grid = membrane.grid
+        p = corners(membrane.rest, self.grid)
+        diagonal_1, diagonal_2 = p[..., 2, :] - p[..., 0, :], p[..., 3, :] - p[..., 1, :]
+        normal = torch.linalg.cross(diagonal_1, diagonal_2)
+        area = torch.linalg.vector_norm(normal, dim=-1) / 2
+        axis_1 = nn.functional.normalize(diagonal_1, dim=-1)
+        axis_2 = nn.functional.normalize(torch.linalg.cross(normal, axis_1), dim=-1)
+        centred = p - p.mean(-2, keepdim=True)
+        plane = torch.stack([(centred * axis_1[..., None, :]).sum(-1), (centred * axis_2[..., None, :]).sum(-1)], -1)
+        g11, g12, g22 = (plane[..., a] * plane[..., b] for a, b in ((0, 0), (0, 1), (1, 1)))
+        g11, g12, g22 = g11.sum(-1), g12.sum(-1), g22.sum(-1)
+        inverse = torch.stack([torch.stack([g22, -g12], -1), torch.stack([-g12, g11], -1)], -2)
+        inverse = inverse / (g11 * g22 - g12**2)[..., None, None]
+        self.register_buffer("map_weights", plane @ inverse)
+        self.register_buffer("tension", torch.as_tensor(tension, dtype=torch.float64).clone())
+        self.register_buffer("area", area)
+
+    def affine_maps(self, x: Tensor) -> Tensor:
+        """Linear parts `A [..., m-1, n-1, 3, 2]` of the maps from each quadrilateral's rest plane."""
+        return torch.einsum("...kc,...ka->...ca", corners(x, self.grid), self.map_weights)
+
+    def energy(self, x: Tensor) -> Tensor:
+        """`1/2 tension sum area tr(A^T A)`, `[..., V, 3]` to `[...]`; less the rest's, as `Sheet`'s harmonic energy."""
+        maps = self.affine_maps(x)
+        return self.tension / 2 * (self.area * ((maps**2).sum((-1, -2)) - 2)).sum((-1, -2))
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """`dE/dx`, `[..., V, 3]`."""
+        maps = self.affine_maps(x) * (self.tension * self.area)[..., None, None]
+        return corners_to_vertices(torch.einsum("...ca,...ka->...kc", maps, self.map_weights), self.grid)
+
+    def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
+        """Corner matrices `[..., m-1, n-1, 4, 4]` of `K = L o (R R^T)`, exactly quadratic: `x` is not looked at."""
+        d = corners(directions, self.grid)
+        L = (self.tension * self.area)[..., None, None] * (self.map_weights @ self.map_weights.mT)
+        return L * (d @ d.mT)
+
+    def q_matrix(self, directions: Tensor) -> Tensor:
+        """The paper's `Q` (eq. 18), `[..., 6 (m-1)(n-1), V]`: rows are the weighted entries of all maps, linear in `t`.
+
+        `||Q t||^2 = t^T K t`. Dense: for study and tests, the estimator works with its square.
+        """
+        V = self.grid[0] * self.grid[1]
+        one = torch.eye(V, dtype=directions.dtype, device=directions.device)
+        moved = one[..., :, None] * directions[..., None, :, :]
+        maps = self.affine_maps(moved) * (self.tension * self.area).sqrt()[..., None, None]
+        return maps.flatten(-4).mT

@@ -1,0 +1,1 @@
+"""The whole reconstruction as one ONNX model."""

@@ -1,0 +1,1 @@
+"""What only the paper's study needs: the Monge form, one dimension."""

@@ -1,0 +1,1 @@
+"""A sensor: what is known of it, and its file."""

@@ -1,0 +1,208 @@
+"""Reading and writing `sensor.toml` and the arrays named in it."""
+
+import csv
+import math
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from ..camera.model import Camera, Port
+from ..errors import MembraneError
+from ..io.images import write_image
+from ..surface.membrane import Membrane
+from .model import (
+    FORMAT,
+    METRE,
+    SHAPES_BY_ARRAYS,
+    SHAPES_BY_NUMBERS,
+    Cavity,
+    Markers,
+    Material,
+    Sensor,
+    Surface,
+    content,
+    refuse_off_surface,
+)
+from .table import Table, toml_lines
+
+COARSEST, FINEST = 25, 33  # solver grids chosen without being told
+DOTS_HEADER = ["x", "y", "z", "size"]
+
+
+def read_sensor(path: Path) -> Sensor:
+    """See `Sensor.from_file`."""
+    file = Table.from_file(path)
+    file.allow(("format", "name", "length_unit", "camera", "membrane", "material", "cavity", "markers"))
+    if file.number("format") != FORMAT:
+        raise file.refuse("format", f"{FORMAT}, the one this version reads: update torchmembrane or the file")
+    name, length_unit = file.text("name"), file.text("length_unit", METRE)
+    camera = _read_camera(file.table("camera"))
+    material = _read_material(file.table("material"))
+    cavity = _read_cavity(file.table("cavity"))
+    markers, lines = _read_markers(file.table("markers"))
+    surface, membrane = _read_membrane(file.table("membrane"), markers)
+    if markers.positions is not None:
+        refuse_off_surface(membrane, markers.positions, lambda i: f"{lines[i]}: the dot")
+    with file.naming():
+        return Sensor(name, length_unit, camera, membrane, material, cavity, markers, surface)
+
+
+def write_sensor(sensor: Sensor, path: Path) -> Path:
+    """See `Sensor.to_file`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tables, surface, markers = content(sensor), sensor.surface, sensor.markers
+    if surface.shape in SHAPES_BY_ARRAYS:
+        tables["membrane"]["file"] = f"{path.stem}_{surface.shape}.npz"
+        np.savez_compressed(path.with_name(tables["membrane"]["file"]), **surface.values)
+    if markers.positions is not None:
+        tables["markers"]["file"] = f"{path.stem}_dots.csv"
+        _write_dots(path.with_name(tables["markers"]["file"]), markers)
+    if markers.rest_image is not None:
+        tables["markers"]["rest_image"] = write_image(path.with_name(f"{path.stem}_rest"), markers.rest_image).name
+    ports, medium = tables["camera"].pop("ports"), tables["camera"].pop("medium")
+    blocks = {name: toml_lines(name, table) for name, table in tables.items()}
+    for port in ports:
+        blocks["camera"] += toml_lines("camera.ports", port, repeated=True)
+    if ports:
+        blocks["camera"] += toml_lines("camera.medium", medium)
+    path.write_text("\n\n".join("\n".join(lines) for lines in blocks.values()) + "\n", encoding="utf-8")
+    return path
+
+
+def default_grid(markers: Markers) -> tuple[int, int]:
+    """The solver grid where the file names none: 2.8 times as fine as the dots listed, 25, 29 or 33; 25 for texture.
+
+    33 where dots are still to be found in the rest image.
+    """
+    if markers.kind == "texture":
+        return COARSEST, COARSEST
+    if markers.positions is None:
+        return FINEST, FINEST
+    n = min(max(4 * round(2.8 * math.sqrt(len(markers.positions)) / 4) + 1, COARSEST), FINEST)
+    return n, n
+
+
+def _read_camera(table: Table) -> Camera:
+    table.allow(("model", "image_size", "focal", "centre", "distortion", "ports", "medium"))
+    ports = table.tables("ports")
+    medium = table.table("medium", required=bool(ports))
+    for part in ports:
+        part.allow(Port._fields)
+    if medium:
+        medium.allow(("index",))
+    with table.naming():
+        return Camera(
+            model=table.text("model", ("pinhole", "fisheye")),
+            image_size=table.numbers("image_size", 2, whole=True),
+            focal=table.numbers("focal", 2),
+            centre=table.numbers("centre", 2),
+            distortion=table.numbers("distortion", None),
+            ports=[Port(*(port.number(key) for key in Port._fields)) for port in ports],
+            medium_index=medium.number("index") if medium else 1.0,
+        )
+
+
+def _read_material(table: Table) -> Material:
+    table.allow(("model", "prestretch", "c2_ratio", "shear_modulus", "thickness"))
+    numbers = {key: table.number(key, required=False) for key in ("c2_ratio", "shear_modulus", "thickness")}
+    model, prestretch = table.text("model"), table.number("prestretch")
+    with table.naming():
+        return Material(model, prestretch, **numbers)
+
+
+def _read_cavity(table: Table) -> Cavity:
+    table.allow(("filling", "pressure", "volume"))
+    filling, pressure, volume = table.text("filling"), table.number("pressure", False), table.number("volume", False)
+    with table.naming():
+        return Cavity(filling, pressure, volume)
+
+
+def _read_markers(table: Table) -> tuple[Markers, list[str]]:
+    """The markers, and of each listed dot where it stands: file and line."""
+    table.allow(("kind", "file", "rest_image", "polarity"))
+    kind = table.text("kind", ("dots", "texture"))
+    polarity = table.text("polarity", ("dark", "light"), required=kind == "dots") or "dark"
+    dots, image = table.file("file", required=False), table.file("rest_image", required=False)
+    if dots and kind == "texture":
+        raise table.refuse("file", "none for texture, whose patches are chosen in the rest image: remove it")
+    positions, sizes, lines = _read_dots(dots) if dots else (None, None, [])
+    with table.naming("rest_image"):
+        return Markers(kind, polarity, positions, sizes, image), lines
+
+
+def _read_dots(path: Path) -> tuple[np.ndarray, list[str], list[str]]:
+    try:
+        rows = list(enumerate(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()), 1))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise MembraneError(f"{path}: not readable as CSV ({error}); expected UTF-8 text with x,y,z,size") from error
+    rows = [(i, [cell.strip() for cell in row]) for i, row in rows if row]
+    if not rows or rows[0][1] != DOTS_HEADER:
+        found = ",".join(rows[0][1]) if rows else "nothing"
+        raise MembraneError(f"{path}, line 1: the header is {found!r}; expected x,y,z,size: correct it")
+    if len(rows) == 1:
+        raise MembraneError(f"{path}: no dots after the header; expected a line x,y,z,size for each")
+    dots = [_dot(f"{path}, line {i}", row) for i, row in rows[1:]]
+    return np.array([dot[0] for dot in dots]), [dot[1] for dot in dots], [f"{path}, line {i}" for i, _ in rows[1:]]
+
+
+def _dot(line: str, row: list[str]) -> tuple[list[float], str]:
+    if len(row) != 4:
+        raise MembraneError(f"{line}: {len(row)} values, {','.join(row)}; expected four, x,y,z,size")
+    position = []
+    for key, cell in zip("xyz", row, strict=False):
+        try:
+            position.append(float(cell))
+        except ValueError:
+            raise MembraneError(f"{line}: {key} = {cell!r}; expected a number with a decimal point") from None
+        if not math.isfinite(position[-1]):
+            raise MembraneError(f"{line}: {key} = {cell}; expected a finite number: leave unknown dots out")
+    if row[3] not in ("small", "large"):
+        raise MembraneError(f"{line}: size = {row[3]!r}; expected small or large")
+    return position, row[3]
+
+
+def _write_dots(path: Path, markers: Markers) -> None:
+    rows = [[*map(repr, position), size] for position, size in zip(markers.positions.tolist(), markers.sizes, strict=True)]
+    path.write_text("\n".join(map(",".join, [DOTS_HEADER, *rows])) + "\n", encoding="utf-8")
+
+
+def _read_membrane(table: Table, markers: Markers) -> tuple[Surface, Membrane]:
+    shape = table.text("shape", [*SHAPES_BY_ARRAYS, *SHAPES_BY_NUMBERS])
+    arrays, numbers = SHAPES_BY_ARRAYS.get(shape), SHAPES_BY_NUMBERS.get(shape, ())
+    table.allow(("shape", "grid", *(("file",) if arrays else numbers)), f"for shape {shape}")
+    named = table.numbers("grid", 2, required=False, whole=True)
+    grid = tuple(named or default_grid(markers))
+    if min(grid) < 5:
+        raise table.refuse("grid", "5 x 5 vertices or more; 17 x 17 serves about 150 dots")
+    if arrays:
+        path = table.file("file")
+        surface = Surface(shape, _read_arrays(path, arrays))
+        with table.naming("file"):
+            membrane = surface.membrane(grid)
+            lines = surface.values["vertices" if shape == "grid" else "z"].shape[:2]
+            return surface, membrane.resampled(grid) if lines == grid and not named else membrane  # evenly, unless asked for
+    surface = Surface(shape, {key: table.numbers(key, 3) if key == "semi_axes" else table.number(key) for key in numbers})
+    with table.naming():
+        return surface, surface.membrane(grid)
+
+
+def _read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in names if name in file}
+            found = ", ".join(file) or "nothing"
+    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
+        raise MembraneError(f"{path}: not readable ({error}); expected an .npz as numpy.savez writes it") from error
+    for name in names:
+        if name not in arrays:
+            raise MembraneError(f"{path}: {name} is missing, the file holds {found}; expected {', '.join(names)}: add it")
+        array = arrays[name]
+        if name != "fixed":
+            if array.dtype.kind not in "fiu":
+                raise MembraneError(f"{path}: {name} is of type {array.dtype}; expected numbers")
+            arrays[name] = array.astype(np.float64)
+            if not np.isfinite(arrays[name]).all():
+                at = np.argwhere(~np.isfinite(arrays[name]))[0].tolist()
+                raise MembraneError(f"{path}: {name}{at} is not finite; expected finite numbers everywhere")
+    return arrays

@@ -1,0 +1,1 @@
+"""The rest surface: shapes, the triangulated grid, its stencil."""
