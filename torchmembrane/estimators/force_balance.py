@@ -29,7 +29,7 @@ from ..mechanics.hyperelastic import Sheet
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..solve.stencil_system import NEAR, StencilSystem
 from ..surface.membrane import Membrane, SurfacePoints
-from ..surface.stencil import bordered, combined, inner, ring_edges, taps
+from ..surface.stencil import apply_stencil, bordered, inner, one_ring_edges, stencil_kernels
 from .covariance import StandardDeviations, standard_deviations
 
 STEPS, COARSE_STEPS, TAU = 8, 4, (4.0, 0.4)  # from rest, and so where a finer grid follows
@@ -115,9 +115,11 @@ class ForceBalance(nn.Module):
         within = lambda field: inner(field, membrane.grid)  # noqa: E731
         self.register_buffer("area", within(membrane.rest_area[:, None]).squeeze(-1))
         self.register_buffer("free", within(self.moves).squeeze(-1))
-        self.register_buffer("edges", ring_edges())
-        self.register_buffer("taps", taps())
-        self.register_buffer("free_neighbours", combined(self.moves, taps()[1:], membrane.grid, border=False).reshape(6, -1))
+        self.register_buffer("edges", one_ring_edges())
+        self.register_buffer("stencil_kernels", stencil_kernels())
+        self.register_buffer(
+            "free_neighbours", apply_stencil(self.moves, stencil_kernels()[1:], membrane.grid, border=False).reshape(6, -1)
+        )
         self.register_buffer("surroundings", within(within(_surroundings(membrane)).mT).mT)
         vertex_shares, pair_shares = _shares(membrane, markers)
         self.register_buffer("vertex_shares", vertex_shares)
@@ -227,12 +229,12 @@ class ForceBalance(nn.Module):
     def linearised(self, x: Tensor, pressure: Tensor) -> "Linearised":
         """`contact_force` and what it and the volume do when vertices move, at the inner vertices."""
         grid = self.membrane.grid
-        edges = combined(x, self.edges, grid, border=False).unflatten(-1, (2, -1))
-        gradient, volume_ring = self.membrane.volume_ring(edges)
-        stress, sheet_ring = self.sheet.ring(edges)
+        edges = apply_stencil(x, self.edges, grid, border=False).unflatten(-1, (2, -1))
+        gradient, volume_one_ring = self.membrane.volume_one_ring(edges)
+        stress, sheet_ring = self.sheet.one_ring(edges)
         pull = (stress[:, None] * edges[:, :, 0].unflatten(-1, (6, -1))).sum(2)
         force = pull - inner(self.rest_load, grid).mT - pressure[:, None, None] * gradient
-        beside = self.free_neighbours * (sheet_ring - pressure[:, None, None, None, None] * volume_ring)
+        beside = self.free_neighbours * (sheet_ring - pressure[:, None, None, None, None] * volume_one_ring)
         slope = torch.cat([-sheet_ring.sum(3, keepdim=True), beside], 3) * self.free
         return Linearised(force * self.free, slope, gradient * self.free, F.normalize(gradient, dim=1))
 
@@ -305,7 +307,11 @@ class ForceBalance(nn.Module):
     def along(self, slope: Tensor, move: Tensor) -> Tensor:
         """How forces change, `A u [B, C, 3, N]`, when the inner vertices make moves `u` of that shape: `A^T u` as well."""
         m, n = self.membrane.grid
-        moves = combined(move.mT, self.taps, (m - 2, n - 2)).unflatten(-1, (len(self.taps), -1)).flatten(2, 3)
+        moves = (
+            apply_stencil(move.mT, self.stencil_kernels, (m - 2, n - 2))
+            .unflatten(-1, (len(self.stencil_kernels), -1))
+            .flatten(2, 3)
+        )
         return (slope.flatten(2, 3)[:, None] * moves[:, :, None]).sum(3)
 
     def force_weights(self, normal: Tensor, force: Tensor, tau: float, curvature=False) -> Tensor:

@@ -132,5 +132,7 @@ class MinimumEnergy(nn.Module):
 
 def grid_laplacian(psi: Tensor, grid: tuple[int, int]) -> Tensor:
     """S of eq. 28 for `psi [..., V, C]` (symmetric): every vertex against its neighbours along the grid's lines."""
-    ring = torch.tensor([[2.0, -1, 0, -1], [-1, 2, -1, 0], [0, -1, 2, -1], [-1, 0, -1, 2]], dtype=psi.dtype, device=psi.device)
-    return 0.5 * corners_to_vertices(ring @ corners(psi, grid), grid)
+    laplacian = torch.tensor(
+        [[2.0, -1, 0, -1], [-1, 2, -1, 0], [0, -1, 2, -1], [-1, 0, -1, 2]], dtype=psi.dtype, device=psi.device
+    )
+    return 0.5 * corners_to_vertices(laplacian @ corners(psi, grid), grid)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..surface.membrane import Membrane, corners, corners_to_vertices, triangles_of
-from ..surface.stencil import combined, ring_edges, taps
+from ..surface.stencil import apply_stencil, one_ring_edges, stencil_kernels
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 _FIRST = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -70,7 +70,9 @@ class Sheet(nn.Module):
         for name, value in (("prestretch", prestretch), ("c1", modulus / 2 - c2), ("c2", c2)):
             self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
         self._register_rest("", _edges(membrane.rest, self.grid))
-        self._register_rest("around_", combined(membrane.rest, ring_edges(), self.grid, border=False).unflatten(-1, (2, -1)))
+        self._register_rest(
+            "around_", apply_stencil(membrane.rest, one_ring_edges(), self.grid, border=False).unflatten(-1, (2, -1))
+        )
         for name, constant in _metric_constants().items():
             self.register_buffer(name, constant)
         self._register_ring(membrane)
@@ -86,10 +88,10 @@ class Sheet(nn.Module):
 
     def _register_ring(self, membrane: Membrane) -> None:
         """Of the six triangles around every vertex, `[6 V]` in all: sides (two from the vertex, the one across), constants."""
-        own, ring = taps()[:1], taps()[1:]
+        own, ring = stencil_kernels()[:1], stencil_kernels()[1:]
         following = ring.roll(-1, 0)
         self.register_buffer("sides", torch.cat([ring - own, following - own, following - ring]))
-        sides = lambda x: combined(x, self.sides, self.grid).unflatten(-1, (3, -1))  # noqa: E731
+        sides = lambda x: apply_stencil(x, self.sides, self.grid).unflatten(-1, (3, -1))  # noqa: E731
         missing = (sides(torch.ones_like(membrane.rest)) != 0).any(0).any(0)
         e1, e2, _ = sides(membrane.rest).unbind(-2)
         g11, g12, g22 = (e1 * e1).sum(0), (e1 * e2).sum(0), (e2 * e2).sum(0)
@@ -156,7 +158,7 @@ class Sheet(nn.Module):
         `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron).
         """
         batch, V = x.shape[:-2], x.shape[-2]
-        e = combined(x, self.sides, self.grid)
+        e = apply_stencil(x, self.sides, self.grid)
         squared = (self.total @ (e * e)).reshape(*batch, 3, 6 * V)
         slope = self.heron @ squared  # det dD/dl
         D = self.total @ (squared * slope) * self.half_over_det + self.missing
@@ -189,11 +191,11 @@ class Sheet(nn.Module):
         rows = [[-(ab + ac), ab, ac], [ab.mT, -(ab.mT + bc), bc], [ac.mT, bc.mT, -(ac.mT + bc.mT)]]
         return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
-    def ring(self, edges: Tensor) -> tuple[Tensor, Tensor]:
+    def one_ring(self, edges: Tensor) -> tuple[Tensor, Tensor]:
         """What inner vertices' forces and slopes are made of, at their six neighbours: `s [..., 6, N]`, `H [..., 3, 3, 6, N]`.
 
         The force (as `gradient`) is `sum_i s_i (x_i - x_k)` over the six neighbours; its derivative in neighbour `i` is `H_i`,
-        in the vertex itself minus the sum of the six. `edges [..., 3, 2, 6 N]`, from `ring_edges`. A neighbour is the second
+        in the vertex itself minus the sum of the six. `edges [..., 3, 2, 6 N]`, from `one_ring_edges`. A neighbour is the second
         vertex of the triangle with its number, and the third of that before.
         """
         rest = self._rest("around_")

@@ -13,7 +13,7 @@ from ..camera.model import Camera
 from ..errors import MembraneError
 from ..surface.membrane import Membrane
 
-RING, RING_RADIUS = 4, 0.3  # default lights around the camera's centre, radius over the rim's mean distance from the axis
+ONE_RING, RING_RADIUS = 4, 0.3  # default lights around the camera's centre, radius over the rim's mean distance from the axis
 BRIGHT = 0.95  # the quantile of the rest surface that is exposed as asked
 
 
@@ -55,7 +55,7 @@ class Look:
         if self.lights is not None:
             return torch.from_numpy(np.array(self.lights, dtype=float).reshape(-1, 3))
         radius = RING_RADIUS * float(membrane.rest[membrane.fixed, :2].norm(dim=-1).mean())
-        angle = 2 * math.pi * (torch.arange(RING, dtype=torch.float64) + 0.5) / RING
+        angle = 2 * math.pi * (torch.arange(ONE_RING, dtype=torch.float64) + 0.5) / ONE_RING
         return torch.stack([radius * angle.cos(), radius * angle.sin(), 0 * angle], -1)
 
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from .stencil import combined, taps
+from .stencil import apply_stencil, stencil_kernels
 
 FINE = 40  # samples a line interval, for arc lengths
 TRIANGLE_CORNERS = ((0, 1, 2), (0, 2, 3))
@@ -80,10 +80,10 @@ class Membrane(nn.Module):
         if self.outward < 0:
             triangles = triangles[:, [0, 2, 1]]
         self.register_buffer("rest", rest)
-        p = taps()[1:]
+        p = stencil_kernels()[1:]
         around = torch.stack([self.outward / 6 * (p[2] - p[0]), self.outward / 6 * (p[4] - p[0]), p[3] - p[1], p[5] - p[3]])
         self.register_buffer("around", around)
-        self.register_buffer("beyond", combined(torch.ones(m * n, 1).double(), around, self.grid).flatten())
+        self.register_buffer("beyond", apply_stencil(torch.ones(m * n, 1).double(), around, self.grid).flatten())
         self.register_buffer("turns", torch.tensor([1, 2, 0, 2, 0, 1]))
         self.register_buffer("volume_third_derivatives", self.outward / 6 * _determinant_derivatives())
         self.register_buffer("volume_cross_products", self.outward / 6 * _cross_products())
@@ -112,7 +112,7 @@ class Membrane(nn.Module):
     def normals(self, x: Tensor) -> Tensor:
         """Unit outward normals at the vertices, `[..., V, 3]`: of the summed area vectors, as the volume gradient's."""
         beyond = self.beyond * torch.cat([x.transpose(-2, -1)] * 4, -1)  # neighbours beyond the border are the vertex itself
-        return F.normalize(self._turns(combined(x, self.around, self.grid) - beyond), dim=-1)
+        return F.normalize(self._turns(apply_stencil(x, self.around, self.grid) - beyond), dim=-1)
 
     def volume(self, x: Tensor) -> Tensor:
         """Volume between the surface and the camera centre, `[...]` (eq. 19): `1/6 sum det [x_a, x_b, x_c]`, of the two
@@ -130,7 +130,7 @@ class Membrane(nn.Module):
 
         The six neighbours `p` in turn give `sum p_i x p_i+1 = (p_2 - p_0) x (p_3 - p_1) + (p_4 - p_0) x (p_5 - p_3)`.
         """
-        return self._turns(combined(x, self.around, self.grid))
+        return self._turns(apply_stencil(x, self.around, self.grid))
 
     def _turns(self, p: Tensor) -> Tensor:
         """A sixth of `sum p_i x p_i+1` at every vertex, outwards; `p [..., 3, 4 V]` as `around` has them."""
@@ -141,9 +141,9 @@ class Membrane(nn.Module):
         """Second derivatives of every triangle's share of the volume, `[..., V, 3]` to `[..., m-1, n-1, 2, 9, 9]`."""
         return (triangles_of(corners(x, self.grid)).flatten(-2) @ self.volume_third_derivatives).unflatten(-1, (9, 9))
 
-    def volume_ring(self, edges: Tensor) -> tuple[Tensor, Tensor]:
+    def volume_one_ring(self, edges: Tensor) -> tuple[Tensor, Tensor]:
         """Derivative of `volume` in the inner vertices, `[..., 3, N]`, and the second ones in them and their six neighbours,
-        `[..., 3, 3, 6, N]`; those in one vertex alone are zero. `edges [..., 3, 2, 6 N]`, from `ring_edges`."""
+        `[..., 3, 3, 6, N]`; those in one vertex alone are zero. `edges [..., 3, 2, 6 N]`, from `one_ring_edges`."""
         first, second = edges.unbind(-2)
         gradient = torch.linalg.cross(first, second, dim=-2).unflatten(-1, (6, -1)).sum(-2)
         before = first.unflatten(-1, (6, -1)).roll(1, -2).flatten(-2)

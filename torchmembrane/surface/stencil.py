@@ -1,7 +1,7 @@
 """The seven-point stencil of a grid of triangles: every vertex inside the border and the six around it.
 
 Fields over all `V` vertices are `[..., V, C]`; over the `N = (m - 2) (n - 2)` inner ones, row by row, `[..., N, C]` or,
-components first, `[..., C, N]`. The six are in turn: `k`, `RING[i]` and `RING[i + 1]` are a triangle. Convolutions, slices and
+components first, `[..., C, N]`. The six are in turn: `k`, `ONE_RING[i]` and `ONE_RING[i + 1]` are a triangle. Convolutions, slices and
 pads: no index arithmetic.
 """
 
@@ -9,25 +9,25 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-RING = ((1, 0), (1, 1), (0, 1), (-1, 0), (-1, -1), (0, -1))
-STENCIL = ((0, 0), *RING)
+ONE_RING = ((1, 0), (1, 1), (0, 1), (-1, 0), (-1, -1), (0, -1))
+STENCIL = ((0, 0), *ONE_RING)
 
 
-def taps() -> Tensor:
-    """Weights for `combined` that pick the vertex itself and its six neighbours, `[7, 3, 3]`."""
+def stencil_kernels() -> Tensor:
+    """Weights for `apply_stencil` that pick the vertex itself and its six neighbours, `[7, 3, 3]`."""
     picks = torch.zeros(len(STENCIL), 3, 3, dtype=torch.float64)
     for pick, (i, j) in zip(picks, STENCIL, strict=True):
         pick[1 + i, 1 + j] = 1.0
     return picks
 
 
-def ring_edges() -> Tensor:
-    """Weights for `combined`: of the six triangles around a vertex the edges from it, all first ones before all second ones."""
-    own, ring = taps()[:1], taps()[1:]
+def one_ring_edges() -> Tensor:
+    """Weights for `apply_stencil`: of the six triangles around a vertex the edges from it, all first ones before all second ones."""
+    own, ring = stencil_kernels()[:1], stencil_kernels()[1:]
     return torch.cat([ring - own, ring.roll(-1, 0) - own])
 
 
-def combined(field: Tensor, weights: Tensor, grid: tuple[int, int], border=True) -> Tensor:
+def apply_stencil(field: Tensor, weights: Tensor, grid: tuple[int, int], border=True) -> Tensor:
     """Combinations of the values around every vertex, zero beyond the border: `[..., V, C]` to `[..., C, W V]`.
 
     `weights [W, 3, 3]`; without `border` around the inner vertices only, `[..., C, W N]`. One convolution, many times faster in
