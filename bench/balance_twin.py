@@ -10,7 +10,7 @@ from scipy.sparse.linalg import splu
 
 from torchmembrane.estimators.force_balance import LONGEST_STEP, ForceBalance
 from torchmembrane.surface.membrane import corners, triangles_of
-from torchmembrane.surface.stencil import bordered, inner
+from torchmembrane.surface.stencil import inner, pad_border
 
 DAMPING = 1e-6
 
@@ -51,7 +51,7 @@ class BalanceTwin:
         e, free, count = self.estimator, self.free, self.count
         force = e.contact_force(x, pressure)
         inner_weights = e.force_weights(*(inner(field, e.membrane.grid).mT for field in (e.membrane.normals(x), force)), tau)
-        weights = bordered(inner_weights.flatten(1, 2).mT, e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
+        weights = pad_border(inner_weights.flatten(1, 2).mT, e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
         blocks = e.sheet.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)
         angle, slope = e.angles(x, seen)
         slope = slope.movedim(-1, 1).numpy()[..., None, :] * self.marker_weights[:, None, :, None]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from ..surface.stencil import bordered
+from ..surface.stencil import pad_border
 
 if TYPE_CHECKING:
     from .force_balance import ForceBalance, Observation
@@ -55,4 +55,4 @@ def standard_deviations(
     total = estimator.along(at.slope, torch.eye(3).to(x)[None, ..., None].expand(1, 3, 3, len(estimator.free))).flatten(2)
     dF = dx @ total.mT - dp[..., None] * at.volume.sum(-1)[:, None]
     spread = lambda change: change.square().sum(1).sqrt()  # noqa: E731
-    return StandardDeviations(bordered(spread(dx).unflatten(-1, (3, -1)).mT, membrane.grid), spread(dF), spread(dp))
+    return StandardDeviations(pad_border(spread(dx).unflatten(-1, (3, -1)).mT, membrane.grid), spread(dF), spread(dp))

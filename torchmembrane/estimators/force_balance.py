@@ -29,7 +29,7 @@ from ..mechanics.hyperelastic import Sheet
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..solve.stencil_system import NEAR, StencilSystem
 from ..surface.membrane import Membrane, SurfacePoints
-from ..surface.stencil import apply_stencil, bordered, inner, one_ring_edges, stencil_kernels
+from ..surface.stencil import apply_stencil, inner, one_ring_edges, pad_border, stencil_kernels
 from .covariance import StandardDeviations, standard_deviations
 
 STEPS, COARSE_STEPS, TAU = 8, 4, (4.0, 0.4)  # from rest, and so where a finer grid follows
@@ -271,11 +271,11 @@ class ForceBalance(nn.Module):
             y = conjugate_gradient(
                 lambda u: self.product(normal, u), lambda r: self.system.substitute(factor, r), loads, CONJUGATE_STEPS
             )
-        move, rise = self._bordered(x, pressure, y, loads, of_fluid)
+        move, rise = self.solve_bordered(x, pressure, y, loads, of_fluid)
         move = move.unflatten(-1, (3, -1)).mT
         longest = torch.linalg.vector_norm(move, dim=-1).amax(-1)
         share = (LONGEST_STEP * self.size / longest.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1.0)
-        return x + bordered(share[:, None, None] * move, self.membrane.grid), pressure + share * rise, made
+        return x + pad_border(share[:, None, None] * move, self.membrane.grid), pressure + share * rise, made
 
     def normal_equations(self, at: "Linearised", W: Tensor, sight: Tensor, weight: Tensor) -> NormalEquations:
         """Of forces weighted by `W [B, 3, 3, N]` and angles by `weight [B, D]`, `sight` being these angles' slope."""
@@ -351,7 +351,7 @@ class ForceBalance(nn.Module):
     def marker_weights_at(self, angle: Tensor, seen: Observation, outlier: float) -> Tensor:
         return seen.weight / (1 + seen.weight * angle.square().sum(1) / outlier**2)
 
-    def _bordered(self, x, pressure, y, loads, of_fluid):
+    def solve_bordered(self, x, pressure, y, loads, of_fluid):
         """Step `d` and rise of the pressure: `M d + m dp + n lambda = -g` with the rows of the pressure and of the volume.
 
         `loads` are `n, g, m`, and `y` is `M^-1` of them.

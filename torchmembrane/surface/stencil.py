@@ -44,7 +44,7 @@ def inner(field: Tensor, grid: tuple[int, int]) -> Tensor:
     return field.unflatten(-2, grid)[..., 1:-1, 1:-1, :].flatten(-3, -2)
 
 
-def bordered(field: Tensor, grid: tuple[int, int]) -> Tensor:
+def pad_border(field: Tensor, grid: tuple[int, int]) -> Tensor:
     """Adjoint of `inner`: zero on the border."""
     m, n = grid
     return F.pad(field.unflatten(-2, (m - 2, n - 2)), (0, 0, 1, 1, 1, 1)).flatten(-3, -2)
