@@ -4,7 +4,7 @@ python bench/energy_steps.py CASES [--grid 17] [--steps 6 8 10 12] [--json FILE]
 
 CASES as for accuracy.py; rays from the exact markers of every press. Printed for each material (the sensor's, harmonic),
 precision and number of steps: worst and median over the presses of the surface's error against 60 steps in float64, over its
-displacement (rms both), and the largest unbalance, by which a result counts as converged.
+displacement (rms both), and the largest relative step, by which a result counts as converged.
 """
 
 import argparse
@@ -42,16 +42,16 @@ def main():
             for key, values in errors(reconstructor, torch.from_numpy(np.array(pixels, float)), args.steps).items():
                 found.setdefault((model or "the sensor's", *key), []).append(values)
     for (model, precision, steps), values in found.items():
-        error, unbalance = torch.cat(values, 1)
+        error, relative_step = torch.cat(values, 1)
         row = dict(material=model, precision=precision, steps=steps, worst=float(error.max()), median=float(error.median()))
-        rows.append(row | dict(unbalance=float(unbalance.max())))
-        print("{material:12s} {precision} {steps:2d} steps: {worst:.1e} ({median:.1e}), {unbalance:.1e}".format(**rows[-1]))
+        rows.append(row | dict(relative_step=float(relative_step.max())))
+        print("{material:12s} {precision} {steps:2d} steps: {worst:.1e} ({median:.1e}), {relative_step:.1e}".format(**rows[-1]))
     write(args.json, dict(rows=rows))
 
 
 @torch.no_grad()
 def errors(reconstructor: Reconstructor, pixels: torch.Tensor, counts: list[int]) -> dict:
-    """`[2, presses]` error and unbalance for each precision and number of steps."""
+    """`[2, presses]` error and relative step for each precision and number of steps."""
     origins, directions = reconstructor.rays(pixels - reconstructor.rest_pixels, torch.ones_like(pixels[..., 0]))
     origins, estimator, found = origins.expand(directions.shape), reconstructor.estimator, {}
     rms = lambda x: x.norm(dim=-1).square().mean(-1).sqrt()  # noqa: E731
@@ -63,7 +63,7 @@ def errors(reconstructor: Reconstructor, pixels: torch.Tensor, counts: list[int]
         for estimator.steps in counts:
             got = estimator(origins.to(dtype), directions.to(dtype))
             error = rms(got.vertices.double() - exact) / displacement
-            found[str(dtype)[6:], estimator.steps] = torch.stack([error, got.unbalance.double()])
+            found[str(dtype)[6:], estimator.steps] = torch.stack([error, got.relative_step.double()])
     return found
 
 

@@ -268,4 +268,4 @@ def test_steps_after_convergence_change_nothing_in_float32():
     origins, directions = (ray.float() for ray in bent_rays(membrane, 1e-4, (64,)))
     estimator = make(membrane).float()
     for estimator.steps in (10, 20, 30):
-        assert estimator(origins, directions).unbalance.max() < 3e-7
+        assert estimator(origins, directions).relative_step.max() < 3e-7

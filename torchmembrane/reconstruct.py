@@ -259,7 +259,7 @@ class Reconstructor(nn.Module):
         volume_error = (equilibrium.volume - target) / membrane.rest_volume
         miss2 = torch.where(lost, 0.0, ((self.camera.point_to_pixel(markers) - pixels) ** 2).sum(-1))
         residual = (miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()
-        unsettled = (equilibrium.unbalance > self.estimator.largest_unbalance) | (
+        unsettled = (equilibrium.relative_step > self.estimator.largest_relative_step) | (
             volume_error.abs() > self.estimator.largest_volume_error
         )
         ok, broken = status == results.OK, ~x.flatten(1).isfinite().all(1)

@@ -45,7 +45,7 @@ FLOOR = 1e-3  # of a push's weight; without it a vertex under a contact has no p
 OUTLIER = 5.0  # R
 LONGEST_STEP = 0.026  # over the surface's size
 COARSEST, COARSEST_WARM = 9, 13  # fewest lines of a coarser grid, of one that is given the previous frame's solution
-LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR = 2e-3, 1e-3  # rms of the last step over the size, and volume error, when settled
+LARGEST_RELATIVE_STEP, LARGEST_VOLUME_ERROR = 2e-3, 1e-3  # rms of the last step over the size, and volume error, when settled
 
 
 def schedule(steps: int, fall: tuple[float, float]) -> list[tuple[float, float]]:
@@ -103,7 +103,7 @@ class ForceBalance(nn.Module):
                  filling="liquid", gas: tuple[float, float] | None = None, steps: int | None = None):  # fmt: skip
         super().__init__()
         self.membrane, self.sheet, self.noise = membrane, sheet, noise
-        self.largest_unbalance, self.largest_volume_error = LARGEST_UNBALANCE, LARGEST_VOLUME_ERROR
+        self.largest_relative_step, self.largest_volume_error = LARGEST_RELATIVE_STEP, LARGEST_VOLUME_ERROR
         rest_pressure, rest_load = rest_balance(membrane, sheet)
         self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
         self.size, self.cone = membrane.size, CONE

@@ -17,7 +17,7 @@ from ..surface.membrane import Membrane, corners, corners_to_vertices
 ELEMENTS = ("triangle", "quadrilateral")
 VOLUMES = ("exact", "linear")
 STEPS, RELAXED_STEPS = 10, 60
-CONVERGED = 1e-5  # largest unbalance, and volume error where the volume is exact, of a converged surface
+CONVERGED = 1e-5  # largest relative step, and volume error where the volume is exact, of a converged surface
 
 
 class MinimumEnergy(nn.Module):
@@ -46,7 +46,7 @@ class MinimumEnergy(nn.Module):
             if value not in known:
                 raise MembraneError(f"MinimumEnergy: {name} = {value!r}; expected one of {', '.join(known)}")
         self.membrane, self.sheet, self.volume_constraint = membrane, sheet, volume
-        self.largest_unbalance, self.largest_volume_error = CONVERGED, CONVERGED if volume == "exact" else float("inf")
+        self.largest_relative_step, self.largest_volume_error = CONVERGED, CONVERGED if volume == "exact" else float("inf")
         self.steps = steps
         self.energy = sheet if element == "triangle" else AffineQuadrilaterals(membrane, sheet.tension)
         origins, directions = rest_rays

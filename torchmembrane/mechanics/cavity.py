@@ -11,13 +11,13 @@ from ..surface.membrane import Membrane
 
 class Equilibrium(NamedTuple):
     """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`
-    (zero for minimum energy), and `unbalance [...]`, how far from settled: a displacement over the surface's size."""
+    (zero for minimum energy), and `relative_step [...]`: the last step over the surface's size."""
 
     vertices: Tensor
     pressure: Tensor
     volume: Tensor
     traction: Tensor
-    unbalance: Tensor
+    relative_step: Tensor
 
 
 FILLINGS = ("liquid", "gas", "open")

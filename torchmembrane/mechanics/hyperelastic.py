@@ -195,8 +195,8 @@ class Sheet(nn.Module):
         """What inner vertices' forces and slopes are made of, at their six neighbours: `s [..., 6, N]`, `H [..., 3, 3, 6, N]`.
 
         The force (as `gradient`) is `sum_i s_i (x_i - x_k)` over the six neighbours; its derivative in neighbour `i` is `H_i`,
-        in the vertex itself minus the sum of the six. `edges [..., 3, 2, 6 N]`, from `one_ring_edges`. A neighbour is the second
-        vertex of the triangle with its number, and the third of that before.
+        in the vertex itself minus the sum of the six. `edges [..., 3, 2, 6 N]`, from `one_ring_edges`. A neighbour is the
+        second vertex of the triangle with its number, and the third of that before.
         """
         rest = self._rest("around_")
         blocks, stress = (a.unflatten(-1, (6, -1)) for a in self._pairs(self._strain(edges, rest), rest, count=2))

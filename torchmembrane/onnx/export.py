@@ -246,8 +246,8 @@ def _first_step(estimator, surface, pressure, before, origins, across, weight, t
     return x, pressure, surface, *factor
 
 
-def _result(reconstructor, vertices, pressure, volume, traction, unbalance, displacement, confidence, status):
-    equilibrium = Equilibrium(vertices, pressure, volume, traction, unbalance)
+def _result(reconstructor, vertices, pressure, volume, traction, relative_step, displacement, confidence, status):
+    equilibrium = Equilibrium(vertices, pressure, volume, traction, relative_step)
     return tuple(reconstructor.result(equilibrium, displacement, confidence, status))
 
 

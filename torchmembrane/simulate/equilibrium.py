@@ -85,7 +85,7 @@ class Equilibrium:
         """Equilibrium from a start `x [V, 3]`, whose rim stays where it is. Raises `MembraneError` if none is found."""
         for iteration in range(NEWTON_STEPS):
             projected = [contact.projected(x[self.free]) for contact in contacts]
-            residual = np.abs(self._unbalanced(x, pressure, [contact.force(x[self.free]) for contact in projected])).max()
+            residual = np.abs(self._out_of_balance(x, pressure, [contact.force(x[self.free]) for contact in projected])).max()
             change = max((p.distance_from(c) for p, c in zip(projected, contacts, strict=True)), default=0.0)
             settled = max(residual, change) <= FORCE_TOLERANCE * self.force_scale
             if settled and abs(self._gap(x, pressure)[0]) <= VOLUME_TOLERANCE * float(self.membrane.rest_volume):
@@ -99,7 +99,7 @@ class Equilibrium:
             f"{self.force_scale:.3g} is one element's tension; expected a start near it: take smaller steps"
         )
 
-    def _unbalanced(self, x, pressure, pushes):
+    def _out_of_balance(self, x, pressure, pushes):
         """`grad U - h - p grad V - contact forces` on the free degrees of freedom; `pushes [F, 3]` of each indenter."""
         field = self.sheet.gradient(x) - self.load - pressure * self.membrane.volume_gradient(x)
         return (field[self.free] - sum(pushes)).numpy().ravel()
@@ -116,7 +116,7 @@ class Equilibrium:
         linear = [contact.linearised(a).force(x[self.free]) for contact, a in each]
         push, (gap, compliance) = self.membrane.volume_gradient(x)[self.free].numpy().ravel(), self._gap(x, pressure)
         try:
-            y, g = _solved(K, np.stack([-self._unbalanced(x, pressure, linear), push], 1)).T
+            y, g = _solved(K, np.stack([-self._out_of_balance(x, pressure, linear), push], 1)).T
         except RuntimeError:  # exactly singular
             return None
         softness = push @ g
@@ -130,7 +130,7 @@ class Equilibrium:
             """Of the potential along the step, with the multipliers it gave: volume and active contacts are augmented."""
             gap, compliance = self._gap(x, pressure)
             held = [contact.held(x[self.free], a) for contact, a in zip(contacts, active, strict=True)]
-            return direction @ self._unbalanced(x, pressure + gap / (compliance + abs(softness)), held)
+            return direction @ self._out_of_balance(x, pressure + gap / (compliance + abs(softness)), held)
 
         start, share = slope(x), min(1.0, LONGEST_STEP * self.membrane.size / float(move.norm(dim=-1).max()))
         for _ in range(HALVINGS if start < 0 else 0):

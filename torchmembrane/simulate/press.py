@@ -166,7 +166,7 @@ def _result(equilibrium: Equilibrium, rest_pressure, x, pressure, contacts, iter
     nodal = torch.zeros_like(x).index_copy(0, equilibrium.free, each.sum(0))
     push = pressure * membrane._thirds_to_vertices(membrane.area_vectors(x))
     rim = (equilibrium.sheet.gradient(x) - push)[membrane.fixed].sum(0)
-    unbalanced = nodal.sum(0) + push.sum(0) + equilibrium.load.sum(0) + rim
+    left_over = nodal.sum(0) + push.sum(0) + equilibrium.load.sum(0) + rim
     return Press(
         vertices=x,
         contact=torch.zeros_like(membrane.fixed).index_copy(0, equilibrium.free, (normal > 0).any(0)),
@@ -179,6 +179,6 @@ def _result(equilibrium: Equilibrium, rest_pressure, x, pressure, contacts, iter
         volume_error=float(membrane.volume(x) / membrane.rest_volume) - 1,
         penetration=max(0.0, *(float(-contact.indenter.distance(free).min()) for contact in contacts)),
         rim_reaction=rim,
-        imbalance=float(unbalanced.norm() / (nodal.norm(dim=-1).sum() + push.norm(dim=-1).sum())),
+        imbalance=float(left_over.norm() / (nodal.norm(dim=-1).sum() + push.norm(dim=-1).sum())),
         iterations=iterations,
     )

@@ -1,8 +1,8 @@
 """The seven-point stencil of a grid of triangles: every vertex inside the border and the six around it.
 
 Fields over all `V` vertices are `[..., V, C]`; over the `N = (m - 2) (n - 2)` inner ones, row by row, `[..., N, C]` or,
-components first, `[..., C, N]`. The six are in turn: `k`, `ONE_RING[i]` and `ONE_RING[i + 1]` are a triangle. Convolutions, slices and
-pads: no index arithmetic.
+components first, `[..., C, N]`. The six, the one-ring, are in turn: `k`, `ONE_RING[i]` and `ONE_RING[i + 1]` are a triangle.
+Convolutions, slices and pads: no index arithmetic.
 """
 
 import torch
@@ -14,7 +14,7 @@ STENCIL = ((0, 0), *ONE_RING)
 
 
 def stencil_kernels() -> Tensor:
-    """Weights for `apply_stencil` that pick the vertex itself and its six neighbours, `[7, 3, 3]`."""
+    """Kernels for `apply_stencil` that pick the vertex itself and its six neighbours, `[7, 3, 3]`."""
     picks = torch.zeros(len(STENCIL), 3, 3, dtype=torch.float64)
     for pick, (i, j) in zip(picks, STENCIL, strict=True):
         pick[1 + i, 1 + j] = 1.0
@@ -22,21 +22,21 @@ def stencil_kernels() -> Tensor:
 
 
 def one_ring_edges() -> Tensor:
-    """Weights for `apply_stencil`: of the six triangles around a vertex the edges from it, all first ones before all second ones."""
+    """Kernels for `apply_stencil`: the edges from a vertex in the six triangles around it, all first ones before all second."""
     own, ring = stencil_kernels()[:1], stencil_kernels()[1:]
     return torch.cat([ring - own, ring.roll(-1, 0) - own])
 
 
-def apply_stencil(field: Tensor, weights: Tensor, grid: tuple[int, int], border=True) -> Tensor:
+def apply_stencil(field: Tensor, kernels: Tensor, grid: tuple[int, int], border=True) -> Tensor:
     """Combinations of the values around every vertex, zero beyond the border: `[..., V, C]` to `[..., C, W V]`.
 
-    `weights [W, 3, 3]`; without `border` around the inner vertices only, `[..., C, W N]`. One convolution, many times faster in
+    `kernels [W, 3, 3]`; without `border` around the inner vertices only, `[..., C, W N]`. One convolution, many times faster in
     exported models than differences of slices.
     """
     *batch, V, C = field.shape
     count = V if border else (grid[0] - 2) * (grid[1] - 2)
     planes = field.transpose(-2, -1).reshape(-1, 1, *grid)
-    return F.conv2d(planes, weights[:, None], padding=int(border)).reshape(*batch, C, len(weights) * count)
+    return F.conv2d(planes, kernels[:, None], padding=int(border)).reshape(*batch, C, len(kernels) * count)
 
 
 def inner(field: Tensor, grid: tuple[int, int]) -> Tensor:
