@@ -52,7 +52,7 @@ class BalanceTwin:
         force = e.contact_force(x, pressure)
         inner_weights = e.force_weights(*(inner(field, e.membrane.grid).mT for field in (e.membrane.normals(x), force)), tau)
         weights = pad_border(inner_weights.flatten(1, 2).mT, e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
-        blocks = e.sheet.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)
+        blocks = e.elasticity.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)
         angle, slope = e.angles(x, seen)
         slope = slope.movedim(-1, 1).numpy()[..., None, :] * self.marker_weights[:, None, :, None]
         certainty = np.repeat(e.marker_weights_at(angle, seen, outlier)[0].numpy(), 2)

@@ -2,7 +2,7 @@
 
 python bench/monge.py CASES [--json FILE]
 
-CASES as for accuracy.py; sensors whose rest surface is no graph over (x, y) are left out. From exact markers, harmonic sheet.
+CASES as for accuracy.py; sensors whose rest surface is no graph over (x, y) are left out. From exact markers, harmonic membrane.
 Printed for each form: surface error over displacement at the markers, rms distance of its vertices from the first form's, and
 its pressure change over the rest pressure.
 """
@@ -23,13 +23,13 @@ from torchmembrane.reconstruct import Reconstructor
 
 
 def forms(reconstructor: Reconstructor) -> dict:
-    membrane, sheet = reconstructor.estimator.membrane, reconstructor.estimator.energy
+    membrane, elasticity = reconstructor.estimator.membrane, reconstructor.estimator.energy
     rest_rays = reconstructor.camera.pixel_to_ray(reconstructor.vertex_pixels)
     return {
         "material, exact volume": reconstructor.estimator,
-        "material, linear volume": MinimumEnergy(membrane, sheet, rest_rays, volume="linear"),
-        "fixed x y, once (eq. 22)": MongeMinimumEnergy(membrane, sheet, rest_rays),
-        "fixed x y, five times": MongeMinimumEnergy(membrane, sheet, rest_rays, steps=5),
+        "material, linear volume": MinimumEnergy(membrane, elasticity, rest_rays, volume="linear"),
+        "fixed x y, once (eq. 22)": MongeMinimumEnergy(membrane, elasticity, rest_rays),
+        "fixed x y, five times": MongeMinimumEnergy(membrane, elasticity, rest_rays, steps=5),
     }
 
 

@@ -18,7 +18,7 @@ import torch
 from record import write
 
 from torchmembrane import MembraneError
-from torchmembrane.mechanics.hyperelastic import Sheet
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.presets import NAMES, preset
 from torchmembrane.sensor.model import Sensor
 from torchmembrane.simulate.dataset import Plan, random_frame, stroke_to
@@ -41,15 +41,15 @@ INK_ONLY = Look(ambient=1.0, vignetting=0.0, blur=0.0, exposure=1.0, outside=1.0
 DATA_SET = 6
 
 
-def sheet_of(membrane):
-    return Sheet(membrane, "neo_hookean", PRESTRETCH)
+def elasticity_of(membrane):
+    return ElasticEnergy(membrane, "neo_hookean", PRESTRETCH)
 
 
 def laplace(membrane, curvature: float) -> float:
     """Relative error of the pressure of a liquid under constant tension, p = T x curvature."""
-    sheet = sheet_of(membrane)
-    solution = Equilibrium(membrane, sheet, Liquid(float(membrane.rest_volume))).solve(membrane.rest, 0.1)
-    return solution.pressure / float(sheet.tension * curvature) - 1
+    elasticity = elasticity_of(membrane)
+    solution = Equilibrium(membrane, elasticity, Liquid(float(membrane.rest_volume))).solve(membrane.rest, 0.1)
+    return solution.pressure / float(elasticity.tension * curvature) - 1
 
 
 def inflation(n: int) -> float:
@@ -60,7 +60,7 @@ def inflation(n: int) -> float:
     x, pressure, errors = cap.rest, exact[0], []
     for s, expected in zip(stretches, exact, strict=True):
         x = torch.where(cap.fixed[:, None], s * cap.rest, x)
-        x, pressure, *_ = Equilibrium(cap, sheet_of(cap), Liquid(s**3 * float(cap.rest_volume))).solve(x, pressure)
+        x, pressure, *_ = Equilibrium(cap, elasticity_of(cap), Liquid(s**3 * float(cap.rest_volume))).solve(x, pressure)
         errors.append(abs(pressure / expected - 1))
     return max(errors)
 
@@ -72,9 +72,9 @@ def flat_bulge(n: int) -> float:
     series = 16 * side**2 / np.pi**4 * (sign[:, None] * sign / (odd[:, None] ** 2 + odd**2)).sum()
     along = np.linspace(-side / 2, side / 2, n)
     flat = heightfield(along, along, np.full((n, n), 10.0))
-    sheet = sheet_of(flat)
-    x = Equilibrium(flat, sheet, Open()).solve(flat.rest, pressure).vertices
-    return (float(x[n * n // 2, 2]) - 10) * float(sheet.tension) / (pressure * series) - 1
+    elasticity = elasticity_of(flat)
+    x = Equilibrium(flat, elasticity, Open()).solve(flat.rest, pressure).vertices
+    return (float(x[n * n // 2, 2]) - 10) * float(elasticity.tension) / (pressure * series) - 1
 
 
 CLOSED_FORMS = {
@@ -111,10 +111,10 @@ def straight(membrane, depth=DEPTH):
 def presses_of_a_dome() -> list[dict]:
     """Balance of a press of 3 mm on a dome of 33 x 33, and its time."""
     dome, rows = spherical_cap(12, 9, 3, (33, 33)), []
-    sheet = sheet_of(dome)
-    press(dome, sheet, straight(dome, 0.5))  # warm-up
+    elasticity = elasticity_of(dome)
+    press(dome, elasticity, straight(dome, 0.5))  # warm-up
     for friction in (0.0, FRICTION):
-        seconds, state = processor_seconds(lambda mu=friction: press(dome, sheet, straight(dome), friction=mu))
+        seconds, state = processor_seconds(lambda mu=friction: press(dome, elasticity, straight(dome), friction=mu))
         row = dict(
             friction=friction, imbalance=state.imbalance, volume_error=state.volume_error, penetration=state.penetration,
             steps=state.iterations, seconds=seconds,
@@ -148,8 +148,8 @@ def agreement(root: Path, case: dict, n: int) -> dict:
     sensor, truth = Sensor.from_file(root / case["sensor"]), np.load(root / case["truth"])
     material, base_z = sensor.material, float(sensor.membrane.rest[sensor.membrane.fixed, 2].min())
     membrane = SHAPES[case["folder"].partition("_")[0]](base_z, (n, n))
-    sheet = Sheet(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
-    seconds, state = processor_seconds(lambda: press(membrane, sheet, case_paths(case), friction=case["friction"]))
+    elasticity = ElasticEnergy(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
+    seconds, state = processor_seconds(lambda: press(membrane, elasticity, case_paths(case), friction=case["friction"]))
     row = dict(case=case["case"], folder=case["folder"], friction=case["friction"], seconds=seconds)
     for points in ("dots", "probes"):
         X, x = truth[f"{points}_nominal"], truth[f"{points}_deformed"]
@@ -228,7 +228,7 @@ def rendered_dots() -> list[dict]:
         membrane, depth = simulator.membrane, 0.05 * simulator.membrane.size
         middle = membrane.rest[membrane.fixed].mean(0).numpy()
         start, travel, *_ = stroke_to(simulator, Sphere(2.5 * depth), middle, (-0.2, 0.1, -1), depth)
-        state = press(membrane, simulator.sheet, [[start, start.moved(depth * travel)]], **simulator.cavity)
+        state = press(membrane, simulator.elasticity, [[start, start.moved(depth * travel)]], **simulator.cavity)
         for surface, vertices in (("rest", membrane.rest), ("pressed", state.vertices)):
             errors = dot_errors(simulator, vertices)
             row = dict(preset=name, surface=surface, dots=len(errors), of=len(simulator.pattern.positions))

@@ -23,7 +23,7 @@ from balance_twin import BalanceTwin
 from record import median_seconds, write
 from scipy.sparse.linalg import splu
 
-from torchmembrane.mechanics.hyperelastic import Sheet
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.surface.membrane import corners
 
@@ -34,8 +34,8 @@ def scipy_twin(reconstructor):
     index = corners(torch.arange(len(membrane.rest))[:, None], membrane.grid)[..., 0].reshape(-1, 4).numpy()
     up = torch.zeros_like(membrane.rest)
     up[:, 2] = 1
-    sheet = Sheet(reconstructor.sensor.membrane, "harmonic", reconstructor.sensor.material.prestretch)
-    local = sheet.to(up.dtype).stiffness_along(membrane.rest, up).reshape(-1, 4, 4).numpy().astype(float)
+    elasticity = ElasticEnergy(reconstructor.sensor.membrane, "harmonic", reconstructor.sensor.material.prestretch)
+    local = elasticity.to(up.dtype).stiffness_along(membrane.rest, up).reshape(-1, 4, 4).numpy().astype(float)
     row, column = np.repeat(index, 4, 1).ravel(), np.tile(index, (1, 4)).ravel()
     free, fixed = membrane.free.numpy(), membrane.fixed.numpy()
     rest_range = estimator.rest_range.numpy().astype(float)

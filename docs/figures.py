@@ -70,7 +70,7 @@ def pressed(sensor: str, *strokes) -> Shown:
         body = Cylinder(radius, axis=axis[0], translation=start) if axis else Sphere(radius, translation=start)
         body = body.touching(sim.membrane, unit)
         paths.append([body, body.moved(depth * unit)])
-    state = press(sim.membrane, sim.sheet, paths, **sim.cavity)
+    state = press(sim.membrane, sim.elasticity, paths, **sim.cavity)
     seen, rest = sim.renderer.dots(state.vertices), sim.rest_dots
     image = sim.image(state.vertices, np.random.default_rng(0)) / 255
     arrays = (rest.positions, seen.positions, seen.pixels, state.contact_points)

@@ -5,7 +5,7 @@ import torch
 
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance import ForceBalance, _across
-from torchmembrane.mechanics.hyperelastic import Sheet
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
@@ -31,11 +31,11 @@ def observed(name, n, truth_grid=25, **options):
     direction = torch.tensor(direction, dtype=torch.float64) / torch.tensor(direction).norm()
     dome, rest = shape(truth_grid), shape(n)
     ball = Sphere(radius).touching(dome, -direction)
-    truth = press(dome, Sheet(dome, **material), [[ball, ball.moved(-depth * direction)]])
+    truth = press(dome, ElasticEnergy(dome, **material), [[ball, ball.moved(-depth * direction)]])
     net = shape(33).resampled((13, 13)).rest.reshape(13, 13, 3)
     positions = net[1:-1, 1:-1].reshape(-1, 3)
     markers, noise = rest.closest_points(positions.numpy()), 2 * NOISE / float(camera.focal.mean())
-    estimator = ForceBalance(rest, Sheet(rest, **material), markers, positions, noise, **options)
+    estimator = ForceBalance(rest, ElasticEnergy(rest, **material), markers, positions, noise, **options)
     return estimator, camera, camera.point_to_pixel(carried(truth.vertices, dome, positions))
 
 

@@ -1,11 +1,11 @@
-"""Laws of the sheet's energy and of the paper's element."""
+"""Laws of the membrane's energy and of the paper's element."""
 
 import numpy as np
 import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.mechanics.hyperelastic import MODELS, AffineQuadrilaterals, Sheet, _metric
+from torchmembrane.mechanics.hyperelastic import MODELS, AffineQuadrilaterals, ElasticEnergy, _metric
 from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices, triangles_of
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
 
@@ -29,11 +29,11 @@ def dense(energy, membrane, x, directions):
 
 
 def elements(membrane):
-    return [Sheet(membrane, model, **ELASTIC) for model in MODELS] + [AffineQuadrilaterals(membrane, 1.3)]
+    return [ElasticEnergy(membrane, model, **ELASTIC) for model in MODELS] + [AffineQuadrilaterals(membrane, 1.3)]
 
 
 def test_energy_density_is_that_of_the_principal_stretches():
-    """A plane sheet stretched by (a, b): closed forms with the 1/2 and the area that eqs. 11, 12, 54 leave out."""
+    """A plane membrane stretched by (a, b): closed forms with the 1/2 and the area that eqs. 11, 12, 54 leave out."""
     X = np.stack(np.meshgrid(np.linspace(0, 2, 4), np.linspace(0, 3, 5), [5.0], indexing="ij"), -1)[:, :, 0]
     plane = Membrane(X)
     a, b, l, mu, r = 1.1, 0.95, ELASTIC["prestretch"], ELASTIC["modulus"], ELASTIC["c2_ratio"]  # noqa: E741
@@ -46,7 +46,7 @@ def test_energy_density_is_that_of_the_principal_stretches():
         "mooney_rivlin": c1 * (s1 + s2 + s3 - 3) + c2 * (s1 * s2 + s1 * s3 + s2 * s3 - 3),
     }
     for model, density in closed.items():
-        assert float(Sheet(plane, model, **ELASTIC).energy(x)) == pytest.approx(6 * density)
+        assert float(ElasticEnergy(plane, model, **ELASTIC).energy(x)) == pytest.approx(6 * density)
     assert float(AffineQuadrilaterals(plane, mu * l**2).energy(x)) == pytest.approx(6 * closed["harmonic"])
 
 
@@ -71,20 +71,20 @@ def test_stiffness_is_the_hessian_along_the_directions_in_tension(membrane):
 def test_mooney_rivlin_stiffness_leaves_out_only_the_term_that_is_not_convex(membrane):
     x = stretched(membrane)
     d = torch.nn.functional.normalize(x, dim=-1)
-    sheet = Sheet(membrane, "mooney_rivlin", **ELASTIC)
+    elasticity = ElasticEnergy(membrane, "mooney_rivlin", **ELASTIC)
 
-    at, twice_12 = sheet.strain(x), torch.tensor([1.0, 2.0, 1.0], dtype=x.dtype)[:, None]
+    at, twice_12 = elasticity.strain(x), torch.tensor([1.0, 2.0, 1.0], dtype=x.dtype)[:, None]
 
     def with_linear_D(t):
         """`C2 l^4 D` replaced by its tangent in the metric at `x`."""
-        moved = sheet.strain(x + t[:, None] * d)
+        moved = elasticity.strain(x + t[:, None] * d)
         tangent = (at.adjugate * twice_12 * (_metric(moved.edges) - _metric(at.edges))).sum(-2, keepdim=True)
-        bend = moved.D - at.D - tangent / sheet.det
-        return sheet.energy(x + t[:, None] * d) - sheet.c2 * sheet.prestretch**4 * (sheet.area * bend).sum()
+        bend = moved.D - at.D - tangent / elasticity.det
+        return elasticity.energy(x + t[:, None] * d) - elasticity.c2 * elasticity.prestretch**4 * (elasticity.area * bend).sum()
 
     start = torch.zeros(len(x), dtype=torch.float64)
     hessian = torch.autograd.functional.hessian(with_linear_D, start)
-    torch.testing.assert_close(dense(sheet, membrane, x, d), hessian, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(dense(elasticity, membrane, x, d), hessian, rtol=1e-9, atol=1e-9)
 
 
 def assembled(blocks, membrane):
@@ -99,22 +99,22 @@ def assembled(blocks, membrane):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_hessian_blocks_are_autograd_of_the_gradient(membrane, model):
-    sheet = Sheet(membrane, model, **ELASTIC)
+    elasticity = ElasticEnergy(membrane, model, **ELASTIC)
     for x in (stretched(membrane), stretched(membrane, 0.8, 0.4)):
-        jacobian = torch.autograd.functional.jacobian(sheet.gradient, x).flatten(2).flatten(0, 1)
-        torch.testing.assert_close(assembled(sheet.hessian_blocks(x), membrane), jacobian, rtol=1e-9, atol=1e-9)
+        jacobian = torch.autograd.functional.jacobian(elasticity.gradient, x).flatten(2).flatten(0, 1)
+        torch.testing.assert_close(assembled(elasticity.hessian_blocks(x), membrane), jacobian, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_positive_hessian_blocks_are_positive_and_exact_in_tension(membrane, model):
-    sheet = Sheet(membrane, model, **ELASTIC)
-    eigenvalues = torch.linalg.eigvalsh(sheet.hessian_blocks(stretched(membrane, 0.8, 0.4), positive=True))
+    elasticity = ElasticEnergy(membrane, model, **ELASTIC)
+    eigenvalues = torch.linalg.eigvalsh(elasticity.hessian_blocks(stretched(membrane, 0.8, 0.4), positive=True))
     assert (eigenvalues[..., 0] / eigenvalues[..., -1]).min() > -1e-14
     if model != "harmonic":
-        assert torch.linalg.eigvalsh(sheet.hessian_blocks(stretched(membrane, 0.8, 0.4))).min() < -0.1
+        assert torch.linalg.eigvalsh(elasticity.hessian_blocks(stretched(membrane, 0.8, 0.4))).min() < -0.1
     if model != "mooney_rivlin":
         x = stretched(membrane)
-        torch.testing.assert_close(sheet.hessian_blocks(x, positive=True), sheet.hessian_blocks(x))
+        torch.testing.assert_close(elasticity.hessian_blocks(x, positive=True), elasticity.hessian_blocks(x))
 
 
 def test_positive_hessian_blocks_are_the_stiffness_along_directions(membrane):
@@ -123,9 +123,9 @@ def test_positive_hessian_blocks_are_the_stiffness_along_directions(membrane):
     along[torch.arange(len(x)), :, torch.arange(len(x))] = d
     along = along.flatten(0, 1)
     for model in MODELS:
-        sheet = Sheet(membrane, model, **ELASTIC)
-        H = assembled(sheet.hessian_blocks(x, positive=True), membrane)
-        torch.testing.assert_close(along.T @ H @ along, dense(sheet, membrane, x, d), rtol=1e-9, atol=1e-9)
+        elasticity = ElasticEnergy(membrane, model, **ELASTIC)
+        H = assembled(elasticity.hessian_blocks(x, positive=True), membrane)
+        torch.testing.assert_close(along.T @ H @ along, dense(elasticity, membrane, x, d), rtol=1e-9, atol=1e-9)
 
 
 def test_stiffness_is_symmetric_and_positive_even_in_compression(membrane):
@@ -142,7 +142,7 @@ def test_harmonic_stiffness_is_the_hadamard_product(membrane):
     """`K = L o (R R^T)` for any rays, and independent of the deformed surface."""
     d = torch.nn.functional.normalize(stretched(membrane), dim=-1)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(d)
-    for energy in (Sheet(membrane, "harmonic", 1.2), AffineQuadrilaterals(membrane, 1.44)):
+    for energy in (ElasticEnergy(membrane, "harmonic", 1.2), AffineQuadrilaterals(membrane, 1.44)):
         L = dense(energy, membrane, membrane.rest, up)
         torch.testing.assert_close(dense(energy, membrane, stretched(membrane), d), L * (d @ d.T))
 
@@ -164,7 +164,7 @@ def test_affine_element_is_blind_to_the_hourglass_and_triangles_are_not():
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(36, 3)
     energy = lambda e: checkerboard @ dense(e, plane, plane.rest, up) @ checkerboard  # noqa: E731
     assert abs(energy(AffineQuadrilaterals(plane))) < 1e-12
-    assert energy(Sheet(plane, "harmonic")) > 10
+    assert energy(ElasticEnergy(plane, "harmonic")) > 10
 
 
 def test_rest_metric_of_a_planar_quadrilateral_is_singular_in_space():
@@ -191,9 +191,9 @@ def test_energy_ignores_rotation_and_translation(membrane):
 @pytest.mark.parametrize("model", MODELS)
 def test_rest_tension_is_the_derivative_of_the_energy_by_area(model):
     cap = spherical_cap(12, 9, 15, (9, 9))
-    sheet, step = Sheet(cap, model, **ELASTIC), 1e-6
-    slope = (sheet.energy((1 + step) * cap.rest) - sheet.energy((1 - step) * cap.rest)) / (2 * step)
-    torch.testing.assert_close(slope, 2 * sheet.tension * cap.rest_area.sum(), rtol=1e-6, atol=0)
+    elasticity, step = ElasticEnergy(cap, model, **ELASTIC), 1e-6
+    slope = (elasticity.energy((1 + step) * cap.rest) - elasticity.energy((1 - step) * cap.rest)) / (2 * step)
+    torch.testing.assert_close(slope, 2 * elasticity.tension * cap.rest_area.sum(), rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -205,14 +205,14 @@ def test_rest_pressure_is_tension_times_curvature(make, curvature):
     errors = []
     for n in (17, 33):
         membrane = make(n)
-        sheet = Sheet(membrane, "neo_hookean", 1.3)
+        elasticity = ElasticEnergy(membrane, "neo_hookean", 1.3)
         free, normal = membrane.free, membrane.rest_normals
-        force, push = sheet.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
+        force, push = elasticity.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
         p0 = (force * normal)[free].sum() / (push * normal)[free].sum()
-        errors.append(abs(float(p0 / (sheet.tension * curvature)) - 1))
+        errors.append(abs(float(p0 / (elasticity.tension * curvature)) - 1))
     assert errors[1] < 0.01 and errors[1] < 0.6 * errors[0] + 1e-9
 
 
 def test_an_unknown_model_is_refused(membrane):
     with pytest.raises(MembraneError, match="expected one of"):
-        Sheet(membrane, "hookean")
+        ElasticEnergy(membrane, "hookean")

@@ -20,7 +20,7 @@ from torchmembrane.estimators.force_balance import (
     _across,
 )
 from torchmembrane.mechanics.cavity import Equilibrium
-from torchmembrane.mechanics.hyperelastic import Sheet
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
@@ -41,18 +41,18 @@ def dots(membrane, per_side=11):
 def make(n=13, **options):
     dome = spherical_cap(12, 9, 3, (n, n))
     positions = dots(spherical_cap(12, 9, 3, (33, 33)))
-    sheet = Sheet(dome, "neo_hookean", 1.3)
-    return ForceBalance(dome, sheet, dome.closest_points(positions.numpy()), positions, noise=0.1 / 168, **options)
+    elasticity = ElasticEnergy(dome, "neo_hookean", 1.3)
+    return ForceBalance(dome, elasticity, dome.closest_points(positions.numpy()), positions, noise=0.1 / 168, **options)
 
 
 @pytest.fixture(scope="module")
 def pressed():
     """A ball of radius 4 pressed 2 mm, 30 degrees off the axis, on 31 x 31 vertices: noisy marker rays, and the truth."""
     dome = spherical_cap(12, 9, 3, (31, 31))
-    sheet = Sheet(dome, "neo_hookean", 1.3)
+    elasticity = ElasticEnergy(dome, "neo_hookean", 1.3)
     ball, direction = Sphere(4.0), torch.tensor([0.5, 0.0, 0.866], dtype=torch.float64)
     start = ball.touching(dome, -direction)
-    truth = press(dome, sheet, [[start, start.moved(-2.0 * direction)]])
+    truth = press(dome, elasticity, [[start, start.moved(-2.0 * direction)]])
     positions = dots(spherical_cap(12, 9, 3, (33, 33)))
     moved = carried(truth.vertices, dome, positions)
     pixels = CAMERA.point_to_pixel(moved)
@@ -116,7 +116,9 @@ def test_normal_equations_are_those_of_the_dense_slopes(hole):
     fixed[4, 3] = hole
     dome = Membrane(spherical_cap(12, 9, 3, (10, 9)).rest.reshape(10, 9, 3).numpy(), fixed.numpy())
     positions = dots(spherical_cap(12, 9, 3, (33, 33)))
-    estimator = ForceBalance(dome, Sheet(dome, prestretch=1.3), dome.closest_points(positions.numpy()), positions, 0.1 / 168)
+    estimator = ForceBalance(
+        dome, ElasticEnergy(dome, prestretch=1.3), dome.closest_points(positions.numpy()), positions, 0.1 / 168
+    )
     x, p = bent(dome), torch.tensor([0.3], dtype=torch.float64)
     directions = torch.nn.functional.normalize(positions + 0.3, dim=-1)[None]
     seen = Observation(0.1 * directions.mT, _across(directions.mT), torch.ones(1, len(positions), dtype=torch.float64))

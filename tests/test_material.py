@@ -11,7 +11,7 @@ from torchmembrane import MembraneError
 from torchmembrane.calibrate.material import STRETCHES, Presses, _log_stretch, material_from_pixels
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
-from torchmembrane.mechanics.hyperelastic import Sheet
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
 from torchmembrane.simulate.indenters import Sphere
@@ -32,11 +32,11 @@ def sensor(material):
 def presses():
     """Pixels of the dots under a ball pressed in two directions, on 31 x 31 vertices, with noise, and its forces."""
     dome, dots = CAP.membrane((31, 31)), sensor(Material("neo_hookean", 1.5)).markers.positions
-    sheet, pixels, forces = Sheet(dome, "neo_hookean", PRESTRETCH, MODULUS), [], []
+    elasticity, pixels, forces = ElasticEnergy(dome, "neo_hookean", PRESTRETCH, MODULUS), [], []
     for direction in ((0.5, 0.0, -0.866), (-0.3, 0.3, -0.906)):
         direction = torch.tensor(direction, dtype=torch.float64)
         ball = Sphere(4.0).touching(dome, direction)
-        state = press(dome, sheet, [[ball, ball.moved(2.5 * direction)]])
+        state = press(dome, elasticity, [[ball, ball.moved(2.5 * direction)]])
         pixels.append(CAMERA.point_to_pixel(carried(state.vertices, dome, dots)))
         forces.append(state.force.numpy())
     pixels = torch.stack(pixels)
@@ -62,7 +62,7 @@ def test_prestretch_and_modulus_are_found_whatever_the_file_says(presses):
     error = np.abs(found.values - [PRESTRETCH, MODULUS])
     assert (error < 3 * found.deviations).all(), (found.values, found.deviations)
     assert found.deviations[0] < 0.1 * PRESTRETCH and found.deviations[1] < 0.3 * MODULUS
-    assert found.covariance[0, 1] < 0  # more tension at rest, or a stiffer sheet
+    assert found.covariance[0, 1] < 0  # more tension at rest, or a stiffer membrane
     material = found.sensor.material
     assert (material.prestretch, material.modulus) == pytest.approx(tuple(found.values))
     assert material.thickness == 0.5

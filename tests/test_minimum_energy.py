@@ -7,7 +7,7 @@ from axisymmetric import harmonic, least_energy, neo_hookean
 
 from torchmembrane import MembraneError
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
-from torchmembrane.mechanics.hyperelastic import AffineQuadrilaterals, Sheet
+from torchmembrane.mechanics.hyperelastic import AffineQuadrilaterals, ElasticEnergy
 from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices
 from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, spherical_cap
 
@@ -17,7 +17,7 @@ def rest_rays(membrane):
 
 
 def make(membrane, model="neo_hookean", prestretch=1.2, modulus=1.0, **options):
-    return MinimumEnergy(membrane, Sheet(membrane, model, prestretch, modulus, 0.1), rest_rays(membrane), **options)
+    return MinimumEnergy(membrane, ElasticEnergy(membrane, model, prestretch, modulus, 0.1), rest_rays(membrane), **options)
 
 
 def bent_rays(membrane, size=0.03, batch=()):
@@ -226,9 +226,9 @@ def test_ray_origins_off_the_centre_give_the_same_surface(finger):
     """Behind ports rays have origins: sliding an origin along its own ray changes nothing (gain `-d.(L o)` of the load)."""
     origins, d = bent_rays(finger)
     shift = 1.5 * d[:, 2:] * d
-    sheet = Sheet(finger, "harmonic", 1.2)
+    elasticity = ElasticEnergy(finger, "harmonic", 1.2)
     rest_o, rest_d = rest_rays(finger)
-    moved = MinimumEnergy(finger, sheet, (rest_o + 1.5 * rest_d[:, 2:] * rest_d, rest_d), steps=20)
+    moved = MinimumEnergy(finger, elasticity, (rest_o + 1.5 * rest_d[:, 2:] * rest_d, rest_d), steps=20)
     torch.testing.assert_close(moved(origins + shift, d).vertices, make(finger, "harmonic", steps=20)(origins, d).vertices)
 
 

@@ -6,7 +6,7 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
-from torchmembrane.mechanics.hyperelastic import Sheet
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.paper.monge import MongeMinimumEnergy, adjugate, coefficients, form_matrix, metric
 from torchmembrane.surface.membrane import corners, triangles_of
 from torchmembrane.surface.shapes import ellipsoid_cap, heightfield, spherical_cap
@@ -86,15 +86,15 @@ def pieces(x, grid):
 def test_half_the_form_over_root_det_g_is_the_harmonic_energy():
     """Eqs. 11-13 with the 1/2 and, as adj G is det G times the inverse, `dx dy / sqrt(det G)` for the piece's weight."""
     cap = spherical_cap(12, 7, 5, (9, 9))
-    sheet, x = Sheet(cap, "harmonic", 1.1), moved(cap)
+    elasticity, x = ElasticEnergy(cap, "harmonic", 1.1), moved(cap)
     plane, rest_slope = pieces(cap.rest, cap.grid)
     there, slope = pieces(x, cap.grid)
     A = torch.linalg.solve(plane, there).mT
     footprint = torch.linalg.det(plane).abs() / 2
     density = coefficients(A, rest_slope, torch.zeros_like(slope))(slope) / torch.linalg.det(metric(rest_slope)).sqrt()
-    energy = sheet.tension * (footprint * density).sum() / 2 - sheet.tension * sheet.area.sum()
-    torch.testing.assert_close(energy, sheet.energy(x))
-    estimator = MongeMinimumEnergy(cap, sheet, rays(cap))
+    energy = elasticity.tension * (footprint * density).sum() / 2 - elasticity.tension * elasticity.area.sum()
+    torch.testing.assert_close(energy, elasticity.energy(x))
+    estimator = MongeMinimumEnergy(cap, elasticity, rays(cap))
     maps = estimator.maps(x)
     torch.testing.assert_close(maps.square().sum((-1, -2)), density)
 
@@ -122,7 +122,7 @@ def rays(membrane, turn=0.0):
 
 
 def make(cap, **options):
-    return MongeMinimumEnergy(cap, Sheet(cap, "harmonic", 1.2), rays(cap), **options)
+    return MongeMinimumEnergy(cap, ElasticEnergy(cap, "harmonic", 1.2), rays(cap), **options)
 
 
 def test_no_flow_no_displacement_and_the_volume_is_linear():
@@ -137,14 +137,14 @@ def test_no_flow_no_displacement_and_the_volume_is_linear():
 def test_no_force_is_left_on_the_heights():
     """Repeated, eq. 22 ends at a stationary point of energy, rest load and smoother on the surfaces of this volume."""
     cap = spherical_cap(12, 7, 15, (9, 9))
-    sheet, estimator = Sheet(cap, "harmonic", 1.2), make(cap, steps=25)
+    elasticity, estimator = ElasticEnergy(cap, "harmonic", 1.2), make(cap, steps=25)
     now = rays(cap, 0.01)
     psi, pressure, step = estimator.heights(*now)
     cell = estimator._cells(psi, *now)
 
     def energy(y):
         smooth, load = y @ estimator.smooth @ y / 2, estimator.rest_load @ y
-        return sheet.energy(estimator.material(y, cell, *now)) + smooth - load
+        return elasticity.energy(estimator.material(y, cell, *now)) + smooth - load
 
     force = torch.func.grad(energy)(psi) - pressure * estimator.v
     scale = estimator.rest_pressure * estimator.v.mean()
@@ -155,8 +155,8 @@ def test_fixed_points_and_material_points_agree_as_the_grid_is_refined():
     gaps = []
     for n in (9, 13, 19):
         cap = spherical_cap(12, 5, 15, (n, n))
-        sheet = Sheet(cap, "harmonic", 1.2)
-        material = MinimumEnergy(cap, sheet, rays(cap))(*rays(cap, 0.03)).vertices
+        elasticity = ElasticEnergy(cap, "harmonic", 1.2)
+        material = MinimumEnergy(cap, elasticity, rays(cap))(*rays(cap, 0.03)).vertices
         fixed = make(cap, steps=5)(*rays(cap, 0.03)).vertices
         gaps.append(float((fixed - material).square().sum(-1).mean().sqrt()))
     size = float((material - cap.rest).square().sum(-1).mean().sqrt())

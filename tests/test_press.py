@@ -6,7 +6,7 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.mechanics.cavity import rest_balance
-from torchmembrane.mechanics.hyperelastic import Sheet
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate import equilibrium as equilibrium_module
 from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
 from torchmembrane.simulate.indenters import Plane, Sphere, facing
@@ -19,8 +19,8 @@ PRESTRETCH = 1.3
 GRIDS = (9, 17, 33)
 
 
-def sheet_of(membrane, prestretch=PRESTRETCH, **material):
-    return Sheet(membrane, "neo_hookean", prestretch, **material)
+def elasticity_of(membrane, prestretch=PRESTRETCH, **material):
+    return ElasticEnergy(membrane, "neo_hookean", prestretch, **material)
 
 
 def errors_fall_quadratically(errors, within):
@@ -49,9 +49,9 @@ def test_liquid_pressure_is_tension_times_curvature(make, curvature):
     errors = []
     for n in GRIDS:
         membrane = make(n)
-        sheet = sheet_of(membrane)
-        solution = Equilibrium(membrane, sheet, Liquid(float(membrane.rest_volume))).solve(membrane.rest, 0.1)
-        errors.append(solution.pressure / float(sheet.tension * curvature) - 1)
+        elasticity = elasticity_of(membrane)
+        solution = Equilibrium(membrane, elasticity, Liquid(float(membrane.rest_volume))).solve(membrane.rest, 0.1)
+        errors.append(solution.pressure / float(elasticity.tension * curvature) - 1)
     errors_fall_quadratically(errors, 0.01)
 
 
@@ -64,7 +64,7 @@ def test_inflated_sphere_follows_its_pressure_curve():
         x, pressure, curve = cap.rest, exact[0], []
         for s in stretches:
             x = torch.where(cap.fixed[:, None], s * cap.rest, x)
-            inflated = Equilibrium(cap, sheet_of(cap), Liquid(s**3 * float(cap.rest_volume)))
+            inflated = Equilibrium(cap, elasticity_of(cap), Liquid(s**3 * float(cap.rest_volume)))
             x, pressure, *_ = inflated.solve(x, pressure)
             curve.append(pressure)
         errors.append(np.abs(curve / exact - 1).max())
@@ -80,10 +80,10 @@ def test_flat_square_bulges_like_the_fourier_series():
     for n in GRIDS:
         along = np.linspace(-side / 2, side / 2, n)
         flat = heightfield(along, along, np.full((n, n), 10.0))
-        sheet = sheet_of(flat)
-        x = Equilibrium(flat, sheet, Open()).solve(flat.rest, pressure).vertices
+        elasticity = elasticity_of(flat)
+        x = Equilibrium(flat, elasticity, Open()).solve(flat.rest, pressure).vertices
         middle = float(x[n * n // 2, 2]) - 10
-        errors.append(middle * float(sheet.tension) / (pressure * series) - 1)
+        errors.append(middle * float(elasticity.tension) / (pressure * series) - 1)
     errors_fall_quadratically(errors, 0.002)
 
 
@@ -109,7 +109,7 @@ def test_volume_hessian_blocks_are_autograd_of_the_volume(dome):
 
 def test_without_contact_the_rest_surface_stays(dome):
     far = tip(dome).moved((0, 0, 5.0))
-    state = press(dome, sheet_of(dome), [[far]])
+    state = press(dome, elasticity_of(dome), [[far]])
     torch.testing.assert_close(state.vertices, dome.rest, rtol=0, atol=1e-9)
     assert not state.contact.any() and state.force.norm() == 0 and state.contact_points.isnan().all()
     assert state.pressure == pytest.approx(state.rest_pressure)
@@ -121,17 +121,17 @@ def slid(dome):
     start = tip(dome, (0.3, 0.1, -1))
     down = start.moved((0.6, 0.2, -2.0))
     end = down.moved((0.5, -0.5, 0))
-    return end, press(dome, sheet_of(dome), [[start, down, end]], friction=0.4)
+    return end, press(dome, elasticity_of(dome), [[start, down, end]], friction=0.4)
 
 
 def test_forces_balance_and_the_liquid_keeps_its_volume(dome, slid):
     """Contact + pressure on the lumped areas + rim + rest load = 0."""
     _, state = slid
-    sheet = sheet_of(dome)
+    elasticity = elasticity_of(dome)
     areas = torch.zeros_like(dome.rest).index_add(
         0, dome.triangles.ravel(), dome.area_vectors(state.vertices).reshape(-1, 3).repeat_interleave(3, 0) / 3
     )
-    _, load = rest_balance(dome, sheet)
+    _, load = rest_balance(dome, elasticity)
     total = state.force + state.pressure * areas.sum(0) + load.sum(0) + state.rim_reaction
     assert total.norm() < 1e-6 * state.force.norm() and state.imbalance < 1e-8
     assert abs(state.volume_error) < 1e-9
@@ -153,7 +153,7 @@ def test_nothing_penetrates_and_friction_stays_in_its_cone(dome, slid):
 def test_a_plate_that_slides_far_drags_with_mu_times_its_force(dome):
     plate = Plane(rotation=facing((0, 0, -1))).touching(dome, (0, 0, -1))
     down = plate.moved((0, 0, -1.5))
-    *_, state = presses(dome, sheet_of(dome), [[plate, down, down.moved((3.0, 0, 0))]], friction=0.2)
+    *_, state = presses(dome, elasticity_of(dome), [[plate, down, down.moved((3.0, 0, 0))]], friction=0.2)
     assert float(state.force[0]) == pytest.approx(-0.2 * float(state.force[2]), rel=1e-3)
     assert abs(float(state.force[1])) < 1e-3 * float(state.force[0])
 
@@ -161,7 +161,7 @@ def test_a_plate_that_slides_far_drags_with_mu_times_its_force(dome):
 def test_what_sticks_moves_with_the_indenter(dome):
     start = tip(dome)
     down = start.moved((0, 0, -2.0))
-    pushed, dragged = presses(dome, sheet_of(dome), [[down, down.moved((0.3, 0, 0))]], friction=50.0)
+    pushed, dragged = presses(dome, elasticity_of(dome), [[down, down.moved((0.3, 0, 0))]], friction=50.0)
     stuck = pushed.contact & dragged.contact
     moved = (dragged.vertices - pushed.vertices)[stuck]
     assert stuck.sum() > 3
@@ -171,9 +171,9 @@ def test_what_sticks_moves_with_the_indenter(dome):
 def test_without_friction_only_the_end_of_the_path_counts_and_release_forgets(dome):
     start = tip(dome, (0.3, 0.1, -1))
     end = start.moved((0.4, 0.5, -2.0))
-    sheet = sheet_of(dome)
-    straight = press(dome, sheet, [[start, end]])
-    *_, detour, released = presses(dome, sheet, [[start, start.moved((-1.0, 0, -2.5)), end, start.moved((0, 0, 1.0))]])
+    elasticity = elasticity_of(dome)
+    straight = press(dome, elasticity, [[start, end]])
+    *_, detour, released = presses(dome, elasticity, [[start, start.moved((-1.0, 0, -2.5)), end, start.moved((0, 0, 1.0))]])
     torch.testing.assert_close(detour.vertices, straight.vertices, rtol=0, atol=1e-6)
     torch.testing.assert_close(released.vertices, dome.rest, rtol=0, atol=1e-6)
 
@@ -181,15 +181,15 @@ def test_without_friction_only_the_end_of_the_path_counts_and_release_forgets(do
 @pytest.mark.parametrize("friction", [0.0, 0.2])
 def test_the_work_of_the_indenter_is_the_energy_stored_and_what_friction_takes(dome, friction):
     """A press and a slide of 3 mm, in which friction takes mu N times the slide; the liquid does no work."""
-    sheet, start = sheet_of(dome), tip(dome)
-    _, load = rest_balance(dome, sheet)
+    elasticity, start = elasticity_of(dome), tip(dome)
+    _, load = rest_balance(dome, elasticity)
     offsets = np.zeros((61, 3))
     offsets[:31, 2], offsets[31:, 2], offsets[31:, 0] = -np.linspace(0, 2, 31), -2, np.linspace(0, 3, 31)[1:]
-    states = list(presses(dome, sheet, [[start.moved(offset) for offset in offsets]], friction=friction))
+    states = list(presses(dome, elasticity, [[start.moved(offset) for offset in offsets]], friction=friction))
     force = np.stack([state.force.numpy() for state in states])
     work = ((force[1:] + force[:-1]) / 2 * np.diff(offsets, axis=0)).sum()
     last = states[-1].vertices
-    stored = float(sheet.energy(last) - sheet.energy(dome.rest) - (load * (last - dome.rest)).sum())
+    stored = float(elasticity.energy(last) - elasticity.energy(dome.rest) - (load * (last - dome.rest)).sum())
     pushes = [(s.traction.norm(dim=-1) * dome.vertex_area(s.vertices)).sum() for s in states[31:]]
     taken = friction / (1 + friction**2) ** 0.5 * 3 * float(sum(pushes)) / len(pushes)
     assert work - stored == pytest.approx(taken, rel=0.03, abs=5e-3 * stored)
@@ -199,8 +199,8 @@ def test_turning_everything_turns_the_answer(dome):
     turn = facing((0.2, -0.1, 1.0)) @ facing((0, 1.0, 0.05)).T @ facing((0, 0.9, 0.1))
     turned = Membrane((dome.rest @ turn.T).reshape(17, 17, 3))
     ball = tip(dome, (0.4, 0, -1)).moved((0.6, 0, -1.5))
-    one = press(dome, sheet_of(dome), [[ball]])
-    other = press(turned, sheet_of(turned), [[ball.at(turn @ ball.translation)]])
+    one = press(dome, elasticity_of(dome), [[ball]])
+    other = press(turned, elasticity_of(turned), [[ball.at(turn @ ball.translation)]])
     torch.testing.assert_close(other.vertices, one.vertices @ turn.T, rtol=0, atol=1e-8)
     torch.testing.assert_close(other.force, turn @ one.force, rtol=0, atol=1e-7)
 
@@ -208,19 +208,19 @@ def test_turning_everything_turns_the_answer(dome):
 def test_scaling_lengths_and_modulus_scales_forces(dome):
     large = Membrane(2 * dome.rest.reshape(17, 17, 3))
     ball, large_ball = tip(dome).moved((0, 0, -2.0)), tip(large, radius=8.0).moved((0, 0, -4.0))
-    one = press(dome, sheet_of(dome), [[ball]])
-    other = press(large, sheet_of(large, modulus=3.0), [[large_ball]])
+    one = press(dome, elasticity_of(dome), [[ball]])
+    other = press(large, elasticity_of(large, modulus=3.0), [[large_ball]])
     torch.testing.assert_close(other.vertices, 2 * one.vertices, rtol=0, atol=1e-7)
     torch.testing.assert_close(other.force, 6 * one.force)
     assert other.pressure == pytest.approx(1.5 * one.pressure)
 
 
 def test_a_gas_yields_by_its_law_between_liquid_and_open(dome):
-    path, sheet = [[tip(dome), tip(dome).moved((0, 0, -2.0))]], sheet_of(dome)
+    path, elasticity = [[tip(dome), tip(dome).moved((0, 0, -2.0))]], elasticity_of(dome)
     absolute, volume = 1.0, 3000.0
-    liquid = press(dome, sheet, path)
-    gas = press(dome, sheet, path, filling="gas", gas=(absolute, volume))
-    free = press(dome, sheet, path, filling="open")
+    liquid = press(dome, elasticity, path)
+    gas = press(dome, elasticity, path, filling="gas", gas=(absolute, volume))
+    free = press(dome, elasticity, path, filling="open")
     rise = gas.volume_error * float(dome.rest_volume)
     assert (absolute + gas.pressure - gas.rest_pressure) * (volume + rise) == pytest.approx(absolute * volume, rel=1e-9)
     assert free.pressure == pytest.approx(free.rest_pressure) and free.volume_error < gas.volume_error < 0
@@ -230,7 +230,7 @@ def test_a_gas_yields_by_its_law_between_liquid_and_open(dome):
 def test_two_indenters_have_their_own_forces(dome):
     left, right = tip(dome, (0.5, 0, -1)), tip(dome, (-0.5, 0, -1))
     left, right = left.moved((0.6, 0, -1.2)), right.moved((-0.6, 0, -1.2))
-    state = press(dome, sheet_of(dome), [[left], [right]])
+    state = press(dome, elasticity_of(dome), [[left], [right]])
     torch.testing.assert_close(state.forces.sum(0), state.force)
     mirror = torch.tensor([-1.0, 1, 1]).double()
     torch.testing.assert_close(state.forces[0], mirror * state.forces[1], rtol=0.02, atol=0.02)
@@ -240,14 +240,14 @@ def test_two_indenters_have_their_own_forces(dome):
 def test_a_small_ball_does_not_slip_through_in_one_long_step():
     dome = spherical_cap(12, 9, 3, (25, 25))
     ball = tip(dome, radius=1.0)
-    state = press(dome, sheet_of(dome), [[ball, ball.moved((0, 0, -3.0))]], increment=3.0)
+    state = press(dome, elasticity_of(dome), [[ball, ball.moved((0, 0, -3.0))]], increment=3.0)
     assert float(state.vertices[312, 2]) == pytest.approx(12 - 3.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("model", "prestretch"), [("mooney_rivlin", 1.3), ("neo_hookean", 1.05), ("harmonic", 1.3)])
 def test_every_material_can_be_pressed(dome, model, prestretch):
-    sheet = Sheet(dome, model, prestretch, c2_ratio=0.2)
-    state = press(dome, sheet, [[tip(dome), tip(dome).moved((0.3, 0, -2.5))]], friction=0.3)
+    elasticity = ElasticEnergy(dome, model, prestretch, c2_ratio=0.2)
+    state = press(dome, elasticity, [[tip(dome), tip(dome).moved((0.3, 0, -2.5))]], friction=0.3)
     assert state.force[2] < 0 and state.pressure > state.rest_pressure and state.imbalance < 1e-8
 
 
@@ -266,11 +266,11 @@ def test_carried_points_move_with_the_surface(dome):
 def test_an_unconverged_state_is_never_given(dome, monkeypatch, limit, value):
     monkeypatch.setattr(equilibrium_module, limit, value)
     with pytest.raises(MembraneError, match="press: no equilibrium .* in steps down to"):
-        press(dome, sheet_of(dome), [[tip(dome), tip(dome).moved((0, 0, -3.0))]])
+        press(dome, elasticity_of(dome), [[tip(dome), tip(dome).moved((0, 0, -3.0))]])
 
 
 def test_wrong_arguments_are_refused(dome):
-    sheet, ball = sheet_of(dome), tip(dome)
+    elasticity, ball = elasticity_of(dome), tip(dome)
     for paths, options, message in (
         ([[ball], [ball, ball]], {}, "paths of"),
         ([], {}, "paths of"),
@@ -279,4 +279,4 @@ def test_wrong_arguments_are_refused(dome):
         ([[ball]], dict(filling="water"), "water"),
     ):
         with pytest.raises(MembraneError, match=message):
-            press(dome, sheet, paths, **options)
+            press(dome, elasticity, paths, **options)

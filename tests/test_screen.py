@@ -11,7 +11,7 @@ from torchmembrane.estimators.flow import FlowInterpolation
 from torchmembrane.estimators.force_balance import ForceBalance
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.markers.screen import MismatchScreen
-from torchmembrane.mechanics.hyperelastic import Sheet
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
 from torchmembrane.surface.shapes import spherical_cap
@@ -27,7 +27,7 @@ def pressed():
     travel = torch.tensor([-0.4, 0.2, -0.9], dtype=torch.float64)
     ball = Sphere(3.0, translation=(0, 0, -0.5)).touching(fine, travel)
     state = press(
-        fine, Sheet(fine, "neo_hookean", 1.3), [[ball, ball.moved(3.0 * torch.nn.functional.normalize(travel, dim=0))]]
+        fine, ElasticEnergy(fine, "neo_hookean", 1.3), [[ball, ball.moved(3.0 * torch.nn.functional.normalize(travel, dim=0))]]
     )
     dots = spherical_cap(12, 9, 3, (13, 13)).rest.reshape(13, 13, 3)[1:-1, 1:-1].reshape(-1, 3)
     moved = carried(state.vertices, fine, dots)
@@ -82,16 +82,16 @@ def test_an_affine_flow_is_believed_whatever_its_size():
 def test_the_surface_error_grows_by_less_than_a_fifth(pressed, estimator):
     rest, anchors, pixels, dots, moved = pressed
     dome = spherical_cap(12, 9, 3, (13, 13))
-    points, sheet = dome.closest_points(dots.numpy()), Sheet(dome, "neo_hookean", 1.3)
+    points, elasticity = dome.closest_points(dots.numpy()), ElasticEnergy(dome, "neo_hookean", 1.3)
     vertex_pixels = CAMERA.point_to_pixel(dome.rest)
 
     def error(seen, confidence):
         if estimator == "force-balance":
-            balance = ForceBalance(dome, sheet, points, dots, 0.1 / 168)
+            balance = ForceBalance(dome, elasticity, points, dots, 0.1 / 168)
             x = balance(*CAMERA.pixel_to_ray(seen), confidence).vertices
         else:
             flow = FlowInterpolation(dome, points)(seen - rest, confidence)
-            x = MinimumEnergy(dome, sheet, CAMERA.pixel_to_ray(vertex_pixels))(
+            x = MinimumEnergy(dome, elasticity, CAMERA.pixel_to_ray(vertex_pixels))(
                 *CAMERA.pixel_to_ray(vertex_pixels + flow)
             ).vertices
         u = (x - dome.rest)[:, torch.from_numpy(points.vertices.astype(int))]

@@ -9,7 +9,7 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.flow import FlowInterpolation
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.estimators.segmentation import PolarAngle, Segmentation, peaks, polar_angle
-from torchmembrane.mechanics.hyperelastic import Sheet
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
 from torchmembrane.surface.shapes import half_cylinder, spherical_cap
@@ -66,7 +66,7 @@ def make(base_z, **options):
     dome = spherical_cap(12, 9, base_z, (17, 17))
     rays = central(dome.rest)
     options = {"smoothing": 0.1, **options}
-    return Segmentation(MinimumEnergy(dome, Sheet(dome, "neo_hookean", 1.3), rays, **options), rays)
+    return Segmentation(MinimumEnergy(dome, ElasticEnergy(dome, "neo_hookean", 1.3), rays, **options), rays)
 
 
 def seen(base_z, *presses):
@@ -77,7 +77,7 @@ def seen(base_z, *presses):
         travel = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float64), dim=-1)
         ball = Sphere(3.0, translation=(0, 0, base_z - 3.5)).touching(fine, travel)
         paths.append([ball, ball.moved(depth * travel)])
-    state = press(fine, Sheet(fine, "neo_hookean", 1.3), paths)
+    state = press(fine, ElasticEnergy(fine, "neo_hookean", 1.3), paths)
     dots = spherical_cap(12, 9, base_z, (13, 13)).rest.reshape(13, 13, 3)[1:-1, 1:-1].reshape(-1, 3)
     pixel = CAMERA.point_to_pixel
     noise = 0.05 * torch.randn(len(dots), 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -144,7 +144,7 @@ def test_the_smoother_leaves_contacts_alone(off_axis):
     dome = spherical_cap(12, 9, FAR, (9, 9))
     rays = central(dome.rest)
     options = dict(element="quadrilateral", volume="linear", smoothing=2.0, steps=200)
-    estimator = MinimumEnergy(dome, Sheet(dome, "harmonic", 1.3), rays, **options)
+    estimator = MinimumEnergy(dome, ElasticEnergy(dome, "harmonic", 1.3), rays, **options)
     bent = torch.nn.functional.normalize(rays[1] + 0.02 * torch.sin(dome.rest[:, [1, 2, 0]]) * (~dome.fixed)[:, None], dim=-1)
     relaxed = torch.zeros(len(dome.rest), dtype=torch.bool)
     relaxed[[30, 31, 40]] = True
@@ -174,6 +174,6 @@ def test_the_smoother_leaves_contacts_alone(off_axis):
 
 def test_no_rounds_are_refused():
     dome = spherical_cap(12, 9, FAR, (9, 9))
-    estimator = MinimumEnergy(dome, Sheet(dome), central(dome.rest))
+    estimator = MinimumEnergy(dome, ElasticEnergy(dome), central(dome.rest))
     with pytest.raises(MembraneError, match="rounds = 0; expected at least 1"):
         Segmentation(estimator, central(dome.rest), rounds=0)

@@ -22,7 +22,7 @@ from .markers.locate import DotLocator
 from .markers.place import FEWEST_MARKERS, place_markers
 from .markers.screen import MismatchScreen
 from .mechanics.cavity import Equilibrium
-from .mechanics.hyperelastic import Sheet
+from .mechanics.hyperelastic import ElasticEnergy
 from .sensor.model import Sensor
 
 ESTIMATORS = ("force-balance", "minimum-energy")
@@ -41,7 +41,7 @@ class Reconstructor(nn.Module):
     Arguments
         sensor      a `Sensor` (`Reconstructor.from_file` reads one)
         estimator   "force-balance", or "minimum-energy": the paper's; finds no contacts and flattens what is narrow and far
-        model       the sheet's energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin"
+        model       the membrane's energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin"
         element     "triangle", or "quadrilateral": the paper's affine quadrilaterals (harmonic), with `smoothing` (eq. 28)
         volume      "exact", or "linear": the paper's linearised constraint (eq. 21)
         flow        "smooth", or "bilinear" between the dots (section 5); minimum energy only, as element and volume
@@ -71,19 +71,19 @@ class Reconstructor(nn.Module):
         self.locator = markers.locator
         self.screen = MismatchScreen(markers.model_pixels, vertex_pixels[membrane.fixed].numpy())
         self.finds_contacts = estimator == "force-balance"
-        sheet, cavity = self._sheet(membrane, model), self._cavity(membrane)
+        elasticity, cavity = self._elasticity(membrane, model), self._cavity(membrane)
         if self.finds_contacts:
             if element != "triangle" or volume != "exact" or smoothing:
                 raise MembraneError(
                     "Reconstructor: force-balance has linear triangles, exact volume, no smoother; leave those options out"
                 )
             noise = MARKER_NOISE[sensor.markers.kind] / float(self.camera.focal.mean())
-            self.estimator = ForceBalance(membrane, sheet, markers.points, markers.positions, noise, *cavity)
+            self.estimator = ForceBalance(membrane, elasticity, markers.points, markers.positions, noise, *cavity)
         else:
             smoothing = (0.1 if element == "quadrilateral" else 0.0) if smoothing is None else smoothing
             rays = self.camera.pixel_to_ray(vertex_pixels)
             self.flow = FlowInterpolation(membrane, markers.points, flow)
-            self.estimator = MinimumEnergy(membrane, sheet, rays, element, smoothing, *cavity, volume)
+            self.estimator = MinimumEnergy(membrane, elasticity, rays, element, smoothing, *cavity, volume)
         self.register_buffer("vertex_pixels", vertex_pixels)
         self.register_buffer("rest_markers", torch.from_numpy(markers.positions))
         self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
@@ -99,9 +99,9 @@ class Reconstructor(nn.Module):
         """The reconstructor of a sensor file; options as for the class."""
         return cls(Sensor.from_file(path), **options)
 
-    def _sheet(self, membrane, model: str | None) -> Sheet:
+    def _elasticity(self, membrane, model: str | None) -> ElasticEnergy:
         material = self.sensor.material
-        return Sheet(membrane, model or material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
+        return ElasticEnergy(membrane, model or material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
 
     def _cavity(self, membrane) -> tuple[str, tuple[float, float] | None]:
         """The cavity's filling, and a gas' pressure and volume."""

@@ -43,7 +43,7 @@ class Checkerboard:
 
     @property
     def extent(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner of the sheet, `[2]` each."""
+        """Lower and upper corner of the printed page, `[2]` each."""
         return np.full(2, -2.0 * self.square), self.square * np.array([self.columns + 1, self.rows + 1.0])
 
 

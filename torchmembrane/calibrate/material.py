@@ -1,4 +1,4 @@
-"""The sheet's prestretch from images of presses, and its stiffness from presses of known force."""
+"""The membrane's prestretch from images of presses, and its stiffness from presses of known force."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from ..errors import MembraneError
 from ..estimators.force_balance import ForceBalance
 from ..io.results import OK, STATUS_TEXTS
 from ..mechanics.cavity import Equilibrium
-from ..mechanics.hyperelastic import Sheet
+from ..mechanics.hyperelastic import ElasticEnergy
 from ..reconstruct import Reconstructor
 from ..sensor.model import Sensor
 from ..surface.membrane import SurfacePoints
@@ -78,11 +78,11 @@ def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | No
         p(log l) ~ product over images of [e + (1 - e) exp(-min over x, p of price(x, p; l)) / mean over l of the same]
 
     with e = `WRONG`, for an image that is explained wrongly altogether. Mean and deviation are reported, the latter enlarged
-    where the images contradict one another, and by an error that all images share. A sheet with the wrong l needs forces where
+    where the images contradict one another, and by an error that all images share. A membrane with the wrong l needs forces where
     nothing touches it. Forces are proportional to the modulus, so that each press gives the modulus as force measured / force
     found at modulus 1; their mean is reported.
 
-    Wrong when: the presses are shallow or the markers miss them (the deviation says so); the sheet is not equally stretched in
+    Wrong when: the presses are shallow or the markers miss them (the deviation says so); the membrane is not equally stretched in
     both directions; the rest surface is wrong; the prestretch lies outside `STRETCHES` (then it is found near their end).
     """
     reconstructor = _reconstructor(sensor)
@@ -116,7 +116,7 @@ def _material(sensor: Sensor, reconstructor: Reconstructor, displacement, confid
 def _reconstructor(sensor: Sensor) -> Reconstructor:
     if sensor.material.model == "harmonic":
         raise MembraneError(
-            "calibrate material: a harmonic sheet has one shape at any prestretch; expected neo_hookean or mooney_rivlin"
+            "calibrate material: a harmonic membrane has one shape at any prestretch; expected neo_hookean or mooney_rivlin"
         )
     return Reconstructor(replace(sensor, membrane=sensor.surface.membrane(GRID)), dtype=torch.float64)
 
@@ -146,10 +146,10 @@ class Presses:
         """The estimator with this material, and what it finds."""
         r, known = self.reconstructor, self.reconstructor.estimator
         material, cavity, membrane = r.sensor.material, known.cavity, known.membrane
-        sheet = Sheet(membrane, material.model, stretch, modulus, material.c2_ratio or 0.0)
+        elasticity = ElasticEnergy(membrane, material.model, stretch, modulus, material.c2_ratio or 0.0)
         points = SurfacePoints(r.marker_vertices.numpy(), r.marker_weights.numpy(), np.zeros(len(r.rest_markers)))
         gas = tuple(cavity.gas.tolist())
-        estimator = ForceBalance(membrane, sheet, points, r.rest_markers, known.noise, cavity.filling, gas)
+        estimator = ForceBalance(membrane, elasticity, points, r.rest_markers, known.noise, cavity.filling, gas)
         with torch.no_grad():
             return estimator, estimator(*self.rays, self.confidence)
 
@@ -168,7 +168,7 @@ class Presses:
     def modulus(self, log_stretch: float, deviation: float, forces: np.ndarray) -> tuple[float, float, float, np.ndarray]:
         """Modulus, its deviation at this prestretch, its change with one deviation of the prestretch, magnitudes `[B, 2]`.
 
-        The change is the larger of those to either side, negative: under more tension at rest a softer sheet presses as hard.
+        The change is the larger of those to either side, negative: under more tension at rest a softer membrane presses as hard.
 
         `forces`: as for `material_from_pixels`. A gas resists in newtons: the presses are explained anew with each modulus.
         """

@@ -85,7 +85,7 @@ def _material(sensor, reconstructor) -> list[str]:
     if relative:
         lines.append("without shear_modulus and thickness forces are relative, in units of their product")
     if reconstructor is not None:
-        tension, pressure = float(reconstructor.estimator.sheet.tension), float(reconstructor.estimator.rest_pressure)
+        tension, pressure = float(reconstructor.estimator.elasticity.tension), float(reconstructor.estimator.rest_pressure)
         hectopascal = pressure * METRE[unit] ** 2 / 100
         units = ("(relative)",) * 2 if relative else (f"N/{unit}", f"N/{unit}² = {hectopascal:.4g} hPa")
         lines.append(f"at rest: tension {tension:.4g} {units[0]}, pressure difference {pressure:.4g} {units[1]}")

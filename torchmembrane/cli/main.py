@@ -186,7 +186,7 @@ def _reconstruct_parser(commands) -> None:
     add("images", metavar="IMAGES", nargs="+", help="image files, globs (quoted or not), folders, or videos")
     add("--out", metavar="DIR", type=Path, required=True, help="folder of the results: new, or of the same sensor")
     add("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="how it is found (default: %(default)s)")
-    add("--energy", choices=MODELS, help="the sheet's elastic energy (default: the sensor file's)")
+    add("--energy", choices=MODELS, help="the membrane's elastic energy (default: the sensor file's)")
     element = "triangle (default), or quadrilateral: the paper's, harmonic, with the tension of --energy"
     add("--element", choices=ELEMENTS, default=ELEMENTS[0], help=element)
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: %(default)s)")
@@ -215,7 +215,7 @@ def _export_parser(commands) -> None:
     add("sensor", metavar="SENSOR.toml", help="the sensor file, or preset:NAME")
     add("-o", "--out", metavar="MODEL.onnx", type=Path, required=True, help="the model's file")
     add("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="how it is found (default: %(default)s)")
-    add("--energy", choices=MODELS, help="the sheet's elastic energy (default: the sensor file's)")
+    add("--energy", choices=MODELS, help="the membrane's elastic energy (default: the sensor file's)")
     add("--element", choices=ELEMENTS, default=ELEMENTS[0], help="as for reconstruct (default: %(default)s)")
     add("--tracking", action="store_true", help="start from the frame before, given with the image (force balance)")
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from ..mechanics.hyperelastic import Sheet
+from ..mechanics.hyperelastic import ElasticEnergy
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..surface.membrane import Membrane, SurfacePoints, corners, corners_to_vertices
 from .bilinear import bilinear_matrix
@@ -135,8 +135,8 @@ def roughness(membrane: Membrane, markers: int) -> Tensor:
 def _laplacian(membrane: Membrane) -> Tensor:
     """Dense stiffness `L [V, V]` of the Dirichlet energy on the rest surface (cotangent Laplacian)."""
     V = len(membrane.rest)
-    sheet = Sheet(membrane, "harmonic", 1.0)
+    elasticity = ElasticEnergy(membrane, "harmonic", 1.0)
     one = torch.zeros_like(membrane.rest)
     one[:, 2] = 1.0
-    K = sheet.stiffness_along(membrane.rest, one)
+    K = elasticity.stiffness_along(membrane.rest, one)
     return corners_to_vertices(K @ corners(torch.eye(V, dtype=torch.float64), membrane.grid), membrane.grid)

@@ -25,7 +25,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..mechanics.cavity import CavityLaw, Equilibrium, rest_balance
-from ..mechanics.hyperelastic import Sheet
+from ..mechanics.hyperelastic import ElasticEnergy
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..solve.stencil_system import NEAR, StencilSystem
 from ..surface.membrane import Membrane, SurfacePoints
@@ -88,7 +88,7 @@ class ForceBalance(nn.Module):
     """Surface, contact tractions and pressure from marker rays.
 
     Arguments
-        membrane, sheet    the rest surface on the solver's grid, its material
+        membrane, elasticity  the rest surface on the solver's grid, its material
         markers            the markers' `SurfacePoints`, and `positions [D, 3]`, their rest positions
         noise              angular noise of a marker, radians; about twice the locator's, to leave room for the grid's own error
         filling, gas       the cavity, as for `MinimumEnergy`
@@ -99,15 +99,17 @@ class ForceBalance(nn.Module):
     Wrong when: the press is so shallow that its tractions drown in noise; two contacts lie within `REACH`.
     """
 
-    def __init__(self, membrane: Membrane, sheet: Sheet, markers: SurfacePoints, positions: Tensor, noise: float,
+    def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, markers: SurfacePoints, positions: Tensor, noise: float,
                  filling="liquid", gas: tuple[float, float] | None = None, steps: int | None = None):  # fmt: skip
         super().__init__()
-        self.membrane, self.sheet, self.noise = membrane, sheet, noise
+        self.membrane, self.elasticity, self.noise = membrane, elasticity, noise
         self.largest_relative_step, self.largest_volume_error = LARGEST_RELATIVE_STEP, LARGEST_VOLUME_ERROR
-        rest_pressure, rest_load = rest_balance(membrane, sheet)
+        rest_pressure, rest_load = rest_balance(membrane, elasticity)
         self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
         self.size, self.cone = membrane.size, CONE
-        self.reference = max(float(rest_pressure), float(sheet.tension) / self.size, float(sheet.c1 + sheet.c2) / self.size)
+        self.reference = max(
+            float(rest_pressure), float(elasticity.tension) / self.size, float(elasticity.c1 + elasticity.c2) / self.size
+        )
         self.register_buffer("rest_pressure", rest_pressure)
         self.register_buffer("rest_load", rest_load)
         self.register_buffer("moves", (~membrane.fixed).double()[:, None])
@@ -137,16 +139,16 @@ class ForceBalance(nn.Module):
         every_second = lambda field: field.unflatten(0, grid)[::2, ::2].numpy()  # noqa: E731
         membrane = Membrane(every_second(self.membrane.rest), every_second(self.membrane.fixed))
         markers = membrane.closest_points(self.positions.numpy())
-        sheet = self.sheet.on(membrane)
-        coarse = ForceBalance(membrane, sheet, markers, self.positions, self.noise, filling, gas)
+        elasticity = self.elasticity.on(membrane)
+        coarse = ForceBalance(membrane, elasticity, markers, self.positions, self.noise, filling, gas)
         if coarse.coarse is None:
             coarse.steps, coarse.cone = COARSE_STEPS, COARSE_CONE
         return coarse
 
     def set_prestretch(self, prestretch: Tensor) -> None:
         """Another prestretch `[]`, gradients included; rest pressure and load follow, the reference traction stays."""
-        self.sheet.prestretch = prestretch
-        self.rest_pressure, self.rest_load = rest_balance(self.membrane, self.sheet)
+        self.elasticity.prestretch = prestretch
+        self.rest_pressure, self.rest_load = rest_balance(self.membrane, self.elasticity)
         self.cavity.rest_pressure = self.rest_pressure
         if self.coarse is not None:
             self.coarse.set_prestretch(prestretch)
@@ -224,18 +226,18 @@ class ForceBalance(nn.Module):
     def contact_force(self, x: Tensor, pressure: Tensor) -> Tensor:
         """Force that something outside must exert on every free vertex, `[B, V, 3]`."""
         push = pressure[:, None, None] * self.membrane.volume_gradient(x)
-        return (self.sheet.gradient(x) - self.rest_load - push) * self.moves
+        return (self.elasticity.gradient(x) - self.rest_load - push) * self.moves
 
     def linearised(self, x: Tensor, pressure: Tensor) -> "Linearised":
         """`contact_force` and what it and the volume do when vertices move, at the inner vertices."""
         grid = self.membrane.grid
         edges = apply_stencil(x, self.edges, grid, border=False).unflatten(-1, (2, -1))
         gradient, volume_one_ring = self.membrane.volume_one_ring(edges)
-        stress, sheet_ring = self.sheet.one_ring(edges)
+        stress, elastic_ring = self.elasticity.one_ring(edges)
         pull = (stress[:, None] * edges[:, :, 0].unflatten(-1, (6, -1))).sum(2)
         force = pull - inner(self.rest_load, grid).mT - pressure[:, None, None] * gradient
-        beside = self.free_neighbours * (sheet_ring - pressure[:, None, None, None, None] * volume_one_ring)
-        slope = torch.cat([-sheet_ring.sum(3, keepdim=True), beside], 3) * self.free
+        beside = self.free_neighbours * (elastic_ring - pressure[:, None, None, None, None] * volume_one_ring)
+        slope = torch.cat([-elastic_ring.sum(3, keepdim=True), beside], 3) * self.free
         return Linearised(force * self.free, slope, gradient * self.free, F.normalize(gradient, dim=1))
 
     def markers(self, x: Tensor) -> Tensor:

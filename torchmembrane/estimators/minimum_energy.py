@@ -1,7 +1,7 @@
 """The paper's estimator: of all surfaces on the observed rays, the one of least elastic energy at the fluid's volume.
 
 One unknown for each free vertex, its position `t_k` along its ray, `x_k = o_k + t_k d_k`. For the harmonic energy
-`E(t) = 1/2 t.K t - g.t` exactly, with `K = L o (R R^T)` (eqs. 14, 18, 64); for a hyperelastic sheet the same step is repeated.
+`E(t) = 1/2 t.K t - g.t` exactly, with `K = L o (R R^T)` (eqs. 14, 18, 64); for a hyperelastic membrane the same step is repeated.
 """
 
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..mechanics.cavity import CavityLaw, Equilibrium, rest_balance
-from ..mechanics.hyperelastic import AffineQuadrilaterals, Sheet
+from ..mechanics.hyperelastic import AffineQuadrilaterals, ElasticEnergy
 from ..solve.anderson import accelerated, first
 from ..solve.kkt import constrained_minimum
 from ..surface.membrane import Membrane, corners, corners_to_vertices
@@ -25,7 +25,7 @@ class MinimumEnergy(nn.Module):
 
     Arguments
         membrane    the rest surface on the solver's grid
-        sheet       its material (`Sheet`); with `element = "quadrilateral"` only its rest tension is used
+        elasticity  its material (`ElasticEnergy`); with `element = "quadrilateral"` only its rest tension is used
         element     "triangle" (linear), or "quadrilateral": the paper's affine quadrilaterals, harmonic
         smoothing   weight s of `s |S psi|^2`, `psi = t - t_rest` (eq. 28), over the rest tension; S is the grid's Laplacian
         filling     "liquid" (volume kept), "gas" (pressure x volume kept), "open" (pressure stays at rest)
@@ -39,20 +39,20 @@ class MinimumEnergy(nn.Module):
     distance to the camera are flattened.
     """
 
-    def __init__(self, membrane: Membrane, sheet: Sheet, rest_rays, element="triangle", smoothing=0.0, filling="liquid",
+    def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, rest_rays, element="triangle", smoothing=0.0, filling="liquid",
                  gas: tuple[float, float] | None = None, volume="exact", steps=None):  # fmt: skip
         super().__init__()
         for name, value, known in (("element", element, ELEMENTS), ("volume", volume, VOLUMES)):
             if value not in known:
                 raise MembraneError(f"MinimumEnergy: {name} = {value!r}; expected one of {', '.join(known)}")
-        self.membrane, self.sheet, self.volume_constraint = membrane, sheet, volume
+        self.membrane, self.elasticity, self.volume_constraint = membrane, elasticity, volume
         self.largest_relative_step, self.largest_volume_error = CONVERGED, CONVERGED if volume == "exact" else float("inf")
         self.steps = steps
-        self.energy = sheet if element == "triangle" else AffineQuadrilaterals(membrane, sheet.tension)
+        self.energy = elasticity if element == "triangle" else AffineQuadrilaterals(membrane, elasticity.tension)
         origins, directions = rest_rays
         self.register_buffer("rest_range", ((membrane.rest - origins) * directions).sum(-1))
         self.smooths = smoothing > 0
-        self.register_buffer("smoothing", sheet.tension * smoothing)
+        self.register_buffer("smoothing", elasticity.tension * smoothing)
         rest_pressure, rest_load = rest_balance(membrane, self.energy)
         self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
         self.register_buffer("rest_pressure", rest_pressure)

@@ -66,7 +66,7 @@ class CavityLaw(nn.Module):
 def rest_balance(membrane: Membrane, energy) -> tuple[Tensor, Tensor]:
     """Rest pressure `p0 []` and rest load `h = grad U(X) - p0 grad V(X)` of the free vertices, `[V, 3]`, zero on the rim.
 
-    `p0` weights both with the normals, so spurious tangential parts have no say; `energy`: a `Sheet` or the paper's element.
+    `p0` weights both with the normals, so spurious tangential parts have no say; `energy`: a `ElasticEnergy` or the paper's element.
     """
     force, push = energy.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
     normal, free = membrane.rest_normals, membrane.free

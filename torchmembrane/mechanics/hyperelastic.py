@@ -1,4 +1,4 @@
-"""Elastic energy of the sheet on linear triangles: harmonic, neo-Hookean, Mooney-Rivlin; the paper's affine quadrilaterals.
+"""Elastic energy of the membrane on linear triangles: harmonic, neo-Hookean, Mooney-Rivlin; the paper's affine quadrilaterals.
 
 With the rest metric `G` and the deformed metric `g` of a triangle's edges, `I = tr(G^-1 g)` and `D = det g / det G` are the
 invariants of `C = F^T F`; the energy per rest area is `W(I, D)`. Everything is in units of shear modulus x thickness (at rest,
@@ -50,8 +50,8 @@ class Strain(NamedTuple):
     D: Tensor
 
 
-class Sheet(nn.Module):
-    """The sheet's elastic energy `U(x)`, its gradient, and its stiffness along given directions.
+class ElasticEnergy(nn.Module):
+    """The membrane's elastic energy `U(x)`, its gradient, and its stiffness along given directions.
 
     Arguments: the membrane; `model` harmonic | neo_hookean | mooney_rivlin; `prestretch` l; `modulus` = shear modulus x
     thickness at rest (force / length); `c2_ratio` = C2 / C1.
@@ -64,7 +64,7 @@ class Sheet(nn.Module):
     def __init__(self, membrane: Membrane, model="neo_hookean", prestretch=1.0, modulus=1.0, c2_ratio=0.0):
         super().__init__()
         if model not in MODELS:
-            raise MembraneError(f"Sheet: model = {model!r}; expected one of {', '.join(MODELS)}")
+            raise MembraneError(f"ElasticEnergy: model = {model!r}; expected one of {', '.join(MODELS)}")
         self.model, self.grid = model, membrane.grid
         c2 = modulus / 2 * c2_ratio / (1 + c2_ratio) if model == "mooney_rivlin" else 0.0
         for name, value in (("prestretch", prestretch), ("c1", modulus / 2 - c2), ("c2", c2)):
@@ -105,10 +105,10 @@ class Sheet(nn.Module):
         self.register_buffer("heron", 0.5 - torch.eye(3, dtype=torch.float64))
         self.register_buffer("total", torch.ones(1, 3, dtype=torch.float64))
 
-    def on(self, membrane: Membrane) -> "Sheet":
+    def on(self, membrane: Membrane) -> "ElasticEnergy":
         """The same material on another membrane or grid."""
         modulus = 2 * float(self.c1 + self.c2)
-        return Sheet(membrane, self.model, float(self.prestretch), modulus, float(self.c2 / self.c1))
+        return ElasticEnergy(membrane, self.model, float(self.prestretch), modulus, float(self.c2 / self.c1))
 
     def strain(self, x: Tensor) -> Strain:
         """The strain of `x [..., V, 3]`: of all triangles, `T = 2 (m-1) (n-1)`."""
@@ -153,7 +153,7 @@ class Sheet(nn.Module):
         return (self.area * self.density(I, D)).sum((-1, -2))
 
     def gradient(self, x: Tensor) -> Tensor:
-        """`dU/dx`, `[..., V, 3]`: the sheet's forces with opposite sign, at every vertex from the six triangles around it.
+        """`dU/dx`, `[..., V, 3]`: the membrane's forces with opposite sign, at every vertex from the six triangles around it.
 
         `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron).
         """
@@ -170,7 +170,7 @@ class Sheet(nn.Module):
         """Positive semi-definite stiffness of displacements along one direction a vertex.
 
         Arguments: `x [..., V, 3]`, `directions [..., V, 3]`. Returns the corner matrices `[..., m-1, n-1, 4, 4]`, whose sum
-        over quadrilaterals is `K_kl = d_k . H_kl d_l` with `H` the Hessian of `U`: exact where the sheet is in tension (for
+        over quadrilaterals is `K_kl = d_k . H_kl d_l` with `H` the Hessian of `U`: exact where the membrane is in tension (for
         Mooney-Rivlin without the term of `D` that is not convex), and for the harmonic energy `L_kl d_k . d_l` (eq. 64).
         """
         H = self.hessian_blocks(x, positive=True).unflatten(-1, (3, 3)).unflatten(-3, (3, 3))
@@ -267,7 +267,7 @@ def _determinant(metric: Tensor) -> Tensor:
 def _metric_constants() -> dict[str, Tensor]:
     """What is constant in second derivatives by the metric's entries 11, 12, 22.
 
-    `twice_12 [3]`; `bend [9]`, those of the determinant; `metric_to_pairs [12, 9]`, from any such to `T_cd` of `Sheet._pairs`;
+    `twice_12 [3]`; `bend [9]`, those of the determinant; `metric_to_pairs [12, 9]`, from any such to `T_cd` of `ElasticEnergy._pairs`;
     `stress_to_pairs [3, 3]`, likewise for the stress.
     """
     slopes = np.zeros((2, 3, 2))  # d g / d e_a = sum_c slopes[a, g, c] e_c
@@ -325,7 +325,7 @@ class AffineQuadrilaterals(nn.Module):
         return torch.einsum("...kc,...ka->...ca", corners(x, self.grid), self.map_weights)
 
     def energy(self, x: Tensor) -> Tensor:
-        """`1/2 tension sum area tr(A^T A)`, `[..., V, 3]` to `[...]`; less the rest's, as `Sheet`'s harmonic energy."""
+        """`1/2 tension sum area tr(A^T A)`, `[..., V, 3]` to `[...]`; less the rest's, as `ElasticEnergy`'s harmonic energy."""
         maps = self.affine_maps(x)
         return self.tension / 2 * (self.area * ((maps**2).sum((-1, -2)) - 2)).sum((-1, -2))
 

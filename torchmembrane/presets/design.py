@@ -9,7 +9,7 @@ from tqdm import tqdm
 from ..camera.model import Camera
 from ..io.images import to_grey
 from ..mechanics.cavity import rest_balance
-from ..mechanics.hyperelastic import Sheet
+from ..mechanics.hyperelastic import ElasticEnergy
 from ..sensor.model import METRE, Cavity, Markers, Material, Sensor, Surface
 from ..sensor.toml import default_grid
 from ..simulate.look import Look, noisy
@@ -48,7 +48,7 @@ def bubble() -> Sensor:
 
 
 def half_cylinder() -> Sensor:
-    """A water-filled half cylinder, longer than wide, seen through a sheet of Plexiglas: the paper's Appendix A."""
+    """A water-filled half cylinder, longer than wide, seen through a pane of Plexiglas: the paper's Appendix A."""
     radius, length, half_angle, base_z, spacing = 10.0, 36.0, 80.0, 24.0, 2.4
     return _sensor(
         "half_cylinder",
@@ -75,9 +75,9 @@ def _sensor(name, camera, surface, material, positions, sizes, gas=False) -> Sen
 
 
 def _overpressure(membrane, material) -> float:
-    """What the sheet's tension holds at rest, whole hPa."""
-    sheet = Sheet(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
-    return float(round(float(rest_balance(membrane, sheet)[0]) * METRE["mm"] ** 2 / 100))
+    """What the membrane's tension holds at rest, whole hPa."""
+    elasticity = ElasticEnergy(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
+    return float(round(float(rest_balance(membrane, elasticity)[0]) * METRE["mm"] ** 2 / 100))
 
 
 def _dome_dots(semi_axes, opening: float, base_z: float, spacing: float) -> tuple[np.ndarray, list[str]]:

@@ -33,7 +33,7 @@ SHAPES_BY_ARRAYS = {"grid": ("vertices", "fixed"), "heightfield": ("x", "y", "z"
 
 @dataclass(frozen=True)
 class Material:
-    """The sheet: energy, prestretch, and its stiffness where known.
+    """The membrane: energy, prestretch, and its stiffness where known.
 
     model: "harmonic" | "neo_hookean" | "mooney_rivlin"; prestretch >= 1, equal in both directions; c2_ratio: C2 / C1,
     Mooney-Rivlin only; shear_modulus: N per length unit squared; thickness: length unit, at rest (already stretched).

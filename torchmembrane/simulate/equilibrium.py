@@ -1,4 +1,4 @@
-"""Static equilibrium of the sheet under a pressure that obeys the cavity's law, a dead load, and contacts: Newton's method.
+"""Static equilibrium of the membrane under a pressure that obeys the cavity's law, a dead load, and contacts: Newton's method.
 
 `grad U(x) - h - p grad V(x) = sum of contact forces` on the free vertices, and the cavity's law between V and p.
 """
@@ -14,7 +14,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..mechanics.hyperelastic import Sheet
+from ..mechanics.hyperelastic import ElasticEnergy
 from ..surface.membrane import Membrane, corners, triangles_of
 from .contact import Contact
 
@@ -68,18 +68,18 @@ class Solution(NamedTuple):
 class Equilibrium:
     """Newton's method on one membrane.
 
-    Arguments: the membrane, its `sheet`, the `cavity` (`Liquid`, `Gas`, `Open`), a dead `load [V, 3]` (default: none).
+    Arguments: the membrane, its `elasticity`, the `cavity` (`Liquid`, `Gas`, `Open`), a dead `load [V, 3]` (default: none).
     Element Hessians are exact; where the step they give does not descend, their convex part. The line search is on the slope
     of the potential along the step, its volume term augmented; the bordered matrix is never factored.
     """
 
-    def __init__(self, membrane: Membrane, sheet: Sheet, cavity, load: Tensor | None = None):
-        self.membrane, self.sheet, self.cavity, self.free = membrane, sheet, cavity, membrane.free
+    def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, cavity, load: Tensor | None = None):
+        self.membrane, self.elasticity, self.cavity, self.free = membrane, elasticity, cavity, membrane.free
         self.load = torch.zeros_like(membrane.rest) if load is None else load
         self.matrix = _Pattern(membrane)
-        modulus = float(2 * (sheet.c1 + sheet.c2) + sheet.tension.abs())
+        modulus = float(2 * (elasticity.c1 + elasticity.c2) + elasticity.tension.abs())
         self.force_scale = modulus * membrane.size / len(membrane.rest) ** 0.5
-        self.vertex_stiffness = float(self.matrix(sheet.hessian_blocks(membrane.rest)).diagonal().mean())
+        self.vertex_stiffness = float(self.matrix(elasticity.hessian_blocks(membrane.rest)).diagonal().mean())
 
     def solve(self, x: Tensor, pressure: float, contacts: Sequence[Contact] = ()) -> Solution:
         """Equilibrium from a start `x [V, 3]`, whose rim stays where it is. Raises `MembraneError` if none is found."""
@@ -101,7 +101,7 @@ class Equilibrium:
 
     def _out_of_balance(self, x, pressure, pushes):
         """`grad U - h - p grad V - contact forces` on the free degrees of freedom; `pushes [F, 3]` of each indenter."""
-        field = self.sheet.gradient(x) - self.load - pressure * self.membrane.volume_gradient(x)
+        field = self.elasticity.gradient(x) - self.load - pressure * self.membrane.volume_gradient(x)
         return (field[self.free] - sum(pushes)).numpy().ravel()
 
     def _gap(self, x, pressure):
@@ -111,7 +111,7 @@ class Equilibrium:
         """One Newton step: vertices, pressure and contacts, or None where it does not descend."""
         active = [contact.active_set(x[self.free]) for contact in contacts]
         each = list(zip(contacts, active, strict=True))
-        blocks = self.sheet.hessian_blocks(x, positive) - pressure * self.membrane.volume_hessian_blocks(x)
+        blocks = self.elasticity.hessian_blocks(x, positive) - pressure * self.membrane.volume_hessian_blocks(x)
         K = self.matrix(blocks, sum(contact.stiffness_blocks(x[self.free], a) for contact, a in each))
         linear = [contact.linearised(a).force(x[self.free]) for contact, a in each]
         push, (gap, compliance) = self.membrane.volume_gradient(x)[self.free].numpy().ravel(), self._gap(x, pressure)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..mechanics.cavity import rest_balance
-from ..mechanics.hyperelastic import Sheet
+from ..mechanics.hyperelastic import ElasticEnergy
 from ..surface.membrane import Membrane, SurfacePoints
 from .contact import Contact
 from .equilibrium import Equilibrium, Gas, Liquid, Open
@@ -50,24 +50,24 @@ class Press(NamedTuple):
     iterations: int
 
 
-def press(membrane: Membrane, sheet: Sheet, paths, **options) -> Press:
+def press(membrane: Membrane, elasticity: ElasticEnergy, paths, **options) -> Press:
     """The last state of `presses`, which takes the same arguments: a membrane pressed by indenters.
 
     >>> from torchmembrane.shapes import spherical_cap
     >>> from torchmembrane.simulate.indenters import Sphere
     >>> dome = spherical_cap(12, 9, 3, (9, 9))
     >>> ball = Sphere(4.0).touching(dome, (0, 0, -1))
-    >>> state = press(dome, Sheet(dome, prestretch=1.3), [[ball, ball.moved((0, 0, -1.0))]])
+    >>> state = press(dome, ElasticEnergy(dome, prestretch=1.3), [[ball, ball.moved((0, 0, -1.0))]])
     >>> round(float(state.vertices[40, 2]), 6), state.pressure > state.rest_pressure
     (11.0, True)
     """
-    *_, last = presses(membrane, sheet, paths, **options)
+    *_, last = presses(membrane, elasticity, paths, **options)
     return last
 
 
 def presses(
     membrane: Membrane,
-    sheet: Sheet,
+    elasticity: ElasticEnergy,
     paths: Sequence[Sequence[Indenter]],
     filling="liquid",
     gas: tuple[float, float] | None = None,
@@ -95,9 +95,9 @@ def presses(
     if friction < 0 or (increment is not None and increment <= 0):
         raise MembraneError(f"press: friction = {friction}, increment = {increment}; expected friction >= 0 and increment > 0")
     increment = increment or membrane.size / (100 if friction else 10)
-    balance, load = rest_balance(membrane, sheet)
+    balance, load = rest_balance(membrane, elasticity)
     rest_pressure = float(balance)
-    equilibrium = Equilibrium(membrane, sheet, _cavity(membrane, rest_pressure, filling, gas), load)
+    equilibrium = Equilibrium(membrane, elasticity, _cavity(membrane, rest_pressure, filling, gas), load)
     x, pressure = membrane.rest, rest_pressure
     contacts = [Contact.begun(path[0], x[membrane.free], equilibrium.vertex_stiffness, friction) for path in paths]
     for poses in zip(*paths, strict=True):
@@ -165,7 +165,7 @@ def _result(equilibrium: Equilibrium, rest_pressure, x, pressure, contacts, iter
     each = torch.stack([contact.force(free) for contact in contacts])
     nodal = torch.zeros_like(x).index_copy(0, equilibrium.free, each.sum(0))
     push = pressure * membrane._thirds_to_vertices(membrane.area_vectors(x))
-    rim = (equilibrium.sheet.gradient(x) - push)[membrane.fixed].sum(0)
+    rim = (equilibrium.elasticity.gradient(x) - push)[membrane.fixed].sum(0)
     left_over = nodal.sum(0) + push.sum(0) + equilibrium.load.sum(0) + rim
     return Press(
         vertices=x,

@@ -11,7 +11,7 @@ import torch
 
 from ..errors import MembraneError
 from ..io.images import to_grey
-from ..mechanics.hyperelastic import Sheet
+from ..mechanics.hyperelastic import ElasticEnergy
 from ..sensor.model import Sensor
 from .indenters import Indenter
 from .look import Look, noisy
@@ -92,7 +92,9 @@ class Simulator:
             )
         self.membrane = sensor.surface.membrane(self.grid)
         material, cavity = sensor.material, sensor.cavity
-        self.sheet = Sheet(self.membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
+        self.elasticity = ElasticEnergy(
+            self.membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0
+        )
         self.cavity = {"filling": cavity.filling}
         if cavity.filling == "gas":
             gas = (sensor.gas_pressure, cavity.volume or self.membrane.cavity_volume)
@@ -116,7 +118,7 @@ class Simulator:
         The motion starts at the first touch, which is no frame: with friction the force depends on the path from there.
         """
         poses = [stroke.indenter, *stroke.poses(legs, frames, LIFT * self.membrane.size)]
-        states = presses(self.membrane, self.sheet, [poses], friction=stroke.friction, increment=increment, **self.cavity)
+        states = presses(self.membrane, self.elasticity, [poses], friction=stroke.friction, increment=increment, **self.cavity)
         touched = False
         for state in islice(states, 1, None):
             touched = touched or bool(state.contact.any())
