@@ -11,7 +11,7 @@ from torch import Tensor
 from ..errors import MembraneError
 from ..estimators.force_balance import ForceBalance
 from ..io.results import OK, STATUS_TEXTS
-from ..mechanics.cavity import Equilibrium
+from ..estimators.base import Equilibrium
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..reconstruct import Reconstructor
 from ..sensor.model import Sensor

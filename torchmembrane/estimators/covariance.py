@@ -6,19 +6,15 @@ At the solution a small change `e` of the measured angles moves surface and pres
     [m' c  0] [dp    ] = [   0   ],    M = A^T W A + J^T w J,
     [n' 0  C] [lambda]   [   0   ]
 
-with `W` the curvature of a push's price (flat where it bends down; what rubs by its parabola), so that noise of covariance S
-gives the sandwich `H^-1 J^T w S w J H^-1`. One load a marker and direction of its noise, all solved with one factor.
+with `W` the curvature of a push's loss (flat where it bends down; shear by its parabola), so that noise of covariance S gives
+the sandwich `H^-1 J^T w S w J H^-1`. One load per marker and direction of its noise, all solved with one factor.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from ..surface.stencil import pad_border
-
-if TYPE_CHECKING:
-    from .force_balance import ForceBalance, Observation
 
 
 class StandardDeviations(NamedTuple):
@@ -29,30 +25,40 @@ class StandardDeviations(NamedTuple):
     pressure: Tensor
 
 
-def standard_deviations(
-    estimator: "ForceBalance", x: Tensor, pressure: Tensor, seen: "Observation", noise: Tensor, tau: float, outlier: float
-) -> StandardDeviations:
-    """Arguments: the solution's `x [B, V, 3]`, `pressure [B]`; what it was found from; `noise [B, D, 2, 3]`: how one standard
-    deviation of a marker's noise in each of two independent directions turns its ray, radians."""
-    system, membrane = estimator.system, estimator.membrane
-    at = estimator.linearised(x, pressure)
-    W = estimator.force_weights(at.normal, at.force, tau, curvature=True)
-    angle, sight = estimator.angles(x, seen)
-    weight = estimator.marker_weights_at(angle, seen, outlier)
-    normal = estimator.normal_equations(at, W, sight, weight)
-    loads, (_, c) = estimator.loads(normal, at, angle)
-    borders = loads[:, [2, 0]]
-    turns = torch.einsum("bdrj,bajd,bacd->bdrc", noise, seen.across, normal.weighted_sight)
-    g = torch.einsum("bdrc,dn->bdrcn", turns, estimator.vertex_shares).flatten(3).flatten(1, 2)
-    y = system.substitute(system.factor(estimator.matrix(normal)), torch.cat([g, borders], 1))
-    dx, dp = y[:, :-2], torch.zeros_like(g[..., 0])
-    if estimator.cavity.filling != "open":
+class LinearisedSolution(NamedTuple):
+    """A solution, linearised.
+
+    solve        `M^-1` of loads `[B, L, 3 N]`
+    borders      `[B, 2, 3 N]`, `m` and `n`: what the pressure and the volume do to the equations
+    corner       `c` and `C`, `[B]` each; None where the pressure is fixed (an open cavity)
+    force        `[B, 3, 3 N]`, the total force's derivative in the inner vertices
+    of_pressure  `[B, 3]`, minus its derivative in the pressure
+    """
+
+    solve: Callable[[Tensor], Tensor]
+    borders: Tensor
+    corner: tuple[Tensor, Tensor] | None
+    force: Tensor
+    of_pressure: Tensor
+
+
+def spread(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Standard deviations of the inner vertices `[B, 3 N]`, the total force `[B, 3]` and the pressure `[B]`.
+
+    Args:
+        solution: the linearised solution.
+        noise_loads: `[B, L, 3 N]`, what one standard deviation of each independent noise adds to the equations, `J^T w e`.
+    """
+    y = solution.solve(torch.cat([noise_loads, solution.borders], 1))
+    dx, dp = y[:, :-2], torch.zeros_like(noise_loads[..., 0])
+    if solution.corner is not None:
         border = y[:, -2:]
-        _, compliance = estimator.cavity.condition(membrane.volume(x) - membrane.rest_volume, pressure)
-        corner = torch.diag_embed(torch.stack([c, compliance.expand_as(c)], -1)) - borders @ border.mT
-        rise = torch.linalg.solve(corner, -borders @ dx.mT)
+        corner = torch.diag_embed(torch.stack(solution.corner, -1)) - solution.borders @ border.mT
+        rise = torch.linalg.solve(corner, -solution.borders @ dx.mT)
         dx, dp = dx - rise.mT @ border, rise[:, 0]
-    total = estimator.along(at.slope, torch.eye(3).to(x)[None, ..., None].expand(1, 3, 3, len(estimator.free))).flatten(2)
-    dF = dx @ total.mT - dp[..., None] * at.volume.sum(-1)[:, None]
-    spread = lambda change: change.square().sum(1).sqrt()  # noqa: E731
-    return StandardDeviations(pad_border(spread(dx).unflatten(-1, (3, -1)).mT, membrane.grid), spread(dF), spread(dp))
+    dF = dx @ solution.force.mT - dp[..., None] * solution.of_pressure[:, None]
+    return _root_sum_square(dx), _root_sum_square(dF), _root_sum_square(dp)
+
+
+def _root_sum_square(changes: Tensor) -> Tensor:
+    return changes.square().sum(1).sqrt()

@@ -1,6 +1,4 @@
-"""From marker displacements in the image to a ray through every grid vertex; local affine maps (eqs. 15-17, Appendix C)."""
-
-from typing import NamedTuple
+"""From marker displacements in the image to the flow of every grid vertex (section 5)."""
 
 import numpy as np
 import torch
@@ -10,69 +8,34 @@ from ..errors import MembraneError
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..surface.membrane import Membrane, SurfacePoints, corners, corners_to_vertices
+from .base import Problem
 from .bilinear import bilinear_matrix
+from .settings import FLOWS
 
-KINDS = ("smooth", "bilinear")
 SMOOTHING_LENGTH = 0.45
 """Wavelength, in units of two marker spacings, at which the interpolated flow keeps half of the measured amplitude."""
 
 
-class AffineMap(NamedTuple):
-    """`p' = A p + b`: `A [..., q, p]`, `b [..., q]`."""
+class VertexFlow(nn.Module):
+    """Where the grid's vertices are seen, from where the markers are.
 
-    A: Tensor
-    b: Tensor
-
-
-def affine_fit(points: Tensor, images: Tensor, inverse_moment: Tensor | None = None) -> AffineMap:
-    """Least-squares affine map between matched points (eqs. 15-17, 47-52).
-
-    Arguments: `points [..., n, p]`, `images [..., n, q]`; `inverse_moment [..., p, p]` is `G^-1` where it is known beforehand.
-    `A = F^T G^-1`, `F = sum p p'^T - n pbar p'bar^T`, `G = sum p p^T - n pbar pbar^T`, and `b = p'bar - A pbar`
-    (eq. 17 prints the opposite sign, that of Appendix C's `A x - b`).
-    Wrong when the points are collinear (or, in space, coplanar): `G` is singular there.
-    """
-    mean, image_mean = points.mean(-2), images.mean(-2)
-    centred = points - mean[..., None, :]
-    if inverse_moment is None:
-        inverse_moment = torch.linalg.inv(centred.mT @ centred)
-    F = centred.mT @ (images - image_mean[..., None, :])
-    A = F.mT @ inverse_moment
-    return AffineMap(A, image_mean - (A @ mean[..., None]).squeeze(-1))
-
-
-def weighted_affine_fit(points: Tensor, images: Tensor, weight: Tensor) -> AffineMap:
-    """Affine map that minimises `sum_i e_i.Q_i e_i`, `e_i = A p_i + b - p'_i` (eq. 46, with a weight matrix of each match).
-
-    Arguments: `points [..., n, p]`, `images [..., n, q]`, `weight [..., n, q, q]` symmetric positive definite, the inverse
-    covariances of the matches. One matrix for all changes nothing: eq. 52 does not know Q; then `affine_fit` is enough.
-    Wrong when the points are collinear (in space, coplanar).
-    """
-    homogeneous = torch.cat([points, torch.ones_like(points[..., :1])], -1)
-    normal = torch.einsum("...ia,...ipq,...ib->...paqb", homogeneous, weight, homogeneous)
-    load = torch.einsum("...ia,...ipq,...iq->...pa", homogeneous, weight, images)
-    q, p = images.shape[-1], points.shape[-1]
-    fit = torch.linalg.solve(normal.flatten(-2).flatten(-3, -2), load.flatten(-2)).unflatten(-1, (q, p + 1))
-    return AffineMap(fit[..., :-1], fit[..., -1])
-
-
-class LocalAffineMaps(nn.Module):
-    """One affine map for each quadrilateral of a grid of points, with `G^-1` precomputed (section 3.2).
-
-    Argument: `points [V, p]`, the grid's rest positions (p = 2: in the image, or in the plane). Calling it with the moved
-    points `[..., V, q]` returns `A [..., m-1, n-1, q, p]`, `b [..., m-1, n-1, q]`.
+    Args:
+        problem: the sensor.
+        kind: of the interpolation, "smooth" | "bilinear".
     """
 
-    def __init__(self, points: Tensor, grid: tuple[int, int]):
+    rest_pixels: Tensor
+    vertex_pixels: Tensor
+
+    def __init__(self, problem: Problem, kind: str = "smooth"):
         super().__init__()
-        self.grid = grid
-        p = corners(points, grid)
-        centred = p - p.mean(-2, keepdim=True)
-        self.register_buffer("points", p)
-        self.register_buffer("inverse_moment", torch.linalg.inv(centred.mT @ centred))
+        self.interpolation = FlowInterpolation(problem.membrane, problem.markers, kind)
+        self.register_buffer("rest_pixels", problem.rest_pixels)
+        self.register_buffer("vertex_pixels", problem.vertex_pixels)
 
-    def forward(self, moved: Tensor) -> AffineMap:
-        return affine_fit(self.points, corners(moved, self.grid), self.inverse_moment)
+    def forward(self, pixels: Tensor, confidence: Tensor) -> Tensor:
+        """Pixels `[B, V, 2]` of the vertices, from those of the markers `[B, D, 2]` and their confidence `[B, D]`."""
+        return self.vertex_pixels + self.interpolation(pixels - self.rest_pixels, confidence)
 
 
 class FlowInterpolation(nn.Module):
@@ -90,8 +53,8 @@ class FlowInterpolation(nn.Module):
 
     def __init__(self, membrane: Membrane, markers: SurfacePoints, kind: str = "smooth", steps: int = 12):
         super().__init__()
-        if kind not in KINDS:
-            raise MembraneError(f"FlowInterpolation: kind = {kind!r}; expected one of {', '.join(KINDS)}")
+        if kind not in FLOWS:
+            raise MembraneError(f"FlowInterpolation: kind = {kind!r}; expected one of {', '.join(FLOWS)}")
         self.kind, self.steps = kind, steps
         D, V = len(markers.vertices), len(membrane.rest)
         if D < 3:
@@ -110,9 +73,9 @@ class FlowInterpolation(nn.Module):
     def forward(self, displacement: Tensor, confidence: Tensor) -> Tensor:
         c, displacement = confidence[..., None, :], displacement.mT
         H, lost = self.influence, (1 - c).clamp_min(1e-12).sqrt()  # H is symmetric
-        told = c * torch.where(c > 0, displacement, 0.0)
-        filled = conjugate_gradient(lambda y: y - lost * ((lost * y) @ H), lambda y: y, lost * (told @ H), self.steps)
-        complete = told + lost * filled
+        observed = c * torch.where(c > 0, displacement, 0.0)
+        filled = conjugate_gradient(lambda y: y - lost * ((lost * y) @ H), lambda y: y, lost * (observed @ H), self.steps)
+        complete = observed + lost * filled
         if self.kind == "bilinear":
             return (torch.where(c > 0, displacement, complete @ H) @ self.bilinear.mT).mT
         return (complete @ self.spread).mT

@@ -1,64 +1,115 @@
 """The paper's estimator: of all surfaces on the observed rays, the one of least elastic energy at the fluid's volume.
 
 One unknown for each free vertex, its position `t_k` along its ray, `x_k = o_k + t_k d_k`. For the harmonic energy
-`E(t) = 1/2 t.K t - g.t` exactly, with `K = L o (R R^T)` (eqs. 14, 18, 64); for a hyperelastic membrane the same step is repeated.
+`E(t) = 1/2 t.K t - g.t` exactly, with `K = L o (R R^T)` (eqs. 14, 18, 64); for a hyperelastic one the same step is repeated.
 """
+
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from ..camera.model import Camera, Rays
 from ..errors import MembraneError
-from ..mechanics.cavity import CavityLaw, Equilibrium, rest_balance
-from ..mechanics.hyperelastic import AffineQuadrilaterals, ElasticEnergy
+from ..mechanics.affine_quadrilateral import AffineQuadrilaterals
+from ..mechanics.cavity import CavityLaw, rest_balance
+from ..mechanics.hyperelastic import ElasticEnergy
 from ..solve.anderson import accelerated, first
 from ..solve.kkt import constrained_minimum
 from ..surface.membrane import Membrane, corners, corners_to_vertices
+from .base import Contacts, Equilibrium, Observation, Problem, no_contacts
+from .flow import VertexFlow
+from .settings import MinimumEnergySettings
 
-ELEMENTS = ("triangle", "quadrilateral")
-VOLUMES = ("exact", "linear")
-STEPS, RELAXED_STEPS = 10, 60
+RELAXED_STEPS = 60
 CONVERGED = 1e-5  # largest relative step, and volume error where the volume is exact, of a converged surface
+
+State = tuple[Tensor, Tensor, Tensor]
 
 
 class MinimumEnergy(nn.Module):
     """Surface of least energy on given rays (eqs. 18, 22, 28).
 
-    Arguments
-        membrane    the rest surface on the solver's grid
-        elasticity  its material (`ElasticEnergy`); with `element = "quadrilateral"` only its rest tension is used
-        element     "triangle" (linear), or "quadrilateral": the paper's affine quadrilaterals, harmonic
-        smoothing   weight s of `s |S psi|^2`, `psi = t - t_rest` (eq. 28), over the rest tension; S is the grid's Laplacian
-        filling     "liquid" (volume kept), "gas" (pressure x volume kept), "open" (pressure stays at rest)
-        gas         for a gas: absolute pressure at rest (force / length^2) and volume (length^3)
-        volume      "exact", or "linear": linearised once, at the rest ranges (eq. 21)
-        steps       of the solve, default 10; 60 where the smoother is relaxed, which the constant inverse knows nothing of
-        rest_rays   unit directions `[V, 3]` of the rest rays and their origins `[V, 3]`
-
     The rest load `h = grad U(X) - p0 grad V(X)` is subtracted, so that zero flow gives exactly zero displacement.
-    Wrong where something pushes along the rays: minimum energy says that no force acts there. Features narrower than their
-    distance to the camera are flattened.
+
+    Args:
+        membrane: the rest surface on the solver's grid.
+        elasticity: its material; of the paper's quadrilaterals only the rest tension is used.
+        rest_rays: origins and unit directions `[V, 3]` of the rest rays.
+        filling: the cavity, as for `CavityLaw`.
+        gas: a gas' absolute pressure at rest and its volume.
+        settings: element, smoother, volume constraint, steps.
+        flow: what carries the markers' pixels to the grid's vertices; `prepare` alone needs it.
+
+    Limitations:
+        Minimum energy says that no force acts along the rays: where something pushes along them it is wrong, and features
+        narrower than their distance to the camera are flattened.
     """
 
-    def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, rest_rays, element="triangle", smoothing=0.0, filling="liquid",
-                 gas: tuple[float, float] | None = None, volume="exact", steps=None):  # fmt: skip
+    finds_contacts: ClassVar[bool] = False
+    Settings: ClassVar[type[MinimumEnergySettings]] = MinimumEnergySettings
+    takes_start: ClassVar[bool] = False
+    rest_range: Tensor
+    smoothing: Tensor
+    rest_load: Tensor
+    free: Tensor
+    inverse: Tensor
+
+    def __init__(
+        self,
+        membrane: Membrane,
+        elasticity: ElasticEnergy,
+        rest_rays: Rays | tuple[Tensor, Tensor],
+        filling: str = "liquid",
+        gas: tuple[float, float] | None = None,
+        settings: MinimumEnergySettings | None = None,
+        flow: VertexFlow | None = None,
+    ):
         super().__init__()
-        for name, value, known in (("element", element, ELEMENTS), ("volume", volume, VOLUMES)):
-            if value not in known:
-                raise MembraneError(f"MinimumEnergy: {name} = {value!r}; expected one of {', '.join(known)}")
-        self.membrane, self.elasticity, self.volume_constraint = membrane, elasticity, volume
-        self.largest_relative_step, self.largest_volume_error = CONVERGED, CONVERGED if volume == "exact" else float("inf")
-        self.steps = steps
-        self.energy = elasticity if element == "triangle" else AffineQuadrilaterals(membrane, elasticity.tension)
+        self.settings = settings = settings or MinimumEnergySettings()
+        self.membrane, self.elasticity, self.flow = membrane, elasticity, flow
+        self.steps = settings.steps
+        triangles = settings.element == "triangle"
+        self.energy = elasticity if triangles else AffineQuadrilaterals(membrane, elasticity.tension)
         origins, directions = rest_rays
         self.register_buffer("rest_range", ((membrane.rest - origins) * directions).sum(-1))
-        self.smooths = smoothing > 0
-        self.register_buffer("smoothing", elasticity.tension * smoothing)
+        self.smooths = settings.weight_of_smoother > 0
+        self.register_buffer("smoothing", elasticity.tension * settings.weight_of_smoother)
         rest_pressure, rest_load = rest_balance(membrane, self.energy)
         self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
-        self.register_buffer("rest_pressure", rest_pressure)
         self.register_buffer("rest_load", rest_load)
-        self.register_buffer("moves", (~membrane.fixed).double())
+        self.register_buffer("free", (~membrane.fixed).double())
         self.register_buffer("inverse", self._rest_inverse(directions))
+
+    @classmethod
+    def of(cls, problem: Problem, settings: MinimumEnergySettings | None = None) -> "MinimumEnergy":
+        """The estimator of a sensor."""
+        settings = settings or MinimumEnergySettings()
+        flow = VertexFlow(problem, settings.flow)
+        rays = problem.camera.pixel_to_ray(problem.vertex_pixels)
+        return cls(problem.membrane, problem.elasticity, rays, problem.filling, problem.gas, settings, flow)
+
+    @property
+    def rest_pressure(self) -> Tensor:
+        """Pressure difference across the membrane at rest, `[]`."""
+        return self.cavity.rest_pressure
+
+    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor) -> Observation:
+        """The rays of the grid's vertices, moved by the flow of the markers seen at `pixels [B, D, 2]`."""
+        if self.flow is None:
+            raise MembraneError("MinimumEnergy.prepare: made without a flow; pass flow, or give forward the vertices' rays")
+        return Observation(*camera.pixel_to_ray(self.flow(pixels, confidence)), confidence)
+
+    def is_converged(self, found: Equilibrium) -> Tensor:
+        """`[B]` bool: no step is left and, where the constraint is exact, the volume is what the cavity's law asks for."""
+        converged = ~(found.relative_step > CONVERGED)
+        if self.settings.volume == "linear":
+            return converged
+        return converged & ~(self.cavity.volume_error(found.volume, found.pressure).abs() > CONVERGED)
+
+    def contacts(self, found: Equilibrium) -> Contacts:
+        """None: it is assumed that nothing pushes along the rays."""
+        return no_contacts(found)
 
     def _rest_inverse(self, directions: Tensor) -> Tensor:
         K = self.energy.stiffness_along(self.membrane.rest, directions)
@@ -73,24 +124,35 @@ class MinimumEnergy(nn.Module):
     def _smoother(self, psi: Tensor) -> Tensor:
         return grid_laplacian(psi, self.membrane.grid)
 
-    def forward(self, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None) -> Equilibrium:
-        """`origins`, `directions [..., V, 3]`: the ray of every grid vertex now. Returns the `Equilibrium`.
+    def forward(
+        self, observation: Observation, start: tuple[Tensor, Tensor] | None = None, relaxed: Tensor | None = None
+    ) -> Equilibrium:
+        """The surface on the rays of the grid's vertices.
 
-        `relaxed [..., V]` bool: vertices in contact, where the slope may jump: the smoother of eq. 28 leaves them alone.
+        Args:
+            observation: the ray of every vertex now, `[..., V, 3]`.
+            start: none: the solve starts from rest always.
+            relaxed: `[..., V]` bool, vertices in contact, where the slope may jump: the smoother of eq. 28 leaves them alone.
         """
-        *state, origins, directions = self.start(origins, directions, relaxed)
-        for _ in range((self.steps or (STEPS if relaxed is None else RELAXED_STEPS)) - 1):
+        if start is not None:
+            raise MembraneError("MinimumEnergy: starts from rest always; leave the start out")
+        *state, origins, directions = self.start(observation.origins, observation.directions, relaxed)
+        for _ in range((self.steps if relaxed is None else RELAXED_STEPS) - 1):
             state = self.step(*state, origins, directions, relaxed)
         return self.equilibrium(state[0], origins, directions, relaxed)
 
-    def start(self, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None) -> tuple[Tensor, ...]:
+    def start(
+        self, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Ranges `[..., V]` and history after the first step, from rest; rays `[..., 3, V]` on which the rim stays: `d = 0`."""
         fixed = self.membrane.fixed
         origins, directions = torch.where(fixed, self.membrane.rest.mT, origins.mT), torch.where(fixed, 0.0, directions.mT)
         t = self.rest_range.expand(directions[..., 0, :].shape)
         return *first(t, self._move(t, origins, directions, relaxed)[0]), origins, directions
 
-    def step(self, t: Tensor, latest: Tensor, changes: Tensor, origins: Tensor, directions: Tensor, relaxed=None):
+    def step(
+        self, t: Tensor, latest: Tensor, changes: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None
+    ) -> State:
         """One step in the ranges `t [..., V]`; `latest` and `changes` as `accelerated` has them."""
         move, _ = self._move(t, origins, directions, relaxed)
         return accelerated(t, move, latest, changes)
@@ -117,17 +179,17 @@ class MinimumEnergy(nn.Module):
 
     def _rise(self, t: Tensor, x: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Volume above that at rest `[...]` and its derivative `v [..., V]`: exact, or linear about the rest ranges."""
-        linear = self.volume_constraint == "linear"
+        linear = self.settings.volume == "linear"
         x = origins + self.rest_range * directions if linear else x
         gradient = self.membrane.volume_gradient(x.mT).mT
         v, rise = (gradient * directions).sum(-2), (gradient * x).sum((-1, -2)) / 3 - self.membrane.rest_volume
         return (rise + (v * (t - self.rest_range)).sum(-1) if linear else rise), v
 
     def _smoothing_force(self, t: Tensor, relaxed: Tensor | None) -> Tensor:
-        bend = self._smoother((self.moves * (t - self.rest_range))[..., None])
+        bend = self._smoother((self.free * (t - self.rest_range))[..., None])
         if relaxed is not None:
             bend = torch.where(relaxed[..., None], 0.0, bend)
-        return self.smoothing * self.moves * self._smoother(bend).squeeze(-1)
+        return self.smoothing * self.free * self._smoother(bend).squeeze(-1)
 
 
 def grid_laplacian(psi: Tensor, grid: tuple[int, int]) -> Tensor:

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..mechanics.cavity import Equilibrium
 from ..surface.membrane import Membrane
+from .base import Equilibrium, Observation
 from .minimum_energy import MinimumEnergy
 
 SHARE = 0.5  # of a region's peak: what lies above it, around the peak, is the region
@@ -99,8 +99,9 @@ class Segmentation:
     def __call__(self, origins: Tensor, directions: Tensor) -> Segmented:
         first = contacts = self.by_polar_angle(directions)
         relaxed, settled = first.region > 0, torch.zeros(len(directions), dtype=torch.bool, device=directions.device)
+        observation = Observation(origins, directions, torch.ones_like(directions[..., 0]))
         for _ in range(self.rounds):
-            surface = self.estimator(origins, directions, relaxed)
+            surface = self.estimator(observation, relaxed=relaxed)
             before, contacts = contacts, self.by_normals(surface.vertices)
             moved = (contacts.points - before.points).norm(dim=-1).nan_to_num().amax(-1)
             same = (contacts.points.isnan() == before.points.isnan()).flatten(1).all(1)

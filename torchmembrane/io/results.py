@@ -1,7 +1,7 @@
-"""What one frame's reconstruction holds, its status codes, and how it is stored."""
+"""What one frame's reconstruction holds, and how it is stored."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
@@ -9,19 +9,12 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from .status import Status
 
-OK, TOO_FEW_MARKERS, UNLIKE_REST, NOT_CONVERGED, BLANK, BAD_VALUES, NO_SOLUTION = range(7)
-
-STATUS_TEXTS = {
-    OK: "ok",
-    TOO_FEW_MARKERS: "too few markers found: check light, focus and polarity; no surface",
-    UNLIKE_REST: "image unlike the rest image (most markers not found): is it this sensor's? no surface",
-    NOT_CONVERGED: "the solve has not converged: the answer is kept, do not rely on it",
-    BLANK: "blank or saturated image: no contrast; no surface",
-    BAD_VALUES: "image holds NaN, infinity or values outside 0..1; no surface",
-    NO_SOLUTION: "the solve broke down: the flow folds the surface or is far too large; no surface",
-}
+OK, TOO_FEW_MARKERS, UNLIKE_REST, NOT_CONVERGED, BLANK, BAD_VALUES, NO_SOLUTION = Status  # TEMPORARY
+STATUS_TEXTS = {s.value: s.text for s in Status}  # TEMPORARY
 CONTACT_POINTS = 4
+"""Contacts that are reported at most."""
 
 
 class Reconstruction(NamedTuple):
@@ -41,7 +34,7 @@ class Reconstruction(NamedTuple):
     pressure_change   [B]        the same minus its rest value
     volume_error      [B]        (V - V_target) / V_rest
     residual          [B]        rms distance of measured from modelled marker pixels, px
-    status            [B] int32  0 ok; texts in `STATUS_TEXTS`
+    status            [B] int32  0 ok; texts in `Status`
 
     A frame without a surface has NaN in every floating array but `pixels` and `confidence`, which keep what was found.
     """
@@ -63,9 +56,30 @@ class Reconstruction(NamedTuple):
     status: Tensor
 
     def frame(self, index: int) -> dict[str, np.ndarray]:
-        """One frame as numpy arrays, float32 (status int32)."""
-        arrays = {k: v[index].detach().cpu().numpy() for k, v in self._asdict().items()}
-        return {k: v.astype(np.int32 if k == "status" else np.float32) for k, v in arrays.items()}
+        """One frame as numpy arrays, float32 (status int32), by the names above.
+
+        Example:
+            >>> import torchmembrane as tm
+            >>> reconstructor = tm.Reconstructor.from_file("examples/sensor.toml")
+            >>> result = reconstructor(reconstructor.read("examples/press_on_axis.png"))
+            >>> result.frame(0)["force"].shape, result.cpu().numpy().status.tolist()
+            ((3,), [0])
+        """
+        arrays = {key: value[index].detach().cpu().numpy() for key, value in self._asdict().items()}
+        return {key: value.astype(np.int32 if key == "status" else np.float32) for key, value in arrays.items()}
+
+    def to(self, *args: Any, **kwargs: Any) -> "Reconstruction":
+        """All arrays as `torch.Tensor.to` gives them: another device or precision; the status stays an integer."""
+        moved = {key: value.to(*args, **kwargs) for key, value in self._asdict().items()}
+        return Reconstruction(**(moved | {"status": moved["status"].to(self.status.dtype)}))
+
+    def cpu(self) -> "Reconstruction":
+        """All arrays on the CPU."""
+        return self.to("cpu")
+
+    def numpy(self) -> "Reconstruction":
+        """All arrays as numpy arrays on the CPU, without gradients."""
+        return Reconstruction(**{key: value.detach().cpu().numpy() for key, value in self._asdict().items()})
 
 
 def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:

@@ -1,24 +1,10 @@
 """What the fluid asks of the enclosed volume: kept (liquid), pressure x volume kept (gas), or free at rest pressure (open)."""
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..surface.membrane import Membrane
-
-
-class Equilibrium(NamedTuple):
-    """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`
-    (zero for minimum energy), and `relative_step [...]`: the last step over the surface's size."""
-
-    vertices: Tensor
-    pressure: Tensor
-    volume: Tensor
-    traction: Tensor
-    relative_step: Tensor
-
 
 FILLINGS = ("liquid", "gas", "open")
 
@@ -62,11 +48,16 @@ class CavityLaw(nn.Module):
         absolute, gas = self.gas.unbind()
         return self.rest_volume + gas * (absolute / (absolute + pressure - self.rest_pressure) - 1)
 
+    def volume_error(self, volume: Tensor, pressure: Tensor) -> Tensor:
+        """How far the volume is from the one that the law asks for, over the rest volume, `[...]`."""
+        return (volume - self.target_volume(volume, pressure)) / self.rest_volume
+
 
 def rest_balance(membrane: Membrane, energy) -> tuple[Tensor, Tensor]:
     """Rest pressure `p0 []` and rest load `h = grad U(X) - p0 grad V(X)` of the free vertices, `[V, 3]`, zero on the rim.
 
-    `p0` weights both with the normals, so spurious tangential parts have no say; `energy`: a `ElasticEnergy` or the paper's element.
+    `p0` weights both with the normals, so that spurious tangential parts have zero weight; `energy`: an `ElasticEnergy` or the
+    paper's element.
     """
     force, push = energy.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
     normal, free = membrane.rest_normals, membrane.free

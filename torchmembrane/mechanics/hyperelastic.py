@@ -1,4 +1,4 @@
-"""Elastic energy of the membrane on linear triangles: harmonic, neo-Hookean, Mooney-Rivlin; the paper's affine quadrilaterals.
+"""Elastic energy of the membrane on linear triangles: harmonic, neo-Hookean, Mooney-Rivlin.
 
 With the rest metric `G` and the deformed metric `g` of a triangle's edges, `I = tr(G^-1 g)` and `D = det g / det G` are the
 invariants of `C = F^T F`; the energy per rest area is `W(I, D)`. Everything is in units of shear modulus x thickness (at rest,
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from ..surface.membrane import Membrane, corners, corners_to_vertices, triangles_of
+from ..surface.membrane import Membrane, corners, triangles_of
 from ..surface.stencil import apply_stencil, one_ring_edges, stencil_kernels
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
@@ -267,7 +267,8 @@ def _determinant(metric: Tensor) -> Tensor:
 def _metric_constants() -> dict[str, Tensor]:
     """What is constant in second derivatives by the metric's entries 11, 12, 22.
 
-    `twice_12 [3]`; `bend [9]`, those of the determinant; `metric_to_pairs [12, 9]`, from any such to `T_cd` of `ElasticEnergy._pairs`;
+    `twice_12 [3]`; `bend [9]`, those of the determinant; `metric_to_pairs [12, 9]`, from any such to `T_cd` of
+    `ElasticEnergy._pairs`;
     `stress_to_pairs [3, 3]`, likewise for the stress.
     """
     slopes = np.zeros((2, 3, 2))  # d g / d e_a = sum_c slopes[a, g, c] e_c
@@ -291,62 +292,3 @@ def _tension(stress: Tensor) -> Tensor:
     high, low = (mean + radius).clamp_min(0), (mean - radius).clamp_min(0)
     centre, slope = (high + low) / 2, (high - low) / (2 * radius)
     return torch.cat([centre + slope * half, slope * s12, centre - slope * half], -2)
-
-
-class AffineQuadrilaterals(nn.Module):
-    """The paper's element: one affine map fitted to the four corners (eqs. 15-18), linear in the corner positions.
-
-    The map is fitted in the plane of the quadrilateral (spanned by its diagonals; in space G of eq. 16 is singular), so that
-    `A [3, 2] = sum_k x_k g_k^T` with constant `g_k`, and `E = 1/2 tension sum area tr(A^T A)` (eq. 12 with its 1/2).
-    It is blind to the hourglass mode: use it with the smoother (eq. 28).
-    """
-
-    def __init__(self, membrane: Membrane, tension: float = 1.0):
-        super().__init__()
-        self.grid = membrane.grid
-        p = corners(membrane.rest, self.grid)
-        diagonal_1, diagonal_2 = p[..., 2, :] - p[..., 0, :], p[..., 3, :] - p[..., 1, :]
-        normal = torch.linalg.cross(diagonal_1, diagonal_2)
-        area = torch.linalg.vector_norm(normal, dim=-1) / 2
-        axis_1 = nn.functional.normalize(diagonal_1, dim=-1)
-        axis_2 = nn.functional.normalize(torch.linalg.cross(normal, axis_1), dim=-1)
-        centred = p - p.mean(-2, keepdim=True)
-        plane = torch.stack([(centred * axis_1[..., None, :]).sum(-1), (centred * axis_2[..., None, :]).sum(-1)], -1)
-        g11, g12, g22 = (plane[..., a] * plane[..., b] for a, b in ((0, 0), (0, 1), (1, 1)))
-        g11, g12, g22 = g11.sum(-1), g12.sum(-1), g22.sum(-1)
-        inverse = torch.stack([torch.stack([g22, -g12], -1), torch.stack([-g12, g11], -1)], -2)
-        inverse = inverse / (g11 * g22 - g12**2)[..., None, None]
-        self.register_buffer("map_weights", plane @ inverse)
-        self.register_buffer("tension", torch.as_tensor(tension, dtype=torch.float64).clone())
-        self.register_buffer("area", area)
-
-    def affine_maps(self, x: Tensor) -> Tensor:
-        """Linear parts `A [..., m-1, n-1, 3, 2]` of the maps from each quadrilateral's rest plane."""
-        return torch.einsum("...kc,...ka->...ca", corners(x, self.grid), self.map_weights)
-
-    def energy(self, x: Tensor) -> Tensor:
-        """`1/2 tension sum area tr(A^T A)`, `[..., V, 3]` to `[...]`; less the rest's, as `ElasticEnergy`'s harmonic energy."""
-        maps = self.affine_maps(x)
-        return self.tension / 2 * (self.area * ((maps**2).sum((-1, -2)) - 2)).sum((-1, -2))
-
-    def gradient(self, x: Tensor) -> Tensor:
-        """`dE/dx`, `[..., V, 3]`."""
-        maps = self.affine_maps(x) * (self.tension * self.area)[..., None, None]
-        return corners_to_vertices(torch.einsum("...ca,...ka->...kc", maps, self.map_weights), self.grid)
-
-    def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
-        """Corner matrices `[..., m-1, n-1, 4, 4]` of `K = L o (R R^T)`, exactly quadratic: `x` is not looked at."""
-        d = corners(directions, self.grid)
-        L = (self.tension * self.area)[..., None, None] * (self.map_weights @ self.map_weights.mT)
-        return L * (d @ d.mT)
-
-    def q_matrix(self, directions: Tensor) -> Tensor:
-        """The paper's `Q` (eq. 18), `[..., 6 (m-1)(n-1), V]`: rows are the weighted entries of all maps, linear in `t`.
-
-        `||Q t||^2 = t^T K t`. Dense: for study and tests, the estimator works with its square.
-        """
-        V = self.grid[0] * self.grid[1]
-        one = torch.eye(V, dtype=directions.dtype, device=directions.device)
-        moved = one[..., :, None] * directions[..., None, :, :]
-        maps = self.affine_maps(moved) * (self.tension * self.area).sqrt()[..., None, None]
-        return maps.flatten(-4).mT

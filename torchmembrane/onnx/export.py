@@ -21,7 +21,7 @@ from ..io.results import STATUS_TEXTS, Reconstruction
 from ..io.store import Mesh, Settings
 from ..markers.locate import LEVELS, DotLocator
 from ..markers.match import SETTLING, WIDTHS, DotMatcher, LocalDeformation
-from ..mechanics.cavity import Equilibrium
+from ..estimators.base import Equilibrium
 from ..reconstruct import Reconstructor
 from ..solve.block_tridiagonal import parts
 from .graph import Assembly, traced

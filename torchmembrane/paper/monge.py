@@ -16,7 +16,8 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..estimators.minimum_energy import grid_laplacian
-from ..mechanics.cavity import Equilibrium, rest_balance
+from ..estimators.base import Equilibrium
+from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..surface.membrane import Membrane, corners, triangles_of
 

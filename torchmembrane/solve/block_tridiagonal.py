@@ -46,17 +46,21 @@ def factor(diagonal: Tensor, coupling: Tensor) -> Factor:
 def substitute(factor: Factor, b: Tensor) -> Tensor:
     """Solutions for the rows of `b [..., n, C, s]`, blocks in the order of elimination."""
     pivots, couplings = factor
-    transposed = lambda block: block.transpose(-2, -1)  # noqa: E731  `mT` of a region's input would be a second, aliased one
     x = list(b.split(parts(b.shape[-3]), -3))
     for k, L in enumerate(pivots):
-        x[k] = torch.linalg.solve_triangular(transposed(L), x[k], upper=True, left=False)
+        x[k] = torch.linalg.solve_triangular(_transposed(L), x[k], upper=True, left=False)
         if k < len(couplings):
             subtract_further_in(x, k, x[k] @ couplings[k])
     for k in reversed(range(len(pivots))):
         if k < len(couplings):
-            x[k] = x[k] - further_in(x, k) @ transposed(couplings[k])
+            x[k] = x[k] - further_in(x, k) @ _transposed(couplings[k])
         x[k] = torch.linalg.solve_triangular(pivots[k], x[k], upper=False, left=False)
     return torch.cat(x, -3)
+
+
+def _transposed(block: Tensor) -> Tensor:
+    """`mT` of the input of a compiled region would be a second, aliased one."""
+    return block.transpose(-2, -1)
 
 
 def subtract_further_in(blocks: list[Tensor], k: int, change: Tensor) -> None:

@@ -11,14 +11,33 @@ def conjugate_gradient(
 ) -> Tensor:
     """Solve `A x = b` for symmetric positive definite `A`, each row of `b` by itself.
 
-    Arguments: `apply` and `precondition` map `[..., N]` to `[..., N]` (`A` and an approximate inverse, both symmetric
-    positive definite); `b [..., N]`; `steps` is fixed, so that the graph is static. Returns `x [..., N]`.
-    Steps after convergence change nothing (a zero residual gives a zero step). Hestenes and Stiefel 1952.
+    Steps after convergence change nothing (a zero residual gives a zero step).
+
+    Args:
+        apply: `A`, from `[..., N]` to `[..., N]`.
+        precondition: an approximate inverse of `A`, symmetric positive definite as well.
+        b: `[..., N]`.
+        steps: how many; fixed, so that the graph is static.
+
+    Returns:
+        `x [..., N]`.
+
+    Reference: Hestenes and Stiefel 1952, Methods of conjugate gradients for solving linear systems.
+
+    Example:
+        >>> A, b = torch.tensor([[2.0, 1.0], [1.0, 3.0]]), torch.tensor([3.0, 4.0])
+        >>> conjugate_gradient(lambda y: y @ A, lambda r: r, b, 2)
+        tensor([1.0000, 1.0000])
     """
     tiny = torch.finfo(b.dtype).tiny
-    ratio = lambda p, q: p / q.clamp_min(tiny)  # noqa: E731
-    dot = lambda p, q: (p * q).sum(-1, keepdim=True)  # noqa: E731
-    x, residual = 0, b
+
+    def ratio(p: Tensor, q: Tensor) -> Tensor:
+        return p / q.clamp_min(tiny)
+
+    def dot(p: Tensor, q: Tensor) -> Tensor:
+        return (p * q).sum(-1, keepdim=True)
+
+    x, residual = torch.zeros_like(b), b
     z = precondition(residual)
     direction, rho = z, dot(residual, z)
     for _ in range(steps):

@@ -1,4 +1,4 @@
-"""Quadratic programmes with one linear constraint, by two solves with the same matrix."""
+"""Linear systems with one or two borders, by solves with one symmetric positive definite matrix."""
 
 from typing import NamedTuple
 
@@ -13,17 +13,66 @@ class ConstrainedMinimum(NamedTuple):
 
 
 def constrained_minimum(
-    inverse_load: Tensor, inverse_gradient: Tensor, gradient: Tensor, target, compliance=0.0
+    inverse_load: Tensor, inverse_gradient: Tensor, gradient: Tensor, target: Tensor, compliance: float | Tensor = 0.0
 ) -> ConstrainedMinimum:
     """Minimiser of `1/2 y.K y - g.y` subject to `v.y = c` (eqs. 22, 25-27).
 
-    Arguments: `K^-1 g [..., N]`, `K^-1 v [..., N]`, `v [..., N]`, the target `c [...]`, and the constraint's compliance `C`:
-    with `C > 0` the constraint reads `v.y = c + C lambda` (a gas that yields). Stationarity is `K y = g - lambda v`, so
+    With `C > 0` the constraint reads `v.y = c + C lambda` (a gas that yields). Stationarity is `K y = g - lambda v`, so
 
         lambda = (v.K^-1 g - c) / (v.K^-1 v + C)        (eq. 27 for C = 0)
 
     The indefinite KKT matrix is never formed.
+
+    Args:
+        inverse_load: `K^-1 g [..., N]`.
+        inverse_gradient: `K^-1 v [..., N]`.
+        gradient: `v [..., N]`.
+        target: `c [...]`.
+        compliance: the constraint's, `C [...]`.
+
+    Example:
+        >>> import torch
+        >>> g, v = torch.tensor([2.0, 0.0]), torch.tensor([1.0, 1.0])
+        >>> constrained_minimum(g, v, v, torch.tensor(0.0))  # K = 1
+        ConstrainedMinimum(y=tensor([ 1., -1.]), multiplier=tensor(1.))
     """
-    dot = lambda p, q: (p * q).sum(-1)  # noqa: E731
-    multiplier = (dot(gradient, inverse_load) - target) / (dot(gradient, inverse_gradient) + compliance)
+    multiplier = (_dot(gradient, inverse_load) - target) / (_dot(gradient, inverse_gradient) + compliance)
     return ConstrainedMinimum(inverse_load - multiplier[..., None] * inverse_gradient, multiplier)
+
+
+class BorderedStep(NamedTuple):
+    """`step [B, N]` and what the second border's unknown rises by, `rise [B]`."""
+
+    step: Tensor
+    rise: Tensor
+
+
+def solve_bordered(
+    loads: Tensor, solved: Tensor, corner: Tensor, load: Tensor, compliance: Tensor, target: Tensor
+) -> BorderedStep:
+    """Solve for `d`, `r` and a multiplier `lambda`
+
+        [M  m  n] [d     ]   [-g]
+        [m' c  0] [r     ] = [ b]
+        [n' 0  C] [lambda]   [ t]
+
+    Args:
+        loads: `[B, 3, N]`: `n`, `g`, `m`.
+        solved: `[B, 3, N]`: `M^-1` of them.
+        corner: `c [B]`.
+        load: `b [B]`.
+        compliance: `C`, `[B]` or `[]`.
+        target: `t [B]`.
+    """
+    products = (loads @ solved.mT).flatten(1).unbind(-1)
+    nMn, nMg, nMm, mMg, mMm = *products[:3], *products[7:]
+    a11, a12, a22 = corner - mMm, compliance - nMm, -nMn
+    b1, b2 = load + mMg, target + nMg
+    det = a11 * a22 - a12 * a12
+    rise, multiplier = (b1 * a22 - a12 * b2) / det, (a11 * b2 - a12 * b1) / det
+    of_border, of_load, of_second = solved.unbind(1)
+    return BorderedStep(-(multiplier[:, None] * of_border + of_load + rise[:, None] * of_second), rise)
+
+
+def _dot(p: Tensor, q: Tensor) -> Tensor:
+    return (p * q).sum(-1)

@@ -1,0 +1,107 @@
+"""What every estimator is built from, is given, and finds."""
+
+from typing import ClassVar, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from ..camera.model import Camera
+from ..mechanics.cavity import CavityLaw
+from ..mechanics.hyperelastic import ElasticEnergy
+from ..surface.membrane import Membrane, SurfacePoints
+
+CONTACT_POINTS = 4
+"""Contacts that are reported at most."""
+
+
+class Problem(NamedTuple):
+    """One sensor, as an estimator is built from it.
+
+    camera          its camera
+    membrane        the rest surface on the solver's grid
+    elasticity      what the membrane stores
+    filling, gas    the cavity: "liquid" | "gas" | "open"; a gas' absolute pressure at rest and its volume
+    markers         the markers as material points of the rest surface
+    positions       `[D, 3]` their rest positions
+    rest_pixels     `[D, 2]` where the model sees them at rest
+    vertex_pixels   `[V, 2]` where the model sees the grid's vertices at rest
+    marker_noise    px, standard deviation assumed of a marker: about twice the locator's, to leave room for the grid's own
+                    error
+    """
+
+    camera: Camera
+    membrane: Membrane
+    elasticity: ElasticEnergy
+    filling: str
+    gas: tuple[float, float] | None
+    markers: SurfacePoints
+    positions: Tensor
+    rest_pixels: Tensor
+    vertex_pixels: Tensor
+    marker_noise: float
+
+
+class Observation(NamedTuple):
+    """Measured rays of a batch: `origins`, unit `directions [B, N, 3]`, and `confidence [B, N]`, 0 for a lost one, else up to
+    1.
+
+    Of the markers, or of the grid's vertices: as the estimator's `prepare` makes them.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    confidence: Tensor
+
+
+class Equilibrium(NamedTuple):
+    """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`
+    (zero for minimum energy), and `relative_step [...]`: the last step over the surface's size."""
+
+    vertices: Tensor
+    pressure: Tensor
+    volume: Tensor
+    traction: Tensor
+    relative_step: Tensor
+
+
+class Contacts(NamedTuple):
+    """Where something touches: `indicator [B, V]` in 0..1 and `points [B, 4, 3]`, strongest first, NaN-padded."""
+
+    indicator: Tensor
+    points: Tensor
+
+
+class Estimator(Protocol):
+    """From what the markers show to the surface: an `nn.Module` of one sensor, batched and differentiable.
+
+    `finds_contacts`: tractions, contacts and standard deviations are found; `takes_start`: `forward` accepts the solution of
+    the
+    frames before. `reference` is the traction against which tractions are small or large.
+    """
+
+    finds_contacts: ClassVar[bool]
+    takes_start: ClassVar[bool]
+    membrane: Membrane
+    cavity: CavityLaw
+
+    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor) -> Observation:
+        """The rays that `forward` needs, from the markers' `pixels [B, D, 2]` and their `confidence [B, D]`."""
+        ...
+
+    def __call__(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:
+        """The surface; `start`: vertices `[B, V, 3]` and pressure `[B]` near it, such as the previous frame's."""
+        ...
+
+    def is_converged(self, found: Equilibrium) -> Tensor:
+        """`[B]` bool."""
+        ...
+
+    def contacts(self, found: Equilibrium) -> Contacts:
+        """Where something touches."""
+        ...
+
+
+def no_contacts(found: Equilibrium) -> Contacts:
+    """The contacts of an estimator that looks for none."""
+    x = found.vertices
+    return Contacts(torch.zeros_like(x[..., 0]), x.new_full((x.shape[0], CONTACT_POINTS, 3), torch.nan))

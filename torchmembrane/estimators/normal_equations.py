@@ -1,0 +1,89 @@
+"""The normal equations of a force balance on one grid: forces and bearings, linearised, weighted, put together.
+
+Fields have their components first and the inner vertices, or the markers, last.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..solve.stencil_system import NEAR, StencilSystem
+from .bearings import Bearings, MarkerBearings
+from .contact_force import ContactForce, Linearised
+from .robust import Cauchy
+from .traction_loss import TractionLoss
+
+
+class NormalEquations(NamedTuple):
+    """`M = A^T W A + J^T w J`: the forces' tangent stiffness `A [B, 3, 3, 7, N]` and weights `W [B, 3, 3, N]`; the weighted
+    bearing Jacobian `w J [B, 2, 3, D]` and the markers' blocks `J^T w J [B, 3, 3, D]`, in the markers' positions."""
+
+    stiffness: Tensor
+    weights: Tensor
+    weighted_jacobian: Tensor
+    marker_blocks: Tensor
+
+
+class BalanceEquations(nn.Module):
+    """The equations of a Gauss-Newton step: what forces and markers ask of the inner vertices.
+
+    Args:
+        forces: the contact forces.
+        bearings: the markers' angles.
+        loss: the loss of tractions.
+    """
+
+    def __init__(self, forces: ContactForce, bearings: MarkerBearings, loss: TractionLoss):
+        super().__init__()
+        self.forces, self.bearings, self.loss = forces, bearings, loss
+        self.system = StencilSystem(forces.membrane.grid, forces.inner_free > 0)
+
+    def linearised(
+        self,
+        x: Tensor,
+        pressure: Tensor,
+        measured: Bearings,
+        tau: Tensor | float,
+        outlier: Tensor | float,
+        curvature: bool = False,
+    ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor]]:
+        """The forces, the normal equations and their loads at a surface; `curvature` as for `TractionLoss.weights`."""
+        at = self.forces.linearised(x, pressure)
+        W = self.loss.weights(at.normal, at.force, tau, curvature)
+        angle, jacobian = self.bearings.angles(x, measured)
+        weight = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
+        normal = self.normal_equations(at, W, jacobian, weight)
+        return at, normal, *self.loads(normal, at, angle)
+
+    def normal_equations(self, at: Linearised, W: Tensor, jacobian: Tensor, weight: Tensor) -> NormalEquations:
+        """Of forces weighted by `W [B, 3, 3, N]` and angles by `weight [B, D]`, with the bearing Jacobian of the angles."""
+        weighted = weight[:, None, None] * jacobian
+        return NormalEquations(at.stiffness, W, weighted, (jacobian[:, :, :, None] * weighted[:, :, None]).sum(1))
+
+    def loads(self, normal: NormalEquations, at: Linearised, angle: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """`v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, 3, 3 N]`; `f^T W v` and `v^T W v`, `[B]`."""
+        W, v = normal.weights, at.volume
+        weighted = torch.stack([_weighed(W, at.force), -_weighed(W, v)], 1)
+        of_forces, of_fluid = self.forces.change(at.stiffness, weighted).split(1, 1)
+        of_markers = (normal.weighted_jacobian * angle[:, :, None]).sum(1) @ self.bearings.vertex_shares
+        loads = torch.cat([v[:, None], of_forces + of_markers[:, None], of_fluid], 1).flatten(2)
+        return loads, ((weighted[:, 0] * v).sum((1, 2)), (-weighted[:, 1] * v).sum((1, 2)))
+
+    def matrix(self, normal: NormalEquations) -> tuple[Tensor, Tensor, Tensor]:
+        """`M` as `system.factor` takes it."""
+        A = normal.stiffness.transpose(2, 3).flatten(2, 3).movedim(-1, 1)
+        near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1)).permute(0, 3, 1, 4, 2)
+        return self.system.matrix(A.mT @ (normal.weights.movedim(-1, 1) @ A), near)
+
+    def product(self, normal: NormalEquations, u: Tensor) -> Tensor:
+        """`M u` for `u [B, C, 3 N]`, without the matrix."""
+        u, change, shares = u.unflatten(-1, (3, -1)), self.forces.change, self.bearings.vertex_shares
+        of_forces = change(normal.stiffness, _weighed(normal.weights[:, None], change(normal.stiffness, u)))
+        of_markers = _weighed(normal.marker_blocks[:, None], u @ shares.transpose(0, 1)) @ shares
+        return (of_forces + of_markers).flatten(2)
+
+
+def _weighed(blocks: Tensor, field: Tensor) -> Tensor:
+    """Blocks `[..., 3, 3, N]` times a field `[..., 3, N]`."""
+    return (blocks * field[..., None, :, :]).sum(-2)

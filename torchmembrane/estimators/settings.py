@@ -1,0 +1,117 @@
+"""What can be chosen about an estimator: frozen, checked at construction."""
+
+from dataclasses import dataclass
+
+from ..errors import MembraneError
+
+ELEMENTS = ("triangle", "quadrilateral")
+VOLUMES = ("exact", "linear")
+FLOWS = ("smooth", "bilinear")
+
+
+@dataclass(frozen=True)
+class ForceBalanceSettings:
+    """Settings of `ForceBalance`; lengths are over the surface's size, tractions over the reference traction `p0`.
+
+    Args:
+        steps: from rest, on a grid that no coarser one goes before.
+        coarse_steps: from rest, where a finer grid follows.
+        fine_steps: from the coarsest grid's solution.
+        finer_steps: from the solution of a grid that is not the coarsest.
+        warm_steps: from the solution of the frame before.
+        conjugate_steps: conjugate-gradient steps of a step that has the factor of another.
+        tau: first and last scale of the compressive traction's loss, from rest.
+        fine_tau: the same, from a coarser grid's solution.
+        warm_tau: the same, from the solution of the frame before.
+        decline: share of the steps over which tau declines.
+        sparsity: loss of the compressive traction p0 on the whole surface, while it is quadratic.
+        friction: weight of the shear traction's loss over that of the compressive one.
+        slip: scale of the shear traction's loss: where it begins to be linear.
+        cone: how much less shear weighs where something pushes.
+        coarse_cone: the same on the coarsest grid, whose own error looks like friction under a contact.
+        reach: radius of the surroundings that are asked whether a vertex is pushed.
+        floor: least weight of a compressive traction; without it a vertex under a contact has no place of its own.
+        outlier: scale of the markers' loss, over their noise.
+        longest_step: largest step of a vertex.
+        coarsest: fewest lines of a coarser grid.
+        coarsest_warm: fewest lines of a coarser grid that is given the solution of the frame before.
+        largest_relative_step: rms of the last step of a converged solution.
+        largest_volume_error: volume error of a converged solution, over the rest volume.
+
+    Example:
+        >>> ForceBalanceSettings(steps=12).gnc_schedule(3, (4.0, 0.4))
+        [(4.0, 50.0), (0.4, 5.0), (0.4, 5.0)]
+    """
+
+    steps: int = 8
+    coarse_steps: int = 4
+    fine_steps: int = 5
+    finer_steps: int = 4
+    warm_steps: int = 4
+    conjugate_steps: int = 2
+    tau: tuple[float, float] = (4.0, 0.4)
+    fine_tau: tuple[float, float] = (0.8, 0.4)
+    warm_tau: tuple[float, float] = (1.2, 0.4)
+    decline: float = 0.6
+    sparsity: float = 3200.0
+    friction: float = 3.75
+    slip: float = 0.05
+    cone: float = 15.0
+    coarse_cone: float = 5.0
+    reach: float = 0.04
+    floor: float = 1e-3
+    outlier: float = 5.0
+    longest_step: float = 0.026
+    coarsest: int = 9
+    coarsest_warm: int = 13
+    largest_relative_step: float = 2e-3
+    largest_volume_error: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "coarse_steps", "fine_steps", "finer_steps", "warm_steps"):
+            if getattr(self, name) < 2:
+                raise MembraneError(f"ForceBalanceSettings: {name} = {getattr(self, name)}; expected at least 2")
+
+    def gnc_schedule(self, steps: int, tau: tuple[float, float]) -> list[tuple[float, float]]:
+        """Scales of the losses in every step, graduated non-convexity: of compressive tractions (tau), of markers."""
+        first, last = tau
+        taus = [first * (last / first) ** min(1.0, k / (self.decline * (steps - 1))) for k in range(steps)]
+        return [(tau, self.outlier * tau / last) for tau in taus]
+
+
+@dataclass(frozen=True)
+class MinimumEnergySettings:
+    """Settings of `MinimumEnergy`.
+
+    Args:
+        element: "triangle" (linear), or "quadrilateral": the paper's affine quadrilaterals, harmonic.
+        smoothing: weight s of `s |S psi|^2`, `psi = t - t_rest` (eq. 28), over the rest tension; S is the grid's Laplacian.
+            Default: 0.1 for quadrilaterals, else none.
+        volume: "exact", or "linear": linearised once, at the rest ranges (eq. 21).
+        flow: of the grid's vertices, "smooth", or "bilinear" between the dots (section 5).
+        steps: of the solve; 60 are made where the smoother is relaxed, which the constant inverse knows nothing of.
+
+    Raises:
+        MembraneError: a value that is none of these.
+
+    Example:
+        >>> MinimumEnergySettings(element="quadrilateral").weight_of_smoother
+        0.1
+    """
+
+    element: str = "triangle"
+    smoothing: float | None = None
+    volume: str = "exact"
+    flow: str = "smooth"
+    steps: int = 10
+
+    def __post_init__(self) -> None:
+        for name, known in (("element", ELEMENTS), ("volume", VOLUMES), ("flow", FLOWS)):
+            if getattr(self, name) not in known:
+                value = getattr(self, name)
+                raise MembraneError(f"MinimumEnergySettings: {name} = {value!r}; expected one of {', '.join(known)}")
+
+    @property
+    def weight_of_smoother(self) -> float:
+        """`smoothing`, or its default."""
+        return (0.1 if self.element == "quadrilateral" else 0.0) if self.smoothing is None else self.smoothing

@@ -1,0 +1,82 @@
+"""Images as cameras give them, as one grey batch."""
+
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import MembraneError
+from .images import GREY
+
+Channels = Literal["rgb", "bgr"]
+CHANNELS = ("rgb", "bgr")
+SHAPES = "[H, W], [H, W, 3], [B, H, W], [B, 1 | 3, H, W] or [B, H, W, 1 | 3]"
+WHITE = {torch.uint8: 255.0, torch.uint16: 65535.0}
+
+
+def grey_batch(images: Tensor | np.ndarray, size: tuple[int, int], channels: Channels, like: Tensor) -> Tensor:
+    """Grey images `[B, 1, height, width]` in 0..1, of the precision and on the device of `like`.
+
+    Args:
+        images: torch or numpy, `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or `[B, H, W, 1 | 3]`; uint8, uint16 or
+            float in 0..1. Grey is 0.299 R + 0.587 G + 0.114 B.
+        size: width and height, px.
+        channels: order of the three channels, "rgb" or "bgr".
+        like: a tensor.
+
+    Raises:
+        MembraneError: another shape, size or type; says what came, what was expected, and how to permute.
+
+    Example:
+        >>> photograph = np.zeros((480, 640, 3), np.uint8)
+        >>> list(grey_batch(photograph, (640, 480), "bgr", torch.zeros(())).shape)
+        [1, 1, 480, 640]
+    """
+    pixels = _tensor(images)
+    if not (pixels.is_floating_point() or pixels.dtype in WHITE):
+        raise MembraneError(f"images of type {pixels.dtype}; expected uint8, uint16, or float in 0..1")
+    planes = _planes(pixels, (size[1], size[0]))
+    white = WHITE.get(pixels.dtype)
+    planes = [plane.to(like) if white is None else plane.to(like) / white for plane in planes]
+    if len(planes) == 1:
+        return planes[0][:, None]
+    red, green, blue = planes if channels == "rgb" else reversed(planes)
+    return (GREY[0] * red + GREY[1] * green + GREY[2] * blue)[:, None]
+
+
+def _tensor(images: Tensor | np.ndarray) -> Tensor:
+    if isinstance(images, Tensor):
+        return images
+    array = np.asarray(images)
+    try:
+        return torch.from_numpy(np.ascontiguousarray(array, array.dtype.newbyteorder("=")))
+    except TypeError as error:
+        raise MembraneError(f"images of type {array.dtype}; expected uint8, uint16, or float in 0..1") from error
+
+
+def _planes(pixels: Tensor, size: tuple[int, int]) -> list[Tensor]:
+    """The channels, one or three, `[B, H, W]` each."""
+    shape = tuple(pixels.shape)
+    if shape[-2:] == size and len(shape) == 2:
+        return [pixels[None]]
+    if shape[-2:] == size and len(shape) == 3:
+        return [pixels]
+    if shape[-2:] == size and len(shape) == 4 and shape[1] in (1, 3):
+        return list(pixels.unbind(1))
+    if shape[-3:-1] == size and len(shape) in (3, 4) and shape[-1] in (1, 3):
+        return list((pixels if len(shape) == 4 else pixels[None]).unbind(-1))
+    raise MembraneError(_refusal(shape, size))
+
+
+def _refusal(shape: tuple[int, ...], size: tuple[int, int]) -> str:
+    height, width = size
+    said = f"images {list(shape)}; expected {SHAPES} with H = {height}, W = {width}"
+    if len(shape) == 4 and shape[-3:-1] == size[::-1] or shape[-2:] == size[::-1]:
+        return f"{said}: rows and columns are exchanged; swap them, images.swapaxes(-1, -2), or (-2, -3) with channels last"
+    if shape[-2:] == size or shape[-3:-1] == size:
+        return f"{said}: other than one or three channels; give grey or colour, without alpha"
+    seen = shape[-3:-1] if shape[-1] in (1, 3) else shape[-2:]
+    if len(seen) == 2:
+        said = f"the image is {seen[1]} x {seen[0]} px, expected {width} x {height} ({said})"
+    return f"{said}: use images of this sensor's camera at its calibrated resolution"

@@ -1,0 +1,34 @@
+"""What can be said of a frame."""
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """How the reconstruction of a frame ended; its value is what results store, `text` says it in words.
+
+    Example:
+        >>> Status(4).name, Status.OK.text
+        ('BLANK', 'ok')
+        >>> Status.NOT_CONVERGED.has_surface, Status.BLANK.has_surface
+        (True, False)
+    """
+
+    text: str
+
+    def __new__(cls, value: int, text: str) -> "Status":
+        status = int.__new__(cls, value)
+        status._value_, status.text = value, text
+        return status
+
+    OK = 0, "ok"
+    TOO_FEW_MARKERS = 1, "too few markers found: check light, focus and polarity; no surface"
+    UNLIKE_REST = 2, "image unlike the rest image (most markers not found): is it this sensor's? no surface"
+    NOT_CONVERGED = 3, "the solve has not converged: the answer is kept, do not rely on it"
+    BLANK = 4, "blank or saturated image: no contrast; no surface"
+    BAD_VALUES = 5, "image holds NaN, infinity or values outside 0..1; no surface"
+    NO_SOLUTION = 6, "the solve broke down: the flow folds the surface or is far too large; no surface"
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether the frame keeps its answer; all others are NaN."""
+        return self in (Status.OK, Status.NOT_CONVERGED)

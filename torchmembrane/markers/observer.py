@@ -1,0 +1,153 @@
+"""What the markers show in a batch of images: displacements, confidence, and a status for every frame."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..errors import MembraneError
+from ..io.status import Status
+from .locate import DotLocator
+from .place import FEWEST_MARKERS, PlacedMarkers
+from .screen import MismatchScreen
+
+FOUND = 0.5
+"""Confidence above which a marker counts as found."""
+FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5  # of the markers: fewer found are too few, or an image unlike the rest image
+LEAST_CONTRAST, SATURATED_SHARE = 0.02, 0.98
+SPARSE = 4  # px: every so many rows and columns are asked whether they are saturated
+
+
+class MarkerFlow(NamedTuple):
+    """Of a batch: the markers' `displacement [B, D, 2]` px, their `confidence [B, D]` in 0..1, `status [B]` so far."""
+
+    displacement: Tensor
+    confidence: Tensor
+    status: Tensor
+
+
+class MarkerObserver(nn.Module):
+    """Images of one sensor to what its markers show.
+
+    Args:
+        markers: the markers on the rest surface, with their locator.
+        rim_pixels: `[R, 2]`, the fixed rim in the rest image, where nothing moves.
+        name: the sensor's, for messages.
+        dtype: precision of the pixels.
+        rest_image: `[height, width]` grey, or None: displacements are then from where the model sees the markers.
+
+    Raises:
+        MembraneError: most markers are not found in the rest image.
+    """
+
+    rest_pixels: Tensor
+    measured_rest: Tensor
+
+    def __init__(
+        self, markers: PlacedMarkers, rim_pixels: np.ndarray, name: str, dtype: torch.dtype, rest_image: np.ndarray | None
+    ):
+        super().__init__()
+        self.locator = markers.locator
+        self.screen = MismatchScreen(markers.model_pixels, rim_pixels)
+        self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
+        self.register_buffer("measured_rest", torch.from_numpy(markers.model_pixels))
+        self.to(dtype)
+        if rest_image is not None:
+            self.measured_rest = self._in_rest_image(torch.from_numpy(rest_image).to(dtype), name)
+
+    def _in_rest_image(self, image: Tensor, name: str) -> Tensor:
+        """The markers in the rest image: subtracted from every frame's, rest offsets are nulled (section 5.2)."""
+        pixels, found = self.locate(image[None, None])
+        if found.sum() < max(FEWEST_MARKERS, ALIKE_SHARE * found.shape[1]):
+            raise MembraneError(
+                f"sensor {name!r}: only {int(found.sum())} of {found.shape[1]} markers are found in the rest image; "
+                "expected most: check the marker file, the polarity and the camera against the image"
+            )
+        return torch.where(found[0, :, None], pixels[0], self.measured_rest)
+
+    @property
+    def follows(self) -> bool:
+        """Whether markers are followed from frame to frame: dots are."""
+        return isinstance(self.locator, DotLocator)
+
+    def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels `[B, D, 2]` of the markers in grey images `[B, 1, height, width]`, and which of them are found `[B, D]`."""
+        with torch.no_grad():
+            pixels, confidence = self.locator(images)
+        return pixels, confidence > FOUND
+
+    def forward(self, images: Tensor, previous: Tensor | None = None, rest_pixels: Tensor | None = None) -> MarkerFlow:
+        """What grey images `[B, 1, height, width]` show.
+
+        Args:
+            images: in 0..1.
+            previous: `[B, D, 2]`, `pixels` of the frames before, from which dots are followed where that is possible.
+            rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: in the rest image.
+        """
+        status = self.check(images)
+        before = () if previous is None or not self.follows else (self.located(previous),)
+        return MarkerFlow(*self.displaced(*self.locator(images, *before), status, rest_pixels), status)
+
+    def check(self, images: Tensor) -> Tensor:
+        """Status `[B]` of images."""
+        flat, sparse = images.flatten(1), images[..., ::SPARSE, ::SPARSE].flatten(1)
+        mean, low, high = flat.mean(1), flat.amin(1), flat.amax(1)
+        bad = ~(mean.isfinite() & (low > -1e-3) & (high < 1.001))  # one value that is not finite makes the mean so
+        saturated = ((sparse - 0.5).abs() > 0.495).to(sparse.dtype).mean(1)
+        blank = (high - low < LEAST_CONTRAST) | ((saturated > SATURATED_SHARE) & (mean > 0.5))
+        status = torch.where(blank, Status.BLANK.value, Status.OK.value)
+        return torch.where(bad, Status.BAD_VALUES.value, status)
+
+    def located(self, pixels: Tensor) -> Tensor:
+        """`pixels` of a result as the locator found them."""
+        return pixels - self.rest_pixels + self.measured_rest
+
+    def displaced(
+        self, pixels: Tensor, confidence: Tensor, status: Tensor, rest_pixels: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Displacements and confidence from what the locator makes of images; zero where these hold bad values."""
+        bad = (status == Status.BAD_VALUES.value)[:, None]
+        rest = self.measured_rest if rest_pixels is None else rest_pixels
+        return torch.where(bad[..., None], 0.0, pixels - rest), torch.where(bad, 0.0, confidence)
+
+    def from_pixels(self, pixels: Tensor, confidence: Tensor | None, rest_pixels: Tensor | None) -> MarkerFlow:
+        """What markers located elsewhere show, those that belong with no neighbour without confidence.
+
+        Arguments and errors as for `Reconstructor.from_pixels`.
+        """
+        pixels = torch.as_tensor(pixels).to(self.rest_pixels)
+        pixels = pixels[None] if pixels.ndim == 2 else pixels
+        if pixels.shape[1:] != self.rest_pixels.shape:
+            raise MembraneError(
+                f"from_pixels: pixels {list(pixels.shape)}; expected [B, {len(self.rest_pixels)}, 2], one for each marker"
+            )
+        rest = self.rest_pixels if rest_pixels is None else torch.as_tensor(rest_pixels).to(pixels)
+        if rest.shape != self.rest_pixels.shape:
+            raise MembraneError(f"from_pixels: rest_pixels {list(rest.shape)}; expected {list(self.rest_pixels.shape)}")
+        finite = pixels.isfinite().all(-1)
+        confidence = torch.where(finite, _checked_confidence(confidence, pixels), 0.0)
+        displacement = torch.where(finite[..., None], pixels - rest, 0.0)
+        status = torch.zeros_like(confidence[:, 0], dtype=torch.long)
+        return MarkerFlow(displacement, self.screen(displacement, confidence), status)
+
+    def judge(self, displacement: Tensor, confidence: Tensor, status: Tensor) -> MarkerFlow:
+        """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""
+        found = confidence > FOUND
+        count, D = found.sum(-1), found.shape[-1]
+        unlike = torch.where(count < ALIKE_SHARE * D, Status.UNLIKE_REST.value, Status.OK.value)
+        few = torch.where(count < max(FEWEST_MARKERS, FEWEST_SHARE * D), Status.TOO_FEW_MARKERS.value, unlike)
+        status = torch.where(status == Status.OK.value, few, status)
+        usable = (status == Status.OK.value)[:, None, None]
+        return MarkerFlow(displacement * usable, torch.where(found, confidence, 0.0), status)
+
+
+def _checked_confidence(confidence: Tensor | None, pixels: Tensor) -> Tensor:
+    if confidence is None:
+        return torch.ones_like(pixels[..., 0])
+    confidence, shape = torch.as_tensor(confidence).to(pixels), pixels.shape[:2]
+    if confidence.shape not in (shape, shape[1:]):
+        raise MembraneError(f"from_pixels: confidence {list(confidence.shape)}; expected {list(shape)}, one for each marker")
+    if not torch.compiler.is_compiling() and not ((confidence >= 0) & (confidence <= 1)).all():
+        raise MembraneError("from_pixels: confidence outside 0..1; expected 0 for a lost marker, up to 1 for a sure one")
+    return confidence.expand(shape)
