@@ -4,7 +4,10 @@ import pytest
 import torch
 
 from torchmembrane.camera.model import Camera
-from torchmembrane.estimators.force_balance import ForceBalance, _across
+from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.bearings import across
+from torchmembrane.estimators.force_balance import ForceBalance
+from torchmembrane.estimators.settings import ForceBalanceSettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
@@ -25,7 +28,7 @@ PRESSES = {
 }
 
 
-def observed(name, n, truth_grid=25, **options):
+def observed(name, n, truth_grid=25, steps=8, **options):
     """An estimator on `n` x `n` vertices, its camera, and the markers' exact pixels in a press on a finer grid."""
     shape, camera, material, radius, direction, depth = PRESSES[name]
     direction = torch.tensor(direction, dtype=torch.float64) / torch.tensor(direction).norm()
@@ -35,28 +38,28 @@ def observed(name, n, truth_grid=25, **options):
     net = shape(33).resampled((13, 13)).rest.reshape(13, 13, 3)
     positions = net[1:-1, 1:-1].reshape(-1, 3)
     markers, noise = rest.closest_points(positions.numpy()), 2 * NOISE / float(camera.focal.mean())
-    estimator = ForceBalance(rest, ElasticEnergy(rest, **material), markers, positions, noise, **options)
+    settings, elasticity = ForceBalanceSettings(steps=steps), ElasticEnergy(rest, **material)
+    estimator = ForceBalance(rest, elasticity, markers, positions, noise, settings=settings, **options)
     return estimator, camera, camera.point_to_pixel(carried(truth.vertices, dome, positions))
 
 
 def estimate(estimator, camera, pixels, start=None):
-    rays = camera.pixel_to_ray(pixels)
-    return estimator(*rays, torch.ones_like(pixels[..., 0]), start)
+    return estimator(estimator.prepare(camera, pixels, torch.ones_like(pixels[..., 0])), start)
 
 
 def force_of(estimator, result):
-    return estimator.contact_force(result.vertices, result.pressure).sum(1)
+    return estimator.equations.forces(result.vertices, result.pressure).sum(1)
 
 
 def turns(estimator, camera, pixels, vertices):
     """How the rays to the markers turn by one standard deviation of the pixels, by the camera's inverse: `[B, D, 2, 3]`."""
-    place = estimator.markers(vertices)
+    place = estimator.equations.bearings.markers(vertices)
     origins, directions = camera.pixel_to_ray(pixels)
-    across = _across(directions.mT).movedim(-1, 1)
+    basis = across(directions.mT).movedim(-1, 1)
     step = 1e-5
-    moved = camera.point_to_pixel(place[..., None, :] + step * across) - camera.point_to_pixel(place)[..., None, :]
+    moved = camera.point_to_pixel(place[..., None, :] + step * basis) - camera.point_to_pixel(place)[..., None, :]
     distance = torch.linalg.vector_norm(place - origins, dim=-1)[..., None, None]
-    return NOISE * step / distance * torch.linalg.inv(moved) @ across
+    return NOISE * step / distance * torch.linalg.inv(moved) @ basis
 
 
 @pytest.mark.parametrize("name", PRESSES)
@@ -70,8 +73,8 @@ def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(na
         start = clean.vertices.repeat(DRAWS, 1, 1), clean.pressure.repeat(DRAWS)
         result = estimate(estimator, camera, pixels, start)
         noise = turns(estimator, camera, pixels, result.vertices)
-        rays = camera.pixel_to_ray(pixels)
-        deviations = estimator.standard_deviations(result, *rays, torch.ones_like(pixels[..., 0]), noise)
+        observation = estimator.prepare(camera, pixels, torch.ones_like(pixels[..., 0]))
+        deviations = estimator.standard_deviations(result.vertices, result.pressure, observation, noise)
     free = estimator.membrane.free
     for values, spread in (
         (result.vertices[:, free], deviations.vertices[:, free]),
@@ -84,13 +87,14 @@ def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(na
 def test_deviations_grow_with_the_noise_and_leave_the_rim_alone():
     estimator, camera, exact = observed("cap", 9, truth_grid=15, steps=6)
     result = estimate(estimator, camera, exact[None])
-    rays, weight = camera.pixel_to_ray(exact[None]), torch.ones_like(exact[None, :, 0])
-    once, twice = (estimator.standard_deviations(result, *rays, weight, k * NOISE / 168) for k in (1, 2))
+    rays, weight, found = camera.pixel_to_ray(exact[None]), torch.ones_like(exact[None, :, 0]), result[:2]
+    all_found = Observation(*rays, weight)
+    once, twice = (estimator.standard_deviations(*found, all_found, k * NOISE / 168) for k in (1, 2))
     for a, b in zip(once, twice, strict=True):
         torch.testing.assert_close(2 * a, b)
     assert (once.vertices[:, estimator.membrane.fixed] == 0).all() and (once.force > 0).all()
-    weight[:, 60:] = 0
-    lost = estimator.standard_deviations(result, *rays, weight, NOISE / 168)
+    half = weight * (torch.arange(weight.shape[1]) < 60)
+    lost = estimator.standard_deviations(*found, Observation(*rays, half), NOISE / 168)
     assert lost.vertices.norm() > 1.2 * once.vertices.norm()
 
 
@@ -102,7 +106,7 @@ def along(function, at, direction, step=1e-5):
 def test_gradients_in_the_pixels_agree_with_finite_differences(pressed):
     """Of vertices and force, through camera and unrolled steps; at rest too, where forces and angles vanish."""
     estimator, camera, exact = observed("half cylinder", 9, truth_grid=15, steps=4)
-    pixels = (exact if pressed else camera.point_to_pixel(estimator.positions))[None]
+    pixels = (exact if pressed else camera.point_to_pixel(estimator.equations.bearings.positions))[None]
     generator = torch.Generator().manual_seed(0)
     direction = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
     weights = torch.randn(estimator.membrane.rest.shape, generator=generator, dtype=torch.float64)

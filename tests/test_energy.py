@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.mechanics.hyperelastic import MODELS, AffineQuadrilaterals, ElasticEnergy, _metric
+from torchmembrane.mechanics.affine_quadrilateral import AffineQuadrilaterals
+from torchmembrane.mechanics.hyperelastic import MODELS, ElasticEnergy, _metric
 from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices, triangles_of
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
 

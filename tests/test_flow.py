@@ -5,14 +5,8 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.estimators.flow import (
-    FlowInterpolation,
-    LocalAffineMaps,
-    affine_fit,
-    roughness,
-    weighted_affine_fit,
-    weights,
-)
+from torchmembrane.estimators.affine_maps import LocalAffineMaps, affine_fit, weighted_affine_fit
+from torchmembrane.estimators.flow import FlowInterpolation, roughness, weights
 from torchmembrane.surface.membrane import SurfacePoints
 from torchmembrane.surface.shapes import heightfield, spherical_cap
 

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.flow import FlowInterpolation
 from torchmembrane.estimators.force_balance import ForceBalance
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
@@ -88,12 +89,11 @@ def test_the_surface_error_grows_by_less_than_a_fifth(pressed, estimator):
     def error(seen, confidence):
         if estimator == "force-balance":
             balance = ForceBalance(dome, elasticity, points, dots, 0.1 / 168)
-            x = balance(*CAMERA.pixel_to_ray(seen), confidence).vertices
+            x = balance(balance.prepare(CAMERA, seen, confidence)).vertices
         else:
             flow = FlowInterpolation(dome, points)(seen - rest, confidence)
-            x = MinimumEnergy(dome, elasticity, CAMERA.pixel_to_ray(vertex_pixels))(
-                *CAMERA.pixel_to_ray(vertex_pixels + flow)
-            ).vertices
+            least = MinimumEnergy(dome, elasticity, CAMERA.pixel_to_ray(vertex_pixels))
+            x = least(Observation(*CAMERA.pixel_to_ray(vertex_pixels + flow), confidence)).vertices
         u = (x - dome.rest)[:, torch.from_numpy(points.vertices.astype(int))]
         placed = dots + (torch.from_numpy(points.weights)[..., None] * u).sum(-2)
         return (placed - moved).square().sum((-1, -2)).sqrt()

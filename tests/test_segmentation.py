@@ -6,8 +6,10 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.flow import FlowInterpolation
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
+from torchmembrane.estimators.settings import MinimumEnergySettings
 from torchmembrane.estimators.segmentation import PolarAngle, Segmentation, peaks, polar_angle
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
@@ -65,8 +67,8 @@ def test_a_line_of_hills_is_cut_where_they_stand_alone():
 def make(base_z, **options):
     dome = spherical_cap(12, 9, base_z, (17, 17))
     rays = central(dome.rest)
-    options = {"smoothing": 0.1, **options}
-    return Segmentation(MinimumEnergy(dome, ElasticEnergy(dome, "neo_hookean", 1.3), rays, **options), rays)
+    settings = MinimumEnergySettings(**{"smoothing": 0.1, **options})
+    return Segmentation(MinimumEnergy(dome, ElasticEnergy(dome, "neo_hookean", 1.3), rays, settings=settings), rays)
 
 
 def seen(base_z, *presses):
@@ -143,8 +145,8 @@ def test_the_smoother_leaves_contacts_alone(off_axis):
     """Eq. 28 with the rows of S at a contact struck out, against the dense KKT system."""
     dome = spherical_cap(12, 9, FAR, (9, 9))
     rays = central(dome.rest)
-    options = dict(element="quadrilateral", volume="linear", smoothing=2.0, steps=200)
-    estimator = MinimumEnergy(dome, ElasticEnergy(dome, "harmonic", 1.3), rays, **options)
+    settings = MinimumEnergySettings("quadrilateral", 2.0, "linear", steps=200, relaxed_steps=200)
+    estimator = MinimumEnergy(dome, ElasticEnergy(dome, "harmonic", 1.3), rays, settings=settings)
     bent = torch.nn.functional.normalize(rays[1] + 0.02 * torch.sin(dome.rest[:, [1, 2, 0]]) * (~dome.fixed)[:, None], dim=-1)
     relaxed = torch.zeros(len(dome.rest), dtype=torch.bool)
     relaxed[[30, 31, 40]] = True
@@ -158,7 +160,6 @@ def test_the_smoother_leaves_contacts_alone(off_axis):
         for p, q, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
             S[p, q] += sign * w
     start = torch.where(dome.fixed[:, None], dome.rest, t0[:, None] * bent)
-    x = lambda t: torch.where(dome.fixed[:, None], dome.rest, t[:, None] * bent)  # noqa: E731
     Q = estimator.energy.q_matrix(bent)
     v = (dome.volume_gradient(start) * bent).sum(-1)[free]
     smooth = estimator.smoothing * S.T @ ((~relaxed).double()[:, None] * S)
@@ -168,8 +169,10 @@ def test_the_smoother_leaves_contacts_alone(off_axis):
     psi = torch.linalg.solve(kkt, torch.cat([load, (dome.rest_volume - dome.volume(start))[None]]))[:-1]
     t = t0.clone()
     t[free] += psi
-    torch.testing.assert_close(estimator(rays[0], bent, relaxed).vertices, x(t), rtol=0, atol=1e-7)
-    assert (estimator(rays[0], bent).vertices - x(t)).abs().max() > 1e-5
+    x = torch.where(dome.fixed[:, None], dome.rest, t[:, None] * bent)
+    observation = Observation(rays[0], bent, torch.ones_like(t))
+    torch.testing.assert_close(estimator(observation, relaxed=relaxed).vertices, x, rtol=0, atol=1e-7)
+    assert (estimator(observation).vertices - x).abs().max() > 1e-5
 
 
 def test_no_rounds_are_refused():

@@ -21,7 +21,6 @@ from .base import Contacts, Equilibrium, Observation, Problem, no_contacts
 from .flow import VertexFlow
 from .settings import MinimumEnergySettings
 
-RELAXED_STEPS = 60
 CONVERGED = 1e-5  # largest relative step, and volume error where the volume is exact, of a converged surface
 
 State = tuple[Tensor, Tensor, Tensor]
@@ -137,7 +136,7 @@ class MinimumEnergy(nn.Module):
         if start is not None:
             raise MembraneError("MinimumEnergy: starts from rest always; leave the start out")
         *state, origins, directions = self.start(observation.origins, observation.directions, relaxed)
-        for _ in range((self.steps if relaxed is None else RELAXED_STEPS) - 1):
+        for _ in range((self.steps if relaxed is None else self.settings.relaxed_steps) - 1):
             state = self.step(*state, origins, directions, relaxed)
         return self.equilibrium(state[0], origins, directions, relaxed)
 

@@ -89,7 +89,8 @@ class MinimumEnergySettings:
             Default: 0.1 for quadrilaterals, else none.
         volume: "exact", or "linear": linearised once, at the rest ranges (eq. 21).
         flow: of the grid's vertices, "smooth", or "bilinear" between the dots (section 5).
-        steps: of the solve; 60 are made where the smoother is relaxed, which the constant inverse knows nothing of.
+        steps: of the solve.
+        relaxed_steps: of the solve where the smoother is relaxed, which the constant inverse knows nothing of.
 
     Raises:
         MembraneError: a value that is none of these.
@@ -104,6 +105,7 @@ class MinimumEnergySettings:
     volume: str = "exact"
     flow: str = "smooth"
     steps: int = 10
+    relaxed_steps: int = 60
 
     def __post_init__(self) -> None:
         for name, known in (("element", ELEMENTS), ("volume", VOLUMES), ("flow", FLOWS)):
