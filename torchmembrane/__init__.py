@@ -1,7 +1,91 @@
-"""3-D shape of a deformable membrane from one image of its markings: geometry, elasticity, equilibrium."""
+"""3-D shape of a deformable membrane from one image of its markings: geometry, elasticity, equilibrium.
 
-from .errors import MembraneError
-from .io.results import STATUS_TEXTS, Reconstruction
+    import torchmembrane as tm
 
-__version__ = "0.1.0"
-__all__ = ["MembraneError", "Reconstruction", "STATUS_TEXTS", "__version__"]
+    sensor = tm.Sensor.from_file("sensor.toml")   # or tm.preset("fingertip")
+    reconstructor = tm.Reconstructor(sensor)      # an nn.Module
+    result = reconstructor(frames)                # a tm.Reconstruction
+    tracker = tm.Tracker(reconstructor)           # one stream: tracker(frame)
+    results = tm.read_results("out/")             # what `torchmembrane reconstruct` wrote
+    tm.export(reconstructor, "model.onnx")        # image to result without torch
+
+Names are loaded when they are first used: the import alone needs neither torch nor any other package.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    __version__: str
+    from . import calibrate, simulate
+    from .camera.model import Camera
+    from .camera.ports import Port
+    from .errors import MembraneError
+    from .estimators.base import Estimator
+    from .estimators.covariance import StandardDeviations
+    from .estimators.force_balance import ForceBalance
+    from .estimators.minimum_energy import MinimumEnergy
+    from .estimators.settings import ForceBalanceSettings, MinimumEnergySettings
+    from .io.results import Reconstruction
+    from .io.status import Status
+    from .io.store import read_results
+    from .mechanics.hyperelastic import ElasticEnergy
+    from .onnx.export import export
+    from .presets import preset
+    from .reconstruct import Reconstructor
+    from .sensor.parts import Cavity, Markers, Material, Surface
+    from .sensor.model import Sensor
+    from .surface.membrane import Membrane
+    from .track import Tracker
+
+_HOMES = {
+    "Camera": "camera.model",
+    "Cavity": "sensor.model",
+    "ElasticEnergy": "mechanics.hyperelastic",
+    "Estimator": "estimators.base",
+    "ForceBalance": "estimators.force_balance",
+    "ForceBalanceSettings": "estimators.settings",
+    "Markers": "sensor.model",
+    "Material": "sensor.model",
+    "Membrane": "surface.membrane",
+    "MembraneError": "errors",
+    "MinimumEnergy": "estimators.minimum_energy",
+    "MinimumEnergySettings": "estimators.settings",
+    "Port": "camera.model",
+    "Reconstruction": "io.results",
+    "Reconstructor": "reconstruct",
+    "Sensor": "sensor.model",
+    "StandardDeviations": "estimators.covariance",
+    "Status": "io.status",
+    "Surface": "sensor.model",
+    "Tracker": "track",
+    "export": "onnx.export",
+    "preset": "presets",
+    "read_results": "io.store",
+}
+_NAMESPACES = ("calibrate", "simulate")
+
+__all__ = [
+    "Camera", "Cavity", "ElasticEnergy", "Estimator", "ForceBalance", "ForceBalanceSettings", "Markers", "Material", "Membrane",
+    "MembraneError", "MinimumEnergy", "MinimumEnergySettings", "Port", "Reconstruction", "Reconstructor", "Sensor",
+    "StandardDeviations", "Status", "Surface", "Tracker", "__version__", "calibrate", "export", "preset", "read_results",
+    "simulate",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> object:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("torchmembrane")
+    if name in _NAMESPACES:
+        return import_module(f".{name}", __name__)
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f".{_HOMES[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
