@@ -72,7 +72,7 @@ def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(na
         noise = turns(estimator, camera, pixels, result.vertices)
         rays = camera.pixel_to_ray(pixels)
         deviations = estimator.standard_deviations(result, *rays, torch.ones_like(pixels[..., 0]), noise)
-    free = estimator.membrane.free
+    free = estimator.membrane.free_vertices
     for values, spread in (
         (result.vertices[:, free], deviations.vertices[:, free]),
         (force_of(estimator, result), deviations.force),

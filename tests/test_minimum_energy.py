@@ -62,7 +62,7 @@ def test_the_surface_is_a_stationary_point_on_its_rays(finger, options):
     estimator = make(finger, **{"steps": 20, **options})
     origins, d = bent_rays(finger)
     got = estimator(origins, d)
-    x, free = got.vertices, finger.free
+    x, free = got.vertices, finger.free_vertices
     linear = options.get("volume") == "linear"
     start = torch.where(finger.fixed[:, None], finger.rest, estimator.rest_range[:, None] * d)
     push = finger.volume_gradient(start if linear else x)
@@ -106,7 +106,7 @@ def test_linear_volume_solves_equation_22(finger):
     estimator = make(finger, "harmonic", element="quadrilateral", smoothing=smoothing, volume="linear", steps=120)
     origins, d = bent_rays(finger)
     quads = AffineQuadrilaterals(finger, estimator.energy.tension)
-    free, rest_range = finger.free, estimator.rest_range
+    free, rest_range = finger.free_vertices, estimator.rest_range
     Q = quads.q_matrix(d)
     start = torch.where(finger.fixed[:, None], finger.rest, rest_range[:, None] * d)
     v = (finger.volume_gradient(start) * d).sum(-1)[free]

@@ -130,7 +130,7 @@ def test_no_flow_no_displacement_and_the_volume_is_linear():
     estimator = make(cap)
     got = estimator(*rays(cap))
     assert (got.vertices - cap.rest).abs().max() < 1e-10 and abs(float(got.pressure - estimator.rest_pressure)) < 1e-10
-    psi = random(len(cap.free))
+    psi = random(len(cap.free_vertices))
     torch.testing.assert_close(cap.volume(estimator.surface(psi)) - cap.rest_volume, estimator.v @ psi)
 
 

@@ -97,7 +97,7 @@ class FlowInterpolation(nn.Module):
         if D < 3:
             raise MembraneError(f"FlowInterpolation: {D} markers; expected at least 3")
         W, bending = weights(markers, V), roughness(membrane, D)
-        free = membrane.free
+        free = membrane.free_vertices
         normal = (W.T @ W + bending)[free][:, free]
         inverse = torch.zeros(V, V, dtype=torch.float64)
         inverse[free[:, None], free] = torch.linalg.inv(normal)

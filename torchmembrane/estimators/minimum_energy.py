@@ -62,7 +62,7 @@ class MinimumEnergy(nn.Module):
 
     def _rest_inverse(self, directions: Tensor) -> Tensor:
         K = self.energy.stiffness_along(self.membrane.rest, directions)
-        V, free, grid = len(self.membrane.rest), self.membrane.free, self.membrane.grid
+        V, free, grid = len(self.membrane.rest), self.membrane.free_vertices, self.membrane.grid
         one = torch.eye(V, dtype=torch.float64)
         smooth = self.smoothing * self._smoother(self._smoother(one))
         dense = (corners_to_vertices(K @ corners(one, grid), grid) + smooth)[free][:, free]

@@ -112,8 +112,10 @@ class MongeMinimumEnergy(nn.Module):
         self.rest_slope = (self.rest_plane @ edges[..., 2:]).squeeze(-1)
         self.weight = (elasticity.tension * footprint).sqrt()[..., None, None]
         shares = footprint.flatten().repeat_interleave(3) / 3
-        self.v = footprint.new_zeros(len(membrane.rest)).index_add(0, membrane.triangles.flatten(), shares)[membrane.free]
-        S = grid_laplacian(torch.eye(len(membrane.rest), dtype=torch.float64), membrane.grid)[:, membrane.free]
+        self.v = footprint.new_zeros(len(membrane.rest)).index_add(0, membrane.triangles.flatten(), shares)[
+            membrane.free_vertices
+        ]
+        S = grid_laplacian(torch.eye(len(membrane.rest), dtype=torch.float64), membrane.grid)[:, membrane.free_vertices]
         self.smooth = smoothing * elasticity.tension * S.T @ S
         Q, gamma = self._linearised(torch.zeros_like(self.v), *rest_rays)
         self.rest_load = -Q.T @ gamma - self.rest_pressure * self.v
@@ -143,7 +145,7 @@ class MongeMinimumEnergy(nn.Module):
 
     def surface(self, psi: Tensor) -> Tensor:
         """The points `(x, y, s + psi)` over the fixed grid, `[V, 3]`."""
-        lift = psi.new_zeros(len(self.membrane.rest)).index_add(0, self.membrane.free, psi)
+        lift = psi.new_zeros(len(self.membrane.rest)).index_add(0, self.membrane.free_vertices, psi)
         return torch.cat([self.membrane.rest[:, :2], self.membrane.rest[:, 2:] + lift[:, None]], 1)
 
     def _cells(self, psi: Tensor, origins: Tensor, directions: Tensor) -> Tensor:

@@ -89,7 +89,7 @@ class Membrane(nn.Module):
         self.register_buffer("volume_cross_products", self.outward / 6 * _cross_products())
         self.register_buffer("triangles", triangles)
         self.register_buffer("fixed", torch.from_numpy(fixed.ravel().copy()))
-        self.register_buffer("free", torch.nonzero(~self.fixed).ravel())
+        self.register_buffer("free_vertices", torch.nonzero(~self.fixed).ravel())
         self.register_buffer("rest_area", self.vertex_area(rest))
         self.register_buffer("rest_normals", self.normals(rest))
         self.register_buffer("rest_volume", self.volume(rest))
