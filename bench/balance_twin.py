@@ -9,8 +9,8 @@ import torch
 from scipy.sparse.linalg import splu
 
 from torchmembrane.estimators.force_balance import LONGEST_STEP, ForceBalance
-from torchmembrane.surface.membrane import corners, triangles_of
 from torchmembrane.surface.stencil import inner, pad_border
+from torchmembrane.surface.topology import corners, triangles_of
 
 DAMPING = 1e-6
 

@@ -25,7 +25,7 @@ from scipy.sparse.linalg import splu
 
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.surface.membrane import corners
+from torchmembrane.surface.topology import corners
 
 
 def scipy_twin(reconstructor):

@@ -6,8 +6,9 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.mechanics.hyperelastic import MODELS, AffineQuadrilaterals, ElasticEnergy, _metric
-from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices, triangles_of
+from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
+from torchmembrane.surface.topology import corners, corners_to_vertices, triangles_of
 
 ELASTIC = dict(prestretch=1.2, modulus=0.7, c2_ratio=0.15)
 

@@ -13,7 +13,7 @@ from torchmembrane.estimators.flow import (
     weighted_affine_fit,
     weights,
 )
-from torchmembrane.surface.membrane import SurfacePoints
+from torchmembrane.surface.projection import SurfacePoints
 from torchmembrane.surface.shapes import heightfield, spherical_cap
 
 

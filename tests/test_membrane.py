@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices, triangles_of, triangles_to_corners
+from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, half_cylinder, heightfield, spherical_cap
+from torchmembrane.surface.topology import corners, corners_to_vertices, triangles_of, triangles_to_corners
 
 SHAPES = {
     "spherical_cap": lambda n: spherical_cap(12, 9, 15, (n, n)),

@@ -8,8 +8,9 @@ from axisymmetric import harmonic, least_energy, neo_hookean
 from torchmembrane import MembraneError
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.mechanics.hyperelastic import AffineQuadrilaterals, ElasticEnergy
-from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices
+from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, spherical_cap
+from torchmembrane.surface.topology import corners, corners_to_vertices
 
 
 def rest_rays(membrane):

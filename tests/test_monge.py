@@ -8,8 +8,8 @@ from torchmembrane import MembraneError
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.paper.monge import MongeMinimumEnergy, adjugate, coefficients, form_matrix, metric
-from torchmembrane.surface.membrane import corners, triangles_of
 from torchmembrane.surface.shapes import ellipsoid_cap, heightfield, spherical_cap
+from torchmembrane.surface.topology import corners, triangles_of
 
 
 def random(*shape, seed=0):

@@ -15,7 +15,7 @@ from ..mechanics.cavity import Equilibrium
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..reconstruct import Reconstructor
 from ..sensor.model import Sensor
-from ..surface.membrane import SurfacePoints
+from ..surface.projection import SurfacePoints
 
 GRID = (17, 17)  # on finer grids the price is less smooth in the prestretch
 STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it

@@ -9,7 +9,9 @@ from torch import Tensor, nn
 from ..errors import MembraneError
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..solve.conjugate_gradient import conjugate_gradient
-from ..surface.membrane import Membrane, SurfacePoints, corners, corners_to_vertices
+from ..surface.membrane import Membrane
+from ..surface.projection import SurfacePoints
+from ..surface.topology import corners, corners_to_vertices
 from .bilinear import bilinear_matrix
 
 KINDS = ("smooth", "bilinear")

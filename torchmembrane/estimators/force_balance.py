@@ -28,7 +28,8 @@ from ..mechanics.cavity import CavityLaw, Equilibrium, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..solve.stencil_system import NEAR, StencilSystem
-from ..surface.membrane import Membrane, SurfacePoints
+from ..surface.membrane import Membrane
+from ..surface.projection import SurfacePoints
 from ..surface.stencil import apply_stencil, inner, one_ring_edges, pad_border, stencil_kernels
 from .covariance import StandardDeviations, standard_deviations
 

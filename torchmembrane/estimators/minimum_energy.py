@@ -12,7 +12,8 @@ from ..mechanics.cavity import CavityLaw, Equilibrium, rest_balance
 from ..mechanics.hyperelastic import AffineQuadrilaterals, ElasticEnergy
 from ..solve.anderson import accelerated, first
 from ..solve.kkt import constrained_minimum
-from ..surface.membrane import Membrane, corners, corners_to_vertices
+from ..surface.membrane import Membrane
+from ..surface.topology import corners, corners_to_vertices
 
 ELEMENTS = ("triangle", "quadrilateral")
 VOLUMES = ("exact", "linear")

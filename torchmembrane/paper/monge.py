@@ -18,7 +18,8 @@ from ..errors import MembraneError
 from ..estimators.minimum_energy import grid_laplacian
 from ..mechanics.cavity import Equilibrium, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
-from ..surface.membrane import Membrane, corners, triangles_of
+from ..surface.membrane import Membrane
+from ..surface.topology import corners, triangles_of
 
 STEEPEST = 20.0  # slope of a rest surface that heights can describe
 

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..mechanics.hyperelastic import ElasticEnergy
-from ..surface.membrane import Membrane, corners, triangles_of
+from ..surface.membrane import Membrane
+from ..surface.topology import corners, triangles_of
 from .contact import Contact
 
 FORCE_TOLERANCE = 1e-9  # over modulus x edge length

@@ -10,7 +10,8 @@ from torch import Tensor
 from ..errors import MembraneError
 from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
-from ..surface.membrane import Membrane, SurfacePoints
+from ..surface.membrane import Membrane
+from ..surface.projection import SurfacePoints
 from .contact import Contact
 from .equilibrium import Equilibrium, Gas, Liquid, Open
 from .indenters import Indenter
