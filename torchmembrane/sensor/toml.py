@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..camera.model import Camera, Port
+from ..camera.model import Camera
+from ..camera.ports import Port
 from ..errors import MembraneError
 from ..io.images import write_image
 from ..surface.membrane import Membrane
