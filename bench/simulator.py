@@ -20,7 +20,7 @@ from record import write
 from torchmembrane import MembraneError
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.presets import NAMES, preset
-from torchmembrane.sensor.model import Sensor
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.dataset import Plan, random_frame, stroke_to
 from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
 from torchmembrane.simulate.indenters import Cylinder, Plane, Sphere, facing

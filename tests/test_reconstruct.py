@@ -11,7 +11,8 @@ import torch
 from torchmembrane import MembraneError
 from torchmembrane.io import results
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.model import Cavity, Sensor
+from torchmembrane.sensor.parts import Cavity
+from torchmembrane.sensor.sensor import Sensor
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PAPERS = "minimum-energy"

@@ -10,7 +10,8 @@ import torch
 from PIL import Image
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.shapes import spherical_cap
 
 GOOD = """format = 1

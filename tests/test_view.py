@@ -9,7 +9,8 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.io import results
 from torchmembrane.io.store import Mesh
 from torchmembrane.plot import frames as view
-from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor
+from torchmembrane.sensor.parts import Cavity, Markers, Material
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.shapes import spherical_cap
 
 GRID = (15, 15)

@@ -23,7 +23,7 @@ from .markers.place import FEWEST_MARKERS, place_markers
 from .markers.screen import MismatchScreen
 from .mechanics.cavity import Equilibrium
 from .mechanics.hyperelastic import ElasticEnergy
-from .sensor.model import Sensor
+from .sensor.sensor import Sensor
 
 ESTIMATORS = ("force-balance", "minimum-energy")
 FOUND = 0.5

@@ -14,7 +14,7 @@ from ..io.results import OK, STATUS_TEXTS
 from ..mechanics.cavity import Equilibrium
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..reconstruct import Reconstructor
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from ..surface.projection import SurfacePoints
 
 GRID = (17, 17)  # on finer grids the price is less smooth in the prestretch

@@ -9,7 +9,7 @@ import torch
 
 from ..errors import MembraneError
 from ..markers.place import rim_mask
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from ..surface.topology import rim_loop
 from .fit import outline_centres

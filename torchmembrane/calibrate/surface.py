@@ -8,7 +8,8 @@ import torch
 from scipy.interpolate import RBFInterpolator
 
 from ..errors import MembraneError
-from ..sensor.model import Markers, Sensor, Surface
+from ..sensor.parts import Markers, Surface
+from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from ..surface.tangent import tangent_axes
 from ..targets import OUTLINE

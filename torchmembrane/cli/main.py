@@ -18,7 +18,7 @@ from ..jobs.local import find_inputs, reconstruct_files
 from ..mechanics.hyperelastic import MODELS
 from ..presets import sensor_file
 from ..reconstruct import ESTIMATORS, Reconstructor
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from .calibrate import add_calibrate
 from .describe import described, rest_frame
 from .simulate import add_simulate

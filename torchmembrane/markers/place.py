@@ -6,7 +6,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from ..surface.projection import SurfacePoints
 from ..surface.tangent import tangent_axes
 from ..surface.topology import rim_loop

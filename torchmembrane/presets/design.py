@@ -10,7 +10,8 @@ from ..camera.model import Camera
 from ..io.images import to_grey
 from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
-from ..sensor.model import METRE, Cavity, Markers, Material, Sensor, Surface
+from ..sensor.parts import METRE, Cavity, Markers, Material, Surface
+from ..sensor.sensor import Sensor
 from ..sensor.toml import default_grid
 from ..simulate.look import Look, noisy
 from ..simulate.render import Renderer

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from ..surface.tangent import tangent_axes
 from .look import BRIGHT, Look, blurred, mirrored, scattered, vignette
 from .pattern import Canvas, Dots, Painted, Speckle, pattern_of

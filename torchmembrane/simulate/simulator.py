@@ -12,7 +12,7 @@ import torch
 from ..errors import MembraneError
 from ..io.images import to_grey
 from ..mechanics.hyperelastic import ElasticEnergy
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from .indenters import Indenter
 from .look import Look, noisy
 from .pattern import pattern_of
