@@ -12,8 +12,8 @@ from ..errors import MembraneError
 from ..estimators.force_balance import ForceBalance
 from ..io.results import OK, STATUS_TEXTS
 from ..mechanics.cavity import Equilibrium
-from ..mechanics.hyperelastic import ElasticEnergy
 from ..reconstruct import Reconstructor
+from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor
 from ..surface.projection import SurfacePoints
 
@@ -145,8 +145,8 @@ class Presses:
     def explained(self, stretch: float, modulus: float) -> tuple[ForceBalance, Equilibrium]:
         """The estimator with this material, and what it finds."""
         r, known = self.reconstructor, self.reconstructor.estimator
-        material, cavity, membrane = r.sensor.material, known.cavity, known.membrane
-        elasticity = ElasticEnergy(membrane, material.model, stretch, modulus, material.c2_ratio or 0.0)
+        cavity, membrane = known.cavity, known.membrane
+        elasticity = elastic_energy(r.sensor, membrane, prestretch=stretch, modulus=modulus)
         points = SurfacePoints(r.marker_vertices.numpy(), r.marker_weights.numpy(), np.zeros(len(r.rest_markers)))
         gas = tuple(cavity.gas.tolist())
         estimator = ForceBalance(membrane, elasticity, points, r.rest_markers, known.noise, cavity.filling, gas)

@@ -43,7 +43,7 @@ class Membrane(nn.Module):
         MembraneError: the grid folds, degenerates, has a free border or cannot be seen from the camera.
 
     Limitations:
-        One sheet that is seen from the camera everywhere; no undercuts.
+        Every point is seen from the camera, the origin: no undercuts.
 
     Example:
         >>> x, y = np.meshgrid(np.arange(5.0), np.arange(4.0), indexing="ij")
