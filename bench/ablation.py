@@ -24,7 +24,8 @@ from torchmembrane import reconstruct
 from torchmembrane.estimators import force_balance
 from torchmembrane.estimators.force_balance import FRICTION, SPARSITY
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.model import Cavity, Sensor
+from torchmembrane.sensor.parts import Cavity
+from torchmembrane.sensor.sensor import Sensor
 
 GRID = 33
 

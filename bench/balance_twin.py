@@ -9,8 +9,8 @@ import torch
 from scipy.sparse.linalg import splu
 
 from torchmembrane.estimators.force_balance import LONGEST_STEP, ForceBalance
-from torchmembrane.surface.membrane import corners, triangles_of
 from torchmembrane.surface.stencil import inner, pad_border
+from torchmembrane.surface.topology import corners, triangles_of
 
 DAMPING = 1e-6
 
@@ -32,7 +32,7 @@ class BalanceTwin:
         self.marker_weights, marker = points.weights, dofs(points.vertices)
         self.marker_row = np.repeat(np.arange(2 * len(marker)), 9)
         self.marker_column = np.repeat(marker, 2, 0).ravel()
-        self.free = dofs(estimator.membrane.free.numpy()[:, None]).ravel()
+        self.free = dofs(estimator.membrane.free_vertices.numpy()[:, None]).ravel()
         self.count = 3 * len(index)
 
     def __call__(self, origins, directions, weight) -> tuple[np.ndarray, float]:

@@ -36,7 +36,7 @@ from torchmembrane.plot.calibration import Report, fit_figure, mill_figure, surf
 from torchmembrane.plot.frames import save
 from torchmembrane.presets import preset
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.model import Markers, Surface
+from torchmembrane.sensor.parts import Markers, Surface
 from torchmembrane.simulate.board import BoardImages
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Plane, Sphere

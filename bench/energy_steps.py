@@ -18,7 +18,7 @@ from accuracy import cases_in
 from record import write
 
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.model import Sensor
+from torchmembrane.sensor.sensor import Sensor
 
 CONVERGED = 60
 

@@ -17,7 +17,8 @@ from accuracy import cases_in
 from record import write
 from scipy.spatial import cKDTree
 
-from torchmembrane.reconstruct import FOUND, Reconstructor
+from torchmembrane.markers.observer import FOUND
+from torchmembrane.reconstruct import Reconstructor
 
 SHARE, NOISE, ALLOWED = 0.05, 0.05, 0.2
 

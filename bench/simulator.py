@@ -20,7 +20,8 @@ from record import write
 from torchmembrane import MembraneError
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.presets import NAMES, preset
-from torchmembrane.sensor.model import Sensor
+from torchmembrane.sensor.factories import elastic_energy
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.dataset import Plan, random_frame, stroke_to
 from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
 from torchmembrane.simulate.indenters import Cylinder, Plane, Sphere, facing
@@ -146,9 +147,9 @@ def case_paths(case: dict) -> list[list]:
 def agreement(root: Path, case: dict, n: int) -> dict:
     """Differences from a case's truth, in %: of the surface over its rms displacement, of force and pressure change."""
     sensor, truth = Sensor.from_file(root / case["sensor"]), np.load(root / case["truth"])
-    material, base_z = sensor.material, float(sensor.membrane.rest[sensor.membrane.fixed, 2].min())
+    base_z = float(sensor.membrane.rest[sensor.membrane.fixed, 2].min())
     membrane = SHAPES[case["folder"].partition("_")[0]](base_z, (n, n))
-    elasticity = ElasticEnergy(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
+    elasticity = elastic_energy(sensor, membrane)
     seconds, state = processor_seconds(lambda: press(membrane, elasticity, case_paths(case), friction=case["friction"]))
     row = dict(case=case["case"], folder=case["folder"], friction=case["friction"], seconds=seconds)
     for points in ("dots", "probes"):

@@ -25,7 +25,7 @@ from scipy.sparse.linalg import splu
 
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.surface.membrane import corners
+from torchmembrane.surface.topology import corners
 
 
 def scipy_twin(reconstructor):
@@ -37,7 +37,7 @@ def scipy_twin(reconstructor):
     elasticity = ElasticEnergy(reconstructor.sensor.membrane, "harmonic", reconstructor.sensor.material.prestretch)
     local = elasticity.to(up.dtype).stiffness_along(membrane.rest, up).reshape(-1, 4, 4).numpy().astype(float)
     row, column = np.repeat(index, 4, 1).ravel(), np.tile(index, (1, 4)).ravel()
-    free, fixed = membrane.free.numpy(), membrane.fixed.numpy()
+    free, fixed = membrane.free_vertices.numpy(), membrane.fixed.numpy()
     rest_range = estimator.rest_range.numpy().astype(float)
     X, h, p0 = (a.numpy().astype(float) for a in (membrane.rest, estimator.rest_load, estimator.rest_pressure))
     V0 = float(membrane.rest_volume)

@@ -17,7 +17,8 @@ from record import write
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from torchmembrane.reconstruct import FOUND, Reconstructor
+from torchmembrane.markers.observer import FOUND
+from torchmembrane.reconstruct import Reconstructor
 
 REACH = 0.75  # of the distance to the nearest dot of its size: how far a dot is looked for
 NEIGHBOURS = 4  # matched large dots that predict a small one

@@ -22,12 +22,13 @@ from PIL import Image
 from torchmembrane.estimators.flow import FlowInterpolation
 from torchmembrane.estimators.segmentation import PolarAngle, Segmentation
 from torchmembrane.io.results import Reconstruction
+from torchmembrane.markers.observer import FOUND
 from torchmembrane.paper.pressed_strip import Disc, PressedStrip
 from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile
 from torchmembrane.paper.strip import Strip
 from torchmembrane.plot.frames import BLUE, GREY, VERMILION
 from torchmembrane.presets import preset_file
-from torchmembrane.reconstruct import FOUND, Reconstructor
+from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.simulate.indenters import Cylinder, Sphere
 from torchmembrane.simulate.look import Look
 from torchmembrane.simulate.press import press

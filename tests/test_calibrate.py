@@ -24,7 +24,8 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.io.images import to_grey
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.board import BoardImages
 from torchmembrane.simulate.look import Look
 from torchmembrane.simulate.simulator import Simulator

@@ -14,7 +14,7 @@ from torchmembrane import __version__
 from torchmembrane.cli import main as cli
 from torchmembrane.errors import MembraneError
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.model import Sensor
+from torchmembrane.sensor.sensor import Sensor
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SENSOR = str(EXAMPLES / "sensor.toml")

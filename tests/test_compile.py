@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.model import Sensor
+from torchmembrane.sensor.sensor import Sensor
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

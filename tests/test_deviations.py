@@ -5,13 +5,13 @@ import torch
 
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.base import Observation
-from torchmembrane.estimators.bearings import across
 from torchmembrane.estimators.force_balance import ForceBalance
 from torchmembrane.estimators.settings import ForceBalanceSettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
+from torchmembrane.surface.tangent import tangent_frame
 
 NOISE, DRAWS = 0.05, 192  # px
 CAP, FINGER, CYLINDER = (
@@ -55,7 +55,7 @@ def turns(estimator, camera, pixels, vertices):
     """How the rays to the markers turn by one standard deviation of the pixels, by the camera's inverse: `[B, D, 2, 3]`."""
     place = estimator.equations.bearings.markers(vertices)
     origins, directions = camera.pixel_to_ray(pixels)
-    basis = across(directions.mT).movedim(-1, 1)
+    basis = tangent_frame(directions.mT, dim=1).movedim(-1, 1)
     step = 1e-5
     moved = camera.point_to_pixel(place[..., None, :] + step * basis) - camera.point_to_pixel(place)[..., None, :]
     distance = torch.linalg.vector_norm(place - origins, dim=-1)[..., None, None]
@@ -75,7 +75,7 @@ def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(na
         noise = turns(estimator, camera, pixels, result.vertices)
         observation = estimator.prepare(camera, pixels, torch.ones_like(pixels[..., 0]))
         deviations = estimator.standard_deviations(result.vertices, result.pressure, observation, noise)
-    free = estimator.membrane.free
+    free = estimator.membrane.free_vertices
     for values, spread in (
         (result.vertices[:, free], deviations.vertices[:, free]),
         (force_of(estimator, result), deviations.force),

@@ -7,8 +7,9 @@ import torch
 from torchmembrane import MembraneError
 from torchmembrane.mechanics.affine_quadrilateral import AffineQuadrilaterals
 from torchmembrane.mechanics.hyperelastic import MODELS, ElasticEnergy, _metric
-from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices, triangles_of
+from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
+from torchmembrane.surface.topology import corners, corners_to_vertices, triangles_of
 
 ELASTIC = dict(prestretch=1.2, modulus=0.7, c2_ratio=0.15)
 
@@ -135,7 +136,7 @@ def test_stiffness_is_symmetric_and_positive_even_in_compression(membrane):
     for energy in elements(membrane):
         K = dense(energy, membrane, x, d)
         torch.testing.assert_close(K, K.T)
-        free = membrane.free
+        free = membrane.free_vertices
         assert torch.linalg.eigvalsh(K[free][:, free])[0] > 0
 
 
@@ -207,7 +208,7 @@ def test_rest_pressure_is_tension_times_curvature(make, curvature):
     for n in (17, 33):
         membrane = make(n)
         elasticity = ElasticEnergy(membrane, "neo_hookean", 1.3)
-        free, normal = membrane.free, membrane.rest_normals
+        free, normal = membrane.free_vertices, membrane.rest_normals
         force, push = elasticity.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
         p0 = (force * normal)[free].sum() / (push * normal)[free].sum()
         errors.append(abs(float(p0 / (elasticity.tension * curvature)) - 1))

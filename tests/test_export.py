@@ -24,7 +24,8 @@ from torchmembrane.onnx import export
 from torchmembrane.onnx.export import Piece
 from torchmembrane.onnx.graph import Assembly, traced
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.simulator import Simulator

@@ -7,7 +7,7 @@ import torch
 from torchmembrane import MembraneError
 from torchmembrane.estimators.affine_maps import LocalAffineMaps, affine_fit, weighted_affine_fit
 from torchmembrane.estimators.flow import FlowInterpolation, roughness, weights
-from torchmembrane.surface.membrane import SurfacePoints
+from torchmembrane.surface.projection import SurfacePoints
 from torchmembrane.surface.shapes import heightfield, spherical_cap
 
 
@@ -83,7 +83,7 @@ def test_lost_markers_have_no_say_and_the_rest_fills_in():
     s, c = torch.from_numpy(bump(xyz)), torch.ones(len(xyz), dtype=torch.float64)
     lost = [5, 30, 60, 61, 62, 90]
     c[lost], s[lost] = 0.0, torch.nan
-    W, free = weights(points, len(cap.rest)), cap.free
+    W, free = weights(points, len(cap.rest)), cap.free_vertices
     normal = (W.T @ (c[:, None] * W) + roughness(cap, len(xyz)))[free][:, free]
     want = torch.linalg.solve(normal, (W.T @ torch.where(c[:, None] > 0, s, 0.0))[free])
     got = flow(s, c)

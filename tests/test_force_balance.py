@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.bearings import Bearings
 from torchmembrane.estimators.contact_patches import contact_indicator, contact_points
-from torchmembrane.estimators.base import Equilibrium, Observation
-from torchmembrane.estimators.bearings import Bearings, across
 from torchmembrane.estimators.force_balance import ForceBalance
 from torchmembrane.estimators.robust import Cauchy
 from torchmembrane.estimators.settings import ForceBalanceSettings
@@ -23,6 +23,7 @@ from torchmembrane.solve import block_tridiagonal, matrix_products
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import spherical_cap
 from torchmembrane.surface.stencil import inner
+from torchmembrane.surface.tangent import tangent_frame
 
 SETTINGS = ForceBalanceSettings()
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -129,7 +130,9 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     )
     x, p = bent(dome), torch.tensor([0.3], dtype=torch.float64)
     directions = torch.nn.functional.normalize(positions + 0.3, dim=-1)[None]
-    measured = Bearings(0.1 * directions.mT, across(directions.mT), torch.ones(1, len(positions), dtype=torch.float64))
+    measured = Bearings(
+        0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, len(positions), dtype=torch.float64)
+    )
     equations = estimator.equations
     at = equations.forces.linearised(x, p)
     angle, jacobian = equations.bearings.angles(x, measured)
@@ -169,7 +172,9 @@ def test_the_bearing_jacobian_is_the_derivative_of_the_angles():
     estimator = make(7)
     bearings = estimator.equations.bearings
     directions = torch.nn.functional.normalize(bearings.positions + 0.3, dim=-1)[None]
-    measured = Bearings(0.1 * directions.mT, across(directions.mT), torch.ones(1, len(directions[0]), dtype=torch.float64))
+    measured = Bearings(
+        0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, len(directions[0]), dtype=torch.float64)
+    )
     x = bent(estimator.membrane)
     _, jacobian = bearings.angles(x, measured)
     exact = torch.autograd.functional.jacobian(lambda y: bearings.angles(y, measured)[0], x)[0, :, :, 0]
@@ -239,7 +244,7 @@ def along_y(normal):
 
 
 def patch_of_pushes(estimator, push, tensile_elsewhere=0.0, shear=0.0):
-    """Forces at rest: `push` (over the reference) on the middle of the dome, `shear` along it, `tensile_elsewhere` on the rest."""
+    """Forces at rest over the reference: `push` on the middle of the dome, `shear` along it, `tensile_elsewhere` on the rest."""
     X, normal = at_rest(estimator)
     middle = X[:, :2].norm(dim=1) < 4.0
     pushed = -push * normal + shear * along_y(normal)
@@ -264,7 +269,9 @@ def test_large_pushes_weigh_little_small_ones_and_tensile_tractions_do_not():
         force, _ = patch_of_pushes(estimator, push)
         assert low < weights(estimator, force, tau)[0][centre] < high
     force, middle = patch_of_pushes(estimator, 4.0, tensile_elsewhere=4.0)
-    torch.testing.assert_close(weights(estimator, force)[0][~middle], torch.full((int((~middle).sum()),), 1 + SETTINGS.floor).double())
+    torch.testing.assert_close(
+        weights(estimator, force)[0][~middle], torch.full((int((~middle).sum()),), 1 + SETTINGS.floor).double()
+    )
 
 
 def test_shear_weighs_much_but_where_something_pushes():
@@ -288,11 +295,12 @@ def test_a_lone_push_is_taken_for_error_its_patch_for_a_contact():
 def test_outliers_weigh_little(pressed):
     """A few markers off by 2 px of 168 px/rad, a fifth of the spacing."""
     (origins, directions), positions, moved, _ = pressed
-    weight = torch.ones(1, len(positions), dtype=torch.float64)
     wrong = directions.clone()
     generator = torch.Generator().manual_seed(1)
     outliers = torch.randperm(len(positions), generator=generator)[:6]
-    wrong[outliers] += 2 / 168 * torch.nn.functional.normalize(torch.randn(6, 3, generator=generator, dtype=wrong.dtype), dim=-1)
+    wrong[outliers] += (
+        2 / 168 * torch.nn.functional.normalize(torch.randn(6, 3, generator=generator, dtype=wrong.dtype), dim=-1)
+    )
     wrong = torch.nn.functional.normalize(wrong, dim=-1)
     estimator = make(17)
     clean = relative(estimator, estimator(seen(origins, directions)), positions, moved)
@@ -302,7 +310,6 @@ def test_outliers_weigh_little(pressed):
 
 def test_a_fine_grid_begins_with_the_coarse_ones_solution(pressed):
     (origins, directions), positions, moved, truth = pressed
-    weight = torch.ones(1, len(positions), dtype=torch.float64)
     fine = make(33)
     assert fine.coarse.membrane.grid == (17, 17) and fine.coarse.coarse.membrane.grid == (9, 9)
     assert fine.coarse.coarse.coarse is None and make(16).coarse is None
@@ -318,7 +325,6 @@ def test_a_fine_grid_begins_with_the_coarse_ones_solution(pressed):
 def test_four_steps_from_the_frame_before_follow_a_press(pressed, n):
     """From the solution of a slightly different view of the press, to where the cold solution is."""
     (origins, directions), positions, _, _ = pressed
-    weight = torch.ones(1, len(positions), dtype=torch.float64)
     estimator = make(n)
     rest = torch.nn.functional.normalize(estimator.equations.bearings.positions, dim=-1)
     before = torch.nn.functional.normalize(0.1 * rest + 0.9 * directions, dim=-1)
@@ -438,9 +444,11 @@ def test_the_objective_is_the_misfit_of_the_markers_and_the_loss_of_the_traction
     expected = Cauchy(SETTINGS.outlier).loss(misfit).sum(1)
     torch.testing.assert_close(estimator.objective(none, observation), expected)
     assert (estimator.objective(found, observation) > expected).all()
-    assert estimator.objective(Equilibrium(*found), observation) < estimator.objective(estimator_at_rest(estimator), observation)
+    assert estimator.objective(Equilibrium(*found), observation) < estimator.objective(
+        estimator_at_rest(estimator), observation
+    )
 
 
-def estimator_at_rest(estimator):
+def equilibrium_at_rest(estimator):
     x, pressure = estimator.at_rest(torch.ones(1, 1))
     return estimator.equilibrium(x, pressure, x)

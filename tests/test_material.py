@@ -13,7 +13,8 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
 

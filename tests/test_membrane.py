@@ -7,8 +7,11 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices, triangles_of, triangles_to_corners
+from torchmembrane.linalg import symmetric_adjugate_product, symmetric_determinant
+from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, half_cylinder, heightfield, spherical_cap
+from torchmembrane.surface.tangent import tangent_axes, tangent_frame
+from torchmembrane.surface.topology import corners, corners_to_vertices, rim_loop, triangles_of, triangles_to_corners
 
 SHAPES = {
     "spherical_cap": lambda n: spherical_cap(12, 9, 15, (n, n)),
@@ -206,3 +209,53 @@ def test_wrong_grids_are_refused_in_words(vertices, fixed, words):
 def test_wrong_shapes_are_refused(make):
     with pytest.raises(MembraneError):
         make()
+
+
+def across(directions):
+    """The two vectors across `[B, 3, D]` written out, components first."""
+    x, y, z = directions.unbind(1)
+    none = torch.zeros_like(x)
+    first = torch.where((z.abs() < 0.9)[:, None], torch.stack([y, -x, none], 1), torch.stack([none, z, -y], 1))
+    first = torch.nn.functional.normalize(first, dim=1)
+    return torch.stack([first, torch.linalg.cross(directions, first, dim=1)], 1)
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (3, 1, 200)])
+def test_tangent_frames_are_orthonormal_right_handed_and_the_same_on_any_axis(batch):
+    generator = torch.Generator().manual_seed(0)
+    n = torch.nn.functional.normalize(torch.randn(*batch, 3, generator=generator, dtype=torch.float64), dim=-1)
+    frame = torch.cat([n[..., None, :], tangent_frame(n)], -2)
+    one = torch.eye(3, dtype=torch.float64).expand(*batch, 3, 3)
+    torch.testing.assert_close(frame @ frame.mT, one, rtol=0, atol=1e-14)
+    torch.testing.assert_close(torch.linalg.det(frame), torch.ones(batch, dtype=torch.float64))
+    if batch:
+        components_first = tangent_frame(n.movedim(-1, 0), 0).movedim((0, 1), (-2, -1))
+        torch.testing.assert_close(components_first, tangent_frame(n), rtol=0, atol=1e-15)
+        first = n.reshape(1, -1, 3).mT
+        assert torch.equal(tangent_frame(first, dim=1), across(first))
+
+
+def test_tangent_axes_are_orthonormal_and_right_handed_also_along_the_axes():
+    rng = np.random.default_rng(0)
+    normals = np.concatenate([rng.normal(size=(50, 3)), np.eye(3), -np.eye(3)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    frame = np.concatenate([normals[:, None], tangent_axes(normals)], 1)
+    np.testing.assert_allclose(frame @ frame.swapaxes(1, 2), np.broadcast_to(np.eye(3), frame.shape), atol=1e-14)
+    np.testing.assert_allclose(np.linalg.det(frame), 1.0)
+
+
+@pytest.mark.parametrize("grid", [(3, 3), (4, 6), (7, 5)])
+def test_the_rim_loop_goes_once_around_the_border(grid):
+    m, n = grid
+    i, j = np.divmod(rim_loop(grid), n)
+    assert len(set(zip(i.tolist(), j.tolist(), strict=True))) == len(i) == 2 * (m + n) - 4
+    assert (np.isin(i, (0, m - 1)) | np.isin(j, (0, n - 1))).all()
+    assert (np.abs(i - np.roll(i, 1)) + np.abs(j - np.roll(j, 1)) == 1).all()
+
+
+def test_symmetric_closed_forms_solve_their_systems():
+    rng = np.random.default_rng(0)
+    a, b, c, u, v = rng.normal(size=(5, 40))
+    matrix = np.stack([np.stack([a, b], -1), np.stack([b, c], -1)], -2)
+    solved = np.stack(symmetric_adjugate_product(a, b, c, u, v), -1) / symmetric_determinant(a, b, c)[:, None]
+    np.testing.assert_allclose((matrix @ solved[..., None])[..., 0], np.stack([u, v], -1), atol=1e-9)

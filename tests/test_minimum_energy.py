@@ -11,8 +11,9 @@ from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.estimators.settings import MinimumEnergySettings
 from torchmembrane.mechanics.affine_quadrilateral import AffineQuadrilaterals
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
-from torchmembrane.surface.membrane import Membrane, corners, corners_to_vertices
+from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, spherical_cap
+from torchmembrane.surface.topology import corners, corners_to_vertices
 
 
 def rest_rays(membrane):
@@ -70,7 +71,7 @@ def test_the_surface_is_a_stationary_point_on_its_rays(finger, options):
     estimator = make(finger, **{"steps": 20, **options})
     origins, d = bent_rays(finger)
     got = estimator(seen(origins, d))
-    x, free = got.vertices, finger.free
+    x, free = got.vertices, finger.free_vertices
     linear = options.get("volume") == "linear"
     start = torch.where(finger.fixed[:, None], finger.rest, estimator.rest_range[:, None] * d)
     push = finger.volume_gradient(start if linear else x)
@@ -117,7 +118,7 @@ def test_linear_volume_solves_equation_22(finger):
     estimator = make(finger, "harmonic", element="quadrilateral", smoothing=smoothing, volume="linear", steps=120)
     origins, d = bent_rays(finger)
     quads = AffineQuadrilaterals(finger, estimator.energy.tension)
-    free, rest_range = finger.free, estimator.rest_range
+    free, rest_range = finger.free_vertices, estimator.rest_range
     Q = quads.q_matrix(d)
     start = torch.where(finger.fixed[:, None], finger.rest, rest_range[:, None] * d)
     v = (finger.volume_gradient(start) * d).sum(-1)[free]

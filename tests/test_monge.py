@@ -9,8 +9,8 @@ from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.paper.monge import MongeMinimumEnergy, adjugate, coefficients, form_matrix, metric
-from torchmembrane.surface.membrane import corners, triangles_of
 from torchmembrane.surface.shapes import ellipsoid_cap, heightfield, spherical_cap
+from torchmembrane.surface.topology import corners, triangles_of
 
 
 def random(*shape, seed=0):
@@ -131,7 +131,7 @@ def test_no_flow_no_displacement_and_the_volume_is_linear():
     estimator = make(cap)
     got = estimator(*rays(cap))
     assert (got.vertices - cap.rest).abs().max() < 1e-10 and abs(float(got.pressure - estimator.rest_pressure)) < 1e-10
-    psi = random(len(cap.free))
+    psi = random(len(cap.free_vertices))
     torch.testing.assert_close(cap.volume(estimator.surface(psi)) - cap.rest_volume, estimator.v @ psi)
 
 

@@ -11,9 +11,10 @@ from torchmembrane.simulate import equilibrium as equilibrium_module
 from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
 from torchmembrane.simulate.indenters import Plane, Sphere, facing
 from torchmembrane.simulate.press import carried, press, presses
-from torchmembrane.surface.membrane import Membrane, corners, triangles_of
+from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import half_cylinder, heightfield, spherical_cap
 from torchmembrane.surface.stencil import ONE_RING, apply_stencil, inner, one_ring_edges
+from torchmembrane.surface.topology import corners, triangles_of
 
 PRESTRETCH = 1.3
 GRIDS = (9, 17, 33)

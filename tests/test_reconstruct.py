@@ -13,7 +13,8 @@ from torchmembrane.estimators.settings import MinimumEnergySettings
 from torchmembrane.io import results
 from torchmembrane.io.status import Status
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.model import Cavity, Sensor
+from torchmembrane.sensor.parts import Cavity
+from torchmembrane.sensor.sensor import Sensor
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PAPERS = "minimum-energy"

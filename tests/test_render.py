@@ -9,7 +9,8 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
-from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.look import Look, blurred, noisy, scattered
 from torchmembrane.simulate.pattern import Dots, Painted, Speckle, pattern_of
 from torchmembrane.simulate.raster import seen_triangles

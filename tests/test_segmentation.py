@@ -9,8 +9,8 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.flow import FlowInterpolation
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
-from torchmembrane.estimators.settings import MinimumEnergySettings
 from torchmembrane.estimators.segmentation import PolarAngle, Segmentation, peaks, polar_angle
+from torchmembrane.estimators.settings import MinimumEnergySettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
@@ -150,7 +150,7 @@ def test_the_smoother_leaves_contacts_alone(off_axis):
     bent = torch.nn.functional.normalize(rays[1] + 0.02 * torch.sin(dome.rest[:, [1, 2, 0]]) * (~dome.fixed)[:, None], dim=-1)
     relaxed = torch.zeros(len(dome.rest), dtype=torch.bool)
     relaxed[[30, 31, 40]] = True
-    free, t0 = dome.free, dome.rest.norm(dim=-1)
+    free, t0 = dome.free_vertices, dome.rest.norm(dim=-1)
     index = torch.arange(81).reshape(9, 9)
     pairs = torch.cat([torch.stack([index[1:].flatten(), index[:-1].flatten()], -1),
                        torch.stack([index[:, 1:].flatten(), index[:, :-1].flatten()], -1)])  # fmt: skip

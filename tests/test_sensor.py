@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import shutil
+import warnings
 
 import numpy as np
 import pytest
@@ -10,7 +11,10 @@ import torch
 from PIL import Image
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
+from torchmembrane.sensor.factories import cavity_filling, cavity_law, elastic_energy
+from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.shapes import spherical_cap
 
 GOOD = """format = 1
@@ -399,3 +403,32 @@ def test_a_files_own_lines_are_made_even_unless_they_are_asked_for(tmp_path):
     assert steps.max() < 1.05 * steps.min()
     asked = Sensor.from_file(write(tmp_path, text.replace('file = "flat.npz"', 'file = "flat.npz"\ngrid = [25, 25]')))
     np.testing.assert_array_equal(asked.membrane.rest.reshape(25, 25, 3).numpy(), vertices)
+
+
+def test_the_elastic_energy_is_of_the_sensors_material_unless_another_is_given(tmp_path):
+    sensor = Sensor.from_file(write(tmp_path))
+    energy, membrane = elastic_energy(sensor, sensor.membrane), sensor.membrane
+    same = ElasticEnergy(membrane, "mooney_rivlin", 1.2, 0.15, 0.1)
+    assert torch.equal(energy.gradient(membrane.rest), same.gradient(membrane.rest))
+    other = elastic_energy(sensor, membrane, "neo_hookean", prestretch=1.4, modulus=2.0)
+    assert (other.model, float(other.prestretch), float(other.c1)) == ("neo_hookean", 1.4, 1.0)
+
+
+def test_a_gas_keeps_pressure_times_volume_in_the_sensors_units(tmp_path):
+    sensor = Sensor.from_file(write(tmp_path))
+    assert cavity_filling(sensor, sensor.membrane) == ("gas", (0.1013, sensor.membrane.cavity_volume))
+    known = dataclasses.replace(sensor, cavity=Cavity("gas", 1013.0, 500.0))
+    law = cavity_law(known, sensor.membrane, torch.tensor(0.02))
+    assert law.filling == "gas" and torch.allclose(law.gas, torch.tensor([0.1013, 500.0], dtype=torch.float64))
+    for filling in ("liquid", "open"):
+        other = dataclasses.replace(sensor, cavity=Cavity(filling))
+        assert cavity_filling(other, sensor.membrane) == (filling, None)
+
+
+def test_a_relative_gas_is_a_liquid_and_says_so_where_it_is_asked(tmp_path):
+    sensor = Sensor.from_file(write(tmp_path, replaced("shear_modulus = 0.3\n", "")))
+    with pytest.warns(UserWarning, match="acts as a liquid"):
+        assert cavity_filling(sensor, sensor.membrane, warn=True) == ("liquid", None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert cavity_filling(sensor, sensor.membrane) == ("liquid", None)

@@ -14,7 +14,8 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.presets import NAMES, design, preset, preset_file, sensor_file
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
+from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate import dataset
 from torchmembrane.simulate.frames import Frames, FrameTable
 from torchmembrane.simulate.indenters import Sphere

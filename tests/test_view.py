@@ -9,7 +9,8 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.io import results
 from torchmembrane.io.store import Mesh
 from torchmembrane.plot import frames as view
-from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor
+from torchmembrane.sensor.parts import Cavity, Markers, Material
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.shapes import spherical_cap
 
 GRID = (15, 15)
@@ -179,7 +180,7 @@ def test_saved_as_png_1600_wide_whole_or_not_at_all(mesh, tmp_path):
 def test_a_sensor_is_drawn_with_rays_that_bend_at_ports():
     camera = Camera("pinhole", SIZE, (240, 240), (320, 240), ports=[(2, 3, 1.49)], medium_index=1.33)
     membrane = spherical_cap(12.0, 6.0, 20.0, grid=(9, 9))
-    markers = Markers("dots", positions=membrane.rest[membrane.free].numpy())
+    markers = Markers("dots", positions=membrane.rest[membrane.free_vertices].numpy())
     sensor = Sensor("cap", "mm", camera, membrane, Material("harmonic", 1.2), Cavity("liquid"), markers)
     side, space, image = view.sensor_figure(sensor).axes
     assert "[mm]" in side.get_xlabel() and "[mm]" in space.get_zlabel() and image.get_xlabel() == "u [px]"

@@ -34,30 +34,30 @@ if TYPE_CHECKING:
     from .presets import preset
     from .reconstruct import Reconstructor
     from .sensor.parts import Cavity, Markers, Material, Surface
-    from .sensor.model import Sensor
+    from .sensor.sensor import Sensor
     from .surface.membrane import Membrane
     from .track import Tracker
 
 _HOMES = {
     "Camera": "camera.model",
-    "Cavity": "sensor.model",
+    "Cavity": "sensor.parts",
     "ElasticEnergy": "mechanics.hyperelastic",
     "Estimator": "estimators.base",
     "ForceBalance": "estimators.force_balance",
     "ForceBalanceSettings": "estimators.settings",
-    "Markers": "sensor.model",
-    "Material": "sensor.model",
+    "Markers": "sensor.parts",
+    "Material": "sensor.parts",
     "Membrane": "surface.membrane",
     "MembraneError": "errors",
     "MinimumEnergy": "estimators.minimum_energy",
     "MinimumEnergySettings": "estimators.settings",
-    "Port": "camera.model",
+    "Port": "camera.ports",
     "Reconstruction": "io.results",
     "Reconstructor": "reconstruct",
-    "Sensor": "sensor.model",
+    "Sensor": "sensor.sensor",
     "StandardDeviations": "estimators.covariance",
     "Status": "io.status",
-    "Surface": "sensor.model",
+    "Surface": "sensor.parts",
     "Tracker": "track",
     "export": "onnx.export",
     "preset": "presets",

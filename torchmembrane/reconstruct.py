@@ -1,7 +1,6 @@
 """From images to surfaces: `Reconstructor`, an `nn.Module` that holds everything constant of one sensor."""
 
 import copy
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +19,8 @@ from .io.results import Reconstruction
 from .io.status import Status
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
 from .markers.place import place_markers
-from .mechanics.hyperelastic import ElasticEnergy
-from .sensor.model import Sensor
-from .surface.membrane import Membrane
+from .sensor.factories import cavity_filling, elastic_energy
+from .sensor.sensor import Sensor
 
 ESTIMATORS: dict[str, type[ForceBalance] | type[MinimumEnergy]] = {
     "force-balance": ForceBalance,
@@ -92,7 +90,7 @@ class Reconstructor(nn.Module):
         rim_pixels, rest_image = vertex_pixels[membrane.fixed].numpy(), sensor.markers.rest_image
         self.observer = MarkerObserver(markers, rim_pixels, sensor.name, dtype, rest_image)
         problem = Problem(
-            self.camera, membrane, self._elasticity(membrane), *self._cavity(membrane), markers.points, positions,
+            self.camera, membrane, elastic_energy(sensor, membrane, model), *cavity_filling(sensor, membrane, warn=True), markers.points, positions,
             model_pixels, vertex_pixels, MARKER_NOISE[sensor.markers.kind],
         )  # fmt: skip
         self.estimator = _of(problem, estimator, settings)
@@ -106,23 +104,6 @@ class Reconstructor(nn.Module):
     def from_file(cls, path: str | Path, estimator: str = "force-balance", **options) -> "Reconstructor":
         """The reconstructor of a sensor file; options as for the class."""
         return cls(Sensor.from_file(path), estimator, **options)
-
-    def _elasticity(self, membrane: Membrane) -> ElasticEnergy:
-        material = self.sensor.material
-        return ElasticEnergy(membrane, self.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
-
-    def _cavity(self, membrane: Membrane) -> tuple[str, tuple[float, float] | None]:
-        """The cavity's filling, and a gas' pressure and volume."""
-        sensor = self.sensor
-        if sensor.cavity.filling != "gas":
-            return sensor.cavity.filling, None
-        if sensor.force_unit == "relative":
-            warnings.warn(
-                f"sensor {sensor.name!r}: a gas without shear_modulus and thickness acts as a liquid (volume kept)",
-                stacklevel=3,
-            )
-            return "liquid", None
-        return "gas", (sensor.gas_pressure, sensor.cavity.volume or membrane.cavity_volume)
 
     @property
     def rest_pixels(self) -> Tensor:

@@ -58,7 +58,7 @@ class Tracker:
         self._rest_pixels: Tensor | None = None
 
     def rezero(self, frame: Tensor | np.ndarray | None = None) -> None:
-        """Take a frame without contact, default the latest, for the rest state: what has drifted since the rest image is nulled.
+        """Take a frame without contact, default the latest, for the rest state: what drifted since the rest image is nulled.
 
         Markers that are not found in it keep their places in the sensor's rest image.
 

@@ -7,7 +7,7 @@ import torch
 
 from ..errors import MembraneError
 from ..markers.place import rim_mask
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from .surface import Correction, Feet, correction, feet_of, fine_surface, recalibrated
 from .views import placed_dots
 

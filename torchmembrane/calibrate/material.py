@@ -9,13 +9,13 @@ from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..estimators.base import Equilibrium
 from ..estimators.force_balance import ForceBalance
 from ..io.results import OK, STATUS_TEXTS
-from ..estimators.base import Equilibrium
-from ..mechanics.hyperelastic import ElasticEnergy
 from ..reconstruct import Reconstructor
-from ..sensor.model import Sensor
-from ..surface.membrane import SurfacePoints
+from ..sensor.factories import elastic_energy
+from ..sensor.sensor import Sensor
+from ..surface.projection import SurfacePoints
 
 GRID = (17, 17)  # on finer grids the price is less smooth in the prestretch
 STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it
@@ -78,11 +78,13 @@ def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | No
         p(log l) ~ product over images of [e + (1 - e) exp(-min over x, p of price(x, p; l)) / mean over l of the same]
 
     with e = `WRONG`, for an image that is explained wrongly altogether. Mean and deviation are reported, the latter enlarged
-    where the images contradict one another, and by an error that all images share. A membrane with the wrong l needs forces where
+    where the images contradict one another, and by an error that all images share. A membrane with the wrong l needs forces
+    where
     nothing touches it. Forces are proportional to the modulus, so that each press gives the modulus as force measured / force
     found at modulus 1; their mean is reported.
 
-    Wrong when: the presses are shallow or the markers miss them (the deviation says so); the membrane is not equally stretched in
+    Wrong when: the presses are shallow or the markers miss them (the deviation says so); the membrane is not equally stretched
+    in
     both directions; the rest surface is wrong; the prestretch lies outside `STRETCHES` (then it is found near their end).
     """
     reconstructor = _reconstructor(sensor)
@@ -145,8 +147,8 @@ class Presses:
     def explained(self, stretch: float, modulus: float) -> tuple[ForceBalance, Equilibrium]:
         """The estimator with this material, and what it finds."""
         r, known = self.reconstructor, self.reconstructor.estimator
-        material, cavity, membrane = r.sensor.material, known.cavity, known.membrane
-        elasticity = ElasticEnergy(membrane, material.model, stretch, modulus, material.c2_ratio or 0.0)
+        cavity, membrane = known.cavity, known.membrane
+        elasticity = elastic_energy(r.sensor, membrane, prestretch=stretch, modulus=modulus)
         points = SurfacePoints(r.marker_vertices.numpy(), r.marker_weights.numpy(), np.zeros(len(r.rest_markers)))
         gas = tuple(cavity.gas.tolist())
         estimator = ForceBalance(membrane, elasticity, points, r.rest_markers, known.noise, cavity.filling, gas)
@@ -168,7 +170,8 @@ class Presses:
     def modulus(self, log_stretch: float, deviation: float, forces: np.ndarray) -> tuple[float, float, float, np.ndarray]:
         """Modulus, its deviation at this prestretch, its change with one deviation of the prestretch, magnitudes `[B, 2]`.
 
-        The change is the larger of those to either side, negative: under more tension at rest a softer membrane presses as hard.
+        The change is the larger of those to either side, negative: under more tension at rest a softer membrane presses as
+        hard.
 
         `forces`: as for `material_from_pixels`. A gas resists in newtons: the presses are explained anew with each modulus.
         """

@@ -9,8 +9,9 @@ import torch
 
 from ..errors import MembraneError
 from ..markers.place import rim_mask
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
+from ..surface.topology import rim_loop
 from .fit import outline_centres
 from .surface import dot_outlines, feet_of, fine_surface
 
@@ -113,10 +114,7 @@ def write_mill(path: Path, sensor: Sensor, dots: MillDots) -> None:
 
 def write_svg(path: Path, sensor: Sensor, dots: MillDots) -> None:
     """The dots and the rim seen along the axis, one unit a length unit, for printing or looking at."""
-    m, n = sensor.membrane.grid
-    index = np.arange(m * n).reshape(m, n)
-    loop = np.concatenate([index[:-1, 0], index[-1, :-1], index[:0:-1, -1], index[0, :0:-1]])
-    rim = sensor.membrane.rest.numpy()[loop, :2]
+    rim = sensor.membrane.rest.numpy()[rim_loop(sensor.membrane.grid), :2]
     low, size = rim.min(0) - 2, np.ptp(rim, 0) + 4
     unit = sensor.length_unit
     outline = " ".join(f"{x:.3f},{y:.3f}" for x, y in rim)

@@ -8,7 +8,7 @@ from torch.func import jacfwd, vmap
 
 from ..errors import MembraneError
 from ..markers.dots import measure_dots
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from .fit import Fit, fit, outline_centres, rotations, strays, with_common_errors
 from .surface import dot_outlines, fine_surface, frames_at, recalibrated, unit_shapes
 

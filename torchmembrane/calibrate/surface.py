@@ -8,8 +8,10 @@ import torch
 from scipy.interpolate import RBFInterpolator
 
 from ..errors import MembraneError
-from ..sensor.model import Markers, Sensor, Surface
+from ..sensor.parts import Markers, Surface
+from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
+from ..surface.tangent import tangent_axes
 from ..targets import OUTLINE
 
 FINE = 65  # vertices a side of the surface that is calibrated
@@ -48,9 +50,7 @@ def recalibrated(sensor: Sensor, surface: Membrane, vertices: np.ndarray, positi
 def frames_at(surface: Membrane, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Outward normals `[D, 3]` and two tangents `[D, 3, 2]` of the surface next to `positions [D, 3]`."""
     normals = feet_of(surface, positions).normals
-    first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return normals, np.stack([first, np.cross(normals, first)], -1)
+    return normals, tangent_axes(normals).swapaxes(1, 2)
 
 
 def dot_outlines(surface: Membrane, positions: np.ndarray, radii: np.ndarray) -> np.ndarray:

@@ -10,12 +10,27 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ..linalg import symmetric_adjugate_product, symmetric_determinant
+
 LENS_STEPS = 12  # Newton steps that undo a distortion
 FOLD_SAMPLES = 512  # angles from the axis at which a distortion is tested for folding back
 
 
 def pinhole_direction(image: Tensor, distortion: Tensor) -> Tensor:
-    """Image positions `[..., 2]` to directions `[..., 3]`; `distortion` is k1 k2 p1 p2 k3, or empty."""
+    """Image positions to directions through a pinhole.
+
+    Args:
+        image: `[..., 2]`, pixels less the centre, over the focal length.
+        distortion: k1 k2 p1 p2 k3, or empty.
+
+    Returns:
+        Unit directions `[..., 3]`; NaN where the distortion folds back, and beyond.
+
+    Example:
+        >>> k = torch.tensor([-0.2, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+        >>> pinhole_image(pinhole_direction(torch.tensor([0.3, 0.0], dtype=torch.float64), k), k).round(decimals=9).tolist()
+        [0.3, 0.0]
+    """
     xy = image
     if len(distortion):
         radial, p1, p2, fold = _pinhole_terms(distortion)
@@ -25,8 +40,8 @@ def pinhole_direction(image: Tensor, distortion: Tensor) -> Tensor:
             xy = xy * (fold**2 / (xy * xy).sum(-1, keepdim=True).clamp(min=fold**2)).sqrt()
             distorted, a, b, c = distort(xy, radial, p1, p2)
             du, dv = (target - distorted).unbind(-1)
-            determinant = (a * c - b * b).clamp(min=1e-6)
-            xy = xy + torch.stack([c * du - b * dv, a * dv - b * du], -1) / determinant[..., None]
+            determinant = symmetric_determinant(a, b, c).clamp(min=1e-6)
+            xy = xy + torch.stack(symmetric_adjugate_product(a, b, c, du, dv), -1) / determinant[..., None]
         distorted, a, b, c = distort(xy, radial, p1, p2)
         solved = ((distorted - target).abs() < _tolerance(xy)).all(-1) & (a + c > 0) & (a * c > b * b)
         xy = torch.where(within & solved[..., None], xy, math.nan)
@@ -35,7 +50,19 @@ def pinhole_direction(image: Tensor, distortion: Tensor) -> Tensor:
 
 
 def pinhole_image(points: Tensor, distortion: Tensor) -> Tensor:
-    """Points `[..., 3]` to image positions `[..., 2]`; NaN behind the camera."""
+    """Points to image positions through a pinhole.
+
+    Args:
+        points: `[..., 3]`, length unit.
+        distortion: k1 k2 p1 p2 k3, or empty.
+
+    Returns:
+        `[..., 2]`, in focal lengths; NaN behind the camera and where the distortion folds back.
+
+    Example:
+        >>> pinhole_image(torch.tensor([1.0, -2.0, 10.0]), torch.zeros(0)).round(decimals=6).tolist()
+        [0.10000000149011612, -0.20000000298023224]
+    """
     ahead = points[..., 2:] > 0
     xy = points[..., :2] / torch.where(ahead, points[..., 2:], 1.0)
     if len(distortion):
@@ -54,7 +81,21 @@ def _pinhole_terms(distortion: Tensor) -> tuple[list[Tensor], Tensor, Tensor, Te
 
 
 def distort(xy: Tensor, radial: list[Tensor], p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """OpenCV's radial and tangential distortion `[..., 2]` and its derivative `[[a, b], [b, c]]`, each `[...]`."""
+    """OpenCV's radial and tangential distortion.
+
+    Args:
+        xy: `[..., 2]`, undistorted, in focal lengths.
+        radial: k1 k2 k3.
+        p1: first tangential coefficient.
+        p2: second tangential coefficient.
+
+    Returns:
+        The distorted positions `[..., 2]`, and their derivative's entries `a`, `b`, `c` of `[[a, b], [b, c]]`, each `[...]`.
+
+    Example:
+        >>> distort(torch.tensor([0.5, 0.0]), [torch.tensor(-0.2)], torch.tensor(0.0), torch.tensor(0.0))[0].tolist()
+        [0.4749999940395355, 0.0]
+    """
     x, y = xy.unbind(-1)
     r_squared = x * x + y * y
     factor, rate = _radial(r_squared, radial)
@@ -67,7 +108,19 @@ def distort(xy: Tensor, radial: list[Tensor], p1: Tensor, p2: Tensor) -> tuple[T
 
 
 def fisheye_direction(image: Tensor, distortion: Tensor) -> Tensor:
-    """Image positions `[..., 2]` (rad, distorted) to directions `[..., 3]`; `distortion` is k1 k2 k3 k4, or empty."""
+    """Image positions to directions through a fisheye lens.
+
+    Args:
+        image: `[..., 2]`, pixels less the centre, over the focal length (rad, distorted).
+        distortion: k1 k2 k3 k4, or empty.
+
+    Returns:
+        Unit directions `[..., 3]`; NaN where the distortion folds back, and beyond.
+
+    Example:
+        >>> fisheye_direction(torch.tensor([torch.pi / 2, 0.0]), torch.zeros(0)).round(decimals=6).tolist()
+        [1.0, 0.0, -0.0]
+    """
     r_squared = (image * image).sum(-1, keepdim=True)
     off_axis = r_squared > torch.finfo(image.dtype).eps ** 2
     radius = torch.where(off_axis, r_squared, 1.0).sqrt()
@@ -88,18 +141,30 @@ def fisheye_direction(image: Tensor, distortion: Tensor) -> Tensor:
 
 
 def fisheye_image(points: Tensor, distortion: Tensor) -> Tensor:
-    """Points `[..., 3]` to image positions `[..., 2]`, up to 180 degrees from the axis."""
+    """Points to image positions through a fisheye lens, up to 180 degrees from the axis.
+
+    Args:
+        points: `[..., 3]`, length unit.
+        distortion: k1 k2 k3 k4, or empty.
+
+    Returns:
+        `[..., 2]`, rad, distorted; NaN where the distortion folds back, and on the axis behind the camera.
+
+    Example:
+        >>> fisheye_image(torch.tensor([2.0, 0.0, 0.0]), torch.zeros(0)).round(decimals=4).tolist()
+        [1.5707999467849731, 0.0]
+    """
     xy, z = points[..., :2], points[..., 2:]
     rho_squared = (xy * xy).sum(-1, keepdim=True)
     off_axis = rho_squared > torch.finfo(points.dtype).eps ** 2 * z * z
     rho = torch.where(off_axis, rho_squared, 1.0).sqrt()
     theta = torch.atan2(torch.where(off_axis, rho, 0.0), torch.where(off_axis, z, 1.0))
     scale = torch.where(off_axis, theta / rho, 1 / torch.where(z > 0, z, 1.0))
-    seen = off_axis | (z > 0)
+    visible = off_axis | (z > 0)
     if len(distortion):
-        seen = seen & (theta <= _fisheye_fold(distortion))
+        visible = visible & (theta <= _fisheye_fold(distortion))
         scale = scale * _radial(theta * theta, distortion.unbind())[0]
-    return torch.where(seen, xy * scale, math.nan)
+    return torch.where(visible, xy * scale, math.nan)
 
 
 def _fisheye_fold(distortion: Tensor) -> Tensor:
@@ -110,7 +175,8 @@ def _fisheye_fold(distortion: Tensor) -> Tensor:
 def _radial(r_squared: Tensor, coefficients: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """`1 + sum_i k_i r^(2 i)` and its derivative in r^2."""
     factor, rate = torch.zeros_like(r_squared), torch.zeros_like(r_squared)
-    for k in (*reversed(coefficients), 1.0):
+    descending: list[Tensor | float] = [*reversed(coefficients), 1.0]
+    for k in descending:
         factor, rate = factor * r_squared + k, rate * r_squared + factor
     return factor, rate
 
@@ -124,4 +190,6 @@ def _fold(radii: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
 
 def _tolerance(value: Tensor) -> float:
     """How far from its target, in focal lengths, Newton may end and still count as having found the position."""
-    return torch.finfo(value.dtype).eps ** (2 / 3)
+    epsilon: float = torch.finfo(value.dtype).eps
+    tolerance: float = epsilon ** (2 / 3)
+    return tolerance

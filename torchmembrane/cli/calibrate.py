@@ -22,7 +22,8 @@ from ..io.images import read_image
 from ..jobs.local import find_inputs
 from ..plot.calibration import Report, fit_figure, material_figure, mill_figure, surface_figure
 from ..presets import sensor_file
-from ..sensor.model import Markers, Sensor
+from ..sensor.parts import Markers
+from ..sensor.sensor import Sensor
 from ..targets import Checkerboard, DotBoard
 
 CONTENT = """

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from ..io.results import STATUS_TEXTS
-from ..sensor.model import METRE
+from ..sensor.parts import METRE
 
 LISTED = 12
 """Missing markers that are named one by one."""

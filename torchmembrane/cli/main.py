@@ -10,7 +10,7 @@ import torch
 
 from .. import __version__
 from ..errors import MembraneError
-from ..estimators.minimum_energy import ELEMENTS
+from ..estimators.settings import ELEMENTS
 from ..io.images import read_image
 from ..io.results import load_frame
 from ..io.store import FORMATS, MESH, Mesh, Settings, check_folder
@@ -18,7 +18,7 @@ from ..jobs.local import find_inputs, reconstruct_files
 from ..mechanics.hyperelastic import MODELS
 from ..presets import sensor_file
 from ..reconstruct import ESTIMATORS, Reconstructor
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from .calibrate import add_calibrate
 from .describe import described, rest_frame
 from .simulate import add_simulate

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from ..errors import MembraneError
 from ..presets import NAMES, sensor_file
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from ..simulate.dataset import KINDS, Plan, make_frames, stroke_to
 from ..simulate.frames import FORMATS, Video, open_frames
 from ..simulate.indenters import Box, Cylinder, Indenter, Mesh, Plane, Sphere, Wedge

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..surface.membrane import corners
+from ..surface.topology import corners
 
 
 class AffineMap(NamedTuple):

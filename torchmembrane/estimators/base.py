@@ -8,7 +8,8 @@ from torch import Tensor
 from ..camera.model import Camera
 from ..mechanics.cavity import CavityLaw
 from ..mechanics.hyperelastic import ElasticEnergy
-from ..surface.membrane import Membrane, SurfacePoints
+from ..surface.membrane import Membrane
+from ..surface.projection import SurfacePoints
 
 CONTACT_POINTS = 4
 """Contacts that are reported at most."""

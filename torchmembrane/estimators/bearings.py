@@ -6,8 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from ..solve.stencil_system import NEAR
-from ..surface.membrane import Membrane, SurfacePoints
+from ..surface.membrane import Membrane
+from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner
+from ..surface.tangent import tangent_frame
 from .base import Observation
 
 
@@ -46,7 +48,7 @@ class MarkerBearings(nn.Module):
     def measured(self, observation: Observation) -> Bearings:
         """The markers' rays as `angles` takes them."""
         origins, directions, confidence = observation
-        return Bearings(origins.mT, across(directions.mT), confidence / self.noise**2)
+        return Bearings(origins.mT, tangent_frame(directions.mT, dim=1), confidence / self.noise**2)
 
     def markers(self, x: Tensor) -> Tensor:
         """The markers' positions on the surface `x [B, V, 3]`, `[B, D, 3]`."""
@@ -60,15 +62,6 @@ class MarkerBearings(nn.Module):
         along = (to_marker / distance)[:, None]
         angle = (measured.across * along).sum(2, keepdim=True)
         return angle.squeeze(2), (measured.across - angle * along) / distance[:, None]
-
-
-def across(directions: Tensor) -> Tensor:
-    """Two unit vectors across each unit direction, `[B, 3, D]` to `[B, 2, 3, D]`."""
-    x, y, z = directions.unbind(1)
-    none = torch.zeros_like(x)
-    first = torch.where((z.abs() < 0.9)[:, None], torch.stack([y, -x, none], 1), torch.stack([none, z, -y], 1))
-    first = torch.nn.functional.normalize(first, dim=1)
-    return torch.stack([first, torch.linalg.cross(directions, first, dim=1)], 1)
 
 
 def _shares(membrane: Membrane, markers: SurfacePoints) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from ..errors import MembraneError
-from ..surface.membrane import Membrane, SurfacePoints
+from ..surface.membrane import Membrane
+from ..surface.projection import SurfacePoints
 
 NEWTON_STEPS = 12
 OUTSIDE = 1e-9

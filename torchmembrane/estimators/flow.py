@@ -7,7 +7,9 @@ from torch import Tensor, nn
 from ..errors import MembraneError
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..solve.conjugate_gradient import conjugate_gradient
-from ..surface.membrane import Membrane, SurfacePoints, corners, corners_to_vertices
+from ..surface.membrane import Membrane
+from ..surface.projection import SurfacePoints
+from ..surface.topology import corners, corners_to_vertices
 from .base import Problem
 from .bilinear import bilinear_matrix
 from .settings import FLOWS
@@ -60,7 +62,7 @@ class FlowInterpolation(nn.Module):
         if D < 3:
             raise MembraneError(f"FlowInterpolation: {D} markers; expected at least 3")
         W, bending = weights(markers, V), roughness(membrane, D)
-        free = membrane.free
+        free = membrane.free_vertices
         normal = (W.T @ W + bending)[free][:, free]
         inverse = torch.zeros(V, V, dtype=torch.float64)
         inverse[free[:, None], free] = torch.linalg.inv(normal)

@@ -31,7 +31,8 @@ from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..solve.kkt import BorderedStep, solve_bordered
-from ..surface.membrane import Membrane, SurfacePoints
+from ..surface.membrane import Membrane
+from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner, pad_border
 from .base import CONTACT_POINTS, Contacts, Equilibrium, Observation, Problem
 from .bearings import Bearings, MarkerBearings

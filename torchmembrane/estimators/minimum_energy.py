@@ -16,7 +16,8 @@ from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..solve.anderson import accelerated, first
 from ..solve.kkt import constrained_minimum
-from ..surface.membrane import Membrane, corners, corners_to_vertices
+from ..surface.membrane import Membrane
+from ..surface.topology import corners, corners_to_vertices
 from .base import Contacts, Equilibrium, Observation, Problem, no_contacts
 from .flow import VertexFlow
 from .settings import MinimumEnergySettings
@@ -112,7 +113,7 @@ class MinimumEnergy(nn.Module):
 
     def _rest_inverse(self, directions: Tensor) -> Tensor:
         K = self.energy.stiffness_along(self.membrane.rest, directions)
-        V, free, grid = len(self.membrane.rest), self.membrane.free, self.membrane.grid
+        V, free, grid = len(self.membrane.rest), self.membrane.free_vertices, self.membrane.grid
         one = torch.eye(V, dtype=torch.float64)
         smooth = self.smoothing * self._smoother(self._smoother(one))
         dense = (corners_to_vertices(K @ corners(one, grid), grid) + smooth)[free][:, free]

@@ -6,8 +6,10 @@ from PIL import Image, ImageDraw
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from ..sensor.model import Sensor
-from ..surface.membrane import SurfacePoints
+from ..sensor.sensor import Sensor
+from ..surface.projection import SurfacePoints
+from ..surface.tangent import tangent_axes
+from ..surface.topology import rim_loop
 from .dots import DotPattern, find_dots, measure_dots
 from .locate import DotLocator
 from .texture import TextureLocator, choose_patches
@@ -83,12 +85,9 @@ def _unit_dot_shapes(sensor: Sensor, placed: PlacedMarkers) -> np.ndarray:
     """How a dot of radius 1 in the surface's tangent plane is imaged: `[D, 2, 2]`, px per length unit."""
     normals = (sensor.membrane.rest_normals.numpy()[placed.points.vertices] * placed.points.weights[..., None]).sum(1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    least = np.eye(3)[np.abs(normals).argmin(1)]
-    tangent = np.cross(normals, least)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     step = 1e-4 * sensor.membrane.size
     columns = []
-    for direction in (tangent, np.cross(normals, tangent)):
+    for direction in tangent_axes(normals).swapaxes(0, 1):
         ends = [sensor.camera.point_to_pixel(torch.from_numpy(placed.positions + s * step * direction)) for s in (1, -1)]
         columns.append(((ends[0] - ends[1]) / (2 * step)).numpy())
     return np.stack(columns, -1)
@@ -96,9 +95,7 @@ def _unit_dot_shapes(sensor: Sensor, placed: PlacedMarkers) -> np.ndarray:
 
 def rim_mask(sensor: Sensor, vertex_pixels: Tensor) -> np.ndarray:
     """Pixels inside the rim's outline, `[height, width]` bool."""
-    m, n = sensor.membrane.grid
-    index = np.arange(m * n).reshape(m, n)
-    loop = np.concatenate([index[:-1, 0], index[-1, :-1], index[:0:-1, -1], index[0, :0:-1]])
+    loop = rim_loop(sensor.membrane.grid)
     mask = Image.new("1", tuple(sensor.camera.image_size))
     ImageDraw.Draw(mask).polygon([tuple(p) for p in vertex_pixels[loop].tolist()], fill=1)
     return np.asarray(mask)

@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from ..surface.membrane import Membrane, corners, corners_to_vertices
+from ..surface.membrane import Membrane
+from ..surface.topology import corners, corners_to_vertices
 
 
 class AffineQuadrilaterals(nn.Module):

@@ -60,6 +60,6 @@ def rest_balance(membrane: Membrane, energy) -> tuple[Tensor, Tensor]:
     paper's element.
     """
     force, push = energy.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
-    normal, free = membrane.rest_normals, membrane.free
+    normal, free = membrane.rest_normals, membrane.free_vertices
     p0 = (force * normal)[free].sum() / (push * normal)[free].sum()
     return p0, torch.where(membrane.fixed[:, None], 0.0, force - p0 * push)

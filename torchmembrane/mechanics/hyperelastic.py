@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from ..surface.membrane import Membrane, corners, triangles_of
+from ..surface.membrane import Membrane
 from ..surface.stencil import apply_stencil, one_ring_edges, stencil_kernels
+from ..surface.topology import corners, triangles_of
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 _FIRST = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))

@@ -15,13 +15,13 @@ from onnx import TensorProto, helper
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from ..estimators.force_balance import ForceBalance, Observation
+from ..estimators.base import Equilibrium, Observation
+from ..estimators.force_balance import ForceBalance
 from ..estimators.minimum_energy import STEPS
 from ..io.results import STATUS_TEXTS, Reconstruction
 from ..io.store import Mesh, Settings
 from ..markers.locate import LEVELS, DotLocator
 from ..markers.match import SETTLING, WIDTHS, DotMatcher, LocalDeformation
-from ..estimators.base import Equilibrium
 from ..reconstruct import Reconstructor
 from ..solve.block_tridiagonal import parts
 from .graph import Assembly, traced

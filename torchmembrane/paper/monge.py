@@ -1,6 +1,7 @@
 """The paper's own unknown: heights at fixed (x, y), `z = s(x, y) + psi(x, y)` (eqs. 5-10, 14, 18, 22; Appendix D).
 
-A piece of the membrane with rest slopes `s_x, s_y` moves by the plane map A to x', where the surface has the slopes of `s + psi`:
+A piece of the membrane with rest slopes `s_x, s_y` moves by the plane map A to x', where the surface has the slopes of `s +
+psi`:
 
     tr(A^T H A adj G) = m_xx psi_x^2 + m_xy psi_x psi_y + m_yy psi_y^2 + m_x psi_x + m_y psi_y + m_0    (eqs. 55-62)
 
@@ -15,11 +16,12 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from ..estimators.minimum_energy import grid_laplacian
 from ..estimators.base import Equilibrium
+from ..estimators.minimum_energy import grid_laplacian
 from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
-from ..surface.membrane import Membrane, corners, triangles_of
+from ..surface.membrane import Membrane
+from ..surface.topology import corners, triangles_of
 
 STEEPEST = 20.0  # slope of a rest surface that heights can describe
 
@@ -86,7 +88,8 @@ def form_matrix(m: Coefficients, dx: float, dy: float) -> Tensor:
 class MongeMinimumEnergy(nn.Module):
     """The minimum-energy estimator with heights at fixed (x, y) as unknowns, harmonic material, liquid filling; for study.
 
-    Arguments: membrane; `ElasticEnergy` ("harmonic"); rest rays `origins`, `directions [V, 3]`; steps: 1 is the paper's (eqs. 18, 22,
+    Arguments: membrane; `ElasticEnergy` ("harmonic"); rest rays `origins`, `directions [V, 3]`; steps: 1 is the paper's (eqs.
+    18, 22,
     about psi = 0), more repeat it about the surface found. Calling it with the rays of one frame gives the `Equilibrium`, its
     vertices the material points: where their rays meet the surface found. Raises `MembraneError` for a surface that is no graph
     over (x, y). A rest load in psi is subtracted, so that zero flow gives exactly psi = 0.
@@ -113,8 +116,10 @@ class MongeMinimumEnergy(nn.Module):
         self.rest_slope = (self.rest_plane @ edges[..., 2:]).squeeze(-1)
         self.weight = (elasticity.tension * footprint).sqrt()[..., None, None]
         shares = footprint.flatten().repeat_interleave(3) / 3
-        self.v = footprint.new_zeros(len(membrane.rest)).index_add(0, membrane.triangles.flatten(), shares)[membrane.free]
-        S = grid_laplacian(torch.eye(len(membrane.rest), dtype=torch.float64), membrane.grid)[:, membrane.free]
+        self.v = footprint.new_zeros(len(membrane.rest)).index_add(0, membrane.triangles.flatten(), shares)[
+            membrane.free_vertices
+        ]
+        S = grid_laplacian(torch.eye(len(membrane.rest), dtype=torch.float64), membrane.grid)[:, membrane.free_vertices]
         self.smooth = smoothing * elasticity.tension * S.T @ S
         Q, gamma = self._linearised(torch.zeros_like(self.v), *rest_rays)
         self.rest_load = -Q.T @ gamma - self.rest_pressure * self.v
@@ -144,7 +149,7 @@ class MongeMinimumEnergy(nn.Module):
 
     def surface(self, psi: Tensor) -> Tensor:
         """The points `(x, y, s + psi)` over the fixed grid, `[V, 3]`."""
-        lift = psi.new_zeros(len(self.membrane.rest)).index_add(0, self.membrane.free, psi)
+        lift = psi.new_zeros(len(self.membrane.rest)).index_add(0, self.membrane.free_vertices, psi)
         return torch.cat([self.membrane.rest[:, :2], self.membrane.rest[:, 2:] + lift[:, None]], 1)
 
     def _cells(self, psi: Tensor, origins: Tensor, directions: Tensor) -> Tensor:

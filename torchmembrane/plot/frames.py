@@ -13,6 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..io.results import OK, STATUS_TEXTS
 from ..io.store import Mesh
+from ..surface.topology import rim_loop
 
 BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # told apart with any colour vision
 PRESSED_IN, PUSH = "RdBu", "Oranges"  # negative (in) red, positive (out) blue
@@ -328,8 +329,7 @@ def _line_through(vertex: int, X, grid, across: int) -> np.ndarray:
 
 def _rim(grid) -> np.ndarray:
     """Vertex indices once around the grid's border, closed."""
-    index = np.arange(grid[0] * grid[1]).reshape(grid)
-    return np.concatenate([index[:-1, 0], index[-1, :-1], index[:0:-1, -1], index[0, ::-1]])
+    return np.append(rim_loop(grid), 0)
 
 
 def _side_axis(X, vertex: int) -> int:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ..errors import MembraneError
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 
 NAMES = ("fingertip", "bubble", "half_cylinder")
 PREFIX = "preset:"

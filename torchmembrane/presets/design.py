@@ -9,8 +9,9 @@ from tqdm import tqdm
 from ..camera.model import Camera
 from ..io.images import to_grey
 from ..mechanics.cavity import rest_balance
-from ..mechanics.hyperelastic import ElasticEnergy
-from ..sensor.model import METRE, Cavity, Markers, Material, Sensor, Surface
+from ..sensor.factories import elastic_energy
+from ..sensor.parts import METRE, Cavity, Markers, Material, Surface
+from ..sensor.sensor import Sensor
 from ..sensor.toml import default_grid
 from ..simulate.look import Look, noisy
 from ..simulate.render import Renderer
@@ -68,16 +69,17 @@ def write(folder: Path) -> None:
 def _sensor(name, camera, surface, material, positions, sizes, gas=False) -> Sensor:
     markers = Markers("dots", "dark", positions, sizes)
     membrane = surface.membrane(default_grid(markers))
-    cavity = Cavity("gas", AIR + _overpressure(membrane, material)) if gas else Cavity("liquid")
-    blank = Sensor(name, "mm", camera, membrane, material, cavity, markers, surface)
+    blank = Sensor(name, "mm", camera, membrane, material, Cavity("liquid"), markers, surface)
+    if gas:
+        blank = replace(blank, cavity=Cavity("gas", AIR + _overpressure(blank)))
     image = noisy(Renderer(blank, look=Look())(membrane.rest), NOISE, np.random.default_rng(0))
     return replace(blank, markers=replace(markers, rest_image=to_grey((255 * image).round().byte().numpy())))
 
 
-def _overpressure(membrane, material) -> float:
+def _overpressure(sensor: Sensor) -> float:
     """What the membrane's tension holds at rest, whole hPa."""
-    elasticity = ElasticEnergy(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
-    return float(round(float(rest_balance(membrane, elasticity)[0]) * METRE["mm"] ** 2 / 100))
+    rest_pressure, _ = rest_balance(sensor.membrane, elastic_energy(sensor, sensor.membrane))
+    return float(round(float(rest_pressure) * METRE["mm"] ** 2 / 100))
 
 
 def _dome_dots(semi_axes, opening: float, base_z: float, spacing: float) -> tuple[np.ndarray, list[str]]:

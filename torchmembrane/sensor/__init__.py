@@ -1,1 +1,1 @@
-"""A sensor: what is known of it, and its file."""
+"""A sensor: what is known of it, its file, and the mechanics that follow from it."""

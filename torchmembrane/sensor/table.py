@@ -7,21 +7,36 @@ import difflib
 import json
 import math
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from ..errors import MembraneError
 
 
 class Table:
-    """One table of a TOML file: typed, finite values by key, or a `MembraneError` that says where and what."""
+    """One table of a TOML file: typed, finite values by key, or a `MembraneError` that says where and what.
 
-    def __init__(self, path: Path, name: str, values: Mapping):
+    Args:
+        path: the file.
+        name: of the table, dotted; empty for the file itself.
+        values: by key.
+
+    Example:
+        >>> table = Table(Path("sensor.toml"), "material", {"prestretch": "1.2"})
+        >>> table.number("prestretch")
+        Traceback (most recent call last):
+        ...
+        torchmembrane.errors.MembraneError: sensor.toml: [material] prestretch = "1.2"; expected a finite number
+    """
+
+    def __init__(self, path: Path, name: str, values: Mapping[str, Any]) -> None:
         self.path, self.name, self.values = path, name, values
 
     @classmethod
     def from_file(cls, path: Path) -> "Table":
+        """The table of a whole file."""
         try:
             text = path.read_text(encoding="utf-8")
             return cls(path, "", tomllib.loads(text))
@@ -35,19 +50,24 @@ class Table:
             cause = str(error).replace("at end of document", f"at line {len(text.splitlines())}, the last")
             raise MembraneError(f"{path}: not valid TOML: {cause}; correct that line") from error
 
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
     def where(self, key: str = "") -> str:
+        """File, table and key, as messages begin."""
         return " ".join(part for part in (f"{self.path}:", f"[{self.name}]" if self.name else "", key) if part)
 
     def refuse(self, key: str, expected: str) -> MembraneError:
+        """The error for a value that is not what was expected."""
         return MembraneError(f"{self.where(key)} = {_shown(self.values[key])}; expected {expected}")
 
     @contextmanager
-    def naming(self, key: str = ""):
+    def naming(self, key: str = "") -> Iterator[None]:
         """Put file, table and key before the message of whatever is refused inside."""
         try:
             yield
         except MembraneError as error:
-            shown = f" = {_shown(self.values[key])}" if key in self.values else ""
+            shown = f" = {_shown(self.values[key])}" if key in self else ""
             raise MembraneError(f"{self.where(key)}{shown}: {error}") from error
 
     def allow(self, keys: Iterable[str], owner: str = "here") -> None:
@@ -59,72 +79,99 @@ class Table:
                 remedy = f"did you mean {closest[0]!r}?" if closest else "remove it"
                 raise MembraneError(f"{self.where(key)} is unknown {owner}; expected {', '.join(keys)}; {remedy}")
 
-    def _get(self, key: str, right, expected: str, required: bool):
-        if key not in self.values:
-            if required:
-                raise MembraneError(f"{self.where(key)} is missing; expected {expected}: add it")
-            return None
-        if not right(self.values[key]):
-            raise self.refuse(key, expected)
-        return self.values[key]
-
-    def table(self, key: str, required: bool = True) -> "Table | None":
+    def table(self, key: str) -> "Table":
+        """The table within this one."""
         name = f"{self.name}.{key}" if self.name else key
-        values = self._get(key, lambda v: isinstance(v, dict), f"a table [{name}]", required)
-        return None if values is None else Table(self.path, name, values)
+        return Table(self.path, name, self._get(key, _is_table, f"a table [{name}]"))
 
     def tables(self, key: str) -> list["Table"]:
-        def right(values):
-            return isinstance(values, list) and all(isinstance(v, dict) for v in values)
+        """The tables of a list of them, `[[key]]`; none if there are none."""
+        if key not in self:
+            return []
+        values = self._get(key, _are_tables, f"tables [[{self.name}.{key}]]")
+        return [Table(self.path, f"{self.name}.{key}[{i}]", value) for i, value in enumerate(values)]
 
-        values = self._get(key, right, f"tables [[{self.name}.{key}]]", False) or []
-        return [Table(self.path, f"{self.name}.{key}[{i}]", v) for i, v in enumerate(values)]
-
-    def text(self, key: str, choices: Iterable[str] = (), required: bool = True) -> str | None:
+    def text(self, key: str, choices: Iterable[str] = ()) -> str:
+        """Text that is not empty; one of `choices` where they are given."""
         choices = tuple(choices)
         expected = " or ".join(map(_shown, choices)) or "text in quotes"
-        return self._get(key, lambda v: isinstance(v, str) and v and (not choices or v in choices), expected, required)
 
-    def number(self, key: str, required: bool = True) -> float | None:
-        value = self._get(key, _finite, "a finite number", required)
-        return None if value is None else float(value)
+        def right(value: object) -> bool:
+            return isinstance(value, str) and value != "" and (not choices or value in choices)
 
-    def numbers(self, key: str, count: int | None, required: bool = True, whole: bool = False) -> list | None:
-        right, kind = (_whole, "whole") if whole else (_finite, "finite")
-        expected = f"a list of {'' if count is None else f'{count} '}{kind} numbers"
+        value: str = self._get(key, right, expected)
+        return value
 
-        def right_list(values):
-            return isinstance(values, list) and len(values) == (count or len(values)) and all(map(right, values))
+    def number(self, key: str) -> float:
+        """A finite number."""
+        return float(self._get(key, _finite, "a finite number"))
 
-        values = self._get(key, right_list, expected, required)
-        return None if values is None else [value if whole else float(value) for value in values]
+    def numbers(self, key: str, count: int | None = None) -> list[float]:
+        """A list of finite numbers, `count` of them where that is given."""
+        return [float(value) for value in self._list(key, count, _finite, "finite")]
 
-    def file(self, key: str, required: bool = True) -> Path | None:
+    def whole_numbers(self, key: str, count: int) -> list[int]:
+        """A list of `count` whole numbers."""
+        return self._list(key, count, _whole, "whole")
+
+    def file(self, key: str) -> Path:
         """The path of the file that `key` names, relative to this file's folder."""
-        name = self.text(key, required=required)
-        if name is None:
-            return None
-        path = self.path.parent / name
+        path = self.path.parent / self.text(key)
         if not path.is_file():
             raise self.refuse(key, f"a file; there is none at {path}: paths are relative to the sensor file")
         return path
 
+    def _list(self, key: str, count: int | None, right: Callable[[object], bool], kind: str) -> list[Any]:
+        def right_list(values: object) -> bool:
+            return isinstance(values, list) and len(values) == (count or len(values)) and all(map(right, values))
 
-def toml_lines(name: str, values: Mapping, repeated: bool = False) -> list[str]:
-    """A table as lines of TOML: text, numbers and lists of numbers; keys that are None are left out."""
+        values: list[Any] = self._get(key, right_list, f"a list of {'' if count is None else f'{count} '}{kind} numbers")
+        return values
+
+    def _get(self, key: str, right: Callable[[object], bool], expected: str) -> Any:
+        if key not in self:
+            raise MembraneError(f"{self.where(key)} is missing; expected {expected}: add it")
+        if not right(self.values[key]):
+            raise self.refuse(key, expected)
+        return self.values[key]
+
+
+def toml_lines(name: str, values: Mapping[str, object], repeated: bool = False) -> list[str]:
+    """A table as lines of TOML.
+
+    Args:
+        name: of the table, dotted; empty for the file itself.
+        values: text, numbers and lists of numbers by key; keys that are None are left out.
+        repeated: one of a list of tables.
+
+    Returns:
+        The lines, the table's head first.
+
+    Example:
+        >>> toml_lines("cavity", {"filling": "gas", "pressure": 1013.0, "volume": None})
+        ['[cavity]', 'filling = "gas"', 'pressure = 1013.0']
+    """
     head = [f"[[{name}]]" if repeated else f"[{name}]"] if name else []
     return head + [f"{key} = {_shown(value)}" for key, value in values.items() if value is not None]
 
 
-def _shown(value) -> str:
+def _shown(value: object) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
     return repr(list(value) if isinstance(value, tuple) else value)
 
 
-def _finite(value) -> bool:
+def _finite(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _whole(value) -> bool:
+def _whole(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _is_table(value: object) -> bool:
+    return isinstance(value, dict)
+
+
+def _are_tables(values: object) -> bool:
+    return isinstance(values, list) and all(map(_is_table, values))

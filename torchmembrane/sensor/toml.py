@@ -3,35 +3,52 @@
 import csv
 import math
 import zipfile
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..camera.model import Camera, Port
+from ..camera.model import Camera
+from ..camera.ports import Port
 from ..errors import MembraneError
-from ..io.images import write_image
+from ..io.images import read_image, write_image
 from ..surface.membrane import Membrane
-from .model import (
-    FORMAT,
+from .parts import (
     METRE,
     SHAPES_BY_ARRAYS,
     SHAPES_BY_NUMBERS,
     Cavity,
     Markers,
     Material,
-    Sensor,
+    SensorParts,
     Surface,
-    content,
     refuse_off_surface,
 )
 from .table import Table, toml_lines
 
-COARSEST, FINEST = 25, 33  # solver grids chosen without being told
+FORMAT = 1
+COARSEST, FINEST = 25, 33  # solver grids chosen where the file names none
 DOTS_HEADER = ["x", "y", "z", "size"]
 
 
-def read_sensor(path: Path) -> Sensor:
-    """See `Sensor.from_file`."""
+def read_sensor(path: Path) -> SensorParts:
+    """The parts of the sensor that a `sensor.toml` describes; `Sensor.from_file` puts them together.
+
+    Args:
+        path: of the `.toml` file; the files named in it are relative to its folder.
+
+    Returns:
+        `SensorParts`.
+
+    Raises:
+        MembraneError: names file, key (or line), what came, what was expected and the remedy.
+
+    Example:
+        >>> parts = read_sensor(Path("examples/sensor.toml"))
+        >>> parts.material.model, parts.membrane.grid
+        ('neo_hookean', (33, 33))
+    """
     file = Table.from_file(path)
     file.allow(("format", "name", "length_unit", "camera", "membrane", "material", "cavity", "markers"))
     if file.number("format") != FORMAT:
@@ -43,21 +60,28 @@ def read_sensor(path: Path) -> Sensor:
     markers, lines = _read_markers(file.table("markers"))
     surface, membrane = _read_membrane(file.table("membrane"), markers)
     if markers.positions is not None:
-        refuse_off_surface(membrane, markers.positions, lambda i: f"{lines[i]}: the dot")
-    with file.naming():
-        return Sensor(name, length_unit, camera, membrane, material, cavity, markers, surface)
+        refuse_off_surface(membrane, markers.positions, [f"{line}: the dot" for line in lines])
+    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface)
 
 
-def write_sensor(sensor: Sensor, path: Path) -> Path:
-    """See `Sensor.to_file`."""
+def write_sensor(parts: SensorParts, path: Path) -> Path:
+    """Write a sensor's file, its arrays beside it; `Sensor.to_file` calls this.
+
+    Args:
+        parts: what is written.
+        path: of the `.toml` file; the other files are named after it.
+
+    Returns:
+        The path.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    tables, surface, markers = content(sensor), sensor.surface, sensor.markers
+    tables, surface, markers = tables_of(parts), parts.surface, parts.markers
     if surface.shape in SHAPES_BY_ARRAYS:
         tables["membrane"]["file"] = f"{path.stem}_{surface.shape}.npz"
         np.savez_compressed(path.with_name(tables["membrane"]["file"]), **surface.values)
     if markers.positions is not None:
         tables["markers"]["file"] = f"{path.stem}_dots.csv"
-        _write_dots(path.with_name(tables["markers"]["file"]), markers)
+        _write_dots(path.with_name(tables["markers"]["file"]), markers.positions, markers.sizes or [])
     if markers.rest_image is not None:
         tables["markers"]["rest_image"] = write_image(path.with_name(f"{path.stem}_rest"), markers.rest_image).name
     ports, medium = tables["camera"].pop("ports"), tables["camera"].pop("medium")
@@ -70,10 +94,37 @@ def write_sensor(sensor: Sensor, path: Path) -> Path:
     return path
 
 
+def tables_of(parts: SensorParts) -> dict[str, dict[str, Any]]:
+    """A sensor's numbers and words, without arrays, as the tables and keys of its file."""
+    camera, material, cavity, markers = parts.camera, parts.material, parts.cavity, parts.markers
+    return {
+        "": {"format": FORMAT, "name": parts.name, "length_unit": parts.length_unit},
+        "camera": {
+            "model": camera.model,
+            "image_size": list(camera.image_size),
+            **{key: getattr(camera, key).tolist() for key in ("focal", "centre", "distortion")},
+            "ports": [port._asdict() for port in camera.ports],
+            "medium": {"index": camera.medium_index.item()} if camera.ports else {},
+        },
+        "membrane": {"shape": parts.surface.shape, "grid": list(parts.membrane.grid), **parts.surface.numbers()},
+        "material": asdict(material),
+        "cavity": asdict(cavity),
+        "markers": {"kind": markers.kind, "polarity": markers.polarity},
+    }
+
+
 def default_grid(markers: Markers) -> tuple[int, int]:
     """The solver grid where the file names none: 2.8 times as fine as the dots listed, 25, 29 or 33; 25 for texture.
 
-    33 where dots are still to be found in the rest image.
+    Args:
+        markers: listed dots, dots still to be found in the rest image (33), or texture.
+
+    Returns:
+        Numbers of vertices along both directions.
+
+    Example:
+        >>> default_grid(Markers("dots", positions=np.zeros((100, 3))))
+        (29, 29)
     """
     if markers.kind == "texture":
         return COARSEST, COARSEST
@@ -86,7 +137,7 @@ def default_grid(markers: Markers) -> tuple[int, int]:
 def _read_camera(table: Table) -> Camera:
     table.allow(("model", "image_size", "focal", "centre", "distortion", "ports", "medium"))
     ports = table.tables("ports")
-    medium = table.table("medium", required=bool(ports))
+    medium = table.table("medium") if ports or "medium" in table else None
     for part in ports:
         part.allow(Port._fields)
     if medium:
@@ -94,10 +145,10 @@ def _read_camera(table: Table) -> Camera:
     with table.naming():
         return Camera(
             model=table.text("model", ("pinhole", "fisheye")),
-            image_size=table.numbers("image_size", 2, whole=True),
+            image_size=table.whole_numbers("image_size", 2),
             focal=table.numbers("focal", 2),
             centre=table.numbers("centre", 2),
-            distortion=table.numbers("distortion", None),
+            distortion=table.numbers("distortion"),
             ports=[Port(*(port.number(key) for key in Port._fields)) for port in ports],
             medium_index=medium.number("index") if medium else 1.0,
         )
@@ -105,7 +156,7 @@ def _read_camera(table: Table) -> Camera:
 
 def _read_material(table: Table) -> Material:
     table.allow(("model", "prestretch", "c2_ratio", "shear_modulus", "thickness"))
-    numbers = {key: table.number(key, required=False) for key in ("c2_ratio", "shear_modulus", "thickness")}
+    numbers = {key: table.number(key) for key in ("c2_ratio", "shear_modulus", "thickness") if key in table}
     model, prestretch = table.text("model"), table.number("prestretch")
     with table.naming():
         return Material(model, prestretch, **numbers)
@@ -113,25 +164,27 @@ def _read_material(table: Table) -> Material:
 
 def _read_cavity(table: Table) -> Cavity:
     table.allow(("filling", "pressure", "volume"))
-    filling, pressure, volume = table.text("filling"), table.number("pressure", False), table.number("volume", False)
+    filling = table.text("filling")
+    numbers = {key: table.number(key) for key in ("pressure", "volume") if key in table}
     with table.naming():
-        return Cavity(filling, pressure, volume)
+        return Cavity(filling, **numbers)
 
 
 def _read_markers(table: Table) -> tuple[Markers, list[str]]:
     """The markers, and of each listed dot where it stands: file and line."""
     table.allow(("kind", "file", "rest_image", "polarity"))
     kind = table.text("kind", ("dots", "texture"))
-    polarity = table.text("polarity", ("dark", "light"), required=kind == "dots") or "dark"
-    dots, image = table.file("file", required=False), table.file("rest_image", required=False)
+    polarity = table.text("polarity", ("dark", "light")) if kind == "dots" or "polarity" in table else "dark"
+    dots, image = (table.file(key) if key in table else None for key in ("file", "rest_image"))
     if dots and kind == "texture":
         raise table.refuse("file", "none for texture, whose patches are chosen in the rest image: remove it")
     positions, sizes, lines = _read_dots(dots) if dots else (None, None, [])
     with table.naming("rest_image"):
-        return Markers(kind, polarity, positions, sizes, image), lines
+        return Markers(kind, polarity, positions, sizes, read_image(image) if image else None), lines
 
 
 def _read_dots(path: Path) -> tuple[np.ndarray, list[str], list[str]]:
+    """Positions `[D, 3]`, sizes, and where each dot stands."""
     try:
         rows = list(enumerate(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()), 1))
     except (UnicodeDecodeError, csv.Error) as error:
@@ -162,8 +215,8 @@ def _dot(line: str, row: list[str]) -> tuple[list[float], str]:
     return position, row[3]
 
 
-def _write_dots(path: Path, markers: Markers) -> None:
-    rows = [[*map(repr, position), size] for position, size in zip(markers.positions.tolist(), markers.sizes, strict=True)]
+def _write_dots(path: Path, positions: np.ndarray, sizes: list[str]) -> None:
+    rows = [[*map(repr, position), size] for position, size in zip(positions.tolist(), sizes, strict=True)]
     path.write_text("\n".join(map(",".join, [DOTS_HEADER, *rows])) + "\n", encoding="utf-8")
 
 
@@ -171,8 +224,8 @@ def _read_membrane(table: Table, markers: Markers) -> tuple[Surface, Membrane]:
     shape = table.text("shape", [*SHAPES_BY_ARRAYS, *SHAPES_BY_NUMBERS])
     arrays, numbers = SHAPES_BY_ARRAYS.get(shape), SHAPES_BY_NUMBERS.get(shape, ())
     table.allow(("shape", "grid", *(("file",) if arrays else numbers)), f"for shape {shape}")
-    named = table.numbers("grid", 2, required=False, whole=True)
-    grid = tuple(named or default_grid(markers))
+    named = table.whole_numbers("grid", 2) if "grid" in table else None
+    grid = (named[0], named[1]) if named else default_grid(markers)
     if min(grid) < 5:
         raise table.refuse("grid", "5 x 5 vertices or more; 17 x 17 serves about 150 dots")
     if arrays:

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..mechanics.hyperelastic import ElasticEnergy
-from ..surface.membrane import Membrane, corners, triangles_of
+from ..surface.membrane import Membrane
+from ..surface.topology import corners, triangles_of
 from .contact import Contact
 
 FORCE_TOLERANCE = 1e-9  # over modulus x edge length
@@ -74,7 +75,7 @@ class Equilibrium:
     """
 
     def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, cavity, load: Tensor | None = None):
-        self.membrane, self.elasticity, self.cavity, self.free = membrane, elasticity, cavity, membrane.free
+        self.membrane, self.elasticity, self.cavity, self.free = membrane, elasticity, cavity, membrane.free_vertices
         self.load = torch.zeros_like(membrane.rest) if load is None else load
         self.matrix = _Pattern(membrane)
         modulus = float(2 * (elasticity.c1 + elasticity.c2) + elasticity.tension.abs())
@@ -148,7 +149,7 @@ class _Pattern:
     """Sum of triangle blocks and free vertices' blocks on the free degrees of freedom, with a sparsity pattern found once."""
 
     def __init__(self, membrane: Membrane):
-        V, free = len(membrane.rest), membrane.free.numpy()
+        V, free = len(membrane.rest), membrane.free_vertices.numpy()
         number = np.full(V, -1)
         number[free] = np.arange(len(free))
         triangles = triangles_of(corners(torch.arange(V)[:, None], membrane.grid)).reshape(-1, 3).numpy()

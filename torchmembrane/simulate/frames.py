@@ -13,7 +13,7 @@ from ..errors import MembraneError
 from ..io.results import save_frame
 from ..io.store import load_pyarrow
 from ..jobs.local import load_pyav
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 from .simulator import Frame, Simulator
 
 SENSOR, SETTINGS, REST = "sensor.toml", "simulation.json", "rest_truth.npz"

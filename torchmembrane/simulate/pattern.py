@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
 
 DOT_RADIUS = {"small": 0.16, "large": 0.27}  # over the dots' spacing
 WAVES = 96  # of a speckle

@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from ..sensor.model import Sensor
+from ..sensor.sensor import Sensor
+from ..surface.tangent import tangent_axes
 from .look import BRIGHT, Look, blurred, mirrored, scattered, vignette
 from .pattern import Canvas, Dots, Painted, Speckle, pattern_of
 from .raster import seen_triangles
@@ -234,9 +235,7 @@ def _dot_coordinates(corners: np.ndarray, positions, normals, radii) -> tuple[Te
     inked = distance < radii[dot] + 2 * reach
     dot = dot[inked]
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    axes = np.stack([first, np.cross(normals, first)], -1) / radii[:, None, None]
+    axes = tangent_axes(normals).swapaxes(1, 2) / radii[:, None, None]
     place = (corners[inked] - positions[dot][:, None]) @ axes[dot]
     return torch.from_numpy(inked), torch.from_numpy(place)
 

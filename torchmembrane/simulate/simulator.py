@@ -11,8 +11,8 @@ import torch
 
 from ..errors import MembraneError
 from ..io.images import to_grey
-from ..mechanics.hyperelastic import ElasticEnergy
-from ..sensor.model import Sensor
+from ..sensor.factories import cavity_filling, elastic_energy
+from ..sensor.sensor import Sensor
 from .indenters import Indenter
 from .look import Look, noisy
 from .pattern import pattern_of
@@ -91,14 +91,8 @@ class Simulator:
                 "data simulated on the estimator's own grid flatter it"
             )
         self.membrane = sensor.surface.membrane(self.grid)
-        material, cavity = sensor.material, sensor.cavity
-        self.elasticity = ElasticEnergy(
-            self.membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0
-        )
-        self.cavity = {"filling": cavity.filling}
-        if cavity.filling == "gas":
-            gas = (sensor.gas_pressure, cavity.volume or self.membrane.cavity_volume)
-            self.cavity = {"filling": "liquid"} if sensor.force_unit == "relative" else {"filling": "gas", "gas": gas}
+        self.elasticity = elastic_energy(sensor, self.membrane)
+        self.cavity = cavity_filling(sensor, self.membrane)._asdict()
         self.pattern = pattern_of(sensor, radii, missing)
         self.renderer = Renderer(sensor, self.grid, self.pattern, look)
         self.rest_dots = self.renderer.dots(self.membrane.rest)

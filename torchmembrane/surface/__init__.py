@@ -1,1 +1,1 @@
-"""The rest surface: shapes, the triangulated grid, its stencil."""
+"""The surface: shapes, the triangulated grid and who neighbours whom in it, its stencil, tangents, projection onto it."""

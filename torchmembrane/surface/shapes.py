@@ -4,35 +4,102 @@ Round rims are mapped to the border of a square grid by the elliptical map `x = 
 smooth inside; then the radius is taken as an angle, so that the mesh does not coarsen towards steep sides.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..errors import MembraneError
 from .membrane import Membrane
 
 
 def disc_grid(m: int, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates `x, y [m, n]` of a grid over the unit disc whose border is the unit circle."""
+    """Coordinates of a grid over the unit disc whose border is the unit circle.
+
+    Args:
+        m: lines along x.
+        n: lines along y.
+
+    Returns:
+        `x, y`, each `[m, n]`.
+
+    Example:
+        >>> x, y = disc_grid(3, 3)
+        >>> np.hypot(x, y).round(6).tolist()
+        [[1.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0]]
+    """
     u, v = np.meshgrid(np.linspace(-1, 1, m), np.linspace(-1, 1, n), indexing="ij")
     return u * np.sqrt(1 - v**2 / 2), v * np.sqrt(1 - u**2 / 2)
 
 
-def spherical_cap(rim_radius: float, height: float, base_z: float, grid=(17, 17)) -> Membrane:
-    """The cap of a sphere, `height` above its circular rim at `z = base_z`, bulging away from the camera."""
+def spherical_cap(rim_radius: float, height: float, base_z: float, grid: tuple[int, int] = (17, 17)) -> Membrane:
+    """The cap of a sphere over its circular rim, bulging away from the camera.
+
+    Args:
+        rim_radius: length unit.
+        height: of the pole above the rim.
+        base_z: the rim's z.
+        grid: vertices along x and y.
+
+    Returns:
+        The `Membrane`.
+
+    Raises:
+        MembraneError: a length is not finite and positive, or the camera does not see all of the surface from within.
+
+    Example:
+        >>> spherical_cap(rim_radius=12.0, height=9.0, base_z=15.0).rest[:, 2].max().item()
+        24.0
+    """
     _positive("spherical_cap", rim_radius=rim_radius, height=height)
     radius = (rim_radius**2 + height**2) / (2 * height)
-    opening = np.arctan2(rim_radius, radius - height)
+    opening = float(np.arctan2(rim_radius, radius - height))
     return _dome(grid, (radius, radius, radius), opening, base_z)
 
 
-def ellipsoid_cap(semi_axes, base_z: float, grid=(17, 17)) -> Membrane:
-    """The upper half of an ellipsoid with semi-axes `(a, b, c)` along x, y, z and its elliptic rim at `z = base_z`."""
+def ellipsoid_cap(semi_axes: Sequence[float], base_z: float, grid: tuple[int, int] = (17, 17)) -> Membrane:
+    """The upper half of an ellipsoid over its elliptic rim, bulging away from the camera.
+
+    Args:
+        semi_axes: `a, b, c` along x, y, z, length unit.
+        base_z: the rim's z.
+        grid: vertices along x and y.
+
+    Returns:
+        The `Membrane`.
+
+    Raises:
+        MembraneError: an axis is not finite and positive, or the camera does not see all of the surface from within.
+
+    Example:
+        >>> ellipsoid_cap([10.0, 8.0, 12.0], base_z=3.0).rest[:, 2].max().round(decimals=9).item()
+        15.0
+    """
     a, b, c = semi_axes
     _positive("ellipsoid_cap", a=a, b=b, c=c)
     return _dome(grid, (a, b, c), np.pi / 2, base_z)
 
 
-def half_cylinder(radius: float, length: float, half_angle: float, base_z: float, grid=(17, 17)) -> Membrane:
-    """A cylinder along x bulging away from the camera, `half_angle` degrees to both sides, long edges at `base_z`."""
+def half_cylinder(radius: float, length: float, half_angle: float, base_z: float, grid: tuple[int, int] = (17, 17)) -> Membrane:
+    """A cylinder along x, bulging away from the camera.
+
+    Args:
+        radius: length unit.
+        length: along x.
+        half_angle: to both sides of the top, degrees, at most 90.
+        base_z: the long edges' z.
+        grid: vertices along x and around.
+
+    Returns:
+        The `Membrane`.
+
+    Raises:
+        MembraneError: a value is not finite and positive, the angle too large, or the surface not seen from within.
+
+    Example:
+        >>> half_cylinder(radius=10.0, length=36.0, half_angle=90.0, base_z=24.0).rest[:, 2].max().item()
+        34.0
+    """
     _positive("half_cylinder", radius=radius, length=length, half_angle=half_angle)
     if half_angle > 90:
         raise MembraneError(f"half_cylinder: half_angle = {half_angle}; expected at most 90 degrees")
@@ -43,8 +110,24 @@ def half_cylinder(radius: float, length: float, half_angle: float, base_z: float
     return Membrane(np.stack([x, radius * np.sin(angle), z], -1))
 
 
-def heightfield(x, y, z) -> Membrane:
-    """The surface `z [m, n]` over increasing `x [m]`, `y [n]`; its border is the rim."""
+def heightfield(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Membrane:
+    """A surface of heights over a rectangle; its border is the rim.
+
+    Args:
+        x: `[m]`, increasing, length unit.
+        y: `[n]`, increasing.
+        z: `[m, n]`.
+
+    Returns:
+        The `Membrane`.
+
+    Raises:
+        MembraneError: shapes that do not belong together, coordinates that do not increase.
+
+    Example:
+        >>> heightfield([0, 1, 2], [0, 1, 2, 3], np.full((3, 4), 5.0)).grid
+        (3, 4)
+    """
     x, y, z = (np.asarray(a, dtype=float) for a in (x, y, z))
     if x.ndim != 1 or y.ndim != 1 or z.shape != (len(x), len(y)):
         raise MembraneError(
@@ -56,7 +139,7 @@ def heightfield(x, y, z) -> Membrane:
     return Membrane(np.stack([gx, gy, z], -1))
 
 
-def _dome(grid, semi_axes, opening, base_z) -> Membrane:
+def _dome(grid: tuple[int, int], semi_axes: tuple[float, float, float], opening: float, base_z: float) -> Membrane:
     x, y = disc_grid(*grid)
     a, b, c = semi_axes
     angle = np.hypot(x, y) * opening
@@ -64,7 +147,7 @@ def _dome(grid, semi_axes, opening, base_z) -> Membrane:
     return Membrane(np.stack([a * scale * x, b * scale * y, base_z + c * (np.cos(angle) - np.cos(opening))], -1))
 
 
-def _positive(function: str, **values) -> None:
+def _positive(function: str, **values: float) -> None:
     for name, value in values.items():
         if not (np.isfinite(value) and value > 0):
             raise MembraneError(f"{function}: {name} = {value}; expected a finite positive number")

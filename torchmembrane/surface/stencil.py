@@ -14,7 +14,15 @@ STENCIL = ((0, 0), *ONE_RING)
 
 
 def stencil_kernels() -> Tensor:
-    """Kernels for `apply_stencil` that pick the vertex itself and its six neighbours, `[7, 3, 3]`."""
+    """Kernels for `apply_stencil` that pick the vertex itself and its six neighbours.
+
+    Returns:
+        `[7, 3, 3]`, in the order of `STENCIL`.
+
+    Example:
+        >>> stencil_kernels()[1].tolist()
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    """
     picks = torch.zeros(len(STENCIL), 3, 3, dtype=torch.float64)
     for pick, (i, j) in zip(picks, STENCIL, strict=True):
         pick[1 + i, 1 + j] = 1.0
@@ -22,16 +30,37 @@ def stencil_kernels() -> Tensor:
 
 
 def one_ring_edges() -> Tensor:
-    """Kernels for `apply_stencil`: the edges from a vertex in the six triangles around it, all first ones before all second."""
+    """Kernels for `apply_stencil`: the edges from a vertex in the six triangles around it.
+
+    Returns:
+        `[12, 3, 3]`, the first edges of all six triangles before the second ones.
+
+    Example:
+        >>> field = torch.arange(9, dtype=torch.float64)[:, None]
+        >>> apply_stencil(field, one_ring_edges(), (3, 3), border=False).unflatten(-1, (2, 6))[0].tolist()
+        [[3.0, 4.0, 1.0, -3.0, -4.0, -1.0], [4.0, 1.0, -3.0, -4.0, -1.0, 3.0]]
+    """
     own, ring = stencil_kernels()[:1], stencil_kernels()[1:]
     return torch.cat([ring - own, ring.roll(-1, 0) - own])
 
 
-def apply_stencil(field: Tensor, kernels: Tensor, grid: tuple[int, int], border=True) -> Tensor:
-    """Combinations of the values around every vertex, zero beyond the border: `[..., V, C]` to `[..., C, W V]`.
+def apply_stencil(field: Tensor, kernels: Tensor, grid: tuple[int, int], border: bool = True) -> Tensor:
+    """Combinations of the values around every vertex, zero beyond the border.
 
-    `kernels [W, 3, 3]`; without `border` around the inner vertices only, `[..., C, W N]`. One convolution, many times faster in
-    exported models than differences of slices.
+    One convolution, many times faster in exported models than differences of slices.
+
+    Args:
+        field: `[..., V, C]`.
+        kernels: `[W, 3, 3]`.
+        grid: `m, n` with `V = m n`.
+        border: False for the `N` inner vertices only.
+
+    Returns:
+        Components first: `[..., C, W V]`, or without the border `[..., C, W N]`.
+
+    Example:
+        >>> apply_stencil(torch.arange(9.0)[:, None], stencil_kernels().float(), (3, 3), border=False).tolist()
+        [[4.0, 7.0, 8.0, 5.0, 1.0, 0.0, 3.0]]
     """
     *batch, V, C = field.shape
     count = V if border else (grid[0] - 2) * (grid[1] - 2)
@@ -40,11 +69,36 @@ def apply_stencil(field: Tensor, kernels: Tensor, grid: tuple[int, int], border=
 
 
 def inner(field: Tensor, grid: tuple[int, int]) -> Tensor:
-    """A vertex field `[..., V, C]` at the inner vertices, `[..., N, C]`."""
-    return field.unflatten(-2, grid)[..., 1:-1, 1:-1, :].flatten(-3, -2)
+    """A vertex field at the inner vertices.
+
+    Args:
+        field: `[..., V, C]`.
+        grid: `m, n`.
+
+    Returns:
+        `[..., N, C]`, `N = (m - 2) (n - 2)`.
+
+    Example:
+        >>> inner(torch.arange(12)[:, None], (3, 4))[:, 0].tolist()
+        [5, 6]
+    """
+    within: Tensor = field.unflatten(-2, grid)[..., 1:-1, 1:-1, :]
+    return within.flatten(-3, -2)
 
 
 def pad_border(field: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Adjoint of `inner`: zero on the border."""
+    """A field of the inner vertices as one of all, zero on the border: the adjoint of `inner`.
+
+    Args:
+        field: `[..., N, C]`.
+        grid: `m, n`.
+
+    Returns:
+        `[..., V, C]`.
+
+    Example:
+        >>> pad_border(torch.tensor([[5], [6]]), (3, 4))[:, 0].tolist()
+        [0, 0, 0, 0, 0, 5, 6, 0, 0, 0, 0, 0]
+    """
     m, n = grid
     return F.pad(field.unflatten(-2, (m - 2, n - 2)), (0, 0, 1, 1, 1, 1)).flatten(-3, -2)

@@ -1,0 +1,112 @@
+"""From a sensor to the mechanics of its membrane: elastic energy, cavity."""
+
+import warnings
+from typing import NamedTuple
+
+from torch import Tensor
+
+from ..mechanics.cavity import CavityLaw
+from ..mechanics.hyperelastic import ElasticEnergy
+from ..surface.membrane import Membrane
+from .sensor import Sensor
+
+
+class CavityFilling(NamedTuple):
+    """What a cavity is filled with, as estimators and the simulator take it.
+
+    Attributes:
+        filling: "liquid" | "gas" | "open".
+        gas: absolute pressure at rest (force / length^2) and volume (length^3) of a gas, else None.
+    """
+
+    filling: str
+    gas: tuple[float, float] | None = None
+
+
+def elastic_energy(
+    sensor: Sensor,
+    membrane: Membrane,
+    model: str | None = None,
+    *,
+    prestretch: float | None = None,
+    modulus: float | None = None,
+) -> ElasticEnergy:
+    """The elastic energy of a sensor's material on a membrane of any grid.
+
+    Args:
+        sensor: gives the material.
+        membrane: the rest surface, such as `sensor.membrane`.
+        model: another one than the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin".
+        prestretch: another one than the sensor's.
+        modulus: another shear modulus x thickness than the sensor's, force / length.
+
+    Returns:
+        The `ElasticEnergy`.
+
+    Example:
+        >>> from torchmembrane.sensor.sensor import Sensor
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> elastic_energy(sensor, sensor.membrane, "harmonic").model
+        'harmonic'
+    """
+    material = sensor.material
+    return ElasticEnergy(
+        membrane,
+        model or material.model,
+        material.prestretch if prestretch is None else prestretch,
+        material.modulus if modulus is None else modulus,
+        material.c2_ratio or 0.0,
+    )
+
+
+def cavity_filling(sensor: Sensor, membrane: Membrane, *, warn: bool = False) -> CavityFilling:
+    """What fills a sensor's cavity, in the sensor's units.
+
+    A gas of a sensor without modulus and thickness acts as a liquid: its pressure cannot be compared with relative ones.
+
+    Args:
+        sensor: gives filling, pressure and volume.
+        membrane: gives a gas' volume where the sensor does not: that between its rim and its rest surface.
+        warn: say so in a warning where a gas acts as a liquid; attributed to the caller of the function that calls this.
+
+    Returns:
+        `CavityFilling`; `*` of it are the arguments `filling, gas` of estimators and presses.
+
+    Example:
+        >>> from torchmembrane.sensor.sensor import Sensor
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> cavity_filling(sensor, sensor.membrane)
+        CavityFilling(filling='liquid', gas=None)
+    """
+    if sensor.cavity.filling != "gas" or sensor.gas_pressure is None:
+        return CavityFilling(sensor.cavity.filling)
+    if sensor.force_unit == "relative":
+        if warn:
+            warnings.warn(
+                f"sensor {sensor.name!r}: a gas without shear_modulus and thickness acts as a liquid (volume kept)",
+                stacklevel=3,
+            )
+        return CavityFilling("liquid")
+    return CavityFilling("gas", (sensor.gas_pressure, sensor.cavity.volume or membrane.cavity_volume))
+
+
+def cavity_law(sensor: Sensor, membrane: Membrane, rest_pressure: Tensor, *, warn: bool = False) -> CavityLaw:
+    """The law of a sensor's cavity under a membrane of any grid.
+
+    Args:
+        sensor: gives filling, pressure and volume.
+        membrane: the rest surface.
+        rest_pressure: the pressure difference at rest `[]`, from `rest_balance`.
+        warn: as for `cavity_filling`.
+
+    Returns:
+        The `CavityLaw`.
+
+    Example:
+        >>> import torch
+        >>> from torchmembrane.sensor.sensor import Sensor
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> cavity_law(sensor, sensor.membrane, torch.tensor(0.02)).filling
+        'liquid'
+    """
+    return CavityLaw(membrane, rest_pressure, *cavity_filling(sensor, membrane, warn=warn))

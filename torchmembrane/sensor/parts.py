@@ -1,0 +1,254 @@
+"""What a sensor is made of: material, cavity, markers and rest surface as plain values, checked where they are made.
+
+Lengths are in the sensor's unit, in the camera's frame. Pressures are in hPa, as in the file.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..camera.model import Camera
+from ..errors import MembraneError, expect
+from ..io.images import read_image, to_grey
+from ..surface import shapes
+from ..surface.membrane import Membrane
+
+OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, in the surface's size
+METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}  # one metre in the length unit
+MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
+SHAPES_BY_NUMBERS = {
+    "spherical_cap": ("rim_radius", "height", "base_z"),
+    "ellipsoid_cap": ("semi_axes", "base_z"),
+    "half_cylinder": ("radius", "length", "half_angle", "base_z"),
+}
+SHAPES_BY_ARRAYS = {"grid": ("vertices", "fixed"), "heightfield": ("x", "y", "z")}
+
+
+@dataclass(frozen=True)
+class Material:
+    """The membrane's elastic energy, its prestretch, and its stiffness where known.
+
+    Args:
+        model: "harmonic" | "neo_hookean" | "mooney_rivlin".
+        prestretch: 1 or more, equal in both directions.
+        c2_ratio: C2 / C1, Mooney-Rivlin only.
+        shear_modulus: N per length unit squared; None: forces are relative.
+        thickness: length unit, at rest (already stretched); None: forces are relative.
+
+    Raises:
+        MembraneError: names the value, what came and what was expected.
+
+    Example:
+        >>> Material("neo_hookean", prestretch=1.25, shear_modulus=0.3, thickness=0.4).modulus
+        0.12
+    """
+
+    model: str
+    prestretch: float
+    c2_ratio: float | None = None
+    shear_modulus: float | None = None
+    thickness: float | None = None
+
+    def __post_init__(self) -> None:
+        expect(self.model in MODELS, "material model", self.model, f"one of {', '.join(MODELS)}")
+        expect(1 <= self.prestretch < math.inf, "prestretch", self.prestretch, "1 (unstretched) or more")
+        if self.model == "mooney_rivlin":
+            right = self.c2_ratio is not None and 0 <= self.c2_ratio < math.inf
+            expect(right, "c2_ratio", self.c2_ratio, "C2 / C1, 0 or more, as model is mooney_rivlin: add it")
+        else:
+            expect(self.c2_ratio is None, "c2_ratio", self.c2_ratio, f"none, as model is {self.model}: remove it")
+        _expect_positive(shear_modulus=self.shear_modulus, thickness=self.thickness)
+
+    @property
+    def modulus(self) -> float:
+        """Shear modulus times thickness, N per length unit; 1 where either is unknown."""
+        return 1.0 if self.shear_modulus is None or self.thickness is None else self.shear_modulus * self.thickness
+
+
+@dataclass(frozen=True)
+class Cavity:
+    """What presses from inside.
+
+    Args:
+        filling: "liquid" (volume kept) | "gas" (absolute pressure x volume kept) | "open" (pressure stays at rest).
+        pressure: of a gas, absolute, at rest, hPa.
+        volume: of a gas, length unit cubed; None: between the rim and the rest surface.
+
+    Raises:
+        MembraneError: names the value, what came and what was expected.
+
+    Example:
+        >>> Cavity("gas", pressure=1013.0).volume is None
+        True
+    """
+
+    filling: str
+    pressure: float | None = None
+    volume: float | None = None
+
+    def __post_init__(self) -> None:
+        expect(self.filling in ("liquid", "gas", "open"), "filling", self.filling, "'liquid', 'gas' or 'open'")
+        known = self.filling != "gas" or self.pressure is not None
+        expect(known, "pressure", None, "the gas' absolute pressure at rest in hPa, about 1013: add it")
+        _expect_positive(pressure=self.pressure, volume=self.volume)
+
+
+@dataclass(frozen=True, eq=False)
+class Markers:
+    """What the camera follows.
+
+    Args:
+        kind: "dots" | "texture".
+        polarity: "dark" | "light", the marks against their ground.
+        positions: `[D, 3]` of the dots at rest, length unit, camera frame; None: found in the rest image.
+        sizes: D times "small" | "large"; None: all small.
+        rest_image: an array as `to_grey` takes it, kept as grey float32 `[height, width]`; or a path, which is read.
+
+    Raises:
+        MembraneError: names the value, what came and what was expected.
+
+    Example:
+        >>> Markers("dots", positions=np.array([[0.0, 0.0, 24.0], [2.0, 0.0, 23.8]])).sizes
+        ['small', 'small']
+    """
+
+    kind: str
+    polarity: str = "dark"
+    positions: np.ndarray | None = None
+    sizes: list[str] | None = None
+    rest_image: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        expect(self.kind in ("dots", "texture"), "kind", self.kind, "'dots' or 'texture'")
+        expect(self.polarity in ("dark", "light"), "polarity", self.polarity, "'dark' or 'light'")
+        if self.rest_image is not None:
+            given = self.rest_image
+            image = read_image(given) if isinstance(given, str | Path) else to_grey(given)
+            object.__setattr__(self, "rest_image", image)
+        elif self.kind == "texture":
+            raise MembraneError("rest_image is missing; expected for texture, whose patches are chosen in it: add one")
+        elif self.positions is None:
+            raise MembraneError("file and rest_image are missing; expected dots, an image that shows them, or both")
+        if self.positions is None:
+            expect(self.sizes is None, "sizes", self.sizes, "none without positions")
+            return
+        positions = np.asarray(self.positions, dtype=np.float64)
+        right = positions.ndim == 2 and positions.shape[1] == 3 and len(positions) > 0 and bool(np.isfinite(positions).all())
+        expect(right, "positions", f"an array {list(positions.shape)}", "[D, 3], finite, D at least 1")
+        sizes = ["small"] * len(positions) if self.sizes is None else list(self.sizes)
+        right = len(sizes) == len(positions) and set(sizes) <= {"small", "large"}
+        expect(right, "sizes", sizes, f"{len(positions)} times 'small' or 'large'")
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "sizes", sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The rest surface as the file describes it, before it is brought on the solver grid.
+
+    Args:
+        shape: "grid" | "spherical_cap" | "ellipsoid_cap" | "half_cylinder" | "heightfield".
+        values: the numbers or arrays that belong to it, by the file's keys.
+
+    Example:
+        >>> cap = Surface("spherical_cap", {"rim_radius": 12.0, "height": 9.0, "base_z": 15.0})
+        >>> cap.membrane((17, 21)).grid
+        (17, 21)
+    """
+
+    shape: str
+    values: Mapping[str, Any]
+
+    def membrane(self, grid: tuple[int, int]) -> Membrane:
+        """The surface on a solver grid; what lies in arrays is interpolated unless it has that grid already.
+
+        Args:
+            grid: numbers of vertices along both directions.
+
+        Returns:
+            The `Membrane`.
+
+        Raises:
+            MembraneError: the surface folds, or cannot be seen from the camera.
+        """
+        if self.shape in SHAPES_BY_NUMBERS:
+            made: Membrane = getattr(shapes, self.shape)(**self.values, grid=grid)
+            return made
+        source = Membrane(**self.values) if self.shape == "grid" else shapes.heightfield(**self.values)
+        return source if source.grid == tuple(grid) else source.resampled((grid[0], grid[1]))
+
+    @classmethod
+    def of(cls, membrane: Membrane) -> "Surface":
+        """The surface that a membrane's own grid describes.
+
+        Args:
+            membrane: on any grid.
+
+        Returns:
+            A `Surface` of shape "grid".
+        """
+        m, n = membrane.grid
+        vertices = membrane.rest.cpu().double().numpy().reshape(m, n, 3)
+        return cls("grid", {"vertices": vertices, "fixed": membrane.fixed.cpu().numpy().reshape(m, n)})
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Those of the values that are arrays, which lie in a file of their own."""
+        return {key: value for key, value in self.values.items() if isinstance(value, np.ndarray)}
+
+    def numbers(self) -> dict[str, Any]:
+        """Those of the values that stand in the sensor file itself."""
+        return {key: value for key, value in self.values.items() if not isinstance(value, np.ndarray)}
+
+
+class SensorParts(NamedTuple):
+    """All parts of a sensor, as its file gives them and takes them.
+
+    Attributes:
+        name: any text.
+        length_unit: "mm" | "cm" | "m".
+        camera: the `Camera`.
+        membrane: the rest surface on the solver grid.
+        material: the `Material`.
+        cavity: the `Cavity`.
+        markers: the `Markers`.
+        surface: the rest surface as the file describes it.
+    """
+
+    name: str
+    length_unit: str
+    camera: Camera
+    membrane: Membrane
+    material: Material
+    cavity: Cavity
+    markers: Markers
+    surface: Surface
+
+
+def refuse_off_surface(membrane: Membrane, positions: np.ndarray, names: Sequence[str]) -> None:
+    """Refuse the first dot that is not near the rest surface.
+
+    Args:
+        membrane: the rest surface.
+        positions: `[D, 3]`.
+        names: of the D dots, as the message begins.
+
+    Raises:
+        MembraneError: with its name, position, distance and what was expected.
+    """
+    distance = membrane.closest_points(positions).distance
+    limit = OFF_SURFACE * membrane.size
+    if not (distance <= limit).all():
+        i = int(np.flatnonzero(~(distance <= limit))[0])
+        raise MembraneError(
+            f"{names[i]} at {positions[i].tolist()} is {distance[i]:.4g} off the rest surface; expected at most {limit:.4g}: "
+            "give positions at rest, in the camera's frame and the sensor's length unit"
+        )
+
+
+def _expect_positive(**values: float | None) -> None:
+    for name, value in values.items():
+        expect(value is None or 0 < value < math.inf, name, value, "a finite positive number, or leave it out")

@@ -1,0 +1,151 @@
+"""A sensor: camera, membrane, material, cavity and markers, read from one `sensor.toml` and written back."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..camera.model import Camera
+from ..errors import MembraneError, expect
+from ..surface.membrane import Membrane
+from .parts import METRE, Cavity, Markers, Material, SensorParts, Surface, refuse_off_surface
+from .toml import read_sensor, tables_of, write_sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """All that is known of one sensor; checked at construction.
+
+    Args:
+        name: any text.
+        length_unit: "mm" | "cm" | "m".
+        camera: the calibrated `Camera`.
+        membrane: the rest surface on the solver grid, in the camera's frame.
+        material: its elastic energy and stiffness.
+        cavity: what fills it.
+        markers: what the camera follows on it.
+        surface: how the file describes the rest surface (default: by the membrane's grid).
+
+    Raises:
+        MembraneError: a dot lies off the rest surface, or the rest image has another size than the camera's.
+
+    Example:
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> sensor.camera.image_size, sensor.length_unit, sensor.force_unit
+        ((640, 480), 'mm', 'N')
+    """
+
+    name: str
+    length_unit: str
+    camera: Camera
+    membrane: Membrane
+    material: Material
+    cavity: Cavity
+    markers: Markers
+    surface: Surface = None  # type: ignore[assignment]  # set below where it is left out
+
+    def __post_init__(self) -> None:
+        expect(self.length_unit in METRE, "length_unit", self.length_unit, "'mm', 'cm' or 'm'")
+        if self.surface is None or not _same_surface(self.surface.membrane(self.membrane.grid), self.membrane):
+            object.__setattr__(self, "surface", Surface.of(self.membrane))
+        if self.markers.rest_image is not None:
+            size = self.markers.rest_image.shape[::-1]
+            if size != self.camera.image_size:
+                raise MembraneError(
+                    f"Sensor: rest_image is {size[0]} x {size[1]} px and image_size {list(self.camera.image_size)}; expected "
+                    "the same: calibrate the camera at the images' resolution"
+                )
+        if self.markers.positions is not None:
+            names = [f"Sensor: markers.positions[{i}]" for i in range(len(self.markers.positions))]
+            refuse_off_surface(self.membrane, self.markers.positions, names)
+
+    @property
+    def force_unit(self) -> str:
+        """Either "N" or "relative": forces in units of shear modulus x thickness x length unit."""
+        known = self.material.shear_modulus is not None and self.material.thickness is not None
+        return "N" if known else "relative"
+
+    @property
+    def gas_pressure(self) -> float | None:
+        """The cavity's absolute pressure at rest in N per length unit squared; 1 hPa = 100 N/m^2."""
+        pressure = self.cavity.pressure
+        return None if pressure is None else 100 * pressure / METRE[self.length_unit] ** 2
+
+    @property
+    def parts(self) -> SensorParts:
+        """The arguments that make this sensor."""
+        return SensorParts(*(getattr(self, name) for name in SensorParts._fields))
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """sha256 of the content: arrays and the rest image's grey values, wherever and in whatever order they were written."""
+        markers = self.markers
+        arrays: dict[str, np.ndarray | None] = {**self.surface.arrays()}
+        arrays |= {"positions": markers.positions, "rest_image": markers.rest_image}
+        words = dict(tables_of(self.parts), sizes=markers.sizes)
+        digest = hashlib.sha256(json.dumps(_as_numbers(words), sort_keys=True).encode())
+        for key, array in sorted(arrays.items()):
+            if array is not None:
+                digest.update(f"{key} {array.shape}".encode())
+                digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+        return digest.hexdigest()
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> "Sensor":
+        """The sensor that a `sensor.toml` describes, with the files named in it (paths relative to it).
+
+        Args:
+            path: of the `.toml` file.
+
+        Returns:
+            The `Sensor`.
+
+        Raises:
+            MembraneError: names file, key (or line), what came, what was expected and the remedy.
+
+        Example:
+            >>> Sensor.from_file("examples/sensor.toml").markers.kind
+            'dots'
+        """
+        parts = read_sensor(Path(path))
+        try:
+            return cls(*parts)
+        except MembraneError as error:
+            raise MembraneError(f"{path}: {error}") from error
+
+    def to_file(self, path: str | Path) -> Path:
+        """Write the sensor, its arrays beside it: `sensor_grid.npz`, `sensor_dots.csv`, `sensor_rest.png`.
+
+        Args:
+            path: a `.toml`, after which the arrays' files are named; or a folder, which gets `sensor.toml`.
+
+        Returns:
+            The path of the `.toml` file.
+
+        Example:
+            >>> import tempfile
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     written = Sensor.from_file("examples/sensor.toml").to_file(folder)
+            ...     sorted(file.name for file in written.parent.iterdir())
+            ['sensor.toml', 'sensor_dots.csv', 'sensor_grid.npz', 'sensor_rest.png']
+        """
+        path = Path(path)
+        return write_sensor(self.parts, path if path.suffix == ".toml" else path / "sensor.toml")
+
+
+def _same_surface(one: Membrane, other: Membrane) -> bool:
+    return torch.equal(one.rest, other.rest.to(one.rest)) and torch.equal(one.fixed, other.fixed.to(one.fixed.device))
+
+
+def _as_numbers(value: object) -> object:
+    """Whole and other numbers alike, so that 12 and 12.0 have one fingerprint."""
+    if isinstance(value, Mapping):
+        return {key: _as_numbers(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_numbers(item) for item in value]
+    return value if value is None or isinstance(value, str) else float(value)  # type: ignore[arg-type]

@@ -1,0 +1,85 @@
+"""What a grid of vertices has to be to become a `Membrane`: finite, framed by a fixed rim, without folds, seen from inside."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import MembraneError
+
+SMALLEST_AREA = 1e-9  # of a triangle, over that of the largest
+
+
+def checked_grid(vertices: ArrayLike, fixed: ArrayLike | None) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and fixed ones of a grid as arrays.
+
+    Args:
+        vertices: `[m, n, 3]`, length unit.
+        fixed: `[m, n]` bool, or None: the border.
+
+    Returns:
+        `[m, n, 3]` float64 and `[m, n]` bool.
+
+    Raises:
+        MembraneError: another shape, a vertex that is not finite, a free border, no free vertex.
+    """
+    X = np.asarray(vertices, dtype=np.float64)
+    if X.ndim != 3 or X.shape[2] != 3 or min(X.shape[:2]) < 3:
+        raise MembraneError(f"Membrane: vertices of shape {list(X.shape)}; expected [m, n, 3] with m, n >= 3")
+    if not np.isfinite(X).all():
+        i, j = np.argwhere(~np.isfinite(X).all(-1))[0]
+        raise MembraneError(f"Membrane: vertex ({i}, {j}) is not finite; expected finite coordinates")
+    border = np.zeros(X.shape[:2], bool)
+    border[[0, -1]] = border[:, [0, -1]] = True
+    if fixed is None:
+        return X, border
+    fixed = np.asarray(fixed)
+    if fixed.shape != border.shape or fixed.dtype != bool:
+        raise MembraneError(
+            f"Membrane: fixed is {fixed.dtype} {list(fixed.shape)}; expected bool {list(border.shape)}, one per vertex"
+        )
+    if not fixed[border].all():
+        i, j = np.argwhere(border & ~fixed)[0]
+        raise MembraneError(f"Membrane: border vertex ({i}, {j}) is free; expected every border vertex to be fixed (the rim)")
+    if fixed.all():
+        raise MembraneError("Membrane: every vertex is fixed; expected free vertices inside the rim")
+    return X, fixed
+
+
+def checked_orientation(X: np.ndarray, triangles: np.ndarray, fixed: np.ndarray) -> int:
+    """Which way the triangles face, seen from the camera at the origin.
+
+    Args:
+        X: vertices `[V, 3]`.
+        triangles: `[T, 3]`, their vertices.
+        fixed: `[V]` bool; triangles between fixed vertices alone are not looked at.
+
+    Returns:
+        +1 if the triangles already point away from the camera, -1 if all have to be turned.
+
+    Raises:
+        MembraneError: the grid lies behind the camera, a triangle has no area, or the grid folds.
+    """
+    if X[:, 2].max() <= 0:
+        raise MembraneError(
+            f"Membrane: the grid lies behind the camera (largest z = {X[:, 2].max():.4g}); expected it at z > 0, "
+            "in the camera's frame with +z towards the membrane"
+        )
+    a, b, c = X[triangles].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    free = ~fixed[triangles].all(1)
+    area = np.linalg.norm(normal, axis=1)
+    empty = free & (area < SMALLEST_AREA * area.max())
+    if empty.any():
+        k = np.flatnonzero(empty)[0]
+        raise MembraneError(
+            f"Membrane: the triangle of vertices {triangles[k].tolist()} has no area; expected distinct vertices"
+        )
+    facing = np.sign((normal * (a + b + c)).sum(1))[free]
+    outward = 1 if facing.sum() >= 0 else -1
+    hidden = facing != outward
+    if hidden.any():
+        k = np.flatnonzero(free)[np.flatnonzero(hidden)[0]]
+        raise MembraneError(
+            f"Membrane: {hidden.sum()} of {free.sum()} triangles turn their outside to the camera, the first one at vertices "
+            f"{triangles[k].tolist()}; expected a grid without folds whose inside is seen from the camera everywhere"
+        )
+    return outward

@@ -1,0 +1,44 @@
+"""A grid of vertices on other lines, equally spaced along the surface."""
+
+import numpy as np
+from scipy.interpolate import CubicSpline, RectBivariateSpline
+
+FINE = 40  # samples between two lines, for arc lengths
+
+
+def resampled_grid(X: np.ndarray, fixed: np.ndarray, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """A grid's surface on another grid.
+
+    Bicubic in the grid's own coordinates, so that the rim stays where it is; the new lines are at equal steps of the mean
+    arc length: steep sides, where a file's grid is often coarse, get their share.
+
+    Args:
+        X: vertices `[m, n, 3]`.
+        fixed: `[m, n]` bool.
+        grid: the new numbers of lines.
+
+    Returns:
+        Vertices `[*grid, 3]`, and which are fixed, `[*grid]`: the border, and inside it as the nearest vertex.
+    """
+    lines = even_lines(X, grid[0]), even_lines(X.swapaxes(0, 1), grid[1])
+    m, n = (np.arange(count) for count in X.shape[:2])
+    vertices = np.stack([RectBivariateSpline(m, n, X[..., c])(*lines) for c in range(3)], -1)
+    rows, columns = (np.rint(line[1:-1]).clip(1, count - 2).astype(int) for line, count in zip(lines, X.shape[:2], strict=True))
+    resampled = np.ones(grid, bool)
+    resampled[1:-1, 1:-1] = fixed[rows][:, columns]
+    return vertices, resampled
+
+
+def even_lines(X: np.ndarray, count: int) -> np.ndarray:
+    """Coordinates along the first axis of `X [m, n, 3]` of `count` lines at equal rms distance from line to line.
+
+    Example:
+        >>> x = np.array([0.0, 1.0, 2.0, 4.0, 6.0])
+        >>> X = np.stack(np.broadcast_arrays(x[:, None], np.zeros((1, 4)), 5.0), -1)
+        >>> even_lines(X, 4).round(1).tolist()
+        [0.0, 2.0, 3.0, 4.0]
+    """
+    fine = np.linspace(0, len(X) - 1, FINE * (len(X) - 1) + 1)
+    step = np.diff(CubicSpline(np.arange(len(X)), X)(fine), axis=0)
+    length = np.concatenate([[0.0], np.cumsum(((step**2).sum(-1).mean(1)) ** 0.5)])
+    return np.interp(np.linspace(0, length[-1], count), length, fine)
