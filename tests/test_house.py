@@ -20,11 +20,11 @@ DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs
 LONGEST_FILE, LONGEST_FUNCTION = 350, 50
 HEAVY = ("torch", "kornia", "scipy", "matplotlib", "tqdm")
 
-CONSTANT = r"`((?:[a-z_]+\.)*(?:[A-Z][A-Z0-9_]+|[A-Z]\w+Settings\.[a-z]\w*))`"
+CONSTANT = r"`((?:[a-z_]+\.)*(?:[A-Z][A-Z0-9_]+|(?:[A-Z]\w+Settings)?\.[a-z]\w*))`"
 NUMBER = r"-?[0-9.]+(?:e-?[0-9]+)?"
-QUOTED = re.compile(rf"{CONSTANT} = ({NUMBER}(?:, {NUMBER})*)")
+QUOTED = re.compile(rf"{CONSTANT}\s=\s({NUMBER}(?:,\s{NUMBER})*)")
 """A constant, or a setting and its default, as documents quote them: the name, as much of its module as tells it apart, then
-the value or values."""
+the value or values. `.name`: a setting that only one class has."""
 NAMED = re.compile(CONSTANT)
 
 every_file = pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
@@ -153,7 +153,7 @@ def meant(name: str, known: dict[str, object]) -> list[str]:
     >>> meant("balance.REACH", {"estimators.balance.prices.REACH": 0.04, "markers.texture.REACH": 7})
     ['estimators.balance.prices.REACH']
     """
-    *above, last = name.split(".")
+    *above, last = name.lstrip(".").split(".")
     full_names = [full for full in known if full.split(".")[-1] == last]
     return [full for full in full_names if set(above) <= set(full.split("."))]
 
@@ -163,7 +163,7 @@ def test_quoted_constants_are_the_code_s(path):
     known, wrong = constants(), []
     for name, text in QUOTED.findall(path.read_text()):
         full = meant(name, known)
-        values = tuple(float(part) for part in text.split(", "))
+        values = tuple(float(part) for part in text.split(","))
         if [known[each] for each in full] not in ([values], [values[0]] if len(values) == 1 else None):
             wrong.append(f"{name} = {text}: {({each: known[each] for each in full}) or 'no such constant'}")
     assert not wrong
@@ -173,7 +173,7 @@ def test_quoted_constants_are_the_code_s(path):
 def test_named_constants_exist(path):
     """Those with their module or class; a bare `NAME` may as well stand for a file's or an argument's."""
     known = constants()
-    assert not [name for name in NAMED.findall(path.read_text()) if "." in name and len(meant(name, known)) != 1]
+    assert not [name for name in NAMED.findall(path.read_text()) if name.find(".") > 0 and len(meant(name, known)) != 1]
 
 
 @pytest.mark.parametrize("page, at_least", [("conventions.md", 9), ("mathematics.md", 20), ("force_balance.md", 9)])
