@@ -1,0 +1,109 @@
+"""Changelog, guide for contributors and citation say what is there."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+CHANGELOG = (ROOT / "CHANGELOG.md").read_text()
+MOVED = re.findall(r"^\| `(torchmembrane[\w.]*)` \| `(torchmembrane[\w.]*)` \|$", CHANGELOG, re.M)
+
+
+def read_yaml(text: str):
+    """The part of YAML that a citation needs: blocks of keys and of list items, texts and whole numbers.
+
+    >>> read_yaml('title: "A: b"\\nauthors:\\n  - name: C\\n    age: 3\\n  - name: D\\nkeywords:\\n  - E')
+    {'title': 'A: b', 'authors': [{'name': 'C', 'age': 3}, {'name': 'D'}], 'keywords': ['E']}
+    """
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    assert not [line for line in lines if "\t" in line]
+    found, rest = _block(lines, 0)
+    assert not rest, f"not understood: {rest[0]!r}"
+    return found
+
+
+def _block(lines: list[str], indent: int):
+    """What stands at the beginning of `lines` at this indent, and the lines that are left."""
+    found = [] if lines[0].lstrip().startswith("- ") else {}
+    while lines and len(lines[0]) - len(lines[0].lstrip()) == indent:
+        item, lines = lines[0].strip(), lines[1:]
+        if isinstance(found, list):
+            mark, item = item[:2], item[2:]
+            assert mark == "- ", f"expected an item of a list: {item!r}"
+            value, lines = _block([" " * (indent + 2) + item, *lines], indent + 2) if _pair(item) else (_scalar(item), lines)
+            found.append(value)
+        else:
+            assert _pair(item), f"expected `key: value`: {item!r}"
+            key, text = _pair(item).groups()
+            assert key not in found, f"twice: {key}"
+            found[key], lines = (_scalar(text), lines) if text else _block(lines, indent + 2)
+    return found, lines
+
+
+def _pair(item: str) -> re.Match | None:
+    return re.fullmatch(r"([a-z][a-z-]*):(?: (.+))?", item)
+
+
+def _scalar(text: str) -> str | int:
+    if quoted := re.fullmatch(r'"([^"\\]*)"', text):
+        return quoted[1]
+    assert not re.search(r": | #|^[\[{&*!|>%@`\"'?-]", text), f"needs quotes: {text!r}"
+    return int(text) if text.isdigit() else text
+
+
+@pytest.fixture(scope="module")
+def citation():
+    return read_yaml((ROOT / "CITATION.cff").read_text())
+
+
+def test_citation_has_what_the_format_requires(citation):
+    assert {"cff-version", "message", "title", "authors"} <= citation.keys()
+    assert citation["cff-version"] == "1.2.0" and citation["type"] == "software"
+    for reference in citation["references"]:
+        assert {"type", "title", "authors"} <= reference.keys()
+        assert all({"given-names", "family-names"} <= person.keys() for person in reference["authors"])
+
+
+def test_citation_is_of_this_version(citation):
+    project = PROJECT["project"]
+    assert citation["title"] == project["name"] and citation["version"] == project["version"]
+    assert citation["license"] == project["license"] and citation["abstract"] == project["description"]
+    assert citation["repository-code"] == project["urls"]["Homepage"]
+    assert [author["name"] for author in citation["authors"]] == [author["name"] for author in project["authors"]]
+
+
+def test_a_broken_citation_is_not_read():
+    for broken in ("title: A: b", "title: A\ntitle: B", "authors:\n  name: A\n - b", "- a\nb: c"):
+        with pytest.raises(AssertionError):
+            read_yaml(broken)
+
+
+def test_changelog_begins_with_this_version():
+    assert re.search(r"^## \[(.+?)\]", CHANGELOG, re.M)[1] == PROJECT["project"]["version"]
+
+
+@pytest.mark.parametrize("new", sorted({new for _, new in MOVED}))
+def test_moved_modules_are_where_the_changelog_says(new):
+    path = ROOT.joinpath(*new.split("."))
+    assert path.with_suffix(".py").exists() or (path / "__init__.py").exists()
+
+
+def test_changelog_lists_no_module_twice():
+    before = [old for old, _ in MOVED]
+    assert len(before) > 30 and len(set(before)) == len(before)
+
+
+def test_drawn_layers_are_the_checked_ones():
+    contracts = PROJECT["tool"]["importlinter"]["contracts"]
+    (layers,) = (contract["layers"] for contract in contracts if contract["type"] == "layers")
+    drawn = "\n".join(f"    {layer.replace('torchmembrane.', '')}" for layer in layers)
+    assert f"\n\n{drawn}\n\n" in (ROOT / "CONTRIBUTING.md").read_text()
+
+
+@pytest.mark.parametrize("page", ["CHANGELOG.md", "CONTRIBUTING.md"])
+def test_linked_files_exist(page):
+    targets = re.findall(r"\]\(([^)#:]+)\)", (ROOT / page).read_text())
+    assert targets and not [target for target in targets if not (ROOT / target).exists()]
