@@ -130,9 +130,7 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     )
     x, p = bent(dome), torch.tensor([0.3], dtype=torch.float64)
     directions = torch.nn.functional.normalize(positions + 0.3, dim=-1)[None]
-    measured = Bearings(
-        0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, len(positions), dtype=torch.float64)
-    )
+    measured = Bearings(0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, directions.shape[1]).double())
     equations = estimator.equations
     at = equations.forces.linearised(x, p)
     angle, jacobian = equations.bearings.angles(x, measured)
@@ -172,9 +170,7 @@ def test_the_bearing_jacobian_is_the_derivative_of_the_angles():
     estimator = make(7)
     bearings = estimator.equations.bearings
     directions = torch.nn.functional.normalize(bearings.positions + 0.3, dim=-1)[None]
-    measured = Bearings(
-        0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, len(directions[0]), dtype=torch.float64)
-    )
+    measured = Bearings(0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, directions.shape[1]).double())
     x = bent(estimator.membrane)
     _, jacobian = bearings.angles(x, measured)
     exact = torch.autograd.functional.jacobian(lambda y: bearings.angles(y, measured)[0], x)[0, :, :, 0]
@@ -244,7 +240,7 @@ def along_y(normal):
 
 
 def patch_of_pushes(estimator, push, tensile_elsewhere=0.0, shear=0.0):
-    """Forces at rest over the reference: `push` on the middle of the dome, `shear` along it, `tensile_elsewhere` on the rest."""
+    """Forces at rest, over the reference: `push` and `shear` on the middle of the dome, `tensile_elsewhere` on the rest."""
     X, normal = at_rest(estimator)
     middle = X[:, :2].norm(dim=1) < 4.0
     pushed = -push * normal + shear * along_y(normal)
@@ -444,9 +440,7 @@ def test_the_objective_is_the_misfit_of_the_markers_and_the_loss_of_the_traction
     expected = Cauchy(SETTINGS.outlier).loss(misfit).sum(1)
     torch.testing.assert_close(estimator.objective(none, observation), expected)
     assert (estimator.objective(found, observation) > expected).all()
-    assert estimator.objective(Equilibrium(*found), observation) < estimator.objective(
-        estimator_at_rest(estimator), observation
-    )
+    assert estimator.objective(found, observation) < estimator.objective(equilibrium_at_rest(estimator), observation)
 
 
 def equilibrium_at_rest(estimator):

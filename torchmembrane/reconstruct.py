@@ -85,14 +85,22 @@ class Reconstructor(nn.Module):
             raise MembraneError(
                 f"sensor {sensor.name!r}: parts of the rest surface cannot be imaged by its camera; check the poses"
             )
-        markers = place_markers(sensor, vertex_pixels)
+        markers, cavity = place_markers(sensor, vertex_pixels), cavity_filling(sensor, membrane, warn=True)
         positions, model_pixels = torch.from_numpy(markers.positions), torch.from_numpy(markers.model_pixels)
         rim_pixels, rest_image = vertex_pixels[membrane.fixed].numpy(), sensor.markers.rest_image
         self.observer = MarkerObserver(markers, rim_pixels, sensor.name, dtype, rest_image)
         problem = Problem(
-            self.camera, membrane, elastic_energy(sensor, membrane, model), *cavity_filling(sensor, membrane, warn=True), markers.points, positions,
-            model_pixels, vertex_pixels, MARKER_NOISE[sensor.markers.kind],
-        )  # fmt: skip
+            camera=self.camera,
+            membrane=membrane,
+            elasticity=elastic_energy(sensor, membrane, model),
+            filling=cavity.filling,
+            gas=cavity.gas,
+            markers=markers.points,
+            positions=positions,
+            rest_pixels=model_pixels,
+            vertex_pixels=vertex_pixels,
+            marker_noise=MARKER_NOISE[sensor.markers.kind],
+        )
         self.estimator = _of(problem, estimator, settings)
         self.register_buffer("vertex_pixels", vertex_pixels)
         self.register_buffer("rest_markers", positions)
