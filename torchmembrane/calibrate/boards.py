@@ -10,9 +10,9 @@ from torch.func import functional_call, jacfwd, vmap
 
 from ..camera.model import COEFFICIENTS, Camera
 from ..errors import MembraneError
+from ..io.optional import load_opencv
 from ..targets import Checkerboard, DotBoard
 from .fit import Fit, fit, outline_centres, rotations, strays
-from .targets import opencv
 
 LENS = ("focal", "centre", "distortion")
 PORTS = ("port_distance", "port_thickness", "port_index", "medium_index")
@@ -141,7 +141,7 @@ def _with(camera: Camera, values: dict[str, Tensor]) -> Camera:
 
 
 def _opencv_lens(camera: Camera, board: Checkerboard, views: Views) -> tuple[Camera, np.ndarray]:
-    cv2 = opencv()
+    cv2 = load_opencv()
     if len(views.pixels) < 3:
         raise MembraneError(f"calibrate camera: {len(views.pixels)} images; expected at least 3, better 10, in different poses")
     (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
@@ -166,7 +166,7 @@ def _opencv_lens(camera: Camera, board: Checkerboard, views: Views) -> tuple[Cam
 
 def _start_pose(camera: Camera, board: DotBoard, pixels: np.ndarray, filled: bool) -> np.ndarray:
     """A first pose `[6]`, for the design's ports: the better of the two that a central camera allows."""
-    cv2 = opencv()
+    cv2 = load_opencv()
     seen = np.isfinite(pixels).all(1)
     medium = float(camera.medium_index) if filled else 1.0
     camera = Camera(camera.model, camera.image_size, *(getattr(camera, name).tolist() for name in LENS), camera.ports, medium)

@@ -5,6 +5,7 @@ import heapq
 import numpy as np
 
 from ..errors import MembraneError
+from ..io.optional import load_opencv
 from ..markers.dots import find_dots
 from ..targets import LARGE, MARKS, Checkerboard, DotBoard
 
@@ -13,22 +14,13 @@ FAR_OFF = 10**6
 STEP_ERROR = 0.35  # of a lattice step, by which a neighbour may be off its prediction
 
 
-def opencv():
-    """The module cv2, or a `MembraneError` that names the extra."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise MembraneError("calibrate: OpenCV is missing; install it with pip install 'torchmembrane[calibrate]'") from error
-    return cv2
-
-
 def find_target(image: np.ndarray, board: Checkerboard | DotBoard) -> np.ndarray:
     """Where the board's points are in an image `[H, W]` (grey 0..1): `[D, 2]` px, NaN where not seen."""
     return (_find_corners if isinstance(board, Checkerboard) else _find_board_dots)(image, board)
 
 
 def _find_corners(image: np.ndarray, board: Checkerboard) -> np.ndarray:
-    cv2 = opencv()
+    cv2 = load_opencv()
     grey = np.rint(255 * image).astype(np.uint8)
     flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
     found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=flags)

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import MembraneError
+from .atomic import whole_file
+from .optional import load_pyarrow
 from .results import NOT_CONVERGED, OK, Reconstruction, load_frame, save_frame, stack_frames
 
 FINISHED = (OK, NOT_CONVERGED)
@@ -260,17 +262,5 @@ class FrameTable:
         return {name: {k: v[i] for k, v in columns.items()} for i, name in enumerate(table["name"].to_pylist())}
 
     def _save(self, table, part: Path) -> None:
-        partial = part.with_name("." + part.name)  # hidden: readers of the folder pass over it
-        self.parquet.write_table(table, partial)
-        partial.replace(part)
-
-
-def load_pyarrow():
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MembraneError(
-            'Parquet results need pyarrow, which is not installed: pip install "torchmembrane[parquet]"'
-        ) from error
-    return pyarrow, pyarrow.parquet
+        with whole_file(part) as partial:
+            self.parquet.write_table(table, partial)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .atomic import whole_file
 from .results import STATUS_TEXTS
 from .store import PART_ROWS, FrameFiles, FrameTable, Mesh
 
@@ -54,12 +55,10 @@ class Summary:
         self.rows[row["name"]] = row
 
     def write(self) -> None:
-        partial = self.path.with_name(self.path.name + ".partial")
-        with open(partial, "w", newline="", encoding="utf-8") as file:
+        with whole_file(self.path) as partial, open(partial, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, COLUMNS)
             writer.writeheader()
             writer.writerows(self.rows[name] for name in sorted(self.rows))
-        partial.replace(self.path)
 
 
 def _rows(path: Path) -> list[dict]:

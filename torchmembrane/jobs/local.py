@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from ..errors import MembraneError
 from ..io.images import to_grey
+from ..io.optional import load_pyav
 from ..io.results import NOT_CONVERGED, STATUS_TEXTS, Reconstruction
 from ..io.store import FINISHED, MESH, Mesh, Settings, open_folder
 from ..io.summary import UNREADABLE, Summary
@@ -239,11 +240,3 @@ def _video_length(path: Path) -> int | None:
             return container.streams.video[0].frames or None
     except (av.FFmpegError, IndexError):
         return None
-
-
-def load_pyav():
-    try:
-        import av
-    except ImportError as error:
-        raise MembraneError('videos need PyAV, which is not installed: pip install "torchmembrane[video]"') from error
-    return av

@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ..io.atomic import whole_file
 from ..io.results import OK, STATUS_TEXTS
 from ..io.store import Mesh
 
@@ -46,10 +47,9 @@ def figure(frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = 
 def save(drawing: Figure, path: str | Path) -> None:
     """Write a figure as PNG, whole or not at all."""
     path = Path(path)
-    partial = path.with_name(path.name + ".partial")
     path.parent.mkdir(parents=True, exist_ok=True)
-    drawing.savefig(partial, format="png")
-    partial.replace(path)
+    with whole_file(path) as partial:
+        drawing.savefig(partial, format="png")
 
 
 def show(drawing: Figure) -> None:
