@@ -19,7 +19,7 @@ from ..calibrate.targets import find_target
 from ..calibrate.views import rest_from_views
 from ..errors import MembraneError
 from ..io.images import read_image
-from ..jobs.local import find_inputs
+from ..jobs.inputs import find_inputs
 from ..plot.calibration import Report, fit_figure, material_figure, mill_figure, surface_figure
 from ..presets import sensor_file
 from ..sensor.model import Markers, Sensor

@@ -14,7 +14,8 @@ from ..estimators.minimum_energy import ELEMENTS
 from ..io.images import read_image
 from ..io.results import load_frame
 from ..io.store import FORMATS, MESH, Mesh, Settings, check_folder
-from ..jobs.local import find_inputs, reconstruct_files
+from ..jobs.inputs import find_inputs
+from ..jobs.local import reconstruct_files
 from ..mechanics.hyperelastic import MODELS
 from ..presets import sensor_file
 from ..reconstruct import ESTIMATORS, Reconstructor
