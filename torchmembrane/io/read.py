@@ -32,7 +32,8 @@ def read_results(folder: str | Path) -> "Results":
         >>> import tempfile
         >>> from torchmembrane.cli.main import main
         >>> folder = tempfile.mkdtemp()
-        >>> main(["reconstruct", "examples/sensor.toml", "examples/rest.png", "--out", folder, "--estimator", "minimum-energy"]) # doctest: +ELLIPSIS
+        >>> options = ["--estimator", "minimum-energy", "--out", folder]
+        >>> main(["reconstruct", "examples/sensor.toml", "examples/rest.png", *options])  # doctest: +ELLIPSIS
         frames: 1 reconstructed, 0 failed, 0 finished before; results in ...
         0
         >>> results = read_results(folder)
