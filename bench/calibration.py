@@ -2,7 +2,7 @@
 
 python bench/calibration.py [PART ...] [--seeds 3] [--json FILE] [--figures docs/calibration]
 
-Parts: lens ports rest effect views depth pattern material.
+Parts: lens ports rest effect views depth layout material.
 Sensors of this package are seen by the simulator with noise 40 dB below white; the first guess is off. Printed: error, reported
 standard deviation, and the largest error over its deviation; for `effect` the error of the surface at the dots before and after
 the pose was calibrated.
@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from torchmembrane.calibrate.boards import Views, lens_from_views, ports_from_views
 from torchmembrane.calibrate.depth import rest_from_depth
+from torchmembrane.calibrate.layout import layout_for_pixels, pixel_lattice
 from torchmembrane.calibrate.material import material_from_images
-from torchmembrane.calibrate.mill import dots_for_pixels, pixel_lattice
 from torchmembrane.calibrate.rest import rest_from_image
 from torchmembrane.calibrate.surface import feet_of, fine_surface
 from torchmembrane.calibrate.targets import find_target
@@ -32,7 +32,7 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.errors import MembraneError
 from torchmembrane.io.images import to_grey
 from torchmembrane.markers.dots import find_dots
-from torchmembrane.plot.calibration import Report, fit_figure, mill_figure, surface_figure
+from torchmembrane.plot.calibration import Report, fit_figure, layout_figure, surface_figure
 from torchmembrane.plot.frames import save
 from torchmembrane.presets import preset
 from torchmembrane.reconstruct import Reconstructor
@@ -219,11 +219,11 @@ def depth(seeds, figures):
             save(surface_figure(report, design.camera.image_size, places, found.surface, "mm"), figures / f"depth_{name}.png")
 
 
-def pattern(seeds, figures):
+def layout(seeds, figures):
     for name in ("half_cylinder", "fingertip"):
         sensor = preset(name)
         pixels, sizes = pixel_lattice(sensor, 30.0)
-        dots = dots_for_pixels(sensor, pixels, sizes)
+        dots = layout_for_pixels(sensor, pixels, sizes)
         made = replace(sensor, markers=Markers("dots", "dark", dots.positions, sizes))
         seen = find_dots(rest_image(made, 0), "dark").pixels
         gap, _ = cKDTree(seen).query(pixels)
@@ -232,7 +232,7 @@ def pattern(seeds, figures):
         yield record
         if figures:
             title = f"{name}: {len(pixels)} dots that make a square lattice in the image"
-            save(mill_figure(title, sensor, dots), figures / f"pattern_{name}.png")
+            save(layout_figure(title, sensor, dots), figures / f"layout_{name}.png")
 
 
 def poses_seen(photograph: BoardImages, board, count: int, depths, spread: float, rng) -> np.ndarray:
@@ -321,7 +321,7 @@ def draw(folder: Path | None, name: str, report: Report) -> None:
         save(fit_figure(report, (640, 480)), folder / f"{name}.png")
 
 
-PARTS = {part.__name__: part for part in (lens, ports, rest, effect, views, depth, pattern, material)}
+PARTS = {part.__name__: part for part in (lens, ports, rest, effect, views, depth, layout, material)}
 
 
 def main():

@@ -16,7 +16,7 @@ from torchmembrane import MembraneError
 from torchmembrane.calibrate.boards import Views, lens_from_views, ports_from_views
 from torchmembrane.calibrate.depth import rest_from_depth
 from torchmembrane.calibrate.fit import fit, outline_centres, rotations, with_common_errors
-from torchmembrane.calibrate.mill import dots_for_pixels, pixel_lattice
+from torchmembrane.calibrate.layout import layout_for_pixels, pixel_lattice
 from torchmembrane.calibrate.rest import rest_from_image
 from torchmembrane.calibrate.targets import find_target
 from torchmembrane.calibrate.views import rest_from_views
@@ -326,12 +326,12 @@ def test_rest_surface_and_dots_are_found_from_a_depth_image(design, truth, image
     assert cKDTree(truth.markers.positions).query(found.sensor.markers.positions)[0].max() < 0.06
 
 
-# dots for a mill
+# fabrication layout
 
 
-def test_dots_for_a_wanted_pattern_are_seen_where_they_were_wanted(design):
+def test_dots_laid_out_for_a_wanted_pattern_are_seen_where_they_were_wanted(design):
     pixels, sizes = pixel_lattice(design, 20.0)
-    dots = dots_for_pixels(design, pixels, sizes)
+    dots = layout_for_pixels(design, pixels, sizes)
     x, y, z = dots.positions.T
     assert np.abs(np.sqrt(x**2 + y**2 + (z - 6.4) ** 2) - 10.6).max() < 2e-3  # on the cap's sphere
     assert np.abs(dots.normals - (dots.positions - [0, 0, 6.4]) / 10.6).max() < 2e-3
@@ -340,7 +340,7 @@ def test_dots_for_a_wanted_pattern_are_seen_where_they_were_wanted(design):
     found = rest_from_image(made, simulator_of(made).rest_image())
     assert np.nanmax(np.abs(found.pixels - pixels)) < 0.12
     with pytest.raises(MembraneError, match="misses the rest surface"):
-        dots_for_pixels(design, np.array([[5.0, 5.0]]), ["small"])
+        layout_for_pixels(design, np.array([[5.0, 5.0]]), ["small"])
 
 
 # the command
@@ -377,20 +377,20 @@ def test_command_camera_leaves_out_images_without_a_board(design, tmp_path, caps
     assert np.abs(found.focal.numpy() - 150).max() < 1 and len(found.ports) == 1
 
 
-def test_command_pattern_writes_for_mill_and_eye(design, tmp_path, capsys):
+def test_command_layout_writes_for_machine_and_eye(design, tmp_path, capsys):
     path = design.to_file(tmp_path / "design")
-    code, said, _ = run(capsys, "pattern", path, "--pitch", 25, "--out", tmp_path / "out")
-    assert code == 0 and "mill.csv" in said
+    code, said, _ = run(capsys, "layout", path, "--pitch", 25, "--out", tmp_path / "out")
+    assert code == 0 and "layout.csv" in said
     made = Sensor.from_file(tmp_path / "out" / "sensor.toml")
-    with (tmp_path / "out" / "mill.csv").open() as file:
+    with (tmp_path / "out" / "layout.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(made.markers.positions)
     places = np.array([[float(row[key]) for key in "xyz"] for row in rows])
     assert np.allclose(places + [0, 0, 12.0], made.markers.positions, atol=2e-5)
-    drawing = ElementTree.parse(tmp_path / "out" / "mill.svg").getroot()
+    drawing = ElementTree.parse(tmp_path / "out" / "layout.svg").getroot()
     assert len(drawing.findall("{*}ellipse")) == len(rows) and drawing.get("width").endswith("mm")
     (tmp_path / "wanted.csv").write_text("u,v,size\n160,120,large\n180,120,tiny\n")
-    code, _, errors = run(capsys, "pattern", path, "--pixels", tmp_path / "wanted.csv", "--out", tmp_path / "no")
+    code, _, errors = run(capsys, "layout", path, "--pixels", tmp_path / "wanted.csv", "--out", tmp_path / "no")
     assert code == 2 and "small or large" in errors
-    code, _, errors = run(capsys, "pattern", path, "--out", tmp_path / "no")
+    code, _, errors = run(capsys, "layout", path, "--out", tmp_path / "no")
     assert code == 2 and "--pixels" in errors

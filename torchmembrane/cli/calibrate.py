@@ -1,4 +1,4 @@
-"""`torchmembrane calibrate`: sensor files from images, and dots for a mill from a pattern in the image."""
+"""`torchmembrane calibrate`: sensor files from images, and the layout of dots to fabricate from a pattern in the image."""
 
 import argparse
 import csv
@@ -11,8 +11,8 @@ import torch
 
 from ..calibrate.boards import PORTS, CameraFit, Views, lens_from_views, ports_from_views
 from ..calibrate.depth import rest_from_depth
+from ..calibrate.layout import layout_for_pixels, pixel_lattice, read_pixels, write_layout, write_svg
 from ..calibrate.material import STRETCHES, material_from_images
-from ..calibrate.mill import dots_for_pixels, pixel_lattice, read_pixels, write_mill, write_svg
 from ..calibrate.rest import rest_from_image
 from ..calibrate.surface import fine_surface
 from ..calibrate.targets import find_target
@@ -20,7 +20,7 @@ from ..calibrate.views import rest_from_views
 from ..errors import MembraneError
 from ..io.images import read_image
 from ..jobs.inputs import find_inputs
-from ..plot.calibration import Report, fit_figure, material_figure, mill_figure, surface_figure
+from ..plot.calibration import Report, fit_figure, layout_figure, material_figure, surface_figure
 from ..presets import sensor_file
 from ..sensor.model import Markers, Sensor
 from ..targets import Checkerboard, DotBoard
@@ -39,7 +39,7 @@ A sensor is calibrated in this order, each step starting from the sensor file of
   depth      the same from a depth image
   material   prestretch from images of presses; stiffness, where the forces of some are known
 and the other way round:
-  pattern    from the dots wanted in the image to places on the rest surface, for a mill"""
+  layout     from the dots wanted in the image to places on the rest surface, to fabricate them"""
 EXAMPLES = {
     "camera": "torchmembrane calibrate camera design.toml board/*.png --corners 11,8 --square 2.5 --out lens",
     "ports": "torchmembrane calibrate ports lens/sensor.toml --air dry/ --medium wet/ --dots 17,13 --pitch 2 --out ports",
@@ -47,7 +47,7 @@ EXAMPLES = {
     "views": "torchmembrane calibrate views ports/sensor.toml first.png second.png third.png --motions motions.csv --out rest",
     "depth": "torchmembrane calibrate depth sensor.toml depth.npy --image rest.png --out rest",
     "material": "torchmembrane calibrate material rest/sensor.toml press/*.png --forces forces.csv --out material",
-    "pattern": "torchmembrane calibrate pattern design.toml --pitch 30 --out mill",
+    "layout": "torchmembrane calibrate layout design.toml --pitch 30 --out layout",
 }
 
 
@@ -163,22 +163,22 @@ def material(arguments) -> int:
     return _done(arguments, found.sensor, report, material_figure(report, found, [path.name for path in paths]))
 
 
-def pattern(arguments) -> int:
-    """`torchmembrane calibrate pattern`"""
+def layout(arguments) -> int:
+    """`torchmembrane calibrate layout`"""
     sensor = _sensor(arguments)
     if (arguments.pixels is None) == (arguments.pitch is None):
-        raise MembraneError("calibrate pattern: expected either --pixels FILE or --pitch PX")
+        raise MembraneError("calibrate layout: expected either --pixels FILE or --pitch PX")
     wanted = read_pixels(arguments.pixels) if arguments.pixels else pixel_lattice(sensor, arguments.pitch)
-    dots = dots_for_pixels(sensor, *wanted)
+    dots = layout_for_pixels(sensor, *wanted)
     made = replace(sensor, markers=Markers("dots", sensor.markers.polarity, dots.positions, dots.sizes))
     path = made.to_file(arguments.out)
-    write_mill(arguments.out / "mill.csv", sensor, dots)
-    write_svg(arguments.out / "mill.svg", sensor, dots)
+    write_layout(arguments.out / "layout.csv", sensor, dots)
+    write_svg(arguments.out / "layout.svg", sensor, dots)
     from ..plot.frames import save
 
     title = f"{len(dots.radii)} dots, radii {dots.radii.min():.3g} to {dots.radii.max():.3g} {sensor.length_unit}"
-    save(mill_figure(title, sensor, dots), arguments.out / "report.png")
-    print(f"{title}\n{arguments.out / 'mill.csv'} for the mill, mill.svg to look at, and the sensor that has them: {path}")
+    save(layout_figure(title, sensor, dots), arguments.out / "report.png")
+    print(f"{title}\n{arguments.out / 'layout.csv'} to fabricate, layout.svg to look at, and the sensor that has them: {path}")
     return 0
 
 
@@ -314,7 +314,7 @@ def _material_options(add) -> None:
     add("--forces", metavar="FILE.csv", type=Path, help=where)
 
 
-def _pattern_options(add) -> None:
+def _layout_options(add) -> None:
     add("--pixels", metavar="FILE.csv", type=Path, help="the wanted dots: u,v,size (small | large)")
     add("--pitch", metavar="PX", type=_length, help="a square lattice of this pitch within the rim's outline")
 
@@ -343,5 +343,5 @@ VERBS = {
     "views": (views, "find dots and rest surface from several views", _views_options),
     "depth": (depth, "find rest surface and dots from a depth image", _depth_options),
     "material": (material, "find prestretch and stiffness from images of presses", _material_options),
-    "pattern": (pattern, "turn dots wanted in the image into places on the rest surface", _pattern_options),
+    "layout": (layout, "turn dots wanted in the image into places on the rest surface", _layout_options),
 }

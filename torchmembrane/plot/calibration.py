@@ -179,7 +179,7 @@ def material_figure(report: Report, found, names: list[str]) -> Figure:
     return drawing
 
 
-def mill_figure(title: str, sensor, dots) -> Figure:
+def layout_figure(title: str, sensor, dots) -> Figure:
     """The wanted pattern in the image, and its dots on the rest surface, from above and from the side."""
     drawing = Figure(figsize=(15, 4.6), layout="constrained")
     drawing.suptitle(title)

@@ -1,4 +1,7 @@
-"""From the dot pattern wanted in the image, through the ports, to places on the rest surface: how the paper made its sensor."""
+"""The fabrication layout: from the dot pattern wanted in the image, through the ports, to places on the rest surface.
+
+So the paper made its sensor (section 5.2).
+"""
 
 import csv
 from pathlib import Path
@@ -19,8 +22,16 @@ MARGIN = 0.6  # of a pitch, that a lattice keeps from the rim's outline
 NEWTON_STEPS, AIMS = 3, 2
 
 
-class MillDots(NamedTuple):
-    """Dots to be made: `positions`, outward `normals [D, 3]` in the camera's frame, `radii [D]`, `sizes`, `pixels [D, 2]`."""
+class FabricationLayout(NamedTuple):
+    """Dots to be made on the rest surface.
+
+    Attributes:
+        positions: `[D, 3]` centres, camera frame, length unit.
+        normals: `[D, 3]` outward unit normals there.
+        radii: `[D]`, length unit.
+        sizes: small or large, of each.
+        pixels: `[D, 2]` where they are to be seen, px.
+    """
 
     positions: np.ndarray
     normals: np.ndarray
@@ -32,7 +43,7 @@ class MillDots(NamedTuple):
 def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
     """A square lattice in the image about the principal point, `pitch` px, within the rim: `[D, 2]`, and sizes in turns."""
     if not pitch >= 4:
-        raise MembraneError(f"calibrate pattern: pitch = {pitch}; expected 4 px or more, so that dots can be told apart")
+        raise MembraneError(f"calibrate layout: pitch = {pitch}; expected 4 px or more, so that dots can be told apart")
     width, height = sensor.camera.image_size
     centre = sensor.camera.centre.numpy()
     reach = int(max(width, height) / pitch)
@@ -47,7 +58,7 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
     return pixels[kept], np.where((i + j) % 2 == 0, "large", "small")[kept].tolist()
 
 
-def dots_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> MillDots:
+def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> FabricationLayout:
     """Dots on the rest surface whose outlines are seen, through the ports, with their centres at `pixels [D, 2]`.
 
     A dot's own centre is seen beside its outline's, so that the ray aimed at is moved until the outline's is right. Raises
@@ -62,7 +73,7 @@ def dots_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> Mil
         outlines = sensor.camera.point_to_pixel(torch.from_numpy(dot_outlines(surface, X, radii)))
         aimed = aimed + (wanted - outline_centres(outlines).numpy())
     X, normals = _ray_hits(sensor, surface, aimed)
-    return MillDots(X, normals, radii, list(sizes), wanted)
+    return FabricationLayout(X, normals, radii, list(sizes), wanted)
 
 
 def _ray_hits(sensor: Sensor, surface: Membrane, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +84,7 @@ def _ray_hits(sensor: Sensor, surface: Membrane, pixels: np.ndarray) -> tuple[np
     if missed.any():
         d = int(np.flatnonzero(missed)[0])
         raise MembraneError(
-            f"calibrate pattern: the ray of pixel {pixels[d].tolist()} (dot {d}) misses the rest surface; expected pixels "
+            f"calibrate layout: the ray of pixel {pixels[d].tolist()} (dot {d}) misses the rest surface; expected pixels "
             "within the rim's outline: leave it out"
         )
     finer = sensor.surface.membrane(tuple(2 * side - 1 for side in surface.grid))
@@ -101,8 +112,8 @@ def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
     return pixels, sizes
 
 
-def write_mill(path: Path, sensor: Sensor, dots: MillDots) -> None:
-    """CSV for a mill: `dot,x,y,z,nx,ny,nz,radius,size`, origin at the rim's centre, axes parallel to the camera's."""
+def write_layout(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
+    """CSV for the machine that makes the dots: `dot,x,y,z,nx,ny,nz,radius,size`, origin at the rim's centre, axes parallel to the camera's."""
     rim = sensor.membrane.rest[sensor.membrane.fixed].mean(0).numpy()
     lines = ["dot,x,y,z,nx,ny,nz,radius,size"]
     rows = zip(dots.positions - rim, dots.normals, dots.radii, dots.sizes, strict=True)
@@ -111,7 +122,7 @@ def write_mill(path: Path, sensor: Sensor, dots: MillDots) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def write_svg(path: Path, sensor: Sensor, dots: MillDots) -> None:
+def write_svg(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
     """The dots and the rim seen along the axis, one unit a length unit, for printing or looking at."""
     m, n = sensor.membrane.grid
     index = np.arange(m * n).reshape(m, n)
