@@ -25,7 +25,7 @@ from torchmembrane.calibrate.depth import rest_from_depth
 from torchmembrane.calibrate.layout import layout_for_pixels, pixel_lattice
 from torchmembrane.calibrate.material import material_from_images
 from torchmembrane.calibrate.rest import rest_from_image
-from torchmembrane.calibrate.surface import feet_of, fine_surface
+from torchmembrane.calibrate.surface import fine_surface, surface_projection
 from torchmembrane.calibrate.targets import find_target
 from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
@@ -227,7 +227,7 @@ def layout(seeds, figures):
         made = replace(sensor, markers=Markers("dots", "dark", dots.positions, sizes))
         seen = find_dots(rest_image(made, 0), "dark").pixels
         gap, _ = cKDTree(seen).query(pixels)
-        record = dict(what=f"pattern, {name}", dots=len(pixels), found=int((gap < 3).sum()), rms=rms(gap[gap < 3]))
+        record = dict(what=f"layout, {name}", dots=len(pixels), found=int((gap < 3).sum()), rms=rms(gap[gap < 3]))
         print(record)
         yield record
         if figures:
@@ -284,8 +284,8 @@ def surface_errors(truth, design, found) -> dict[str, float]:
     """Distances, mm, of the designed and the calibrated surface from the true one, free vertices, and over their deviations."""
     target = truth.surface.membrane((129, 129))
     free = ~fine_surface(design).fixed.numpy()
-    before = feet_of(target, fine_surface(design).rest.numpy()[free]).heights
-    after = feet_of(target, found.surface.vertices[free]).heights
+    before = surface_projection(target, fine_surface(design).rest.numpy()[free]).signed_distance
+    after = surface_projection(target, found.surface.vertices[free]).signed_distance
     deviations = found.surface.deviations[free]
     return dict(
         surface_before=rms(before), surface_after=rms(after), surface_deviation=rms(deviations),

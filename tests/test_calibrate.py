@@ -322,7 +322,7 @@ def test_rest_surface_and_dots_are_found_from_a_depth_image(design, truth, image
     vertices = found.sensor.surface.values["vertices"].reshape(-1, 3)
     gap = truth.surface.membrane((129, 129)).closest_points(vertices).distance
     assert (gap < 3 * found.surface.deviations)[radius < 8].mean() > 0.97
-    assert gap[radius < 8].mean() < 0.02 < 0.15 < np.abs(found.feet.heights).mean()
+    assert gap[radius < 8].mean() < 0.02 < 0.15 < np.abs(found.projection.signed_distance).mean()
     assert cKDTree(truth.markers.positions).query(found.sensor.markers.positions)[0].max() < 0.06
 
 

@@ -8,7 +8,7 @@ import torch
 from ..errors import MembraneError
 from ..markers.place import rim_mask
 from ..sensor.model import Sensor
-from .surface import Correction, Feet, correction, feet_of, fine_surface, recalibrated
+from .surface import Correction, SurfaceProjection, correction, fine_surface, recalibrated, surface_projection
 from .views import placed_dots
 
 CELL = 24  # px: over such squares depths are averaged
@@ -17,12 +17,18 @@ NEAR = 0.1  # of the surface's size: depths farther from the design are of somet
 
 
 class DepthFit(NamedTuple):
-    """The sensor with the surface of a depth image: `Correction` of the design, and what it rests on: `Feet [N]` of squares of
-    depths on the designed surface, and the standard deviations of their heights `[N]`, length unit."""
+    """The sensor with the surface of a depth image.
+
+    Attributes:
+        sensor: the sensor with the surface and the dots found.
+        surface: `Correction` of the designed surface.
+        projection: `[N]` squares of averaged depths, projected onto the designed surface.
+        deviations: `[N]` standard deviations of their signed distances, length unit.
+    """
 
     sensor: Sensor
     surface: Correction
-    feet: Feet
+    projection: SurfaceProjection
     deviations: np.ndarray
 
 
@@ -38,22 +44,26 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> Dep
         )
     surface = fine_surface(sensor)
     points, cells = _points(sensor, depth)
-    feet = feet_of(surface, points)
-    near = np.abs(feet.heights) < NEAR * surface.size
-    feet = Feet(*(values[near] for values in feet))
+    projection = surface_projection(surface, points)
+    near = np.abs(projection.signed_distance) < NEAR * surface.size
+    projection = SurfaceProjection(*(values[near] for values in projection))
     square = np.unique(cells[near], return_inverse=True)[1]
     counts = np.bincount(square)
-    mean = lambda values: np.stack([np.bincount(square, column) for column in values.T], -1) / counts[:, None]  # noqa: E731
-    places, normals, heights = mean(feet.places), mean(feet.normals), mean(feet.heights[:, None])[:, 0]
-    spread = np.bincount(square, (feet.heights - heights[square]) ** 2) / counts
+
+    def square_mean(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(square, column) for column in values.T], -1) / counts[:, None]
+
+    closest, normals = square_mean(projection.points), square_mean(projection.normals)
+    distance = square_mean(projection.signed_distance[:, None])[:, 0]
+    spread = np.bincount(square, (projection.signed_distance - distance[square]) ** 2) / counts
     kept = counts >= FEWEST
     deviations = np.sqrt(spread / (counts - 1).clip(1))[kept]
     normals = normals[kept] / np.linalg.norm(normals[kept], axis=1, keepdims=True)
-    feet = Feet(places[kept], normals, heights[kept])
-    change = correction(surface, feet, deviations**2)
+    projection = SurfaceProjection(closest[kept], normals, distance[kept])
+    change = correction(surface, projection, deviations**2)
     dots, sizes = placed_dots(recalibrated(sensor, surface, change.vertices, None, None, image), image)
     moved = recalibrated(sensor, surface, change.vertices, dots, sizes, image)
-    return DepthFit(moved, change, feet, deviations)
+    return DepthFit(moved, change, projection, deviations)
 
 
 def _points(sensor: Sensor, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from ..markers.place import rim_mask
 from ..sensor.model import Sensor
 from ..surface.membrane import Membrane
 from .fit import outline_centres
-from .surface import dot_outlines, feet_of, fine_surface
+from .surface import dot_outlines, fine_surface, surface_projection
 
 RADIUS = {"small": 0.16, "large": 0.27}  # of dots, over their spacing
 MARGIN = 0.6  # of a pitch, that a lattice keeps from the rim's outline
@@ -90,9 +90,9 @@ def _ray_hits(sensor: Sensor, surface: Membrane, pixels: np.ndarray) -> tuple[np
     finer = sensor.surface.membrane(tuple(2 * side - 1 for side in surface.grid))
     X = origin + reach[:, None] * direction
     for _ in range(NEWTON_STEPS):
-        feet = feet_of(finer, X)
-        X = X - (feet.heights / (direction * feet.normals).sum(1))[:, None] * direction
-    return X, feet_of(finer, X).normals
+        near = surface_projection(finer, X)
+        X = X - (near.signed_distance / (direction * near.normals).sum(1))[:, None] * direction
+    return X, surface_projection(finer, X).normals
 
 
 def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:

@@ -13,7 +13,7 @@ from ..markers.place import rim_mask
 from ..sensor.model import Sensor
 from .fit import Fit, fit, outline_centres, rotations, strays, with_common_errors
 from .rest import measured_outlines, shading_bias
-from .surface import Correction, correction, feet_of, fine_surface, recalibrated
+from .surface import Correction, correction, fine_surface, recalibrated, surface_projection
 
 SIDEWAYS = 0.015  # px: a turned view is shaded to one side, and its located dots share a shift (0.024 px at 4 degrees)
 
@@ -131,9 +131,9 @@ def _bundle(sensor, surface, X, sizes, rel, pixels, motions, travel_error, image
         found.values[own:].reshape(-1, 3),
         np.where(seen[..., None], pixels - each(*parts(found.values)).numpy(), np.nan),
     )
-    feet = feet_of(surface, dots)
+    projection = surface_projection(surface, dots)
     blocks = np.stack([found.covariance[own + 3 * d : own + 3 * d + 3, own + 3 * d : own + 3 * d + 3] for d in range(D)])
-    change = correction(surface, feet, np.einsum("di,dij,dj->d", feet.normals, blocks, feet.normals))
+    change = correction(surface, projection, np.einsum("di,dij,dj->d", projection.normals, blocks, projection.normals))
     moved = recalibrated(sensor, surface, change.vertices, dots, sizes, image)
     names = [f"{name}[{p}]" for p in range(1, P) for name in ("turn_x", "turn_y", "turn_z", "place_x", "place_y", "place_z")]
     scale = np.array(([180 / np.pi] * 3 + [1.0] * 3) * (P - 1) + [1.0] * (3 * D))
