@@ -274,14 +274,14 @@ def test_a_lone_push_is_taken_for_error_its_patch_for_a_contact():
     assert prices(estimator, alone)[0][centre] > 1.5 * prices(estimator, force)[0][centre]
 
 
-def test_strays_have_little_say(pressed):
+def test_outliers_have_little_weight(pressed):
     """A few markers off by 2 px of 168 px/rad, a fifth of the spacing."""
     (origins, directions), positions, moved, _ = pressed
     weight = torch.ones(1, len(positions), dtype=torch.float64)
     wrong = directions.clone()
     generator = torch.Generator().manual_seed(1)
-    stray = torch.randperm(len(positions), generator=generator)[:6]
-    wrong[stray] += 2 / 168 * torch.nn.functional.normalize(torch.randn(6, 3, generator=generator, dtype=wrong.dtype), dim=-1)
+    outliers = torch.randperm(len(positions), generator=generator)[:6]
+    wrong[outliers] += 2 / 168 * torch.nn.functional.normalize(torch.randn(6, 3, generator=generator, dtype=wrong.dtype), dim=-1)
     wrong = torch.nn.functional.normalize(wrong, dim=-1)
     estimator = make(17)
     clean = relative(estimator, estimator(origins[None], directions[None], weight), positions, moved)

@@ -12,7 +12,7 @@ from ..camera.model import COEFFICIENTS, Camera
 from ..errors import MembraneError
 from ..io.optional import load_opencv
 from ..targets import Checkerboard, DotBoard
-from .fit import Fit, fit, outline_centres, rotations, strays
+from .fit import Fit, fit, outline_centres, rotations, outliers
 
 LENS = ("focal", "centre", "distortion")
 PORTS = ("port_distance", "port_thickness", "port_index", "medium_index")
@@ -121,9 +121,9 @@ def _fit_camera(
     for _ in range(ROUNDS):
         theta = fit(residuals, jacobian, theta, what).values
         left = (all_views(*parts(theta)) - pixels)[observed].numpy()
-        wild = strays(left)
-        pull = design_precision * np.median(np.abs(left[~wild])) / 0.6745
-        seen[observed] = torch.from_numpy(~wild)
+        mistaken = outliers(left)
+        pull = design_precision * np.median(np.abs(left[~mistaken])) / 0.6745
+        seen[observed] = torch.from_numpy(~mistaken)
     found = fit(residuals, jacobian, theta, what)
     shared, poses, _ = parts(found.values)
     left = torch.where(seen[..., None], pixels - all_views(shared, poses, filled), torch.nan).numpy()

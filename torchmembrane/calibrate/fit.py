@@ -12,7 +12,7 @@ from ..errors import MembraneError
 
 TOLERANCE, MOST_STEPS = 1e-7, 200
 LEAST = 1e-13  # smallest singular value told from nothing, over the largest
-STRAY = 6.0  # residuals beyond so many robust standard deviations are mistakes, not noise
+OUTLIER = 6.0  # residuals beyond so many robust standard deviations are mistakes, not noise
 
 
 class Fit(NamedTuple):
@@ -64,10 +64,10 @@ def with_common_errors(found: Fit, jacobian: np.ndarray, errors: np.ndarray) -> 
     return found._replace(covariance=found.covariance + shifts @ shifts.T)
 
 
-def strays(residuals: np.ndarray) -> np.ndarray:
+def outliers(residuals: np.ndarray) -> np.ndarray:
     """Which of the residual vectors `[N, 2]` are mistakes: far beyond the others."""
     length = np.linalg.norm(residuals, axis=-1)
-    return ~(length <= STRAY * max(np.nanmedian(length) / 1.18, 1e-9))  # 1.18: median length for unit deviation in the plane
+    return ~(length <= OUTLIER * max(np.nanmedian(length) / 1.18, 1e-9))  # 1.18: median length for unit deviation in the plane
 
 
 def rotations(vectors: Tensor) -> Tensor:

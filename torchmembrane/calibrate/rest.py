@@ -9,7 +9,7 @@ from torch.func import jacfwd, vmap
 from ..errors import MembraneError
 from ..markers.dots import measure_dots
 from ..sensor.model import Sensor
-from .fit import Fit, fit, outline_centres, rotations, strays, with_common_errors
+from .fit import Fit, fit, outline_centres, rotations, outliers, with_common_errors
 from .surface import dot_outlines, fine_surface, frames_at, recalibrated, unit_shapes
 
 NAMES = ["tilt_x", "tilt_y", "tilt_z", "offset_x", "offset_y", "offset_z"]
@@ -59,7 +59,7 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
         return jacfwd(modelled)(torch.from_numpy(theta), torch.from_numpy(outlines[used])).flatten(0, 1).numpy()
 
     result = fit(residuals, jacobian, np.zeros(6), "calibrate rest")
-    used[used] = ~strays(result.residuals.reshape(-1, 2))
+    used[used] = ~outliers(result.residuals.reshape(-1, 2))
     result = fit(residuals, jacobian, result.values, "calibrate rest")
     found = result.values
     result = with_common_errors(result, jacobian(found), shading_bias(sensor, pixels[used]).reshape(-1, 1))

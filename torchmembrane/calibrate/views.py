@@ -11,7 +11,7 @@ from ..errors import MembraneError
 from ..markers.dots import find_dots
 from ..markers.place import rim_mask
 from ..sensor.model import Sensor
-from .fit import Fit, fit, outline_centres, rotations, strays, with_common_errors
+from .fit import Fit, fit, outline_centres, rotations, outliers, with_common_errors
 from .rest import measured_outlines, shading_bias
 from .surface import Correction, correction, fine_surface, recalibrated, surface_projection
 
@@ -118,8 +118,8 @@ def _bundle(sensor, surface, X, sizes, rel, pixels, motions, travel_error, image
     pixels, seen, D = pixels[:, kept], seen[:, kept], int(kept.sum())
     theta, pull = np.concatenate([motions.ravel(), X.ravel()]), 0.05 / travel_error
     found = fit(residuals, jacobian, theta, "calibrate views")
-    wild = strays(found.residuals[:-1].reshape(-1, 2))
-    seen[np.nonzero(seen)] = ~wild
+    mistaken = outliers(found.residuals[:-1].reshape(-1, 2))
+    seen[np.nonzero(seen)] = ~mistaken
     pull = found.noise / travel_error
     found = fit(residuals, jacobian, found.values, "calibrate views")
     sideways = np.broadcast_to(SIDEWAYS * np.eye(2)[:, None], (2, seen.sum(), 2))
