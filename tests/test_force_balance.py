@@ -237,7 +237,7 @@ def patch_of_pushes(estimator, push, pull_elsewhere=0.0, rub=0.0):
     return (traction * estimator.area[:, None])[None], middle
 
 
-def prices(estimator, force, tau=0.5):
+def weights(estimator, force, tau=0.5):
     """Weight of the normal and of one tangential direction at every inner vertex, over that of a small push."""
     _, normal = at_rest(estimator)
     W = estimator.force_weights(normal.mT, force.mT, tau)[0].movedim(-1, 0)
@@ -246,23 +246,23 @@ def prices(estimator, force, tau=0.5):
     return tuple((d[:, None] @ W @ d[..., None]).ravel() / scale for d in (normal, along))
 
 
-def test_large_pushes_get_cheap_small_ones_and_pulls_do_not():
+def test_large_pushes_get_a_small_weight_small_ones_and_pulls_do_not():
     estimator = make(17)
     centre = next(at_rest(estimator))[:, :2].norm(dim=1).argmin()
     for push, tau, low, high in ((1e-3, 0.5, 0.99, 1.01), (4.0, 0.5, 0.0, 0.01), (4.0, 100.0, 0.95, 1.01)):
         force, _ = patch_of_pushes(estimator, push)
-        assert low < prices(estimator, force, tau)[0][centre] < high
+        assert low < weights(estimator, force, tau)[0][centre] < high
     force, middle = patch_of_pushes(estimator, 4.0, pull_elsewhere=4.0)
-    torch.testing.assert_close(prices(estimator, force)[0][~middle], torch.full((int((~middle).sum()),), 1 + FLOOR).double())
+    torch.testing.assert_close(weights(estimator, force)[0][~middle], torch.full((int((~middle).sum()),), 1 + FLOOR).double())
 
 
-def test_rubbing_is_dear_but_where_something_pushes():
+def test_shear_has_a_large_weight_but_where_something_pushes():
     estimator = make(17)
     centre = next(at_rest(estimator))[:, :2].norm(dim=1).argmin()
-    dear, _ = patch_of_pushes(estimator, 1e-6, rub=0.5)
-    cheap, _ = patch_of_pushes(estimator, 4.0, rub=0.5)
-    dear, cheap = (prices(estimator, force)[1][centre] for force in (dear, cheap))
-    assert 0.9 * FRICTION / 0.5 < dear < FRICTION / 0.5 and cheap < dear / (0.9 * CONE * 4)
+    large, _ = patch_of_pushes(estimator, 1e-6, rub=0.5)
+    small, _ = patch_of_pushes(estimator, 4.0, rub=0.5)
+    large, small = (weights(estimator, force)[1][centre] for force in (large, small))
+    assert 0.9 * FRICTION / 0.5 < large < FRICTION / 0.5 and small < large / (0.9 * CONE * 4)
 
 
 def test_a_lone_push_is_taken_for_error_its_patch_for_a_contact():
@@ -271,7 +271,7 @@ def test_a_lone_push_is_taken_for_error_its_patch_for_a_contact():
     centre = next(at_rest(estimator))[:, :2].norm(dim=1).argmin()
     alone = torch.zeros_like(force)
     alone[0, centre] = force[0, centre]
-    assert prices(estimator, alone)[0][centre] > 1.5 * prices(estimator, force)[0][centre]
+    assert weights(estimator, alone)[0][centre] > 1.5 * weights(estimator, force)[0][centre]
 
 
 def test_outliers_have_little_weight(pressed):
@@ -281,7 +281,9 @@ def test_outliers_have_little_weight(pressed):
     wrong = directions.clone()
     generator = torch.Generator().manual_seed(1)
     outliers = torch.randperm(len(positions), generator=generator)[:6]
-    wrong[outliers] += 2 / 168 * torch.nn.functional.normalize(torch.randn(6, 3, generator=generator, dtype=wrong.dtype), dim=-1)
+    wrong[outliers] += (
+        2 / 168 * torch.nn.functional.normalize(torch.randn(6, 3, generator=generator, dtype=wrong.dtype), dim=-1)
+    )
     wrong = torch.nn.functional.normalize(wrong, dim=-1)
     estimator = make(17)
     clean = relative(estimator, estimator(origins[None], directions[None], weight), positions, moved)
@@ -397,7 +399,7 @@ def test_the_example_images_give_shape_force_and_place():
     assert np.median(errors) < 0.15 and max(errors) < 0.3, errors
 
 
-def test_price_of_normal_tractions_has_the_slope_that_the_weights_say(monkeypatch):
+def test_loss_of_normal_tractions_has_the_slope_that_the_weights_say(monkeypatch):
     monkeypatch.setattr("torchmembrane.estimators.force_balance.FLOOR", 0.0)
     estimator = make()
     membrane, p0 = estimator.membrane, estimator.reference
@@ -407,8 +409,8 @@ def test_price_of_normal_tractions_has_the_slope_that_the_weights_say(monkeypatc
     level = p0 * torch.linspace(-1.5, 0.5, len(membrane.rest), dtype=torch.float64)
     traction = (level[:, None] * membrane.rest_normals)[None].requires_grad_()
     rest = Equilibrium(membrane.rest[None], estimator.rest_pressure[None], membrane.rest_volume[None], traction, None)
-    price = estimator.price(rest, *(a[None] for a in rays), torch.ones(1, len(estimator.positions), dtype=torch.float64))
-    (slope,) = torch.autograd.grad(price.sum(), traction)
+    loss = estimator.price(rest, *(a[None] for a in rays), torch.ones(1, len(estimator.positions), dtype=torch.float64))
+    (slope,) = torch.autograd.grad(loss.sum(), traction)
     force, normal = within(traction.detach() * membrane.rest_area[:, None]), within(membrane.rest_normals)
     W = estimator.force_weights(normal.mT, force.mT, 0.4).movedim(-1, 1)
     expected = estimator.area[:, None] * (W @ force[..., None]).squeeze(-1)

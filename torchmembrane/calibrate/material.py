@@ -17,21 +17,21 @@ from ..reconstruct import Reconstructor
 from ..sensor.model import Sensor
 from ..surface.membrane import SurfacePoints
 
-GRID = (17, 17)  # on finer grids the price is less smooth in the prestretch
+GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
 STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it
 BETWEEN = 5  # prestretches tried on either side of the lowest
-PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the price's, alike in all images
+PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the loss's, alike in all images
 WRONG = 0.02  # probability that an image is explained wrongly altogether and tells nothing
 FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known force (docs/calibration.md)
 GAS_ROUNDS = 4
 FINE = 4001  # prestretches over which the probability is summed
 
 
-class Profile(NamedTuple):
-    """The least price at each prestretch: `stretches [S]`, increasing, `prices [S, B]` of every image."""
+class LossProfile(NamedTuple):
+    """The least loss at each prestretch: `stretches [S]`, increasing, `losses [S, B]` of every image."""
 
     stretches: np.ndarray
-    prices: np.ndarray
+    losses: np.ndarray
 
 
 class MaterialFit(NamedTuple):
@@ -45,7 +45,7 @@ class MaterialFit(NamedTuple):
     sensor: Sensor
     values: np.ndarray
     covariance: np.ndarray
-    profile: Profile
+    profile: LossProfile
     each: np.ndarray
     forces: np.ndarray
 
@@ -75,7 +75,7 @@ def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | No
     Force balance is solved at many prestretches l. What it minimises, in standard deviations of the markers and of tractions in
     units of the rest pressure, is taken for the negative logarithm of a probability:
 
-        p(log l) ~ product over images of [e + (1 - e) exp(-min over x, p of price(x, p; l)) / mean over l of the same]
+        p(log l) ~ product over images of [e + (1 - e) exp(-min over x, p of loss(x, p; l)) / mean over l of the same]
 
     with e = `WRONG`, for an image that is explained wrongly altogether. Mean and deviation are reported, the latter enlarged
     where the images contradict one another, and by an error that all images share. A membrane with the wrong l needs forces where
@@ -95,8 +95,8 @@ def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | No
 def _material(sensor: Sensor, reconstructor: Reconstructor, displacement, confidence, forces) -> MaterialFit:
     presses = Presses(reconstructor, displacement, confidence)
     profile = presses.profile()
-    each = np.array([_log_stretch(profile.stretches, prices[:, None]) for prices in profile.prices.T])
-    log_stretch, deviation = _log_stretch(profile.stretches, profile.prices)
+    each = np.array([_log_stretch(profile.stretches, losses[:, None]) for losses in profile.losses.T])
+    log_stretch, deviation = _log_stretch(profile.stretches, profile.losses)
     variances = each[:, 1] ** 2 + PRESTRETCH_ERROR**2
     contradiction = ((each[:, 0] - log_stretch) ** 2 / variances).sum() / max(len(each) - 1, 1)
     deviation = np.hypot(deviation * np.sqrt(max(1.0, contradiction)), PRESTRETCH_ERROR)
@@ -121,12 +121,12 @@ def _reconstructor(sensor: Sensor) -> Reconstructor:
     return Reconstructor(replace(sensor, membrane=sensor.surface.membrane(GRID)), dtype=torch.float64)
 
 
-def _log_stretch(stretches: np.ndarray, prices: np.ndarray) -> tuple[float, float]:
-    """Mean and standard deviation of the logarithm of the prestretch, from prices `[S, B]` at `stretches [S]`."""
+def _log_stretch(stretches: np.ndarray, losses: np.ndarray) -> tuple[float, float]:
+    """Mean and standard deviation of the logarithm of the prestretch, from losses `[S, B]` at `stretches [S]`."""
     z = np.log(stretches)
     fine = np.linspace(z[0], z[-1], FINE)
-    price = PchipInterpolator(z, prices)(fine)
-    alone = np.exp(price.min(0) - price)
+    loss = PchipInterpolator(z, losses)(fine)
+    alone = np.exp(loss.min(0) - loss)
     weight = (WRONG + (1 - WRONG) * alone / alone.mean(0)).prod(1)
     mean = (weight * fine).sum() / weight.sum()
     return mean, np.sqrt((weight * (fine - mean) ** 2).sum() / weight.sum())
@@ -153,15 +153,15 @@ class Presses:
         with torch.no_grad():
             return estimator, estimator(*self.rays, self.confidence)
 
-    def profile(self) -> Profile:
-        """The presses' prices at `STRETCHES`, and closer together around the lowest."""
-        prices = {stretch: self._prices(stretch) for stretch in STRETCHES}
-        k = min(max(int(np.argmin([values.sum() for values in prices.values()])), 1), len(STRETCHES) - 2)
-        prices |= {stretch: self._prices(stretch) for stretch in np.geomspace(*STRETCHES[[k - 1, k + 1]], BETWEEN + 2)[1:-1]}
-        stretches = np.array(sorted(prices))
-        return Profile(stretches, np.array([prices[stretch] for stretch in stretches]))
+    def profile(self) -> LossProfile:
+        """The presses' losses at `STRETCHES`, and closer together around the lowest."""
+        losses = {stretch: self._losses(stretch) for stretch in STRETCHES}
+        k = min(max(int(np.argmin([values.sum() for values in losses.values()])), 1), len(STRETCHES) - 2)
+        losses |= {stretch: self._losses(stretch) for stretch in np.geomspace(*STRETCHES[[k - 1, k + 1]], BETWEEN + 2)[1:-1]}
+        stretches = np.array(sorted(losses))
+        return LossProfile(stretches, np.array([losses[stretch] for stretch in stretches]))
 
-    def _prices(self, stretch: float) -> np.ndarray:
+    def _losses(self, stretch: float) -> np.ndarray:
         estimator, found = self.explained(stretch, self.reconstructor.sensor.material.modulus)
         return estimator.price(found, *self.rays, self.confidence).numpy()
 

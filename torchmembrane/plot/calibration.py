@@ -150,19 +150,19 @@ def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarr
 
 
 def material_figure(report: Report, found, names: list[str]) -> Figure:
-    """Prices over the prestretch and the estimate, and forces found and measured where any are, of a `MaterialFit`."""
+    """Losses over the prestretch and the estimate, and forces found and measured where any are, of a `MaterialFit`."""
     known = np.isfinite(found.forces).all(1)
     panels = 2 if known.any() else 1
     drawing = Figure(figsize=(1 + 6 * panels, 4.6), layout="constrained")
     drawing.suptitle(report.title)
     axes = drawing.subplots(1, panels, squeeze=False)[0]
-    stretches, prices = found.profile
-    axes[0].plot(stretches, prices - prices.min(0), "-", color=GREY, lw=1, label="each image")
-    axes[0].plot(stretches, prices.sum(1) - prices.sum(1).min(), ".-", color=BLUE, label="all")
+    stretches, losses = found.profile
+    axes[0].plot(stretches, losses - losses.min(0), "-", color=GREY, lw=1, label="each image")
+    axes[0].plot(stretches, losses.sum(1) - losses.sum(1).min(), ".-", color=BLUE, label="all")
     value, deviation = report.values[0], report.deviations[0]
     axes[0].axvspan(value - deviation, value + deviation, color=VERMILION, alpha=0.2)
     axes[0].axvline(value, color=VERMILION, label=f"{value:.3f} ± {deviation:.2g}")
-    axes[0].set(xscale="log", yscale="symlog", xlabel="prestretch", ylabel="price above the lowest")
+    axes[0].set(xscale="log", yscale="symlog", xlabel="prestretch", ylabel="loss above the lowest")
     axes[0].set_ylim(bottom=0)
     axes[0].set_xticks([1, 1.2, 1.5, 2, 3], ["1", "1.2", "1.5", "2", "3"])
     axes[0].minorticks_off()
