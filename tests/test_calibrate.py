@@ -218,7 +218,7 @@ def test_ports_are_found_from_images_in_air_and_in_the_medium():
     assert np.allclose([*found.camera.ports[0], float(found.camera.medium_index)], found.fit.values[:4])
 
 
-def test_in_the_medium_thickness_and_index_cannot_be_told_apart():
+def test_in_the_medium_thickness_and_index_are_not_identifiable():
     rng = np.random.default_rng(2)
     found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT), 3, rng), np.ones(3, bool)))
     covariance, deviations = found.fit.covariance, found.fit.deviations

@@ -63,7 +63,7 @@ def ports_from_views(camera: Camera, board: DotBoard, views: Views, held: Sequen
 
     `held`: those of `PORTS` that stay as they are in `camera`, whose lens is taken as known. What views in air and views in the
     medium tell: in air a plate shifts every ray by a length that knows neither its distance nor the medium; in a medium its
-    thickness and index cannot be told apart (docs/calibration.md). Give both.
+    thickness and index are not identifiable one by one (docs/calibration.md). Give both.
     """
     if not camera.ports:
         raise MembraneError("calibrate ports: the sensor has no ports; expected [[camera.ports]] with design values")

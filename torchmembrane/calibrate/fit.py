@@ -18,8 +18,8 @@ OUTLIER = 6.0  # residuals beyond so many robust standard deviations are mistake
 class Fit(NamedTuple):
     """The minimum of `|r(theta)|^2`: `values [n]`, their `covariance [n, n]`, `residuals [m]`, and the `noise` of one residual.
 
-    With `J = dr / dtheta` at the minimum and `s^2 = |r|^2 / (m - n)` the covariance is `s^2 (J^T J)^-1`. What the data cannot
-    tell apart shows in it: as huge deviations with correlations near one.
+    With `J = dr / dtheta` at the minimum and `s^2 = |r|^2 / (m - n)` the covariance is `s^2 (J^T J)^-1`. What the
+    data cannot distinguish shows in it: as huge deviations with correlations near one.
     """
 
     values: np.ndarray

@@ -43,7 +43,7 @@ class FabricationLayout(NamedTuple):
 def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
     """A square lattice in the image about the principal point, `pitch` px, within the rim: `[D, 2]`, and sizes in turns."""
     if not pitch >= 4:
-        raise MembraneError(f"calibrate layout: pitch = {pitch}; expected 4 px or more, so that dots can be told apart")
+        raise MembraneError(f"calibrate layout: pitch = {pitch}; expected 4 px or more, so that dots are distinguishable")
     width, height = sensor.camera.image_size
     centre = sensor.camera.centre.numpy()
     reach = int(max(width, height) / pitch)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from .frames import BLUE, GREY, VERMILION, save
 
-TOLD_APART = 0.95  # correlation above which two settings are said to be hard to tell apart
+INDISTINGUISHABLE = 0.95  # correlation above which two settings are said to be hardly distinguishable
 PARAMETERS_DRAWN = 24
 GAINS = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000])
 
@@ -53,8 +53,8 @@ class Report(NamedTuple):
 
     @property
     def confused(self) -> list[tuple[str, str, float]]:
-        """Pairs that the data hardly tell apart, with their correlation."""
-        rows, columns = np.nonzero(np.triu(np.abs(self.correlations) > TOLD_APART, 1))
+        """Pairs that the data hardly distinguish, with their correlation."""
+        rows, columns = np.nonzero(np.triu(np.abs(self.correlations) > INDISTINGUISHABLE, 1))
         return [(self.names[i], self.names[j], float(self.correlations[i, j])) for i, j in zip(rows, columns, strict=True)]
 
     @property
@@ -66,7 +66,7 @@ class Report(NamedTuple):
             lines.append(
                 f"  residuals: {len(self.residuals)} points, {rms:.3f} px rms, at most {np.abs(self.residuals).max():.3f} px"
             )
-        lines += [f"  hardly told apart: {a} and {b} (correlation {c:+.4f})" for a, b, c in self.confused]
+        lines += [f"  hardly distinguishable: {a} and {b} (correlation {c:+.4f})" for a, b, c in self.confused]
         return [self.title, *lines, *(f"  {note}" for note in self.notes)]
 
     def write(self, folder: Path, drawing: Figure) -> None:

@@ -15,7 +15,7 @@ from ..io.atomic import whole_file
 from ..io.results import OK, STATUS_TEXTS
 from ..io.store import Mesh
 
-BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # told apart with any colour vision
+BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # distinguishable with any colour vision
 PRESSED_IN, PUSH = "RdBu", "Oranges"  # negative (in) red, positive (out) blue
 FORCE_ARROW = 0.2  # of the image's width: a force across the optical axis; shorter when it points along it
 MAGNIFICATIONS = (1, 2, 3, 5, 10, 20)
