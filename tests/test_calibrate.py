@@ -13,12 +13,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from torchmembrane import MembraneError
-from torchmembrane.calibrate.boards import Views, lens_from_views, ports_from_views
+from torchmembrane.calibrate.camera import Views, lens_from_views, ports_from_views
 from torchmembrane.calibrate.depth import rest_from_depth
+from torchmembrane.calibrate.detection import find_target
 from torchmembrane.calibrate.fit import fit, outline_centres, rotations, with_common_errors
 from torchmembrane.calibrate.layout import layout_for_pixels, pixel_lattice
 from torchmembrane.calibrate.rest import rest_from_image
-from torchmembrane.calibrate.targets import find_target
 from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli

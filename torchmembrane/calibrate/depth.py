@@ -33,9 +33,24 @@ class DepthFit(NamedTuple):
 
 
 def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> DepthFit:
-    """Rest surface from `depth [H, W]` (z along the axis, length unit; NaN or 0: none), dots from the rest image `[H, W]`.
+    """Rest surface from a depth image, and the dots on it from the rest image.
 
-    Within the rim's outline, averaged over squares of 24 px, the designed surface is moved along its normals onto the depths.
+    The depths within the rim's outline are averaged over squares of 24 px; the designed surface is moved along its normals onto
+    these averages.
+
+    Args:
+        sensor: the design.
+        depth: `[H, W]` z along the camera's axis, length unit; NaN or 0 where there is none.
+        image: `[H, W]` the membrane at rest, grey in 0..1.
+
+    Returns:
+        The sensor with the surface and dots found, and what they rest on.
+
+    Raises:
+        MembraneError: the depth image has another size than the camera's, or too few depths or dots are found.
+
+    Limitations:
+        Depths farther from the design than a tenth of the surface's size are taken for something else and left out.
     """
     width, height = sensor.camera.image_size
     if depth.shape != (height, width):
@@ -72,5 +87,5 @@ def _points(sensor: Sensor, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     mask[1::2] = mask[:, 1::2] = False
     v, u = np.nonzero(mask)
     origin, direction = (a.numpy() for a in sensor.camera.pixel_to_ray(torch.from_numpy(np.stack([u, v], -1).astype(float))))
-    reach = (depth[v, u] - origin[:, 2]) / direction[:, 2]
-    return origin + reach[:, None] * direction, (v // CELL) * 10_000 + u // CELL
+    distance = (depth[v, u] - origin[:, 2]) / direction[:, 2]
+    return origin + distance[:, None] * direction, (v // CELL) * 10_000 + u // CELL

@@ -41,7 +41,23 @@ class FabricationLayout(NamedTuple):
 
 
 def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
-    """A square lattice in the image about the principal point, `pitch` px, within the rim: `[D, 2]`, and sizes in turns."""
+    """A square lattice in the image about the principal point, within the rim, of large and small dots in turns.
+
+    Args:
+        sensor: camera and rest surface.
+        pitch: of the lattice, px, 4 or more.
+
+    Returns:
+        Pixels `[D, 2]`, and the sizes, small or large, of each.
+
+    Raises:
+        MembraneError: the pitch is too small.
+
+    Example:
+        >>> pixels, sizes = pixel_lattice(Sensor.from_file("examples/sensor.toml"), 60.0)
+        >>> pixels.shape, sizes[:3]
+        ((32, 2), ['large', 'small', 'large'])
+    """
     if not pitch >= 4:
         raise MembraneError(f"calibrate layout: pitch = {pitch}; expected 4 px or more, so that dots are distinguishable")
     width, height = sensor.camera.image_size
@@ -59,10 +75,27 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
 
 
 def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> FabricationLayout:
-    """Dots on the rest surface whose outlines are seen, through the ports, with their centres at `pixels [D, 2]`.
+    """Dots on the rest surface whose outlines are seen, through the ports, with their centres at `pixels`.
 
-    A dot's own centre is seen beside its outline's, so that the ray aimed at is moved until the outline's is right. Raises
-    `MembraneError` for the first pixel whose ray misses the surface.
+    A dot's own centre is seen beside its outline's, so that the ray aimed at is moved until the outline's is right.
+
+    Args:
+        sensor: camera, with its ports, and rest surface.
+        pixels: `[D, 2]` where the dots are wanted in the image.
+        sizes: small or large, of each.
+
+    Returns:
+        The dots to be made.
+
+    Raises:
+        MembraneError: the ray of a pixel misses the surface; the first such pixel is named.
+
+    Example:
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> layout = layout_for_pixels(sensor, np.array([[320.0, 240.0], [360.0, 240.0]]), ["large", "small"])
+        >>> sensor.camera.point_to_pixel(torch.from_numpy(layout.positions)).numpy().round(0)
+        array([[320., 240.],
+               [360., 240.]])
     """
     wanted = aimed = np.asarray(pixels, float)
     surface = fine_surface(sensor)
@@ -79,8 +112,8 @@ def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> F
 def _ray_hits(sensor: Sensor, surface: Membrane, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where rays meet the surface, and its normals there, `[D, 3]` each: the mesh first, then Newton on one twice as fine."""
     origin, direction = (ray.numpy() for ray in sensor.camera.pixel_to_ray(torch.from_numpy(pixels)))
-    reach = surface.ray_points(np.nan_to_num(origin), np.nan_to_num(direction)).distance
-    missed = ~(np.isfinite(reach) & np.isfinite(direction).all(1))
+    distance = surface.ray_points(np.nan_to_num(origin), np.nan_to_num(direction)).distance
+    missed = ~(np.isfinite(distance) & np.isfinite(direction).all(1))
     if missed.any():
         d = int(np.flatnonzero(missed)[0])
         raise MembraneError(
@@ -88,7 +121,7 @@ def _ray_hits(sensor: Sensor, surface: Membrane, pixels: np.ndarray) -> tuple[np
             "within the rim's outline: leave it out"
         )
     finer = sensor.surface.membrane(tuple(2 * side - 1 for side in surface.grid))
-    X = origin + reach[:, None] * direction
+    X = origin + distance[:, None] * direction
     for _ in range(NEWTON_STEPS):
         near = surface_projection(finer, X)
         X = X - (near.signed_distance / (direction * near.normals).sum(1))[:, None] * direction
@@ -105,7 +138,7 @@ def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
         sizes = [size.strip() for _, _, size in body]
     except (ValueError, OSError, UnicodeDecodeError) as error:
         raise MembraneError(
-            f"{path}: not readable ({error}); expected CSV with the header u,v,size and a line a dot"
+            f"{path}: not readable ({error}); expected CSV with the header u,v,size and one line per dot"
         ) from error
     if not right or not sizes or not set(sizes) <= set(RADIUS) or not np.isfinite(pixels).all():
         raise MembraneError(f"{path}: expected the header u,v,size, finite pixels, and sizes small or large")
@@ -113,7 +146,10 @@ def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
 
 
 def write_layout(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
-    """CSV for the machine that makes the dots: `dot,x,y,z,nx,ny,nz,radius,size`, origin at the rim's centre, axes parallel to the camera's."""
+    """CSV for the machine that makes the dots: `dot,x,y,z,nx,ny,nz,radius,size`.
+
+    The origin is at the rim's centre, the axes are parallel to the camera's.
+    """
     rim = sensor.membrane.rest[sensor.membrane.fixed].mean(0).numpy()
     lines = ["dot,x,y,z,nx,ny,nz,radius,size"]
     rows = zip(dots.positions - rim, dots.normals, dots.radii, dots.sizes, strict=True)
@@ -123,7 +159,7 @@ def write_layout(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
 
 
 def write_svg(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
-    """The dots and the rim seen along the axis, one unit a length unit, for printing or looking at."""
+    """A drawing of the dots and the rim along the axis, true to size, for printing or looking at."""
     m, n = sensor.membrane.grid
     index = np.arange(m * n).reshape(m, n)
     loop = np.concatenate([index[:-1, 0], index[-1, :-1], index[:0:-1, -1], index[0, :0:-1]])
@@ -139,6 +175,6 @@ def write_svg(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
     ]
     for (x, y, _), normal, radius in zip(dots.positions, dots.normals, dots.radii, strict=True):
         short, angle = radius * abs(normal[2]), np.degrees(np.arctan2(normal[1], normal[0]))
-        turn = f"rotate({angle:.2f} {x:.3f} {y:.3f})"
-        lines.append(f'<ellipse cx="{x:.3f}" cy="{y:.3f}" rx="{short:.3f}" ry="{radius:.3f}" transform="{turn}"/>')
+        rotation = f"rotate({angle:.2f} {x:.3f} {y:.3f})"
+        lines.append(f'<ellipse cx="{x:.3f}" cy="{y:.3f}" rx="{short:.3f}" ry="{radius:.3f}" transform="{rotation}"/>')
     path.write_text("\n".join([*lines, "</svg>"]) + "\n", encoding="utf-8")

@@ -1,5 +1,6 @@
 """The rest surface as calibration moves it: dots' outlines on it, a new pose, a correction along its normals."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -7,6 +8,7 @@ import numpy as np
 import torch
 from scipy.interpolate import RBFInterpolator
 
+from ..camera.model import Camera
 from ..errors import MembraneError
 from ..sensor.model import Markers, Sensor, Surface
 from ..surface.membrane import Membrane
@@ -30,7 +32,13 @@ class SurfaceProjection(NamedTuple):
 
 
 class Correction(NamedTuple):
-    """A surface moved: `vertices [V, 3]`, by how much along its outward normals `[V]`, and the standard deviations `[V]`."""
+    """A surface moved.
+
+    Attributes:
+        vertices: `[V, 3]` where it is now.
+        offsets: `[V]` by how much it was moved along its outward normals, length unit.
+        deviations: `[V]` standard deviations of the offsets.
+    """
 
     vertices: np.ndarray
     offsets: np.ndarray
@@ -42,7 +50,14 @@ def fine_surface(sensor: Sensor) -> Membrane:
     return sensor.surface.membrane(tuple(max(FINE, side) for side in sensor.membrane.grid))
 
 
-def recalibrated(sensor: Sensor, surface: Membrane, vertices: np.ndarray, positions, sizes, image) -> Sensor:
+def recalibrated(
+    sensor: Sensor,
+    surface: Membrane,
+    vertices: np.ndarray,
+    positions: np.ndarray | None,
+    sizes: Sequence[str] | None,
+    image: np.ndarray,
+) -> Sensor:
     """The sensor with its rest surface at `vertices [V, 3]` (on the grid of `surface`), dots `[D, 3]` and rest image."""
     m, n = surface.grid
     shape = Surface("grid", {"vertices": vertices.reshape(m, n, 3), "fixed": surface.fixed.numpy().reshape(m, n)})
@@ -69,7 +84,7 @@ def dot_outlines(surface: Membrane, positions: np.ndarray, radii: np.ndarray) ->
     return flat - sag[..., None] * normals[:, None]
 
 
-def unit_shapes(camera, outlines: np.ndarray, radii: np.ndarray) -> np.ndarray:
+def unit_shapes(camera: Camera, outlines: np.ndarray, radii: np.ndarray) -> np.ndarray:
     """How dots of radius 1 are imaged, `[D, 2, 2]` px per length unit, from their `outlines [D, 8, 3]` of `radii [D]`."""
     p = camera.point_to_pixel(torch.from_numpy(outlines)).numpy()
     quarter = OUTLINE // 4
@@ -78,10 +93,20 @@ def unit_shapes(camera, outlines: np.ndarray, radii: np.ndarray) -> np.ndarray:
 
 
 def correction(surface: Membrane, projection: SurfaceProjection, variances: np.ndarray) -> Correction:
-    """The smooth displacement of the surface onto N points, given their `projection` and their `variances [N]` along its normals.
+    """The smooth displacement that brings the surface onto N points.
 
-    Thin-plate splines (scipy) of the signed distances as vectors, linear where there are no points; what moves the surface within itself
-    is not seen. Wrong where the rim is far outside the points.
+    Thin-plate splines (scipy) of the signed distances as vectors, linear where there are no points.
+
+    Args:
+        surface: the surface to move.
+        projection: the points, projected onto it.
+        variances: `[N]` of their signed distances.
+
+    Raises:
+        MembraneError: fewer than 12 points.
+
+    Limitations:
+        What moves the surface within itself is not observed. Where the rim is far outside the points, it is extrapolated.
     """
     if len(projection.points) < 12:
         raise MembraneError(f"calibrate: {len(projection.points)} points of the rest surface; expected at least 12")
