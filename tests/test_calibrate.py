@@ -2,6 +2,8 @@
 
 import csv
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -12,7 +14,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from torchmembrane import MembraneError
+from torchmembrane import MembraneError, calibrate
 from torchmembrane.calibrate.camera import Views, lens_from_views, ports_from_views
 from torchmembrane.calibrate.depth import rest_from_depth
 from torchmembrane.calibrate.detection import find_target
@@ -343,6 +345,18 @@ def test_dots_laid_out_for_a_wanted_pattern_are_seen_where_they_were_wanted(desi
         layout_for_pixels(design, np.array([[5.0, 5.0]]), ["small"])
 
 
+# from Python
+
+
+def test_the_public_names_are_loaded_when_asked_for():
+    assert set(calibrate.__all__) <= set(dir(calibrate)) and len(set(calibrate.__all__)) == len(calibrate.__all__)
+    assert all(getattr(calibrate, name).__name__ == name for name in calibrate.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'lens_from_hearsay'"):
+        _ = calibrate.lens_from_hearsay
+    code = "import sys, torchmembrane.calibrate; print('torch' in sys.modules, torchmembrane.calibrate.Views.__name__)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split() == ["False", "Views"]
+
+
 # the command
 
 
@@ -392,5 +406,5 @@ def test_command_layout_writes_for_machine_and_eye(design, tmp_path, capsys):
     (tmp_path / "wanted.csv").write_text("u,v,size\n160,120,large\n180,120,tiny\n")
     code, _, errors = run(capsys, "layout", path, "--pixels", tmp_path / "wanted.csv", "--out", tmp_path / "no")
     assert code == 2 and "small or large" in errors
-    code, _, errors = run(capsys, "layout", path, "--out", tmp_path / "no")
+    code, _, errors = run(capsys, "pattern", path, "--out", tmp_path / "no")  # the step's former name
     assert code == 2 and "--pixels" in errors
