@@ -2,7 +2,7 @@
 
 python bench/calibration.py [PART ...] [--seeds 3] [--json FILE] [--figures docs/calibration]
 
-Parts: lens ports rest effect views depth pattern material.
+Parts: lens ports rest effect views depth layout material.
 Sensors of this package are seen by the simulator with noise 40 dB below white; the first guess is off. Printed: error, reported
 standard deviation, and the largest error over its deviation; for `effect` the error of the surface at the dots before and after
 the pose was calibrated.
@@ -20,19 +20,19 @@ from record import write
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from torchmembrane.calibrate.boards import Views, lens_from_views, ports_from_views
+from torchmembrane.calibrate.camera import Views, lens_from_views, ports_from_views
 from torchmembrane.calibrate.depth import rest_from_depth
+from torchmembrane.calibrate.detection import find_target
+from torchmembrane.calibrate.layout import layout_for_pixels, pixel_lattice
 from torchmembrane.calibrate.material import material_from_images
-from torchmembrane.calibrate.mill import dots_for_pixels, pixel_lattice
 from torchmembrane.calibrate.rest import rest_from_image
-from torchmembrane.calibrate.surface import feet_of, fine_surface
-from torchmembrane.calibrate.targets import find_target
+from torchmembrane.calibrate.surface import fine_surface, surface_projection
 from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
 from torchmembrane.errors import MembraneError
 from torchmembrane.io.images import to_grey
 from torchmembrane.markers.dots import find_dots
-from torchmembrane.plot.calibration import Report, fit_figure, mill_figure, surface_figure
+from torchmembrane.plot.calibration import Report, fit_figure, layout_figure, surface_figure
 from torchmembrane.plot.frames import save
 from torchmembrane.presets import preset
 from torchmembrane.reconstruct import Reconstructor
@@ -219,20 +219,20 @@ def depth(seeds, figures):
             save(surface_figure(report, design.camera.image_size, places, found.surface, "mm"), figures / f"depth_{name}.png")
 
 
-def pattern(seeds, figures):
+def layout(seeds, figures):
     for name in ("half_cylinder", "fingertip"):
         sensor = preset(name)
         pixels, sizes = pixel_lattice(sensor, 30.0)
-        dots = dots_for_pixels(sensor, pixels, sizes)
+        dots = layout_for_pixels(sensor, pixels, sizes)
         made = replace(sensor, markers=Markers("dots", "dark", dots.positions, sizes))
         seen = find_dots(rest_image(made, 0), "dark").pixels
         gap, _ = cKDTree(seen).query(pixels)
-        record = dict(what=f"pattern, {name}", dots=len(pixels), found=int((gap < 3).sum()), rms=rms(gap[gap < 3]))
+        record = dict(what=f"layout, {name}", dots=len(pixels), found=int((gap < 3).sum()), rms=rms(gap[gap < 3]))
         print(record)
         yield record
         if figures:
             title = f"{name}: {len(pixels)} dots that make a square lattice in the image"
-            save(mill_figure(title, sensor, dots), figures / f"pattern_{name}.png")
+            save(layout_figure(title, sensor, dots), figures / f"layout_{name}.png")
 
 
 def poses_seen(photograph: BoardImages, board, count: int, depths, spread: float, rng) -> np.ndarray:
@@ -284,8 +284,8 @@ def surface_errors(truth, design, found) -> dict[str, float]:
     """Distances, mm, of the designed and the calibrated surface from the true one, free vertices, and over their deviations."""
     target = truth.surface.membrane((129, 129))
     free = ~fine_surface(design).fixed.numpy()
-    before = feet_of(target, fine_surface(design).rest.numpy()[free]).heights
-    after = feet_of(target, found.surface.vertices[free]).heights
+    before = surface_projection(target, fine_surface(design).rest.numpy()[free]).signed_distance
+    after = surface_projection(target, found.surface.vertices[free]).signed_distance
     deviations = found.surface.deviations[free]
     return dict(
         surface_before=rms(before), surface_after=rms(after), surface_deviation=rms(deviations),
@@ -321,7 +321,7 @@ def draw(folder: Path | None, name: str, report: Report) -> None:
         save(fit_figure(report, (640, 480)), folder / f"{name}.png")
 
 
-PARTS = {part.__name__: part for part in (lens, ports, rest, effect, views, depth, pattern, material)}
+PARTS = {part.__name__: part for part in (lens, ports, rest, effect, views, depth, layout, material)}
 
 
 def main():

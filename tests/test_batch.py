@@ -15,11 +15,13 @@ import torch
 from PIL import Image
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.io import results, store
+from torchmembrane.io import frames, results
 from torchmembrane.io.images import read_image
-from torchmembrane.io.store import Mesh, Settings, read_results
+from torchmembrane.io.read import read_results
+from torchmembrane.io.store import Mesh, Settings
 from torchmembrane.io.summary import UNREADABLE
-from torchmembrane.jobs.local import find_inputs, reconstruct_files
+from torchmembrane.jobs.inputs import find_inputs
+from torchmembrane.jobs.local import reconstruct_files
 from torchmembrane.surface.shapes import spherical_cap
 
 WIDTH, HEIGHT = 16, 12
@@ -150,7 +152,7 @@ def test_finished_frames_are_skipped_and_failed_ones_tried_again(images, tmp_pat
     images[2].write_bytes(b"broken")
     outcome, lines, _ = reconstruct(images, tmp_path / "out")
     assert outcome == (3, 1, 2, 0) and len(lines) == 2
-    failed = store.load_frame(tmp_path / "out" / "i1.npz")
+    failed = results.load_frame(tmp_path / "out" / "i1.npz")
     assert int(failed["status"]) == results.BLANK and np.isnan(failed["vertices"]).all()
     before = {path.stem: (tmp_path / "out" / f"{path.stem}.npz").stat().st_mtime_ns for path in (images[0], images[3])}
     grey_image(images[1], 90)
@@ -169,7 +171,7 @@ def test_a_failed_frame_whose_file_breaks_has_no_result_any_more(images, tmp_pat
     reconstruct(images, tmp_path / "out", settings)
     images[1].write_bytes(b"broken")
     reconstruct(images, tmp_path / "out", settings)
-    assert read_results(tmp_path / "out")[0] == ["i0", "i2", "i3", "i4"]
+    assert read_results(tmp_path / "out").names == ["i0", "i2", "i3", "i4"]
     assert summary_of(tmp_path / "out")["i1"]["status"] == str(UNREADABLE)
 
 
@@ -185,6 +187,57 @@ def test_summary_is_rebuilt_from_the_frames(images, tmp_path):
 
 
 @pytest.mark.parametrize("settings", [NPZ, PARQUET])
+def test_results_are_read_by_name_in_order_and_all_at_once(images, tmp_path, monkeypatch, settings):
+    monkeypatch.setattr(frames, "PART_ROWS", 2)
+    grey_image(images[1], 0)
+    reconstruct(images, tmp_path / "out", settings)
+    found = read_results(str(tmp_path / "out"))
+    assert len(found) == 5 and found.names == [path.stem for path in images] and found.mesh.settings == settings
+    assert "i3" in found and "mesh" not in found
+    listed = list(found)
+    assert len(listed) == 5 and list(listed[0]) == list(CONTRACT)
+    batch = found.batch()
+    for k, name in enumerate(found.names):
+        assert all(np.array_equal(listed[k][key], found[name][key], equal_nan=True) for key in CONTRACT)
+        assert all(np.array_equal(listed[k][key], getattr(batch, key)[k], equal_nan=True) for key in CONTRACT)
+    assert np.isnan(found["i1"]["vertices"]).all() and int(found["i1"]["status"]) == results.BLANK
+    with pytest.raises(MembraneError, match="no frame 'i9'.*'i0'"):
+        found["i9"]
+
+
+@pytest.mark.parametrize("settings", [NPZ, PARQUET])
+def test_no_frame_is_read_before_it_is_asked_for(images, tmp_path, monkeypatch, settings):
+    reconstruct(images, tmp_path / "out", settings)
+    read, kind = [], frames.FrameFiles if settings is NPZ else frames.FrameTable
+    whole = kind.read
+    monkeypatch.setattr(kind, "read", lambda self, names: read.extend(names := list(names)) or whole(self, names))
+    found = read_results(tmp_path / "out")
+    assert len(found) == 5 and "i3" in found and read == []
+    assert found["i3"]["status"] == 0 and read == ["i3"]
+    next(iter(found))
+    assert "i0" in read
+
+
+def test_a_folder_without_results_is_refused(images, tmp_path):
+    with pytest.raises(MembraneError, match="mesh.npz"):
+        read_results(tmp_path)
+    images[0].write_bytes(b"broken")
+    reconstruct(images[:1], tmp_path / "out")
+    with pytest.raises(MembraneError, match="no frames"):
+        read_results(tmp_path / "out")
+
+
+def test_single_numbers_as_a_table(images, tmp_path):
+    grey_image(images[1], 0)
+    reconstruct(images, tmp_path / "out", PARQUET)
+    found = read_results(tmp_path / "out")
+    table = found.to_pandas()
+    assert list(table.index) == found.names and list(table.columns) == [key for key, shape in CONTRACT.items() if shape == ()]
+    assert table["status"].tolist() == [0, results.BLANK, 0, 0, 0] and table["status"].dtype == np.int32
+    assert np.array_equal(table["pressure"].to_numpy(), found.batch().pressure, equal_nan=True)
+
+
+@pytest.mark.parametrize("settings", [NPZ, PARQUET])
 def test_an_interrupted_run_keeps_what_is_done_and_goes_on(images, tmp_path, settings):
     class Interrupted(Denting):
         def __call__(self, batch):
@@ -194,9 +247,9 @@ def test_an_interrupted_run_keeps_what_is_done_and_goes_on(images, tmp_path, set
 
     with pytest.raises(KeyboardInterrupt):
         reconstruct(images, tmp_path / "out", settings, Interrupted())
-    assert read_results(tmp_path / "out")[0] == list(summary_of(tmp_path / "out")) == ["i0", "i1"]
+    assert read_results(tmp_path / "out").names == list(summary_of(tmp_path / "out")) == ["i0", "i1"]
     assert reconstruct(images, tmp_path / "out", settings)[0] == (3, 0, 0, 2)
-    assert read_results(tmp_path / "out")[0] == [path.stem for path in images]
+    assert read_results(tmp_path / "out").names == [path.stem for path in images]
     assert not [path for path in (tmp_path / "out").rglob("*") if "partial" in path.name or path.name[0] == "."]
 
 
@@ -279,8 +332,9 @@ def test_parquet_holds_the_same_as_npz(images, tmp_path):
     grey_image(images[1], 0)
     reconstruct(images, tmp_path / "npz")
     reconstruct(images, tmp_path / "parquet", PARQUET)
-    (names, one), (same_names, other) = read_results(tmp_path / "npz"), read_results(tmp_path / "parquet")
-    assert names == same_names == [path.stem for path in images]
+    one, other = read_results(tmp_path / "npz"), read_results(tmp_path / "parquet")
+    assert one.names == other.names == [path.stem for path in images]
+    one, other = one.batch(), other.batch()
     for key in CONTRACT:
         a, b = getattr(one, key), getattr(other, key)
         assert a.dtype == b.dtype and torch.equal(torch.nan_to_num(a, -7), torch.nan_to_num(b, -7))
@@ -293,11 +347,11 @@ def test_parquet_can_be_read_by_others(images, tmp_path):
     assert table.column_names == ["name", *CONTRACT]
     assert b'"vertices": [25, 3]' in table.schema.metadata[b"shapes"] and table.schema.metadata[b"length_unit"] == b"mm"
     vertices = np.array(table["vertices"].to_pylist()).reshape(-1, 25, 3)
-    assert np.array_equal(vertices.astype(np.float32), read_results(tmp_path / "out")[1].vertices.numpy())
+    assert np.array_equal(vertices.astype(np.float32), read_results(tmp_path / "out").batch().vertices.numpy())
 
 
 def test_a_frame_tried_again_is_one_row_of_the_dataset(images, tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "PART_ROWS", 2)
+    monkeypatch.setattr(frames, "PART_ROWS", 2)
     grey_image(images[1], 0)
     reconstruct(images, tmp_path / "out", PARQUET)
     assert len(list((tmp_path / "out" / "frames").glob("part-*.parquet"))) == 3
@@ -305,7 +359,7 @@ def test_a_frame_tried_again_is_one_row_of_the_dataset(images, tmp_path, monkeyp
     outcome, _, made = reconstruct(images, tmp_path / "out", PARQUET)
     assert outcome == (1, 0, 0, 4) and made.calls == [1]
     assert sorted(pq.read_table(tmp_path / "out" / "frames")["name"].to_pylist()) == [path.stem for path in images]
-    assert read_results(tmp_path / "out")[1].status.tolist() == [0] * 5
+    assert read_results(tmp_path / "out").batch().status.tolist() == [0] * 5
 
 
 def write_video(path: Path, levels) -> Path:
@@ -324,8 +378,9 @@ def test_a_video_gives_numbered_frames(tmp_path):
     outcome, lines, _ = reconstruct([video], tmp_path / "out")
     assert outcome == (4, 0, 1, 0)
     assert len(lines) == 1 and lines[0].startswith(f"{video}, press_000001: blank")
-    names, batch = read_results(tmp_path / "out")
-    assert names == [f"press_{k:06d}" for k in range(5)]
+    found = read_results(tmp_path / "out")
+    assert found.names == [f"press_{k:06d}" for k in range(5)]
+    batch = found.batch()
     assert torch.allclose(batch.pressure[[0, 2, 3, 4]] * 255, torch.tensor([100.0, 120, 130, 140]), atol=0.01)
     assert reconstruct([video], tmp_path / "out")[0] == (0, 0, 1, 4)
     assert summary_of(tmp_path / "out")["press_000003"]["file"] == str(video)

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -12,13 +14,13 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from torchmembrane import MembraneError
-from torchmembrane.calibrate.boards import Views, lens_from_views, ports_from_views
+from torchmembrane import MembraneError, calibrate
+from torchmembrane.calibrate.camera import Views, lens_from_views, ports_from_views
 from torchmembrane.calibrate.depth import rest_from_depth
+from torchmembrane.calibrate.detection import find_target
 from torchmembrane.calibrate.fit import fit, outline_centres, rotations, with_common_errors
-from torchmembrane.calibrate.mill import dots_for_pixels, pixel_lattice
+from torchmembrane.calibrate.layout import layout_for_pixels, pixel_lattice
 from torchmembrane.calibrate.rest import rest_from_image
-from torchmembrane.calibrate.targets import find_target
 from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
@@ -219,7 +221,7 @@ def test_ports_are_found_from_images_in_air_and_in_the_medium():
     assert np.allclose([*found.camera.ports[0], float(found.camera.medium_index)], found.fit.values[:4])
 
 
-def test_in_the_medium_thickness_and_index_cannot_be_told_apart():
+def test_in_the_medium_thickness_and_index_are_not_identifiable():
     rng = np.random.default_rng(2)
     found = ports_from_views(ported(GUESS), DOTS, Views(exact_views(ported(PORT), 3, rng), np.ones(3, bool)))
     covariance, deviations = found.fit.covariance, found.fit.deviations
@@ -323,16 +325,16 @@ def test_rest_surface_and_dots_are_found_from_a_depth_image(design, truth, image
     vertices = found.sensor.surface.values["vertices"].reshape(-1, 3)
     gap = truth.surface.membrane((129, 129)).closest_points(vertices).distance
     assert (gap < 3 * found.surface.deviations)[radius < 8].mean() > 0.97
-    assert gap[radius < 8].mean() < 0.02 < 0.15 < np.abs(found.feet.heights).mean()
+    assert gap[radius < 8].mean() < 0.02 < 0.15 < np.abs(found.projection.signed_distance).mean()
     assert cKDTree(truth.markers.positions).query(found.sensor.markers.positions)[0].max() < 0.06
 
 
-# dots for a mill
+# fabrication layout
 
 
-def test_dots_for_a_wanted_pattern_are_seen_where_they_were_wanted(design):
+def test_dots_laid_out_for_a_wanted_pattern_are_seen_where_they_were_wanted(design):
     pixels, sizes = pixel_lattice(design, 20.0)
-    dots = dots_for_pixels(design, pixels, sizes)
+    dots = layout_for_pixels(design, pixels, sizes)
     x, y, z = dots.positions.T
     assert np.abs(np.sqrt(x**2 + y**2 + (z - 6.4) ** 2) - 10.6).max() < 2e-3  # on the cap's sphere
     assert np.abs(dots.normals - (dots.positions - [0, 0, 6.4]) / 10.6).max() < 2e-3
@@ -341,7 +343,19 @@ def test_dots_for_a_wanted_pattern_are_seen_where_they_were_wanted(design):
     found = rest_from_image(made, simulator_of(made).rest_image())
     assert np.nanmax(np.abs(found.pixels - pixels)) < 0.12
     with pytest.raises(MembraneError, match="misses the rest surface"):
-        dots_for_pixels(design, np.array([[5.0, 5.0]]), ["small"])
+        layout_for_pixels(design, np.array([[5.0, 5.0]]), ["small"])
+
+
+# from Python
+
+
+def test_the_public_names_are_loaded_when_asked_for():
+    assert set(calibrate.__all__) <= set(dir(calibrate)) and len(set(calibrate.__all__)) == len(calibrate.__all__)
+    assert all(getattr(calibrate, name).__name__ == name for name in calibrate.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'lens_from_hearsay'"):
+        _ = calibrate.lens_from_hearsay
+    code = "import sys, torchmembrane.calibrate; print('torch' in sys.modules, torchmembrane.calibrate.Views.__name__)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split() == ["False", "Views"]
 
 
 # the command
@@ -378,20 +392,20 @@ def test_command_camera_leaves_out_images_without_a_board(design, tmp_path, caps
     assert np.abs(found.focal.numpy() - 150).max() < 1 and len(found.ports) == 1
 
 
-def test_command_pattern_writes_for_mill_and_eye(design, tmp_path, capsys):
+def test_command_layout_writes_for_machine_and_eye(design, tmp_path, capsys):
     path = design.to_file(tmp_path / "design")
-    code, said, _ = run(capsys, "pattern", path, "--pitch", 25, "--out", tmp_path / "out")
-    assert code == 0 and "mill.csv" in said
+    code, said, _ = run(capsys, "layout", path, "--pitch", 25, "--out", tmp_path / "out")
+    assert code == 0 and "layout.csv" in said
     made = Sensor.from_file(tmp_path / "out" / "sensor.toml")
-    with (tmp_path / "out" / "mill.csv").open() as file:
+    with (tmp_path / "out" / "layout.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(made.markers.positions)
     places = np.array([[float(row[key]) for key in "xyz"] for row in rows])
     assert np.allclose(places + [0, 0, 12.0], made.markers.positions, atol=2e-5)
-    drawing = ElementTree.parse(tmp_path / "out" / "mill.svg").getroot()
+    drawing = ElementTree.parse(tmp_path / "out" / "layout.svg").getroot()
     assert len(drawing.findall("{*}ellipse")) == len(rows) and drawing.get("width").endswith("mm")
     (tmp_path / "wanted.csv").write_text("u,v,size\n160,120,large\n180,120,tiny\n")
-    code, _, errors = run(capsys, "pattern", path, "--pixels", tmp_path / "wanted.csv", "--out", tmp_path / "no")
+    code, _, errors = run(capsys, "layout", path, "--pixels", tmp_path / "wanted.csv", "--out", tmp_path / "no")
     assert code == 2 and "small or large" in errors
-    code, _, errors = run(capsys, "pattern", path, "--out", tmp_path / "no")
+    code, _, errors = run(capsys, "pattern", path, "--out", tmp_path / "no")  # the step's former name
     assert code == 2 and "--pixels" in errors

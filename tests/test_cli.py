@@ -1,8 +1,10 @@
 """The command as a person uses it, on the example sensor."""
 
+import argparse
 import csv
 import runpy
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -10,11 +12,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchmembrane import __version__
+from torchmembrane import __version__, presets, reconstruct
+from torchmembrane.calibrate import camera
+from torchmembrane.cli import arguments as types
+from torchmembrane.cli import choices
 from torchmembrane.cli import main as cli
 from torchmembrane.errors import MembraneError
+from torchmembrane.estimators import minimum_energy
+from torchmembrane.io import store
+from torchmembrane.mechanics import hyperelastic
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.sensor import Sensor
+from torchmembrane.simulate import dataset, frames, look, simulator
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SENSOR = str(EXAMPLES / "sensor.toml")
@@ -27,7 +36,7 @@ def example_reconstructor():
 
 @pytest.fixture
 def built_once(example_reconstructor, monkeypatch):
-    monkeypatch.setattr(cli, "Reconstructor", lambda sensor, *_, **__: example_reconstructor)
+    monkeypatch.setattr("torchmembrane.reconstruct.Reconstructor", lambda sensor, *_, **__: example_reconstructor)
 
 
 @pytest.fixture
@@ -66,7 +75,7 @@ def test_options_reach_the_reconstructor(monkeypatch, tmp_path, capsys):
     def refuse(sensor, estimator, *, model, element):
         raise MembraneError(f"{sensor.name} {estimator} {model} {element}")
 
-    monkeypatch.setattr(cli, "Reconstructor", refuse)
+    monkeypatch.setattr("torchmembrane.reconstruct.Reconstructor", refuse)
     call = ("reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")
     assert "nh130 force-balance neo_hookean triangle" in run(capsys, *call)[2]
     options = ("--energy", "harmonic", "--element", "quadrilateral")
@@ -81,9 +90,8 @@ def test_some_frames_failed_gives_1_and_says_which(built_once, tmp_path, capsys)
     assert code == 1 and "frames: 1 reconstructed, 2 failed" in said
     assert f"{images[0]}: not readable" in errors and f"{images[1]}: blank" in errors
     with open(tmp_path / "out" / "summary.csv", newline="") as file:
-        assert [(row["name"], row["status"]) for row in csv.DictReader(file)] == [
-            ("broken", "-1"), ("dark", "4"), ("rest", "0"),
-        ]  # fmt: skip
+        rows = [(row["name"], row["status"]) for row in csv.DictReader(file)]
+    assert rows == [("broken", "-1"), ("dark", "4"), ("rest", "0")]
 
 
 def test_parquet_and_figures(built_once, tmp_path, capsys):
@@ -142,7 +150,7 @@ def test_interruption_gives_130(built_once, monkeypatch, tmp_path, capsys):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "reconstruct_files", stop)
+    monkeypatch.setattr("torchmembrane.jobs.local.reconstruct_files", stop)
     code, _, errors = run(capsys, "reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")
     assert code == 130 and "interrupted" in errors
 
@@ -150,10 +158,9 @@ def test_interruption_gives_130(built_once, monkeypatch, tmp_path, capsys):
 def test_check_says_what_it_understood_and_draws_it(built_once, tmp_path, capsys):
     code, said, _ = run(capsys, "check", SENSOR, "--out", tmp_path / "sensor.png")
     assert code == 0
-    for part in (
-        "fisheye, 640 x 480 px", "field of view 229 x 172 degrees", "no ports", "grid 33 x 33: 1089 vertices, 128",
-        "neo_hookean, prestretch 1.3", "tension 1.34 N/mm", "hPa", "liquid", "121 listed", "121 of 121 found",
-    ):  # fmt: skip
+    camera = ("fisheye, 640 x 480 px", "field of view 229 x 172 degrees", "no ports")
+    membrane = ("grid 33 x 33: 1089 vertices, 128", "neo_hookean, prestretch 1.3", "tension 1.34 N/mm", "hPa", "liquid")
+    for part in (*camera, *membrane, "121 listed", "121 of 121 found"):
         assert part in said
     assert Image.open(tmp_path / "sensor.png").width == 1600
 
@@ -177,13 +184,13 @@ def test_check_of_a_sensor_whose_markers_are_not_found(monkeypatch, tmp_path, ca
     def refuse(*_, **__):
         raise MembraneError("only 3 of 121 markers are found in the rest image")
 
-    monkeypatch.setattr(cli, "Reconstructor", refuse)
+    monkeypatch.setattr("torchmembrane.reconstruct.Reconstructor", refuse)
     code, said, errors = run(capsys, "check", SENSOR, "--out", tmp_path / "sensor.png")
     assert code == 2 and "only 3 of 121" in errors and "fisheye" in said and (tmp_path / "sensor.png").exists()
 
 
 def test_view_draws_a_stored_result(built_once, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(cli, "_has_display", lambda: False)
+    monkeypatch.setattr("torchmembrane.cli.view._has_display", lambda: False)
     assert run(capsys, "reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")[0] == 0
     result = tmp_path / "out" / "rest.npz"
     code, said, _ = run(capsys, "view", result, "--image", EXAMPLES / "rest.png", "--out", tmp_path / "a.png")
@@ -200,6 +207,49 @@ def test_help_shows_examples_and_exit_codes(command, capsys):
     said = capsys.readouterr().out
     assert stop.value.code == 0 and f"  torchmembrane {command} " in said and "examples:" in said
     assert "exit code" in said or command == "view"
+
+
+HEAVY = ("torch", "kornia", "scipy", "matplotlib", "tqdm", "numpy", "PIL")
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["simulate", "--help"], ["calibrate", "ports", "--help"]])
+def test_help_loads_nothing_heavy(arguments):
+    code = (
+        "import sys\nfrom torchmembrane.cli.main import main\n"
+        f"try:\n    main({arguments!r})\nexcept SystemExit as stop:\n    assert stop.code == 0\n"
+        f"print('loaded', [name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith("loaded []")
+
+
+def test_the_options_choices_are_what_the_package_has():
+    assert choices.ESTIMATORS == reconstruct.ESTIMATORS and choices.ENERGIES == hyperelastic.MODELS
+    assert choices.ELEMENTS == minimum_energy.ELEMENTS and choices.RESULT_FORMATS == store.FORMATS
+    assert choices.PRESETS == presets.NAMES and choices.INDENTERS == dataset.KINDS and choices.LEGS == simulator.LEGS
+    assert choices.SIMULATION_FORMATS == frames.FORMATS and choices.PORTS == camera.PORTS
+    assert (choices.HIGHLIGHT, choices.BLUR) == (look.Look.highlight, look.Look.blur)
+
+
+@pytest.mark.parametrize(
+    "kind, good, value, bad",
+    [
+        (types.positive, "0.5", 0.5, ["0", "-1", "nan", "inf", "1,2", "a", ""]),
+        (types.not_negative, "0", 0.0, ["-0.1", "nan", "inf", "x"]),
+        (types.count, "12", 12, ["0", "-3", "1.5", "", "1e3"]),
+        (types.seed, "0", 0, ["-1", "0.5", "x"]),
+        (types.vector, "1,-2,3.5", [1.0, -2.0, 3.5], ["1,2", "1,2,3,4", "1,2,nan", "1,2,x", ""]),
+        (types.positive_pair("two radii"), "0.1,2", [0.1, 2.0], ["1", "1,0", "1,2,3", "1,-2"]),
+        (types.count_pair("two counts"), "11,8", [11, 8], ["11", "11,0", "11,8.5", "11;8"]),
+        (types.numbers("numbers"), "0,17", [0, 17], ["", "1,", "a", "1.5"]),
+        (types.some_of(("push", "slide"), "legs"), "slide,push", ["slide", "push"], ["", "pull", "push,"]),
+    ],
+)
+def test_types_of_arguments_say_what_they_expect(kind, good, value, bad):
+    assert kind(good) == value
+    for text in bad:
+        with pytest.raises(argparse.ArgumentTypeError, match="expected"):
+            kind(text)
 
 
 def test_version_also_as_a_module(monkeypatch, capsys):

@@ -45,7 +45,7 @@ def presses():
     return pixels + NOISE * noise, np.stack(forces)
 
 
-def test_prices_are_read_as_logarithms_of_a_probability():
+def test_losses_are_read_as_logarithms_of_a_probability():
     z = np.log(STRETCHES)
     mean, deviation = _log_stretch(STRETCHES, np.full((len(z), 2), 7.0))
     assert abs(mean - z.mean()) < 1e-3 and abs(deviation - (z[-1] - z[0]) / 12**0.5) < 1e-3
@@ -86,7 +86,7 @@ def test_rest_tells_no_prestretch():
     assert len(found.values) == 1 and found.deviations[0] > 0.25
 
 
-def test_a_harmonic_sheet_is_refused():
+def test_a_harmonic_membrane_is_refused():
     with pytest.raises(MembraneError, match="harmonic"):
         material_from_pixels(sensor(Material("harmonic", 1.5)), torch.zeros(1, 81, 2))
 

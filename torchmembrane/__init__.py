@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from .estimators.force_balance import ForceBalance
     from .estimators.minimum_energy import MinimumEnergy
     from .estimators.settings import ForceBalanceSettings, MinimumEnergySettings
+    from .io.read import read_results
     from .io.results import Reconstruction
     from .io.status import Status
-    from .io.store import read_results
     from .mechanics.hyperelastic import ElasticEnergy
     from .onnx.export import export
     from .presets import preset

@@ -1,1 +1,72 @@
-"""Calibration (section 5.2): lens, ports, rest surface and dots from images, and the way back, from image to mill."""
+"""Calibration (section 5.2): lens, ports, rest surface, dots and material from images, and the way back, to a layout of dots.
+
+Each step takes the sensor, or the camera, of the step before and gives it with what was found and how surely. The names are
+loaded when they are first used.
+
+Example:
+    >>> from torchmembrane import calibrate
+    >>> from torchmembrane import Sensor
+    >>> pixels, sizes = calibrate.pixel_lattice(Sensor.from_file("examples/sensor.toml"), 60.0)
+    >>> len(pixels)
+    32
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ..targets import Checkerboard, DotBoard
+    from .camera import CameraFit, Views, lens_from_views, ports_from_views
+    from .depth import DepthFit, rest_from_depth
+    from .detection import find_target
+    from .fit import Fit
+    from .layout import FabricationLayout, layout_for_pixels, pixel_lattice
+    from .material import MaterialFit, material_from_images, material_from_pixels
+    from .rest import RestFit, rest_from_image
+    from .views import ViewsFit, rest_from_views
+
+_MODULES = {
+    "..targets": ("Checkerboard", "DotBoard"),
+    ".camera": ("CameraFit", "Views", "lens_from_views", "ports_from_views"),
+    ".depth": ("DepthFit", "rest_from_depth"),
+    ".detection": ("find_target",),
+    ".fit": ("Fit",),
+    ".layout": ("FabricationLayout", "layout_for_pixels", "pixel_lattice"),
+    ".material": ("MaterialFit", "material_from_images", "material_from_pixels"),
+    ".rest": ("RestFit", "rest_from_image"),
+    ".views": ("ViewsFit", "rest_from_views"),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+__all__ = [
+    "CameraFit",
+    "Checkerboard",
+    "DepthFit",
+    "DotBoard",
+    "FabricationLayout",
+    "Fit",
+    "MaterialFit",
+    "RestFit",
+    "Views",
+    "ViewsFit",
+    "find_target",
+    "layout_for_pixels",
+    "lens_from_views",
+    "material_from_images",
+    "material_from_pixels",
+    "pixel_lattice",
+    "ports_from_views",
+    "rest_from_depth",
+    "rest_from_image",
+    "rest_from_views",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULE_OF[name], __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(set(globals()) | set(__all__))

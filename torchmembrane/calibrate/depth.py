@@ -8,7 +8,7 @@ import torch
 from ..errors import MembraneError
 from ..markers.place import rim_mask
 from ..sensor.sensor import Sensor
-from .surface import Correction, Feet, correction, feet_of, fine_surface, recalibrated
+from .surface import Correction, SurfaceProjection, correction, fine_surface, recalibrated, surface_projection
 from .views import placed_dots
 
 CELL = 24  # px: over such squares depths are averaged
@@ -17,19 +17,40 @@ NEAR = 0.1  # of the surface's size: depths farther from the design are of somet
 
 
 class DepthFit(NamedTuple):
-    """The sensor with the surface of a depth image: `Correction` of the design, and what it rests on: `Feet [N]` of squares of
-    depths on the designed surface, and the standard deviations of their heights `[N]`, length unit."""
+    """The sensor with the surface of a depth image.
+
+    Attributes:
+        sensor: the sensor with the surface and the dots found.
+        surface: `Correction` of the designed surface.
+        projection: `[N]` squares of averaged depths, projected onto the designed surface.
+        deviations: `[N]` standard deviations of their signed distances, length unit.
+    """
 
     sensor: Sensor
     surface: Correction
-    feet: Feet
+    projection: SurfaceProjection
     deviations: np.ndarray
 
 
 def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> DepthFit:
-    """Rest surface from `depth [H, W]` (z along the axis, length unit; NaN or 0: none), dots from the rest image `[H, W]`.
+    """Rest surface from a depth image, and the dots on it from the rest image.
 
-    Within the rim's outline, averaged over squares of 24 px, the designed surface is moved along its normals onto the depths.
+    The depths within the rim's outline are averaged over squares of 24 px; the designed surface is moved along its normals onto
+    these averages.
+
+    Args:
+        sensor: the design.
+        depth: `[H, W]` z along the camera's axis, length unit; NaN or 0 where there is none.
+        image: `[H, W]` the membrane at rest, grey in 0..1.
+
+    Returns:
+        The sensor with the surface and dots found, and what they rest on.
+
+    Raises:
+        MembraneError: the depth image has another size than the camera's, or too few depths or dots are found.
+
+    Limitations:
+        Depths farther from the design than a tenth of the surface's size are taken for something else and left out.
     """
     width, height = sensor.camera.image_size
     if depth.shape != (height, width):
@@ -38,22 +59,26 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> Dep
         )
     surface = fine_surface(sensor)
     points, cells = _points(sensor, depth)
-    feet = feet_of(surface, points)
-    near = np.abs(feet.heights) < NEAR * surface.size
-    feet = Feet(*(values[near] for values in feet))
+    projection = surface_projection(surface, points)
+    near = np.abs(projection.signed_distance) < NEAR * surface.size
+    projection = SurfaceProjection(*(values[near] for values in projection))
     square = np.unique(cells[near], return_inverse=True)[1]
     counts = np.bincount(square)
-    mean = lambda values: np.stack([np.bincount(square, column) for column in values.T], -1) / counts[:, None]  # noqa: E731
-    places, normals, heights = mean(feet.places), mean(feet.normals), mean(feet.heights[:, None])[:, 0]
-    spread = np.bincount(square, (feet.heights - heights[square]) ** 2) / counts
+
+    def square_mean(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(square, column) for column in values.T], -1) / counts[:, None]
+
+    closest, normals = square_mean(projection.points), square_mean(projection.normals)
+    distance = square_mean(projection.signed_distance[:, None])[:, 0]
+    spread = np.bincount(square, (projection.signed_distance - distance[square]) ** 2) / counts
     kept = counts >= FEWEST
     deviations = np.sqrt(spread / (counts - 1).clip(1))[kept]
     normals = normals[kept] / np.linalg.norm(normals[kept], axis=1, keepdims=True)
-    feet = Feet(places[kept], normals, heights[kept])
-    change = correction(surface, feet, deviations**2)
+    projection = SurfaceProjection(closest[kept], normals, distance[kept])
+    change = correction(surface, projection, deviations**2)
     dots, sizes = placed_dots(recalibrated(sensor, surface, change.vertices, None, None, image), image)
     moved = recalibrated(sensor, surface, change.vertices, dots, sizes, image)
-    return DepthFit(moved, change, feet, deviations)
+    return DepthFit(moved, change, projection, deviations)
 
 
 def _points(sensor: Sensor, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,5 +87,5 @@ def _points(sensor: Sensor, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     mask[1::2] = mask[:, 1::2] = False
     v, u = np.nonzero(mask)
     origin, direction = (a.numpy() for a in sensor.camera.pixel_to_ray(torch.from_numpy(np.stack([u, v], -1).astype(float))))
-    reach = (depth[v, u] - origin[:, 2]) / direction[:, 2]
-    return origin + reach[:, None] * direction, (v // CELL) * 10_000 + u // CELL
+    distance = (depth[v, u] - origin[:, 2]) / direction[:, 2]
+    return origin + distance[:, None] * direction, (v // CELL) * 10_000 + u // CELL

@@ -11,15 +11,21 @@ from torch import Tensor
 from ..errors import MembraneError
 
 TOLERANCE, MOST_STEPS = 1e-7, 200
-LEAST = 1e-13  # smallest singular value told from nothing, over the largest
-STRAY = 6.0  # residuals beyond so many robust standard deviations are mistakes, not noise
+LEAST = 1e-13  # smallest singular value that counts as different from zero, over the largest
+OUTLIER = 6.0  # residuals beyond so many robust standard deviations are mistakes, not noise
 
 
 class Fit(NamedTuple):
-    """The minimum of `|r(theta)|^2`: `values [n]`, their `covariance [n, n]`, `residuals [m]`, and the `noise` of one residual.
+    """The minimum of `|r(theta)|^2` over n unknowns, from m residuals.
 
-    With `J = dr / dtheta` at the minimum and `s^2 = |r|^2 / (m - n)` the covariance is `s^2 (J^T J)^-1`. What the data cannot
-    tell apart shows in it: as huge deviations with correlations near one.
+    With `J = dr / dtheta` at the minimum and `s^2 = |r|^2 / (m - n)` the covariance is `s^2 (J^T J)^-1`. What the
+    data cannot distinguish shows in it: as huge deviations with correlations near one.
+
+    Attributes:
+        values: `[n]` the unknowns at the minimum.
+        covariance: `[n, n]` of the values.
+        residuals: `[m]` at the minimum.
+        noise: `s`, the standard deviation of one residual.
     """
 
     values: np.ndarray
@@ -29,16 +35,44 @@ class Fit(NamedTuple):
 
     @property
     def deviations(self) -> np.ndarray:
-        """Standard deviations `[n]`."""
+        """Standard deviations of the values, `[n]`."""
         return np.sqrt(np.diag(self.covariance))
 
+    def in_degrees(self, count: int) -> "Fit":
+        """The fit with the first `count` motions, each a rotation vector (rad) and a shift, given in degrees and lengths."""
+        scale = np.ones(len(self.values))
+        scale[: 6 * count].reshape(count, 6)[:, :3] = 180 / np.pi
+        return self._replace(values=scale * self.values, covariance=scale[:, None] * self.covariance * scale)
 
-def fit(residuals: Callable, jacobian: Callable, start: np.ndarray, what: str) -> Fit:
-    """Levenberg-Marquardt (scipy's trust region) from `start [n]`; both functions take `theta [n]` as float64.
 
+def fit(
+    residuals: Callable[[np.ndarray], np.ndarray],
+    jacobian: Callable[[np.ndarray], np.ndarray],
+    start: np.ndarray,
+    what: str,
+) -> Fit:
+    """The values that make the sum of squared residuals least, by Levenberg-Marquardt (scipy's trust region).
 
-    Wrong when the residuals are not independent and alike, and when what is held fixed is not right. Raises `MembraneError`
-    where there are too few data or no finite start; `what` names the fit.
+    Args:
+        residuals: from `theta [n]`, float64, to `[m]`, with m larger than n.
+        jacobian: from `theta [n]` to `[m, n]`.
+        start: `[n]` where to begin.
+        what: names the fit in errors.
+
+    Returns:
+        The minimum with its covariance.
+
+    Raises:
+        MembraneError: too few data, no finite start, or no convergence.
+
+    Limitations:
+        The covariance assumes that residuals are independent and of equal variance, and that what is held fixed is right.
+
+    Example:
+        >>> x = np.arange(5.0)
+        >>> line = np.stack([np.ones(5), x], -1)
+        >>> fit(lambda theta: line @ theta - (2 + 3 * x), lambda theta: line, np.zeros(2), "line").values.round(6)
+        array([2., 3.])
     """
     start = np.asarray(start, float)
     first = residuals(start)
@@ -64,10 +98,10 @@ def with_common_errors(found: Fit, jacobian: np.ndarray, errors: np.ndarray) -> 
     return found._replace(covariance=found.covariance + shifts @ shifts.T)
 
 
-def strays(residuals: np.ndarray) -> np.ndarray:
-    """Which of the residual vectors `[N, 2]` are mistakes: far beyond the others."""
+def outliers(residuals: np.ndarray) -> np.ndarray:
+    """Which of the residual vectors `[N, 2]` are mistakes, far beyond the others: `[N]` bool."""
     length = np.linalg.norm(residuals, axis=-1)
-    return ~(length <= STRAY * max(np.nanmedian(length) / 1.18, 1e-9))  # 1.18: median length for unit deviation in the plane
+    return ~(length <= OUTLIER * max(np.nanmedian(length) / 1.18, 1e-9))  # 1.18: median length for unit deviation in the plane
 
 
 def rotations(vectors: Tensor) -> Tensor:
@@ -91,8 +125,8 @@ def outline_centres(pixels: Tensor) -> Tensor:
     p = pixels - mean[..., None, :]
     gap = torch.arange(count, dtype=torch.float64)
     angle = torch.pi * (gap[:, None] - gap) / count
-    slope = torch.where(angle == 0, 0.0, torch.cos((gap[:, None] - gap) * torch.pi) / (2 * torch.tan(angle)))
-    q = slope @ p
+    derivative = torch.where(angle == 0, 0.0, torch.cos((gap[:, None] - gap) * torch.pi) / (2 * torch.tan(angle)))
+    q = derivative @ p
     cross = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
     return mean + 2 / 3 * (p * cross[..., None]).sum(-2) / cross.sum(-1, keepdim=True)
 

@@ -17,46 +17,67 @@ from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor
 from ..surface.projection import SurfacePoints
 
-GRID = (17, 17)  # on finer grids the price is less smooth in the prestretch
+GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
 STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it
 BETWEEN = 5  # prestretches tried on either side of the lowest
-PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the price's, alike in all images
+PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the loss's, alike in all images
 WRONG = 0.02  # probability that an image is explained wrongly altogether and tells nothing
 FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known force (docs/calibration.md)
 GAS_ROUNDS = 4
 FINE = 4001  # prestretches over which the probability is summed
 
 
-class Profile(NamedTuple):
-    """The least price at each prestretch: `stretches [S]`, increasing, `prices [S, B]` of every image."""
+class LossProfile(NamedTuple):
+    """The least loss at each prestretch.
+
+    Attributes:
+        stretches: `[S]` prestretches, increasing.
+        losses: `[S, B]` of every image.
+    """
 
     stretches: np.ndarray
-    prices: np.ndarray
+    losses: np.ndarray
 
 
 class MaterialFit(NamedTuple):
     """The sensor with the material found.
 
-    values, covariance: prestretch and, where forces are known, modulus = shear modulus x thickness (N per length unit), `[n]`
-    and `[n, n]`; profile: what the prestretch rests on; each: `[B, 2]` prestretch and deviation from each image alone;
-    forces: `[B, 2]` magnitudes found and measured, NaN where not known.
+    Attributes:
+        sensor: the sensor with this material.
+        values: `[n]` prestretch and, where forces are known, modulus = shear modulus x thickness (N per length unit).
+        covariance: `[n, n]` of the values.
+        profile: the losses on which the prestretch rests.
+        each: `[B, 2]` prestretch and standard deviation from each image alone.
+        forces: `[B, 2]` magnitudes found and measured, N, NaN where not known.
     """
 
     sensor: Sensor
     values: np.ndarray
     covariance: np.ndarray
-    profile: Profile
+    profile: LossProfile
     each: np.ndarray
     forces: np.ndarray
 
     @property
     def deviations(self) -> np.ndarray:
-        """Standard deviations `[n]`."""
+        """Standard deviations of the values, `[n]`."""
         return np.sqrt(np.diag(self.covariance))
 
 
 def material_from_images(sensor: Sensor, images: Tensor, forces: np.ndarray | None = None) -> MaterialFit:
-    """See `material_from_pixels`; `images [B, 1, height, width]` grey in 0..1. Raises where one shows too few markers."""
+    """Prestretch from images of presses, and the modulus where their forces are known; see `material_from_pixels`.
+
+    Args:
+        sensor: the sensor, calibrated but for its material.
+        images: `[B, 1, H, W]` grey in 0..1.
+        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
+
+    Returns:
+        The sensor with the material found.
+
+    Raises:
+        MembraneError: an image shows too few markers, or the sensor's material is harmonic.
+    """
     reconstructor = _reconstructor(sensor)
     with torch.no_grad():
         displacement, confidence, status = reconstructor.observe(images.double())
@@ -69,23 +90,31 @@ def material_from_images(sensor: Sensor, images: Tensor, forces: np.ndarray | No
 def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | None = None) -> MaterialFit:
     """Prestretch from presses, and the modulus where their forces are known.
 
-    Arguments: `pixels [B, D, 2]` of the markers in B images of presses (NaN where lost), less what rest images show beside the
-    model; `forces`: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
-
     Force balance is solved at many prestretches l. What it minimises, in standard deviations of the markers and of tractions in
     units of the rest pressure, is taken for the negative logarithm of a probability:
 
-        p(log l) ~ product over images of [e + (1 - e) exp(-min over x, p of price(x, p; l)) / mean over l of the same]
+        p(log l) ~ product over images of [e + (1 - e) exp(-min over x, p of loss(x, p; l)) / mean over l of the same]
 
     with e = `WRONG`, for an image that is explained wrongly altogether. Mean and deviation are reported, the latter enlarged
     where the images contradict one another, and by an error that all images share. A membrane with the wrong l needs forces
-    where
-    nothing touches it. Forces are proportional to the modulus, so that each press gives the modulus as force measured / force
-    found at modulus 1; their mean is reported.
+    where nothing touches it. Forces are proportional to the modulus, so that each press gives the modulus as force measured /
+    force found at modulus 1; their mean is reported.
 
-    Wrong when: the presses are shallow or the markers miss them (the deviation says so); the membrane is not equally stretched
-    in
-    both directions; the rest surface is wrong; the prestretch lies outside `STRETCHES` (then it is found near their end).
+    Args:
+        sensor: the sensor, calibrated but for its material.
+        pixels: `[B, D, 2]` of the markers in B images of presses (NaN where lost), less what rest images show beside the model.
+        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
+
+    Returns:
+        The sensor with the material found.
+
+    Raises:
+        MembraneError: the sensor's material is harmonic: its shape does not depend on the prestretch.
+
+    Limitations:
+        Shallow presses, or presses that the markers miss, identify little (the deviation is large then). The membrane must be
+        equally stretched in both directions, and the rest surface right. A prestretch outside `STRETCHES` is found near their
+        end.
     """
     reconstructor = _reconstructor(sensor)
     pixels = torch.as_tensor(pixels).to(reconstructor.rest_pixels)
@@ -94,11 +123,13 @@ def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | No
     return _material(sensor, reconstructor, displacement, (~lost).to(pixels), forces)
 
 
-def _material(sensor: Sensor, reconstructor: Reconstructor, displacement, confidence, forces) -> MaterialFit:
+def _material(
+    sensor: Sensor, reconstructor: Reconstructor, displacement: Tensor, confidence: Tensor, forces: np.ndarray | None
+) -> MaterialFit:
     presses = Presses(reconstructor, displacement, confidence)
     profile = presses.profile()
-    each = np.array([_log_stretch(profile.stretches, prices[:, None]) for prices in profile.prices.T])
-    log_stretch, deviation = _log_stretch(profile.stretches, profile.prices)
+    each = np.array([_log_stretch(profile.stretches, losses[:, None]) for losses in profile.losses.T])
+    log_stretch, deviation = _log_stretch(profile.stretches, profile.losses)
     variances = each[:, 1] ** 2 + PRESTRETCH_ERROR**2
     contradiction = ((each[:, 0] - log_stretch) ** 2 / variances).sum() / max(len(each) - 1, 1)
     deviation = np.hypot(deviation * np.sqrt(max(1.0, contradiction)), PRESTRETCH_ERROR)
@@ -123,21 +154,24 @@ def _reconstructor(sensor: Sensor) -> Reconstructor:
     return Reconstructor(replace(sensor, membrane=sensor.surface.membrane(GRID)), dtype=torch.float64)
 
 
-def _log_stretch(stretches: np.ndarray, prices: np.ndarray) -> tuple[float, float]:
-    """Mean and standard deviation of the logarithm of the prestretch, from prices `[S, B]` at `stretches [S]`."""
+def _log_stretch(stretches: np.ndarray, losses: np.ndarray) -> tuple[float, float]:
+    """Mean and standard deviation of the logarithm of the prestretch, from losses `[S, B]` at `stretches [S]`."""
     z = np.log(stretches)
     fine = np.linspace(z[0], z[-1], FINE)
-    price = PchipInterpolator(z, prices)(fine)
-    alone = np.exp(price.min(0) - price)
+    loss = PchipInterpolator(z, losses)(fine)
+    alone = np.exp(loss.min(0) - loss)
     weight = (WRONG + (1 - WRONG) * alone / alone.mean(0)).prod(1)
     mean = (weight * fine).sum() / weight.sum()
     return mean, np.sqrt((weight * (fine - mean) ** 2).sum() / weight.sum())
 
 
 class Presses:
-    """What was seen of B presses, to be explained by one material or another.
+    """B presses as measured, to be explained by one material or another.
 
-    Arguments: the sensor's reconstructor; displacements `[B, D, 2]` px and confidence `[B, D]` of its markers.
+    Args:
+        reconstructor: the sensor's.
+        displacement: `[B, D, 2]` of its markers, px.
+        confidence: `[B, D]` of its markers.
     """
 
     def __init__(self, reconstructor: Reconstructor, displacement: Tensor, confidence: Tensor):
@@ -155,25 +189,32 @@ class Presses:
         with torch.no_grad():
             return estimator, estimator(*self.rays, self.confidence)
 
-    def profile(self) -> Profile:
-        """The presses' prices at `STRETCHES`, and closer together around the lowest."""
-        prices = {stretch: self._prices(stretch) for stretch in STRETCHES}
-        k = min(max(int(np.argmin([values.sum() for values in prices.values()])), 1), len(STRETCHES) - 2)
-        prices |= {stretch: self._prices(stretch) for stretch in np.geomspace(*STRETCHES[[k - 1, k + 1]], BETWEEN + 2)[1:-1]}
-        stretches = np.array(sorted(prices))
-        return Profile(stretches, np.array([prices[stretch] for stretch in stretches]))
+    def profile(self) -> LossProfile:
+        """The presses' losses at `STRETCHES`, and closer together around the lowest."""
+        losses = {stretch: self._losses(stretch) for stretch in STRETCHES}
+        k = min(max(int(np.argmin([values.sum() for values in losses.values()])), 1), len(STRETCHES) - 2)
+        losses |= {stretch: self._losses(stretch) for stretch in np.geomspace(*STRETCHES[[k - 1, k + 1]], BETWEEN + 2)[1:-1]}
+        stretches = np.array(sorted(losses))
+        return LossProfile(stretches, np.array([losses[stretch] for stretch in stretches]))
 
-    def _prices(self, stretch: float) -> np.ndarray:
+    def _losses(self, stretch: float) -> np.ndarray:
         estimator, found = self.explained(stretch, self.reconstructor.sensor.material.modulus)
         return estimator.price(found, *self.rays, self.confidence).numpy()
 
     def modulus(self, log_stretch: float, deviation: float, forces: np.ndarray) -> tuple[float, float, float, np.ndarray]:
-        """Modulus, its deviation at this prestretch, its change with one deviation of the prestretch, magnitudes `[B, 2]`.
+        """The modulus from presses of known force.
 
-        The change is the larger of those to either side, negative: under more tension at rest a softer membrane presses as
-        hard.
+        A gas resists in newtons: there the presses are explained anew with each modulus.
 
-        `forces`: as for `material_from_pixels`. A gas resists in newtons: the presses are explained anew with each modulus.
+        Args:
+            log_stretch: logarithm of the prestretch.
+            deviation: its standard deviation.
+            forces: as for `material_from_pixels`.
+
+        Returns:
+            The modulus; its standard deviation at this prestretch; its change with one deviation of the prestretch, the larger
+            of those to either side, negative, as under more tension at rest a softer membrane presses as hard; and magnitudes
+            of the forces found and measured, `[B, 2]`.
         """
         modulus = self.reconstructor.sensor.material.modulus
         for _ in range(GAS_ROUNDS if self.reconstructor.estimator.cavity.filling == "gas" else 1):

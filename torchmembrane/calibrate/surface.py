@@ -1,5 +1,6 @@
 """The rest surface as calibration moves it: dots' outlines on it, a new pose, a correction along its normals."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -7,6 +8,7 @@ import numpy as np
 import torch
 from scipy.interpolate import RBFInterpolator
 
+from ..camera.model import Camera
 from ..errors import MembraneError
 from ..sensor.parts import Markers, Surface
 from ..sensor.sensor import Sensor
@@ -17,17 +19,28 @@ from ..targets import OUTLINE
 FINE = 65  # vertices a side of the surface that is calibrated
 
 
-class Feet(NamedTuple):
-    """The closest points of a surface, `places [N, 3]`, its outward `normals [N, 3]` there, and how far outside (positive) or
-    inside it the points are that stand on them, `heights [N]`."""
+class SurfaceProjection(NamedTuple):
+    """Points projected onto a surface.
 
-    places: np.ndarray
+    Attributes:
+        points: `[N, 3]` the closest points of the surface, length unit.
+        normals: `[N, 3]` its outward unit normals there.
+        signed_distance: `[N]` from there to the points that were projected, along the normals: positive outside.
+    """
+
+    points: np.ndarray
     normals: np.ndarray
-    heights: np.ndarray
+    signed_distance: np.ndarray
 
 
 class Correction(NamedTuple):
-    """A surface moved: `vertices [V, 3]`, by how much along its outward normals `[V]`, and the standard deviations `[V]`."""
+    """A surface moved.
+
+    Attributes:
+        vertices: `[V, 3]` where it is now.
+        offsets: `[V]` by how much it was moved along its outward normals, length unit.
+        deviations: `[V]` standard deviations of the offsets.
+    """
 
     vertices: np.ndarray
     offsets: np.ndarray
@@ -39,7 +52,14 @@ def fine_surface(sensor: Sensor) -> Membrane:
     return sensor.surface.membrane(tuple(max(FINE, side) for side in sensor.membrane.grid))
 
 
-def recalibrated(sensor: Sensor, surface: Membrane, vertices: np.ndarray, positions, sizes, image) -> Sensor:
+def recalibrated(
+    sensor: Sensor,
+    surface: Membrane,
+    vertices: np.ndarray,
+    positions: np.ndarray | None,
+    sizes: Sequence[str] | None,
+    image: np.ndarray,
+) -> Sensor:
     """The sensor with its rest surface at `vertices [V, 3]` (on the grid of `surface`), dots `[D, 3]` and rest image."""
     m, n = surface.grid
     shape = Surface("grid", {"vertices": vertices.reshape(m, n, 3), "fixed": surface.fixed.numpy().reshape(m, n)})
@@ -49,7 +69,7 @@ def recalibrated(sensor: Sensor, surface: Membrane, vertices: np.ndarray, positi
 
 def frames_at(surface: Membrane, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Outward normals `[D, 3]` and two tangents `[D, 3, 2]` of the surface next to `positions [D, 3]`."""
-    normals = feet_of(surface, positions).normals
+    normals = surface_projection(surface, positions).normals
     return normals, tangent_axes(normals).swapaxes(1, 2)
 
 
@@ -59,12 +79,12 @@ def dot_outlines(surface: Membrane, positions: np.ndarray, radii: np.ndarray) ->
     angle = 2 * np.pi * np.arange(OUTLINE) / OUTLINE
     circle = np.stack([np.cos(angle), np.sin(angle)])
     flat = positions[:, None] + radii[:, None, None] * (tangents @ circle).swapaxes(1, 2)
-    heights = [feet_of(surface, points.reshape(-1, 3)).heights for points in (flat, positions)]
-    sag = heights[0].reshape(flat.shape[:2]) - heights[1][:, None]
+    at_circle, at_centre = (surface_projection(surface, points.reshape(-1, 3)).signed_distance for points in (flat, positions))
+    sag = at_circle.reshape(flat.shape[:2]) - at_centre[:, None]
     return flat - sag[..., None] * normals[:, None]
 
 
-def unit_shapes(camera, outlines: np.ndarray, radii: np.ndarray) -> np.ndarray:
+def unit_shapes(camera: Camera, outlines: np.ndarray, radii: np.ndarray) -> np.ndarray:
     """How dots of radius 1 are imaged, `[D, 2, 2]` px per length unit, from their `outlines [D, 8, 3]` of `radii [D]`."""
     p = camera.point_to_pixel(torch.from_numpy(outlines)).numpy()
     quarter = OUTLINE // 4
@@ -72,26 +92,36 @@ def unit_shapes(camera, outlines: np.ndarray, radii: np.ndarray) -> np.ndarray:
     return np.stack(columns, -1)
 
 
-def correction(surface: Membrane, feet: Feet, variances: np.ndarray) -> Correction:
-    """The smooth displacement of the surface that has the heights of `feet [N]`, of `variances [N]`, along their normals.
+def correction(surface: Membrane, projection: SurfaceProjection, variances: np.ndarray) -> Correction:
+    """The smooth displacement that brings the surface onto N points.
 
-    Thin-plate splines (scipy) of the heights as vectors, linear where there are no points; what moves the surface within itself
-    is not seen. Wrong where the rim is far outside the points.
+    Thin-plate splines (scipy) of the signed distances as vectors, linear where there are no points.
+
+    Args:
+        surface: the surface to move.
+        projection: the points, projected onto it.
+        variances: `[N]` of their signed distances.
+
+    Raises:
+        MembraneError: fewer than 12 points.
+
+    Limitations:
+        What moves the surface within itself is not observed. Where the rim is far outside the points, it is extrapolated.
     """
-    if len(feet.places) < 12:
-        raise MembraneError(f"calibrate: {len(feet.places)} points of the rest surface; expected at least 12")
-    unit = np.eye(len(feet.places))
-    weights = RBFInterpolator(feet.places, unit, kernel="thin_plate_spline", degree=1)(surface.rest.numpy())
-    shift = weights @ (feet.heights[:, None] * feet.normals)
+    if len(projection.points) < 12:
+        raise MembraneError(f"calibrate: {len(projection.points)} points of the rest surface; expected at least 12")
+    unit = np.eye(len(projection.points))
+    weights = RBFInterpolator(projection.points, unit, kernel="thin_plate_spline", degree=1)(surface.rest.numpy())
+    shift = weights @ (projection.signed_distance[:, None] * projection.normals)
     offsets = (shift * surface.rest_normals.numpy()).sum(1)
     return Correction(surface.rest.numpy() + shift, offsets, np.sqrt(weights**2 @ variances))
 
 
-def feet_of(surface: Membrane, points: np.ndarray) -> Feet:
-    """The feet of `points [N, 3]` on the surface."""
+def surface_projection(surface: Membrane, points: np.ndarray) -> SurfaceProjection:
+    """The projection of `points [N, 3]` onto the surface."""
     near = surface.closest_points(points)
-    places, normals = (
+    closest, normals = (
         (values.numpy()[near.vertices] * near.weights[..., None]).sum(1) for values in (surface.rest, surface.rest_normals)
     )
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    return Feet(places, normals, ((points - places) * normals).sum(1))
+    return SurfaceProjection(closest, normals, ((points - closest) * normals).sum(1))

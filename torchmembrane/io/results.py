@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from .atomic import whole_file
 from .status import Status
 
 OK, TOO_FEW_MARKERS, UNLIKE_REST, NOT_CONVERGED, BLANK, BAD_VALUES, NO_SOLUTION = Status  # TEMPORARY
@@ -84,11 +85,8 @@ class Reconstruction(NamedTuple):
 
 def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
     """Write one frame (`Reconstruction.frame`) to `path` (.npz), whole or not at all."""
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    with open(partial, "wb") as file:
+    with whole_file(path) as partial, open(partial, "wb") as file:
         np.savez(file, **frame)
-    partial.replace(path)
 
 
 def load_frame(path: str | Path) -> dict[str, np.ndarray]:

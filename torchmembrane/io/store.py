@@ -1,21 +1,22 @@
-"""Results on disk: `mesh.npz` once, and every frame either as its own NAME.npz or as a row of one Parquet dataset."""
+"""A folder of results: the settings that all its frames share, and `mesh.npz`, which holds them beside the rest surface."""
 
-import json
 import zipfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from torch import Tensor
 
 from ..errors import MembraneError
-from .results import NOT_CONVERGED, OK, Reconstruction, load_frame, save_frame, stack_frames
+from .results import NOT_CONVERGED, OK, save_frame
+
+if TYPE_CHECKING:
+    from ..reconstruct import Reconstructor
 
 FINISHED = (OK, NOT_CONVERGED)
 """Status of frames that are not tried again."""
 FORMATS = ("npz", "parquet")
 MESH = "mesh.npz"
-PART_ROWS = 256
-"""Frames of one Parquet file; what a killed run can lose at most."""
 
 
 class Settings(NamedTuple):
@@ -61,16 +62,24 @@ class Mesh(NamedTuple):
     format: str
 
     @classmethod
-    def of(cls, reconstructor, settings: Settings) -> "Mesh":
+    def of(cls, reconstructor: "Reconstructor", settings: Settings) -> "Mesh":
         """What the frames of a `Reconstructor` share."""
         sensor, membrane = reconstructor.sensor, reconstructor.estimator.membrane
-        single = lambda a: a.detach().cpu().numpy().astype(np.float32)  # noqa: E731
         return cls(
-            single(membrane.rest), single(membrane.rest_normals),
-            membrane.triangles.cpu().numpy().astype(np.int64), membrane.fixed.cpu().numpy(), np.array(membrane.grid),
-            single(reconstructor.vertex_pixels), single(reconstructor.rest_pixels), np.array(sensor.camera.image_size),
-            sensor.length_unit, sensor.force_unit, sensor.name, sensor.fingerprint, *settings,
-        )  # fmt: skip
+            rest_vertices=_single(membrane.rest),
+            rest_normals=_single(membrane.rest_normals),
+            triangles=membrane.triangles.cpu().numpy().astype(np.int64),
+            fixed=membrane.fixed.cpu().numpy(),
+            grid=np.array(membrane.grid),
+            vertex_pixels=_single(reconstructor.vertex_pixels),
+            rest_pixels=_single(reconstructor.rest_pixels),
+            image_size=np.array(sensor.camera.image_size),
+            length_unit=sensor.length_unit,
+            force_unit=sensor.force_unit,
+            name=sensor.name,
+            sensor=sensor.fingerprint,
+            **settings._asdict(),
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> "Mesh":
@@ -90,6 +99,7 @@ class Mesh(NamedTuple):
 
     @property
     def settings(self) -> Settings:
+        """The choices that made the results."""
         return Settings(self.estimator, self.energy, self.element, self.format)
 
     def normal_displacement(self, frame: dict[str, np.ndarray]) -> np.ndarray:
@@ -120,157 +130,5 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
             )
 
 
-def open_folder(folder: str | Path, mesh: Mesh) -> "FrameFiles | FrameTable":
-    """The frames of a folder that is made if need be; refuses what `check_folder` refuses."""
-    folder = Path(folder)
-    check_folder(folder, mesh.sensor, mesh.settings)
-    frames = _frames(folder, mesh)
-    if not (folder / MESH).exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        mesh.save(folder / MESH)
-    return frames
-
-
-def read_results(folder: str | Path) -> tuple[list[str], Reconstruction]:
-    """All frames of a folder of either format, in name order: names, and a batch (failed ones NaN, with their status).
-
-    Raises `MembraneError` where there are none.
-    """
-    folder = Path(folder)
-    frames = _frames(folder, Mesh.load(folder / MESH))
-    names = sorted(frames.statuses())
-    if not names:
-        raise MembraneError(f"{folder}: no frames; expected results of `torchmembrane reconstruct`")
-    return names, stack_frames(frames.read(names))
-
-
-def _frames(folder: Path, mesh: Mesh):
-    return FrameTable(folder / "frames", mesh) if mesh.format == "parquet" else FrameFiles(folder)
-
-
-class FrameFiles:
-    """Frames as one NAME.npz each."""
-
-    def __init__(self, folder: Path):
-        self.folder = folder
-
-    def statuses(self) -> dict[str, int]:
-        """Name and status of every frame stored; files that hold no result are left out."""
-        found = {p.stem: _stored_status(p) for p in self.folder.glob("*.npz") if p.name != MESH}
-        return {name: status for name, status in found.items() if status is not None}
-
-    def read(self, names) -> list[dict[str, np.ndarray]]:
-        return [load_frame(self.folder / f"{name}.npz") for name in names]
-
-    def write(self, name: str, frame: dict[str, np.ndarray]) -> None:
-        save_frame(self.folder / f"{name}.npz", frame)
-
-    def forget(self, name: str) -> None:
-        (self.folder / f"{name}.npz").unlink(missing_ok=True)
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-
-def _stored_status(path: Path) -> int | None:
-    try:
-        with np.load(path) as data:
-            return int(data["status"])
-    except (KeyError, OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile):
-        return None
-
-
-class FrameTable:
-    """Frames as rows of `part-*.parquet`: a column `name`, and the keys of `Reconstruction`, arrays as flat lists.
-
-    The schema's metadata hold the shapes (`shapes`, JSON: key to shape), units and the sensor's fingerprint. No name is
-    in two rows at any time. Rows are held back until `PART_ROWS` of them make a file; `flush` writes the rest.
-    """
-
-    def __init__(self, folder: Path, mesh: Mesh):
-        self.arrow, self.parquet = load_pyarrow()
-        self.folder, self.waiting = folder, {}
-        self.metadata = {key: getattr(mesh, key) for key in ("length_unit", "force_unit", "name", "sensor")}
-        self.part_of = {name: part for part in self._parts() for name in self._column(part, "name")}
-
-    def statuses(self) -> dict[str, int]:
-        pairs = (zip(self._column(p, "name"), self._column(p, "status"), strict=True) for p in self._parts())
-        return dict(pair for part in pairs for pair in part) | {n: int(f["status"]) for n, f in self.waiting.items()}
-
-    def read(self, names) -> list[dict[str, np.ndarray]]:
-        names, found = list(names), dict(self.waiting)
-        for part in {self.part_of[name] for name in names if name in self.part_of}:
-            found |= self._frames_of(self.parquet.read_table(part))
-        return [found[name] for name in names]
-
-    def write(self, name: str, frame: dict[str, np.ndarray]) -> None:
-        self.waiting[name] = frame
-        if len(self.waiting) >= PART_ROWS:
-            self.flush()
-
-    def forget(self, name: str) -> None:
-        self.waiting.pop(name, None)
-        self._drop([name])
-
-    def flush(self) -> None:
-        if not self.waiting:
-            return
-        self.folder.mkdir(exist_ok=True)
-        self._drop(self.waiting)
-        last = max((int(p.stem.rpartition("-")[2]) for p in self._parts()), default=-1)
-        part = self.folder / f"part-{last + 1:05d}.parquet"
-        self._save(self._table(self.waiting), part)
-        self.part_of |= dict.fromkeys(self.waiting, part)
-        self.waiting = {}
-
-    def _parts(self) -> list[Path]:
-        return sorted(self.folder.glob("part-*.parquet"))
-
-    def _column(self, part: Path, key: str) -> list:
-        try:
-            return self.parquet.read_table(part, columns=[key])[key].to_pylist()
-        except (OSError, ValueError, KeyError) as error:
-            raise MembraneError(f"{part}: not a part of torchmembrane's results ({error}); move it away") from error
-
-    def _drop(self, names) -> None:
-        """Take rows out of the parts that hold them."""
-        stale = [name for name in names if name in self.part_of]
-        for part in {self.part_of.pop(name) for name in stale}:
-            table = self.parquet.read_table(part)
-            keep = self.arrow.array([name not in stale for name in table["name"].to_pylist()])
-            rest = table.filter(keep)
-            self._save(rest, part) if len(rest) else part.unlink()
-
-    def _table(self, frames: dict[str, dict[str, np.ndarray]]):
-        columns, shapes = {"name": self.arrow.array(list(frames))}, {}
-        for key in Reconstruction._fields:
-            values = np.stack([frame[key] for frame in frames.values()])
-            shapes[key], flat = list(values.shape[1:]), self.arrow.array(values.ravel())
-            size = int(np.prod(shapes[key]))
-            columns[key] = self.arrow.FixedSizeListArray.from_arrays(flat, size) if shapes[key] else flat
-        return self.arrow.table(columns).replace_schema_metadata(self.metadata | {"shapes": json.dumps(shapes)})
-
-    def _frames_of(self, table) -> dict[str, dict[str, np.ndarray]]:
-        shapes = json.loads(table.schema.metadata[b"shapes"])
-        columns = {}
-        for key, shape in shapes.items():
-            column = table[key].combine_chunks()
-            values = (column.flatten() if shape else column).to_numpy(zero_copy_only=False)
-            columns[key] = values.reshape(len(table), *shape)
-        return {name: {k: v[i] for k, v in columns.items()} for i, name in enumerate(table["name"].to_pylist())}
-
-    def _save(self, table, part: Path) -> None:
-        partial = part.with_name("." + part.name)  # hidden: readers of the folder pass over it
-        self.parquet.write_table(table, partial)
-        partial.replace(part)
-
-
-def load_pyarrow():
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MembraneError(
-            'Parquet results need pyarrow, which is not installed: pip install "torchmembrane[parquet]"'
-        ) from error
-    return pyarrow, pyarrow.parquet
+def _single(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().numpy().astype(np.float32)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from .frames import BLUE, GREY, VERMILION, save
 
-TOLD_APART = 0.95  # correlation above which two settings are said to be hard to tell apart
+INDISTINGUISHABLE = 0.95  # correlation above which two settings are said to be hardly distinguishable
 PARAMETERS_DRAWN = 24
 GAINS = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000])
 
@@ -53,8 +53,8 @@ class Report(NamedTuple):
 
     @property
     def confused(self) -> list[tuple[str, str, float]]:
-        """Pairs that the data hardly tell apart, with their correlation."""
-        rows, columns = np.nonzero(np.triu(np.abs(self.correlations) > TOLD_APART, 1))
+        """Pairs that the data hardly distinguish, with their correlation."""
+        rows, columns = np.nonzero(np.triu(np.abs(self.correlations) > INDISTINGUISHABLE, 1))
         return [(self.names[i], self.names[j], float(self.correlations[i, j])) for i, j in zip(rows, columns, strict=True)]
 
     @property
@@ -66,7 +66,7 @@ class Report(NamedTuple):
             lines.append(
                 f"  residuals: {len(self.residuals)} points, {rms:.3f} px rms, at most {np.abs(self.residuals).max():.3f} px"
             )
-        lines += [f"  hardly told apart: {a} and {b} (correlation {c:+.4f})" for a, b, c in self.confused]
+        lines += [f"  hardly distinguishable: {a} and {b} (correlation {c:+.4f})" for a, b, c in self.confused]
         return [self.title, *lines, *(f"  {note}" for note in self.notes)]
 
     def write(self, folder: Path, drawing: Figure) -> None:
@@ -150,19 +150,19 @@ def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarr
 
 
 def material_figure(report: Report, found, names: list[str]) -> Figure:
-    """Prices over the prestretch and the estimate, and forces found and measured where any are, of a `MaterialFit`."""
+    """Losses over the prestretch and the estimate, and forces found and measured where any are, of a `MaterialFit`."""
     known = np.isfinite(found.forces).all(1)
     panels = 2 if known.any() else 1
     drawing = Figure(figsize=(1 + 6 * panels, 4.6), layout="constrained")
     drawing.suptitle(report.title)
     axes = drawing.subplots(1, panels, squeeze=False)[0]
-    stretches, prices = found.profile
-    axes[0].plot(stretches, prices - prices.min(0), "-", color=GREY, lw=1, label="each image")
-    axes[0].plot(stretches, prices.sum(1) - prices.sum(1).min(), ".-", color=BLUE, label="all")
+    stretches, losses = found.profile
+    axes[0].plot(stretches, losses - losses.min(0), "-", color=GREY, lw=1, label="each image")
+    axes[0].plot(stretches, losses.sum(1) - losses.sum(1).min(), ".-", color=BLUE, label="all")
     value, deviation = report.values[0], report.deviations[0]
     axes[0].axvspan(value - deviation, value + deviation, color=VERMILION, alpha=0.2)
     axes[0].axvline(value, color=VERMILION, label=f"{value:.3f} ± {deviation:.2g}")
-    axes[0].set(xscale="log", yscale="symlog", xlabel="prestretch", ylabel="price above the lowest")
+    axes[0].set(xscale="log", yscale="symlog", xlabel="prestretch", ylabel="loss above the lowest")
     axes[0].set_ylim(bottom=0)
     axes[0].set_xticks([1, 1.2, 1.5, 2, 3], ["1", "1.2", "1.5", "2", "3"])
     axes[0].minorticks_off()
@@ -179,7 +179,7 @@ def material_figure(report: Report, found, names: list[str]) -> Figure:
     return drawing
 
 
-def mill_figure(title: str, sensor, dots) -> Figure:
+def layout_figure(title: str, sensor, dots) -> Figure:
     """The wanted pattern in the image, and its dots on the rest surface, from above and from the side."""
     drawing = Figure(figsize=(15, 4.6), layout="constrained")
     drawing.suptitle(title)

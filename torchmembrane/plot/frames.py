@@ -11,11 +11,12 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ..io.atomic import whole_file
 from ..io.results import OK, STATUS_TEXTS
 from ..io.store import Mesh
 from ..surface.topology import rim_loop
 
-BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # told apart with any colour vision
+BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # distinguishable with any colour vision
 PRESSED_IN, PUSH = "RdBu", "Oranges"  # negative (in) red, positive (out) blue
 FORCE_ARROW = 0.2  # of the image's width: a force across the optical axis; shorter when it points along it
 MAGNIFICATIONS = (1, 2, 3, 5, 10, 20)
@@ -47,10 +48,9 @@ def figure(frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = 
 def save(drawing: Figure, path: str | Path) -> None:
     """Write a figure as PNG, whole or not at all."""
     path = Path(path)
-    partial = path.with_name(path.name + ".partial")
     path.parent.mkdir(parents=True, exist_ok=True)
-    drawing.savefig(partial, format="png")
-    partial.replace(path)
+    with whole_file(path) as partial:
+        drawing.savefig(partial, format="png")
 
 
 def show(drawing: Figure) -> None:

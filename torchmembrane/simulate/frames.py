@@ -10,9 +10,9 @@ import numpy as np
 from PIL import Image
 
 from ..errors import MembraneError
+from ..io.atomic import whole_file
+from ..io.optional import load_pyarrow, load_pyav
 from ..io.results import save_frame
-from ..io.store import load_pyarrow
-from ..jobs.local import load_pyav
 from ..sensor.sensor import Sensor
 from .simulator import Frame, Simulator
 
@@ -87,9 +87,8 @@ class FrameTable(Frames):
             columns[key] = self.arrow.FixedSizeListArray.from_arrays(flat, size) if shapes[key] else flat
         table = self.arrow.table(columns).replace_schema_metadata({"shapes": json.dumps(shapes)})
         part = self.folder / "frames" / f"part-{len(self._parts()):05d}.parquet"
-        partial = part.with_name("." + part.name)
-        self.parquet.write_table(table, partial)
-        partial.replace(part)
+        with whole_file(part) as partial:
+            self.parquet.write_table(table, partial)
         self.waiting = {}
 
     def __iter__(self) -> Iterator[tuple[str, Frame]]:
@@ -181,6 +180,5 @@ def _check(folder: Path, settings: dict) -> None:
 
 def _write(path: Path, content: bytes) -> None:
     """A file, whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(content)
-    partial.replace(path)
+    with whole_file(path) as partial:
+        partial.write_bytes(content)

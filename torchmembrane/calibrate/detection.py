@@ -5,6 +5,7 @@ import heapq
 import numpy as np
 
 from ..errors import MembraneError
+from ..io.optional import load_opencv
 from ..markers.dots import find_dots
 from ..targets import LARGE, MARKS, Checkerboard, DotBoard
 
@@ -13,22 +14,35 @@ FAR_OFF = 10**6
 STEP_ERROR = 0.35  # of a lattice step, by which a neighbour may be off its prediction
 
 
-def opencv():
-    """The module cv2, or a `MembraneError` that names the extra."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise MembraneError("calibrate: OpenCV is missing; install it with pip install 'torchmembrane[calibrate]'") from error
-    return cv2
-
-
 def find_target(image: np.ndarray, board: Checkerboard | DotBoard) -> np.ndarray:
-    """Where the board's points are in an image `[H, W]` (grey 0..1): `[D, 2]` px, NaN where not seen."""
-    return (_find_corners if isinstance(board, Checkerboard) else _find_board_dots)(image, board)
+    """The board's points in an image.
+
+    Args:
+        image: `[H, W]` grey in 0..1.
+        board: the board that the image shows.
+
+    Returns:
+        `[D, 2]` px, in the order of `board.points`; NaN where a dot is not visible. Of a checkerboard all corners are found.
+
+    Raises:
+        MembraneError: the image does not show the board; OpenCV is not installed (checkerboards).
+
+    Example:
+        >>> from torchmembrane.camera.model import Camera
+        >>> from torchmembrane.simulate.board import BoardImages
+        >>> board, camera = DotBoard(9, 7, 2.0), Camera("pinhole", (320, 240), (150.0, 150.0), (160.0, 120.0))
+        >>> image = BoardImages.of(camera).image(board, np.eye(3), np.array([0.0, 0.0, 16.0]))
+        >>> pixels = find_target(image / 255, board)
+        >>> np.isfinite(pixels).all(), pixels[board.large].round(0) + 0.0
+        (np.True_, array([[160., 120.],
+               [216., 120.],
+               [160., 158.]]))
+    """
+    return _find_corners(image, board) if isinstance(board, Checkerboard) else _find_board_dots(image, board)
 
 
 def _find_corners(image: np.ndarray, board: Checkerboard) -> np.ndarray:
-    cv2 = opencv()
+    cv2 = load_opencv()
     grey = np.rint(255 * image).astype(np.uint8)
     flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
     found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=flags)
@@ -48,7 +62,7 @@ def _find_corners(image: np.ndarray, board: Checkerboard) -> np.ndarray:
 def _find_board_dots(image: np.ndarray, board: DotBoard) -> np.ndarray:
     dots = find_dots(image, "dark")
     radius = np.sqrt(np.abs(np.linalg.det(dots.shapes)))
-    steps = _walk(dots.pixels)
+    steps = _lattice_steps(dots.pixels)
     large = _larger_than_neighbours(steps, radius)
     steps = _turned_to_marks(steps, large)
     pixels = np.full((len(board.points), 2), np.nan)
@@ -59,10 +73,12 @@ def _find_board_dots(image: np.ndarray, board: DotBoard) -> np.ndarray:
     return pixels
 
 
-def _walk(pixels: np.ndarray) -> np.ndarray:
+def _lattice_steps(pixels: np.ndarray) -> np.ndarray:
     """Lattice steps `[N, 2]` of dots `[N, 2]`, from the middle one, surest first; `FAR_OFF`: not reached."""
     start = int(np.linalg.norm(pixels - np.median(pixels, 0), axis=1).argmin())
-    steps, placed, taken = np.full(pixels.shape, FAR_OFF), set(), set()
+    steps = np.full(pixels.shape, FAR_OFF)
+    placed: set[int] = set()
+    taken: set[tuple[int, int]] = set()
     front = [(0.0, start, (0, 0), _first_basis(pixels, start))]
     while front:
         _, here, step, basis = heapq.heappop(front)
@@ -108,5 +124,5 @@ def _turned_to_marks(steps: np.ndarray, large: np.ndarray) -> np.ndarray:
             if all((origin[0] + a, origin[1] + b) in marks for a, b in MARKS):
                 return turned - np.array(origin)
     raise MembraneError(
-        f"the board's three large dots are not recognised ({large.sum()} large dots seen); expected all three in the image"
+        f"the board's three large dots are not recognised ({large.sum()} large dots found); expected all three in the image"
     )

@@ -1,4 +1,7 @@
-"""From the dot pattern wanted in the image, through the ports, to places on the rest surface: how the paper made its sensor."""
+"""The fabrication layout: from the dot pattern wanted in the image, through the ports, to places on the rest surface.
+
+So the paper made its sensor (section 5.2).
+"""
 
 import csv
 from pathlib import Path
@@ -13,15 +16,23 @@ from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from ..surface.topology import rim_loop
 from .fit import outline_centres
-from .surface import dot_outlines, feet_of, fine_surface
+from .surface import dot_outlines, fine_surface, surface_projection
 
 RADIUS = {"small": 0.16, "large": 0.27}  # of dots, over their spacing
 MARGIN = 0.6  # of a pitch, that a lattice keeps from the rim's outline
 NEWTON_STEPS, AIMS = 3, 2
 
 
-class MillDots(NamedTuple):
-    """Dots to be made: `positions`, outward `normals [D, 3]` in the camera's frame, `radii [D]`, `sizes`, `pixels [D, 2]`."""
+class FabricationLayout(NamedTuple):
+    """Dots to be made on the rest surface.
+
+    Attributes:
+        positions: `[D, 3]` centres, camera frame, length unit.
+        normals: `[D, 3]` outward unit normals there.
+        radii: `[D]`, length unit.
+        sizes: small or large, of each.
+        pixels: `[D, 2]` where they are to be seen, px.
+    """
 
     positions: np.ndarray
     normals: np.ndarray
@@ -31,9 +42,25 @@ class MillDots(NamedTuple):
 
 
 def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
-    """A square lattice in the image about the principal point, `pitch` px, within the rim: `[D, 2]`, and sizes in turns."""
+    """A square lattice in the image about the principal point, within the rim, of large and small dots in turns.
+
+    Args:
+        sensor: camera and rest surface.
+        pitch: of the lattice, px, 4 or more.
+
+    Returns:
+        Pixels `[D, 2]`, and the sizes, small or large, of each.
+
+    Raises:
+        MembraneError: the pitch is too small.
+
+    Example:
+        >>> pixels, sizes = pixel_lattice(Sensor.from_file("examples/sensor.toml"), 60.0)
+        >>> pixels.shape, sizes[:3]
+        ((32, 2), ['large', 'small', 'large'])
+    """
     if not pitch >= 4:
-        raise MembraneError(f"calibrate pattern: pitch = {pitch}; expected 4 px or more, so that dots can be told apart")
+        raise MembraneError(f"calibrate layout: pitch = {pitch}; expected 4 px or more, so that dots are distinguishable")
     width, height = sensor.camera.image_size
     centre = sensor.camera.centre.numpy()
     reach = int(max(width, height) / pitch)
@@ -48,11 +75,28 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
     return pixels[kept], np.where((i + j) % 2 == 0, "large", "small")[kept].tolist()
 
 
-def dots_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> MillDots:
-    """Dots on the rest surface whose outlines are seen, through the ports, with their centres at `pixels [D, 2]`.
+def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> FabricationLayout:
+    """Dots on the rest surface whose outlines are seen, through the ports, with their centres at `pixels`.
 
-    A dot's own centre is seen beside its outline's, so that the ray aimed at is moved until the outline's is right. Raises
-    `MembraneError` for the first pixel whose ray misses the surface.
+    A dot's own centre is seen beside its outline's, so that the ray aimed at is moved until the outline's is right.
+
+    Args:
+        sensor: camera, with its ports, and rest surface.
+        pixels: `[D, 2]` where the dots are wanted in the image.
+        sizes: small or large, of each.
+
+    Returns:
+        The dots to be made.
+
+    Raises:
+        MembraneError: the ray of a pixel misses the surface; the first such pixel is named.
+
+    Example:
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> layout = layout_for_pixels(sensor, np.array([[320.0, 240.0], [360.0, 240.0]]), ["large", "small"])
+        >>> sensor.camera.point_to_pixel(torch.from_numpy(layout.positions)).numpy().round(0)
+        array([[320., 240.],
+               [360., 240.]])
     """
     wanted = aimed = np.asarray(pixels, float)
     surface = fine_surface(sensor)
@@ -63,26 +107,26 @@ def dots_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> Mil
         outlines = sensor.camera.point_to_pixel(torch.from_numpy(dot_outlines(surface, X, radii)))
         aimed = aimed + (wanted - outline_centres(outlines).numpy())
     X, normals = _ray_hits(sensor, surface, aimed)
-    return MillDots(X, normals, radii, list(sizes), wanted)
+    return FabricationLayout(X, normals, radii, list(sizes), wanted)
 
 
 def _ray_hits(sensor: Sensor, surface: Membrane, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where rays meet the surface, and its normals there, `[D, 3]` each: the mesh first, then Newton on one twice as fine."""
     origin, direction = (ray.numpy() for ray in sensor.camera.pixel_to_ray(torch.from_numpy(pixels)))
-    reach = surface.ray_points(np.nan_to_num(origin), np.nan_to_num(direction)).distance
-    missed = ~(np.isfinite(reach) & np.isfinite(direction).all(1))
+    distance = surface.ray_points(np.nan_to_num(origin), np.nan_to_num(direction)).distance
+    missed = ~(np.isfinite(distance) & np.isfinite(direction).all(1))
     if missed.any():
         d = int(np.flatnonzero(missed)[0])
         raise MembraneError(
-            f"calibrate pattern: the ray of pixel {pixels[d].tolist()} (dot {d}) misses the rest surface; expected pixels "
+            f"calibrate layout: the ray of pixel {pixels[d].tolist()} (dot {d}) misses the rest surface; expected pixels "
             "within the rim's outline: leave it out"
         )
     finer = sensor.surface.membrane(tuple(2 * side - 1 for side in surface.grid))
-    X = origin + reach[:, None] * direction
+    X = origin + distance[:, None] * direction
     for _ in range(NEWTON_STEPS):
-        feet = feet_of(finer, X)
-        X = X - (feet.heights / (direction * feet.normals).sum(1))[:, None] * direction
-    return X, feet_of(finer, X).normals
+        near = surface_projection(finer, X)
+        X = X - (near.signed_distance / (direction * near.normals).sum(1))[:, None] * direction
+    return X, surface_projection(finer, X).normals
 
 
 def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
@@ -95,15 +139,18 @@ def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
         sizes = [size.strip() for _, _, size in body]
     except (ValueError, OSError, UnicodeDecodeError) as error:
         raise MembraneError(
-            f"{path}: not readable ({error}); expected CSV with the header u,v,size and a line a dot"
+            f"{path}: not readable ({error}); expected CSV with the header u,v,size and one line per dot"
         ) from error
     if not right or not sizes or not set(sizes) <= set(RADIUS) or not np.isfinite(pixels).all():
         raise MembraneError(f"{path}: expected the header u,v,size, finite pixels, and sizes small or large")
     return pixels, sizes
 
 
-def write_mill(path: Path, sensor: Sensor, dots: MillDots) -> None:
-    """CSV for a mill: `dot,x,y,z,nx,ny,nz,radius,size`, origin at the rim's centre, axes parallel to the camera's."""
+def write_layout(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
+    """CSV for the machine that makes the dots: `dot,x,y,z,nx,ny,nz,radius,size`.
+
+    The origin is at the rim's centre, the axes are parallel to the camera's.
+    """
     rim = sensor.membrane.rest[sensor.membrane.fixed].mean(0).numpy()
     lines = ["dot,x,y,z,nx,ny,nz,radius,size"]
     rows = zip(dots.positions - rim, dots.normals, dots.radii, dots.sizes, strict=True)
@@ -112,8 +159,8 @@ def write_mill(path: Path, sensor: Sensor, dots: MillDots) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def write_svg(path: Path, sensor: Sensor, dots: MillDots) -> None:
-    """The dots and the rim seen along the axis, one unit a length unit, for printing or looking at."""
+def write_svg(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
+    """A drawing of the dots and the rim along the axis, true to size, for printing or looking at."""
     rim = sensor.membrane.rest.numpy()[rim_loop(sensor.membrane.grid), :2]
     low, size = rim.min(0) - 2, np.ptp(rim, 0) + 4
     unit = sensor.length_unit
@@ -126,6 +173,6 @@ def write_svg(path: Path, sensor: Sensor, dots: MillDots) -> None:
     ]
     for (x, y, _), normal, radius in zip(dots.positions, dots.normals, dots.radii, strict=True):
         short, angle = radius * abs(normal[2]), np.degrees(np.arctan2(normal[1], normal[0]))
-        turn = f"rotate({angle:.2f} {x:.3f} {y:.3f})"
-        lines.append(f'<ellipse cx="{x:.3f}" cy="{y:.3f}" rx="{short:.3f}" ry="{radius:.3f}" transform="{turn}"/>')
+        rotation = f"rotate({angle:.2f} {x:.3f} {y:.3f})"
+        lines.append(f'<ellipse cx="{x:.3f}" cy="{y:.3f}" rx="{short:.3f}" ry="{radius:.3f}" transform="{rotation}"/>')
     path.write_text("\n".join([*lines, "</svg>"]) + "\n", encoding="utf-8")

@@ -1,0 +1,131 @@
+"""Arguments that several commands take, and types that turn an argument's text into a value or say what was expected."""
+
+import math
+from argparse import Action, ArgumentTypeError, RawDescriptionHelpFormatter
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from .choices import ELEMENTS, ENERGIES, ESTIMATORS
+
+Add: TypeAlias = Callable[..., Action]
+"""A parser's `add_argument`."""
+
+
+def add_command(commands: Any, name: str, run: Callable[..., int], purpose: str, examples: str, *aliases: str) -> Add:
+    """Add a command's parser.
+
+    Args:
+        commands: what `add_subparsers` gave.
+        name: the command.
+        run: is called with the parsed arguments; returns the exit code.
+        purpose: one line, without capital and full stop.
+        examples: shown below the options.
+        *aliases: other names of the command.
+
+    Returns:
+        The parser's `add_argument`.
+    """
+    parser = commands.add_parser(
+        name,
+        aliases=aliases,
+        help=purpose,
+        description=purpose[0].upper() + purpose[1:] + ".",
+        epilog=examples,
+        formatter_class=RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+    return parser.add_argument
+
+
+def add_sensor(add: Add) -> None:
+    """The sensor file."""
+    add("sensor", metavar="SENSOR.toml", help="the sensor file, or preset:NAME")
+
+
+def add_estimator(add: Add, element: str) -> None:
+    """How the surface is found; `element` is the help of --element."""
+    add("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="how the surface is found (default: %(default)s)")
+    add("--energy", choices=ENERGIES, help="the membrane's elastic energy (default: the sensor file's)")
+    add("--element", choices=ELEMENTS, default=ELEMENTS[0], help=element)
+
+
+def positive(text: str) -> float:
+    """A positive number.
+
+    >>> positive("0.5")
+    0.5
+    """
+    (value,) = _values(text, float, 1, "a positive number")
+    if not value > 0:
+        raise ArgumentTypeError(f"{text!r}; expected a positive number")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """A number, 0 or more."""
+    (value,) = _values(text, float, 1, "a number, 0 or more")
+    if value < 0:
+        raise ArgumentTypeError(f"{text!r}; expected a number, 0 or more")
+    return value
+
+
+def count(text: str) -> int:
+    """A whole number, 1 or more."""
+    if not text.isdigit() or int(text) < 1:
+        raise ArgumentTypeError(f"{text!r}; expected a whole number, 1 or more")
+    return int(text)
+
+
+def seed(text: str) -> int:
+    """A whole number, 0 or more."""
+    return 0 if text == "0" else count(text)
+
+
+def vector(text: str) -> list[float]:
+    """Three numbers X,Y,Z.
+
+    >>> vector("0.5,0,-1")
+    [0.5, 0.0, -1.0]
+    """
+    return _values(text, float, 3, "three numbers X,Y,Z")
+
+
+def positive_pair(expected: str) -> Callable[[str], list[float]]:
+    """The type of two positive numbers; `expected` says which in an error."""
+    return lambda text: _values(text, positive, 2, expected)
+
+
+def count_pair(expected: str) -> Callable[[str], list[int]]:
+    """The type of two whole numbers, 1 or more; `expected` says which in an error.
+
+    >>> count_pair("two counts, COLUMNS,ROWS")("11,8")
+    [11, 8]
+    """
+    return lambda text: _values(text, count, 2, expected)
+
+
+def numbers(expected: str) -> Callable[[str], list[int]]:
+    """The type of one or more whole numbers; `expected` says which in an error."""
+    return lambda text: _values(text, int, None, expected)
+
+
+def some_of(choices: tuple[str, ...], expected: str) -> Callable[[str], list[str]]:
+    """The type of some of the choices, in any order, also repeated; `expected` says which in an error."""
+
+    def chosen(text: str) -> list[str]:
+        parts = text.split(",")
+        if not set(parts) <= set(choices):
+            raise ArgumentTypeError(f"{text!r}; expected {expected}")
+        return parts
+
+    return chosen
+
+
+def _values(text: str, kind: Callable[[str], Any], number: int | None, expected: str) -> list[Any]:
+    try:
+        values = [kind(part) for part in text.split(",")]
+    except (ValueError, ArgumentTypeError):
+        values = []
+    if not values or not all(map(math.isfinite, values)) or (number and len(values) != number):
+        raise ArgumentTypeError(f"{text!r}; expected {expected}")
+    return values

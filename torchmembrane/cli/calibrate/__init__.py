@@ -1,0 +1,157 @@
+"""`torchmembrane calibrate`: sensor files from images, and the layout of dots to fabricate from a pattern in the image.
+
+Here are the steps' parsers; what a step does is in the module that its entry in `STEPS` names, loaded when it runs.
+"""
+
+from argparse import Namespace, RawDescriptionHelpFormatter
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..arguments import Add, add_command, count_pair, positive
+from ..choices import PORTS
+
+PURPOSE = "find lens, ports, rest surface and dots from images; make a layout of dots"
+CONTENT = """
+SENSOR.toml holds the design; it may be preset:NAME. DIR then holds
+  sensor.toml    the sensor as calibrated, with its files
+  report.json    what was found, standard deviations, correlations
+  report.png     residuals and what goes with them"""
+ORDER = """\
+A sensor is calibrated in this order, each step starting from the sensor file of the one before:
+  camera     lens, from a checkerboard in air, ports not mounted
+  ports      distance, thickness and index of flat layers, from a board of dots, in air and in the medium
+  rest       where the rest surface stands, and its dots, from the rest image, when the dots are listed
+  views      the same from several views, when they are not
+  depth      the same from a depth image
+  material   prestretch from images of presses; stiffness, where the forces of some are known
+and the other way round:
+  layout     from the dots wanted in the image to positions on the rest surface, to fabricate them"""
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command's parser with its steps."""
+    parser = commands.add_parser(
+        "calibrate",
+        help=PURPOSE,
+        description="Calibrate a sensor (section 5.2 of the paper).",
+        epilog=ORDER,
+        formatter_class=RawDescriptionHelpFormatter,
+    )
+    steps = parser.add_subparsers(title="steps", metavar="STEP", required=True)
+    for name, step in STEPS.items():
+        example = f"example:\n  torchmembrane calibrate {name} {step.example}\n{CONTENT}"
+        add = add_command(steps, name, partial(_run, step.module, name), step.purpose, example, *step.aliases)
+        add("sensor", metavar="SENSOR.toml", help="the design, or the sensor file of the step before")
+        step.add_options(add)
+        add("--out", metavar="DIR", type=Path, required=True, help="folder of the calibrated sensor")
+
+
+def _run(module: str, step: str, arguments: Namespace) -> int:
+    return getattr(import_module(f".{module}", __name__), step)(arguments)
+
+
+def _camera_options(add: Add) -> None:
+    corners = count_pair("two counts, COLUMNS,ROWS")
+    add("images", metavar="IMAGES", nargs="+", help="of the checkerboard in different poses, filling the image")
+    add("--corners", metavar="COLUMNS,ROWS", type=corners, required=True, help="inner corners of the checkerboard")
+    add("--square", metavar="LENGTH", type=positive, required=True, help="side of its squares, in the sensor's unit")
+
+
+def _ports_options(add: Add) -> None:
+    add("--air", metavar="IMAGES", nargs="+", default=[], help="of the board of dots through the ports, before filling")
+    add("--medium", metavar="IMAGES", nargs="+", default=[], help="of the same in the medium")
+    add("--dots", metavar="COLUMNS,ROWS", type=count_pair("two counts, COLUMNS,ROWS"), required=True, help="of the board")
+    add("--pitch", metavar="LENGTH", type=positive, required=True, help="of its dots, in the sensor's unit")
+    add(
+        "--radius", metavar="LENGTH", type=positive, help="of its dots (default: 0.22 pitches; the three marks: 1.7 times that)"
+    )
+    add("--held", metavar="NAME", nargs="+", choices=PORTS, default=[], help=f"taken as known: {', '.join(PORTS)}")
+
+
+def _rest_options(add: Add) -> None:
+    add("image", metavar="REST.png", help="the membrane at rest")
+
+
+def _views_options(add: Add) -> None:
+    add("images", metavar="IMAGES", nargs="+", help="of the membrane at rest; the first by the camera as it is in the sensor")
+    where = "CSV x,y,z,turn_x,turn_y,turn_z: where the camera was for each image, roughly, in its first frame; degrees"
+    add("--motions", metavar="FILE.csv", type=Path, required=True, help=where)
+    scale = "standard deviation of the second image's travel, which sets the scale (default: %(default)s)"
+    add("--travel-error", metavar="LENGTH", type=positive, default=0.01, help=scale)
+
+
+def _depth_options(add: Add) -> None:
+    add("depth", metavar="DEPTH", type=Path, help=".npy or 16-bit PNG, registered to the camera: z along the axis, 0 none")
+    add("--unit", metavar="LENGTH", type=positive, default=1.0, help="of one step of its values (default: %(default)s)")
+    add("--image", metavar="REST.png", required=True, help="the membrane at rest, to find the dots in")
+
+
+def _material_options(add: Add) -> None:
+    add("images", metavar="IMAGES", nargs="+", help="of presses, deep ones: files, globs, folders")
+    vectors, lengths = "CSV image,fx,fy,fz (on the membrane, in the camera's frame)", "image,force (magnitude)"
+    add("--forces", metavar="FILE.csv", type=Path, help=f"{vectors} or {lengths}, N: total force in some images")
+
+
+def _layout_options(add: Add) -> None:
+    add("--pixels", metavar="FILE.csv", type=Path, help="the wanted dots: u,v,size (small | large)")
+    add("--pitch", metavar="PX", type=positive, help="a square lattice of this pitch within the rim's outline")
+
+
+class Step(NamedTuple):
+    """A step of calibration: the module that has a function of its name, its parser's texts, options and other names."""
+
+    module: str
+    purpose: str
+    add_options: Callable[[Add], None]
+    example: str
+    aliases: tuple[str, ...] = ()
+
+
+STEPS = {
+    "camera": Step(
+        "camera",
+        "find the lens from images of a checkerboard",
+        _camera_options,
+        "design.toml board/*.png --corners 11,8 --square 2.5 --out lens",
+    ),
+    "ports": Step(
+        "camera",
+        "find the flat layers from images of a board of dots through them",
+        _ports_options,
+        "lens/sensor.toml --air dry/ --medium wet/ --dots 17,13 --pitch 2 --out ports",
+    ),
+    "rest": Step(
+        "surface",
+        "find the rest surface's pose and its dots from one rest image of listed dots",
+        _rest_options,
+        "ports/sensor.toml rest.png --out rest",
+    ),
+    "views": Step(
+        "surface",
+        "find dots and rest surface from several views",
+        _views_options,
+        "ports/sensor.toml first.png second.png third.png --motions motions.csv --out rest",
+    ),
+    "depth": Step(
+        "surface",
+        "find rest surface and dots from a depth image",
+        _depth_options,
+        "sensor.toml depth.npy --image rest.png --out rest",
+    ),
+    "material": Step(
+        "material",
+        "find prestretch and stiffness from images of presses",
+        _material_options,
+        "rest/sensor.toml press/*.png --forces forces.csv --out material",
+    ),
+    "layout": Step(
+        "layout",
+        "turn dots wanted in the image into positions on the rest surface",
+        _layout_options,
+        "design.toml --pitch 30 --out layout",
+        ("pattern",),
+    ),
+}

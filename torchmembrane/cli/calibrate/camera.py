@@ -1,0 +1,54 @@
+"""The steps `camera` and `ports`: the camera from images of boards."""
+
+from argparse import Namespace
+from dataclasses import replace
+
+import numpy as np
+
+from ...calibrate.camera import CameraFit, Views, lens_from_views, ports_from_views
+from ...camera.model import Camera
+from ...errors import MembraneError
+from ...plot.calibration import Report, fit_figure
+from ...sensor.sensor import Sensor
+from ...targets import Checkerboard, DotBoard
+from .files import read_sensor, read_targets, write_calibrated
+
+
+def camera(arguments: Namespace) -> int:
+    """`torchmembrane calibrate camera`"""
+    sensor, (columns, rows) = read_sensor(arguments), arguments.corners
+    board = Checkerboard(columns, rows, arguments.square)
+    pixels = read_targets(arguments.images, sensor, board)
+    found = lens_from_views(sensor.camera, board, Views(pixels, np.zeros(len(pixels), bool)))
+    units = [{"focal": "px", "centre": "px"}.get(name.split("[")[0], "") for name in found.names]
+    return _write(arguments, sensor, found, pixels, units, f"lens: {sensor.camera.model}, {len(pixels)} images")
+
+
+def ports(arguments: Namespace) -> int:
+    """`torchmembrane calibrate ports`"""
+    sensor, (columns, rows) = read_sensor(arguments), arguments.dots
+    board = DotBoard(columns, rows, arguments.pitch, arguments.radius)
+    sets = [read_targets(images, sensor, board) for images in (arguments.air, arguments.medium) if images]
+    if not sets:
+        raise MembraneError("calibrate ports: no images; expected --air IMAGES, --medium IMAGES, best both")
+    pixels = np.concatenate(sets)
+    filled = np.arange(len(pixels)) >= (len(sets[0]) if arguments.air else 0)
+    found = ports_from_views(sensor.camera, board, Views(pixels, filled), arguments.held)
+    units = ["" if "index" in name else sensor.length_unit for name in found.names]
+    title = f"ports: {(~filled).sum()} images in air, {filled.sum()} in the medium"
+    return _write(arguments, sensor, found, pixels, units, title)
+
+
+def _write(arguments: Namespace, sensor: Sensor, found: CameraFit, pixels: np.ndarray, units: list[str], title: str) -> int:
+    design = [_value(sensor.camera, name) for name in found.names]
+    report = Report.of(title, found.names, units, design, found.fit, pixels, found.residuals)
+    drawing = fit_figure(report, sensor.camera.image_size)
+    return write_calibrated(arguments, replace(sensor, camera=found.camera), report, drawing)
+
+
+def _value(camera: Camera, name: str) -> float:
+    """A number of the camera by its name in a fit, as `focal[1]`; 0 for a coefficient that it does not have."""
+    key, _, index = name.rstrip("]").partition("[")
+    values = getattr(camera, key).reshape(-1).tolist()
+    i = int(index or 0)
+    return values[i] if i < len(values) else 0.0

@@ -1,0 +1,95 @@
+"""What the steps of `torchmembrane calibrate` read and write: sensors, boards in images, tables, reports."""
+
+import csv
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ...calibrate.detection import find_target
+from ...errors import MembraneError
+from ...io.images import read_image
+from ...jobs.inputs import find_inputs
+from ...plot.calibration import Report
+from ...presets import sensor_file
+from ...sensor.sensor import Sensor
+from ...targets import Checkerboard, DotBoard
+
+
+def read_sensor(arguments: Namespace) -> Sensor:
+    """The sensor that the arguments name."""
+    return Sensor.from_file(sensor_file(arguments.sensor))
+
+
+def write_calibrated(arguments: Namespace, sensor: Sensor, report: Report, drawing: Figure) -> int:
+    """Write the calibrated sensor and its report, print what was found; returns the exit code."""
+    path = sensor.to_file(arguments.out)
+    report.write(arguments.out, drawing)
+    print("\n".join([*report.lines, f"calibrated sensor: {path}; report.json and report.png beside it"]))
+    return 0
+
+
+def read_sensor_image(path: Path, sensor: Sensor) -> np.ndarray:
+    """An image `[H, W]` that must be as large as the sensor's."""
+    image = read_image(path)
+    if image.shape[::-1] != sensor.camera.image_size:
+        raise MembraneError(f"{path}: {image.shape[1]} x {image.shape[0]} px; expected {list(sensor.camera.image_size)}")
+    return image
+
+
+def read_targets(images: Sequence[str], sensor: Sensor, board: Checkerboard | DotBoard) -> np.ndarray:
+    """The board's points in every image that shows it, `[P, D, 2]`; an image that shows none is reported and left out."""
+    found = []
+    for path in find_inputs(images).images:
+        image = read_sensor_image(path, sensor)
+        try:
+            found.append(find_target(image, board))
+        except MembraneError as error:
+            print(f"{path} left out: {error}")
+    if not found:
+        raise MembraneError(f"calibrate: no image of {len(images)} shows {board}")
+    return np.stack(found)
+
+
+def read_motions(path: Path) -> np.ndarray:
+    """Where the camera was, `[P, 6]`: position (length unit) and rotation vector (degrees) of each view."""
+    try:
+        rows = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise MembraneError(
+            f"{path}: not readable ({error}); expected CSV with the header x,y,z,turn_x,turn_y,turn_z and one line per image"
+        ) from error
+    if rows.shape[1] != 6 or not np.isfinite(rows).all():
+        raise MembraneError(f"{path}: {rows.shape[1]} columns; expected six finite numbers, x,y,z,turn_x,turn_y,turn_z")
+    return rows
+
+
+def read_forces(path: Path, images: Sequence[Path]) -> np.ndarray:
+    """Forces of the images `[B, 3]`, or magnitudes `[B, 1]`, N, NaN where the file has none."""
+    expected = "CSV with the header image,fx,fy,fz or image,force and one line per image, N"
+    try:
+        header, *rows = csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
+        known = {name: [float(value) for value in values] for name, *values in rows}
+    except (OSError, ValueError) as error:
+        raise MembraneError(f"{path}: not readable ({error}); expected {expected}") from error
+    if header not in (["image", "fx", "fy", "fz"], ["image", "force"]):
+        raise MembraneError(f"{path}: the header is {','.join(header)!r}; expected {expected}")
+    if wrong := [name for name, values in known.items() if len(values) != len(header) - 1 or not np.isfinite(values).all()]:
+        raise MembraneError(f"{path}: {wrong[0]} has {known[wrong[0]]}; expected {len(header) - 1} finite numbers")
+    if unknown := known.keys() - {image.name for image in images}:
+        raise MembraneError(f"{path}: {min(unknown)} is none of the images given; expected their names, as {images[0].name}")
+    if not known:
+        raise MembraneError(f"{path}: no forces after the header; expected {expected}")
+    return np.array([known.get(image.name, [np.nan] * (len(header) - 1)) for image in images])
+
+
+def read_depth(path: Path, unit: float) -> np.ndarray:
+    """A depth image `[H, W]` in the sensor's length unit; `unit`: of one step of the file's values."""
+    if path.suffix != ".npy":
+        return read_image(path).astype(float) * 65535 * unit
+    try:
+        return unit * np.load(path, allow_pickle=False).astype(float)
+    except (OSError, ValueError) as error:
+        raise MembraneError(f"{path}: not readable ({error}); expected a depth image as numpy.save writes it") from error

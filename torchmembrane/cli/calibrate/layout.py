@@ -1,0 +1,28 @@
+"""The step `layout`: from the dots wanted in the image to positions on the rest surface."""
+
+from argparse import Namespace
+from dataclasses import replace
+
+from ...calibrate.layout import layout_for_pixels, pixel_lattice, read_pixels, write_layout, write_svg
+from ...errors import MembraneError
+from ...plot.calibration import layout_figure
+from ...plot.frames import save
+from ...sensor.parts import Markers
+from .files import read_sensor
+
+
+def layout(arguments: Namespace) -> int:
+    """`torchmembrane calibrate layout`"""
+    sensor = read_sensor(arguments)
+    if (arguments.pixels is None) == (arguments.pitch is None):
+        raise MembraneError("calibrate layout: expected either --pixels FILE or --pitch PX")
+    wanted = read_pixels(arguments.pixels) if arguments.pixels else pixel_lattice(sensor, arguments.pitch)
+    dots = layout_for_pixels(sensor, *wanted)
+    made = replace(sensor, markers=Markers("dots", sensor.markers.polarity, dots.positions, dots.sizes))
+    path = made.to_file(arguments.out)
+    write_layout(arguments.out / "layout.csv", sensor, dots)
+    write_svg(arguments.out / "layout.svg", sensor, dots)
+    title = f"{len(dots.radii)} dots, radii {dots.radii.min():.3g} to {dots.radii.max():.3g} {sensor.length_unit}"
+    save(layout_figure(title, sensor, dots), arguments.out / "report.png")
+    print(f"{title}\n{arguments.out / 'layout.csv'} to fabricate, layout.svg to look at, and the sensor that has them: {path}")
+    return 0

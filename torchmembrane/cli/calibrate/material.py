@@ -1,0 +1,35 @@
+"""The step `material`: prestretch and stiffness from images of presses."""
+
+from argparse import Namespace
+
+import numpy as np
+import torch
+
+from ...calibrate.material import STRETCHES, material_from_images
+from ...jobs.inputs import find_inputs
+from ...plot.calibration import Report, material_figure
+from .files import read_forces, read_sensor, read_sensor_image, write_calibrated
+
+
+def material(arguments: Namespace) -> int:
+    """`torchmembrane calibrate material`"""
+    sensor, paths = read_sensor(arguments), find_inputs(arguments.images).images
+    forces = read_forces(arguments.forces, paths) if arguments.forces else None
+    images = torch.from_numpy(np.stack([read_sensor_image(path, sensor) for path in paths]))[:, None]
+    found = material_from_images(sensor, images, forces)
+    unit, n = sensor.length_unit, len(found.values)
+    each = zip(paths, found.each, strict=True)
+    notes = [f"{path.name} alone: prestretch {one:.3f} ± {sd:.2g}" for path, (one, sd) in each]
+    if found.values[0] + found.deviations[0] > STRETCHES[-1]:
+        notes.append(f"the prestretch may be larger: {STRETCHES[-1]:g} is the largest that was tried")
+    if n == 2:
+        notes.append("modulus: shear modulus x thickness; the sensor file's thickness is kept, or 1 where it has none")
+    report = Report.without_parameters(f"material from {len(paths)} images of presses", notes)._replace(
+        names=["prestretch", "modulus"][:n],
+        units=["", f"N/{unit}"][:n],
+        design=np.array([sensor.material.prestretch, sensor.material.modulus][:n]),
+        values=found.values,
+        deviations=found.deviations,
+        correlations=found.covariance / np.outer(found.deviations, found.deviations),
+    )
+    return write_calibrated(arguments, found.sensor, report, material_figure(report, found, [path.name for path in paths]))

@@ -1,0 +1,73 @@
+"""The steps `rest`, `views` and `depth`: the rest surface and its dots from images of the membrane at rest."""
+
+from argparse import Namespace
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from ...calibrate.depth import rest_from_depth
+from ...calibrate.rest import rest_from_image
+from ...calibrate.surface import Correction, fine_surface
+from ...calibrate.views import rest_from_views
+from ...io.images import read_image
+from ...plot.calibration import Report, fit_figure, surface_figure
+from ...sensor.sensor import Sensor
+from .files import read_depth, read_motions, read_sensor, write_calibrated
+
+
+def rest(arguments: Namespace) -> int:
+    """`torchmembrane calibrate rest`"""
+    sensor, image = read_sensor(arguments), read_image(arguments.image)
+    found = rest_from_image(sensor, image)
+    units = ["degrees"] * 3 + [sensor.length_unit] * 3
+    shifts = np.linalg.norm(found.shifts, axis=1)
+    notes = [
+        f"{np.isfinite(found.pixels).all(1).sum()} of {len(shifts)} dots found; moved along the surface to null what is left: "
+        f"{np.sqrt((shifts**2).mean()):.4f} {sensor.length_unit} rms, at most {shifts.max():.4f}"
+    ]
+    title = "rest surface from one image"
+    report = Report.of(title, found.names, units, np.zeros(6), found.fit, found.pixels, found.residuals, notes)
+    return write_calibrated(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size))
+
+
+def views(arguments: Namespace) -> int:
+    """`torchmembrane calibrate views`"""
+    sensor, motions = read_sensor(arguments), read_motions(arguments.motions)
+    found = rest_from_views(sensor, [read_image(path) for path in arguments.images], motions, arguments.travel_error)
+    unit, P = sensor.length_unit, len(motions)
+    design = np.concatenate([motions[1:, 3:], motions[1:, :3]], 1).ravel()
+    rms = np.sqrt((found.deviations**2).mean(0))
+    notes = [
+        f"{len(found.dots)} dots, standard deviations along x, y, z {rms[0]:.4f}, {rms[1]:.4f}, {rms[2]:.4f} {unit}",
+        _moved(found.surface, unit),
+    ]
+    units = (["degrees"] * 3 + [unit] * 3) * (P - 1)
+    modelled = found.sensor.camera.point_to_pixel(torch.from_numpy(found.dots)).numpy()
+    pixels = np.broadcast_to(modelled, found.residuals.shape)
+    report = Report.of(f"rest surface from {P} views", found.names, units, design, found.fit, pixels, found.residuals, notes)
+    return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface))
+
+
+def depth(arguments: Namespace) -> int:
+    """`torchmembrane calibrate depth`"""
+    sensor = read_sensor(arguments)
+    found = rest_from_depth(sensor, read_depth(arguments.depth, arguments.unit), read_image(arguments.image))
+    unit = sensor.length_unit
+    notes = [
+        f"{len(found.deviations)} squares of depths, each known to {np.median(found.deviations):.4f} {unit}",
+        _moved(found.surface, unit),
+        f"{len(found.sensor.markers.positions)} dots placed on the surface",
+    ]
+    report = Report.without_parameters("rest surface from a depth image", notes)
+    return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface))
+
+
+def _drawn(sensor: Sensor, report: Report, surface: Correction) -> Figure:
+    vertices = fine_surface(sensor).rest.numpy()
+    return surface_figure(report, sensor.camera.image_size, vertices, surface, sensor.length_unit)
+
+
+def _moved(surface: Correction, unit: str) -> str:
+    rms, sd = (float(np.sqrt((a**2).mean())) for a in (surface.offsets, surface.deviations))
+    return f"surface moved along its normals by {rms:.4f} {unit} rms, known to {sd:.4f} {unit} rms"

@@ -1,0 +1,17 @@
+"""What the command's options may be, and their defaults: written here once more, so that `--help` loads nothing heavy.
+
+A test holds every one of them to what the package itself has.
+"""
+
+ESTIMATORS = ("force-balance", "minimum-energy")
+ENERGIES = ("harmonic", "neo_hookean", "mooney_rivlin")
+ELEMENTS = ("triangle", "quadrilateral")
+RESULT_FORMATS = ("npz", "parquet")
+
+PRESETS = ("fingertip", "bubble", "half_cylinder")
+INDENTERS = ("sphere", "cylinder", "wedge", "box", "plane")
+LEGS = ("push", "slide", "release")
+SIMULATION_FORMATS = ("png", "parquet")
+HIGHLIGHT, BLUR = 0.0, 0.6
+
+PORTS = ("port_distance", "port_thickness", "port_index", "medium_index")

@@ -1,0 +1,52 @@
+"""`torchmembrane export`: image to result as one ONNX model."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from .arguments import add_command, add_estimator, add_sensor
+
+PURPOSE = "write image to result as one ONNX model"
+EXAMPLES = """\
+examples:
+  torchmembrane export sensor.toml -o model.onnx
+  torchmembrane export preset:fingertip -o fingertip.onnx --estimator minimum-energy
+  torchmembrane export sensor.toml -o video.onnx --tracking
+
+The model takes `image` [batch, 1, height, width], grey in 0..1, and gives the arrays of a NAME.npz, one row per frame;
+--tracking, also previous_vertices, previous_pressure and (dots) previous_pixels: those of the frames before, NaN to start from
+rest. To run it without torch: the package torchmembrane-edge (folder export/). Needs: pip install "torchmembrane[export]"
+
+exit code: 0 written, 2 wrong usage or sensor file"""
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command's parser."""
+    add = add_command(commands, "export", run, PURPOSE, EXAMPLES)
+    add_sensor(add)
+    add("-o", "--out", metavar="MODEL.onnx", type=Path, required=True, help="the model's file")
+    add_estimator(add, "as for reconstruct (default: %(default)s)")
+    add("--tracking", action="store_true", help="start from the frame before, given with the image (force balance)")
+
+
+def run(arguments: Namespace) -> int:
+    """Write the model; returns the exit code."""
+    from ..errors import MembraneError
+    from ..io.store import FORMATS, Settings
+    from ..presets import sensor_file
+    from ..reconstruct import Reconstructor
+    from ..sensor.sensor import Sensor
+
+    try:
+        from ..onnx.export import export
+    except ImportError as error:
+        raise MembraneError(
+            f'export needs {error.name}, which is not installed: pip install "torchmembrane[export]"'
+        ) from error
+    sensor = Sensor.from_file(sensor_file(arguments.sensor))
+    energy = arguments.energy or sensor.material.model
+    settings = Settings(arguments.estimator, energy, arguments.element, FORMATS[0])
+    reconstructor = Reconstructor(sensor, arguments.estimator, model=energy, element=arguments.element)
+    export(reconstructor, arguments.out, settings, arguments.tracking)
+    print(f"written: {arguments.out}, {arguments.out.stat().st_size / 1e6:.1f} MB")
+    return 0

@@ -1,0 +1,110 @@
+"""What `torchmembrane simulate` does: one press, the frames along a path, or a data set of random presses."""
+
+from argparse import Namespace
+from contextlib import nullcontext
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from ..errors import MembraneError
+from ..presets import sensor_file
+from ..sensor.sensor import Sensor
+from ..simulate.dataset import KINDS, Plan, make_frames, stroke_to
+from ..simulate.frames import Video, open_frames
+from ..simulate.indenters import Box, Cylinder, Indenter, Mesh, Plane, Sphere, Wedge
+from ..simulate.look import Look
+from ..simulate.simulator import Simulator, Stroke
+
+
+def simulate(arguments: Namespace) -> int:
+    """Simulate what the arguments ask for; returns the exit code."""
+    torch.set_num_threads(1)
+    sensor = Sensor.from_file(sensor_file(arguments.sensor))
+    look = Look(noise=arguments.noise, highlight=arguments.highlight, blur=arguments.blur)
+    simulator = Simulator(sensor, arguments.grid, look, arguments.dots, arguments.missing)
+    return (_random if arguments.random else _single)(arguments, simulator)
+
+
+def _random(arguments: Namespace, simulator: Simulator) -> int:
+    kinds = arguments.indenter.split(",") if arguments.indenter else KINDS
+    if unknown := [kind for kind in kinds if kind not in KINDS]:
+        raise MembraneError(f"--indenter {unknown[0]}: no random indenter; expected some of {', '.join(KINDS)}")
+    plan = Plan(kinds, arguments.friction, arguments.seed, arguments.increment)
+    shared = {"kinds": list(kinds), "friction": plan.friction, "increment": plan.increment}
+    frames = open_frames(arguments.out, simulator, shared, arguments.format)
+    outcome = make_frames(simulator, plan, arguments.random, frames, arguments.jobs)
+    print(f"presses: {outcome.made} made, {outcome.failed} failed, {outcome.skipped} there before; in {arguments.out}")
+    return 1 if outcome.failed else 0
+
+
+def _single(arguments: Namespace, simulator: Simulator) -> int:
+    stroke = _stroke(arguments, simulator)
+    if arguments.path:
+        return _film(arguments, simulator, stroke)
+    legs = ("push",) if arguments.slide is None else ("push", "slide")
+    *_, state = simulator.presses(stroke, legs, increment=arguments.increment)
+    frame = simulator.frame(state, stroke, np.random.default_rng(arguments.seed))
+    open_frames(arguments.out, simulator, {}).write(arguments.name, frame)
+    force, touching = float(state.force.norm()), int(state.contact.sum())
+    print(
+        f"{arguments.out / arguments.name}.png: force {force:.4g} {simulator.sensor.force_unit}, pressure change "
+        f"{state.pressure - state.rest_pressure:.4g}, {touching} of {len(state.contact)} vertices in contact"
+    )
+    return 0
+
+
+def _film(arguments, simulator: Simulator, stroke: Stroke) -> int:
+    rng, total = np.random.default_rng(arguments.seed), len(arguments.path) * arguments.frames
+    states = simulator.presses(stroke, arguments.path, arguments.frames, arguments.increment)
+    states = chain([next(states)], states)  # a press that cannot begin leaves no folder
+    frames = open_frames(arguments.out, simulator, {})
+    video = Video(arguments.out / f"{arguments.name}.mp4") if arguments.video else nullcontext()
+    with video:
+        for number, state in enumerate(tqdm(states, total=total, desc="simulate", unit="frame")):
+            name, frame = f"{arguments.name}_{number:06d}", simulator.frame(state, stroke, rng)
+            if arguments.video:
+                video.add(frame.image)
+                frames.write_truth(name, frame)
+            else:
+                frames.write(name, frame)
+    print(f"{total} frames in {arguments.out}")
+    return 0
+
+
+def _stroke(arguments: Namespace, simulator: Simulator) -> Stroke:
+    membrane = simulator.membrane
+    aim = membrane.rest[membrane.fixed].mean(0).numpy() if arguments.aim is None else np.array(arguments.aim)
+    direction = np.array(arguments.direction)
+    if not np.linalg.norm(direction) > 0:
+        raise MembraneError("--direction: has no length; expected X,Y,Z, the side from which the indenter comes")
+    slide = np.zeros(3) if arguments.slide is None else np.array(arguments.slide)
+    turn, friction = np.deg2rad(arguments.turn), arguments.friction
+    return stroke_to(simulator, _body(arguments), aim, -direction, arguments.depth, turn, slide, friction)
+
+
+def _body(arguments: Namespace) -> Indenter:
+    kind = arguments.indenter
+    if kind == "sphere":
+        return Sphere(_needed(arguments, "radius"))
+    if kind == "plane":
+        return Plane()
+    if kind == "cylinder":
+        return Cylinder(_needed(arguments, "radius"))
+    if kind == "wedge":
+        return Wedge(_needed(arguments, "opening"), _needed(arguments, "radius"))
+    if kind == "box":
+        return Box(np.array(_needed(arguments, "sides")), _needed(arguments, "radius"))
+    if not Path(kind).is_file():
+        raise MembraneError(f"--indenter {kind!r}: neither a file nor one of {', '.join(KINDS)}")
+    return Mesh.read(kind)
+
+
+def _needed(arguments: Namespace, name: str) -> Any:
+    value = getattr(arguments, name)
+    if value is None:
+        raise MembraneError(f"--indenter {arguments.indenter} needs --{name}")
+    return value

@@ -1,0 +1,71 @@
+"""`torchmembrane reconstruct`: images or a video to a folder of results."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from .arguments import add_command, add_estimator, add_sensor, count
+from .choices import RESULT_FORMATS
+
+PURPOSE = "reconstruct surfaces from images or a video of one sensor"
+EXAMPLES = """\
+examples:
+  torchmembrane reconstruct sensor.toml press.png --out results --figures
+  torchmembrane reconstruct sensor.toml 'day1/*.jpg' day2/ --out results --batch 32
+  torchmembrane reconstruct sensor.toml press.mp4 --out results --format parquet
+
+DIR then holds
+  NAME.npz       the result for the image NAME.png (parquet: the dataset frames/part-*.parquet)
+  mesh.npz       rest surface, triangles, units
+  summary.csv    one row per frame
+  NAME.png       its figure (--figures)
+Frames of a video are called STEM_000000, STEM_000001 ... The same command again goes on after an
+interruption: finished frames are skipped, failed ones tried again. In Python,
+torchmembrane.read_results(DIR) gives the frames one by one, by name, or as one batch.
+
+exit code: 0 all well, 1 some frames failed (see stderr and summary.csv), 2 wrong usage or sensor file"""
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command's parser."""
+    add = add_command(commands, "reconstruct", run, PURPOSE, EXAMPLES)
+    add_sensor(add)
+    add("images", metavar="IMAGES", nargs="+", help="image files, globs (quoted or not), folders, or videos")
+    add("--out", metavar="DIR", type=Path, required=True, help="folder of the results: new, or of the same sensor")
+    add_estimator(add, "triangle (default), or quadrilateral: the paper's, harmonic, with the tension of --energy")
+    add("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: %(default)s)")
+    add("--batch", metavar="N", type=count, default=16, help="frames computed at once (default: %(default)s)")
+    add("--video", action="store_true", help="treat every input as a video (mp4, mov, avi, mkv, webm always are)")
+    one = "one .npz per frame, or one dataset (default: %(default)s)"
+    add("--format", choices=RESULT_FORMATS, default=RESULT_FORMATS[0], help=one)
+    add("--figures", action="store_true", help="also NAME.png: flow, side view and displacement of every frame")
+
+
+def run(arguments: Namespace) -> int:
+    """Reconstruct; returns the exit code."""
+    import torch
+
+    from ..errors import MembraneError
+    from ..io.store import Settings, check_folder
+    from ..jobs.inputs import find_inputs
+    from ..jobs.local import reconstruct_files
+    from ..presets import sensor_file
+    from ..reconstruct import Reconstructor
+    from ..sensor.sensor import Sensor
+
+    if arguments.device == "cuda" and not torch.cuda.is_available():
+        raise MembraneError("--device cuda: torch sees no CUDA device; pass --device cpu, or install torch with CUDA")
+    inputs = find_inputs(arguments.images, arguments.video)
+    sensor = Sensor.from_file(sensor_file(arguments.sensor))
+    energy = arguments.energy or sensor.material.model
+    settings = Settings(arguments.estimator, energy, arguments.element, arguments.format)
+    check_folder(arguments.out, sensor.fingerprint, settings)
+    reconstructor = Reconstructor(sensor, arguments.estimator, model=energy, element=arguments.element).to(arguments.device)
+    options = {"batch": arguments.batch, "figures": arguments.figures}
+    counts = reconstruct_files(reconstructor, inputs, arguments.out, settings, **options)
+    unsure = f" ({counts.not_converged} not converged)" if counts.not_converged else ""
+    print(
+        f"frames: {counts.reconstructed} reconstructed{unsure}, {counts.failed} failed, "
+        f"{counts.skipped} finished before; results in {arguments.out}"
+    )
+    return 1 if counts.failed else 0

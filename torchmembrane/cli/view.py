@@ -1,0 +1,55 @@
+"""`torchmembrane view`: a stored result drawn."""
+
+import os
+import sys
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from .arguments import add_command
+
+PURPOSE = "draw a stored result"
+EXAMPLES = """\
+examples:
+  torchmembrane view results/press.npz --out press.png
+  torchmembrane view results/press.npz --image press.png
+
+Without --out a window is opened; without a display, RESULT_view.png is written."""
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command's parser."""
+    add = add_command(commands, "view", run, PURPOSE, EXAMPLES)
+    add("result", metavar="RESULT.npz", type=Path, help="a frame's result")
+    add("--mesh", metavar="mesh.npz", type=Path, help="the mesh of its folder (default: mesh.npz beside it)")
+    add("--image", metavar="IMAGE", type=Path, help="the frame's image, drawn behind the flow")
+    add("--out", metavar="FILE.png", type=Path, help="where to draw it (default: in a window, if there is a display)")
+
+
+def run(arguments: Namespace) -> int:
+    """Draw the result; returns the exit code."""
+    from ..errors import MembraneError
+    from ..io.images import read_image
+    from ..io.results import load_frame
+    from ..io.store import MESH, Mesh
+    from ..plot.frames import figure, save, show
+
+    frame, mesh = load_frame(arguments.result), Mesh.load(arguments.mesh or arguments.result.parent / MESH)
+    vertices, expected = len(frame["vertices"]), len(mesh.rest_vertices)
+    if vertices != expected:
+        raise MembraneError(
+            f"{arguments.result}: {vertices} vertices, the mesh has {expected}; pass the {MESH} of its folder as --mesh"
+        )
+    image = read_image(arguments.image) if arguments.image else None
+    drawing = figure(frame, mesh, image, arguments.result.stem)
+    if arguments.out is None and _has_display():
+        show(drawing)
+        return 0
+    out = arguments.out or arguments.result.with_name(f"{arguments.result.stem}_view.png")
+    save(drawing, out)
+    print(f"drawn in {out}")
+    return 0
+
+
+def _has_display() -> bool:
+    return sys.platform in ("win32", "darwin") or any(os.environ.get(key) for key in ("DISPLAY", "WAYLAND_DISPLAY"))

@@ -1,0 +1,49 @@
+"""Packages that may be missing: imported where they are used, with an error that names the extra to install."""
+
+from importlib import import_module
+from typing import Any
+
+from ..errors import MembraneError
+
+
+def load_pyarrow() -> tuple[Any, Any]:
+    """The modules `pyarrow` and `pyarrow.parquet`.
+
+    Raises:
+        MembraneError: PyArrow is not installed.
+    """
+    return _load("pyarrow", "Parquet results need pyarrow", "parquet"), import_module("pyarrow.parquet")
+
+
+def load_pyav() -> Any:
+    """The module `av`.
+
+    Raises:
+        MembraneError: PyAV is not installed.
+    """
+    return _load("av", "videos need PyAV", "video")
+
+
+def load_opencv() -> Any:
+    """The module `cv2`.
+
+    Raises:
+        MembraneError: OpenCV is not installed.
+    """
+    return _load("cv2", "calibration from boards needs OpenCV", "calibrate")
+
+
+def load_pandas() -> Any:
+    """The module `pandas`.
+
+    Raises:
+        MembraneError: pandas is not installed.
+    """
+    return _load("pandas", "a DataFrame of results needs pandas", "pandas")
+
+
+def _load(module: str, purpose: str, extra: str) -> Any:
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise MembraneError(f'{purpose}, which is not installed: pip install "torchmembrane[{extra}]"') from error

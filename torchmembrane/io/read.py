@@ -1,0 +1,115 @@
+"""Results read back: a folder of `torchmembrane reconstruct` as a sequence of frames that are loaded one by one."""
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from ..errors import MembraneError
+from .frames import PART_ROWS, Frame, frames_of
+from .optional import load_pandas
+from .results import Reconstruction, stack_frames
+from .store import MESH, Mesh
+
+
+def read_results(folder: str | Path) -> "Results":
+    """The results in a folder, of either format.
+
+    Only names and `mesh.npz` are read now; frames are read where they are asked for. Frames that failed are among them, NaN,
+    with their status; images that could not be read have no frame (`summary.csv` lists them). Frames that are written to the
+    folder later are not seen.
+
+    Args:
+        folder: what `torchmembrane reconstruct --out` was given.
+
+    Returns:
+        The frames, in name order.
+
+    Raises:
+        MembraneError: the folder holds no results, or not one frame.
+
+    Example:
+        >>> import tempfile
+        >>> from torchmembrane.cli.main import main
+        >>> folder = tempfile.mkdtemp()
+        >>> options = ["--estimator", "minimum-energy", "--out", folder]
+        >>> main(["reconstruct", "examples/sensor.toml", "examples/rest.png", *options])  # doctest: +ELLIPSIS
+        frames: 1 reconstructed, 0 failed, 0 finished before; results in ...
+        0
+        >>> results = read_results(folder)
+        >>> results.names, results["rest"]["vertices"].shape, results.mesh.length_unit
+        (['rest'], (1089, 3), 'mm')
+        >>> [int(frame["status"]) for frame in results], results.batch().vertices.shape
+        ([0], torch.Size([1, 1089, 3]))
+    """
+    return Results(Path(folder))
+
+
+class Results:
+    """The frames of a folder of results: a sequence in name order, and a mapping by name.
+
+    `len(results)` frames; `for frame in results` gives each as a dict of arrays (`Reconstruction.frame`), in the order of
+    `results.names`; `results["press"]` gives one, `"press" in results` asks for it. Frames are read from disk each time and not
+    kept: iterating over a folder of any size takes little memory, and over a Parquet dataset it is faster than asking by name,
+    which reads a part of the dataset each time.
+
+    Args:
+        folder: the folder of results.
+
+    Attributes:
+        folder: the same.
+        mesh: what all frames share: rest surface, triangles, units, settings.
+        names: of all frames, sorted.
+
+    Raises:
+        MembraneError: the folder holds no results, or not one frame.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.mesh = Mesh.load(folder / MESH)
+        self._frames = frames_of(folder, self.mesh)
+        self.names = sorted(self._frames.statuses())
+        self._known = frozenset(self.names)
+        if not self.names:
+            raise MembraneError(f"{folder}: no frames; expected results of `torchmembrane reconstruct`")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._known
+
+    def __getitem__(self, name: str) -> Frame:
+        if name not in self._known:
+            raise MembraneError(f"{self.folder}: no frame {name!r}; expected one of {len(self)}, {self.names[0]!r} the first")
+        return self._frames.read([name])[0]
+
+    def __iter__(self) -> Iterator[Frame]:
+        names = iter(self.names)
+        while group := list(islice(names, PART_ROWS)):
+            yield from self._frames.read(group)
+
+    def __repr__(self) -> str:
+        return f"Results({str(self.folder)!r}: {len(self)} frames of {self.mesh.name!r})"
+
+    def batch(self) -> Reconstruction:
+        """All frames as one batch of tensors on the CPU, in the order of `names`.
+
+        Returns:
+            A `Reconstruction` whose tensors have `len(self)` rows. All frames are in memory at once.
+        """
+        return stack_frames(list(self))
+
+    def to_pandas(self) -> Any:
+        """The frames' single numbers (pressure, residual, status ...) as a table.
+
+        Returns:
+            A `pandas.DataFrame`: one row per frame, the names as its index, one column per array that holds one number.
+
+        Raises:
+            MembraneError: pandas is not installed (extra `pandas`).
+        """
+        pandas = load_pandas()
+        rows = [{key: array[()] for key, array in frame.items() if array.ndim == 0} for frame in self]
+        return pandas.DataFrame(rows, index=pandas.Index(self.names, name="name"))

@@ -1,0 +1,82 @@
+"""What a call names - files, globs, folders - as image and video files, in the order of the call."""
+
+import glob
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from ..errors import MembraneError
+from ..io.store import MESH
+
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
+
+
+class Inputs(NamedTuple):
+    """Image and video files in the order of the call.
+
+    Attributes:
+        images: image files.
+        videos: video files.
+    """
+
+    images: list[Path]
+    videos: list[Path]
+
+    def video_of(self, name: str) -> Path | None:
+        """The video whose frame would have this name, STEM_NUMBER.
+
+        Example:
+            >>> Inputs([], [Path("day/press.mp4")]).video_of("press_000012").name
+            'press.mp4'
+        """
+        stem, _, number = name.rpartition("_")
+        return next((path for path in self.videos if path.stem == stem and number.isdigit()), None)
+
+
+def find_inputs(arguments: Iterable[str | Path], video: bool = False) -> Inputs:
+    """Files, globs and folders as files.
+
+    Args:
+        arguments: paths of files, folders (their images in name order) and glob patterns.
+        video: take every file for a video.
+
+    Returns:
+        The files, images and videos each in the order of the call.
+
+    Raises:
+        MembraneError: an argument names no file, or two frames would have one name.
+
+    Example:
+        >>> [path.name for path in find_inputs(["examples/*_*.png"]).images]
+        ['flat_plate.png', 'press_on_axis.png', 'two_contacts.png']
+    """
+    paths = [path for argument in arguments for path in _expanded(str(argument), VIDEOS if video else IMAGES)]
+    is_video = {path: video or path.suffix.lower() in VIDEOS for path in paths}
+    inputs = Inputs([path for path in paths if not is_video[path]], [path for path in paths if is_video[path]])
+    for name, count in Counter(path.stem for path in paths).items():
+        if count > 1:
+            twins = ", ".join(str(path) for path in paths if path.stem == name)
+            raise MembraneError(f"two inputs of the name {name!r} ({twins}); results bear it: rename, or use two calls")
+    for image in inputs.images:
+        if inputs.video_of(image.stem):
+            raise MembraneError(f"{image}: a frame of {inputs.video_of(image.stem)} has the same name; use two calls")
+        if f"{image.stem}.npz" == MESH:
+            raise MembraneError(f"{image}: its result would be {MESH}, which holds the mesh; rename the image")
+    return inputs
+
+
+def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
+    path = Path(argument)
+    if path.is_dir():
+        found = sorted(p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
+        if not found:
+            raise MembraneError(f"{path}: the folder holds no files {' '.join(suffixes)}")
+        return found
+    if path.exists():
+        return [path]
+    found = [Path(match) for match in sorted(glob.glob(argument, recursive=True))]
+    if not any(p.is_file() for p in found):
+        raise MembraneError(f"{argument}: no such file, no pattern that matches one; expected images, globs, folders")
+    return [p for p in found if p.is_file()]
