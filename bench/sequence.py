@@ -35,10 +35,10 @@ def main():
     with torch.no_grad():
         for path in sorted(args.folder.glob("[0-9]*.png")):
             displacement, confidence, _ = reconstructor.observe(reconstructor.read(path))
-            pixels = displacement + reconstructor.measured_rest
+            pixels = displacement + reconstructor.observer.measured_rest
             for name, start in (("cold", None), ("warm", previous)):
                 began = time.process_time()
-                result = reconstructor.from_pixels(pixels, confidence, reconstructor.measured_rest, start)
+                result = reconstructor.from_pixels(pixels, confidence, reconstructor.observer.measured_rest, start)
                 seconds[name] += time.process_time() - began
                 found[name].append(result)
             previous = result

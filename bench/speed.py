@@ -68,8 +68,8 @@ def minimum_energy(args):
         with torch.no_grad():
             for batch in args.batches:
                 images = image.expand(batch, -1, -1, -1).contiguous()
-                pixels, confidence = reconstructor.locator(images)
-                displacement = pixels - reconstructor.measured_rest
+                pixels, confidence = reconstructor.observer.locator(images)
+                displacement = pixels - reconstructor.observer.measured_rest
                 flow = reconstructor.flow(displacement, confidence)
                 rays = reconstructor.camera.pixel_to_ray(reconstructor.vertex_pixels + flow)
                 parts = dict(

@@ -18,6 +18,7 @@ from torchmembrane.errors import MembraneError
 from torchmembrane.io import frames, results
 from torchmembrane.io.images import read_image
 from torchmembrane.io.read import read_results
+from torchmembrane.io.status import Status
 from torchmembrane.io.store import Mesh, Settings
 from torchmembrane.io.summary import UNREADABLE
 from torchmembrane.jobs.inputs import find_inputs
@@ -57,12 +58,12 @@ class Denting:
         self.furthest_ahead = max(self.furthest_ahead, self.read_count - sum(self.calls))
         self.calls.append(len(images))
         grey, membrane = images.mean((1, 2, 3)), self.estimator.membrane
-        status = torch.where(grey == 0, results.BLANK, torch.where(grey < 0.1, results.NOT_CONVERGED, results.OK))
+        status = torch.where(grey == 0, Status.BLANK, torch.where(grey < 0.1, Status.NOT_CONVERGED, Status.OK))
         grey = torch.where(grey == 0, torch.nan, grey)
         depth = -grey[:, None, None] * membrane.rest_normals * (~membrane.fixed)[:, None]
         fields = {key: grey.reshape(-1, *[1] * len(shape)).expand(-1, *shape) for key, shape in CONTRACT.items()}
         fields |= {"vertices": membrane.rest + depth, "displacement": depth, "status": status.int()}
-        fields["confidence"] = torch.where(status == results.BLANK, 0.0, 1.0)[:, None].expand(-1, 7)
+        fields["confidence"] = torch.where(status == Status.BLANK, 0.0, 1.0)[:, None].expand(-1, 7)
         return results.Reconstruction(**fields)
 
 
@@ -153,7 +154,7 @@ def test_finished_frames_are_skipped_and_failed_ones_tried_again(images, tmp_pat
     outcome, lines, _ = reconstruct(images, tmp_path / "out")
     assert outcome == (3, 1, 2, 0) and len(lines) == 2
     failed = results.load_frame(tmp_path / "out" / "i1.npz")
-    assert int(failed["status"]) == results.BLANK and np.isnan(failed["vertices"]).all()
+    assert int(failed["status"]) == Status.BLANK and np.isnan(failed["vertices"]).all()
     before = {path.stem: (tmp_path / "out" / f"{path.stem}.npz").stat().st_mtime_ns for path in (images[0], images[3])}
     grey_image(images[1], 90)
     grey_image(images[2], 90)
@@ -161,7 +162,7 @@ def test_finished_frames_are_skipped_and_failed_ones_tried_again(images, tmp_pat
     assert outcome == (2, 0, 0, 3) and lines == [] and sum(made.calls) == 2
     assert before == {name: (tmp_path / "out" / f"{name}.npz").stat().st_mtime_ns for name in before}
     rows = summary_of(tmp_path / "out")
-    assert [rows[f"i{k}"]["status"] for k in range(5)] == [str(results.NOT_CONVERGED), "0", "0", "0", "0"]
+    assert [rows[f"i{k}"]["status"] for k in range(5)] == [str(Status.NOT_CONVERGED), "0", "0", "0", "0"]
     assert rows["i0"]["file"] == str(images[0]) and float(rows["i0"]["seconds"]) > 0
 
 
@@ -200,7 +201,7 @@ def test_results_are_read_by_name_in_order_and_all_at_once(images, tmp_path, mon
     for k, name in enumerate(found.names):
         assert all(np.array_equal(listed[k][key], found[name][key], equal_nan=True) for key in CONTRACT)
         assert all(np.array_equal(listed[k][key], getattr(batch, key)[k], equal_nan=True) for key in CONTRACT)
-    assert np.isnan(found["i1"]["vertices"]).all() and int(found["i1"]["status"]) == results.BLANK
+    assert np.isnan(found["i1"]["vertices"]).all() and int(found["i1"]["status"]) == Status.BLANK
     with pytest.raises(MembraneError, match="no frame 'i9'.*'i0'"):
         found["i9"]
 
@@ -233,7 +234,7 @@ def test_single_numbers_as_a_table(images, tmp_path):
     found = read_results(tmp_path / "out")
     table = found.to_pandas()
     assert list(table.index) == found.names and list(table.columns) == [key for key, shape in CONTRACT.items() if shape == ()]
-    assert table["status"].tolist() == [0, results.BLANK, 0, 0, 0] and table["status"].dtype == np.int32
+    assert table["status"].tolist() == [0, Status.BLANK, 0, 0, 0] and table["status"].dtype == np.int32
     assert np.array_equal(table["pressure"].to_numpy(), found.batch().pressure, equal_nan=True)
 
 

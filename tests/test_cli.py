@@ -72,14 +72,16 @@ def test_reconstruct_examples_end_to_end(tmp_path, capsys):
 
 
 def test_options_reach_the_reconstructor(monkeypatch, tmp_path, capsys):
-    def refuse(sensor, estimator, *, model, element):
-        raise MembraneError(f"{sensor.name} {estimator} {model} {element}")
+    def refuse(sensor, estimator, *, settings, model):
+        raise MembraneError(f"{sensor.name} {estimator} {model} {settings and settings.element}")
 
-    monkeypatch.setattr("torchmembrane.reconstruct.Reconstructor", refuse)
+    monkeypatch.setattr("torchmembrane.cli.build.Reconstructor", refuse)
     call = ("reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")
-    assert "nh130 force-balance neo_hookean triangle" in run(capsys, *call)[2]
+    assert "nh130 force-balance None None" in run(capsys, *call)[2]
     options = ("--energy", "harmonic", "--element", "quadrilateral")
-    assert "nh130 force-balance harmonic quadrilateral" in run(capsys, *call, *options)[2]
+    assert "force-balance has linear triangles" in run(capsys, *call, *options)[2]
+    least = ("--estimator", "minimum-energy", *options)
+    assert "nh130 minimum-energy harmonic quadrilateral" in run(capsys, *call, *least)[2]
 
 
 def test_some_frames_failed_gives_1_and_says_which(built_once, tmp_path, capsys):

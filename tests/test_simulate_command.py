@@ -263,9 +263,9 @@ def test_every_dot_of_a_preset_is_found_in_its_rest_image(name):
     reconstructor = Reconstructor(sensor)
     rest = reconstructor(torch.from_numpy(sensor.markers.rest_image)).frame(0)
     assert sensor.name == name and int(rest["status"]) == 0 and (rest["confidence"] > 0.8).all()
-    strength = reconstructor.locator.strength  # what each dot's own blob is expected to have
+    strength = reconstructor.observer.locator.strength  # what each dot's own blob is expected to have
     assert strength.min() > 0.3 * strength.median()
-    off = (reconstructor.measured_rest - reconstructor.rest_pixels).norm(dim=-1)
+    off = (reconstructor.observer.measured_rest - reconstructor.rest_pixels).norm(dim=-1)
     assert off.square().mean().sqrt() < 0.2  # of the outline's centre from the centre's image
 
 

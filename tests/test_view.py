@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from torchmembrane.camera.model import Camera
-from torchmembrane.io import results
+from torchmembrane.io.status import Status
 from torchmembrane.io.store import Mesh
 from torchmembrane.plot import frames as view
 from torchmembrane.sensor.parts import Cavity, Markers, Material
@@ -44,7 +44,7 @@ def pressed(mesh: Mesh, depth=1.5, flow=4.0) -> dict[str, np.ndarray]:
         "confidence": np.isfinite(pixels[:, 0]).astype(np.float32), "pressure_change": np.float32(0.0123),
         "contact_points": np.full((4, 3), np.nan, np.float32), "traction": np.zeros_like(displacement),
         "normals": mesh.rest_normals, "force": np.zeros(3, np.float32),
-        "residual": np.float32(0.25), "status": np.int32(results.OK),
+        "residual": np.float32(0.25), "status": np.int32(Status.OK),
     }  # fmt: skip
 
 
@@ -124,7 +124,7 @@ def test_the_side_view_shows_the_dent_in_profile(mesh, vertex, letter):
     assert farther == letter and side.get_xlabel().startswith(letter)
 
 
-@pytest.mark.parametrize("status", [results.TOO_FEW_MARKERS, results.UNLIKE_REST, results.BLANK, results.BAD_VALUES])
+@pytest.mark.parametrize("status", [Status.TOO_FEW_MARKERS, Status.UNLIKE_REST, Status.BLANK, Status.BAD_VALUES])
 def test_a_failed_frame_says_so_in_words(mesh, status):
     frame = pressed(mesh)
     nothing = ("vertices", "displacement", "pressure_change", "pixels")
@@ -133,12 +133,12 @@ def test_a_failed_frame_says_so_in_words(mesh, status):
     drawing = view.figure(frame, mesh, np.zeros((480, 640)), "dark")
     words = texts(drawing)
     assert "no surface for this frame" in words and "0 of 150 markers found" in words
-    assert results.STATUS_TEXTS[status].partition(":")[0] in words and "NOT OK" in drawing.get_suptitle()
+    assert Status(status).text.partition(":")[0] in words and "NOT OK" in drawing.get_suptitle()
     assert "nan" not in words
 
 
 def test_an_answer_without_convergence_is_drawn_and_named(mesh):
-    frame = pressed(mesh) | {"status": np.int32(results.NOT_CONVERGED)}
+    frame = pressed(mesh) | {"status": np.int32(Status.NOT_CONVERGED)}
     drawing = view.figure(frame, mesh)
     assert len(drawing.axes) == 3 and "NOT OK: the solve has not converged" in drawing.get_suptitle()
 

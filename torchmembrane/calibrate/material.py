@@ -11,7 +11,7 @@ from torch import Tensor
 from ..errors import MembraneError
 from ..estimators.base import Equilibrium
 from ..estimators.force_balance import ForceBalance
-from ..io.results import OK, STATUS_TEXTS
+from ..io.status import Status
 from ..reconstruct import Reconstructor
 from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor
@@ -80,10 +80,10 @@ def material_from_images(sensor: Sensor, images: Tensor, forces: np.ndarray | No
     """
     reconstructor = _reconstructor(sensor)
     with torch.no_grad():
-        displacement, confidence, status = reconstructor.observe(images.double())
-        displacement, confidence, status = reconstructor.judge(displacement, confidence, status)
-    for i in np.flatnonzero(status != OK):
-        raise MembraneError(f"calibrate material: image {i + 1}: {STATUS_TEXTS[int(status[i])]}; leave it out")
+        displacement, confidence, status = reconstructor.observer(images.double())
+        displacement, confidence, status = reconstructor.observer.judge(displacement, confidence, status)
+    for i in np.flatnonzero(status != Status.OK):
+        raise MembraneError(f"calibrate material: image {i + 1}: {Status(int(status[i])).text}; leave it out")
     return _material(sensor, reconstructor, displacement, confidence, forces)
 
 
@@ -176,7 +176,7 @@ class Presses:
 
     def __init__(self, reconstructor: Reconstructor, displacement: Tensor, confidence: Tensor):
         self.reconstructor = reconstructor
-        self.rays, self.confidence = reconstructor.rays(displacement, confidence), confidence
+        self.observation = reconstructor.observation(displacement, confidence)
 
     def explained(self, stretch: float, modulus: float) -> tuple[ForceBalance, Equilibrium]:
         """The estimator with this material, and what it finds."""
@@ -185,9 +185,11 @@ class Presses:
         elasticity = elastic_energy(r.sensor, membrane, prestretch=stretch, modulus=modulus)
         points = SurfacePoints(r.marker_vertices.numpy(), r.marker_weights.numpy(), np.zeros(len(r.rest_markers)))
         gas = tuple(cavity.gas.tolist())
-        estimator = ForceBalance(membrane, elasticity, points, r.rest_markers, known.noise, cavity.filling, gas)
+        estimator = ForceBalance(
+            membrane, elasticity, points, r.rest_markers, known.equations.bearings.noise, cavity.filling, gas
+        )
         with torch.no_grad():
-            return estimator, estimator(*self.rays, self.confidence)
+            return estimator, estimator(self.observation)
 
     def profile(self) -> LossProfile:
         """The presses' losses at `STRETCHES`, and closer together around the lowest."""
@@ -199,7 +201,7 @@ class Presses:
 
     def _losses(self, stretch: float) -> np.ndarray:
         estimator, found = self.explained(stretch, self.reconstructor.sensor.material.modulus)
-        return estimator.price(found, *self.rays, self.confidence).numpy()
+        return estimator.objective(found, self.observation).numpy()
 
     def modulus(self, log_stretch: float, deviation: float, forces: np.ndarray) -> tuple[float, float, float, np.ndarray]:
         """The modulus from presses of known force.

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from ..io.results import STATUS_TEXTS
+from ..io.status import Status
 from ..sensor.parts import METRE
 
 LISTED = 12
@@ -118,11 +118,11 @@ def _markers(sensor, reconstructor, frame) -> list[str]:
     model = reconstructor.rest_pixels.cpu().numpy()
     lines += [f"  not found: marker {d} (from 0), expected at pixel {_listed(model[d])}" for d in missing[:LISTED]]
     lines += [f"  and {len(missing) - LISTED} more"] * (len(missing) > LISTED)
-    off = np.linalg.norm(reconstructor.measured_rest.cpu().numpy() - model, axis=1)[found]
+    off = np.linalg.norm(reconstructor.observer.measured_rest.cpu().numpy() - model, axis=1)[found]
     if len(off):
         rms = np.sqrt((off**2).mean())
         lines.append(f"they lie {rms:.2f} px (rms; at most {off.max():.2f} px) from where the model has them")
-    return [*lines, f"the rest image reconstructed: {STATUS_TEXTS[int(frame['status'])]}"]
+    return [*lines, f"the rest image reconstructed: {Status(int(frame['status'])).text}"]
 
 
 def _listed(values) -> str:

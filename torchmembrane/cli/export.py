@@ -32,10 +32,9 @@ def add_parser(commands: Any) -> None:
 def run(arguments: Namespace) -> int:
     """Write the model; returns the exit code."""
     from ..errors import MembraneError
-    from ..io.store import FORMATS, Settings
     from ..presets import sensor_file
-    from ..reconstruct import Reconstructor
     from ..sensor.sensor import Sensor
+    from .build import build_reconstructor
 
     try:
         from ..onnx.export import export
@@ -43,10 +42,7 @@ def run(arguments: Namespace) -> int:
         raise MembraneError(
             f'export needs {error.name}, which is not installed: pip install "torchmembrane[export]"'
         ) from error
-    sensor = Sensor.from_file(sensor_file(arguments.sensor))
-    energy = arguments.energy or sensor.material.model
-    settings = Settings(arguments.estimator, energy, arguments.element, FORMATS[0])
-    reconstructor = Reconstructor(sensor, arguments.estimator, model=energy, element=arguments.element)
-    export(reconstructor, arguments.out, settings, arguments.tracking)
+    reconstructor = build_reconstructor(Sensor.from_file(sensor_file(arguments.sensor)), arguments)
+    export(reconstructor, arguments.out, tracking=arguments.tracking)
     print(f"written: {arguments.out}, {arguments.out.stat().st_size / 1e6:.1f} MB")
     return 0

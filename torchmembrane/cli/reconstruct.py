@@ -50,8 +50,8 @@ def run(arguments: Namespace) -> int:
     from ..jobs.inputs import find_inputs
     from ..jobs.local import reconstruct_files
     from ..presets import sensor_file
-    from ..reconstruct import Reconstructor
     from ..sensor.sensor import Sensor
+    from .build import build_reconstructor
 
     if arguments.device == "cuda" and not torch.cuda.is_available():
         raise MembraneError("--device cuda: torch sees no CUDA device; pass --device cpu, or install torch with CUDA")
@@ -60,7 +60,7 @@ def run(arguments: Namespace) -> int:
     energy = arguments.energy or sensor.material.model
     settings = Settings(arguments.estimator, energy, arguments.element, arguments.format)
     check_folder(arguments.out, sensor.fingerprint, settings)
-    reconstructor = Reconstructor(sensor, arguments.estimator, model=energy, element=arguments.element).to(arguments.device)
+    reconstructor = build_reconstructor(sensor, arguments).to(arguments.device)
     options = {"batch": arguments.batch, "figures": arguments.figures}
     counts = reconstruct_files(reconstructor, inputs, arguments.out, settings, **options)
     unsure = f" ({counts.not_converged} not converged)" if counts.not_converged else ""

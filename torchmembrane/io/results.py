@@ -10,12 +10,6 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from .atomic import whole_file
-from .status import Status
-
-OK, TOO_FEW_MARKERS, UNLIKE_REST, NOT_CONVERGED, BLANK, BAD_VALUES, NO_SOLUTION = Status  # TEMPORARY
-STATUS_TEXTS = {s.value: s.text for s in Status}  # TEMPORARY
-CONTACT_POINTS = 4
-"""Contacts that are reported at most."""
 
 
 class Reconstruction(NamedTuple):

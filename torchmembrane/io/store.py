@@ -8,12 +8,13 @@ import numpy as np
 from torch import Tensor
 
 from ..errors import MembraneError
-from .results import NOT_CONVERGED, OK, save_frame
+from .results import save_frame
+from .status import Status
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
 
-FINISHED = (OK, NOT_CONVERGED)
+FINISHED = (Status.OK, Status.NOT_CONVERGED)
 """Status of frames that are not tried again."""
 FORMATS = ("npz", "parquet")
 MESH = "mesh.npz"

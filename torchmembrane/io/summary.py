@@ -9,7 +9,7 @@ import numpy as np
 
 from .atomic import whole_file
 from .frames import PART_ROWS, Frame, FrameFiles, FrameTable
-from .results import STATUS_TEXTS
+from .status import Status
 from .store import Mesh
 
 SUMMARY = "summary.csv"
@@ -61,7 +61,7 @@ class Summary:
         status, found = int(frame["status"]), frame["confidence"] > 0
         pressures = frame["residual"], frame["pressure"], frame["pressure_change"]
         numbers = (*pressures, np.linalg.norm(frame["force"]), *lowest, frame["volume_error"], seconds)
-        self._set(name, file, status, STATUS_TEXTS[status], found.sum(), found.size, *map(_number, numbers))
+        self._set(name, file, status, Status(status).text, found.sum(), found.size, *map(_number, numbers))
 
     def add_unreadable(self, name: str, file: Path, reason: str) -> None:
         """A row for a file that gave no image."""

@@ -12,7 +12,8 @@ import torch
 from ..errors import MembraneError
 from ..io.frames import Frame, open_folder
 from ..io.optional import load_pyav
-from ..io.results import NOT_CONVERGED, STATUS_TEXTS, Reconstruction
+from ..io.results import Reconstruction
+from ..io.status import Status
 from ..io.store import FINISHED, Mesh, Settings
 from ..io.summary import UNREADABLE, Summary
 from .decode import DecodedFrame, read_ahead, sources, video_length
@@ -78,12 +79,12 @@ def reconstruct_files(
                     done[status] += 1
                     if status not in FINISHED:
                         of_video = "" if frame.name == frame.file.stem else f", {frame.name}"
-                        report(f"{frame.file}{of_video}: {frame.reason or STATUS_TEXTS[status]}")
+                        report(f"{frame.file}{of_video}: {frame.reason or Status(status).text}")
                 progress.update(len(group))
     finally:
         folder.close()
     good = sum(done[status] for status in FINISHED)
-    return FrameCounts(good, done[NOT_CONVERGED], done.total() - good, progress.initial)
+    return FrameCounts(good, done[Status.NOT_CONVERGED], done.total() - good, progress.initial)
 
 
 class _ResultFolder:

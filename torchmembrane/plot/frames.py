@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ..io.atomic import whole_file
-from ..io.results import OK, STATUS_TEXTS
+from ..io.status import Status
 from ..io.store import Mesh
 from ..surface.topology import rim_loop
 
@@ -174,7 +174,7 @@ def _panels(count):
 
 def _title(frame, mesh: Mesh, name: str) -> str:
     status = int(frame["status"])
-    words = [name] * bool(name) + ["ok" if status == OK else "NOT OK: " + STATUS_TEXTS[status].partition(":")[0]]
+    words = [name] * bool(name) + ["ok" if status == Status.OK else "NOT OK: " + Status(status).text.partition(":")[0]]
     if np.isfinite(frame["pressure_change"]):
         unit = "(relative)" if mesh.force_unit == "relative" else f"{mesh.force_unit}/{mesh.length_unit}²"
         words += [f"pressure change {frame['pressure_change']:+.3g} {unit}", f"residual {frame['residual']:.2f} px"]
@@ -183,7 +183,7 @@ def _title(frame, mesh: Mesh, name: str) -> str:
 
 def _draw_failure(axes, frame) -> None:
     axes.set_axis_off()
-    headline, _, remedy = STATUS_TEXTS[int(frame["status"])].removesuffix("; no surface").partition(": ")
+    headline, _, remedy = Status(int(frame["status"])).text.removesuffix("; no surface").partition(": ")
     found = frame["confidence"] > 0
     count = f"{found.sum()} of {found.size} markers found"
     words = {"no surface for this frame": 24, headline: 17, remedy: 13, count: 13}
@@ -257,7 +257,7 @@ def _draw_projection(axes, sensor, reconstructor, frame) -> None:
     axes.add_collection(_mesh_lines(pixels, grid, color=BLUE, lw=0.4))
     axes.plot(*pixels[_rim(grid)].T, color=BLUE, lw=1.8, label="rim and grid, projected")
     if frame is not None:
-        place, found = reconstructor.measured_rest.cpu().numpy(), frame["confidence"] > 0
+        place, found = reconstructor.observer.measured_rest.cpu().numpy(), frame["confidence"] > 0
         size, label = 6 if len(found) < 300 else 2.5, f"markers found ({found.sum()})"
         axes.plot(*place[found].T, "o", ms=size, mfc="none", mec=VERMILION, mew=1, label=label)
         if not found.all():
