@@ -18,7 +18,7 @@ from torchmembrane.cli import arguments as types
 from torchmembrane.cli import choices
 from torchmembrane.cli import main as cli
 from torchmembrane.errors import MembraneError
-from torchmembrane.estimators import minimum_energy
+from torchmembrane.estimators import settings
 from torchmembrane.io import store
 from torchmembrane.mechanics import hyperelastic
 from torchmembrane.reconstruct import Reconstructor
@@ -226,8 +226,8 @@ def test_help_loads_nothing_heavy(arguments):
 
 
 def test_the_options_choices_are_what_the_package_has():
-    assert choices.ESTIMATORS == reconstruct.ESTIMATORS and choices.ENERGIES == hyperelastic.MODELS
-    assert choices.ELEMENTS == minimum_energy.ELEMENTS and choices.RESULT_FORMATS == store.FORMATS
+    assert choices.ESTIMATORS == tuple(reconstruct.ESTIMATORS) and choices.ENERGIES == hyperelastic.MODELS
+    assert choices.ELEMENTS == settings.ELEMENTS and choices.RESULT_FORMATS == store.FORMATS
     assert choices.PRESETS == presets.NAMES and choices.INDENTERS == dataset.KINDS and choices.LEGS == simulator.LEGS
     assert choices.SIMULATION_FORMATS == frames.FORMATS and choices.PORTS == camera.PORTS
     assert (choices.HIGHLIGHT, choices.BLUR) == (look.Look.highlight, look.Look.blur)
