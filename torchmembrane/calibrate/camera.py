@@ -229,5 +229,5 @@ def _with(camera: Camera, values: Mapping[str, Tensor]) -> Camera:
         return values.get(name, getattr(camera, name)).reshape(-1).tolist()
 
     ports = list(zip(get("port_distance"), get("port_thickness"), get("port_index"), strict=True))
-    lens = [get(name) for name in LENS]
-    return Camera(camera.model, camera.image_size, *lens, ports, get("medium_index")[0])
+    lens = get("focal"), get("centre"), get("distortion")
+    return Camera(camera.model, camera.image_size, *lens, ports=ports, medium_index=get("medium_index")[0])

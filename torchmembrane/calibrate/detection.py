@@ -1,6 +1,7 @@
 """Targets found in images: corners of a checkerboard by OpenCV, dots by this package's own detector."""
 
 import heapq
+from typing import Any
 
 import numpy as np
 
@@ -79,7 +80,7 @@ def _lattice_steps(pixels: np.ndarray) -> np.ndarray:
     steps = np.full(pixels.shape, FAR_OFF)
     placed: set[int] = set()
     taken: set[tuple[int, int]] = set()
-    front = [(0.0, start, (0, 0), _first_basis(pixels, start))]
+    front: list[tuple[Any, ...]] = [(0.0, start, (0, 0), _first_basis(pixels, start))]  # gap, dot, its steps, basis
     while front:
         _, here, step, basis = heapq.heappop(front)
         if here in placed or step in taken:

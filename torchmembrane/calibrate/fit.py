@@ -86,7 +86,7 @@ def fit(
     if solution.status <= 0:
         raise MembraneError(f"{what}: not converged after {solution.nfev} steps; check the images and the design values")
     noise = float(np.sqrt((solution.fun**2).sum() / (first.size - start.size)))
-    return Fit(solution.x, noise**2 * _inverse_gram(solution.jac), solution.fun, noise)
+    return Fit(solution.x, noise**2 * _inverse_gram(np.asarray(solution.jac)), solution.fun, noise)
 
 
 def with_common_errors(found: Fit, jacobian: np.ndarray, errors: np.ndarray) -> Fit:

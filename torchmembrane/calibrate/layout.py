@@ -1,4 +1,4 @@
-"""The fabrication layout: from the dot pattern wanted in the image, through the ports, to places on the rest surface.
+"""The fabrication layout: from the dot pattern wanted in the image, through the ports, to positions on the rest surface.
 
 So the paper made its sensor (section 5.2).
 """

@@ -195,7 +195,9 @@ class Presses:
         """The presses' losses at `STRETCHES`, and closer together around the lowest."""
         losses = {stretch: self._losses(stretch) for stretch in STRETCHES}
         k = min(max(int(np.argmin([values.sum() for values in losses.values()])), 1), len(STRETCHES) - 2)
-        losses |= {stretch: self._losses(stretch) for stretch in np.geomspace(*STRETCHES[[k - 1, k + 1]], BETWEEN + 2)[1:-1]}
+        losses |= {
+            stretch: self._losses(stretch) for stretch in np.geomspace(STRETCHES[k - 1], STRETCHES[k + 1], BETWEEN + 2)[1:-1]
+        }
         stretches = np.array(sorted(losses))
         return LossProfile(stretches, np.array([losses[stretch] for stretch in stretches]))
 
@@ -229,8 +231,8 @@ class Presses:
 
     def _ratios(self, stretch: float, modulus: float, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Forces measured over found of the presses of known force `[F]`, and all magnitudes, found and measured `[B, 2]`."""
-        estimator, found = self.explained(stretch, modulus)
-        found = (found.traction * estimator.membrane.rest_area[:, None]).sum(1).numpy()
+        estimator, equilibrium = self.explained(stretch, modulus)
+        found = (equilibrium.traction * estimator.membrane.rest_area[:, None]).sum(1).numpy()
         size, measured = np.linalg.norm(found, axis=1), np.linalg.norm(forces, axis=1)
         along = (forces * found).sum(1) / size if forces.shape[1] == 3 else measured
         return (along / size)[np.isfinite(along)], np.stack([size, measured], -1)

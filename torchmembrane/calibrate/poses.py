@@ -32,8 +32,8 @@ def lens_and_poses(camera: Camera, board: Checkerboard, pixels: np.ndarray) -> t
             )
         else:
             flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
-            points, imaged = ([a.astype(np.float64) for a in arrays] for arrays in (points, imaged))
-            _, K, k, rotation_vectors, translations = cv2.fisheye.calibrate(points, imaged, size, K, np.zeros(4), flags=flags)
+            exact = [[a.astype(np.float64) for a in arrays] for arrays in (points, imaged)]
+            _, K, k, rotation_vectors, translations = cv2.fisheye.calibrate(*exact, size, K, np.zeros(4), flags=flags)
     except cv2.error as error:
         raise MembraneError(f"calibrate camera: OpenCV finds no {camera.model} lens for these images ({error})") from error
     poses = np.concatenate([np.reshape(rotation_vectors, (-1, 3)), np.reshape(translations, (-1, 3))], 1)

@@ -69,7 +69,7 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
     if sensor.markers.positions is None:
         raise MembraneError("calibrate rest: the sensor lists no dots; expected [markers] file, or use views or depth")
     surface, X = fine_surface(sensor), sensor.markers.positions
-    sizes = np.array([size == "large" for size in sensor.markers.sizes], dtype=int)
+    sizes = np.array([int(size == "large") for size in sensor.markers.sizes or ()])
     outlines, pixels = measured_outlines(sensor, surface, X, sizes, image)
     pivot = surface.rest[surface.fixed].mean(0)
     visible = np.isfinite(pixels).all(1)

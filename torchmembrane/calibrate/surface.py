@@ -1,6 +1,5 @@
 """The rest surface as calibration moves it: dots' outlines on it, a new pose, a correction along its normals."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -57,7 +56,7 @@ def recalibrated(
     surface: Membrane,
     vertices: np.ndarray,
     positions: np.ndarray | None,
-    sizes: Sequence[str] | None,
+    sizes: list[str] | None,
     image: np.ndarray,
 ) -> Sensor:
     """The sensor with its rest surface at `vertices [V, 3]` (on the grid of `surface`), dots `[D, 3]` and rest image."""

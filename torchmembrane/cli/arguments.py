@@ -34,7 +34,8 @@ def add_command(commands: Any, name: str, run: Callable[..., int], purpose: str,
         formatter_class=RawDescriptionHelpFormatter,
     )
     parser.set_defaults(run=run)
-    return parser.add_argument
+    add: Add = parser.add_argument
+    return add
 
 
 def add_sensor(add: Add) -> None:
@@ -55,7 +56,7 @@ def positive(text: str) -> float:
     >>> positive("0.5")
     0.5
     """
-    (value,) = _values(text, float, 1, "a positive number")
+    value: float = _values(text, float, 1, "a positive number")[0]
     if not value > 0:
         raise ArgumentTypeError(f"{text!r}; expected a positive number")
     return value
@@ -63,7 +64,7 @@ def positive(text: str) -> float:
 
 def not_negative(text: str) -> float:
     """A number, 0 or more."""
-    (value,) = _values(text, float, 1, "a number, 0 or more")
+    value: float = _values(text, float, 1, "a number, 0 or more")[0]
     if value < 0:
         raise ArgumentTypeError(f"{text!r}; expected a number, 0 or more")
     return value

@@ -1,10 +1,16 @@
 """What a sensor file means, in words."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 
+from ..camera.model import Camera
+from ..io.frames import Frame
 from ..io.status import Status
+from ..reconstruct import Reconstructor
 from ..sensor.parts import METRE
+from ..sensor.sensor import Sensor
 
 LISTED = 12
 """Missing markers that are named one by one."""
@@ -15,7 +21,7 @@ FILLINGS = {
 }
 
 
-def rest_frame(reconstructor) -> dict[str, np.ndarray] | None:
+def rest_frame(reconstructor: Reconstructor) -> Frame | None:
     """The frame of the sensor's own rest image, None where there is none."""
     image = reconstructor.sensor.markers.rest_image
     if image is None:
@@ -24,7 +30,7 @@ def rest_frame(reconstructor) -> dict[str, np.ndarray] | None:
         return reconstructor(torch.from_numpy(image)).frame(0)
 
 
-def described(sensor, reconstructor=None, frame=None) -> list[str]:
+def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame: Frame | None = None) -> list[str]:
     """Lines that say what was understood of a `Sensor`; more of them with its `Reconstructor` and rest frame."""
     lines = {
         "sensor": [f"{sensor.name!r}, fingerprint {sensor.fingerprint[:12]}, lengths in {sensor.length_unit}"],
@@ -37,7 +43,7 @@ def described(sensor, reconstructor=None, frame=None) -> list[str]:
     return [f"{key if i == 0 else '':<10}{line}" for key, block in lines.items() for i, line in enumerate(block)]
 
 
-def _camera(camera, unit: str) -> list[str]:
+def _camera(camera: Camera, unit: str) -> list[str]:
     width, height = camera.image_size
     per = "px" if camera.model == "pinhole" else "px/rad"
     bent = camera.distortion.tolist()
@@ -53,7 +59,7 @@ def _camera(camera, unit: str) -> list[str]:
     return lines
 
 
-def _opening(camera, axis: int) -> float:
+def _opening(camera: Camera, axis: int) -> float:
     """Degrees seen along the image's row (axis 0) or column (axis 1) through the centre."""
     pixels = camera.centre.repeat(401, 1)
     pixels[:, axis] = torch.linspace(-0.5, camera.image_size[axis] - 0.5, 401, dtype=pixels.dtype)
@@ -61,7 +67,7 @@ def _opening(camera, axis: int) -> float:
     return float(np.ptp(np.degrees(np.arctan2(direction[:, axis], direction[:, 2]))[np.isfinite(direction[:, 2])]))
 
 
-def _membrane(sensor) -> list[str]:
+def _membrane(sensor: Sensor) -> list[str]:
     membrane, unit = sensor.membrane, sensor.length_unit
     X = membrane.rest.numpy()
     sides = ", ".join(f"{a} {low:.4g} to {high:.4g}" for a, low, high in zip("xyz", X.min(0), X.max(0), strict=True))
@@ -72,7 +78,7 @@ def _membrane(sensor) -> list[str]:
     ]
 
 
-def _material(sensor, reconstructor) -> list[str]:
+def _material(sensor: Sensor, reconstructor: Reconstructor | None) -> list[str]:
     material, unit = sensor.material, sensor.length_unit
     known = {
         "C2 / C1": (material.c2_ratio, ""),
@@ -92,7 +98,7 @@ def _material(sensor, reconstructor) -> list[str]:
     return lines
 
 
-def _cavity(sensor) -> list[str]:
+def _cavity(sensor: Sensor) -> list[str]:
     cavity, words = sensor.cavity, [FILLINGS[sensor.cavity.filling]]
     if cavity.filling == "gas":
         volume = cavity.volume or sensor.membrane.cavity_volume
@@ -102,7 +108,7 @@ def _cavity(sensor) -> list[str]:
     return ["; ".join(words)]
 
 
-def _markers(sensor, reconstructor, frame) -> list[str]:
+def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame | None) -> list[str]:
     markers = sensor.markers
     lines = [f"{markers.kind}, {markers.polarity}"]
     if markers.positions is not None:
@@ -110,7 +116,7 @@ def _markers(sensor, reconstructor, frame) -> list[str]:
         lines[0] += f", {len(markers.positions)} listed: {large} large, {len(markers.sizes) - large} small"
     if reconstructor is not None and markers.positions is None:
         lines[0] += f", {len(reconstructor.rest_pixels)} placed on the rest surface from the rest image"
-    if frame is None:
+    if frame is None or reconstructor is None:
         return [*lines, "no rest image" if markers.rest_image is None else "not looked for in the rest image"]
     found = frame["confidence"] > 0
     lines.append(f"{found.sum()} of {found.size} found in the rest image")
@@ -125,5 +131,5 @@ def _markers(sensor, reconstructor, frame) -> list[str]:
     return [*lines, f"the rest image reconstructed: {Status(int(frame['status'])).text}"]
 
 
-def _listed(values) -> str:
+def _listed(values: Iterable[float]) -> str:
     return ", ".join(f"{value:.5g}" for value in values)

@@ -20,7 +20,7 @@ def main(argv: list[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(f"torchmembrane: warning: {message}", file=sys.stderr)
         try:
-            return arguments.run(arguments)
+            return int(arguments.run(arguments))
         except (MembraneError, OSError) as error:
             print(f"torchmembrane: error: {error}", file=sys.stderr)
             return 2

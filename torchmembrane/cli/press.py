@@ -57,16 +57,15 @@ def _single(arguments: Namespace, simulator: Simulator) -> int:
     return 0
 
 
-def _film(arguments, simulator: Simulator, stroke: Stroke) -> int:
+def _film(arguments: Namespace, simulator: Simulator, stroke: Stroke) -> int:
     rng, total = np.random.default_rng(arguments.seed), len(arguments.path) * arguments.frames
     states = simulator.presses(stroke, arguments.path, arguments.frames, arguments.increment)
     states = chain([next(states)], states)  # a press that cannot begin leaves no folder
     frames = open_frames(arguments.out, simulator, {})
-    video = Video(arguments.out / f"{arguments.name}.mp4") if arguments.video else nullcontext()
-    with video:
+    with Video(arguments.out / f"{arguments.name}.mp4") if arguments.video else nullcontext() as video:
         for number, state in enumerate(tqdm(states, total=total, desc="simulate", unit="frame")):
             name, frame = f"{arguments.name}_{number:06d}", simulator.frame(state, stroke, rng)
-            if arguments.video:
+            if video is not None:
                 video.add(frame.image)
                 frames.write_truth(name, frame)
             else:
@@ -97,7 +96,7 @@ def _body(arguments: Namespace) -> Indenter:
     if kind == "wedge":
         return Wedge(_needed(arguments, "opening"), _needed(arguments, "radius"))
     if kind == "box":
-        return Box(np.array(_needed(arguments, "sides")), _needed(arguments, "radius"))
+        return Box(torch.tensor(_needed(arguments, "sides"), dtype=torch.float64), _needed(arguments, "radius"))
     if not Path(kind).is_file():
         raise MembraneError(f"--indenter {kind!r}: neither a file nor one of {', '.join(KINDS)}")
     return Mesh.read(kind)

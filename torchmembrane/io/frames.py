@@ -128,9 +128,9 @@ class FrameTable:
     def _parts(self) -> list[Path]:
         return sorted(self.folder.glob("part-*.parquet"))
 
-    def _column(self, part: Path, key: str) -> list:
+    def _column(self, part: Path, key: str) -> list[Any]:
         try:
-            return self.parquet.read_table(part, columns=[key])[key].to_pylist()
+            return list(self.parquet.read_table(part, columns=[key])[key].to_pylist())
         except (OSError, ValueError, KeyError) as error:
             raise MembraneError(f"{part}: not a part of torchmembrane's results ({error}); move it away") from error
 

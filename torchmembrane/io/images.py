@@ -54,7 +54,8 @@ def to_grey(array: np.ndarray) -> np.ndarray:
     else:
         raise MembraneError(f"to_grey: values of type {array.dtype}; expected uint8, uint16 or float in 0..1")
     if array.ndim == 3:
-        array = sum(weight * array[..., c].astype(np.float64) for c, weight in enumerate(GREY))
+        array = array.astype(np.float64)
+        array = GREY[0] * array[..., 0] + GREY[1] * array[..., 1] + GREY[2] * array[..., 2]
     return (array.astype(np.float64) / white).astype(np.float32)
 
 

@@ -79,8 +79,9 @@ class Reconstruction(NamedTuple):
 
 def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
     """Write one frame (`Reconstruction.frame`) to `path` (.npz), whole or not at all."""
+    arrays: dict[str, Any] = frame
     with whole_file(path) as partial, open(partial, "wb") as file:
-        np.savez(file, **frame)
+        np.savez(file, **arrays)
 
 
 def load_frame(path: str | Path) -> dict[str, np.ndarray]:

@@ -105,7 +105,8 @@ class Mesh(NamedTuple):
 
     def normal_displacement(self, frame: dict[str, np.ndarray]) -> np.ndarray:
         """Displacement along the rest normals, `[V]`, length unit: negative where the membrane is pressed in."""
-        return (frame["displacement"] * self.rest_normals).sum(-1)
+        along: np.ndarray = (frame["displacement"] * self.rest_normals).sum(-1)
+        return along
 
 
 def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:

@@ -4,6 +4,7 @@ import csv
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -60,15 +61,17 @@ class Summary:
             lowest = [depth.min(), *frame["vertices"][depth.argmin()]]
         status, found = int(frame["status"]), frame["confidence"] > 0
         pressures = frame["residual"], frame["pressure"], frame["pressure_change"]
-        numbers = (*pressures, np.linalg.norm(frame["force"]), *lowest, frame["volume_error"], seconds)
-        self._set(name, file, status, Status(status).text, found.sum(), found.size, *map(_number, numbers))
+        numbers: list[Any] = [*pressures, np.linalg.norm(frame["force"]), *lowest, frame["volume_error"], seconds]
+        cells = [_number(number) for number in numbers]
+        self._set(name, file, status, Status(status).text, found.sum(), found.size, *cells)
 
     def add_unreadable(self, name: str, file: Path, reason: str) -> None:
         """A row for a file that gave no image."""
         self._set(name, file, UNREADABLE, f"unreadable: {reason}", *[""] * len(OF_FRAME))
 
     def _set(self, *values: object) -> None:
-        row = dict(zip(COLUMNS, [*values, self.mesh.length_unit, self.mesh.force_unit], strict=True))
+        cells = [str(value) for value in (*values, self.mesh.length_unit, self.mesh.force_unit)]
+        row = dict(zip(COLUMNS, cells, strict=True))
         self.rows[row["name"]] = row
 
     def write(self) -> None:
@@ -79,7 +82,7 @@ class Summary:
             writer.writerows(self.rows[name] for name in sorted(self.rows))
 
 
-def _rows(path: Path) -> list[dict]:
+def _rows(path: Path) -> list[dict[str, str]]:
     """The rows of an earlier summary.csv; none where it has other columns or is no table."""
     if not path.exists():
         return []
@@ -88,5 +91,5 @@ def _rows(path: Path) -> list[dict]:
         return list(reader) if tuple(reader.fieldnames or ()) == COLUMNS else []
 
 
-def _number(value: float) -> str:
+def _number(value: np.ndarray | float) -> str:
     return f"{value:.6g}" if np.isfinite(value) else ""

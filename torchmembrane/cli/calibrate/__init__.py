@@ -50,7 +50,7 @@ def add_parser(commands: Any) -> None:
 
 
 def _run(module: str, step: str, arguments: Namespace) -> int:
-    return getattr(import_module(f".{module}", __name__), step)(arguments)
+    return int(getattr(import_module(f".{module}", __name__), step)(arguments))
 
 
 def _camera_options(add: Add) -> None:
