@@ -90,7 +90,7 @@ def _first_hits(start: np.ndarray, d: np.ndarray, triangles: np.ndarray) -> tupl
     ranges = np.where((w > -1e-9).all(-1) & (ranges > 0), ranges, np.inf)
     first, row = ranges.argmin(1), np.arange(len(ranges))
     distance = ranges[row, first]
-    hit: np.ndarray = np.isfinite(distance)
+    hit = np.isfinite(distance)
     return first, np.where(hit[:, None], w[row, first], 1 / 3), np.where(hit, distance, np.nan)
 
 
@@ -106,7 +106,7 @@ def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> tuple[np.ndar
     det = np.maximum(symmetric_determinant(*metric), 1e-300)
     v, w = v / det, w / det
     inside = np.stack([1 - v - w, v, w], -1)
-    candidates = [np.where((inside >= 0).all(-1)[..., None], inside, np.nan)]
+    candidates = [np.where((inside >= 0).all(-1, keepdims=True), inside, np.nan)]
     for s, e in EDGES:
         start, edge = triangles[..., s, :], triangles[..., e, :] - triangles[..., s, :]
         u = np.clip(_dot(p - start, edge) / np.maximum(_dot(edge, edge), 1e-300), 0, 1)
