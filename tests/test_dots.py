@@ -10,9 +10,13 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.markers.dots import DotPattern, find_dots, measure_dots
-from torchmembrane.markers.locate import DotLocator, EllipseFit, bands, blur_rows, metric_of, pyramid
-from torchmembrane.markers.match import Coherence, mapping
+from torchmembrane.markers.dots import DotLocator, DotPattern, find_dots, measure_dots
+from torchmembrane.markers.dots.bands import bands, blur_rows
+from torchmembrane.markers.dots.coherence import Coherence
+from torchmembrane.markers.dots.deformation import mapping
+from torchmembrane.markers.dots.ellipse import metric_of
+from torchmembrane.markers.dots.fit import EllipseFit
+from torchmembrane.markers.dots.pyramid import pyramid
 
 SIZE, CENTRE, RADIUS, PITCH = (320, 240), np.array([158.3, 119.6]), 112.0, 22.0
 PATTERNS = [("square", True), ("square", False), ("hexagonal", True), ("hexagonal", False)]

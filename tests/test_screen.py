@@ -10,7 +10,7 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.flow import FlowInterpolation
 from torchmembrane.estimators.force_balance import ForceBalance
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
-from torchmembrane.markers.screen import MismatchScreen
+from torchmembrane.markers.screening import MismatchScreen
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press

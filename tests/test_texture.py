@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.markers.texture import Neighbourhood, TextureLocator, choose_patches, inverse_2x2
+from torchmembrane.markers.neighbourhood import Neighbourhood, inverse_2x2
+from torchmembrane.markers.texture import TextureLocator, choose_patches
 
 HEIGHT, WIDTH = 240, 320
 CENTRE = np.array([165.0, 115.0])

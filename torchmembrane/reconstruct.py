@@ -18,9 +18,9 @@ from .estimators.minimum_energy import MinimumEnergy
 from .io import results
 from .io.images import read_image
 from .io.results import CONTACT_POINTS, Reconstruction
-from .markers.locate import DotLocator
-from .markers.place import FEWEST_MARKERS, place_markers
-from .markers.screen import MismatchScreen
+from .markers.dots import DotLocator
+from .markers.placement import FEWEST_MARKERS, place_markers
+from .markers.screening import MismatchScreen
 from .mechanics.cavity import Equilibrium
 from .mechanics.hyperelastic import ElasticEnergy
 from .sensor.model import Sensor

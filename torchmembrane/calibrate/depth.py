@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
-from ..markers.place import rim_mask
+from ..markers.placement import rim_mask
 from ..sensor.model import Sensor
 from .surface import Correction, Feet, correction, feet_of, fine_surface, recalibrated
 from .views import placed_dots

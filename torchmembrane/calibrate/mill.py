@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
-from ..markers.place import rim_mask
+from ..markers.placement import rim_mask
 from ..sensor.model import Sensor
 from ..surface.membrane import Membrane
 from .fit import outline_centres

@@ -9,7 +9,7 @@ from torch.func import jacfwd, vmap
 
 from ..errors import MembraneError
 from ..markers.dots import find_dots
-from ..markers.place import rim_mask
+from ..markers.placement import rim_mask
 from ..sensor.model import Sensor
 from .fit import Fit, fit, outline_centres, rotations, strays, with_common_errors
 from .rest import measured_outlines, shading_bias

@@ -5,8 +5,8 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import MembraneError
-from .match import spacing
-from .texture import Neighbourhood
+from .neighbourhood import Neighbourhood
+from .spacing import spacing
 
 TOLERANCE = 0.2  # of the distance to the nearest marker: what a press may put between a displacement and its neighbours' fit
 FEWEST = 6

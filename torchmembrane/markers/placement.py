@@ -8,8 +8,7 @@ from torch import Tensor, nn
 from ..errors import MembraneError
 from ..sensor.model import Sensor
 from ..surface.membrane import SurfacePoints
-from .dots import DotPattern, find_dots, measure_dots
-from .locate import DotLocator
+from .dots import DotLocator, DotPattern, find_dots, measure_dots
 from .texture import TextureLocator, choose_patches
 
 FEWEST_MARKERS = 8

@@ -1,0 +1,111 @@
+"""Locating dots in a batch of frames: blobs at the pattern's scales, matched, then fitted to sub-pixel accuracy."""
+
+import numpy as np
+import torch
+from scipy import ndimage
+from scipy.spatial import Delaunay, cKDTree
+from torch import nn
+
+from ...errors import MembraneError
+from ..spacing import spacing, square_distance
+from .coherence import Coherence
+from .detect import BlobDetector
+from .ellipse import draw, size_tolerance
+from .fit import EllipseFit
+from .match import DotMatcher
+from .pyramid import pyramid
+
+STRAY = 0.5  # from where its neighbours predict it, pitches: a dot so far off is half trusted
+FEWEST = 0.2  # mean confidence of a frame that is half trusted
+
+
+def membrane_mask(pixels, anchors, image_size):
+    """`[1, 1, H, W]` 1 inside the rim and 2 pixels off it, else 0: the short triangles between dots and anchors."""
+    width, height = image_size
+    if anchors is None:
+        return torch.ones(1, 1, height, width, dtype=torch.float64)
+    points = np.concatenate([pixels, anchors])
+    triangulation = Delaunay(points)
+    corners = points[triangulation.simplices]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max(1)
+    pitch = np.append(spacing(pixels)[1], np.zeros(len(anchors)))[triangulation.simplices].max(1)
+    kept = np.append(longest < 3 * pitch, False)
+    inside = kept[triangulation.find_simplex(np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1))]
+    inside = ndimage.binary_erosion(ndimage.binary_closing(inside, iterations=2), iterations=2)
+    return torch.as_tensor(inside, dtype=torch.float64)[None, None]
+
+
+class DotLocator(nn.Module):
+    """Pixels of the pattern's dots in each frame of a batch, with a confidence.
+
+    Blobs at the pattern's scales, matched from where the dots were or else along the smooth flow inwards from the rim, then
+    a least-squares fit of a blurred ellipse on sloping background. A lost dot has confidence 0 and its predicted pixel.
+
+    pattern: `DotPattern`, the markers in the rest image; image_size: width, height; polarity: "dark" or "light";
+    anchors: `[A, 2]` pixels of the rim, where nothing moves, closer together than the dots; without them the pattern's
+    own outline has to do.
+    Wrong when the flow changes by more than about half a pitch from one dot to the next: spacing below about half of
+    that at rest, rotation or shear of more than about 25 degrees, or a flow of more than two pitches. Most such regions
+    end in a seam and are lost with all that is near it; what is left is confidently a whole pitch off, one-size patterns
+    more often. Without anchors a pattern that moves as a whole by a pitch, two sizes by the pitch of the large ones,
+    looks as at rest: that cannot be told at all. A dot that is missing beside a blob of its size may be taken for it.
+    Where many dots are missing (20 %) and as many false ones stand among them, right dots are lost as well.
+    """
+
+    def __init__(self, pattern, image_size, polarity, anchors=None):
+        super().__init__()
+        if polarity not in ("dark", "light"):
+            raise MembraneError(f'DotLocator: polarity is {polarity!r}, expected "dark" or "light"')
+        pixels, shapes = np.asarray(pattern.pixels, float), np.asarray(pattern.shapes, float)
+        if len(pixels) < 6 or not (np.isfinite(pixels).all() and np.isfinite(shapes).all()):
+            raise MembraneError(
+                f"DotLocator: {len(pixels)} dots, {int(np.isnan(pixels).any(1).sum())} of them NaN, expected at least "
+                "6, all finite; leave out dots that were not seen in the rest image"
+            )
+        self.polarity, self.image_size = polarity, tuple(image_size)
+        tolerance = size_tolerance(shapes, np.asarray(pattern.sizes))
+        self.fit = EllipseFit(pixels, shapes, image_size, tolerance)
+        inside = membrane_mask(pixels, anchors, image_size)
+        radii = np.sqrt(np.abs(np.linalg.det(shapes)))
+        self.detect = BlobDetector(radii, spacing(pixels)[0].min(), int(1.2 * len(pixels)) + 16, inside)
+        drawn = pyramid(draw(pixels, shapes, image_size))
+        blobs, log_radius, strength = (x[0].numpy() for x in self.detect.double()(drawn))
+        blobs, log_radius, strength = (x[strength > 1e-6] for x in (blobs, log_radius, strength))  # the rest fill up the count
+        own = cKDTree(blobs).query(pixels)[1]
+        self.match = DotMatcher(pixels, log_radius[own], tolerance, anchors)
+        self.coherence = Coherence(pixels, log_radius[own], tolerance)
+        self.register_buffer("strength", torch.as_tensor(strength[own]))
+        self.register_buffer("rest", torch.as_tensor(pixels))
+        self.register_buffer("shapes", torch.as_tensor(shapes))
+        self.float()
+
+    def forward(self, image, previous=None):
+        """`image [B, 1, H, W]` in 0..1 -> pixels `[B, D, 2]`, confidence `[B, D]` in 0..1.
+
+        `previous [B, D, 2]`: pixels in the frames before, NaN where lost, from which the dots are followed (else from rest).
+        """
+        *levels, blobs, log_radius, valid = self.begin(image)
+        return self.end(*levels, blobs, log_radius, valid, *self.match(blobs, log_radius, valid, previous))
+
+    def begin(self, image):
+        """The levels of the pyramid, and the blobs: places `[B, K, 2]`, log radius `[B, K]`, and how surely one is a dot."""
+        levels, rest = pyramid(1 - image if self.polarity == "light" else image), self.rest
+        blobs, log_radius, strength = self.detect(levels)
+        nearest = square_distance(blobs - self.match.origin, self.match.pixels).argmin(-1)
+        relative = strength / self.strength[nearest]
+        level = relative[:, : rest.shape[0] // 2].mean(1, keepdim=True)
+        valid = torch.sigmoid(20 * (relative / (level + 1e-3) - 0.4))
+        return *levels, blobs, log_radius, valid
+
+    def end(self, level_0, level_1, level_2, blobs, log_radius, valid, place, certainty, strain):
+        """Pixels and confidence, by the fit about where the matcher places the dots."""
+        levels, rest = (level_0, level_1, level_2), self.rest
+        _, gradient, _ = self.match.predict(certainty, place - rest, strain)
+        shape = self.shapes + gradient.clamp(-0.6, 0.6) @ self.shapes
+        pixels, _, quality = self.fit(levels, place, shape)
+        predicted, _, _ = self.match.predict(certainty * quality, pixels - rest, strain)
+        stray = (pixels - rest - predicted).square().sum(-1).clamp_min(1e-12).sqrt() / self.match.nearest
+        confidence = quality * torch.sigmoid(20 * (STRAY - stray))
+        confidence = confidence * self.coherence(pixels, confidence, strain, rest + predicted, blobs, log_radius, valid)
+        confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
+        return torch.where(confidence[..., None] > 0.05, pixels, rest + predicted), confidence
