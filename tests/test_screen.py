@@ -58,7 +58,7 @@ def test_mismatched_markers_are_flagged_and_no_others(pressed):
         assert torch.equal(screen((wrong - rest)[None], one)[0] < 0.5, flags)
 
 
-def test_a_lost_marker_has_no_say_and_stays_lost(pressed):
+def test_a_lost_marker_has_zero_weight_and_stays_lost(pressed):
     rest, anchors, pixels, _, _ = pressed
     screen = MismatchScreen(rest.numpy(), anchors.numpy())
     confidence = torch.ones(2, len(rest), dtype=torch.float64)

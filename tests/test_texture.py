@@ -168,7 +168,7 @@ def test_lost_pixels_are_what_the_neighbours_predict(locator, pixels):
     assert np.median(error[hidden]) < 0.7 and error[hidden].max() < 3
 
 
-def test_affine_flow_is_predicted_and_outliers_have_no_say(pixels):
+def test_affine_flow_is_predicted_and_outliers_have_zero_weight(pixels):
     gradient, shift = torch.tensor([[0.1, -0.2], [0.3, 0.05]]), torch.tensor([3.0, -2.0])
     flow = (torch.tensor(pixels, dtype=torch.float32) @ gradient.T + shift)[None]
     broken = flow.clone()

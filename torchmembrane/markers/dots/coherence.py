@@ -2,12 +2,11 @@
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
-from torch import nn
+from torch import Tensor, nn
 
-from ..spacing import spacing, square_distance
-from .deformation import NEIGHBOURS
+from ..spacing import neighbours, safe_length, spacing, square_distance
 
+NEIGHBOURS = 6
 SEAM = 2.0  # width of the neighbourhood in which a seam is looked for, pitches
 TEAR = 0.045  # root of the share of dots lost and blobs left over, times the relative error of steps
 CLAIM = 0.35  # a blob so near to a dot is the dot's, pitches
@@ -21,12 +20,27 @@ class Coherence(nn.Module):
     from a dot to its neighbour is not what the deformation measured at both makes of it at rest. Lost dots or blobs left
     over alone, or a field that varies fast, are no seam. A blob left over as near to the prediction as the dot's own is
     its rival: then neither is believed.
+
+    Args:
+        pixels: centres `[D, 2]` of the dots at rest, px.
+        log_radius: `[D]`, as the blob detector finds it at rest.
+        size_tolerance: standard deviation of a dot's log radius.
     """
 
-    def __init__(self, pixels, log_radius, size_tolerance):
+    near: Tensor
+    step: Tensor
+    length: Tensor
+    share: Tensor
+    total: Tensor
+    reach: Tensor
+    origin: Tensor
+    nearest: Tensor
+    log_radius: Tensor
+
+    def __init__(self, pixels: np.ndarray, log_radius: np.ndarray, size_tolerance: float):
         super().__init__()
         self.size_tolerance = size_tolerance
-        near = cKDTree(pixels).query(pixels, k=min(NEIGHBOURS - 1, len(pixels)))[1][:, 1:].T.copy()
+        near = neighbours(pixels, NEIGHBOURS).T.copy()
         step = np.moveaxis(pixels[near] - pixels, -1, 0).copy()
         nearest, mean = spacing(pixels)
         square = ((pixels[:, None] - pixels) ** 2).sum(-1)
@@ -41,9 +55,24 @@ class Coherence(nn.Module):
         self.register_buffer("nearest", torch.as_tensor(nearest))
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
 
-    def forward(self, pixels, confidence, gradient, predicted, blobs, log_radius, valid):
-        """`pixels [B, D, 2]`, `confidence [B, D]`, `gradient [B, D, 2, 2]`, `predicted [B, D, 2]` px; blobs as for
-        `DotMatcher` -> `[B, D]` in 0..1.
+    def forward(
+        self,
+        pixels: Tensor,
+        confidence: Tensor,
+        gradient: Tensor,
+        predicted: Tensor,
+        blobs: Tensor,
+        log_radius: Tensor,
+        valid: Tensor,
+    ) -> Tensor:
+        """Trust `[B, D]` in 0..1 in the matches of a frame.
+
+        Args:
+            pixels: of the dots as found `[B, D, 2]`, px.
+            confidence: `[B, D]` in 0..1.
+            gradient: of the flow `[B, D, 2, 2]`.
+            predicted: where its neighbours predict each dot `[B, D, 2]`, px.
+            blobs: `[B, K, 2]`, px; log_radius, valid: `[B, K]`, as for `DotMatcher`.
         """
         sure = torch.sigmoid(20 * (confidence - 0.5))
         blobs, pixels, predicted = (x - self.origin for x in (blobs, pixels, predicted))
@@ -51,19 +80,23 @@ class Coherence(nn.Module):
         claimed = ((square < (CLAIM * self.nearest) ** 2) * sure[:, None]).amax(-1)
         misfit = (log_radius - self.log_radius[square.argmin(-1)]) / self.size_tolerance
         left = valid * torch.exp(-0.5 * misfit.square()) * (1 - claimed)
-        own = (pixels - predicted).square().sum(-1).clamp_min(1e-12).sqrt()
+        own = safe_length(pixels - predicted, -1)
         other = square_distance(blobs, predicted).clamp_min(1e-12).sqrt()
         margin = (other - own[:, None]) / self.nearest
         alone = 1 - (left[..., None] * torch.sigmoid(20 * (RIVAL - margin))).amax(1)
         left = (left[:, None] @ torch.exp(-square / (2 * self.reach**2))).squeeze(1) / self.total
         lost = (1 - sure) @ self.share
+        error = self._error_of_steps(pixels, sure, gradient)
+        tear = torch.minimum(lost, left).clamp_min(1e-12).sqrt() * error
+        return alone * torch.sigmoid(8 * (1 - tear / TEAR))
+
+    def _error_of_steps(self, pixels: Tensor, sure: Tensor, gradient: Tensor) -> Tensor:
+        """Relative error `[B, D]`, averaged around every dot, of the steps to its neighbours against the gradient."""
         here = torch.cat([gradient.flatten(2), pixels, sure[..., None]], -1)
         there = here.index_select(1, self.near.flatten()).mT.unflatten(-1, self.near.shape)  # [B, 7, neighbours, D]
         here = here.mT[:, :, None]
         ends = (there[:, :4] + here[:, :4]).unflatten(1, (2, 2)) / 2
         change = there[:, 4:6] - here[:, 4:6] - self.step - (ends * self.step).sum(2)
         pair = there[:, 6] * here[:, 6]
-        error = (pair * change.square().sum(1).clamp_min(1e-12).sqrt() / self.length).sum(1) @ self.share
-        error = error / (pair.sum(1) @ self.share + 1e-3)
-        tear = torch.minimum(lost, left).clamp_min(1e-12).sqrt() * error
-        return alone * torch.sigmoid(8 * (1 - tear / TEAR))
+        error = (pair * safe_length(change, 1) / self.length).sum(1) @ self.share
+        return error / (pair.sum(1) @ self.share + 1e-3)

@@ -2,20 +2,22 @@
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
-from torch import nn
+from torch import Tensor, nn
 
-from ..spacing import spacing, square_distance
+from ..spacing import neighbours, spacing, square_distance
 
 WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
+NEIGHBOURS = 8
 FAR = 1e6
 FADED = 30.0  # exponent of a weight that no longer counts; subnormal numbers are slow
-NEIGHBOURS = 8
 
 
-def mapping():
-    """`[8, 24]`: of `A = [[a, b], [c, d]]`, `a b c d a^2+c^2 ab+cd b^2+d^2 1` to the matrix `[4, 6]` that takes monomials
-    `u v uu uv vv 1` of `x` to `A x`, `|A x|^2` and 1.
+def monomial_map() -> Tensor:
+    """The linear map from a matrix's entries to how it acts on monomials.
+
+    Returns:
+        `[8, 24]`: of `A = [[a, b], [c, d]]`, `a b c d a^2+c^2 ab+cd b^2+d^2 1` to the matrix `[4, 6]` that takes monomials
+        `u v uu uv vv 1` of `x` to `A x`, `|A x|^2` and 1.
     """
     matrix = np.zeros((8, 4, 6))
     matrix[np.arange(8), [0, 0, 1, 1, 2, 2, 2, 3], [0, 1, 0, 1, 2, 3, 4, 5]] = [1, 1, 1, 1, 1, 2, 1, 1]
@@ -28,30 +30,40 @@ class LocalDeformation(nn.Module):
     The dots next to the rest dot at that place are mapped by `A`, laid on the nearest blobs, and `A` fitted, a fixed
     number of times, with an average over nearby blobs between. Nothing needs to be known of which blob is which dot.
     Blobs are the last axis throughout.
+
+    Args:
+        pixels: centres `[D, 2]` of the dots at rest, px.
     """
 
-    def __init__(self, pixels):
+    pixels: Tensor
+    around: Tensor
+    pitch: Tensor
+    monomial_map: Tensor
+
+    def __init__(self, pixels: np.ndarray):
         super().__init__()
-        near = cKDTree(pixels).query(pixels, k=min(NEIGHBOURS + 1, len(pixels)))[1][:, 1:]
         pitch = spacing(pixels)[1]
-        around = (pixels[near] - pixels[:, None]) / pitch[:, None, None]
+        around = (pixels[neighbours(pixels, NEIGHBOURS)] - pixels[:, None]) / pitch[:, None, None]
         self.register_buffer("pixels", torch.as_tensor(pixels))
         u, v = np.moveaxis(around, -1, 0)
         self.register_buffer("around", torch.as_tensor(np.stack([u, v, u * u, u * v, v * v, np.ones_like(u)], 1)))
         self.register_buffer("pitch", torch.as_tensor(pitch))
-        self.register_buffer("mapping", mapping())
+        self.register_buffer("monomial_map", monomial_map())
 
-    def forward(self, blobs, valid):
+    def forward(self, blobs: Tensor, valid: Tensor) -> Tensor:
         """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, 2, 2, K]`."""
-        gradient, *scene = self.begin(blobs, valid)
+        gradient, around, away, beside, nearby = self.begin(blobs, valid)
         for width in WIDTHS:
-            (gradient,) = self.refine(gradient, *scene, valid, width)
+            (gradient,) = self.refine(gradient, around, away, beside, nearby, valid, width)
         return gradient
 
-    def begin(self, blobs, valid):
-        """A first gradient; monomials `[B, K, 6, M]` of the dots around; of the blobs beside, in pitches, what their square
-        distance needs `[B, K, 4, 12]`, and places and validity `[B, K, 3, 12]`; how near all blobs (columns) have the others
-        `[B, K, K]`.
+    def begin(self, blobs: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What the fits need of a frame.
+
+        Returns:
+            A first gradient `[B, 2, 2, K]`; monomials `[B, K, 6, M]` of the dots around; of the blobs beside, in pitches,
+            what their square distance needs `[B, K, 4, 12]`, and positions and validity `[B, K, 3, 12]`; how near all
+            blobs (columns) have the others `[B, K, K]`.
         """
         middle = self.pixels.mean(0)
         own = square_distance(blobs - middle, self.pixels - middle).argmin(-1)
@@ -59,8 +71,8 @@ class LocalDeformation(nn.Module):
         apart = square_distance(blobs - middle, blobs - middle)
         index = (apart + FAR * (1 - valid[:, None])).topk(min(13, blobs.shape[1]), largest=False).indices[..., 1:]
         known = torch.cat([blobs.mT, valid[:, None]], 1).gather(2, index.flatten(1)[:, None].expand(-1, 3, -1))
-        place, there = known.unflatten(2, index.shape[1:]).split([2, 1], 1)
-        others = (place - blobs.mT[..., None]) / pitch[:, None, :, None]  # [B, 2, K, 12]
+        position, there = known.unflatten(2, index.shape[1:]).split([2, 1], 1)
+        others = (position - blobs.mT[..., None]) / pitch[:, None, :, None]  # [B, 2, K, 12]
         square = others.square().sum(1, keepdim=True)
         away = torch.cat([-2 * others, torch.ones_like(square), square], 1)
         beside = torch.cat([others * there, there], 1)
@@ -69,13 +81,15 @@ class LocalDeformation(nn.Module):
         ratio = square[:, 0, :, :4].clamp_min(1e-12).sqrt().mean(-1).clamp(0.4, 2.0)
         return ratio[:, None, None] * eye, around, away.transpose(1, 2), beside.transpose(1, 2), nearby
 
-    def refine(self, gradient, around, away, beside, nearby, valid, width):
-        """The gradient after another fit, with blobs believed up to about `width` pitches off."""
+    def refine(
+        self, gradient: Tensor, around: Tensor, away: Tensor, beside: Tensor, nearby: Tensor, valid: Tensor, width: float
+    ) -> tuple[Tensor]:
+        """The gradient after another fit, with blobs believed up to about `width` pitches off; the rest as of `begin`."""
         a, b, c, d = gradient.flatten(1, 2).unbind(1)
         entries = torch.stack([a, b, c, d, a * a + c * c, a * b + c * d, b * b + d * d, torch.ones_like(a)], -1)
-        mapped = (entries * (-0.5 / width**2) @ self.mapping).unflatten(-1, (4, 6)) @ around
+        mapped = (entries * (-0.5 / width**2) @ self.monomial_map).unflatten(-1, (4, 6)) @ around
         target = beside @ torch.exp((away.mT @ mapped).clamp_min(-FADED))
-        target = target / (target[:, :, 2:] + 0.1)  # weight times place, weight: [B, K, 3, M]
+        target = target / (target[:, :, 2:] + 0.1)  # weight times position, weight: [B, K, 3, M]
         sums = (target @ around.mT).flatten(-2).mT.unflatten(1, (3, 6))
         load = sums[:, :2, :2] + 0.2 * gradient
         uu, uv, vv, weight = (sums[:, 2, 2:] + sums.new_tensor([0.2, 0, 0.2, 0])[:, None]).unbind(1)

@@ -12,28 +12,47 @@ import torch
 from torch import Tensor, nn
 
 from ...errors import MembraneError
-from ..neighbourhood import NEIGHBOURS, LocalFlow, Neighbourhood
-from .pyramid import LEVELS, pyramid
+from ..neighbourhood import NEIGHBOURS, NeighbourFlow, Neighbourhood
+from .pyramid import LEVELS, low_pass_pyramid
 from .template import RADIUS, Search, Template
 
-HEARSAY = 1e-3  # weight of a lost patch's predicted flow: heard only where nobody knows better
+HEARSAY = 1e-3  # weight of a lost patch's predicted flow: it counts only where no neighbour is found
 
 
 class TextureLocator(nn.Module):
     """Find the patches of a rest image again in other images of the deformed membrane.
 
-    A patch is compared up to gain and offset of the light, warped by an affine map (normalised correlation). Wrong when
-    the membrane moved by more than about 25 px, where reflections or shadows are the texture, and on a static thing in
-    front of the membrane as large as a neighbourhood: what is seen is followed, at rest (keep it out of the mask).
+    A patch is compared up to gain and offset of the light, warped by an affine map (normalised correlation).
 
     Args:
-        rest_image: [H, W], grey in 0..1.
-        pixels: patch centres [D, 2], px, from `choose_patches`.
-        anchors: pixels [A, 2] on the rim, where nothing moves, or None.
+        rest_image: `[H, W]`, grey in 0..1.
+        pixels: patch centres `[D, 2]`, px, from `choose_patches`.
+        anchors: pixels `[A, 2]` on the rim, where nothing moves, or None.
+
+    Attributes:
+        follows: False; patches are searched for from rest in every frame.
 
     Raises:
-        MembraneError: the image is not [H, W], or there are too few patches, or some lie outside the image.
+        MembraneError: the image is not `[H, W]`, or there are too few patches, or some lie outside the image.
+
+    Limitations:
+        Patches that moved by more than about 25 px are lost. Where reflections or shadows are the texture, and on a static
+        thing in front of the membrane as large as a neighbourhood, what the image shows is followed, at rest (keep it out
+        of the mask).
+
+    Example:
+        >>> from scipy.ndimage import gaussian_filter
+        >>> from torchmembrane.markers.texture import choose_patches
+        >>> rest = gaussian_filter(np.random.default_rng(0).random((80, 100)), 2)
+        >>> rest = (rest - rest.min()) / np.ptp(rest)
+        >>> locator = TextureLocator(rest, choose_patches(rest, np.ones((80, 100), bool), 200))
+        >>> pixels, confidence = locator(torch.tensor(np.roll(rest, 3, 1)[None, None]).float())
+        >>> (pixels - locator.rest_pixels)[0][:, 0].median().round(decimals=2).item(), bool(confidence.median() > 0.9)
+        (3.0, True)
     """
+
+    follows = False
+    rest_pixels: Tensor
 
     def __init__(self, rest_image: np.ndarray, pixels: np.ndarray, anchors: np.ndarray | None = None):
         super().__init__()
@@ -52,19 +71,21 @@ class TextureLocator(nn.Module):
         self.size = rest_image.shape
         self.register_buffer("rest_pixels", torch.as_tensor(pixels))
         self.neighbourhood = Neighbourhood(pixels, anchors)
-        levels = enumerate(pyramid(torch.as_tensor(rest_image)[None, None]))
-        self.templates = nn.ModuleList(Template(rest, self.rest_pixels / 2**level, RADIUS[level]) for level, rest in levels)
-        self.search = Search(self.templates[-1])
+        levels = enumerate(low_pass_pyramid(torch.as_tensor(rest_image)[None, None]))
+        templates = [Template(rest, self.rest_pixels / 2**level, RADIUS[level]) for level, rest in levels]
+        self.templates = nn.ModuleList(templates)
+        self.search = Search(templates[-1])
         self.to(torch.get_default_dtype())
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels and confidence of the patches; the gradient takes the last level only, the rest is where to look.
+    def forward(self, image: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Locate the patches in a batch of frames; the gradient takes the last level only, the rest is where to look.
 
         Args:
-            image: [B, 1, H, W], grey in 0..1, of the rest image's size.
+            image: `[B, 1, H, W]`, grey in 0..1, of the rest image's size.
+            previous: not used, as `follows` says.
 
         Returns:
-            pixels [B, D, 2] and confidence [B, D] in 0..1; a lost patch has confidence 0 and the pixel that its
+            Pixels `[B, D, 2]` and confidence `[B, D]` in 0..1; a lost patch has confidence 0 and the pixel that its
             neighbours predict.
 
         Raises:
@@ -76,7 +97,7 @@ class TextureLocator(nn.Module):
                 f"TextureLocator: image has shape {tuple(image.shape)}, expected [B, 1, {height}, {width}] "
                 "like the rest image; give grey images from the same camera, not resized"
             )
-        images = pyramid(image)
+        images = low_pass_pyramid(image)
         still = [level.detach() for level in images]
         shift, score = self.search(still[-1])
         flow, local = self.settle(2 ** (LEVELS - 1) * shift, score, torch.zeros_like(shift), 1.0)
@@ -89,8 +110,8 @@ class TextureLocator(nn.Module):
         confidence = likeness * local.trust(found)
         return self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow), confidence
 
-    def settle(self, found: Tensor, weight: Tensor, before: Tensor, tolerance: float) -> tuple[Tensor, LocalFlow]:
-        """The flow [B, D, 2]: `found` where its neighbours bear it out, else what they say, starting from `before`."""
+    def settle(self, found: Tensor, weight: Tensor, before: Tensor, tolerance: float) -> tuple[Tensor, NeighbourFlow]:
+        """The flow `[B, D, 2]`: `found` where its neighbours bear it out, else what they predict, starting from `before`."""
         guess = torch.where((weight > 0)[..., None], found, before)
         local = self.neighbourhood(guess, weight.clamp(min=HEARSAY), tolerance)
         trust = (weight * local.trust(found))[..., None]

@@ -13,15 +13,21 @@ def choose_patches(image: np.ndarray, mask: np.ndarray, count: int = 1200) -> np
     """Choose the patches to follow: corners with a well-conditioned structure tensor, spread evenly.
 
     Args:
-        image: rest image [H, W], grey in 0..1.
-        mask: [H, W] bool, where the membrane is seen.
+        image: rest image `[H, W]`, grey in 0..1.
+        mask: `[H, W]` bool, where the membrane is visible.
         count: patches wanted if all of the mask were textured.
 
     Returns:
-        Patch centres [D, 2], px, the best conditioned first.
+        Patch centres `[D, 2]`, px, the best conditioned first.
 
     Raises:
         MembraneError: image and mask differ in shape, or fewer than 30 places have texture in two directions.
+
+    Example:
+        >>> image = np.random.default_rng(0).random((120, 160))
+        >>> patches = choose_patches(gaussian_filter(image, 2), np.ones((120, 160), bool), 200)
+        >>> len(patches) > 30, bool((patches >= 5).all())
+        (True, True)
     """
     if np.ndim(image) != 2 or np.shape(mask) != np.shape(image):
         raise MembraneError(
@@ -38,10 +44,10 @@ def choose_patches(image: np.ndarray, mask: np.ndarray, count: int = 1200) -> np
     margin = int(spacing) + 1
     taken = np.zeros(np.add(image.shape, 2 * margin), bool)
     chosen = []
-    for place in np.stack([v, u], 1)[order]:
-        if not taken[tuple(place + margin)]:
-            chosen.append(place)
-            taken[tuple((place + margin + disc).T)] = True
+    for pixel in np.stack([v, u], 1)[order]:
+        if not taken[tuple(pixel + margin)]:
+            chosen.append(pixel)
+            taken[tuple((pixel + margin + disc).T)] = True
     if len(chosen) < 30:
         raise MembraneError(
             f"choose_patches: {len(chosen)} textured places in a mask of {int(mask.sum())} px, expected 30 or more; "
@@ -51,7 +57,7 @@ def choose_patches(image: np.ndarray, mask: np.ndarray, count: int = 1200) -> np
 
 
 def weakest_gradient(image: np.ndarray) -> np.ndarray:
-    """Root of the structure tensor's smaller eigenvalue [H, W], grey per px, over about a patch."""
+    """Root of the structure tensor's smaller eigenvalue `[H, W]`, grey per px, over about a patch of `image [H, W]`."""
     v, u = np.gradient(gaussian_filter(np.asarray(image, float), 1.0))
     uu, uv, vv = (gaussian_filter(product, RADIUS[0] / 2) for product in (u * u, u * v, v * v))
     return np.sqrt(np.maximum((uu + vv) / 2 - np.sqrt((uu - vv) ** 2 / 4 + uv**2), 0.0))

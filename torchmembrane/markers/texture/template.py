@@ -12,8 +12,13 @@ WIDTH = 0.6  # standard deviation of a patch's Gaussian window over its half sid
 WARP_DAMPING = 1e-3  # grey^2: keeps weak texture from bending a patch's own affine map with the noise
 
 
-def square(radius: int) -> Tensor:
-    """Integer offsets [(2 radius + 1)^2, 2] in rows of u."""
+def square_offsets(radius: int) -> Tensor:
+    """Integer offsets `[(2 radius + 1)^2, 2]` in rows of u.
+
+    Example:
+        >>> square_offsets(1)[:4].tolist()
+        [[-1.0, -1.0], [0.0, -1.0], [1.0, -1.0], [-1.0, 0.0]]
+    """
     line = torch.arange(-radius, radius + 1, dtype=torch.float64)
     v, u = torch.meshgrid(line, line, indexing="ij")
     return torch.stack([u, v], -1).reshape(-1, 2)
@@ -22,13 +27,28 @@ def square(radius: int) -> Tensor:
 class Template(nn.Module):
     """Patches of one level of the rest image, and the Gauss-Newton steps that bring an image's patches onto them.
 
-    With T the patch less its weighted mean, scaled to unit variance, and S its six derivatives (by shift, by affine
-    map) made orthogonal to 1 and T, a step is (S^T S)^-1 S^T I / (T . I): linear in the image I but for the gain.
+    With `T` the patch less its weighted mean, scaled to unit variance, and `S` its six derivatives (by shift, by affine
+    map) made orthogonal to 1 and `T`, a step is `(S^T S)^-1 S^T I / (T . I)`: linear in the image `I` but for the gain.
+
+    Args:
+        rest: the level of the rest image `[1, 1, H, W]`.
+        centre: of the patches `[D, 2]`, px of the level.
+        radius: half side of a patch, px of the level.
+
+    Reference:
+        Baker and Matthews, Lucas-Kanade 20 years on, IJCV 56, 2004 (inverse compositional).
     """
+
+    centre: Tensor
+    offset: Tensor
+    radius: Tensor
+    weight: Tensor
+    unit: Tensor
+    rows: Tensor
 
     def __init__(self, rest: Tensor, centre: Tensor, radius: int):
         super().__init__()
-        offset = square(radius)
+        offset = square_offsets(radius)
         weight = torch.exp(-offset.square().sum(-1) / (2 * (WIDTH * radius) ** 2))
         weight = weight / weight.sum()
         still = torch.eye(2).to(rest)[None, None]
@@ -52,7 +72,17 @@ class Template(nn.Module):
         self.register_buffer("rows", torch.cat([weight.expand_as(unit), weight * unit, newton], 1))  # [D, 8, N]
 
     def forward(self, image: Tensor, flow: Tensor, gradient: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Refined flow [B, D, 2], px of the level, and likeness [B, D] in 0..1 by correlation, before the last step."""
+        """Bring the patches of an image onto the rest image's.
+
+        Args:
+            image: the level of the image `[B, 1, H, W]`.
+            flow: `[B, D, 2]` to begin with, px of the level.
+            gradient: of the flow `[B, D, 2, 2]`.
+            steps: Gauss-Newton steps.
+
+        Returns:
+            Flow `[B, D, 2]`, px of the level, and likeness `[B, D]` in 0..1 by correlation, before the last step.
+        """
         eye = torch.eye(2, dtype=flow.dtype, device=flow.device)
         affine = gradient + eye
         for _ in range(steps):
@@ -70,19 +100,26 @@ class Template(nn.Module):
 class Search(nn.Module):
     """Exhaustive normalised correlation of the coarsest templates over all shifts up to `REACH`."""
 
+    centre: Tensor
+    offset: Tensor
+    unit: Tensor
+    weight: Tensor
+    shift: Tensor
+    near: Tensor
+
     def __init__(self, template: Template):
         super().__init__()
         self.side = 2 * (RADIUS[-1] + REACH) + 1
-        side, shift = 2 * RADIUS[-1] + 1, square(REACH)
+        side, shift = 2 * RADIUS[-1] + 1, square_offsets(REACH)
         self.register_buffer("centre", template.centre.clone())
-        self.register_buffer("offset", square(RADIUS[-1] + REACH))
+        self.register_buffer("offset", square_offsets(RADIUS[-1] + REACH))
         self.register_buffer("unit", template.unit.reshape(-1, 1, side, side).clone())
         self.register_buffer("weight", template.weight.reshape(1, 1, side, side).clone())
         self.register_buffer("shift", shift)
         self.register_buffer("near", torch.exp(-(shift[:, None] - shift).square().sum(-1) / 2))
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Shift [B, D, 2] of the highest correlation, px of the level, and a score [B, D] in 0..1: high and unique?"""
+        """Shift `[B, D, 2]` of the highest correlation, px of the level, and a score `[B, D]` in 0..1: high and unique?"""
         still = torch.eye(2, dtype=image.dtype, device=image.device).expand(image.shape[0], 1, 2, 2)
         window = sample(image, self.centre.expand(image.shape[0], -1, -1), still, self.offset)
         window = (window - window.mean(-1, keepdim=True)).unflatten(-1, (self.side, self.side))
@@ -92,8 +129,8 @@ class Search(nn.Module):
         mean = F.conv2d(window, weight, groups=patches)
         variance = F.conv2d(window.square(), weight, groups=patches) - mean.square()
         ncc = (product / (variance.clamp(min=0) + 1e-6).sqrt()).flatten(-2)
-        best, place = ncc.max(-1)
-        near = self.near[place]
+        best, at = ncc.max(-1)
+        near = self.near[at]
         share = torch.softmax(40 * ncc, -1) * near
         shift = (share @ self.shift) / (share.sum(-1, keepdim=True) + 1e-12)
         rival = (ncc - 2 * near).amax(-1)
