@@ -12,7 +12,7 @@ HEIGHT, WIDTH = 240, 320
 CENTRE = np.array([165.0, 115.0])
 V, U = np.mgrid[:HEIGHT, :WIDTH]
 VIGNETTE = 1 - 0.5 * ((U - 190) ** 2 + (V - 100) ** 2) / 220**2
-SEEN = ((U - 160) / 150) ** 2 + ((V - 120) / 112) ** 2 < 1
+VISIBLE = ((U - 160) / 150) ** 2 + ((V - 120) / 112) ** 2 < 1
 
 
 def speckle(points, seed, waves=120):
@@ -71,7 +71,7 @@ def pressed():
 
 @pytest.fixture(scope="module")
 def pixels(rest):
-    return choose_patches(rest, SEEN, 500)
+    return choose_patches(rest, VISIBLE, 500)
 
 
 @pytest.fixture(scope="module")
@@ -89,23 +89,23 @@ def errors(locator, image, true):
 
 def test_patches_are_textured_inside_the_mask_and_spread_evenly(rest):
     half = np.where(U < 160, rest, 0.4)
-    chosen = choose_patches(half, SEEN, 500)
+    chosen = choose_patches(half, VISIBLE, 500)
     u, v = chosen.astype(int).T
-    assert SEEN[v, u].all() and (u < 175).all()
+    assert VISIBLE[v, u].all() and (u < 175).all()
     distance = np.linalg.norm(chosen[:, None] - chosen, axis=-1) + 1e9 * np.eye(len(chosen))
-    assert distance.min() > 0.8 * np.sqrt(SEEN.sum() / 500)
-    lattice = np.argwhere(SEEN & (U < 145) & (U > 20))[::97, ::-1]
+    assert distance.min() > 0.8 * np.sqrt(VISIBLE.sum() / 500)
+    lattice = np.argwhere(VISIBLE & (U < 145) & (U > 20))[::97, ::-1]
     assert np.linalg.norm(lattice[:, None] - chosen, axis=-1).min(1).max() < 25
 
 
 def test_stripes_are_no_texture():
     with pytest.raises(MembraneError, match="choose_patches: .* textured places"):
-        choose_patches(0.5 + 0.3 * np.sin(U / 3.0), SEEN)
+        choose_patches(0.5 + 0.3 * np.sin(U / 3.0), VISIBLE)
 
 
 def test_shapes_are_checked(rest, pixels, locator):
     with pytest.raises(MembraneError, match="mask"):
-        choose_patches(rest, SEEN.T)
+        choose_patches(rest, VISIBLE.T)
     with pytest.raises(MembraneError, match="pixels from"):
         TextureLocator(rest, pixels + 100.0)
     with pytest.raises(MembraneError, match=r"D > 16"):

@@ -16,7 +16,7 @@ from ..neighbourhood import NEIGHBOURS, NeighbourFlow, Neighbourhood
 from .pyramid import LEVELS, low_pass_pyramid
 from .template import RADIUS, Search, Template
 
-HEARSAY = 1e-3  # weight of a lost patch's predicted flow: it counts only where no neighbour is found
+LOST_WEIGHT = 1e-3  # of a lost patch's predicted flow in its neighbours' fits: it counts only where none of them is found
 
 
 class TextureLocator(nn.Module):
@@ -113,6 +113,6 @@ class TextureLocator(nn.Module):
     def settle(self, found: Tensor, weight: Tensor, before: Tensor, tolerance: float) -> tuple[Tensor, NeighbourFlow]:
         """The flow `[B, D, 2]`: `found` where its neighbours bear it out, else what they predict, starting from `before`."""
         guess = torch.where((weight > 0)[..., None], found, before)
-        local = self.neighbourhood(guess, weight.clamp(min=HEARSAY), tolerance)
+        local = self.neighbourhood(guess, weight.clamp(min=LOST_WEIGHT), tolerance)
         trust = (weight * local.trust(found))[..., None]
         return trust * found + (1 - trust) * local.flow, local
