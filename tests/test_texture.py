@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import correlate1d
 
 from torchmembrane.errors import MembraneError
 from torchmembrane.markers.neighbourhood import Neighbourhood, inverse_2x2
 from torchmembrane.markers.texture import TextureLocator, choose_patches
+from torchmembrane.markers.texture.pyramid import low_pass_pyramid
 
 HEIGHT, WIDTH = 240, 320
 CENTRE = np.array([165.0, 115.0])
@@ -85,6 +87,16 @@ def errors(locator, image, true):
         found, confidence = locator(batch(image))
     assert torch.isfinite(found).all() and (confidence >= 0).all() and (confidence <= 1).all()
     return np.linalg.norm(found[0].numpy() - true, axis=1), confidence[0].numpy()
+
+
+@pytest.mark.parametrize("size", [(24, 32), (25, 35)])
+def test_levels_are_every_other_pixel_of_the_binomial_low_pass(size):
+    image = np.random.default_rng(0).random(size)
+    for k, level in enumerate(low_pass_pyramid(torch.tensor(image)[None, None])):
+        for axis in (0, 1):
+            image = correlate1d(image, np.array([1, 4, 6, 4, 1]) / 16, axis, mode="nearest")
+        image = image if k == 0 else image[::2, ::2]
+        np.testing.assert_allclose(level[0, 0].numpy(), image, atol=1e-12)
 
 
 def test_patches_are_textured_inside_the_mask_and_spread_evenly(rest):
