@@ -31,7 +31,7 @@ from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
 from torchmembrane.errors import MembraneError
 from torchmembrane.io.images import to_grey
-from torchmembrane.markers.dots import find_dots
+from torchmembrane.markers.dots.pattern import find_dots
 from torchmembrane.plot.calibration import Report, fit_figure, layout_figure, surface_figure
 from torchmembrane.plot.frames import save
 from torchmembrane.presets import preset

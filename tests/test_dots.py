@@ -10,9 +10,14 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.markers.dots import DotPattern, find_dots, measure_dots
-from torchmembrane.markers.locate import DotLocator, EllipseFit, bands, blur_rows, metric_of, pyramid
-from torchmembrane.markers.match import Coherence, mapping
+from torchmembrane.markers.dots.bands import bands, blur_rows
+from torchmembrane.markers.dots.coherence import Coherence
+from torchmembrane.markers.dots.deformation import monomial_map
+from torchmembrane.markers.dots.ellipse import metric_of
+from torchmembrane.markers.dots.fit import EllipseFit
+from torchmembrane.markers.dots.locator import DotLocator
+from torchmembrane.markers.dots.pattern import DotPattern, find_dots, measure_dots
+from torchmembrane.markers.dots.pyramid import mean_pyramid
 
 SIZE, CENTRE, RADIUS, PITCH = (320, 240), np.array([158.3, 119.6]), 112.0, 22.0
 PATTERNS = [("square", True), ("square", False), ("hexagonal", True), ("hexagonal", False)]
@@ -228,14 +233,14 @@ def test_a_dot_out_of_line_with_the_flow_is_not_believed(two):
     s, locate = two
     truth, shapes = deform(s, slide, 0.3)
     same = np.where(s.sizes == s.sizes[0])[0]
-    stray = same[np.linalg.norm(s.pixels[same] - CENTRE, axis=1).argmin()]
-    beside = np.argsort(np.linalg.norm(s.pixels - s.pixels[stray], axis=1))[1]
+    outlier = same[np.linalg.norm(s.pixels[same] - CENTRE, axis=1).argmin()]
+    beside = np.argsort(np.linalg.norm(s.pixels - s.pixels[outlier], axis=1))[1]
     moved = truth.copy()
-    moved[stray] += 0.65 * (truth[beside] - truth[stray])
+    moved[outlier] += 0.65 * (truth[beside] - truth[outlier])
     kept = np.arange(len(truth)) != beside
     _, confidence = locate(batch(render(moved, shapes, kept=kept)))
-    assert confidence[0, [stray, beside]].max() < 0.5
-    assert np.delete(confidence[0].numpy(), [stray, beside]).min() > 0.5
+    assert confidence[0, [outlier, beside]].max() < 0.5
+    assert np.delete(confidence[0].numpy(), [outlier, beside]).min() > 0.5
 
 
 def test_a_bar_beside_a_border_dot_is_not_taken_for_it():
@@ -365,7 +370,7 @@ def test_the_pixels_are_differentiable_in_the_image():
 
 def test_levels_of_the_pyramid_keep_the_mean():
     image = torch.rand(2, 1, 16, 24, generator=torch.Generator().manual_seed(0))
-    for level in pyramid(image):
+    for level in mean_pyramid(image):
         torch.testing.assert_close(level.mean((1, 2, 3)), image.mean((1, 2, 3)))
 
 
@@ -393,7 +398,7 @@ def test_windows_hold_the_pixels_around_each_dot_at_their_places(radius):
     v, u = np.mgrid[: SIZE[1], : SIZE[0]].astype(float)
     pixels = np.random.default_rng(0).uniform(60, 180, (7, 2))
     fit = EllipseFit(pixels, np.broadcast_to(radius * np.eye(2), (7, 2, 2)), SIZE, 0.45).double()
-    values, middle = fit.windows(pyramid(batch(u + 1000 * v, dtype=torch.float64)), torch.tensor(pixels)[None])
+    values, middle = fit.windows(mean_pyramid(batch(u + 1000 * v, dtype=torch.float64)), torch.tensor(pixels)[None])
     place = middle[..., None] + fit.stride[:, None, None] * fit.linear[1:]
     torch.testing.assert_close(values, place[..., 0, :] + 1000 * place[..., 1, :])
     assert (middle - torch.tensor(pixels)).abs().max() <= 0.5 * fit.stride.max() + 1e-9
@@ -410,14 +415,14 @@ def test_the_mapping_takes_monomials_of_a_point_to_its_image():
     (a, b), (c, d), (u, v), one = *A, x, torch.ones(3, dtype=torch.float64)
     entries = torch.stack([a, b, c, d, a * a + c * c, a * b + c * d, b * b + d * d, one[0]])
     y = A @ x
-    got = (entries @ mapping()).reshape(4, 6) @ torch.stack([u, v, u * u, u * v, v * v, one])
+    got = (entries @ monomial_map()).reshape(4, 6) @ torch.stack([u, v, u * u, u * v, v * v, one])
     torch.testing.assert_close(got, torch.stack([*y, y.square().sum(0), one]))
 
 
 def test_the_fit_does_not_run_off_to_a_neighbour():
     pixels = CENTRE + PITCH * np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), -1).reshape(-1, 2)
     shapes = np.broadcast_to(2.7 * np.eye(2), (25, 2, 2))
-    levels = pyramid(batch(render(pixels, shapes), dtype=torch.float64))
+    levels = mean_pyramid(batch(render(pixels, shapes), dtype=torch.float64))
     begin = torch.tensor(pixels + [9.0, 0.0])[None]
     fit = EllipseFit(pixels, shapes, SIZE, 0.45, steps=8).double()
     centre, _, _ = fit(levels, begin, torch.tensor(shapes)[None])

@@ -11,7 +11,7 @@ from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.flow import FlowInterpolation
 from torchmembrane.estimators.force_balance import ForceBalance
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
-from torchmembrane.markers.screen import MismatchScreen
+from torchmembrane.markers.screening import MismatchScreen
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.press import carried, press
@@ -59,7 +59,7 @@ def test_mismatched_markers_are_flagged_and_no_others(pressed):
         assert torch.equal(screen((wrong - rest)[None], one)[0] < 0.5, flags)
 
 
-def test_a_lost_marker_has_no_say_and_stays_lost(pressed):
+def test_a_lost_marker_has_zero_weight_and_stays_lost(pressed):
     rest, anchors, pixels, _, _ = pressed
     screen = MismatchScreen(rest.numpy(), anchors.numpy())
     confidence = torch.ones(2, len(rest), dtype=torch.float64)

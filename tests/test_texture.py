@@ -3,15 +3,19 @@
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import correlate1d
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.markers.texture import Neighbourhood, TextureLocator, choose_patches, inverse_2x2
+from torchmembrane.markers.neighbourhood import Neighbourhood, inverse_2x2
+from torchmembrane.markers.texture.locator import TextureLocator
+from torchmembrane.markers.texture.patches import choose_patches
+from torchmembrane.markers.texture.pyramid import low_pass_pyramid
 
 HEIGHT, WIDTH = 240, 320
 CENTRE = np.array([165.0, 115.0])
 V, U = np.mgrid[:HEIGHT, :WIDTH]
 VIGNETTE = 1 - 0.5 * ((U - 190) ** 2 + (V - 100) ** 2) / 220**2
-SEEN = ((U - 160) / 150) ** 2 + ((V - 120) / 112) ** 2 < 1
+VISIBLE = ((U - 160) / 150) ** 2 + ((V - 120) / 112) ** 2 < 1
 
 
 def speckle(points, seed, waves=120):
@@ -70,7 +74,7 @@ def pressed():
 
 @pytest.fixture(scope="module")
 def pixels(rest):
-    return choose_patches(rest, SEEN, 500)
+    return choose_patches(rest, VISIBLE, 500)
 
 
 @pytest.fixture(scope="module")
@@ -86,25 +90,35 @@ def errors(locator, image, true):
     return np.linalg.norm(found[0].numpy() - true, axis=1), confidence[0].numpy()
 
 
+@pytest.mark.parametrize("size", [(24, 32), (25, 35)])
+def test_levels_are_every_other_pixel_of_the_binomial_low_pass(size):
+    image = np.random.default_rng(0).random(size)
+    for k, level in enumerate(low_pass_pyramid(torch.tensor(image)[None, None])):
+        for axis in (0, 1):
+            image = correlate1d(image, np.array([1, 4, 6, 4, 1]) / 16, axis, mode="nearest")
+        image = image if k == 0 else image[::2, ::2]
+        np.testing.assert_allclose(level[0, 0].numpy(), image, atol=1e-12)
+
+
 def test_patches_are_textured_inside_the_mask_and_spread_evenly(rest):
     half = np.where(U < 160, rest, 0.4)
-    chosen = choose_patches(half, SEEN, 500)
+    chosen = choose_patches(half, VISIBLE, 500)
     u, v = chosen.astype(int).T
-    assert SEEN[v, u].all() and (u < 175).all()
+    assert VISIBLE[v, u].all() and (u < 175).all()
     distance = np.linalg.norm(chosen[:, None] - chosen, axis=-1) + 1e9 * np.eye(len(chosen))
-    assert distance.min() > 0.8 * np.sqrt(SEEN.sum() / 500)
-    lattice = np.argwhere(SEEN & (U < 145) & (U > 20))[::97, ::-1]
+    assert distance.min() > 0.8 * np.sqrt(VISIBLE.sum() / 500)
+    lattice = np.argwhere(VISIBLE & (U < 145) & (U > 20))[::97, ::-1]
     assert np.linalg.norm(lattice[:, None] - chosen, axis=-1).min(1).max() < 25
 
 
 def test_stripes_are_no_texture():
     with pytest.raises(MembraneError, match="choose_patches: .* textured places"):
-        choose_patches(0.5 + 0.3 * np.sin(U / 3.0), SEEN)
+        choose_patches(0.5 + 0.3 * np.sin(U / 3.0), VISIBLE)
 
 
 def test_shapes_are_checked(rest, pixels, locator):
     with pytest.raises(MembraneError, match="mask"):
-        choose_patches(rest, SEEN.T)
+        choose_patches(rest, VISIBLE.T)
     with pytest.raises(MembraneError, match="pixels from"):
         TextureLocator(rest, pixels + 100.0)
     with pytest.raises(MembraneError, match=r"D > 16"):
@@ -167,7 +181,7 @@ def test_lost_pixels_are_what_the_neighbours_predict(locator, pixels):
     assert np.median(error[hidden]) < 0.7 and error[hidden].max() < 3
 
 
-def test_affine_flow_is_predicted_and_outliers_have_no_say(pixels):
+def test_affine_flow_is_predicted_and_outliers_have_zero_weight(pixels):
     gradient, shift = torch.tensor([[0.1, -0.2], [0.3, 0.05]]), torch.tensor([3.0, -2.0])
     flow = (torch.tensor(pixels, dtype=torch.float32) @ gradient.T + shift)[None]
     broken = flow.clone()

@@ -18,7 +18,7 @@ from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
 from .io.status import Status
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
-from .markers.place import place_markers
+from .markers.placement import place_markers
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
 

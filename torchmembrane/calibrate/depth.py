@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
-from ..markers.place import rim_mask
+from ..markers.placement import rim_mask
 from ..sensor.sensor import Sensor
 from .surface import Correction, SurfaceProjection, correction, fine_surface, recalibrated, surface_projection
 from .views import placed_dots

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..errors import MembraneError
 from ..io.optional import load_opencv
-from ..markers.dots import find_dots
+from ..markers.dots.pattern import find_dots
 from ..targets import LARGE, MARKS, Checkerboard, DotBoard
 
 WINDOW = 0.35  # of the shortest side of a square, in which a corner is fitted

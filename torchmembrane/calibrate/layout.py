@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
-from ..markers.place import rim_mask
+from ..markers.placement import rim_mask
 from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from ..surface.topology import rim_loop

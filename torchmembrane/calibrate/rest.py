@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.func import jacfwd, vmap
 
 from ..errors import MembraneError
-from ..markers.dots import measure_dots
+from ..markers.dots.pattern import measure_dots
 from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from .fit import Fit, fit, outliers, outline_centres, rotations, with_common_errors

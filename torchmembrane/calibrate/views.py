@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
-from ..markers.dots import find_dots
-from ..markers.place import rim_mask
+from ..markers.dots.pattern import find_dots
+from ..markers.placement import rim_mask
 from ..sensor.sensor import Sensor
 from .bundle import Bundle, bundle_adjusted
 from .fit import Fit, rotations, with_common_errors

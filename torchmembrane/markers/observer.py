@@ -8,9 +8,9 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..io.status import Status
-from .locate import DotLocator
-from .place import FEWEST_MARKERS, PlacedMarkers
-from .screen import MismatchScreen
+from .locator import Locator
+from .placement import FEWEST_MARKERS, PlacedMarkers
+from .screening import MismatchScreen
 
 FOUND = 0.5
 """Confidence above which a marker counts as found."""
@@ -48,7 +48,7 @@ class MarkerObserver(nn.Module):
         self, markers: PlacedMarkers, rim_pixels: np.ndarray, name: str, dtype: torch.dtype, rest_image: np.ndarray | None
     ):
         super().__init__()
-        self.locator = markers.locator
+        self.locator: Locator = markers.locator
         self.screen = MismatchScreen(markers.model_pixels, rim_pixels)
         self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
         self.register_buffer("measured_rest", torch.from_numpy(markers.model_pixels))
@@ -66,11 +66,6 @@ class MarkerObserver(nn.Module):
             )
         return torch.where(found[0, :, None], pixels[0], self.measured_rest)
 
-    @property
-    def follows(self) -> bool:
-        """Whether markers are followed from frame to frame: dots are."""
-        return isinstance(self.locator, DotLocator)
-
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels `[B, D, 2]` of the markers in grey images `[B, 1, height, width]`, and which of them are found `[B, D]`."""
         with torch.no_grad():
@@ -86,8 +81,8 @@ class MarkerObserver(nn.Module):
             rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: in the rest image.
         """
         status = self.check(images)
-        before = () if previous is None or not self.follows else (self.located(previous),)
-        return MarkerFlow(*self.displaced(*self.locator(images, *before), status, rest_pixels), status)
+        before = None if previous is None else self.located(previous)
+        return MarkerFlow(*self.displaced(*self.locator(images, before), status, rest_pixels), status)
 
     def check(self, images: Tensor) -> Tensor:
         """Status `[B]` of images."""

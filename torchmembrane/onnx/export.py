@@ -20,8 +20,11 @@ from ..estimators.force_balance import ForceBalance
 from ..estimators.minimum_energy import STEPS
 from ..io.results import STATUS_TEXTS, Reconstruction
 from ..io.store import Mesh, Settings
-from ..markers.locate import LEVELS, DotLocator
-from ..markers.match import SETTLING, WIDTHS, DotMatcher, LocalDeformation
+from ..markers.dots.deformation import WIDTHS, LocalDeformation
+from ..markers.dots.locator import DotLocator
+from ..markers.dots.match import SETTLING, DotMatcher
+from ..markers.dots.pyramid import LEVELS
+from ..mechanics.cavity import Equilibrium
 from ..reconstruct import Reconstructor
 from ..solve.block_tridiagonal import parts
 from .graph import Assembly, traced

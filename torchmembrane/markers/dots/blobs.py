@@ -1,0 +1,115 @@
+"""Compact dark blobs in one image, found without any prior."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from ...errors import MembraneError
+
+SCALES = 1.25  # ratio of neighbouring scales
+SMALLEST = 1.2  # px, radius of the smallest dot looked for
+LARGEST = 1 / 16  # radius of the largest, of the image's shorter side
+ELONGATION = 4.0  # long over short axis of a dot at most
+SOLIDITY = 0.75  # of its ellipse that a dot fills, or a dot that its ellipse fills
+
+
+class Blob(NamedTuple):
+    """What the pixels of one blob are: how many, their mean, second moments `[2, 2]` and contrast."""
+
+    area: int
+    centre: np.ndarray
+    moments: np.ndarray
+    contrast: float
+
+
+def blob_seeds(dark: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Maxima `[S, 2]` (u, v) over place and scale of the Hessian's determinant, and their radii `[S]`, best first."""
+    count = int(np.log(min(dark.shape) * LARGEST / SMALLEST) / np.log(SCALES)) + 1
+    radii = SMALLEST * SCALES ** np.arange(count)
+    scales = []
+    for sigma in radii / np.sqrt(2):
+        vv, uu, uv = (ndimage.gaussian_filter(dark, sigma, order) for order in ((2, 0), (0, 2), (1, 1)))
+        scales.append(sigma**2 * np.sqrt(np.maximum(uu * vv - uv**2, 0)) * (uu + vv > 0))
+    responses = np.array(scales)
+    peak = (responses == ndimage.maximum_filter(responses, (3, 3, 3))) & (responses > 0.01)
+    scale, v, u = np.nonzero(peak)
+    order = np.argsort(-responses[peak])
+    return np.stack([u, v], -1)[order], radii[scale[order]]
+
+
+def grow_blob(dark: np.ndarray, seed: np.ndarray, radius: float) -> Blob | None:
+    """The pixels about `seed` (u, v) that are darker than half way to the background, or None where they are no blob."""
+    reach = int(np.ceil(2.6 * radius)) + 2
+    v0, u0 = max(seed[1] - reach, 0), max(seed[0] - reach, 0)
+    patch = dark[v0 : seed[1] + reach + 1, u0 : seed[0] + reach + 1]
+    v, u = np.mgrid[: patch.shape[0], : patch.shape[1]]
+    distance = np.hypot(u + u0 - seed[0], v + v0 - seed[1])
+    core = patch[distance <= max(0.5 * radius, 1)].mean()
+    background = np.median(patch[(distance > 1.5 * radius + 1) & (distance < 2.4 * radius + 2)])
+    if background - core < 0.04:
+        return None
+    labels, _ = ndimage.label(patch < (core + background) / 2)
+    label = labels[seed[1] - v0, seed[0] - u0]
+    blob = labels == label
+    if label == 0 or blob[[0, -1]].any() or blob[:, [0, -1]].any() or blob.sum() < 4:
+        return None
+    position = np.stack([u[blob] + u0, v[blob] + v0], -1).astype(float)
+    centre = position.mean(0)
+    moments = (position - centre).T @ (position - centre) / len(position) + np.eye(2) / 12
+    return Blob(len(position), centre, moments, (background - core) / max(background, 0.05))
+
+
+def is_dot(area: float, moments: np.ndarray, filled: float) -> bool:
+    """Whether a blob is an ellipse: compact, and its area what its moments say, up to a factor of exp(`filled`).
+
+    Example:
+        >>> is_dot(4 * np.pi * 9, 9 * np.eye(2), 0.1), is_dot(4 * np.pi * 6, 9 * np.eye(2), 0.1)
+        (True, False)
+    """
+    small, large = np.linalg.eigvalsh(moments)
+    return bool(large < ELONGATION**2 * small and abs(np.log(area / (4 * np.pi * np.sqrt(small * large)))) < filled)
+
+
+def find_blobs(dark: np.ndarray, mask: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Every compact dark blob of an image.
+
+    Args:
+        dark: image `[H, W]` in 0..1, dots dark.
+        mask: `[H, W]` bool, where to look, or None: everywhere.
+
+    Returns:
+        Centres `[N, 2]` px, shapes `[N, 2, 2]` px, contrasts `[N]`.
+
+    Raises:
+        MembraneError: fewer than 6 are found.
+    """
+    smooth = ndimage.gaussian_filter(dark, 0.6)
+    taken = np.zeros(dark.shape, bool)
+    blobs = []
+    for seed, radius in zip(*blob_seeds(smooth), strict=True):
+        if taken[seed[1], seed[0]] or (mask is not None and not mask[seed[1], seed[0]]):
+            continue
+        blob = grow_blob(smooth, seed, radius)
+        if blob is None or not is_dot(blob.area, blob.moments, -np.log(SOLIDITY)):
+            continue
+        u, v = np.round(blob.centre).astype(int)
+        size = np.sqrt(blob.area / np.pi)
+        margin = np.minimum(blob.centre, np.array(dark.shape[::-1]) - 1 - blob.centre).min()
+        if taken[v, u] or margin < 1.5 * size + 1:
+            continue
+        reach = np.ceil(size).astype(int)
+        taken[max(v - reach, 0) : v + reach + 1, max(u - reach, 0) : u + reach + 1] = True
+        blobs.append((blob.centre, _ellipse(blob), blob.contrast))
+    if len(blobs) < 6:
+        raise MembraneError(
+            f"find_dots: {len(blobs)} dots found, expected at least 6; check the polarity, the rest image and the mask"
+        )
+    centres, shapes, contrasts = (np.array(x) for x in zip(*blobs, strict=True))
+    return centres, shapes, contrasts
+
+
+def _ellipse(blob: Blob) -> np.ndarray:
+    """Shape `[2, 2]` px with the blob's area and axes along those of its moments."""
+    values, axes = np.linalg.eigh(blob.moments)
+    return axes @ np.diag(2 * np.sqrt(values)) @ axes.T * np.sqrt(blob.area / (4 * np.pi * np.sqrt(values.prod())))

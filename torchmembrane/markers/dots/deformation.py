@@ -1,0 +1,100 @@
+"""The deformation at every blob of a frame, from the arrangement of the blobs around it alone."""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..spacing import neighbours, spacing, square_distance
+
+WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
+NEIGHBOURS = 8
+FAR = 1e6
+FADED = 30.0  # exponent of a weight that no longer counts; subnormal numbers are slow
+
+
+def monomial_map() -> Tensor:
+    """The linear map from a matrix's entries to how it acts on monomials.
+
+    Returns:
+        `[8, 24]`: of `A = [[a, b], [c, d]]`, `a b c d a^2+c^2 ab+cd b^2+d^2 1` to the matrix `[4, 6]` that takes monomials
+        `u v uu uv vv 1` of `x` to `A x`, `|A x|^2` and 1.
+    """
+    matrix = np.zeros((8, 4, 6))
+    matrix[np.arange(8), [0, 0, 1, 1, 2, 2, 2, 3], [0, 1, 0, 1, 2, 3, 4, 5]] = [1, 1, 1, 1, 1, 2, 1, 1]
+    return torch.as_tensor(matrix.reshape(8, 24))
+
+
+class LocalDeformation(nn.Module):
+    """The deformation gradient at every blob of a frame, from the arrangement of the blobs around it alone.
+
+    The dots next to the rest dot at that place are mapped by `A`, laid on the nearest blobs, and `A` fitted, a fixed
+    number of times, with an average over nearby blobs between. Nothing needs to be known of which blob is which dot.
+    Blobs are the last axis throughout.
+
+    Args:
+        pixels: centres `[D, 2]` of the dots at rest, px.
+    """
+
+    pixels: Tensor
+    around: Tensor
+    pitch: Tensor
+    monomial_map: Tensor
+
+    def __init__(self, pixels: np.ndarray):
+        super().__init__()
+        pitch = spacing(pixels)[1]
+        around = (pixels[neighbours(pixels, NEIGHBOURS)] - pixels[:, None]) / pitch[:, None, None]
+        self.register_buffer("pixels", torch.as_tensor(pixels))
+        u, v = np.moveaxis(around, -1, 0)
+        self.register_buffer("around", torch.as_tensor(np.stack([u, v, u * u, u * v, v * v, np.ones_like(u)], 1)))
+        self.register_buffer("pitch", torch.as_tensor(pitch))
+        self.register_buffer("monomial_map", monomial_map())
+
+    def forward(self, blobs: Tensor, valid: Tensor) -> Tensor:
+        """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, 2, 2, K]`."""
+        gradient, around, away, beside, nearby = self.begin(blobs, valid)
+        for width in WIDTHS:
+            (gradient,) = self.refine(gradient, around, away, beside, nearby, valid, width)
+        return gradient
+
+    def begin(self, blobs: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What the fits need of a frame.
+
+        Returns:
+            A first gradient `[B, 2, 2, K]`; monomials `[B, K, 6, M]` of the dots around; of the blobs beside, in pitches,
+            what their square distance needs `[B, K, 4, 12]`, and positions and validity `[B, K, 3, 12]`; how near all
+            blobs (columns) have the others `[B, K, K]`.
+        """
+        middle = self.pixels.mean(0)
+        own = square_distance(blobs - middle, self.pixels - middle).argmin(-1)
+        around, pitch = self.around[own], self.pitch[own]
+        apart = square_distance(blobs - middle, blobs - middle)
+        index = (apart + FAR * (1 - valid[:, None])).topk(min(13, blobs.shape[1]), largest=False).indices[..., 1:]
+        known = torch.cat([blobs.mT, valid[:, None]], 1).gather(2, index.flatten(1)[:, None].expand(-1, 3, -1))
+        position, there = known.unflatten(2, index.shape[1:]).split([2, 1], 1)
+        others = (position - blobs.mT[..., None]) / pitch[:, None, :, None]  # [B, 2, K, 12]
+        square = others.square().sum(1, keepdim=True)
+        away = torch.cat([-2 * others, torch.ones_like(square), square], 1)
+        beside = torch.cat([others * there, there], 1)
+        nearby = torch.exp((apart / (-2 * (0.8 * pitch[:, None]) ** 2)).clamp_min(-FADED)) * valid[..., None]
+        eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
+        ratio = square[:, 0, :, :4].clamp_min(1e-12).sqrt().mean(-1).clamp(0.4, 2.0)
+        return ratio[:, None, None] * eye, around, away.transpose(1, 2), beside.transpose(1, 2), nearby
+
+    def refine(
+        self, gradient: Tensor, around: Tensor, away: Tensor, beside: Tensor, nearby: Tensor, valid: Tensor, width: float
+    ) -> tuple[Tensor]:
+        """The gradient after another fit, with blobs believed up to about `width` pitches off; the rest as of `begin`."""
+        a, b, c, d = gradient.flatten(1, 2).unbind(1)
+        entries = torch.stack([a, b, c, d, a * a + c * c, a * b + c * d, b * b + d * d, torch.ones_like(a)], -1)
+        mapped = (entries * (-0.5 / width**2) @ self.monomial_map).unflatten(-1, (4, 6)) @ around
+        target = beside @ torch.exp((away.mT @ mapped).clamp_min(-FADED))
+        target = target / (target[:, :, 2:] + 0.1)  # weight times position, weight: [B, K, 3, M]
+        sums = (target @ around.mT).flatten(-2).mT.unflatten(1, (3, 6))
+        load = sums[:, :2, :2] + 0.2 * gradient
+        uu, uv, vv, weight = (sums[:, 2, 2:] + sums.new_tensor([0.2, 0, 0.2, 0])[:, None]).unbind(1)
+        fitted = load * torch.stack([vv, uu], 1)[:, None] - load.flip(2) * uv[:, None, None]
+        quality = valid * (weight / around.shape[-1]).square()
+        scaled = fitted.flatten(1, 2) * (quality / (uu * vv - uv * uv))[:, None]
+        average = torch.cat([scaled, quality[:, None]], 1) @ nearby + sums.new_tensor([1e-6, 0, 0, 1e-6, 1e-6])[:, None]
+        return ((average[:, :4] / average[:, 4:]).unflatten(1, (2, 2)),)

@@ -1,0 +1,140 @@
+"""Dark blobs at the pattern's scales, in a batch of frames."""
+
+from functools import reduce
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from .bands import BandProduct, SeparableMap, blur_rows, linear_rows, pair_means
+from .pyramid import LEVELS
+
+FINEST_SIGMA = 0.9  # of the blob detector on a level of the pyramid, pixels of the level
+SCALE_STEP = 1.6  # ratio of neighbouring scales of the blob detector at most
+
+Span = tuple[int, int]
+
+
+class HessianScale(nn.Module):
+    """The normalised Hessian's determinant at one scale, on the cells of a box.
+
+    The Gaussian is two products with constant band matrices, on the level of the pyramid that suits the scale.
+    """
+
+    def __init__(self, level: int, sigma: float, cell: int, box: tuple[Span, Span], size: tuple[int, int]):
+        """`sigma`: pixels of the level; `cell`, `box` (v, u) and `size` (height, width): pixels of the image."""
+        super().__init__()
+        self.level, self.sigma, self.cell = level, sigma, cell
+        stride = 2**level
+        self.rows, self.columns = ((end - begin) // stride for begin, end in box)
+        rows = [np.arange(begin // stride - 1, end // stride + 1) for begin, end in box]
+        self.blur_v, self.blur_u = (
+            BandProduct(blur_rows(side // stride, sigma, on)) for on, side in zip(rows, size, strict=True)
+        )
+        self.spread = None
+        if stride > cell:
+            at = [(_cells(span, cell) - (stride - 1) / 2) / stride - span[0] // stride for span in box]
+            self.spread = SeparableMap(*(linear_rows(len(on) - 2, x) for on, x in zip(rows, at, strict=True)))
+
+    def forward(self, levels: list[Tensor]) -> Tensor:
+        """`sigma^4 det Hessian` where the image is darkest, else 0, `[B, 1, rows, columns]` of the cells."""
+        blurred = self.blur_u(self.blur_v(levels[self.level]))
+        above, middle, below = (blurred[..., n : n + self.rows, :] for n in range(3))
+        left, centre, right = (slice(n, n + self.columns) for n in range(3))
+        uu = middle[..., right] + middle[..., left] - 2 * middle[..., centre]
+        vv = (below + above - 2 * middle)[..., centre]
+        along = below - above
+        uv = along[..., right] - along[..., left]
+        response = (uu.relu() * vv.relu() - uv * uv / 16).relu()  # uu and vv have one sign where the determinant is positive
+        if self.spread is not None:
+            response = self.spread(response)
+        return self.sigma**4 * (F.max_pool2d(response, 2) if 2**self.level < self.cell else response)
+
+
+class BlobDetector(nn.Module):
+    """The strongest dark blobs: maxima over place and scale of the normalised Hessian's determinant.
+
+    Only the box that holds the membrane is looked at. Maxima are looked for on cells of 2 x 2 pixels of the finest level
+    in use, and interpolated by a parabola.
+
+    Args:
+        radii: of the pattern's dots `[D]`, px; their 5th to 95th percentile spans the scales.
+        pitch: smallest distance of two dots, px.
+        count: how many blobs are wanted.
+        inside: `[1, 1, H, W]`, 1 where the membrane is, else 0.
+
+    Limitations:
+        Two blobs nearer than a quarter of `pitch` are one. Where there are fewer than `count`, others of strength about
+        0 fill up the list.
+    """
+
+    log_radii: Tensor
+    inside: Tensor
+
+    def __init__(self, radii: np.ndarray, pitch: float, count: int, inside: Tensor):
+        super().__init__()
+        smallest, largest = np.percentile(radii, [5, 95])
+        steps = np.log(max(largest / smallest, 1.001)) / np.log(SCALE_STEP)
+        radii = np.geomspace(smallest, largest, 1 + int(np.ceil(steps)))
+        levels = np.log2(np.maximum(radii / (FINEST_SIGMA * np.sqrt(2)), 1)).astype(int).clip(0, LEVELS - 1)
+        height, width = inside.shape[-2:]
+        self.cell = 2 ** (int(levels[0]) + 1)
+        self.reach, self.count = max(1, int(0.25 * pitch / self.cell)), count
+        block = max(self.cell, 2 ** (LEVELS - 1))
+        lit = inside[0, 0].numpy() > 0
+        self.box = _span(np.any(lit, 1), block), _span(np.any(lit, 0), block)
+        (v0, v1), (u0, u1) = self.box
+        self.register_buffer("log_radii", torch.as_tensor(np.log(radii)))
+        self.register_buffer("inside", (F.avg_pool2d(inside[..., v0:v1, u0:u1], self.cell) > 0.5).double())
+        self.scales = nn.ModuleList(
+            HessianScale(int(k), float(r / np.sqrt(2) / 2**k), self.cell, self.box, (height, width))
+            for k, r in zip(levels, radii, strict=True)
+        )
+        self.background = SeparableMap(
+            *(_background_rows(_cells(span, self.cell), side) for span, side in zip(self.box, (height, width), strict=True))
+        )
+
+    def forward(self, levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Locate blobs in `levels` of `mean_pyramid` with dark dots: centres `[B, K, 2]` px, log radius, strength `[B, K]`."""
+        background = self.background(levels[-1]) + 0.05
+        scales = [scale(levels) for scale in self.scales]
+        peak = reduce(torch.maximum, scales) / background.square() * self.inside
+        reach = self.reach
+        highest = F.max_pool2d(peak, (1, 2 * reach + 1), 1, (0, reach))
+        highest = F.max_pool2d(highest, (2 * reach + 1, 1), 1, (reach, 0))
+        strength, cell = (peak * (peak == highest)).flatten(1).topk(self.count)
+        strength = strength.clamp_min(1e-20).sqrt()
+        scale = torch.cat(scales, 1).flatten(2).gather(2, cell[:, None].expand(-1, len(scales), -1)).square()
+        log_radius = (scale * self.log_radii[:, None]).sum(1) / scale.sum(1).clamp_min(1e-20)
+        return self._centre(peak, cell, strength), log_radius, strength
+
+    def _centre(self, peak: Tensor, cell: Tensor, strength: Tensor) -> Tensor:
+        """Centres `[B, K, 2]` px of the maxima at `cell [B, K]`, by a parabola through the cells beside each."""
+        rows, columns = peak.shape[-2:]
+        sides = torch.stack([cell - 1, cell + 1, cell - columns, cell + columns], -1).clamp(0, rows * columns - 1)
+        beside = peak.flatten(1).gather(1, sides.flatten(1)).unflatten(1, (-1, 2, 2))  # [B, K, uv, before or after]
+        before, after = beside.clamp_min(1e-12).sqrt().unbind(-1)
+        shift = 0.5 * (after - before) / (2 * strength[..., None] - after - before).clamp_min(1e-12)
+        centre = torch.stack([cell % columns, cell // columns], -1) + shift.clamp(-0.5, 0.5)
+        (v0, _), (u0, _) = self.box
+        return centre * self.cell + (self.cell - 1) / 2 + centre.new_tensor([u0, v0])
+
+
+def _span(lit: np.ndarray, block: int) -> Span:
+    """From which pixel to before which, in whole blocks, all of `lit` lies."""
+    on = np.flatnonzero(lit)
+    return int(on[0]) // block * block, min(-(-(int(on[-1]) + 1) // block), len(lit) // block) * block
+
+
+def _cells(span: Span, cell: int) -> np.ndarray:
+    """Centres of the cells of a span, px."""
+    return np.arange(*span, cell) + (cell - 1) / 2
+
+
+def _background_rows(centres: np.ndarray, side: int) -> np.ndarray:
+    """From a row of `side` pixels on the coarsest level to its means over about 8 pixels of the level, at `centres` px."""
+    coarse = side // 2 ** (LEVELS - 1)
+    at = (centres / 2 ** (LEVELS - 1) - (2 ** (LEVELS - 1) - 1) / 2**LEVELS - 0.5) / 2
+    smooth = blur_rows(coarse // 2, 2.0, np.arange(coarse // 2)) @ pair_means(coarse)
+    return linear_rows(coarse // 2, at) @ smooth

@@ -1,0 +1,84 @@
+"""A dot's outline in the image, an ellipse: pixel = centre + shape @ (unit circle)."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+SOFTNESS = 0.6  # px, logistic scale of a dot's blurred outline
+
+
+def half_axes(shapes: np.ndarray) -> np.ndarray:
+    """Long and short half axis `[D, 2]` of the ellipses `shapes [D, 2, 2]`.
+
+    Example:
+        >>> half_axes(np.array([[[0.0, 2.0], [5.0, 0.0]]])).tolist()
+        [[5.0, 2.0]]
+    """
+    return np.linalg.svd(shapes, compute_uv=False)
+
+
+def log_radii(shapes: np.ndarray) -> np.ndarray:
+    """Logarithm `[D]` of the radii of circles as large as the ellipses `shapes [D, 2, 2]`.
+
+    Example:
+        >>> np.exp(log_radii(np.array([[[0.0, 2.0], [8.0, 0.0]]]))).tolist()
+        [4.0]
+    """
+    return 0.5 * np.log(np.abs(np.linalg.det(shapes)))
+
+
+def rms_half_axes(shapes: np.ndarray) -> np.ndarray:
+    """Root mean square `[D]` of the two half axes of the ellipses `shapes [D, 2, 2]`."""
+    return np.linalg.norm(shapes, axis=(1, 2)) / 2**0.5
+
+
+def size_tolerance(shapes: np.ndarray, sizes: np.ndarray) -> float:
+    """Standard deviation of a dot's log radius: wide, but less than half of what separates two sizes.
+
+    Args:
+        shapes: `[D, 2, 2]`, px.
+        sizes: `[D]` int, 0 = small, 1 = large.
+
+    Example:
+        >>> size_tolerance(np.tile(np.eye(2), (3, 1, 1)), np.ones(3, int))
+        0.45
+    """
+    if sizes.min() == sizes.max():
+        return 0.45
+    log_radius = log_radii(shapes)
+    return float(np.clip(0.45 * abs(np.median(log_radius[sizes == 1]) - np.median(log_radius[sizes == 0])), 0.2, 0.45))
+
+
+def metric_of(shape: Tensor) -> Tensor:
+    """`(S S^T)^-1 [2, 2, ...]` of `shape [..., 2, 2]`: `x^T (S S^T)^-1 x = |S^-1 x|^2`."""
+    a, b, c, d = shape.flatten(-2).movedim(-1, 0).split(1)
+    uv, area = a * c + b * d, a * d - b * c
+    return torch.cat([c * c + d * d, -uv, -uv, a * a + b * b]).unflatten(0, (2, 2)) / (area * area)
+
+
+def draw_dots(pixels: np.ndarray, shapes: np.ndarray, image_size: tuple[int, int]) -> Tensor:
+    """The pattern as dark dots on white.
+
+    Args:
+        pixels: centres `[D, 2]`, px.
+        shapes: `[D, 2, 2]`, px.
+        image_size: width, height.
+
+    Returns:
+        Image `[1, 1, H, W]` in 0..1, float64.
+
+    Example:
+        >>> image = draw_dots(np.array([[8.0, 6.0]]), 3 * np.eye(2)[None], (20, 12))
+        >>> list(image.shape), [round(float(image[0, 0, 6, u]), 2) for u in (8, 11, 14)]
+        ([1, 1, 12, 20], [0.11, 0.55, 0.99])
+    """
+    width, height = image_size
+    image = np.ones((height, width))
+    for centre, shape in zip(pixels, shapes, strict=True):
+        reach = int(half_axes(shape)[0]) + 4
+        low, high = np.round(centre).astype(int) - reach, np.round(centre).astype(int) + reach + 1
+        u, v = np.arange(max(low[0], 0), min(high[0], width)), np.arange(max(low[1], 0), min(high[1], height))
+        y = (np.stack(np.meshgrid(u, v), -1) - centre) @ np.linalg.inv(shape).T
+        depth = (1 - np.linalg.norm(y, axis=-1)) * np.sqrt(abs(np.linalg.det(shape)))
+        image[np.ix_(v, u)] -= 0.9 / (1 + np.exp(-depth / SOFTNESS))
+    return torch.as_tensor(image.clip(0))[None, None]

@@ -1,0 +1,155 @@
+"""Locating dots in a batch of frames: blobs at the pattern's scales, matched, then fitted to sub-pixel accuracy."""
+
+import numpy as np
+import torch
+from scipy import ndimage
+from scipy.spatial import Delaunay, cKDTree
+from torch import Tensor, nn
+
+from ...errors import MembraneError
+from ..spacing import safe_length, spacing, square_distance
+from .coherence import Coherence
+from .detect import BlobDetector
+from .ellipse import draw_dots, size_tolerance
+from .fit import EllipseFit
+from .match import DotMatcher
+from .pattern import OUTLIER, DotPattern
+from .pyramid import mean_pyramid
+
+FEWEST = 0.2  # mean confidence of a frame that is half trusted
+
+
+def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tuple[int, int]) -> Tensor:
+    """`[1, 1, H, W]` 1 inside the rim and 2 pixels off it, else 0: the short triangles between dots and anchors."""
+    width, height = image_size
+    if anchors is None:
+        return torch.ones(1, 1, height, width, dtype=torch.float64)
+    points = np.concatenate([pixels, anchors])
+    triangulation = Delaunay(points)
+    corners = points[triangulation.simplices]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max(1)
+    pitch = np.append(spacing(pixels)[1], np.zeros(len(anchors)))[triangulation.simplices].max(1)
+    kept = np.append(longest < 3 * pitch, False)
+    inside = kept[triangulation.find_simplex(np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1))]
+    inside = ndimage.binary_erosion(ndimage.binary_closing(inside, iterations=2), iterations=2)
+    return torch.as_tensor(inside, dtype=torch.float64)[None, None]
+
+
+class DotLocator(nn.Module):
+    """Pixels of the pattern's dots in each frame of a batch, with a confidence.
+
+    Blobs at the pattern's scales, matched from where the dots were or else along the smooth flow inwards from the rim, then
+    a least-squares fit of a blurred ellipse on sloping background. A lost dot has confidence 0 and its predicted pixel.
+
+    Args:
+        pattern: the markers in the rest image.
+        image_size: width, height.
+        polarity: "dark" or "light".
+        anchors: pixels `[A, 2]` of the rim, where nothing moves, closer together than the dots; without them the pattern's
+            own outline has to do.
+
+    Attributes:
+        follows: True; dots are followed from frame to frame.
+
+    Raises:
+        MembraneError: another polarity, fewer than 6 dots, or dots that are not finite.
+
+    Limitations:
+        The flow may change by at most about half a pitch from one dot to the next: wrong where the spacing is below about
+        half of that at rest, where the rotation or shear is more than about 25 degrees, or the flow more than two pitches.
+        Most such regions end in a seam and are lost with all that is near it; what is left is confidently a whole pitch
+        off, one-size patterns more often. Without anchors a pattern that moves as a whole by a pitch, two sizes by the
+        pitch of the large ones, looks as at rest: the two cannot be distinguished. A dot that is missing beside a blob of
+        its size may be taken for it. Where many dots are missing (20 %) and as many false ones stand among them, right
+        dots are lost as well.
+
+    Example:
+        >>> rest = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)
+        >>> pattern = DotPattern(rest, np.tile(4.0 * np.eye(2), (12, 1, 1)), np.ones(12, int))
+        >>> image = draw_dots(rest + [2.5, -1.5], pattern.shapes, (100, 80)).float()
+        >>> pixels, confidence = DotLocator(pattern, (100, 80), "dark")(image)
+        >>> (pixels[0] - torch.tensor(rest)).mean(0).round(decimals=1).tolist(), bool(confidence.min() > 0.9)
+        ([2.5, -1.5], True)
+    """
+
+    follows = True
+    strength: Tensor
+    rest: Tensor
+    shapes: Tensor
+
+    def __init__(self, pattern: DotPattern, image_size: tuple[int, int], polarity: str, anchors: np.ndarray | None = None):
+        super().__init__()
+        if polarity not in ("dark", "light"):
+            raise MembraneError(f'DotLocator: polarity is {polarity!r}, expected "dark" or "light"')
+        pixels, shapes = np.asarray(pattern.pixels, float), np.asarray(pattern.shapes, float)
+        if len(pixels) < 6 or not (np.isfinite(pixels).all() and np.isfinite(shapes).all()):
+            raise MembraneError(
+                f"DotLocator: {len(pixels)} dots, {int(np.isnan(pixels).any(1).sum())} of them NaN, expected at least "
+                "6, all finite; leave out dots that are not visible in the rest image"
+            )
+        self.polarity, self.image_size = polarity, tuple(image_size)
+        tolerance = size_tolerance(shapes, np.asarray(pattern.sizes))
+        self.fit = EllipseFit(pixels, shapes, image_size, tolerance)
+        inside = membrane_mask(pixels, anchors, image_size)
+        radii = np.sqrt(np.abs(np.linalg.det(shapes)))
+        self.detect = BlobDetector(radii, spacing(pixels)[0].min(), int(1.2 * len(pixels)) + 16, inside)
+        drawn = mean_pyramid(draw_dots(pixels, shapes, image_size))
+        blobs, log_radius, strength = (x[0].numpy() for x in self.detect.double()(drawn))
+        blobs, log_radius, strength = (x[strength > 1e-6] for x in (blobs, log_radius, strength))  # the rest fill up the count
+        own = cKDTree(blobs).query(pixels)[1]
+        self.match = DotMatcher(pixels, log_radius[own], tolerance, anchors)
+        self.coherence = Coherence(pixels, log_radius[own], tolerance)
+        self.register_buffer("strength", torch.as_tensor(strength[own]))
+        self.register_buffer("rest", torch.as_tensor(pixels))
+        self.register_buffer("shapes", torch.as_tensor(shapes))
+        self.float()
+
+    def forward(self, image: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Locate the dots in a batch of frames.
+
+        Args:
+            image: `[B, 1, H, W]`, grey in 0..1.
+            previous: pixels `[B, D, 2]` in the frames before, NaN where lost, from which the dots are followed; without it
+                from rest.
+
+        Returns:
+            Pixels `[B, D, 2]` and confidence `[B, D]` in 0..1.
+        """
+        level_0, level_1, level_2, blobs, log_radius, valid = self.begin(image)
+        place, certainty, strain = self.match(blobs, log_radius, valid, previous)
+        return self.end(level_0, level_1, level_2, blobs, log_radius, valid, place, certainty, strain)
+
+    def begin(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The levels of the pyramid, and the blobs: centres `[B, K, 2]`, log radius `[B, K]`, and how surely one is a dot."""
+        levels = mean_pyramid(1 - image if self.polarity == "light" else image)
+        blobs, log_radius, strength = self.detect(levels)
+        nearest = square_distance(blobs - self.match.origin, self.match.pixels).argmin(-1)
+        relative = strength / self.strength[nearest]
+        level = relative[:, : self.rest.shape[0] // 2].mean(1, keepdim=True)
+        valid = torch.sigmoid(20 * (relative / (level + 1e-3) - 0.4))
+        level_0, level_1, level_2 = levels
+        return level_0, level_1, level_2, blobs, log_radius, valid
+
+    def end(
+        self,
+        level_0: Tensor,
+        level_1: Tensor,
+        level_2: Tensor,
+        blobs: Tensor,
+        log_radius: Tensor,
+        valid: Tensor,
+        place: Tensor,
+        certainty: Tensor,
+        strain: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Pixels and confidence, by the fit about where the matcher places the dots."""
+        levels, rest = [level_0, level_1, level_2], self.rest
+        _, gradient, _ = self.match.predict(certainty, place - rest, strain)
+        shape = self.shapes + gradient.clamp(-0.6, 0.6) @ self.shapes
+        pixels, _, quality = self.fit(levels, place, shape)
+        predicted, _, _ = self.match.predict(certainty * quality, pixels - rest, strain)
+        deviation = safe_length(pixels - rest - predicted, -1) / self.match.nearest
+        confidence = quality * torch.sigmoid(20 * (OUTLIER - deviation))
+        confidence = confidence * self.coherence(pixels, confidence, strain, rest + predicted, blobs, log_radius, valid)
+        confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
+        return torch.where(confidence[..., None] > 0.05, pixels, rest + predicted), confidence

@@ -1,0 +1,165 @@
+"""Dots in the rest image: found without any prior, or measured where the sensor file says they are."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from ..spacing import neighbours
+from .blobs import find_blobs
+from .ellipse import log_radii, rms_half_axes, size_tolerance
+from .fit import EllipseFit
+from .match import DotMatcher
+from .pyramid import mean_pyramid
+
+OUTLIER = 0.5  # from where its neighbours predict it, pitches: a dot so far off is half trusted
+
+
+class DotPattern(NamedTuple):
+    """Markers as measured in the rest image.
+
+    Attributes:
+        pixels: centres `[D, 2]` (u, v), px.
+        shapes: `[D, 2, 2]`, pixel = centre + shape @ (unit circle).
+        sizes: `[D]` int, 0 = small, 1 = large (one size only: all 1).
+    """
+
+    pixels: np.ndarray
+    shapes: np.ndarray
+    sizes: np.ndarray
+
+
+def refine(
+    dark: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, tolerance: float = 0.45
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres `[D, 2]` fitted to sub-pixel accuracy, the outline's growth `[D]` px, quality `[D]` in 0..1."""
+    fit = EllipseFit(pixels, shapes, dark.shape[::-1], tolerance, steps=8)
+    levels = mean_pyramid(torch.as_tensor(dark)[None, None])
+    centre, growth, quality = fit(levels, torch.as_tensor(pixels)[None], torch.as_tensor(shapes)[None])
+    return centre[0].numpy(), growth[0].numpy(), quality[0].numpy()
+
+
+def population(pixels: np.ndarray, shapes: np.ndarray, contrasts: np.ndarray) -> np.ndarray:
+    """Which blobs `[N]` belong to the pattern: their size and contrast is near that of the blobs around them."""
+    log_radius = log_radii(shapes)
+    keep = np.ones(len(pixels), bool)
+    for _ in range(3):
+        near = cKDTree(pixels[keep]).query(pixels, k=min(9, keep.sum()))[1]
+        radius, contrast = np.median(log_radius[keep][near], 1), np.median(contrasts[keep][near], 1)
+        keep = (np.abs(log_radius - radius) < np.log(2.2)) & (contrasts > 0.35 * contrast)
+    return keep
+
+
+def size_classes(pixels: np.ndarray, shapes: np.ndarray) -> np.ndarray:
+    """`[D]` 0 small, 1 large: two clusters of log radius about a common quadratic field of the view, else all 1."""
+    log_radius = log_radii(shapes)
+    x = (pixels - pixels.mean(0)) / pixels.std()
+    field = np.stack([np.ones(len(x)), *x.T, x[:, 0] ** 2, x[:, 1] ** 2, x[:, 0] * x[:, 1]], -1)
+    local = np.column_stack([log_radius, log_radius[neighbours(pixels, 8)]])
+    large = log_radius > (local.max(1) + local.min(1)) / 2
+    for _ in range(20):
+        basis = np.column_stack([field, large])
+        fit, *_ = np.linalg.lstsq(basis, log_radius, rcond=None)
+        rest = log_radius - field @ fit[:-1]
+        large = rest > fit[-1] / 2
+    noise = np.std(rest - fit[-1] * large)
+    bimodal = fit[-1] > max(5 * noise, 0.2) and 0.1 < large.mean() < 0.9
+    return large.astype(int) if bimodal else np.ones(len(x), int)
+
+
+def find_dots(image: np.ndarray, polarity: str, mask: np.ndarray | None = None) -> DotPattern:
+    """Find all dots of the pattern in the rest image, any arrangement, one size or two.
+
+    Args:
+        image: `[H, W]`, grey in 0..1.
+        polarity: "dark" or "light".
+        mask: `[H, W]` bool, where to look, or None: everywhere.
+
+    Returns:
+        The pattern, in rows from top to bottom.
+
+    Raises:
+        MembraneError: fewer than 6 dots are found.
+
+    Limitations:
+        Dots that touch one another or the edge of the membrane are not found.
+
+    Example:
+        >>> from torchmembrane.markers.dots.ellipse import draw_dots
+        >>> drawn = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)
+        >>> image = draw_dots(drawn, np.tile(4.0 * np.eye(2), (12, 1, 1)), (100, 80))[0, 0].numpy()
+        >>> pattern = find_dots(image, "dark")
+        >>> len(pattern.pixels), bool(np.abs(np.sort(pattern.pixels, 0) - np.sort(drawn, 0)).max() < 0.05)
+        (12, True)
+    """
+    dark = _dark(image, polarity)
+    pixels, shapes, contrasts = find_blobs(dark, mask)
+    keep = population(pixels, shapes, contrasts)
+    pixels, shapes, contrasts = pixels[keep], shapes[keep], contrasts[keep]
+    pixels, growth, quality = refine(dark, pixels, shapes)
+    shapes = shapes * (1 + growth / rms_half_axes(shapes))[:, None, None]
+    keep = population(pixels, shapes, contrasts) & (quality > 0.3)
+    pixels, shapes = pixels[keep], shapes[keep]
+    order = np.lexsort((pixels[:, 0], pixels[:, 1]))
+    return DotPattern(pixels[order], shapes[order], size_classes(pixels, shapes)[order])
+
+
+def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, sizes: np.ndarray, polarity: str) -> DotPattern:
+    """Measure the listed dots in the rest image.
+
+    Args:
+        image: `[H, W]`, grey in 0..1.
+        pixels: predicted centres `[D, 2]`, off by up to half a pitch.
+        shapes: `[D, 2, 2]` px, of dots of unit radius.
+        sizes: `[D]` int, 0 = small, 1 = large.
+        polarity: "dark" or "light".
+
+    Returns:
+        The pattern in the order given, shapes scaled by each size's radius as found, the centre NaN where a dot is not
+        visible.
+
+    Raises:
+        MembraneError: fewer than 6 dots are found.
+
+    Example:
+        >>> from torchmembrane.markers.dots.ellipse import draw_dots
+        >>> drawn = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)
+        >>> shapes = np.tile(np.eye(2), (12, 1, 1))
+        >>> image = draw_dots(drawn, 4 * shapes, (100, 80))[0, 0].numpy()
+        >>> pattern = measure_dots(image, drawn + [3, -2], shapes, np.ones(12, int), "dark")
+        >>> bool(np.abs(pattern.pixels - drawn).max() < 0.05), round(float(pattern.shapes[0, 0, 0]), 1)
+        (True, 4.0)
+    """
+    dark = _dark(image, polarity)
+    pixels, shapes, sizes = np.asarray(pixels, float), np.asarray(shapes, float), np.asarray(sizes, int)
+    found, outlines, contrasts = find_blobs(dark)
+    keep = population(found, outlines, contrasts)
+    found, outlines = found[keep], outlines[keep]
+    unit, log_radius = log_radii(shapes), log_radii(outlines)
+    nearest = cKDTree(found).query(pixels)[1]
+    radius = {size: np.median((log_radius[nearest] - unit)[sizes == size]) for size in np.unique(sizes)}
+    expected = unit + np.array([radius[size] for size in sizes])
+    scaled = shapes * np.exp(expected - unit)[:, None, None]
+    tolerance = size_tolerance(scaled, sizes)
+    match = DotMatcher(pixels, expected, tolerance)
+    blob_radius = torch.as_tensor(log_radius)[None]
+    position, certainty, strain = match(torch.as_tensor(found)[None], blob_radius, torch.ones_like(blob_radius))
+    centre, growth, quality = refine(dark, position[0].numpy(), scaled, tolerance)
+    deviation = _deviation(match, certainty * torch.as_tensor(quality), centre - pixels, strain)
+    visible = (quality > 0.3) & (deviation < OUTLIER * match.nearest.numpy())
+    for size in np.unique(sizes):
+        scaled[sizes == size] *= 1 + np.median((growth / np.exp(expected))[visible & (sizes == size)])
+    return DotPattern(np.where(visible[:, None], centre, np.nan), scaled, sizes)
+
+
+def _dark(image: np.ndarray, polarity: str) -> np.ndarray:
+    """The image, or its negative where the dots are light."""
+    return np.asarray(image, float) if polarity == "dark" else 1 - np.asarray(image, float)
+
+
+def _deviation(match: DotMatcher, weight: Tensor, flow: np.ndarray, strain: Tensor) -> np.ndarray:
+    """How far `[D]` px the flow `[D, 2]` is from what the dots around each predict."""
+    predicted, _, _ = match.predict(weight, torch.as_tensor(flow)[None], strain)
+    return np.linalg.norm(flow - predicted[0].numpy(), axis=1)

@@ -1,0 +1,28 @@
+"""Images of the dots with their resolution halved twice: means, so that a pixel covers those it replaces."""
+
+import torch.nn.functional as F
+from torch import Tensor
+
+LEVELS = 3
+
+
+def mean_pyramid(image: Tensor) -> list[Tensor]:
+    """The image and its means over 2 x 2 and 4 x 4 pixels.
+
+    Pixel `p` of level `k` is centred at `2^k p + (2^k - 1) / 2` of the image.
+
+    Args:
+        image: `[B, 1, H, W]`.
+
+    Returns:
+        `LEVELS` images `[B, 1, H // 2^k, W // 2^k]`, the finest first.
+
+    Example:
+        >>> import torch
+        >>> [level.flatten().tolist() for level in mean_pyramid(torch.arange(16.0).reshape(1, 1, 4, 4))[1:]]
+        [[2.5, 4.5, 10.5, 12.5], [7.5]]
+    """
+    levels = [image]
+    for _ in range(LEVELS - 1):
+        levels.append(F.avg_pool2d(levels[-1], 2))
+    return levels

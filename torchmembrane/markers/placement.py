@@ -1,0 +1,144 @@
+"""Markers on the rest surface, and what locates them in an image: built once for a sensor."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from ..errors import MembraneError
+from ..sensor.sensor import Sensor
+from ..surface.projection import SurfacePoints
+from ..surface.tangent import tangent_axes
+from ..surface.topology import rim_loop
+from .dots.locator import DotLocator
+from .dots.pattern import DotPattern, find_dots, measure_dots
+from .locator import Locator
+from .texture.locator import TextureLocator
+from .texture.patches import choose_patches
+
+FEWEST_MARKERS = 8
+SMOOTH_GRID = 33
+"""Vertices per side of the surface on which markers are placed: the solver's facets are too coarse for oblique rays."""
+DOT_RADIUS = (0.16, 0.27)
+"""Radius of small and large dots over the dot spacing, where no rest image shows it."""
+
+
+@dataclass(frozen=True)
+class PlacedMarkers:
+    """Markers on the rest surface, and their locator.
+
+    Attributes:
+        positions: `[D, 3]`, length unit, camera frame.
+        model_pixels: `[D, 2]`, where the camera model projects them.
+        points: the same as points of the membrane's triangles.
+        locator: finds them in images.
+    """
+
+    positions: np.ndarray
+    model_pixels: np.ndarray
+    points: SurfacePoints
+    locator: Locator
+
+
+def place_markers(sensor: Sensor, vertex_pixels: Tensor) -> PlacedMarkers:
+    """Place the sensor's markers: listed dots, dots found in the rest image, or texture patches chosen there.
+
+    Args:
+        sensor: with a list of dots or a rest image.
+        vertex_pixels: rest pixels `[V, 2]` of the grid's vertices.
+
+    Raises:
+        MembraneError: too few markers are found.
+    """
+    anchors = vertex_pixels[sensor.membrane.fixed].numpy()
+    markers, (width, height) = sensor.markers, sensor.camera.image_size
+    locator: Locator
+    if markers.kind == "dots" and markers.positions is not None:
+        positions = np.asarray(markers.positions, dtype=float)
+        pattern = _listed_pattern(sensor, positions)
+        locator = DotLocator(pattern, (width, height), markers.polarity, anchors)
+    else:
+        image, mask = markers.rest_image, rim_mask(sensor, vertex_pixels)
+        assert image is not None  # or `Markers` has refused it
+        if markers.kind == "texture":
+            patches = choose_patches(image, mask)
+            positions, placed = _place_on_surface(sensor, patches)
+            locator = TextureLocator(image, patches[placed], anchors)
+        else:
+            pattern = find_dots(image, markers.polarity, mask)
+            positions, placed = _place_on_surface(sensor, pattern.pixels)
+            pattern = DotPattern(*(field[placed] for field in pattern))
+            locator = DotLocator(pattern, (width, height), markers.polarity, anchors)
+    return PlacedMarkers(positions, _model_pixels(sensor, positions), sensor.membrane.closest_points(positions), locator)
+
+
+def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
+    return sensor.camera.point_to_pixel(torch.from_numpy(positions)).numpy()
+
+
+def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the rays of `pixels [D, 2]` in the rest image meet the rest surface, `[M, 3]`; and which of them do, `[D]` bool."""
+    rays = sensor.camera.pixel_to_ray(torch.from_numpy(pixels))
+    m, n = sensor.membrane.grid
+    assert sensor.surface is not None  # `Sensor` has set it
+    smooth = sensor.surface.membrane((max(m, SMOOTH_GRID), max(n, SMOOTH_GRID)))
+    hits = smooth.ray_points(*(r.numpy() for r in rays))
+    placed = np.isfinite(hits.distance)
+    if placed.sum() < FEWEST_MARKERS:
+        raise MembraneError(
+            f"sensor {sensor.name!r}: {placed.sum()} markers found in the rest image lie on the rest surface; expected at "
+            f"least {FEWEST_MARKERS}: check the camera, the rest surface and the polarity"
+        )
+    return (smooth.rest.numpy()[hits.vertices] * hits.weights[..., None]).sum(1)[placed], placed
+
+
+def _listed_pattern(sensor: Sensor, positions: np.ndarray) -> DotPattern:
+    """The dots of the sensor's list, measured in the rest image where there is one."""
+    markers, pixels = sensor.markers, _model_pixels(sensor, positions)
+    sizes = np.array([int(size == "large") for size in markers.sizes or ()], dtype=int)
+    shapes = _unit_dot_shapes(sensor, positions)
+    if markers.rest_image is None:
+        pitch = (float(sensor.membrane.rest_area.sum()) / len(sizes)) ** 0.5
+        return DotPattern(pixels, shapes * np.array(DOT_RADIUS)[sizes][:, None, None] * pitch, sizes)
+    pattern = measure_dots(markers.rest_image, pixels, shapes, sizes, markers.polarity)
+    visible = np.isfinite(pattern.pixels).all(1)
+    return pattern._replace(pixels=np.where(visible[:, None], pattern.pixels, pixels))
+
+
+def _unit_dot_shapes(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
+    """How a dot of radius 1 in the surface's tangent plane is imaged: `[D, 2, 2]`, px per length unit."""
+    points = sensor.membrane.closest_points(positions)
+    normals = (sensor.membrane.rest_normals.numpy()[points.vertices] * points.weights[..., None]).sum(1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    step = 1e-4 * sensor.membrane.size
+    columns = []
+    for direction in tangent_axes(normals).swapaxes(0, 1):
+        ahead, behind = (_model_pixels(sensor, positions + s * step * direction) for s in (1, -1))
+        columns.append((ahead - behind) / (2 * step))
+    return np.stack(columns, -1)
+
+
+def rim_mask(sensor: Sensor, vertex_pixels: Tensor) -> np.ndarray:
+    """Pixels inside the rim's outline.
+
+    Args:
+        sensor: its camera's image size and the membrane's grid are used.
+        vertex_pixels: rest pixels `[V, 2]` of the grid's vertices.
+
+    Returns:
+        `[height, width]` bool.
+
+    Example:
+        >>> from torchmembrane.presets import preset
+        >>> sensor = preset("bubble")
+        >>> mask = rim_mask(sensor, sensor.camera.point_to_pixel(sensor.membrane.rest))
+        >>> mask.shape, bool(mask[240, 320]), bool(mask[0, 0])
+        ((480, 640), True, False)
+    """
+    loop = rim_loop(sensor.membrane.grid)
+    width, height = sensor.camera.image_size
+    mask = Image.new("1", (width, height))
+    ImageDraw.Draw(mask).polygon([tuple(p) for p in vertex_pixels[loop].tolist()], fill=1)
+    return np.asarray(mask)

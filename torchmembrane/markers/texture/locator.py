@@ -1,0 +1,118 @@
+"""Texture as markers: patches of paint or speckle, followed from the rest image into images of the deformed membrane.
+
+Coarse to fine on a pyramid of three levels. At the coarsest every template meets every shift up to `REACH` by
+normalised correlation. The finer ones start from the flow so far, warp by its local affine map, and refine both by
+inverse compositional Gauss-Newton steps (Baker & Matthews, IJCV 56, 2004) with the light's gain and offset projected
+out beforehand: a step is one matrix product with constants. After every level a robust affine fit to its neighbours
+judges each patch.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ...errors import MembraneError
+from ..neighbourhood import NEIGHBOURS, NeighbourFlow, Neighbourhood
+from .pyramid import LEVELS, low_pass_pyramid
+from .template import RADIUS, Search, Template
+
+LOST_WEIGHT = 1e-3  # of a lost patch's predicted flow in its neighbours' fits: it counts only where none of them is found
+
+
+class TextureLocator(nn.Module):
+    """Find the patches of a rest image again in other images of the deformed membrane.
+
+    A patch is compared up to gain and offset of the light, warped by an affine map (normalised correlation).
+
+    Args:
+        rest_image: `[H, W]`, grey in 0..1.
+        pixels: patch centres `[D, 2]`, px, from `choose_patches`.
+        anchors: pixels `[A, 2]` on the rim, where nothing moves, or None.
+
+    Attributes:
+        follows: False; patches are searched for from rest in every frame.
+
+    Raises:
+        MembraneError: the image is not `[H, W]`, or there are too few patches, or some lie outside the image.
+
+    Limitations:
+        Patches that moved by more than about 25 px are lost. Where reflections or shadows are the texture, and on a static
+        thing in front of the membrane as large as a neighbourhood, what the image shows is followed, at rest (keep it out
+        of the mask).
+
+    Example:
+        >>> from scipy.ndimage import gaussian_filter
+        >>> from torchmembrane.markers.texture import choose_patches
+        >>> rest = gaussian_filter(np.random.default_rng(0).random((80, 100)), 2)
+        >>> rest = (rest - rest.min()) / np.ptp(rest)
+        >>> locator = TextureLocator(rest, choose_patches(rest, np.ones((80, 100), bool), 200))
+        >>> pixels, confidence = locator(torch.tensor(np.roll(rest, 3, 1)[None, None]).float())
+        >>> (pixels - locator.rest_pixels)[0][:, 0].median().round(decimals=2).item(), bool(confidence.median() > 0.9)
+        (3.0, True)
+    """
+
+    follows = False
+    rest_pixels: Tensor
+
+    def __init__(self, rest_image: np.ndarray, pixels: np.ndarray, anchors: np.ndarray | None = None):
+        super().__init__()
+        rest_image, pixels = np.asarray(rest_image, float), np.asarray(pixels, float)
+        anchors = np.zeros((0, 2)) if anchors is None else np.asarray(anchors, float)
+        if rest_image.ndim != 2 or pixels.ndim != 2 or pixels.shape[1] != 2 or len(pixels) <= NEIGHBOURS:
+            raise MembraneError(
+                f"TextureLocator: rest_image has shape {rest_image.shape} and pixels {pixels.shape}, expected [H, W] "
+                f"and [D, 2] with D > {NEIGHBOURS}; give a grey image and the result of choose_patches"
+            )
+        if not ((pixels >= 0) & (pixels <= np.array(rest_image.shape)[::-1] - 1)).all():
+            raise MembraneError(
+                f"TextureLocator: pixels from {pixels.min(0)} to {pixels.max(0)}, expected inside the rest image "
+                f"of width and height {rest_image.shape[::-1]}; give (u right, v down) of this very image"
+            )
+        self.size = rest_image.shape
+        self.register_buffer("rest_pixels", torch.as_tensor(pixels))
+        self.neighbourhood = Neighbourhood(pixels, anchors)
+        levels = enumerate(low_pass_pyramid(torch.as_tensor(rest_image)[None, None]))
+        templates = [Template(rest, self.rest_pixels / 2**level, RADIUS[level]) for level, rest in levels]
+        self.templates = nn.ModuleList(templates)
+        self.search = Search(templates[-1])
+        self.to(torch.get_default_dtype())
+
+    def forward(self, image: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Locate the patches in a batch of frames; the gradient takes the last level only, the rest is where to look.
+
+        Args:
+            image: `[B, 1, H, W]`, grey in 0..1, of the rest image's size.
+            previous: not used, as `follows` says.
+
+        Returns:
+            Pixels `[B, D, 2]` and confidence `[B, D]` in 0..1; a lost patch has confidence 0 and the pixel that its
+            neighbours predict.
+
+        Raises:
+            MembraneError: the image has another size than the rest image.
+        """
+        height, width = self.size
+        if image.ndim != 4 or tuple(image.shape[1:]) != (1, height, width):
+            raise MembraneError(
+                f"TextureLocator: image has shape {tuple(image.shape)}, expected [B, 1, {height}, {width}] "
+                "like the rest image; give grey images from the same camera, not resized"
+            )
+        images = low_pass_pyramid(image)
+        still = [level.detach() for level in images]
+        shift, score = self.search(still[-1])
+        flow, local = self.settle(2 ** (LEVELS - 1) * shift, score, torch.zeros_like(shift), 1.0)
+        flow, local = self.settle(2 ** (LEVELS - 1) * shift, score, flow, 1.0)
+        for level, steps, tolerance in ((1, 3, 0.5), (0, 2, 0.3)):
+            found, likeness = self.templates[level](still[level], flow / 2**level, local.gradient, steps)
+            flow, local = self.settle(2**level * found, likeness, flow, tolerance)
+        found, likeness = self.templates[0](images[0], flow, local.gradient, 3)
+        _, local = self.settle(found.detach(), likeness.detach(), flow, 0.3)
+        confidence = likeness * local.trust(found)
+        return self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow), confidence
+
+    def settle(self, found: Tensor, weight: Tensor, before: Tensor, tolerance: float) -> tuple[Tensor, NeighbourFlow]:
+        """The flow `[B, D, 2]`: `found` where its neighbours bear it out, else what they predict, starting from `before`."""
+        guess = torch.where((weight > 0)[..., None], found, before)
+        local = self.neighbourhood(guess, weight.clamp(min=LOST_WEIGHT), tolerance)
+        trust = (weight * local.trust(found))[..., None]
+        return trust * found + (1 - trust) * local.flow, local

@@ -1,0 +1,137 @@
+"""Patches of one level of the rest image: searched for by correlation, refined by Gauss-Newton steps."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from .pyramid import sample
+
+REACH = 7  # px of the coarsest level searched to each side: 28 px of the image
+RADIUS = (8, 8, 6)  # px of the level, half side of a patch, finest level first
+WIDTH = 0.6  # standard deviation of a patch's Gaussian window over its half side
+WARP_DAMPING = 1e-3  # grey^2: keeps weak texture from bending a patch's own affine map with the noise
+
+
+def square_offsets(radius: int) -> Tensor:
+    """Integer offsets `[(2 radius + 1)^2, 2]` in rows of u.
+
+    Example:
+        >>> square_offsets(1)[:4].tolist()
+        [[-1.0, -1.0], [0.0, -1.0], [1.0, -1.0], [-1.0, 0.0]]
+    """
+    line = torch.arange(-radius, radius + 1, dtype=torch.float64)
+    v, u = torch.meshgrid(line, line, indexing="ij")
+    return torch.stack([u, v], -1).reshape(-1, 2)
+
+
+class Template(nn.Module):
+    """Patches of one level of the rest image, and the Gauss-Newton steps that bring an image's patches onto them.
+
+    With `T` the patch less its weighted mean, scaled to unit variance, and `S` its six derivatives (by shift, by affine
+    map) made orthogonal to 1 and `T`, a step is `(S^T S)^-1 S^T I / (T . I)`: linear in the image `I` but for the gain.
+
+    Args:
+        rest: the level of the rest image `[1, 1, H, W]`.
+        centre: of the patches `[D, 2]`, px of the level.
+        radius: half side of a patch, px of the level.
+
+    Reference:
+        Baker and Matthews, Lucas-Kanade 20 years on, IJCV 56, 2004 (inverse compositional).
+    """
+
+    centre: Tensor
+    offset: Tensor
+    radius: Tensor
+    weight: Tensor
+    unit: Tensor
+    rows: Tensor
+
+    def __init__(self, rest: Tensor, centre: Tensor, radius: int):
+        super().__init__()
+        offset = square_offsets(radius)
+        weight = torch.exp(-offset.square().sum(-1) / (2 * (WIDTH * radius) ** 2))
+        weight = weight / weight.sum()
+        still = torch.eye(2).to(rest)[None, None]
+        half = 0.5 * torch.eye(2).to(rest)
+        value = sample(rest, centre[None], still, offset)[0]
+        value = value - (weight * value).sum(-1, keepdim=True)
+        contrast = (weight * value.square()).sum(-1, keepdim=True).sqrt() + 1e-6
+        unit = (value / contrast)[:, None]
+        ahead, behind = ([sample(rest, centre[None] + s * h, still, offset)[0] for h in half] for s in (1, -1))
+        slope = torch.stack(ahead, 1) - torch.stack(behind, 1)  # [D, 2, N]
+        slope = torch.cat([slope, (slope[:, :, None] * offset.T / radius).flatten(1, 2)], 1)
+        slope = slope - (weight * slope).sum(-1, keepdim=True)
+        slope = slope - (weight * slope * unit).sum(-1, keepdim=True) * unit
+        damping = torch.diag(torch.tensor([1e-8] * 2 + [WARP_DAMPING] * 4).to(rest))
+        newton = torch.linalg.solve((weight * slope) @ slope.mT + damping, weight * slope) * contrast[:, None]
+        self.register_buffer("centre", centre.clone())
+        self.register_buffer("offset", offset)
+        self.register_buffer("radius", torch.tensor(float(radius)))
+        self.register_buffer("weight", weight)
+        self.register_buffer("unit", weight * unit[:, 0])
+        self.register_buffer("rows", torch.cat([weight.expand_as(unit), weight * unit, newton], 1))  # [D, 8, N]
+
+    def forward(self, image: Tensor, flow: Tensor, gradient: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        """Bring the patches of an image onto the rest image's.
+
+        Args:
+            image: the level of the image `[B, 1, H, W]`.
+            flow: `[B, D, 2]` to begin with, px of the level.
+            gradient: of the flow `[B, D, 2, 2]`.
+            steps: Gauss-Newton steps.
+
+        Returns:
+            Flow `[B, D, 2]`, px of the level, and likeness `[B, D]` in 0..1 by correlation, before the last step.
+        """
+        eye = torch.eye(2, dtype=flow.dtype, device=flow.device)
+        affine = gradient + eye
+        for _ in range(steps):
+            value = sample(image, self.centre + flow, affine, self.offset)
+            mean, gain, step = torch.einsum("drn,bdn->bdr", self.rows, value).split([1, 1, 6], -1)
+            step = step / gain.clamp(min=1e-4)
+            shift, warp = (step / step.square().sum(-1, keepdim=True).clamp(min=1).sqrt()).split([2, 4], -1)
+            affine = affine @ (eye - warp.unflatten(-1, (2, 2)) / self.radius)
+            flow = flow - (affine @ shift[..., None])[..., 0]
+        variance = value.square() @ self.weight - mean[..., 0].square()
+        ncc = gain[..., 0] / (variance.clamp(min=0) + 1e-6).sqrt()
+        return flow, ((ncc - 0.7) / 0.25).clamp(0, 1)
+
+
+class Search(nn.Module):
+    """Exhaustive normalised correlation of the coarsest templates over all shifts up to `REACH`."""
+
+    centre: Tensor
+    offset: Tensor
+    unit: Tensor
+    weight: Tensor
+    shift: Tensor
+    near: Tensor
+
+    def __init__(self, template: Template):
+        super().__init__()
+        self.side = 2 * (RADIUS[-1] + REACH) + 1
+        side, shift = 2 * RADIUS[-1] + 1, square_offsets(REACH)
+        self.register_buffer("centre", template.centre.clone())
+        self.register_buffer("offset", square_offsets(RADIUS[-1] + REACH))
+        self.register_buffer("unit", template.unit.reshape(-1, 1, side, side).clone())
+        self.register_buffer("weight", template.weight.reshape(1, 1, side, side).clone())
+        self.register_buffer("shift", shift)
+        self.register_buffer("near", torch.exp(-(shift[:, None] - shift).square().sum(-1) / 2))
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Shift `[B, D, 2]` of the highest correlation, px of the level, and a score `[B, D]` in 0..1: high and unique?"""
+        still = torch.eye(2, dtype=image.dtype, device=image.device).expand(image.shape[0], 1, 2, 2)
+        window = sample(image, self.centre.expand(image.shape[0], -1, -1), still, self.offset)
+        window = (window - window.mean(-1, keepdim=True)).unflatten(-1, (self.side, self.side))
+        patches = self.unit.shape[0]
+        weight = self.weight.expand(patches, -1, -1, -1)
+        product = F.conv2d(window, self.unit, groups=patches)
+        mean = F.conv2d(window, weight, groups=patches)
+        variance = F.conv2d(window.square(), weight, groups=patches) - mean.square()
+        ncc = (product / (variance.clamp(min=0) + 1e-6).sqrt()).flatten(-2)
+        best, at = ncc.max(-1)
+        near = self.near[at]
+        share = torch.softmax(40 * ncc, -1) * near
+        shift = (share @ self.shift) / (share.sum(-1, keepdim=True) + 1e-12)
+        rival = (ncc - 2 * near).amax(-1)
+        return shift, ((best - 0.5) / 0.3).clamp(0, 1) * ((best - rival) / 0.2).clamp(0, 1)
