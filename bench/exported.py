@@ -4,8 +4,8 @@ python bench/exported.py CASES [--estimator force-balance] [--tracking] [--only 
 
 CASES as for bench/accuracy.py. For each sensor the model is exported (seconds, MB, nodes), loaded, and run on every image in
 batches of 1, 3 and 16. Printed: the largest difference of vertices (length unit), markers (length unit), pixels (px) and force
-(relative), whether all statuses are equal; milliseconds a frame, best and median, with what its parts take: markers, assembly
-(rays and result) and solve, from onnxruntime's own profile of single frames.
+(relative), whether all statuses are equal; milliseconds a frame, best and median, with what its parts take: markers, reconstruct
+(image check, rays and result) and estimators, from onnxruntime's own profile of single frames.
 """
 
 import argparse
@@ -23,7 +23,6 @@ from accuracy import cases_in
 from record import write
 
 from torchmembrane.io.results import Reconstruction
-from torchmembrane.io.store import Settings
 from torchmembrane.onnx.export import export, previous_of
 from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
 
@@ -55,8 +54,7 @@ def measure(sensor: Path, files: list[Path], estimator: str, tracking: bool, thr
     reconstructor = Reconstructor.from_file(sensor, estimator=estimator)
     with tempfile.TemporaryDirectory() as folder:
         path, start = Path(folder) / "model.onnx", time.perf_counter()
-        settings = Settings(estimator, reconstructor.sensor.material.model, "triangle", "npz")
-        model = export(reconstructor, path, settings, tracking)
+        model = export(reconstructor, path, tracking=tracking)
         row = dict(export_seconds=time.perf_counter() - start, megabytes=path.stat().st_size / 1e6, nodes=count(model.graph))
         start = time.perf_counter()
         session = open_session(path, threads)

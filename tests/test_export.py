@@ -16,13 +16,16 @@ from torch import nn
 
 from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
-from torchmembrane.estimators import force_balance
+from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.settings import ForceBalanceSettings
 from torchmembrane.io.images import to_grey
-from torchmembrane.io.results import BAD_VALUES, BLANK, OK, STATUS_TEXTS, TOO_FEW_MARKERS, Reconstruction, load_frame
-from torchmembrane.io.store import Mesh, Settings
+from torchmembrane.io.results import Reconstruction, load_frame
+from torchmembrane.io.status import Status
+from torchmembrane.io.store import Mesh
 from torchmembrane.onnx import export
 from torchmembrane.onnx.export import Piece
 from torchmembrane.onnx.graph import Assembly, traced
+from torchmembrane.pieces import piece, unless
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
@@ -58,12 +61,10 @@ def images(folder):
 
 @pytest.fixture(scope="module")
 def reconstructor(folder):
-    """With a coarser grid, which only finer ones than this would have."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(force_balance, "COARSEST", 5)
-        patch.setattr(force_balance, "COARSEST_WARM", 5)
-        made = Reconstructor.from_file(folder / "sensor.toml")
-    made.estimator.steps = 12  # on so coarse grids the default does not settle beside lost markers
+    """With a coarser grid, which only finer ones than this would have; so coarse the default does not settle beside lost
+    markers."""
+    settings = ForceBalanceSettings(coarsest=5, coarsest_warm=5, fine_steps=12)
+    made = Reconstructor.from_file(folder / "sensor.toml", settings=settings)
     assert made.estimator.coarse.membrane.grid == (5, 5)
     return made
 
@@ -82,7 +83,7 @@ def model_files(reconstructor, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(export, "traced", once)
         for tracking, path in files.items():
-            export.export(reconstructor, path, Settings("force-balance", "neo_hookean", "triangle", "npz"), tracking)
+            export.export(reconstructor, path, tracking=tracking)
     return files
 
 
@@ -117,7 +118,7 @@ def test_the_model_agrees_with_torch(run, reconstructor, images):
     images = reconstructor.read(*images)
     with torch.no_grad():
         together = reconstructor(images)
-    assert together.status.tolist() == [OK] * 3
+    assert together.status.tolist() == [Status.OK] * 3
     agree(run(images), together)
     assert together.displacement[2].norm(dim=-1).max() > 1
     agree(run(images[:1]), Reconstruction(*(field[:1] for field in together)))
@@ -137,33 +138,41 @@ def test_a_tracking_model_starts_from_the_frames_before(model_files, reconstruct
 def test_minimum_energy_agrees_with_torch(folder):
     reconstructor = Reconstructor.from_file(folder / "sensor.toml", estimator="minimum-energy")
     estimator, tracer = reconstructor.estimator, export.Tracer()
-    flow = 3 * torch.rand(3, 1, 2) * reconstructor.estimator.moves[:, None]
+    flow = 3 * torch.rand(3, 1, 2) * estimator.free[:, None]
     origins, directions = reconstructor.camera.pixel_to_ray(reconstructor.vertex_pixels + flow)
     rays = {"origins": origins.expand(directions.shape).contiguous(), "directions": directions}
-    for name, values in rays.items():
-        tracer.given(name, values[:2])
-    export.minimum_energy(tracer, estimator)
-    tracer.assembly.named(tracer.names["vertices"], "surface")
-    value = lambda name: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", 81, 3])  # noqa: E731
-    model = tracer.assembly.model([value(name) for name in rays], [value("surface")], {})
+    confidence = torch.ones(directions.shape[:2])
+    found = estimator(Observation(*(tracer.given(name, values[:2]) for name, values in rays.items()), confidence[:2]))
+    tracer.assembly.named(found.vertices.name, "surface")
+    shapes = {name: ["batch", 81, 3] for name in (*rays, "surface")}
+    values = {name: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, s) for name, s in shapes.items()}
+    model = tracer.assembly.model([values[name] for name in rays], [values["surface"]], {})
     session = opened(model.SerializeToString())
     with torch.no_grad():
-        expected = estimator(**rays).vertices
+        expected = estimator(Observation(**rays, confidence=confidence)).vertices
     assert (expected - estimator.membrane.rest).norm(dim=-1).max() > 0.1
     for batch in (1, 3):
         (found,) = session.run(None, {name: values[:batch].numpy() for name, values in rays.items()})
         np.testing.assert_allclose(found, expected[:batch].numpy(), rtol=0, atol=1e-4)
 
 
+class Search(nn.Module):
+    @piece
+    def follow(self, x):
+        return (x > 0).all(-1), 2 * x
+
+    @piece
+    def search(self, y):
+        return (y - 1,)
+
+
 def test_what_runs_unless_a_condition_holds_runs_only_then():
-    tracer, none = export.Tracer(), nn.Module()
-    tracer.given("x", torch.ones(2, 3))
-    tracer.piece(none, lambda _, x: ((x > 0).all(), 2 * x), ["x"], ["positive", "y"])
-    with tracer.unless("positive", ["y"]):
-        tracer.piece(none, lambda _, y: (y - 1,), ["y"], ["y"])
-    tracer.assembly.named(tracer.names["y"], "result")
-    value = lambda name: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", 3])  # noqa: E731
-    session = opened(tracer.assembly.model([value("x")], [value("result")], {}).SerializeToString())
+    tracer, search = export.Tracer(), Search()
+    positive, doubled = search.follow(tracer.given("x", torch.ones(2, 3)))
+    (y,) = unless(positive, (doubled,), lambda: search.search(doubled))
+    tracer.assembly.named(y.name, "result")
+    x, result = (onnx.helper.make_tensor_value_info(n, onnx.TensorProto.FLOAT, ["batch", 3]) for n in ("x", "result"))
+    session = opened(tracer.assembly.model([x], [result], {}).SerializeToString())
     for x in (np.ones((3, 3), np.float32), -np.ones((1, 3), np.float32)):
         np.testing.assert_array_equal(session.run(None, {"x": x})[0], 2 * x if (x > 0).all() else 2 * x - 1)
 
@@ -171,7 +180,7 @@ def test_what_runs_unless_a_condition_holds_runs_only_then():
 def test_minimum_energy_does_not_track(folder, tmp_path):
     reconstructor = Reconstructor.from_file(folder / "sensor.toml", estimator="minimum-energy")
     with pytest.raises(MembraneError, match="starts from rest always"):
-        export.export(reconstructor, tmp_path / "no.onnx", Settings("minimum-energy", "", "", "npz"), tracking=True)
+        export.export(reconstructor, tmp_path / "no.onnx", tracking=True)
 
 
 def test_damaged_images_get_the_same_status(run, reconstructor, images):
@@ -183,7 +192,14 @@ def test_damaged_images_get_the_same_status(run, reconstructor, images):
     images = torch.stack([good, blank, nan, noise, hidden, *filled])
     with torch.no_grad():
         expected = reconstructor(images)
-    assert expected.status.tolist() == [OK, BLANK, BAD_VALUES, TOO_FEW_MARKERS, OK, *[BAD_VALUES] * 3]
+    assert expected.status.tolist() == [
+        Status.OK,
+        Status.BLANK,
+        Status.BAD_VALUES,
+        Status.TOO_FEW_MARKERS,
+        Status.OK,
+        *[Status.BAD_VALUES] * 3,
+    ]
     agree(run(images), expected)
 
 
@@ -195,7 +211,9 @@ def test_the_file_is_plain_onnx_and_says_what_it_is(model_file, reconstructor):
     assert model_file.stat().st_size < 25e6
     assert [output.name for output in model.graph.output] == list(Reconstruction._fields)
     known = {entry.key: entry.value for entry in model.metadata_props}
-    assert {int(code): text for code, text in json.loads(known["status_texts"]).items()} == STATUS_TEXTS
+    assert {int(code): text for code, text in json.loads(known["status_texts"]).items()} == {
+        status.value: status.text for status in Status
+    }
     np.testing.assert_array_equal(json.loads(known["mesh"])["triangles"], reconstructor.estimator.membrane.triangles)
 
 
@@ -253,7 +271,7 @@ def test_edge_follows_a_video(model_files, reconstructor, images, monkeypatch):
     with torch.no_grad():
         for frame, k in zip(found, (0, 1, None, 2), strict=True):
             if k is None:
-                assert frame["status"].tolist() == [BLANK] and np.isnan(frame["vertices"]).all()
+                assert frame["status"].tolist() == [Status.BLANK] and np.isnan(frame["vertices"]).all()
                 state = None
                 continue
             if state is None:

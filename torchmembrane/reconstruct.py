@@ -19,6 +19,7 @@ from .io.results import Reconstruction
 from .io.status import Status
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
 from .markers.placement import place_markers
+from .pieces import piece
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
 
@@ -158,8 +159,14 @@ class Reconstructor(nn.Module):
             grey = grey_batch(images, self.image_size, self.channels, self.rest_pixels)
             if previous is not None:
                 previous = self._checked(previous, len(grey))
-            flow = self.observer(grey, None if previous is None else previous.pixels, rest_pixels)
-            return self._solve(flow, previous)
+            return self.reconstruct_grey(grey, previous, rest_pixels)
+
+    def reconstruct_grey(
+        self, grey: Tensor, previous: Reconstruction | None = None, rest_pixels: Tensor | None = None
+    ) -> Reconstruction:
+        """As `forward`, from grey images `[B, 1, height, width]` in 0..1 of this module's precision; nothing is checked."""
+        flow = self.observer(grey, None if previous is None else previous.pixels, rest_pixels)
+        return self._solve(flow, previous)
 
     def from_pixels(
         self,
@@ -193,15 +200,18 @@ class Reconstructor(nn.Module):
         found = self.estimator(self.observation(usable, confidence), start)
         return self.result(found, displacement, confidence, status)
 
+    @piece
     def start(self, vertices: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
         """Vertices `[B, V, 3]` and pressure `[B]` of the frames before, those of rest where there are none (NaN)."""
         vertices = torch.where(vertices.isfinite(), vertices, self.estimator.membrane.rest)
         return vertices, torch.where(pressure.isfinite(), pressure, self.estimator.rest_pressure)
 
+    @piece
     def observation(self, displacement: Tensor, confidence: Tensor) -> Observation:
         """What the estimator is given, from the markers' displacements `[B, D, 2]` and confidence `[B, D]`."""
         return self.estimator.prepare(self.camera, self.rest_pixels + displacement, confidence)
 
+    @piece
     def result(self, found: Equilibrium, displacement: Tensor, confidence: Tensor, status: Tensor) -> Reconstruction:
         """The frames' results, NaN where there is no surface."""
         membrane, lost, x = self.estimator.membrane, confidence <= FOUND, found.vertices

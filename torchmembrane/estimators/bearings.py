@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ..pieces import piece
 from ..solve.stencil_system import NEAR
 from ..surface.membrane import Membrane
 from ..surface.projection import SurfacePoints
@@ -45,6 +46,7 @@ class MarkerBearings(nn.Module):
         self.register_buffer("vertex_shares", vertex_shares)
         self.register_buffer("pair_shares", pair_shares)
 
+    @piece
     def measured(self, observation: Observation) -> Bearings:
         """The markers' rays as `angles` takes them."""
         origins, directions, confidence = observation

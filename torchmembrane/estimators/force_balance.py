@@ -29,6 +29,7 @@ from torch import Tensor, nn
 from ..camera.model import Camera
 from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
+from ..pieces import piece, repeated
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..solve.kkt import BorderedStep, solve_bordered
 from ..surface.membrane import Membrane
@@ -70,6 +71,7 @@ class ForceBalance(nn.Module):
     """
 
     finds_contacts: ClassVar[bool] = True
+    element: ClassVar[str] = "triangle"
     Settings: ClassVar[type[ForceBalanceSettings]] = ForceBalanceSettings
     takes_start: ClassVar[bool] = True
 
@@ -174,14 +176,17 @@ class ForceBalance(nn.Module):
             return settings.gnc_schedule(settings.warm_steps, settings.warm_tau)
         return settings.gnc_schedule(self.steps, settings.tau if self.coarse is None else settings.fine_tau)
 
+    @piece
     def at_rest(self, confidence: Tensor) -> tuple[Tensor, Tensor]:
         """The rest surface and pressure, for every row of `confidence [B, D]`."""
         return self.membrane.rest.repeat(confidence.shape[0], 1, 1), self.rest_pressure.repeat(confidence.shape[0])
 
+    @piece
     def coarsened(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
         """Vertices `[B, V, 3]` and pressure `[B]` on the grid of `coarse`: every second line's."""
         return x.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure
 
+    @piece
     def refined(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
         """Surface and pressure of `coarse` on this grid: the displacement is bilinear between its lines."""
         u = (x - self.coarse.membrane.rest).unflatten(1, self.coarse.membrane.grid).permute(0, 3, 1, 2)
@@ -191,20 +196,45 @@ class ForceBalance(nn.Module):
     def _descend(
         self, x: Tensor, pressure: Tensor, measured: Bearings, schedule: list[tuple[float, float]], one_factor: bool = False
     ) -> Equilibrium:
-        factor, before = None, x
-        for tau, outlier in schedule:
-            before, scales = x, (x.new_tensor(tau), x.new_tensor(outlier))
-            x, pressure, made = self._compiled_once(x, pressure, measured, *scales, factor)
-            factor = (factor or made) if one_factor else None
-        return self.equilibrium(x, pressure, before)
+        """The steps of a schedule; `one_factor`: all with that of the first."""
+        state, factor = (x, pressure, x), None
+        if one_factor:
+            *state, factor = self._first(x, pressure, measured, *schedule[0])
+            schedule = schedule[1:]
+        return self.equilibrium(*repeated(self._next, schedule, state, measured, factor))
+
+    @piece
+    def _first(
+        self, x: Tensor, pressure: Tensor, measured: Bearings, tau: float, outlier: float
+    ) -> tuple[Tensor, Tensor, Tensor, Factor | None]:
+        """Surface, pressure and the surface before; the factor of the step's matrix."""
+        after, pressure, factor = self._traced_once(x, pressure, measured, tau, outlier, None)
+        return after, pressure, x, factor
+
+    @piece
+    def _next(
+        self, x: Tensor, pressure: Tensor, before: Tensor, measured: Bearings, factor: Factor | None, tau: float, outlier: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Surface, pressure and the surface before."""
+        after, pressure, _ = self._traced_once(x, pressure, measured, tau, outlier, factor)
+        return after, pressure, x
+
+    def _traced_once(
+        self, x: Tensor, pressure: Tensor, measured: Bearings, tau: float, outlier: float, factor: Factor | None
+    ) -> tuple[Tensor, Tensor, Factor | None]:
+        """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself."""
+        scales = (torch.as_tensor(scale, dtype=x.dtype, device=x.device) for scale in (tau, outlier))
+        step = self.step if torch.compiler.is_exporting() else self._compiled_once
+        taken: tuple[Tensor, Tensor, Factor | None] = step(x, pressure, measured, *scales, factor)
+        return taken
 
     @torch.compiler.nested_compile_region
     def _compiled_once(
         self, x: Tensor, pressure: Tensor, measured: Bearings, tau: Tensor, outlier: Tensor, factor: Factor | None
     ) -> tuple[Tensor, Tensor, Factor | None]:
-        """`step`, which `torch.compile` then traces and compiles once, not once per step."""
         return self.step(x, pressure, measured, tau, outlier, factor)
 
+    @piece
     def equilibrium(self, x: Tensor, pressure: Tensor, before: Tensor) -> Equilibrium:
         """What this surface and pressure amount to; `before`: the surface a step earlier."""
         step = (x - before).square().sum(-1).mean(-1).sqrt() / self.size

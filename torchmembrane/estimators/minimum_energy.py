@@ -14,6 +14,7 @@ from ..errors import MembraneError
 from ..mechanics.affine_quadrilateral import AffineQuadrilaterals
 from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
+from ..pieces import piece
 from ..solve.anderson import accelerated, first
 from ..solve.kkt import constrained_minimum
 from ..surface.membrane import Membrane
@@ -90,6 +91,11 @@ class MinimumEnergy(nn.Module):
         return cls(problem.membrane, problem.elasticity, rays, problem.filling, problem.gas, settings, flow)
 
     @property
+    def element(self) -> str:
+        """The finite element: "triangle" or "quadrilateral"."""
+        return self.settings.element
+
+    @property
     def rest_pressure(self) -> Tensor:
         """Pressure difference across the membrane at rest, `[]`."""
         return self.cavity.rest_pressure
@@ -141,6 +147,7 @@ class MinimumEnergy(nn.Module):
             state = self.step(*state, origins, directions, relaxed)
         return self.equilibrium(state[0], origins, directions, relaxed)
 
+    @piece
     def start(
         self, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -150,6 +157,7 @@ class MinimumEnergy(nn.Module):
         t = self.rest_range.expand(directions[..., 0, :].shape)
         return *first(t, self._move(t, origins, directions, relaxed)[0]), origins, directions
 
+    @piece
     def step(
         self, t: Tensor, latest: Tensor, changes: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None
     ) -> State:
@@ -157,6 +165,7 @@ class MinimumEnergy(nn.Module):
         move, _ = self._move(t, origins, directions, relaxed)
         return accelerated(t, move, latest, changes)
 
+    @piece
     def equilibrium(self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None) -> Equilibrium:
         """What these ranges amount to, and how far they are from a solution."""
         x = (origins + t[..., None, :] * directions).mT

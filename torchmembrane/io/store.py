@@ -28,6 +28,11 @@ class Settings(NamedTuple):
     element: str
     format: str
 
+    @classmethod
+    def of(cls, reconstructor: "Reconstructor", format: str) -> "Settings":
+        """Those of results that a reconstructor makes."""
+        return cls(reconstructor.estimator_name, reconstructor.model, reconstructor.estimator.element, format)
+
 
 class Mesh(NamedTuple):
     """What all frames of a folder share, as stored in `mesh.npz`.

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..io.status import Status
+from ..pieces import piece
 from .locator import Locator
 from .placement import FEWEST_MARKERS, PlacedMarkers
 from .screening import MismatchScreen
@@ -84,6 +85,7 @@ class MarkerObserver(nn.Module):
         before = None if previous is None else self.located(previous)
         return MarkerFlow(*self.displaced(*self.locator(images, before), status, rest_pixels), status)
 
+    @piece
     def check(self, images: Tensor) -> Tensor:
         """Status `[B]` of images."""
         flat, sparse = images.flatten(1), images[..., ::SPARSE, ::SPARSE].flatten(1)
@@ -94,10 +96,12 @@ class MarkerObserver(nn.Module):
         status = torch.where(blank, Status.BLANK.value, Status.OK.value)
         return torch.where(bad, Status.BAD_VALUES.value, status)
 
+    @piece
     def located(self, pixels: Tensor) -> Tensor:
         """`pixels` of a result as the locator found them."""
         return pixels - self.rest_pixels + self.measured_rest
 
+    @piece
     def displaced(
         self, pixels: Tensor, confidence: Tensor, status: Tensor, rest_pixels: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
@@ -126,6 +130,7 @@ class MarkerObserver(nn.Module):
         status = torch.zeros_like(confidence[:, 0], dtype=torch.long)
         return MarkerFlow(displacement, self.screen(displacement, confidence), status)
 
+    @piece
     def judge(self, displacement: Tensor, confidence: Tensor, status: Tensor) -> MarkerFlow:
         """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""
         found = confidence > FOUND

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ...pieces import piece, repeated
 from ..spacing import neighbours, spacing, square_distance
 
 WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
@@ -52,11 +53,12 @@ class LocalDeformation(nn.Module):
 
     def forward(self, blobs: Tensor, valid: Tensor) -> Tensor:
         """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, 2, 2, K]`."""
-        gradient, around, away, beside, nearby = self.begin(blobs, valid)
-        for width in WIDTHS:
-            (gradient,) = self.refine(gradient, around, away, beside, nearby, valid, width)
+        first, *scene = self.begin(blobs, valid)
+        gradient: Tensor
+        (gradient,) = repeated(self.refine, [(width,) for width in WIDTHS], (first,), *scene, valid)
         return gradient
 
+    @piece
     def begin(self, blobs: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """What the fits need of a frame.
 
@@ -81,6 +83,7 @@ class LocalDeformation(nn.Module):
         ratio = square[:, 0, :, :4].clamp_min(1e-12).sqrt().mean(-1).clamp(0.4, 2.0)
         return ratio[:, None, None] * eye, around, away.transpose(1, 2), beside.transpose(1, 2), nearby
 
+    @piece
     def refine(
         self, gradient: Tensor, around: Tensor, away: Tensor, beside: Tensor, nearby: Tensor, valid: Tensor, width: float
     ) -> tuple[Tensor]:

@@ -7,6 +7,7 @@ from scipy.spatial import Delaunay, cKDTree
 from torch import Tensor, nn
 
 from ...errors import MembraneError
+from ...pieces import piece
 from ..spacing import safe_length, spacing, square_distance
 from .coherence import Coherence
 from .detect import BlobDetector
@@ -119,6 +120,7 @@ class DotLocator(nn.Module):
         place, certainty, strain = self.match(blobs, log_radius, valid, previous)
         return self.end(level_0, level_1, level_2, blobs, log_radius, valid, place, certainty, strain)
 
+    @piece
     def begin(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """The levels of the pyramid, and the blobs: centres `[B, K, 2]`, log radius `[B, K]`, and how surely one is a dot."""
         levels = mean_pyramid(1 - image if self.polarity == "light" else image)
@@ -130,6 +132,7 @@ class DotLocator(nn.Module):
         level_0, level_1, level_2 = levels
         return level_0, level_1, level_2, blobs, log_radius, valid
 
+    @piece
     def end(
         self,
         level_0: Tensor,

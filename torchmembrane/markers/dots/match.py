@@ -1,9 +1,12 @@
 """Matching: which blob of the frame is which dot, grown inwards from the rim along the smooth flow."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ...pieces import piece, repeated, unless
 from ..spacing import spacing, thin_out
 from .deformation import FAR, LocalDeformation
 from .flow import SUPPORT, FlowAverages
@@ -118,19 +121,20 @@ class DotMatcher(nn.Module):
             Positions `[B, D, 2]` px, certainty `[B, D]` in 0..1 and strain `[B, D, 2, 2]`.
         """
         *followed, kept = self.follow(blobs, log_radius, valid, previous)
-        return self.end(*self.either(kept, *followed, *self.search(blobs, log_radius, valid)))
+
+        def searched() -> Sequence[Tensor]:
+            return self.either(kept, *followed, *self.search(blobs, log_radius, valid))
+
+        return self.end(*unless(kept, followed, searched))
 
     def search(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> State:
         """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""
         known, base = self.scene(self.deformation(blobs, valid), blobs, log_radius, valid)
         known, base, *start = self.begin(known, base)
-        state = (start[0], start[1], start[2])
-        for _ in range(self.steps):
-            state = self.grow(*state, known, base)
-        for _ in range(SETTLING):
-            state = self.settle(*state, known, base)
-        return self.best(*state)
+        grown = repeated(self.grow, self.steps, start, known, base)
+        return self.best(*repeated(self.settle, SETTLING, grown, known, base))
 
+    @piece
     def follow(
         self, blobs: Tensor, log_radius: Tensor, valid: Tensor, previous: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -150,11 +154,13 @@ class DotMatcher(nn.Module):
         followed = ~(found & ~(weight >= KEPT)).any(-1)
         return weight, flow, self.averages.gradient(weight, flow, strain), followed
 
+    @piece
     def either(self, kept: Tensor, weight: Tensor, flow: Tensor, strain: Tensor, *searched: Tensor) -> tuple[Tensor, ...]:
         """The dots followed in the frames `kept [B]`, those searched in the others."""
         followed = (weight, flow, strain)
         return tuple(torch.where(kept.reshape(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in zip(followed, searched, strict=True))
 
+    @piece
     def scene(self, deformation: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """What `choose` needs to know of the blobs: `[B, 7, K]`, `[B, D, K]`."""
         strain = deformation - torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
@@ -163,6 +169,7 @@ class DotMatcher(nn.Module):
         misfit = ((self.log_radius[:, None] - (log_radius + 3 * (1 - valid))[:, None]) / self.size_tolerance).square()
         return known, misfit + self.stiffness[:, None] * position.square().sum(1, keepdim=True)
 
+    @piece
     def begin(self, known: Tensor, base: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """The scene of every start; weight, flow and strain of the dots before the first step."""
         starts = self.starts.shape[0]
@@ -172,15 +179,18 @@ class DotMatcher(nn.Module):
         weight, flow, strain = self.choose(flow, FAR + flow[:, 0], known, base)
         return known, base, (weight.unflatten(0, (-1, starts)) * self.starts).flatten(0, 1), flow, strain
 
+    @piece
     def grow(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
         """One step outwards along the strain measured."""
         return self.choose(*self.averages.along(weight, flow, strain), known, base)
 
+    @piece
     def settle(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
         """One step along the strain measured and what the neighbours' flow says of it."""
         gradient = self.averages.gradient(weight, flow, strain)
         return self.choose(*self.averages.along(weight, flow, gradient), known, base)
 
+    @piece
     def best(self, weight: Tensor, flow: Tensor, strain: Tensor) -> State:
         """The best start's."""
         starts = self.starts.shape[0]
@@ -194,6 +204,7 @@ class DotMatcher(nn.Module):
 
         return of_best(weight), of_best(flow), of_best(strain)
 
+    @piece
     def end(self, weight: Tensor, flow: Tensor, strain: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Positions, certainty and strain, as `forward` returns them."""
         return self.pixels + self.origin + flow.mT, weight, strain.movedim(-1, 1)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ...errors import MembraneError
+from ...pieces import piece
 from ..neighbourhood import NEIGHBOURS, NeighbourFlow, Neighbourhood
 from .pyramid import LEVELS, low_pass_pyramid
 from .template import RADIUS, Search, Template
@@ -77,6 +78,7 @@ class TextureLocator(nn.Module):
         self.search = Search(templates[-1])
         self.to(torch.get_default_dtype())
 
+    @piece
     def forward(self, image: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Locate the patches in a batch of frames; the gradient takes the last level only, the rest is where to look.
 

@@ -1,0 +1,112 @@
+"""The order of an estimator's or a locator's steps, written once: for tensors, which take them at once, and for the exporter.
+
+A method that is a `piece`, `repeated` and `unless` do on tensors what they say. Given a `Value`, which stands for a tensor in a
+graph that is being written, they are added to its `graph` instead. Between pieces values are only handed on.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, ParamSpec, Protocol, TypeVar
+
+Inputs = ParamSpec("Inputs")
+Output = TypeVar("Output")
+
+
+class Graph(Protocol):
+    """What writes a graph, piece by piece."""
+
+    def call(self, owner: Any, function: Callable[..., Any], inputs: Sequence[Any]) -> Any:
+        """Values of `function(owner, *inputs)`."""
+        ...
+
+    def repeat(
+        self, step: Callable[..., Any], rows: Sequence[tuple[float, ...]], state: Sequence[Any], given: Sequence[Any]
+    ) -> Any:
+        """Values as `repeated` gives them."""
+        ...
+
+    def unless(self, done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[Any]]) -> Any:
+        """Values as `unless` gives them."""
+        ...
+
+
+class Value:
+    """A tensor to be, in a `graph`."""
+
+    def __init__(self, graph: Graph):
+        self.graph = graph
+
+
+def piece(method: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
+    """Make a method one that a graph holds as it is traced once.
+
+    Args:
+        method: of a module, from tensors or tuples of them to those.
+
+    Example:
+        >>> import torch
+        >>> class Doubling(torch.nn.Module):
+        ...     @piece
+        ...     def forward(self, x):
+        ...         return 2 * x
+        >>> Doubling()(torch.tensor(3))
+        tensor(6)
+    """
+
+    @wraps(method)
+    def called(*owner_and_inputs: Inputs.args, **options: Inputs.kwargs) -> Output:
+        graph = _graph(owner_and_inputs[1:])
+        if graph is None:
+            return method(*owner_and_inputs, **options)
+        written: Output = graph.call(owner_and_inputs[0], method, owner_and_inputs[1:])
+        return written
+
+    return called
+
+
+def repeated(
+    step: Callable[..., Any], rows: int | Sequence[tuple[float, ...]], state: Sequence[Any], *given: Any
+) -> Sequence[Any]:
+    """Take `state = step(*state, *given, *row)` for every row.
+
+    Args:
+        step: a piece that gives the state.
+        rows: the numbers of every step, or how many steps.
+        state: what a step changes.
+        given: what it does not.
+
+    Example:
+        >>> repeated(lambda x, y, rate: (x + rate * y,), [(0.5,), (0.25,)], (1.0,), 4.0)
+        (4.0,)
+    """
+    graph, table = _graph((*state, *given)), [()] * rows if isinstance(rows, int) else rows
+    if graph is not None:
+        written: Sequence[Any] = graph.repeat(step, table, state, given)
+        return written
+    for row in table:
+        state = step(*state, *given, *row)
+    return state
+
+
+def unless(done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[Any]]) -> Sequence[Any]:
+    """Take what `otherwise` gives, which is `values` where `done` holds: a graph works it out only if somewhere it does not.
+
+    Args:
+        done: `[B]` bool.
+        values: what there is.
+        otherwise: gives values of the same number and shapes.
+    """
+    graph = _graph(values)
+    if graph is None:
+        return otherwise()
+    written: Sequence[Any] = graph.unless(done, values, otherwise)
+    return written
+
+
+def _graph(values: Sequence[Any]) -> Graph | None:
+    """The graph of the first `Value` among them, or in tuples among them."""
+    for value in values:
+        graph = value.graph if isinstance(value, Value) else _graph(value) if isinstance(value, (tuple, list)) else None
+        if graph is not None:
+            return graph
+    return None
