@@ -37,11 +37,11 @@ from torchmembrane.plot.frames import save
 from torchmembrane.presets import preset
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.model import Markers, Surface
-from torchmembrane.simulate.board import BoardImages
+from torchmembrane.simulate.appearance import Look
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Plane, Sphere
-from torchmembrane.simulate.look import Look
 from torchmembrane.simulate.simulator import Simulator
+from torchmembrane.simulate.target_renderer import TargetRenderer
 from torchmembrane.targets import Checkerboard, DotBoard
 
 NOISE = 40.0
@@ -58,7 +58,7 @@ OFFSET = np.array([0.0, 0.0, 0.3])
 def lens(seeds, figures):
     board = Checkerboard(11, 8, 2.5)
     for model, truth in LENSES.items():
-        photograph = BoardImages.of(Camera(model, (640, 480), *truth))
+        photograph = TargetRenderer.for_camera(Camera(model, (640, 480), *truth))
         for seed in range(seeds):
             pixels = poses_seen(photograph, board, 12, (14, 26), 0.35, np.random.default_rng(seed))
             guess = Camera(model, (640, 480), (250, 250), (320, 240))
@@ -82,7 +82,7 @@ def ports(seeds, figures):
         for seed in range(seeds):
             rng, sets = np.random.default_rng(seed), []
             for air in (True, False):
-                sets.append(poses_seen(BoardImages.of(make(PORT, air)), board, 6, (14, 22), 0.1, rng))
+                sets.append(poses_seen(TargetRenderer.for_camera(make(PORT, air)), board, 6, (14, 22), 0.1, rng))
             pixels, filled = np.concatenate(sets), np.arange(12) >= 6
             for label, chosen in (("air", ~filled), ("medium", filled), ("both", filled | True)):
                 views = Views(pixels[chosen], filled[chosen])
@@ -235,7 +235,7 @@ def pattern(seeds, figures):
             save(mill_figure(title, sensor, dots), figures / f"pattern_{name}.png")
 
 
-def poses_seen(photograph: BoardImages, board, count: int, depths, spread: float, rng) -> np.ndarray:
+def poses_seen(photograph: TargetRenderer, board, count: int, depths, spread: float, rng) -> np.ndarray:
     """A board in random poses as it was found in its images, `[count, D, 2]` px; poses not wholly seen are drawn again."""
     found, middle = [], np.append(sum(board.extent) / 2, 0.0)
     while len(found) < count:

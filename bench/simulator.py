@@ -21,10 +21,10 @@ from torchmembrane import MembraneError
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.presets import NAMES, preset
 from torchmembrane.sensor.model import Sensor
+from torchmembrane.simulate.appearance import Look
 from torchmembrane.simulate.dataset import Plan, random_frame, stroke_to
 from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
 from torchmembrane.simulate.indenters import Cylinder, Plane, Sphere, facing
-from torchmembrane.simulate.look import Look
 from torchmembrane.simulate.press import carried, press
 from torchmembrane.simulate.simulator import Simulator
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, heightfield, spherical_cap

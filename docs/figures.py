@@ -28,8 +28,8 @@ from torchmembrane.paper.strip import Strip
 from torchmembrane.plot.frames import BLUE, GREY, VERMILION
 from torchmembrane.presets import preset_file
 from torchmembrane.reconstruct import FOUND, Reconstructor
+from torchmembrane.simulate.appearance import Look
 from torchmembrane.simulate.indenters import Cylinder, Sphere
-from torchmembrane.simulate.look import Look
 from torchmembrane.simulate.press import press
 from torchmembrane.simulate.simulator import Simulator
 

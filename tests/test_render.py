@@ -10,7 +10,7 @@ import torch
 from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
 from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
-from torchmembrane.simulate.look import Look, blurred, noisy, scattered
+from torchmembrane.simulate.appearance import Look, blurred, noisy, scattered
 from torchmembrane.simulate.pattern import Dots, Painted, Speckle, pattern_of
 from torchmembrane.simulate.raster import seen_triangles
 from torchmembrane.simulate.render import Renderer, render

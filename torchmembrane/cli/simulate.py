@@ -13,10 +13,10 @@ from tqdm import tqdm
 from ..errors import MembraneError
 from ..presets import NAMES, sensor_file
 from ..sensor.model import Sensor
+from ..simulate.appearance import Look
 from ..simulate.dataset import KINDS, Plan, make_frames, stroke_to
 from ..simulate.frames import FORMATS, Video, open_frames
 from ..simulate.indenters import Box, Cylinder, Indenter, Mesh, Plane, Sphere, Wedge
-from ..simulate.look import Look
 from ..simulate.simulator import LEGS, Simulator, Stroke
 
 EXAMPLES = f"""\

@@ -12,7 +12,7 @@ from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..sensor.model import METRE, Cavity, Markers, Material, Sensor, Surface
 from ..sensor.toml import default_grid
-from ..simulate.look import Look, noisy
+from ..simulate.appearance import Look, noisy
 from ..simulate.render import Renderer
 from . import NAMES
 

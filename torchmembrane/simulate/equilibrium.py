@@ -16,7 +16,7 @@ from torch import Tensor
 from ..errors import MembraneError
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..surface.membrane import Membrane, corners, triangles_of
-from .contact import Contact
+from .frictional_contact import FrictionalContact
 
 FORCE_TOLERANCE = 1e-9  # over modulus x edge length
 VOLUME_TOLERANCE = 1e-11  # over the volume at rest
@@ -61,7 +61,7 @@ class Solution(NamedTuple):
 
     vertices: Tensor
     pressure: float
-    contacts: Sequence[Contact]
+    contacts: Sequence[FrictionalContact]
     iterations: int
 
 
@@ -81,7 +81,7 @@ class Equilibrium:
         self.force_scale = modulus * membrane.size / len(membrane.rest) ** 0.5
         self.vertex_stiffness = float(self.matrix(elasticity.hessian_blocks(membrane.rest)).diagonal().mean())
 
-    def solve(self, x: Tensor, pressure: float, contacts: Sequence[Contact] = ()) -> Solution:
+    def solve(self, x: Tensor, pressure: float, contacts: Sequence[FrictionalContact] = ()) -> Solution:
         """Equilibrium from a start `x [V, 3]`, whose rim stays where it is. Raises `MembraneError` if none is found."""
         for iteration in range(NEWTON_STEPS):
             projected = [contact.projected(x[self.free]) for contact in contacts]

@@ -11,8 +11,8 @@ from ..errors import MembraneError
 from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..surface.membrane import Membrane, SurfacePoints
-from .contact import Contact
 from .equilibrium import Equilibrium, Gas, Liquid, Open
+from .frictional_contact import FrictionalContact
 from .indenters import Indenter
 
 FINEST = 1 / 64  # of an increment, before a press is given up
@@ -99,7 +99,7 @@ def presses(
     rest_pressure = float(balance)
     equilibrium = Equilibrium(membrane, elasticity, _cavity(membrane, rest_pressure, filling, gas), load)
     x, pressure = membrane.rest, rest_pressure
-    contacts = [Contact.begun(path[0], x[membrane.free], equilibrium.vertex_stiffness, friction) for path in paths]
+    contacts = [FrictionalContact.begun(path[0], x[membrane.free], equilibrium.vertex_stiffness, friction) for path in paths]
     for poses in zip(*paths, strict=True):
         x, pressure, contacts, iterations = _moved(equilibrium, x, pressure, contacts, poses, increment)
         yield _result(equilibrium, rest_pressure, x, pressure, contacts, iterations)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..sensor.model import Sensor
-from .look import BRIGHT, Look, blurred, mirrored, scattered, vignette
+from .appearance import BRIGHT, Look, blurred, mirrored, scattered, vignette
 from .pattern import Canvas, Dots, Painted, Speckle, pattern_of
 from .raster import seen_triangles
 

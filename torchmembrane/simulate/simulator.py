@@ -13,8 +13,8 @@ from ..errors import MembraneError
 from ..io.images import to_grey
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..sensor.model import Sensor
+from .appearance import Look, noisy
 from .indenters import Indenter
-from .look import Look, noisy
 from .pattern import pattern_of
 from .press import Press, presses
 from .render import Renderer

@@ -36,7 +36,7 @@ class ActiveSet(NamedTuple):
     turning: Tensor
 
 
-class Contact(NamedTuple):
+class FrictionalContact(NamedTuple):
     """One indenter during one increment of its motion, against F free vertices `x [F, 3]`.
 
     `normal [F]`: N; `tangential [F, 3]`: T; `anchor [F, 3]`: where the vertices would be had they stuck, which slip is
@@ -51,11 +51,11 @@ class Contact(NamedTuple):
     friction: float
 
     @classmethod
-    def begun(cls, indenter: Indenter, x: Tensor, weight: float, friction: float) -> "Contact":
+    def begun(cls, indenter: Indenter, x: Tensor, weight: float, friction: float) -> "FrictionalContact":
         """No force yet, the indenter at its first pose."""
         return cls(indenter, torch.zeros_like(x[:, 0]), torch.zeros_like(x), x, weight, friction)
 
-    def carried_to(self, pose: Indenter, x: Tensor) -> "Contact":
+    def carried_to(self, pose: Indenter, x: Tensor) -> "FrictionalContact":
         """The next increment: the indenter moves to `pose`, from an equilibrium `x` in which this contact held.
 
         A vertex that it meets on the way is carried along only from where it is met. Raises `MembraneError` where the indenter
@@ -67,12 +67,12 @@ class Contact(NamedTuple):
         travel = along - x
         reached = (before < travel.norm(dim=-1)) & ((n_before * travel).sum(-1) > 0)
         if (reached & ((n_before * n_after).sum(-1) < SAME_SIDE)).any():
-            raise MembraneError("Contact: an indenter overtakes the membrane; expected smaller steps, which it can follow")
+            raise MembraneError("press: an indenter overtakes the membrane; expected smaller steps, which it can follow")
         met = (-after / (before - after).clamp_min(1e-300)).clamp(0, 1)
         share = torch.where(self.normal > 0, 1.0, met)[:, None]
         return self._replace(indenter=pose, tangential=self.tangential @ turn.T, anchor=x + share * travel)
 
-    def projected(self, x: Tensor) -> "Contact":
+    def projected(self, x: Tensor) -> "FrictionalContact":
         """The contact with the projections of N and T at `x`; in equilibrium they are N and T."""
         index, phi, n = self._touching(x)
         normal = self.normal[index] - self.weight * phi
@@ -86,7 +86,7 @@ class Contact(NamedTuple):
         n = self.indenter.normal(x[index]).detach()
         return torch.zeros_like(x).index_copy(0, index, self.normal[index, None] * n + self.tangential[index])
 
-    def distance_from(self, other: "Contact") -> float:
+    def distance_from(self, other: "FrictionalContact") -> float:
         """Largest difference of a nodal force component."""
         normal, tangential = self.normal - other.normal, self.tangential - other.tangential
         return float(torch.cat([normal, tangential.ravel()]).abs().max())
@@ -101,7 +101,7 @@ class Contact(NamedTuple):
         e = trial / size.clamp_min(1e-300)[:, None]
         return ActiveSet(index, phi, n, (x - self.anchor)[index], size <= bound, e, turning)
 
-    def linearised(self, active: ActiveSet, move: Tensor | float = 0.0) -> "Contact":
+    def linearised(self, active: ActiveSet, move: Tensor | float = 0.0) -> "FrictionalContact":
         """The contact with the forces that the law, linearised, gives the active vertices after a `move [F, 3]`."""
         rigid, index, n, e = RIGID * self.weight, active.index, active.n, active.e
         move = torch.broadcast_to(torch.as_tensor(move, dtype=n.dtype), self.tangential.shape)[index]
@@ -145,7 +145,7 @@ class Contact(NamedTuple):
     def _trial(self, x: Tensor, index: Tensor, n: Tensor) -> Tensor:
         return _tangential(self.tangential[index] - GENTLE * self.weight * (x - self.anchor)[index], n)
 
-    def _with(self, index: Tensor, normal: Tensor, tangential: Tensor) -> "Contact":
+    def _with(self, index: Tensor, normal: Tensor, tangential: Tensor) -> "FrictionalContact":
         zeros = torch.zeros_like
         return self._replace(
             normal=zeros(self.normal).index_copy(0, index, normal),

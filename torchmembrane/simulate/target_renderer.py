@@ -8,20 +8,20 @@ import torch.nn.functional as F
 
 from ..camera.model import Camera
 from ..targets import Checkerboard, DotBoard
-from .look import blurred, noisy
+from .appearance import blurred, noisy
 
 SAMPLES = 4  # along a pixel's side
 GROUND = 0.4  # reflectance of what is not the board
 
 
-class BoardImages(NamedTuple):
+class TargetRenderer(NamedTuple):
     """What photographs a board: a camera's rays through all samples of its image, `origin` and `direction [H s, W s, 3]`."""
 
     origin: np.ndarray
     direction: np.ndarray
 
     @classmethod
-    def of(cls, camera: Camera) -> "BoardImages":
+    def for_camera(cls, camera: Camera) -> "TargetRenderer":
         width, height = camera.image_size
         u, v = ((np.arange(side * SAMPLES) + 0.5) / SAMPLES - 0.5 for side in (width, height))
         pixels = torch.from_numpy(np.stack(np.meshgrid(u, v), -1))
