@@ -31,9 +31,10 @@ from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
 from torchmembrane.errors import MembraneError
 from torchmembrane.io.images import to_grey
+from torchmembrane.io.report import Report
 from torchmembrane.markers.dots import find_dots
-from torchmembrane.plot.calibration import Report, fit_figure, mill_figure, surface_figure
-from torchmembrane.plot.frames import save
+from torchmembrane.plot.calibration import fit_figure, mill_figure, surface_figure
+from torchmembrane.plot.drawing import save
 from torchmembrane.presets import preset
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.model import Markers, Surface

@@ -25,7 +25,7 @@ from torchmembrane.io.results import Reconstruction
 from torchmembrane.paper.pressed_strip import Disc, PressedStrip
 from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile
 from torchmembrane.paper.strip import Strip
-from torchmembrane.plot.frames import BLUE, GREY, VERMILION
+from torchmembrane.plot.drawing import BLUE, GREY, VERMILION
 from torchmembrane.presets import preset_file
 from torchmembrane.reconstruct import FOUND, Reconstructor
 from torchmembrane.simulate.appearance import Look

@@ -19,8 +19,8 @@ from ..calibrate.targets import find_target
 from ..calibrate.views import rest_from_views
 from ..errors import MembraneError
 from ..io.images import read_image
+from ..io.report import Report
 from ..jobs.local import find_inputs
-from ..plot.calibration import Report, fit_figure, material_figure, mill_figure, surface_figure
 from ..presets import sensor_file
 from ..sensor.model import Markers, Sensor
 from ..targets import Checkerboard, DotBoard
@@ -104,7 +104,7 @@ def rest(arguments) -> int:
     report = Report.of(
         "rest surface from one image", found.names, units, np.zeros(6), found.fit, found.pixels, found.residuals, notes
     )
-    return _done(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size))
+    return _done(arguments, found.sensor, report)
 
 
 def views(arguments) -> int:
@@ -122,8 +122,8 @@ def views(arguments) -> int:
     modelled = found.sensor.camera.point_to_pixel(torch.from_numpy(found.dots)).numpy()
     pixels = np.broadcast_to(modelled, found.residuals.shape)
     report = Report.of(f"rest surface from {P} views", found.names, units, design, found.fit, pixels, found.residuals, notes)
-    places = fine_surface(sensor).rest.numpy()
-    return _done(arguments, found.sensor, report, surface_figure(report, sensor.camera.image_size, places, found.surface, unit))
+    size, places = sensor.camera.image_size, fine_surface(sensor).rest.numpy()
+    return _done(arguments, found.sensor, report, lambda plot: plot.surface_figure(report, size, places, found.surface, unit))
 
 
 def depth(arguments) -> int:
@@ -137,8 +137,8 @@ def depth(arguments) -> int:
         f"{len(found.sensor.markers.positions)} dots placed on the surface",
     ]
     report = Report.without_parameters("rest surface from a depth image", notes)
-    places = fine_surface(sensor).rest.numpy()
-    return _done(arguments, found.sensor, report, surface_figure(report, sensor.camera.image_size, places, found.surface, unit))
+    size, places = sensor.camera.image_size, fine_surface(sensor).rest.numpy()
+    return _done(arguments, found.sensor, report, lambda plot: plot.surface_figure(report, size, places, found.surface, unit))
 
 
 def material(arguments) -> int:
@@ -160,7 +160,7 @@ def material(arguments) -> int:
         report.notes.append(f"the prestretch may be larger: {STRETCHES[-1]:g} is the largest that was tried")
     if n == 2:
         report.notes.append("modulus: shear modulus x thickness; the sensor file's thickness is kept, or 1 where it has none")
-    return _done(arguments, found.sensor, report, material_figure(report, found, [path.name for path in paths]))
+    return _done(arguments, found.sensor, report, lambda plot: plot.material_figure(report, found, [p.name for p in paths]))
 
 
 def pattern(arguments) -> int:
@@ -174,10 +174,10 @@ def pattern(arguments) -> int:
     path = made.to_file(arguments.out)
     write_mill(arguments.out / "mill.csv", sensor, dots)
     write_svg(arguments.out / "mill.svg", sensor, dots)
-    from ..plot.frames import save
+    from ..plot import calibration, drawing
 
     title = f"{len(dots.radii)} dots, radii {dots.radii.min():.3g} to {dots.radii.max():.3g} {sensor.length_unit}"
-    save(mill_figure(title, sensor, dots), arguments.out / "report.png")
+    drawing.save(calibration.mill_figure(title, sensor, dots), arguments.out / "report.png")
     print(f"{title}\n{arguments.out / 'mill.csv'} for the mill, mill.svg to look at, and the sensor that has them: {path}")
     return 0
 
@@ -185,12 +185,15 @@ def pattern(arguments) -> int:
 def _camera_done(arguments, sensor: Sensor, found: CameraFit, pixels: np.ndarray, units: list[str], title: str) -> int:
     design = [_value(sensor.camera, name) for name in found.names]
     report = Report.of(title, found.names, units, design, found.fit, pixels, found.residuals)
-    return _done(arguments, replace(sensor, camera=found.camera), report, fit_figure(report, sensor.camera.image_size))
+    return _done(arguments, replace(sensor, camera=found.camera), report)
 
 
-def _done(arguments, sensor: Sensor, report: Report, drawing) -> int:
-    path = sensor.to_file(arguments.out)
-    report.write(arguments.out, drawing)
+def _done(arguments, sensor: Sensor, report: Report, draw=None) -> int:
+    from ..plot import calibration, drawing
+
+    folder, path = arguments.out, sensor.to_file(arguments.out)
+    report.write(folder)
+    drawing.save(draw(calibration) if draw else calibration.fit_figure(report, sensor.camera.image_size), folder / "report.png")
     print("\n".join([*report.lines, f"calibrated sensor: {path}; report.json and report.png beside it"]))
     return 0
 

@@ -113,7 +113,8 @@ def check(arguments) -> int:
     frame = None if reconstructor is None else rest_frame(reconstructor)
     print("\n".join(described(sensor, reconstructor, frame)))
     if arguments.out:
-        from ..plot.frames import save, sensor_figure
+        from ..plot.drawing import save
+        from ..plot.sensor import sensor_figure
 
         save(sensor_figure(sensor, reconstructor, frame), arguments.out)
         print(f"drawn in {arguments.out}")
@@ -141,7 +142,8 @@ def export(arguments) -> int:
 
 def view(arguments) -> int:
     """`torchmembrane view`"""
-    from ..plot.frames import figure, save, show
+    from ..plot.drawing import save, show
+    from ..plot.frames import figure
 
     frame, mesh = load_frame(arguments.result), Mesh.load(arguments.mesh or arguments.result.parent / MESH)
     vertices, expected = len(frame["vertices"]), len(mesh.rest_vertices)

@@ -218,7 +218,8 @@ def _reconstruct(reconstructor, group: list[Frame]) -> Iterator[tuple[Frame, dic
 
 
 def _draw(path: Path, frame: Frame, result: dict[str, np.ndarray], mesh: Mesh) -> None:
-    from ..plot.frames import figure, save
+    from ..plot.drawing import save
+    from ..plot.frames import figure
 
     save(figure(result, mesh, frame.image[0, 0].cpu().numpy(), frame.name), path)
 
