@@ -38,7 +38,7 @@ from torchmembrane.plot.drawing import save
 from torchmembrane.presets import preset
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.model import Markers, Surface
-from torchmembrane.simulate.appearance import Look
+from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Plane, Sphere
 from torchmembrane.simulate.simulator import Simulator
@@ -116,7 +116,7 @@ def effect(seeds, figures):
     """Error of the dots in space, mm, over all presses, by sensor file and estimator."""
     for name, radius, depth in (("fingertip", 4.0, 2.0), ("half_cylinder", 4.0, 2.0)):
         design, truth = preset(name), posed(preset(name), TILT, OFFSET)
-        simulator = Simulator(truth, look=Look(noise=NOISE))
+        simulator = Simulator(truth, appearance=Appearance(noise=NOISE))
         image = simulator.rest_image()
         calibrated = rest_from_image(bare(design), image).sensor
         sensors = {"design": design, "calibrated": calibrated, "truth": truth}
@@ -156,7 +156,7 @@ def material(seeds, figures):
     for name, prestretch in itertools.product(("fingertip", "half_cylinder"), (1.05, 1.15, 1.3, 1.6, 2.0)):
         design = preset(name)
         truth = replace(design, material=replace(design.material, prestretch=prestretch, shear_modulus=0.3, thickness=0.4))
-        simulator = Simulator(truth, look=Look(noise=NOISE))
+        simulator = Simulator(truth, appearance=Appearance(noise=NOISE))
         sensor = replace(design, markers=replace(design.markers, rest_image=simulator.rest_image()))
         aim = simulator.membrane.rest[simulator.membrane.fixed].mean(0).numpy()
         strokes = [stroke_to(simulator, body, aim, travel, depth) for body, travel, depth in presses]
@@ -204,7 +204,7 @@ def views(seeds, figures):
 def depth(seeds, figures):
     for name in ("fingertip", "half_cylinder"):
         design, truth = preset(name), posed(preset(name), TILT, OFFSET)
-        simulator = Simulator(truth, look=Look(noise=NOISE))
+        simulator = Simulator(truth, appearance=Appearance(noise=NOISE))
         exact, image = simulator.renderer.depth(simulator.membrane.rest).numpy(), simulator.rest_image()
         for seed in range(seeds):
             noisy = exact + np.random.default_rng(seed).normal(size=exact.shape) * 0.2
@@ -277,7 +277,7 @@ def bare(sensor):
 
 
 def rest_image(sensor, seed: int) -> np.ndarray:
-    simulator = Simulator(sensor, look=Look(noise=NOISE))
+    simulator = Simulator(sensor, appearance=Appearance(noise=NOISE))
     return to_grey(simulator.image(simulator.membrane.rest, np.random.default_rng(seed)))
 
 

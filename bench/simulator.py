@@ -21,7 +21,7 @@ from torchmembrane import MembraneError
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.presets import NAMES, preset
 from torchmembrane.sensor.model import Sensor
-from torchmembrane.simulate.appearance import Look
+from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.dataset import Plan, random_frame, stroke_to
 from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
 from torchmembrane.simulate.indenters import Cylinder, Plane, Sphere, facing
@@ -37,7 +37,7 @@ SHAPES = {
     "halfcyl": lambda z, grid: half_cylinder(10, 40, 80, z, grid),
 }
 FRICTION, DEPTH, BALL = 0.4, 3.0, 4.0
-INK_ONLY = Look(ambient=1.0, vignetting=0.0, blur=0.0, exposure=1.0, outside=1.0)
+INK_ONLY = Appearance(ambient=1.0, vignetting=0.0, blur=0.0, exposure=1.0, outside=1.0)
 DATA_SET = 6
 
 
@@ -224,7 +224,7 @@ def dot_errors(simulator: Simulator, vertices) -> np.ndarray:
 def rendered_dots() -> list[dict]:
     rows = []
     for name in NAMES:
-        simulator = Simulator(preset(name), look=INK_ONLY)
+        simulator = Simulator(preset(name), appearance=INK_ONLY)
         membrane, depth = simulator.membrane, 0.05 * simulator.membrane.size
         middle = membrane.rest[membrane.fixed].mean(0).numpy()
         start, travel, *_ = stroke_to(simulator, Sphere(2.5 * depth), middle, (-0.2, 0.1, -1), depth)

@@ -28,7 +28,7 @@ from torchmembrane.paper.strip import Strip
 from torchmembrane.plot.drawing import BLUE, GREY, VERMILION
 from torchmembrane.presets import preset_file
 from torchmembrane.reconstruct import FOUND, Reconstructor
-from torchmembrane.simulate.appearance import Look
+from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.indenters import Cylinder, Sphere
 from torchmembrane.simulate.press import press
 from torchmembrane.simulate.simulator import Simulator
@@ -53,7 +53,7 @@ class Shown(NamedTuple):
 
 @cache
 def simulator(sensor: str) -> Simulator:
-    return Simulator(reconstructor(sensor).sensor, look=Look(noise=NOISE))
+    return Simulator(reconstructor(sensor).sensor, appearance=Appearance(noise=NOISE))
 
 
 @cache

@@ -25,7 +25,7 @@ from torchmembrane.cli import main as cli
 from torchmembrane.io.images import to_grey
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
-from torchmembrane.simulate.appearance import Look
+from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.simulator import Simulator
 from torchmembrane.simulate.target_renderer import TargetRenderer
 from torchmembrane.targets import Checkerboard, DotBoard
@@ -105,7 +105,7 @@ def assembled(design):
 
 
 def simulator_of(sensor):
-    return Simulator(sensor, look=Look(noise=NOISE))
+    return Simulator(sensor, appearance=Appearance(noise=NOISE))
 
 
 @pytest.fixture(scope="module")

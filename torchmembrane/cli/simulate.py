@@ -13,7 +13,7 @@ from tqdm import tqdm
 from ..errors import MembraneError
 from ..presets import NAMES, sensor_file
 from ..sensor.model import Sensor
-from ..simulate.appearance import Look
+from ..simulate.appearance import Appearance
 from ..simulate.dataset import KINDS, Plan, make_frames, stroke_to
 from ..simulate.frames import FORMATS, Video, open_frames
 from ..simulate.indenters import Box, Cylinder, Indenter, Mesh, Plane, Sphere, Wedge
@@ -45,7 +45,9 @@ def add_simulate(commands, command) -> None:
     """Add the command's parser; `command` is `cli._command`."""
     add = command(commands, "simulate", simulate, "press a sensor's membrane and render its image, with the truth", EXAMPLES)
     add("sensor", metavar="SENSOR.toml", help="the sensor file, or preset:NAME")
-    add("--out", metavar="DIR", type=Path, required=True, help="folder of the frames: new, or of the same sensor and look")
+    add(
+        "--out", metavar="DIR", type=Path, required=True, help="folder of the frames: new, or of the same sensor and appearance"
+    )
     add("--name", default="press", help="of a single press' files (default: %(default)s)")
     kinds = f"{', '.join(KINDS)}, or a closed mesh that presses along its +z (STL, OBJ, PLY); with --random several, a,b,c"
     add("--indenter", metavar="KIND", help=kinds)
@@ -71,8 +73,8 @@ def add_simulate(commands, command) -> None:
         "mirrored over scattered light (default: %(default)s)",
         "defocus, standard deviation (default: %(default)s)",
     )
-    add("--highlight", metavar="SHARE", type=_positive_or_0, default=Look.highlight, help=highlight)
-    add("--blur", metavar="PX", type=_positive_or_0, default=Look.blur, help=blur)
+    add("--highlight", metavar="SHARE", type=_positive_or_0, default=Appearance.highlight, help=highlight)
+    add("--blur", metavar="PX", type=_positive_or_0, default=Appearance.blur, help=blur)
     add("--dots", metavar="SMALL,LARGE", type=_pair, help="their radii (default: 0.16 and 0.27 of their spacing)")
     add("--missing", metavar="I,J", type=_numbers, default=(), help="dots that are not painted, from 0")
     add("--grid", metavar="M,N", type=_grid, help="of the equilibrium (default: 38 a side, or finer than the sensor's)")
@@ -84,8 +86,8 @@ def simulate(arguments) -> int:
     torch.set_num_threads(1)
     _check_options(arguments)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
-    look = Look(noise=arguments.noise, highlight=arguments.highlight, blur=arguments.blur)
-    simulator = Simulator(sensor, arguments.grid, look, arguments.dots, arguments.missing)
+    appearance = Appearance(noise=arguments.noise, highlight=arguments.highlight, blur=arguments.blur)
+    simulator = Simulator(sensor, arguments.grid, appearance, arguments.dots, arguments.missing)
     return (_random if arguments.random else _single)(arguments, simulator)
 
 

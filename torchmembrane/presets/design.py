@@ -12,7 +12,7 @@ from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..sensor.model import METRE, Cavity, Markers, Material, Sensor, Surface
 from ..sensor.toml import default_grid
-from ..simulate.appearance import Look, noisy
+from ..simulate.appearance import Appearance, noisy
 from ..simulate.render import Renderer
 from . import NAMES
 
@@ -70,7 +70,7 @@ def _sensor(name, camera, surface, material, positions, sizes, gas=False) -> Sen
     membrane = surface.membrane(default_grid(markers))
     cavity = Cavity("gas", AIR + _overpressure(membrane, material)) if gas else Cavity("liquid")
     blank = Sensor(name, "mm", camera, membrane, material, cavity, markers, surface)
-    image = noisy(Renderer(blank, look=Look())(membrane.rest), NOISE, np.random.default_rng(0))
+    image = noisy(Renderer(blank, appearance=Appearance())(membrane.rest), NOISE, np.random.default_rng(0))
     return replace(blank, markers=replace(markers, rest_image=to_grey((255 * image).round().byte().numpy())))
 
 

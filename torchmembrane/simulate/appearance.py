@@ -18,7 +18,7 @@ BRIGHT = 0.95  # the quantile of the rest surface that is exposed as asked
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """Light, lens and chip.
 
     lights      positions `(x, y, z)` of point lights, length unit, camera frame; default: four around the camera
@@ -48,7 +48,7 @@ class Look:
         ):  # fmt: skip
             value = getattr(self, name)
             if not low <= value <= high:
-                raise MembraneError(f"Look: {name} = {value}; expected a number from {low} to {high}")
+                raise MembraneError(f"Appearance: {name} = {value}; expected a number from {low} to {high}")
 
     def lights_for(self, membrane: Membrane) -> Tensor:
         """Positions `[L, 3]` of the lights."""
@@ -57,6 +57,9 @@ class Look:
         radius = RING_RADIUS * float(membrane.rest[membrane.fixed, :2].norm(dim=-1).mean())
         angle = 2 * math.pi * (torch.arange(ONE_RING, dtype=torch.float64) + 0.5) / ONE_RING
         return torch.stack([radius * angle.cos(), radius * angle.sin(), 0 * angle], -1)
+
+
+DEFAULT_APPEARANCE = Appearance()
 
 
 def scattered(x: Tensor, inward: Tensor, lights: Tensor) -> Tensor:

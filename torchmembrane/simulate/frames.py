@@ -136,10 +136,10 @@ class Video:
 def open_frames(folder: Path, simulator: Simulator, settings: dict, format: str = "png") -> Frames:
     """The frames of a folder that is made if need be, with the sensor as simulated: its rest image from the same light.
 
-    Raises `MembraneError` for a folder made with another sensor, look or `settings`, or with other contents.
+    Raises `MembraneError` for a folder made with another sensor, appearance or `settings`, or with other contents.
     """
     settings = settings | {"sensor": simulator.sensor.fingerprint, "grid": list(simulator.grid), "format": format}
-    settings = json.loads(json.dumps(settings | asdict(simulator.look) | simulator.pattern.described()))
+    settings = json.loads(json.dumps(settings | asdict(simulator.appearance) | simulator.pattern.described()))
     _check(folder, settings)
     if not (folder / SETTINGS).exists():
         folder.mkdir(parents=True, exist_ok=True)

@@ -5,6 +5,7 @@ pixel; each sample finds the triangle it sees and, linear in it, place on the ma
 """
 
 import copy
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..sensor.model import Sensor
-from .appearance import BRIGHT, Look, blurred, mirrored, scattered, vignette
+from .appearance import BRIGHT, DEFAULT_APPEARANCE, Appearance, blurred, mirrored, scattered, vignette
 from .pattern import Canvas, Dots, Painted, Speckle, pattern_of
 from .raster import seen_triangles
 
@@ -38,7 +39,7 @@ class Renderer(nn.Module):
         sensor      camera, rest surface, and the markers from which comes the default pattern
         grid        `(m, n)` of the vertices that will be drawn, default the sensor's solver grid
         pattern     `Dots`, `Speckle` or `Painted`, default `pattern_of(sensor)`
-        look        light, lens and chip (noise is not added here: see `noisy`)
+        appearance        light, lens and chip (noise is not added here: see `noisy`)
         samples     s: samples along a pixel's side
 
     Raises `MembraneError` where the rest surface is nowhere in the image.
@@ -49,9 +50,16 @@ class Renderer(nn.Module):
     torch.Size([480, 640])
     """
 
-    def __init__(self, sensor: Sensor, grid=None, pattern: Dots | Speckle | Painted | None = None, look=Look(), samples=4):  # noqa: B008
+    def __init__(
+        self,
+        sensor: Sensor,
+        grid: Sequence[int] | None = None,
+        pattern: Dots | Speckle | Painted | None = None,
+        appearance: Appearance = DEFAULT_APPEARANCE,
+        samples: int = 4,
+    ):
         super().__init__()
-        self.camera, self.look, self.samples = copy.deepcopy(sensor.camera), look, samples
+        self.camera, self.appearance, self.samples = copy.deepcopy(sensor.camera), appearance, samples
         coarse = sensor.surface.membrane(tuple(grid or sensor.membrane.grid))
         pattern = pattern or pattern_of(sensor)
         self.grid = coarse.grid
@@ -59,7 +67,7 @@ class Renderer(nn.Module):
         self.register_buffer("coarse_rest", coarse.rest)
         for axis in (0, 1):
             self.register_buffer(f"spline_{axis}", _spline_matrix(coarse.grid[axis], self.surface.grid[axis]))
-        self.register_buffer("lights", look.lights_for(coarse))
+        self.register_buffer("lights", appearance.lights_for(coarse))
         self._expose()
         self._paint(pattern)
 
@@ -76,7 +84,7 @@ class Renderer(nn.Module):
 
     def _paint(self, pattern) -> None:
         X, corners = self.surface.rest, self.surface.rest[self.surface.triangles]
-        white = self._light(X)[..., 0] * vignette(self.rest_pixels, self.camera, self.look.vignetting)
+        white = self._light(X)[..., 0] * vignette(self.rest_pixels, self.camera, self.appearance.vignetting)
         self.register_buffer("albedo", pattern.albedo(Canvas(X, self.rest_pixels, white)))
         self.ink, dots = 1.0, pattern if isinstance(pattern, Dots) else None
         positions = np.zeros((0, 3)) if dots is None else dots.positions
@@ -124,8 +132,8 @@ class Renderer(nn.Module):
         images = images.view(*vertices.shape[:-2], *images.shape[-2:])
         width, height = self.camera.image_size
         v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-        images = images * vignette(torch.stack([u, v], -1).to(images), self.camera, self.look.vignetting)
-        return blurred(images, self.look.blur).clamp(0, 1)
+        images = images * vignette(torch.stack([u, v], -1).to(images), self.camera, self.appearance.vignetting)
+        return blurred(images, self.appearance.blur).clamp(0, 1)
 
     def depth(self, vertices: Tensor) -> Tensor:
         """Depth images `[..., H, W]`: z along the axis of what is seen at each pixel's centre, NaN beside the membrane."""
@@ -143,12 +151,14 @@ class Renderer(nn.Module):
 
     def _light(self, x: Tensor) -> Tensor:
         """Grey of a white membrane and of the highlights on it, `[..., W, 2]`."""
-        look, inward = self.look, -self.surface.normals(x)
+        appearance, inward = self.appearance, -self.surface.normals(x)
         direct = scattered(x, inward, self.lights) / self.unit_light
         shine = torch.zeros_like(direct)
-        if look.highlight:
-            shine = mirrored(x, inward, self.lights, look.shininess) / self.unit_light
-        return look.exposure * torch.stack([look.ambient + (1 - look.ambient) * direct, look.highlight * shine], -1)
+        if appearance.highlight:
+            shine = mirrored(x, inward, self.lights, appearance.shininess) / self.unit_light
+        return appearance.exposure * torch.stack(
+            [appearance.ambient + (1 - appearance.ambient) * direct, appearance.highlight * shine], -1
+        )
 
     def _seen(self, x: Tensor, samples: int) -> tuple[Tensor, Tensor]:
         """Corners `[T, 3, 2]` of the projected triangles in samples, and which of them each sample sees, `[H s, W s]`."""
@@ -181,7 +191,7 @@ class Renderer(nn.Module):
             row = self.dot_row[triangle[near]]
             covered = _inside_unit_disc(linear.at(row, place[near]), linear.slope[row])
             grey[near] *= 1 + (self.ink - 1) * covered
-        image = torch.full(seen.shape, self.look.outside, device=seen.device)
+        image = torch.full(seen.shape, self.appearance.outside, device=seen.device)
         image.view(-1)[sample] = grey + shine
         return F.avg_pool2d(image[None, None], self.samples)[0, 0]
 
@@ -208,9 +218,16 @@ class _Linear(NamedTuple):
         return self.value[triangle] + (self.slope[triangle] * step[:, None]).sum(-1)
 
 
-def render(sensor: Sensor, vertices: Tensor, grid=None, pattern=None, look=Look(), samples=4) -> Tensor:  # noqa: B008
+def render(
+    sensor: Sensor,
+    vertices: Tensor,
+    grid: Sequence[int] | None = None,
+    pattern: Dots | Speckle | Painted | None = None,
+    appearance: Appearance = DEFAULT_APPEARANCE,
+    samples: int = 4,
+) -> Tensor:
     """Images `[..., H, W]` of a sensor's membrane at `vertices [..., V, 3]`; arguments as of `Renderer`."""
-    return Renderer(sensor, grid, pattern, look, samples)(vertices)
+    return Renderer(sensor, grid, pattern, appearance, samples)(vertices)
 
 
 def _inside_unit_disc(place: Tensor, slope: Tensor) -> Tensor:

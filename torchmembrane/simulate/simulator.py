@@ -13,7 +13,7 @@ from ..errors import MembraneError
 from ..io.images import to_grey
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..sensor.model import Sensor
-from .appearance import Look, noisy
+from .appearance import DEFAULT_APPEARANCE, Appearance, noisy
 from .indenters import Indenter
 from .pattern import pattern_of
 from .press import Press, presses
@@ -75,15 +75,22 @@ class Simulator:
     Arguments
         sensor     a `Sensor`
         grid       of the equilibrium; default about 38 a side, finer than the solver's, no line in common but the rim
-        look       light, lens, chip
+        appearance       light, lens, chip
         radii      of small and large dots, length unit; default as in `Dots.of`
         missing    dots that are not painted
 
     A gas without modulus acts as a liquid. Raises `MembraneError` for a grid that is the sensor's own.
     """
 
-    def __init__(self, sensor: Sensor, grid=None, look=Look(), radii=None, missing=()):  # noqa: B008
-        self.sensor, self.look = sensor, look
+    def __init__(
+        self,
+        sensor: Sensor,
+        grid: Sequence[int] | None = None,
+        appearance: Appearance = DEFAULT_APPEARANCE,
+        radii: Sequence[float] | None = None,
+        missing: Sequence[int] = (),
+    ):
+        self.sensor, self.appearance = sensor, appearance
         self.grid = tuple(grid or map(_finer, sensor.membrane.grid))
         if any(mine <= solver for mine, solver in zip(self.grid, sensor.membrane.grid, strict=True)):
             raise MembraneError(
@@ -100,13 +107,13 @@ class Simulator:
             gas = (sensor.gas_pressure, cavity.volume or self.membrane.cavity_volume)
             self.cavity = {"filling": "liquid"} if sensor.force_unit == "relative" else {"filling": "gas", "gas": gas}
         self.pattern = pattern_of(sensor, radii, missing)
-        self.renderer = Renderer(sensor, self.grid, self.pattern, look)
+        self.renderer = Renderer(sensor, self.grid, self.pattern, appearance)
         self.rest_dots = self.renderer.dots(self.membrane.rest)
 
     def image(self, vertices: torch.Tensor, rng: np.random.Generator) -> np.ndarray:
         """The membrane at `vertices [V, 3]` as the chip delivers it, uint8 `[H, W]`; `rng` makes the noise."""
         with torch.no_grad():
-            return (255 * noisy(self.renderer(vertices), self.look.noise, rng)).round().byte().cpu().numpy()
+            return (255 * noisy(self.renderer(vertices), self.appearance.noise, rng)).round().byte().cpu().numpy()
 
     def rest_image(self) -> np.ndarray:
         """The image at rest, float32 `[H, W]`, as a sensor keeps it."""
