@@ -10,7 +10,7 @@ import torch
 from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
 from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
-from torchmembrane.simulate.appearance import Appearance, blurred, noisy, scattered
+from torchmembrane.simulate.appearance import Appearance, blurred, diffuse_light, noisy
 from torchmembrane.simulate.pattern import Dots, Painted, Speckle, pattern_of
 from torchmembrane.simulate.raster import seen_triangles
 from torchmembrane.simulate.render import Renderer, render
@@ -142,10 +142,10 @@ def test_lambert_s_law_and_vignetting_on_a_flat_plate():
 
 def test_light_falls_with_the_square_of_the_distance_and_the_cosine():
     up, lights = torch.tensor([[0.0, 0, -1]]), torch.zeros(1, 3)
-    near, far = scattered(torch.tensor([[0.0, 0, 2]]), up, lights), scattered(torch.tensor([[0.0, 0, 4]]), up, lights)
-    tilted = scattered(torch.tensor([[0.0, 0, 2]]), torch.tensor([[0.6, 0, -0.8]]), lights)
+    near, far = diffuse_light(torch.tensor([[0.0, 0, 2]]), up, lights), diffuse_light(torch.tensor([[0.0, 0, 4]]), up, lights)
+    tilted = diffuse_light(torch.tensor([[0.0, 0, 2]]), torch.tensor([[0.6, 0, -0.8]]), lights)
     assert near / far == pytest.approx(4) and tilted / near == pytest.approx(0.8)
-    assert scattered(torch.tensor([[0.0, 0, 2]]), -up, lights) == 0
+    assert diffuse_light(torch.tensor([[0.0, 0, 2]]), -up, lights) == 0
 
 
 def test_a_highlight_lies_where_the_plate_mirrors_the_light():

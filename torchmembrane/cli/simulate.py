@@ -70,7 +70,7 @@ def add_simulate(commands, command) -> None:
     add("--format", choices=FORMATS, default=FORMATS[0], help="of --random: png and npz files, or a Parquet data set")
     add("--noise", metavar="DB", type=float, help="white over the noise's standard deviation (default: no noise)")
     highlight, blur = (
-        "mirrored over scattered light (default: %(default)s)",
+        "specular over diffuse light (default: %(default)s)",
         "defocus, standard deviation (default: %(default)s)",
     )
     add("--highlight", metavar="SHARE", type=_positive_or_0, default=Appearance.highlight, help=highlight)

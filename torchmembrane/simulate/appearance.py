@@ -24,7 +24,7 @@ class Appearance:
     lights      positions `(x, y, z)` of point lights, length unit, camera frame; default: four around the camera
     exposure    grey of the white membrane at rest where it is bright (95 % of it is darker)
     ambient     share of the light that comes from everywhere
-    highlight   Blinn-Phong: mirrored over scattered light, 0 for a mat membrane; with the exponent `shininess`
+    highlight   Blinn-Phong: specular over diffuse light, 0 for a mat membrane; with the exponent `shininess`
     vignetting  light lost in the image's corners: `1 - vignetting (r / r_corner)^2`
     blur        standard deviation of the defocus, px
     outside     grey of what is not membrane
@@ -62,14 +62,14 @@ class Appearance:
 DEFAULT_APPEARANCE = Appearance()
 
 
-def scattered(x: Tensor, inward: Tensor, lights: Tensor) -> Tensor:
+def diffuse_light(x: Tensor, inward: Tensor, lights: Tensor) -> Tensor:
     """Lambert's law, `sum_l max(0, n . l) / |x - x_l|^2`, at points with unit normals `[..., V, 3]`: `[..., V]`."""
     ray = lights - x[..., None, :]
     square = (ray * ray).sum(-1)
     return ((ray * inward[..., None, :]).sum(-1).clamp_min(0) / square**1.5).sum(-1)
 
 
-def mirrored(x: Tensor, inward: Tensor, lights: Tensor, shininess: float) -> Tensor:
+def specular_light(x: Tensor, inward: Tensor, lights: Tensor, shininess: float) -> Tensor:
     """Blinn-Phong, `sum_l max(0, n . h)^shininess / |x - x_l|^2` with h halfway from light to camera: `[..., V]`."""
     ray = lights - x[..., None, :]
     square = (ray * ray).sum(-1)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..sensor.model import Sensor
-from .appearance import BRIGHT, DEFAULT_APPEARANCE, Appearance, blurred, mirrored, scattered, vignette
+from .appearance import BRIGHT, DEFAULT_APPEARANCE, Appearance, blurred, diffuse_light, specular_light, vignette
 from .pattern import Canvas, Dots, Painted, Speckle, pattern_of
 from .raster import seen_triangles
 
@@ -78,7 +78,7 @@ class Renderer(nn.Module):
             raise MembraneError(
                 "Renderer: no part of the rest surface lies in the image; check the camera and the rest surface"
             )
-        light = scattered(X, -self.surface.rest_normals, self.lights)
+        light = diffuse_light(X, -self.surface.rest_normals, self.lights)
         self.register_buffer("unit_light", light[seen].quantile(BRIGHT).clamp_min(1e-12))
         self.register_buffer("rest_pixels", pixels)
 
@@ -152,10 +152,10 @@ class Renderer(nn.Module):
     def _light(self, x: Tensor) -> Tensor:
         """Grey of a white membrane and of the highlights on it, `[..., W, 2]`."""
         appearance, inward = self.appearance, -self.surface.normals(x)
-        direct = scattered(x, inward, self.lights) / self.unit_light
+        direct = diffuse_light(x, inward, self.lights) / self.unit_light
         shine = torch.zeros_like(direct)
         if appearance.highlight:
-            shine = mirrored(x, inward, self.lights, appearance.shininess) / self.unit_light
+            shine = specular_light(x, inward, self.lights, appearance.shininess) / self.unit_light
         return appearance.exposure * torch.stack(
             [appearance.ambient + (1 - appearance.ambient) * direct, appearance.highlight * shine], -1
         )
