@@ -226,8 +226,8 @@ def pattern(seeds, figures):
         pixels, sizes = pixel_lattice(sensor, 30.0)
         dots = dots_for_pixels(sensor, pixels, sizes)
         made = replace(sensor, markers=Markers("dots", "dark", dots.positions, sizes))
-        seen = find_dots(rest_image(made, 0), "dark").pixels
-        gap, _ = cKDTree(seen).query(pixels)
+        found = find_dots(rest_image(made, 0), "dark").pixels
+        gap, _ = cKDTree(found).query(pixels)
         record = dict(what=f"pattern, {name}", dots=len(pixels), found=int((gap < 3).sum()), rms=rms(gap[gap < 3]))
         print(record)
         yield record

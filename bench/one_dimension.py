@@ -26,7 +26,7 @@ EXPERIMENTS = {
 }
 
 
-def seen(truth: PressedStrip, draw: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def observed(truth: PressedStrip, draw: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rest angles of the markers, the angles at which they are seen, with noise, and where they are."""
     theta = np.linspace(0, np.pi, MARKERS + 2)[1:-1]
     place = truth.positions(np.rad2deg(theta))
@@ -57,7 +57,7 @@ def main():
             for estimator in (MinimumEnergyProfile(RADIUS, strip, NODES), ForceBalanceProfile(RADIUS, strip, NODES, 2 * NOISE)):
                 draws = []
                 for draw in range(DRAWS):
-                    theta, psi, place = seen(truth, draw)
+                    theta, psi, place = observed(truth, draw)
                     draws.append(score(estimator(theta, psi), theta, place, truth, strip, estimator.share))
                 median = {key: float(np.median([d[key] for d in draws])) for key in draws[0]}
                 rows.append(dict(experiment=name, material=material, estimator=type(estimator).__name__, **median))

@@ -214,10 +214,10 @@ def ink_centroid(ink: np.ndarray, outline: np.ndarray) -> np.ndarray:
 def dot_errors(simulator: Simulator, vertices) -> np.ndarray:
     """Distances in px of the rendered dots' centroids from their outlines', of those that are seen whole."""
     with torch.no_grad():
-        ink, seen = 1 - simulator.renderer(vertices).numpy(), simulator.renderer.dots(vertices).visible.numpy()
+        ink, visible = 1 - simulator.renderer(vertices).numpy(), simulator.renderer.dots(vertices).visible.numpy()
         rings = outlines(simulator, vertices)
     width, height = simulator.sensor.camera.image_size
-    whole = seen & (rings > 1).all((1, 2)) & (rings < [width - 3, height - 3]).all((1, 2))
+    whole = visible & (rings > 1).all((1, 2)) & (rings < [width - 3, height - 3]).all((1, 2))
     return np.array([np.linalg.norm(ink_centroid(ink, ring) - polygon_centroid(ring)) for ring in rings[whole]])
 
 

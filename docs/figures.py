@@ -71,9 +71,9 @@ def pressed(sensor: str, *strokes) -> Shown:
         body = body.touching(sim.membrane, unit)
         paths.append([body, body.moved(depth * unit)])
     state = press(sim.membrane, sim.elasticity, paths, **sim.cavity)
-    seen, rest = sim.renderer.dots(state.vertices), sim.rest_dots
+    dots, rest = sim.renderer.dots(state.vertices), sim.rest_dots
     image = sim.image(state.vertices, np.random.default_rng(0)) / 255
-    arrays = (rest.positions, seen.positions, seen.pixels, state.contact_points)
+    arrays = (rest.positions, dots.positions, dots.pixels, state.contact_points)
     return Shown(sensor, image.astype(np.float32), *(np.asarray(a) for a in arrays))
 
 

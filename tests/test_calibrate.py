@@ -179,9 +179,9 @@ def test_board_dots_are_named_right_in_any_turn_and_when_cut(turn):
     image = TargetRenderer.for_camera(camera).image(DOTS, R, t, NOISE)
     pixels = find_target(to_grey(image), DOTS)
     expected = outline_centres(camera.point_to_pixel(torch.from_numpy(DOTS.outlines @ R.T + t))).numpy()
-    seen, inside = np.isfinite(pixels).all(1), ((expected > 8) & (expected < [311, 231])).all(1)
-    assert seen[inside].mean() > 0.97 and seen.sum() < len(seen)
-    assert np.abs(pixels - expected)[seen].max() < 0.12
+    visible, inside = np.isfinite(pixels).all(1), ((expected > 8) & (expected < [311, 231])).all(1)
+    assert visible[inside].mean() > 0.97 and visible.sum() < len(visible)
+    assert np.abs(pixels - expected)[visible].max() < 0.12
 
 
 def test_boards_say_what_is_wrong():

@@ -12,7 +12,7 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.sensor.model import Cavity, Markers, Material, Sensor, Surface
 from torchmembrane.simulate.appearance import Appearance, blurred, diffuse_light, noisy
 from torchmembrane.simulate.pattern import Dots, Painted, Speckle, pattern_of
-from torchmembrane.simulate.raster import seen_triangles
+from torchmembrane.simulate.raster import visible_triangles
 from torchmembrane.simulate.render import Renderer, render
 
 SIZE = (160, 120)
@@ -109,7 +109,7 @@ def test_every_sample_sees_the_nearest_triangle_that_faces_it():
         covered = (torch.stack(sides) > 0).all(0) & (depth[k] < nearest)
         expected, nearest = torch.where(covered, k, expected), torch.where(covered, depth[k], nearest)
     assert (expected >= 0).float().mean() > 0.5
-    assert torch.equal(seen_triangles(corners, depth, 24, 20), expected)
+    assert torch.equal(visible_triangles(corners, depth, 24, 20), expected)
 
 
 def test_a_mesh_leaves_no_gaps_and_counts_no_sample_twice():
@@ -120,9 +120,9 @@ def test_a_mesh_leaves_no_gaps_and_counts_no_sample_twice():
     grid[1:-1, 1:-1] += (torch.rand(7, 7, 2, dtype=torch.float64) - 0.5) * (torch.rand(7, 7, 1) > 0.4)
     a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
     corners = torch.cat([torch.stack([a, b, c], -2).reshape(-1, 3, 2), torch.stack([a, c, d], -2).reshape(-1, 3, 2)])
-    seen = seen_triangles(corners, torch.ones(len(corners)), 20, 20)
+    seen = visible_triangles(corners, torch.ones(len(corners)), 20, 20)
     assert (seen[:16, :16] >= 0).all() and (seen >= 0).sum() == 16**2
-    alone = sum((seen_triangles(t[None], torch.ones(1), 20, 20) >= 0).long() for t in corners)
+    alone = sum((visible_triangles(t[None], torch.ones(1), 20, 20) >= 0).long() for t in corners)
     assert alone.max() == 1
 
 

@@ -84,7 +84,7 @@ def _fit_camera(
     design_precision = np.concatenate([1 / (getattr(camera, name).numpy().ravel() * spread.get(name, np.inf)) for name in free])
     outlines, pixels = torch.from_numpy(board.outlines), torch.from_numpy(views.pixels)
     filled, observed = torch.from_numpy(views.filled), torch.from_numpy(np.isfinite(views.pixels).all(-1))
-    seen = observed.clone()
+    visible = observed.clone()
     count = len(start)
 
     def modelled(shared: Tensor, pose: Tensor, filled: Tensor) -> Tensor:
@@ -103,30 +103,30 @@ def _fit_camera(
 
     def residuals(theta):
         apart = (theta[:count] - start) * pull
-        return np.concatenate([apart, (all_views(*parts(theta)) - pixels)[seen].numpy().ravel()])
+        return np.concatenate([apart, (all_views(*parts(theta)) - pixels)[visible].numpy().ravel()])
 
     def jacobian(theta):
         by_shared, by_pose = slopes(*parts(theta))
-        P, D = seen.shape
+        P, D = visible.shape
         J = torch.zeros(P, D, 2, count + 6 * P, dtype=torch.float64)
         J[..., :count] = by_shared
         for view in range(P):
             J[view, ..., count + 6 * view : count + 6 * view + 6] = by_pose[view]
         rows = np.zeros((count, J.shape[-1]))
         rows[:, :count] = np.diag(pull)
-        return np.concatenate([rows, J[seen].flatten(0, 1).numpy()])
+        return np.concatenate([rows, J[visible].flatten(0, 1).numpy()])
 
     pull, theta = design_precision * NOISE, np.concatenate([start, poses.ravel()])
-    seen &= all_views(*parts(theta)).isfinite().all(-1)
+    visible &= all_views(*parts(theta)).isfinite().all(-1)
     for _ in range(ROUNDS):
         theta = fit(residuals, jacobian, theta, what).values
         left = (all_views(*parts(theta)) - pixels)[observed].numpy()
         wild = strays(left)
         pull = design_precision * np.median(np.abs(left[~wild])) / 0.6745
-        seen[observed] = torch.from_numpy(~wild)
+        visible[observed] = torch.from_numpy(~wild)
     found = fit(residuals, jacobian, theta, what)
     shared, poses, _ = parts(found.values)
-    left = torch.where(seen[..., None], pixels - all_views(shared, poses, filled), torch.nan).numpy()
+    left = torch.where(visible[..., None], pixels - all_views(shared, poses, filled), torch.nan).numpy()
     values = dict(zip(free, shared.split(lengths), strict=True))
     names = [name if shape.numel() == 1 else f"{name}[{i}]" for name, shape in shapes.items() for i in range(shape.numel())]
     return CameraFit(_with(camera, values), names, found, poses.numpy(), left)
@@ -167,22 +167,22 @@ def _opencv_lens(camera: Camera, board: Checkerboard, views: Views) -> tuple[Cam
 def _start_pose(camera: Camera, board: DotBoard, pixels: np.ndarray, filled: bool) -> np.ndarray:
     """A first pose `[6]`, for the design's ports: the better of the two that a central camera allows."""
     cv2 = opencv()
-    seen = np.isfinite(pixels).all(1)
+    visible = np.isfinite(pixels).all(1)
     medium = float(camera.medium_index) if filled else 1.0
     camera = Camera(camera.model, camera.image_size, *(getattr(camera, name).tolist() for name in LENS), camera.ports, medium)
-    origin, direction = camera.pixel_to_ray(torch.from_numpy(pixels[seen]))
+    origin, direction = camera.pixel_to_ray(torch.from_numpy(pixels[visible]))
     usable = (direction[:, 2] > 0.2).numpy()
     flat = (direction[:, :2] / direction[:, 2:]).numpy()[usable]
-    points = board.points[seen][usable]
+    points = board.points[visible][usable]
     if len(points) < 6:
         raise MembraneError(f"calibrate ports: {len(points)} dots of the board seen in an image; expected at least 6")
     _, turns, shifts, _ = cv2.solvePnPGeneric(points, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
     behind, face = float(origin[:, 2].mean()), camera.ports[-1].distance + camera.ports[-1].thickness
     fits = []
     for turn, shift in zip(turns, shifts, strict=True):
-        depth = (board.outlines[seen] @ cv2.Rodrigues(turn)[0].T)[..., 2].min() + shift[2, 0] + behind
+        depth = (board.outlines[visible] @ cv2.Rodrigues(turn)[0].T)[..., 2].min() + shift[2, 0] + behind
         start = np.concatenate([turn.ravel(), shift.ravel() + [0, 0, behind + max(0.0, 1.05 * face - depth)]])
-        fits.append(_pose(camera, board.points[seen], pixels[seen], start))
+        fits.append(_pose(camera, board.points[visible], pixels[visible], start))
     return min(fits, key=lambda found: found.noise).values
 
 

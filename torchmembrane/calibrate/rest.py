@@ -46,8 +46,8 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
     sizes = np.array([size == "large" for size in sensor.markers.sizes], dtype=int)
     outlines, pixels = measured_outlines(sensor, surface, X, sizes, image)
     pivot = surface.rest[surface.fixed].mean(0)
-    seen = np.isfinite(pixels).all(1)
-    used = seen.copy()
+    visible = np.isfinite(pixels).all(1)
+    used = visible.copy()
 
     def modelled(theta, outlines):
         return outline_centres(sensor.camera.point_to_pixel((outlines - pivot) @ rotations(theta[:3]).mT + pivot + theta[3:]))
@@ -67,7 +67,7 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
     move = lambda x: (x - pivot.numpy()) @ turn.T + pivot.numpy() + shift  # noqa: E731
     residuals = pixels - modelled(torch.from_numpy(found), torch.from_numpy(outlines)).numpy()
     _, tangents = frames_at(surface, X)
-    shifts = _nulling(sensor, move(outlines), turn @ tangents, pixels, seen)
+    shifts = _nulling(sensor, move(outlines), turn @ tangents, pixels, visible)
     moved = recalibrated(sensor, surface, move(surface.rest.numpy()), move(X) + shifts, sensor.markers.sizes, image)
     return RestFit(moved, NAMES, _in_degrees(result), pixels, residuals, shifts)
 
@@ -89,16 +89,16 @@ def measured_outlines(sensor: Sensor, surface, X: np.ndarray, sizes: np.ndarray,
     shapes = unit_shapes(sensor.camera, camera_points(rough), guess)
     expected = sensor.camera.point_to_pixel(torch.from_numpy(camera_points(X))).numpy()
     pattern = measure_dots(image, expected, shapes, sizes, sensor.markers.polarity)
-    seen = np.isfinite(pattern.pixels).all(1)
-    if seen.sum() < 8:
-        raise MembraneError(f"calibrate: {seen.sum()} of {len(X)} dots found in the image; expected at least 8")
+    visible = np.isfinite(pattern.pixels).all(1)
+    if visible.sum() < 8:
+        raise MembraneError(f"calibrate: {visible.sum()} of {len(X)} dots found in the image; expected at least 8")
     radii = np.sqrt(np.abs(np.linalg.det(pattern.shapes) / np.linalg.det(shapes)))
     return dot_outlines(surface, X, radii), pattern.pixels
 
 
-def _nulling(sensor: Sensor, outlines: np.ndarray, tangents: np.ndarray, pixels: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _nulling(sensor: Sensor, outlines: np.ndarray, tangents: np.ndarray, pixels: np.ndarray, visible: np.ndarray) -> np.ndarray:
     """Shifts `[D, 3]` within the tangent plane after which each seen dot is modelled where it is measured; else 0."""
-    outlines, tangents, target = (torch.from_numpy(np.ascontiguousarray(a[seen])) for a in (outlines, tangents, pixels))
+    outlines, tangents, target = (torch.from_numpy(np.ascontiguousarray(a[visible])) for a in (outlines, tangents, pixels))
 
     def modelled(step, outline, tangent):
         return outline_centres(sensor.camera.point_to_pixel(outline + tangent @ step))
@@ -107,8 +107,8 @@ def _nulling(sensor: Sensor, outlines: np.ndarray, tangents: np.ndarray, pixels:
     for _ in range(3):
         left = target - vmap(modelled)(step, outlines, tangents)
         step = step + torch.linalg.solve(vmap(jacfwd(modelled))(step, outlines, tangents), left)
-    shifts = np.zeros((len(seen), 3))
-    shifts[seen] = (tangents @ step[..., None]).squeeze(-1).numpy()
+    shifts = np.zeros((len(visible), 3))
+    shifts[visible] = (tangents @ step[..., None]).squeeze(-1).numpy()
     return shifts
 
 

@@ -83,8 +83,8 @@ def rest_from_views(sensor: Sensor, images: Sequence[np.ndarray], motions: np.nd
 
 def _bundle(sensor, surface, X, sizes, rel, pixels, motions, travel_error, image) -> ViewsFit:
     P, D, own, travel = len(pixels), len(X), motions.size, np.linalg.norm(motions[0, 3:])
-    seen = np.isfinite(pixels).all(-1)
-    seen &= seen.sum(0) >= 2
+    visible = np.isfinite(pixels).all(-1)
+    visible &= visible.sum(0) >= 2
 
     def modelled(motion, dot, rel):
         return outline_centres(sensor.camera.point_to_pixel((dot + rel - motion[3:]) @ rotations(motion[:3])))
@@ -99,7 +99,7 @@ def _bundle(sensor, surface, X, sizes, rel, pixels, motions, travel_error, image
     def residuals(theta):
         left = each(*parts(theta)).numpy() - pixels
         place = theta[3:6]
-        return np.append(left[seen].ravel(), pull * (np.linalg.norm(place) - travel))
+        return np.append(left[visible].ravel(), pull * (np.linalg.norm(place) - travel))
 
     def jacobian(theta):
         by_motion, by_dot = (a.numpy() for a in slopes(*parts(theta)))
@@ -111,25 +111,25 @@ def _bundle(sensor, surface, X, sizes, rel, pixels, motions, travel_error, image
         row = np.zeros((1, own + 3 * D))
         place = theta[3:6]
         row[0, 3:6] = pull * place / np.linalg.norm(place)
-        return np.concatenate([J[seen].reshape(-1, own + 3 * D), row])
+        return np.concatenate([J[visible].reshape(-1, own + 3 * D), row])
 
-    kept = seen.any(0)
+    kept = visible.any(0)
     X, rel, sizes = X[kept], rel[kept], [size for size, keep in zip(sizes, kept, strict=True) if keep]
-    pixels, seen, D = pixels[:, kept], seen[:, kept], int(kept.sum())
+    pixels, visible, D = pixels[:, kept], visible[:, kept], int(kept.sum())
     theta, pull = np.concatenate([motions.ravel(), X.ravel()]), 0.05 / travel_error
     found = fit(residuals, jacobian, theta, "calibrate views")
     wild = strays(found.residuals[:-1].reshape(-1, 2))
-    seen[np.nonzero(seen)] = ~wild
+    visible[np.nonzero(visible)] = ~wild
     pull = found.noise / travel_error
     found = fit(residuals, jacobian, found.values, "calibrate views")
-    sideways = np.broadcast_to(SIDEWAYS * np.eye(2)[:, None], (2, seen.sum(), 2))
-    biases = np.concatenate([shading_bias(sensor, pixels[seen])[None], sideways])  # [3, N, 2], of every view for itself
-    of_view = np.nonzero(seen)[0][:, None] == np.arange(P)
+    sideways = np.broadcast_to(SIDEWAYS * np.eye(2)[:, None], (2, visible.sum(), 2))
+    biases = np.concatenate([shading_bias(sensor, pixels[visible])[None], sideways])  # [3, N, 2], of every view for itself
+    of_view = np.nonzero(visible)[0][:, None] == np.arange(P)
     errors = np.einsum("knc,np->nckp", biases, of_view).reshape(-1, 3 * P)
     found = with_common_errors(found, jacobian(found.values), np.pad(errors, ((0, 1), (0, 0))))
     dots, left = (
         found.values[own:].reshape(-1, 3),
-        np.where(seen[..., None], pixels - each(*parts(found.values)).numpy(), np.nan),
+        np.where(visible[..., None], pixels - each(*parts(found.values)).numpy(), np.nan),
     )
     feet = feet_of(surface, dots)
     blocks = np.stack([found.covariance[own + 3 * d : own + 3 * d + 3, own + 3 * d : own + 3 * d + 3] for d in range(D)])

@@ -95,11 +95,11 @@ def fisheye_image(points: Tensor, distortion: Tensor) -> Tensor:
     rho = torch.where(off_axis, rho_squared, 1.0).sqrt()
     theta = torch.atan2(torch.where(off_axis, rho, 0.0), torch.where(off_axis, z, 1.0))
     scale = torch.where(off_axis, theta / rho, 1 / torch.where(z > 0, z, 1.0))
-    seen = off_axis | (z > 0)
+    visible = off_axis | (z > 0)
     if len(distortion):
-        seen = seen & (theta <= _fisheye_fold(distortion))
+        visible = visible & (theta <= _fisheye_fold(distortion))
         scale = scale * _radial(theta * theta, distortion.unbind())[0]
-    return torch.where(seen, xy * scale, math.nan)
+    return torch.where(visible, xy * scale, math.nan)
 
 
 def _fisheye_fold(distortion: Tensor) -> Tensor:

@@ -182,7 +182,7 @@ def measure_dots(image, pixels, shapes, sizes, polarity):
     weight = certainty * torch.as_tensor(quality)
     predicted, _, _ = match.predict(weight, torch.as_tensor(centre - pixels)[None], strain)
     stray = np.linalg.norm(centre - pixels - predicted[0].numpy(), axis=1)
-    seen = (quality > 0.3) & (stray < STRAY * match.nearest.numpy())
+    visible = (quality > 0.3) & (stray < STRAY * match.nearest.numpy())
     for size in np.unique(sizes):
-        scaled[sizes == size] *= 1 + np.median((growth / np.exp(expected))[seen & (sizes == size)])
-    return DotPattern(np.where(seen[:, None], centre, np.nan), scaled, sizes)
+        scaled[sizes == size] *= 1 + np.median((growth / np.exp(expected))[visible & (sizes == size)])
+    return DotPattern(np.where(visible[:, None], centre, np.nan), scaled, sizes)

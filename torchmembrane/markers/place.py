@@ -37,12 +37,12 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor) -> PlacedMarkers:
     listed, image = sensor.markers.positions, sensor.markers.rest_image
     if sensor.markers.kind == "texture":
         centres = choose_patches(image, rim_mask(sensor, vertex_pixels))
-        placed, seen = _place_on_surface(sensor, centres)
-        placed.locator = TextureLocator(image, centres[seen], anchors)
+        placed, hit = _place_on_surface(sensor, centres)
+        placed.locator = TextureLocator(image, centres[hit], anchors)
     elif listed is None:
         pattern = find_dots(image, sensor.markers.polarity, rim_mask(sensor, vertex_pixels))
-        placed, seen = _place_on_surface(sensor, pattern.pixels)
-        pattern = DotPattern(*(field[seen] for field in pattern))
+        placed, hit = _place_on_surface(sensor, pattern.pixels)
+        pattern = DotPattern(*(field[hit] for field in pattern))
         placed.locator = DotLocator(pattern, sensor.camera.image_size, sensor.markers.polarity, anchors)
     else:
         positions = np.asarray(listed, dtype=float)
@@ -58,14 +58,14 @@ def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[PlacedMarkers
     m, n = sensor.membrane.grid
     smooth = sensor.surface.membrane((max(m, SMOOTH_GRID), max(n, SMOOTH_GRID)))
     hits = smooth.ray_points(*(r.numpy() for r in rays))
-    seen = np.isfinite(hits.distance)
-    if seen.sum() < FEWEST_MARKERS:
+    hit = np.isfinite(hits.distance)
+    if hit.sum() < FEWEST_MARKERS:
         raise MembraneError(
-            f"sensor {sensor.name!r}: {seen.sum()} markers found in the rest image lie on the rest surface; expected at least "
+            f"sensor {sensor.name!r}: {hit.sum()} markers found in the rest image lie on the rest surface; expected at least "
             f"{FEWEST_MARKERS}: check the camera, the rest surface and the polarity"
         )
-    positions = (smooth.rest.numpy()[hits.vertices] * hits.weights[..., None]).sum(1)[seen]
-    return PlacedMarkers(sensor, positions, sensor.membrane.closest_points(positions)), seen
+    positions = (smooth.rest.numpy()[hits.vertices] * hits.weights[..., None]).sum(1)[hit]
+    return PlacedMarkers(sensor, positions, sensor.membrane.closest_points(positions)), hit
 
 
 def _listed_pattern(sensor: Sensor, placed: PlacedMarkers, image: np.ndarray | None) -> DotPattern:
@@ -75,8 +75,8 @@ def _listed_pattern(sensor: Sensor, placed: PlacedMarkers, image: np.ndarray | N
         spacing = (float(sensor.membrane.rest_area.sum()) / len(sizes)) ** 0.5
         return DotPattern(placed.model_pixels, shapes * np.array(DOT_RADIUS)[sizes][:, None, None] * spacing, sizes)
     pattern = measure_dots(image, placed.model_pixels, shapes, sizes, sensor.markers.polarity)
-    unseen = ~np.isfinite(pattern.pixels).all(1)
-    return pattern._replace(pixels=np.where(unseen[:, None], placed.model_pixels, pattern.pixels))
+    lost = ~np.isfinite(pattern.pixels).all(1)
+    return pattern._replace(pixels=np.where(lost[:, None], placed.model_pixels, pattern.pixels))
 
 
 def _unit_dot_shapes(sensor: Sensor, placed: PlacedMarkers) -> np.ndarray:

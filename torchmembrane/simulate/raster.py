@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 
-def seen_triangles(corners: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
+def visible_triangles(corners: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
     """The nearest triangle that covers each point `(u, v)` of a grid of `height x width` integers.
 
     A triangle covers the points on its edges that face left or up, so that neighbours neither overlap nor leave gaps.

@@ -19,12 +19,12 @@ from ..errors import MembraneError
 from ..sensor.model import Sensor
 from .appearance import BRIGHT, DEFAULT_APPEARANCE, Appearance, blurred, diffuse_light, specular_light, vignette
 from .pattern import Canvas, Dots, Painted, Speckle, pattern_of
-from .raster import seen_triangles
+from .raster import visible_triangles
 
 FINEST_GRID = 513
 
 
-class SeenDots(NamedTuple):
+class RenderedDots(NamedTuple):
     """Dots of a deformed membrane: `positions [..., D, 3]`, the `pixels [..., D, 2]` of their centres, `visible [..., D]`."""
 
     positions: Tensor
@@ -73,13 +73,13 @@ class Renderer(nn.Module):
 
     def _expose(self) -> None:
         X, pixels = self.surface.rest, self.camera.point_to_pixel(self.surface.rest)
-        seen = ((pixels > -0.5) & (pixels < pixels.new_tensor(self.camera.image_size) - 0.5)).all(-1)
-        if not seen.any():
+        visible = ((pixels > -0.5) & (pixels < pixels.new_tensor(self.camera.image_size) - 0.5)).all(-1)
+        if not visible.any():
             raise MembraneError(
                 "Renderer: no part of the rest surface lies in the image; check the camera and the rest surface"
             )
         light = diffuse_light(X, -self.surface.rest_normals, self.lights)
-        self.register_buffer("unit_light", light[seen].quantile(BRIGHT).clamp_min(1e-12))
+        self.register_buffer("unit_light", light[visible].quantile(BRIGHT).clamp_min(1e-12))
         self.register_buffer("rest_pixels", pixels)
 
     def _paint(self, pattern) -> None:
@@ -113,16 +113,16 @@ class Renderer(nn.Module):
         fine = (self.spline_0 @ displacement @ self.spline_1.mT).movedim(-3, -1)
         return self.surface.rest + fine.flatten(-3, -2)
 
-    def dots(self, vertices: Tensor) -> SeenDots:
+    def dots(self, vertices: Tensor) -> RenderedDots:
         """Where the centres of the pattern's dots are and which of them are seen (in the image, and not hidden)."""
         x = self.fine_vertices(vertices)
         displacement = ((x - self.surface.rest)[..., self.dot_vertices, :] * self.dot_weights[..., None]).sum(-2)
         positions = self.dot_rest + displacement
         pixels = self.camera.point_to_pixel(positions)
-        hidden = [self._seen_range(*pair) < 0.99 * p.norm(dim=-1) for *pair, p in _each(x, pixels, positions)]
+        hidden = [self._visible_range(*pair) < 0.99 * p.norm(dim=-1) for *pair, p in _each(x, pixels, positions)]
         size = pixels.new_tensor(self.camera.image_size)
         visible = ((pixels > -0.5) & (pixels < size - 0.5)).all(-1) & ~torch.stack(hidden).view(pixels.shape[:-1])
-        return SeenDots(positions, pixels, visible)
+        return RenderedDots(positions, pixels, visible)
 
     def forward(self, vertices: Tensor) -> Tensor:
         """Images `[..., H, W]`, float32 in 0..1, of the membrane at `vertices [..., V, 3]` on the grid; no noise."""
@@ -141,12 +141,12 @@ class Renderer(nn.Module):
         return torch.stack(images).view(*vertices.shape[:-2], *images[0].shape)
 
     def _depth(self, x: Tensor) -> Tensor:
-        corners, seen = self._seen(x, samples=1)
-        sample = torch.nonzero(seen.view(-1) >= 0).squeeze(-1)
-        place = torch.stack([sample % seen.shape[1], sample // seen.shape[1]], -1).float()
+        corners, visible = self._visible(x, samples=1)
+        sample = torch.nonzero(visible.view(-1) >= 0).squeeze(-1)
+        place = torch.stack([sample % visible.shape[1], sample // visible.shape[1]], -1).float()
         linear = _Linear.of(corners, x[self.surface.triangles][..., 2:])
-        image = torch.full(seen.shape, torch.nan, device=seen.device)
-        image.view(-1)[sample] = linear.at(seen.view(-1)[sample], place).squeeze(-1)
+        image = torch.full(visible.shape, torch.nan, device=visible.device)
+        image.view(-1)[sample] = linear.at(visible.view(-1)[sample], place).squeeze(-1)
         return image
 
     def _light(self, x: Tensor) -> Tensor:
@@ -160,29 +160,29 @@ class Renderer(nn.Module):
             [appearance.ambient + (1 - appearance.ambient) * direct, appearance.highlight * shine], -1
         )
 
-    def _seen(self, x: Tensor, samples: int) -> tuple[Tensor, Tensor]:
+    def _visible(self, x: Tensor, samples: int) -> tuple[Tensor, Tensor]:
         """Corners `[T, 3, 2]` of the projected triangles in samples, and which of them each sample sees, `[H s, W s]`."""
         width, height = self.camera.image_size
         corners = ((self.camera.point_to_pixel(x) + 0.5) * samples - 0.5)[self.surface.triangles]
         depth = x.norm(dim=-1)[self.surface.triangles].mean(-1)
-        return corners, seen_triangles(corners, depth, samples * width, samples * height)
+        return corners, visible_triangles(corners, depth, samples * width, samples * height)
 
-    def _seen_range(self, x: Tensor, pixels: Tensor) -> Tensor:
+    def _visible_range(self, x: Tensor, pixels: Tensor) -> Tensor:
         """How far one sees at `pixels [D, 2]`: to the farthest of the 3 x 3 pixels around each, `[D]`."""
-        _, seen = self._seen(x, samples=1)
-        ranges = F.pad(x.norm(dim=-1)[self.surface.triangles].mean(-1), (0, 1), value=torch.inf)[seen]
-        last = torch.tensor(seen.shape[::-1], device=seen.device) - 1
-        steps = torch.cartesian_prod(*2 * [torch.arange(-1, 2, device=seen.device)])
+        _, visible = self._visible(x, samples=1)
+        ranges = F.pad(x.norm(dim=-1)[self.surface.triangles].mean(-1), (0, 1), value=torch.inf)[visible]
+        last = torch.tensor(visible.shape[::-1], device=visible.device) - 1
+        steps = torch.cartesian_prod(*2 * [torch.arange(-1, 2, device=visible.device)])
         around = pixels.nan_to_num(0.0).round().long() + steps[:, None]
         u, v = around.clamp_min(0).minimum(last).unbind(-1)
         return ranges[v, u].amax(0)
 
     def _sharp(self, x: Tensor, light: Tensor) -> Tensor:
         """One image `[H, W]` before lens and chip: the mean of the samples of each pixel."""
-        corners, seen = self._seen(x, self.samples)
-        sample = torch.nonzero(seen.view(-1) >= 0).squeeze(-1)
-        triangle = seen.view(-1)[sample]
-        place = torch.stack([sample % seen.shape[1], sample // seen.shape[1]], -1).float()
+        corners, visible = self._visible(x, self.samples)
+        sample = torch.nonzero(visible.view(-1) >= 0).squeeze(-1)
+        triangle = visible.view(-1)[sample]
+        place = torch.stack([sample % visible.shape[1], sample // visible.shape[1]], -1).float()
         brightness = torch.stack([self.albedo * light[:, 0], light[:, 1]], -1)[self.surface.triangles]
         grey, shine = _Linear.of(corners, brightness).at(triangle, place).unbind(-1)
         near = torch.nonzero(self.inked[triangle]).squeeze(-1)
@@ -191,7 +191,7 @@ class Renderer(nn.Module):
             row = self.dot_row[triangle[near]]
             covered = _inside_unit_disc(linear.at(row, place[near]), linear.slope[row])
             grey[near] *= 1 + (self.ink - 1) * covered
-        image = torch.full(seen.shape, self.appearance.outside, device=seen.device)
+        image = torch.full(visible.shape, self.appearance.outside, device=visible.device)
         image.view(-1)[sample] = grey + shine
         return F.avg_pool2d(image[None, None], self.samples)[0, 0]
 

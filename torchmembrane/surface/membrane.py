@@ -297,8 +297,8 @@ def _first_hits(start, d, triangles):
     ranges = np.where((w > -1e-9).all(-1) & (ranges > 0), ranges, np.inf)
     first, row = ranges.argmin(1), np.arange(len(ranges))
     distance = ranges[row, first]
-    seen = np.isfinite(distance)
-    return first, np.where(seen[:, None], w[row, first], 1 / 3), np.where(seen, distance, np.nan)
+    hit = np.isfinite(distance)
+    return first, np.where(hit[:, None], w[row, first], 1 / 3), np.where(hit, distance, np.nan)
 
 
 def _closest_on_triangles(p, triangles):
