@@ -23,9 +23,9 @@ from torchmembrane.presets import NAMES, preset
 from torchmembrane.sensor.model import Sensor
 from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.dataset import Plan, random_frame, stroke_to
-from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
+from torchmembrane.simulate.equilibrium import EquilibriumProblem, Liquid, Open
 from torchmembrane.simulate.indenters import Cylinder, Plane, Sphere, facing
-from torchmembrane.simulate.press import carried, press
+from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.simulate.simulator import Simulator
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, heightfield, spherical_cap
 
@@ -48,7 +48,7 @@ def elasticity_of(membrane):
 def laplace(membrane, curvature: float) -> float:
     """Relative error of the pressure of a liquid under constant tension, p = T x curvature."""
     elasticity = elasticity_of(membrane)
-    solution = Equilibrium(membrane, elasticity, Liquid(float(membrane.rest_volume))).solve(membrane.rest, 0.1)
+    solution = EquilibriumProblem(membrane, elasticity, Liquid(float(membrane.rest_volume))).solve(membrane.rest, 0.1)
     return solution.pressure / float(elasticity.tension * curvature) - 1
 
 
@@ -60,7 +60,7 @@ def inflation(n: int) -> float:
     x, pressure, errors = cap.rest, exact[0], []
     for s, expected in zip(stretches, exact, strict=True):
         x = torch.where(cap.fixed[:, None], s * cap.rest, x)
-        x, pressure, *_ = Equilibrium(cap, elasticity_of(cap), Liquid(s**3 * float(cap.rest_volume))).solve(x, pressure)
+        x, pressure, *_ = EquilibriumProblem(cap, elasticity_of(cap), Liquid(s**3 * float(cap.rest_volume))).solve(x, pressure)
         errors.append(abs(pressure / expected - 1))
     return max(errors)
 
@@ -73,7 +73,7 @@ def flat_bulge(n: int) -> float:
     along = np.linspace(-side / 2, side / 2, n)
     flat = heightfield(along, along, np.full((n, n), 10.0))
     elasticity = elasticity_of(flat)
-    x = Equilibrium(flat, elasticity, Open()).solve(flat.rest, pressure).vertices
+    x = EquilibriumProblem(flat, elasticity, Open()).solve(flat.rest, pressure).vertices
     return (float(x[n * n // 2, 2]) - 10) * float(elasticity.tension) / (pressure * series) - 1
 
 

@@ -30,7 +30,7 @@ from torchmembrane.presets import preset_file
 from torchmembrane.reconstruct import FOUND, Reconstructor
 from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.indenters import Cylinder, Sphere
-from torchmembrane.simulate.press import press
+from torchmembrane.simulate.quasi_static import press
 from torchmembrane.simulate.simulator import Simulator
 
 NOISE = 30.0  # dB below white

@@ -7,7 +7,7 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance import ForceBalance, _across
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
-from torchmembrane.simulate.press import carried, press
+from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
 
 NOISE, DRAWS = 0.05, 192  # px

@@ -13,7 +13,7 @@ from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.markers.screen import MismatchScreen
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
-from torchmembrane.simulate.press import carried, press
+from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.surface.shapes import spherical_cap
 
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))

@@ -11,7 +11,7 @@ from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.estimators.segmentation import PolarAngle, Segmentation, peaks, polar_angle
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
-from torchmembrane.simulate.press import carried, press
+from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.surface.shapes import half_cylinder, spherical_cap
 
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))

@@ -16,7 +16,8 @@ from ..sensor.model import Sensor
 from ..simulate.appearance import Appearance
 from ..simulate.dataset import KINDS, Plan, make_frames, stroke_to
 from ..simulate.frames import FORMATS, Video, open_frames
-from ..simulate.indenters import Box, Cylinder, Indenter, Mesh, Plane, Sphere, Wedge
+from ..simulate.indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge
+from ..simulate.mesh_indenter import MeshIndenter
 from ..simulate.simulator import LEGS, Simulator, Stroke
 
 EXAMPLES = f"""\
@@ -161,7 +162,7 @@ def _body(arguments) -> Indenter:
         return Box(*needs("sides", "radius"))
     if not Path(kind).is_file():
         raise MembraneError(f"--indenter {kind!r}: neither a file nor one of {', '.join(KINDS)}")
-    return Mesh.read(kind)
+    return MeshIndenter.read(kind)
 
 
 def _needed(arguments, name: str):

@@ -1,4 +1,4 @@
-"""Images of a flat target, also through ports: every sample's ray is followed to the plane. Light is even."""
+"""Images of a flat calibration target, also through ports: every sample's ray is followed to the plane. Light is even."""
 
 from typing import NamedTuple
 
@@ -15,22 +15,51 @@ GROUND = 0.4  # reflectance of what is not the board
 
 
 class TargetRenderer(NamedTuple):
-    """What photographs a board: a camera's rays through all samples of its image, `origin` and `direction [H s, W s, 3]`."""
+    """One camera's images of flat targets.
+
+    Attributes:
+        origin: of the rays through all samples of the image, `[H s, W s, 3]`.
+        direction: theirs, `[H s, W s, 3]`.
+
+    Example:
+        >>> renderer = TargetRenderer.for_camera(Camera("pinhole", (32, 24), (30.0, 30.0), (15.5, 11.5)))
+        >>> image = renderer.image(Checkerboard(3, 3, 5.0), np.eye(3), (-5.0, -5.0, 40.0))
+        >>> image.shape, int(image.max())
+        ((24, 32), 230)
+    """
 
     origin: np.ndarray
     direction: np.ndarray
 
     @classmethod
     def for_camera(cls, camera: Camera) -> "TargetRenderer":
+        """The renderer of a camera, with or without ports."""
         width, height = camera.image_size
         u, v = ((np.arange(side * SAMPLES) + 0.5) / SAMPLES - 0.5 for side in (width, height))
         pixels = torch.from_numpy(np.stack(np.meshgrid(u, v), -1))
         return cls(*(ray.numpy() for ray in camera.pixel_to_ray(pixels)))
 
-    def image(self, board: Checkerboard | DotBoard, rotation, translation, noise=None, blur=0.6, rng=None) -> np.ndarray:
-        """The board with its point X at `rotation X + translation` in the camera's frame: grey, uint8 `[H, W]`.
+    def image(
+        self,
+        board: Checkerboard | DotBoard,
+        rotation: np.ndarray,
+        translation: np.ndarray,
+        noise: float | None = None,
+        blur: float = 0.6,
+        rng: np.random.Generator | None = None,
+    ) -> np.ndarray:
+        """The board with its point X at `rotation X + translation` in the camera's frame.
 
-        `noise`: white over its standard deviation, dB; `blur`: standard deviation of the defocus, px.
+        Args:
+            board: the target.
+            rotation: `[3, 3]`.
+            translation: `[3]`, length unit.
+            noise: white over its standard deviation, dB; None: no noise.
+            blur: standard deviation of the defocus, px.
+            rng: of the noise.
+
+        Returns:
+            The image in grey, uint8 `[H, W]`.
         """
         rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
         origin, direction = (self.origin - translation) @ rotation, self.direction @ rotation
