@@ -2,7 +2,7 @@
 
 python bench/monge.py CASES [--json FILE]
 
-CASES as for accuracy.py; sensors whose rest surface is no graph over (x, y) are left out. From exact markers, harmonic membrane.
+CASES as for accuracy.py; sensors whose rest surface is no graph over (x, y) are left out. Exact markers, harmonic membrane.
 Printed for each form: surface error over displacement at the markers, rms distance of its vertices from the first form's, and
 its pressure change over the rest pressure.
 """

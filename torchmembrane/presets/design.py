@@ -1,5 +1,6 @@
 """How the presets are made: `python -m torchmembrane.presets.design` writes their files anew."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..sensor.model import METRE, Cavity, Markers, Material, Sensor, Surface
 from ..sensor.toml import default_grid
-from ..simulate.appearance import Appearance, noisy
+from ..simulate.appearance import noisy
 from ..simulate.render import Renderer
+from ..surface.membrane import Membrane
 from . import NAMES
 
 AIR = 1013.0  # hPa
@@ -65,22 +67,31 @@ def write(folder: Path) -> None:
         globals()[name]().to_file(folder / name)
 
 
-def _sensor(name, camera, surface, material, positions, sizes, gas=False) -> Sensor:
+def _sensor(
+    name: str,
+    camera: Camera,
+    surface: Surface,
+    material: Material,
+    positions: np.ndarray,
+    sizes: list[str],
+    gas: bool = False,
+) -> Sensor:
+    """A sensor with the rest image that the renderer makes of it."""
     markers = Markers("dots", "dark", positions, sizes)
     membrane = surface.membrane(default_grid(markers))
     cavity = Cavity("gas", AIR + _overpressure(membrane, material)) if gas else Cavity("liquid")
     blank = Sensor(name, "mm", camera, membrane, material, cavity, markers, surface)
-    image = noisy(Renderer(blank, appearance=Appearance())(membrane.rest), NOISE, np.random.default_rng(0))
+    image = noisy(Renderer(blank)(membrane.rest), NOISE, np.random.default_rng(0))
     return replace(blank, markers=replace(markers, rest_image=to_grey((255 * image).round().byte().numpy())))
 
 
-def _overpressure(membrane, material) -> float:
+def _overpressure(membrane: Membrane, material: Material) -> float:
     """What the membrane's tension holds at rest, whole hPa."""
     elasticity = ElasticEnergy(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
     return float(round(float(rest_balance(membrane, elasticity)[0]) * METRE["mm"] ** 2 / 100))
 
 
-def _dome_dots(semi_axes, opening: float, base_z: float, spacing: float) -> tuple[np.ndarray, list[str]]:
+def _dome_dots(semi_axes: Sequence[float], opening: float, base_z: float, spacing: float) -> tuple[np.ndarray, list[str]]:
     """A square pattern, its pitch measured along the surface from the pole: positions `[D, 3]` and sizes, in turns."""
     a, b, c = semi_axes
     i, j = _lattice(opening * max(a, b) / spacing)
@@ -92,7 +103,10 @@ def _dome_dots(semi_axes, opening: float, base_z: float, spacing: float) -> tupl
     return points[kept].round(5), _sizes((i + j)[kept])
 
 
-def _cylinder_dots(radius, length, half_angle, base_z, spacing) -> tuple[np.ndarray, list[str]]:
+def _cylinder_dots(
+    radius: float, length: float, half_angle: float, base_z: float, spacing: float
+) -> tuple[np.ndarray, list[str]]:
+    """A square pattern on the unrolled cylinder: positions `[D, 3]` and sizes, in turns."""
     i, j = _lattice(length / spacing)
     x, angle = i * spacing, j * spacing / radius
     points = np.stack([x, radius * np.sin(angle), base_z + radius * (np.cos(angle) - np.cos(half_angle))], -1)
@@ -101,8 +115,10 @@ def _cylinder_dots(radius, length, half_angle, base_z, spacing) -> tuple[np.ndar
 
 
 def _lattice(reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Whole steps `i, j` of a square lattice, up to `reach` from its middle both ways."""
     steps = np.arange(-int(reach), int(reach) + 1)
-    return tuple(a.ravel() for a in np.meshgrid(steps, steps, indexing="ij"))
+    i, j = np.meshgrid(steps, steps, indexing="ij")
+    return i.ravel(), j.ravel()
 
 
 def _sizes(order: np.ndarray) -> list[str]:
