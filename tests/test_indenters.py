@@ -6,7 +6,7 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from torchmembrane import MembraneError
+from torchmembrane import MembraneError, simulate
 from torchmembrane.simulate.indenters import Box, Cylinder, Plane, Sphere, Union, Wedge, facing
 from torchmembrane.simulate.mesh_indenter import MeshIndenter
 from torchmembrane.surface.shapes import spherical_cap
@@ -155,3 +155,20 @@ def test_facing_is_a_rotation_with_that_third_axis():
 def test_impossible_bodies_are_refused(make, message):
     with pytest.raises(MembraneError, match=message):
         make()
+
+
+def test_a_truth_names_the_body():
+    """Stored in every simulated frame: other programs read these words."""
+    assert {name: body.kind for name, body in EVERY.items() if name in ("sphere", "plane", "mesh")} == {
+        "sphere": "sphere",
+        "plane": "plane",
+        "mesh": "mesh",
+    }
+
+
+def test_the_namespace_hands_on_every_name_it_lists():
+    assert sorted(simulate.__all__) == sorted(simulate._MODULE_OF)
+    for name in simulate.__all__:
+        assert getattr(simulate, name).__name__ == name
+    with pytest.raises(AttributeError, match="no attribute 'Indentor'"):
+        simulate.Indentor  # noqa: B018

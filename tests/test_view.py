@@ -1,5 +1,8 @@
 """Figures say what a frame holds: where, how deep, in which unit, and in words if there is no surface."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -214,3 +217,10 @@ def test_contacts_are_marked_where_they_are(mesh):
     crosses = [line for line in axes.lines if line.get_marker() == "x"]
     assert len(axes.lines) == unmarked + 1 and len(crosses) == 1
     np.testing.assert_allclose(crosses[0].get_xydata()[0], mesh.vertex_pixels[DENT])
+
+
+def test_matplotlib_is_loaded_only_to_draw():
+    code = (
+        "import sys, torchmembrane.cli.main; sys.exit(int('matplotlib' in sys.modules or 'torchmembrane.plot' in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -82,7 +82,7 @@ class DotBoard:
     columns: int
     rows: int
     pitch: float
-    radius: float | None = None
+    radius: float = None  # type: ignore[assignment]  # 0.22 pitches once constructed
 
     def __post_init__(self) -> None:
         right = self.columns >= 8 and self.rows >= 6 and self.pitch > 0

@@ -89,7 +89,7 @@ def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarr
         (axes[-1], correction.deviations, "standard deviation", dict(cmap="viridis")),
     ]
     for ax, values, title, options in maps:
-        shown = ax.tripcolor(*places[:, :2].T, values, shading="gouraud", **options)
+        shown = ax.tripcolor(places[:, 0], places[:, 1], values, shading="gouraud", **options)
         ax.set(aspect="equal", xlabel=f"x, {unit}", ylabel=f"y, {unit}", title=f"{title}, {unit}")
         ax.invert_yaxis()
         drawing.colorbar(shown, ax=ax, shrink=0.8)

@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
 
 BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # distinct with any colour vision
+Grid = tuple[int, int] | np.ndarray
+
 LINES = 16  # of a grid that are drawn each way, at most about
 
 
@@ -76,26 +78,26 @@ def legend_below(axes: Axes) -> None:
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=4, ncols=2, frameon=False)
 
 
-def few_lines(points: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+def few_lines(points: np.ndarray, grid: Grid) -> np.ndarray:
     """Points `[V, 2]` of a grid as a lattice `[m, n, 2]` of at most about `LINES` lines each way."""
     m, n = (max(1, (size - 1) // LINES) for size in grid)
     return points.reshape(*grid, 2)[::m, ::n]
 
 
-def mesh_lines(points: np.ndarray, grid: tuple[int, int], **style) -> LineCollection:
+def mesh_lines(points: np.ndarray, grid: Grid, **style) -> LineCollection:
     """Rows and columns of a grid of points `[V, 2]`."""
     lattice = few_lines(points, grid)
     return LineCollection([*lattice, *lattice.swapaxes(0, 1)], **style)
 
 
-def line_through(vertex: int, X: np.ndarray, grid: tuple[int, int], across: int) -> np.ndarray:
+def line_through(vertex: int, X: np.ndarray, grid: Grid, across: int) -> np.ndarray:
     """Of the row and the column of a vertex the one that runs along the axis `across`: vertex indices."""
     index = np.arange(len(X)).reshape(grid)
     i, j = divmod(vertex, grid[1])
     return max(index[i], index[:, j], key=lambda line: np.ptp(X[line, across]))
 
 
-def rim_loop(grid: tuple[int, int]) -> np.ndarray:
+def rim_loop(grid: Grid) -> np.ndarray:
     """Vertex indices once around the grid's border, closed.
 
     Example:

@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from matplotlib.tri import TriContourSet
+from matplotlib.tri import Triangulation, TriContourSet
 
 from ..io.results import OK, STATUS_TEXTS
 from ..io.store import Mesh
@@ -111,12 +111,13 @@ def draw_displacement(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> N
     """Displacement along the rest normals where the rest vertices lie in the image; deepest point o, contacts x."""
     depth, place, unit = mesh.normal_displacement(frame), mesh.vertex_pixels, mesh.length_unit
     limit = max(np.abs(depth).max(), _least(mesh))
+    triangulation = Triangulation(*place.T, mesh.triangles)
     marks = MaxNLocator(9, steps=(1, 2, 5, 10), symmetric=True).tick_values(-limit, limit)
     marks = marks[np.abs(marks) < limit]
     levels = np.linspace(-1.001 * limit, 1.001 * limit, 42)
-    shades = axes.tricontourf(*place.T, mesh.triangles, depth, levels=levels, cmap=DISPLACEMENT_MAP)
+    shades = axes.tricontourf(triangulation, depth, levels=levels, cmap=DISPLACEMENT_MAP)
     lines = marks[np.abs(marks) > 1e-9 * limit]
-    axes.tricontour(*place.T, mesh.triangles, depth, levels=lines, colors="0.4", linewidths=0.6, linestyles="-")
+    axes.tricontour(triangulation, depth, levels=lines, colors="0.4", linewidths=0.6, linestyles="-")
     axes.plot(*place[rim_loop(mesh.grid)].T, color="k", lw=1)
     bar = _colour_bar(axes, shades, marks)
     bar.set_label(f"displacement along the normal [{unit}], negative: pressed in")
@@ -138,7 +139,7 @@ def draw_traction(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
     """Compressive normal traction where the rest vertices lie in the image; contacts x, and the total force as an arrow."""
     compressive, place = -(frame["traction"] * frame["normals"]).sum(1), mesh.vertex_pixels
     levels = np.linspace(0, 1.001 * max(compressive.max(), np.finfo(np.float32).tiny), 32)
-    shades = axes.tricontourf(*place.T, mesh.triangles, compressive.clip(0), levels=levels, cmap=TRACTION_MAP)
+    shades = axes.tricontourf(Triangulation(*place.T, mesh.triangles), compressive.clip(0), levels=levels, cmap=TRACTION_MAP)
     axes.plot(*place[rim_loop(mesh.grid)].T, color="k", lw=1)
     bar = _colour_bar(axes, shades)
     bar.locator = MaxNLocator(5)
@@ -198,7 +199,7 @@ def _annotate(axes: Axes, text: str, place: np.ndarray, size: np.ndarray) -> Non
     side, up = (-1 if place[0] > size[0] / 2 else 1), (1 if place[1] > size[1] / 2 else -1)
     axes.annotate(
         text,
-        place,
+        tuple(place),
         xytext=(34 * side, 44 * up),
         textcoords="offset points",
         ha="left" if side > 0 else "right",

@@ -163,7 +163,8 @@ class EquilibriumProblem:
         active = [contact.active_set(x[self.free]) for contact in contacts]
         each = list(zip(contacts, active, strict=True))
         blocks = self.elasticity.hessian_blocks(x, positive) - pressure * self.membrane.volume_hessian_blocks(x)
-        K = self.matrix(blocks, sum(contact.stiffness_blocks(x[self.free], a) for contact, a in each))
+        touching = [contact.stiffness_blocks(x[self.free], a) for contact, a in each]
+        K = self.matrix(blocks, torch.stack(touching).sum(0) if touching else 0)
         linear = [contact.linearised(a).force(x[self.free]) for contact, a in each]
         v, (gap, compliance) = self.membrane.volume_gradient(x)[self.free].numpy().ravel(), self._gap(x, pressure)
         try:

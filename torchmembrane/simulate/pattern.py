@@ -216,8 +216,8 @@ def dot_coordinates(
     """
     middle = corners.mean(1)
     reach = np.linalg.norm(corners - middle[:, None], axis=-1).max(1)
-    distance, dot = cKDTree(positions).query(middle, k=min(4, len(positions)))
-    distance, dot = distance.reshape(len(middle), -1), dot.reshape(len(middle), -1)
+    nearest = cKDTree(positions).query(middle, k=min(4, len(positions)))
+    distance, dot = (np.asarray(a).reshape(len(middle), -1) for a in nearest)
     best = (distance - radii[dot]).argmin(1)[:, None]
     distance, dot = (np.take_along_axis(a, best, 1)[:, 0] for a in (distance, dot))
     inked = distance < radii[dot] + 2 * reach

@@ -134,7 +134,7 @@ def presses(
     rest_pressure = float(balance)
     problem = EquilibriumProblem(membrane, elasticity, _cavity(membrane, rest_pressure, filling, gas), load)
     x, pressure = membrane.rest, rest_pressure
-    contacts = [
+    contacts: Sequence[FrictionalContact] = [
         FrictionalContact.at_first_pose(path[0], x[membrane.free], problem.vertex_stiffness, friction) for path in paths
     ]
     for poses in zip(*paths, strict=True):
