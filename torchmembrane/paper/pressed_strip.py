@@ -142,10 +142,16 @@ class PressedStrip:
         tension, pressure = strip.tension(self.stretch), self.pressure(strip)
         forces = []
         for before, arc, after in zip(self.arcs[::2], self.arcs[1::2], self.arcs[2::2], strict=False):
-            tangent = lambda angle: np.array([-np.sin(angle), np.cos(angle)])  # noqa: E731
             chord = arc.points(np.array([1.0]))[0] - arc.points(np.array([0.0]))[0]
-            forces.append(-tension * (tangent(after.start) - tangent(before.end)) - pressure * np.array([chord[1], -chord[0]]))
+            forces.append(
+                -tension * (_tangent(after.start) - _tangent(before.end)) - pressure * np.array([chord[1], -chord[0]])
+            )
         return np.array(forces)
+
+
+def _tangent(angle: float) -> np.ndarray:
+    """Unit vector `[2]` along a circle at that angle, counterclockwise."""
+    return np.array([-np.sin(angle), np.cos(angle)])
 
 
 def _gap(a: Disc, b: Disc) -> float:

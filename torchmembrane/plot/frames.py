@@ -111,7 +111,7 @@ def draw_displacement(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> N
     """Displacement along the rest normals where the rest vertices lie in the image; deepest point o, contacts x."""
     depth, place, unit = mesh.normal_displacement(frame), mesh.vertex_pixels, mesh.length_unit
     limit = max(np.abs(depth).max(), _least(mesh))
-    triangulation = Triangulation(*place.T, mesh.triangles)
+    triangulation = Triangulation(place[:, 0], place[:, 1], mesh.triangles)
     marks = MaxNLocator(9, steps=(1, 2, 5, 10), symmetric=True).tick_values(-limit, limit)
     marks = marks[np.abs(marks) < limit]
     levels = np.linspace(-1.001 * limit, 1.001 * limit, 42)
@@ -139,7 +139,9 @@ def draw_traction(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
     """Compressive normal traction where the rest vertices lie in the image; contacts x, and the total force as an arrow."""
     compressive, place = -(frame["traction"] * frame["normals"]).sum(1), mesh.vertex_pixels
     levels = np.linspace(0, 1.001 * max(compressive.max(), np.finfo(np.float32).tiny), 32)
-    shades = axes.tricontourf(Triangulation(*place.T, mesh.triangles), compressive.clip(0), levels=levels, cmap=TRACTION_MAP)
+    shades = axes.tricontourf(
+        Triangulation(place[:, 0], place[:, 1], mesh.triangles), compressive.clip(0), levels=levels, cmap=TRACTION_MAP
+    )
     axes.plot(*place[rim_loop(mesh.grid)].T, color="k", lw=1)
     bar = _colour_bar(axes, shades)
     bar.locator = MaxNLocator(5)

@@ -1,6 +1,6 @@
 """A sensor as it was understood: its rays from the side, its rest surface in space, its markers in the rest image."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -84,7 +84,7 @@ def _leaves_port(camera: Camera, points: np.ndarray, depth: float) -> np.ndarray
     return origin + direction * ((depth - origin[:, 2:]) / direction[:, 2:])
 
 
-def _draw_space(axes, X: np.ndarray, grid: tuple[int, int], markers: np.ndarray | None, unit: str) -> None:
+def _draw_space(axes: Any, X: np.ndarray, grid: tuple[int, int], markers: np.ndarray | None, unit: str) -> None:
     """The rest surface and its markers `[D, 3]` on three-dimensional axes."""
     axes.plot_wireframe(*X.T.reshape(3, *grid), color=BLUE, lw=0.5, rcount=LINES + 1, ccount=LINES + 1)
     if markers is not None:

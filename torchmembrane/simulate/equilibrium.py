@@ -109,7 +109,7 @@ class EquilibriumProblem:
         1.0
     """
 
-    def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, cavity: Filling, load: Tensor | None = None):
+    def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, cavity: Filling, load: Tensor | None = None) -> None:
         self.membrane, self.elasticity, self.cavity, self.free = membrane, elasticity, cavity, membrane.free
         self.load = torch.zeros_like(membrane.rest) if load is None else load
         self.matrix = _SparsityPattern(membrane)

@@ -78,7 +78,7 @@ class Renderer(nn.Module):
         pattern: Dots | Speckle | Painted | None = None,
         appearance: Appearance = DEFAULT_APPEARANCE,
         samples: int = 4,
-    ):
+    ) -> None:
         super().__init__()
         self.camera, self.appearance, self.samples = copy.deepcopy(sensor.camera), appearance, samples
         m, n = grid or sensor.membrane.grid

@@ -116,7 +116,7 @@ class Simulator:
         appearance: Appearance = DEFAULT_APPEARANCE,
         radii: Sequence[float] | None = None,
         missing: Sequence[int] = (),
-    ):
+    ) -> None:
         self.sensor, self.appearance = sensor, appearance
         m, n = grid or map(_finer, sensor.membrane.grid)
         self.grid = (m, n)
