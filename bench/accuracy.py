@@ -55,11 +55,11 @@ def main():
                 score(reconstructor, args.cases, case, label, markers, surface)
     table = []
     for (folder, kind), groups in sorted(markers.items()):
-        error, seen = (np.concatenate(part) for part in zip(*groups, strict=True))
+        error, visible = (np.concatenate(part) for part in zip(*groups, strict=True))
         found = np.isfinite(error)
         row = dict(
             sensor=folder, images=kind, median=np.median(error[found]), p95=np.percentile(error[found], 95),
-            found=found.sum() / seen.sum(), wrong=int((error[found] > 3).sum()),
+            found=found.sum() / visible.sum(), wrong=int((error[found] > 3).sum()),
         )  # fmt: skip
         table.append({k: v if isinstance(v, str) else float(v) for k, v in row.items()})
         print(
@@ -86,9 +86,9 @@ def score(reconstructor, root: Path, case: dict, label: str, markers: dict, surf
                     surface.setdefault((f"{label}: {name}", kind), []).append(value)
             surface.setdefault((label, kind), []).append(relative(result))
             if label == "the sensor's material":
-                seen = truth["visible_deformed"].astype(bool) if "visible_deformed" in truth else np.ones(len(X), bool)
+                visible = truth["visible_deformed"].astype(bool) if "visible_deformed" in truth else np.ones(len(X), bool)
                 error = np.linalg.norm(result.pixels[0].numpy() - truth["uv_deformed"], axis=1)
-                markers.setdefault((case["folder"], kind), []).append((error[seen], np.ones(seen.sum())))
+                markers.setdefault((case["folder"], kind), []).append((error[visible], np.ones(visible.sum())))
 
 
 def contact_errors(result, truth) -> dict[str, float]:

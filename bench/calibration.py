@@ -31,17 +31,18 @@ from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
 from torchmembrane.errors import MembraneError
 from torchmembrane.io.images import to_grey
+from torchmembrane.io.report import Report
 from torchmembrane.markers.dots.pattern import find_dots
-from torchmembrane.plot.calibration import Report, fit_figure, layout_figure, surface_figure
-from torchmembrane.plot.frames import save
+from torchmembrane.plot.calibration import fit_figure, layout_figure, surface_figure
+from torchmembrane.plot.drawing import save
 from torchmembrane.presets import preset
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Markers, Surface
-from torchmembrane.simulate.board import BoardImages
+from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Plane, Sphere
-from torchmembrane.simulate.look import Look
 from torchmembrane.simulate.simulator import Simulator
+from torchmembrane.simulate.target_renderer import TargetRenderer
 from torchmembrane.targets import Checkerboard, DotBoard
 
 NOISE = 40.0
@@ -58,7 +59,7 @@ OFFSET = np.array([0.0, 0.0, 0.3])
 def lens(seeds, figures):
     board = Checkerboard(11, 8, 2.5)
     for model, truth in LENSES.items():
-        photograph = BoardImages.of(Camera(model, (640, 480), *truth))
+        photograph = TargetRenderer.for_camera(Camera(model, (640, 480), *truth))
         for seed in range(seeds):
             pixels = poses_seen(photograph, board, 12, (14, 26), 0.35, np.random.default_rng(seed))
             guess = Camera(model, (640, 480), (250, 250), (320, 240))
@@ -82,7 +83,7 @@ def ports(seeds, figures):
         for seed in range(seeds):
             rng, sets = np.random.default_rng(seed), []
             for air in (True, False):
-                sets.append(poses_seen(BoardImages.of(make(PORT, air)), board, 6, (14, 22), 0.1, rng))
+                sets.append(poses_seen(TargetRenderer.for_camera(make(PORT, air)), board, 6, (14, 22), 0.1, rng))
             pixels, filled = np.concatenate(sets), np.arange(12) >= 6
             for label, chosen in (("air", ~filled), ("medium", filled), ("both", filled | True)):
                 views = Views(pixels[chosen], filled[chosen])
@@ -115,7 +116,7 @@ def effect(seeds, figures):
     """Error of the dots in space, mm, over all presses, by sensor file and estimator."""
     for name, radius, depth in (("fingertip", 4.0, 2.0), ("half_cylinder", 4.0, 2.0)):
         design, truth = preset(name), posed(preset(name), TILT, OFFSET)
-        simulator = Simulator(truth, look=Look(noise=NOISE))
+        simulator = Simulator(truth, appearance=Appearance(noise=NOISE))
         image = simulator.rest_image()
         calibrated = rest_from_image(bare(design), image).sensor
         sensors = {"design": design, "calibrated": calibrated, "truth": truth}
@@ -155,7 +156,7 @@ def material(seeds, figures):
     for name, prestretch in itertools.product(("fingertip", "half_cylinder"), (1.05, 1.15, 1.3, 1.6, 2.0)):
         design = preset(name)
         truth = replace(design, material=replace(design.material, prestretch=prestretch, shear_modulus=0.3, thickness=0.4))
-        simulator = Simulator(truth, look=Look(noise=NOISE))
+        simulator = Simulator(truth, appearance=Appearance(noise=NOISE))
         sensor = replace(design, markers=replace(design.markers, rest_image=simulator.rest_image()))
         aim = simulator.membrane.rest[simulator.membrane.fixed].mean(0).numpy()
         strokes = [stroke_to(simulator, body, aim, travel, depth) for body, travel, depth in presses]
@@ -203,7 +204,7 @@ def views(seeds, figures):
 def depth(seeds, figures):
     for name in ("fingertip", "half_cylinder"):
         design, truth = preset(name), posed(preset(name), TILT, OFFSET)
-        simulator = Simulator(truth, look=Look(noise=NOISE))
+        simulator = Simulator(truth, appearance=Appearance(noise=NOISE))
         exact, image = simulator.renderer.depth(simulator.membrane.rest).numpy(), simulator.rest_image()
         for seed in range(seeds):
             noisy = exact + np.random.default_rng(seed).normal(size=exact.shape) * 0.2
@@ -225,9 +226,9 @@ def layout(seeds, figures):
         pixels, sizes = pixel_lattice(sensor, 30.0)
         dots = layout_for_pixels(sensor, pixels, sizes)
         made = replace(sensor, markers=Markers("dots", "dark", dots.positions, sizes))
-        seen = find_dots(rest_image(made, 0), "dark").pixels
-        gap, _ = cKDTree(seen).query(pixels)
-        record = dict(what=f"layout, {name}", dots=len(pixels), found=int((gap < 3).sum()), rms=rms(gap[gap < 3]))
+        found = find_dots(rest_image(made, 0), "dark").pixels
+        gap, _ = cKDTree(found).query(pixels)
+        record = dict(what=f"pattern, {name}", dots=len(pixels), found=int((gap < 3).sum()), rms=rms(gap[gap < 3]))
         print(record)
         yield record
         if figures:
@@ -235,7 +236,7 @@ def layout(seeds, figures):
             save(layout_figure(title, sensor, dots), figures / f"layout_{name}.png")
 
 
-def poses_seen(photograph: BoardImages, board, count: int, depths, spread: float, rng) -> np.ndarray:
+def poses_seen(photograph: TargetRenderer, board, count: int, depths, spread: float, rng) -> np.ndarray:
     """A board in random poses as it was found in its images, `[count, D, 2]` px; poses not wholly seen are drawn again."""
     found, middle = [], np.append(sum(board.extent) / 2, 0.0)
     while len(found) < count:
@@ -276,7 +277,7 @@ def bare(sensor):
 
 
 def rest_image(sensor, seed: int) -> np.ndarray:
-    simulator = Simulator(sensor, look=Look(noise=NOISE))
+    simulator = Simulator(sensor, appearance=Appearance(noise=NOISE))
     return to_grey(simulator.image(simulator.membrane.rest, np.random.default_rng(seed)))
 
 

@@ -4,8 +4,8 @@ python bench/exported.py CASES [--estimator force-balance] [--tracking] [--only 
 
 CASES as for bench/accuracy.py. For each sensor the model is exported (seconds, MB, nodes), loaded, and run on every image in
 batches of 1, 3 and 16. Printed: the largest difference of vertices (length unit), markers (length unit), pixels (px) and force
-(relative), whether all statuses are equal; milliseconds a frame, best and median, with what its parts take: markers, reconstruct
-(image check, rays and result) and estimators, from onnxruntime's own profile of single frames.
+(relative), whether all statuses are equal; milliseconds a frame, best and median, with what its parts take: markers,
+reconstruct (image check, rays and result) and estimators, from onnxruntime's own profile of single frames.
 """
 
 import argparse

@@ -61,11 +61,11 @@ def main():
             rest = r.rest_pixels.double().numpy()
             draws = [mismatched(rest, pixels, np.random.default_rng(k)) for k in range(n)]
             wrong, bad = (np.stack(each) for each in zip(*draws, strict=True))
-            seen = torch.from_numpy(np.stack([pixels, *others, *wrong]))
-            flow = (seen - torch.from_numpy(rest)).to(r.rest_pixels)
+            observed = torch.from_numpy(np.stack([pixels, *others, *wrong]))
+            flow = (observed - torch.from_numpy(rest)).to(r.rest_pixels)
             with torch.no_grad():
                 suspect = (r.screen(flow, torch.ones_like(flow[..., 0])) < FOUND).numpy()
-                results = r.from_pixels(seen), believed(r, flow[-n:])
+                results = r.from_pixels(observed), believed(r, flow[-n:])
             error, spoiled = (np.sqrt(((x.markers.numpy() - Y) ** 2).sum((1, 2)) / ((Y - X) ** 2).sum()) for x in results)
             row = dict(clean=error[0], noise=error[1:-n], believed=np.nan_to_num(spoiled, nan=np.inf), screened=error[-n:])
             rows.append(dict(case=case["case"], estimator=estimator) | {key: value.tolist() for key, value in row.items()})

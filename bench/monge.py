@@ -54,10 +54,10 @@ def main():
             continue
         with torch.no_grad():
             flow = r.flow(pixels - r.rest_pixels, torch.ones(pixels.shape[:2], dtype=torch.float64))[0]
-            seen = r.camera.pixel_to_ray(r.vertex_pixels + flow)
-            first = r.estimator(*seen).vertices
+            observed = r.camera.pixel_to_ray(r.vertex_pixels + flow)
+            first = r.estimator(*observed).vertices
             for name, estimator in estimators.items():
-                got = estimator(*seen)
+                got = estimator(*observed)
                 moved = (got.vertices - r.estimator.membrane.rest)[r.marker_vertices]
                 markers = r.rest_markers + (r.marker_weights[..., None] * moved).sum(-2)
                 error = float(((markers - Y).square().sum() / (Y - X).square().sum()).sqrt())

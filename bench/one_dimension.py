@@ -2,9 +2,10 @@
 
 python bench/one_dimension.py [--json FILE]
 
-Radius 15 mm, prestretch 1.2, 31 markers seen from the centre with 0.2 mrad noise (0.05 px at 240 px/rad); data from the closed
-form (simulate/profile.py), the estimators' polygons have 60 edges. Printed: rms error at the markers over their displacement,
-largest depth found and true, the discs' total force and the pressure against the truth. Medians over eight draws of the noise.
+Radius 15 mm, prestretch 1.2, 31 markers seen from the centre with 0.2 mrad noise (0.05 px at 240 px/rad); data from the
+closed form (paper/pressed_strip.py), the estimators' polygons have 60 edges. Printed: rms error at the markers over their
+displacement, largest depth found and true, the discs' total force and the pressure against the truth. Medians over
+eight draws of the noise.
 """
 
 import argparse
@@ -14,7 +15,7 @@ import numpy as np
 from record import write
 
 from torchmembrane.paper.pressed_strip import Disc, PressedStrip
-from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile, Profile
+from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile, StripProfile
 from torchmembrane.paper.strip import Strip
 
 RADIUS, NODES, MARKERS, NOISE, DRAWS = 15.0, 61, 31, 2e-4, 8
@@ -26,14 +27,14 @@ EXPERIMENTS = {
 }
 
 
-def seen(truth: PressedStrip, draw: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def observed(truth: PressedStrip, draw: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rest angles of the markers, the angles at which they are seen, with noise, and where they are."""
     theta = np.linspace(0, np.pi, MARKERS + 2)[1:-1]
     place = truth.positions(np.rad2deg(theta))
     return theta, np.arctan2(place[:, 1], place[:, 0]) + NOISE * np.random.default_rng(draw).standard_normal(MARKERS), place
 
 
-def score(profile: Profile, theta, place, truth: PressedStrip, strip: Strip, share: float) -> dict[str, float]:
+def score(profile: StripProfile, theta, place, truth: PressedStrip, strip: Strip, share: float) -> dict[str, float]:
     rest = RADIUS * np.stack([np.cos(theta), np.sin(theta)], -1)
     force, found = truth.forces(strip).sum(0), (profile.traction * share).sum(0).numpy()
     fine = truth.positions(np.linspace(0, 180, 2001))
@@ -57,7 +58,7 @@ def main():
             for estimator in (MinimumEnergyProfile(RADIUS, strip, NODES), ForceBalanceProfile(RADIUS, strip, NODES, 2 * NOISE)):
                 draws = []
                 for draw in range(DRAWS):
-                    theta, psi, place = seen(truth, draw)
+                    theta, psi, place = observed(truth, draw)
                     draws.append(score(estimator(theta, psi), theta, place, truth, strip, estimator.share))
                 median = {key: float(np.median([d[key] for d in draws])) for key in draws[0]}
                 rows.append(dict(experiment=name, material=material, estimator=type(estimator).__name__, **median))

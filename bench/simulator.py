@@ -22,11 +22,11 @@ from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.presets import NAMES, preset
 from torchmembrane.sensor.factories import elastic_energy
 from torchmembrane.sensor.sensor import Sensor
+from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.dataset import Plan, random_frame, stroke_to
-from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
+from torchmembrane.simulate.equilibrium import EquilibriumProblem, Liquid, Open
 from torchmembrane.simulate.indenters import Cylinder, Plane, Sphere, facing
-from torchmembrane.simulate.look import Look
-from torchmembrane.simulate.press import carried, press
+from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.simulate.simulator import Simulator
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, heightfield, spherical_cap
 
@@ -38,7 +38,7 @@ SHAPES = {
     "halfcyl": lambda z, grid: half_cylinder(10, 40, 80, z, grid),
 }
 FRICTION, DEPTH, BALL = 0.4, 3.0, 4.0
-INK_ONLY = Look(ambient=1.0, vignetting=0.0, blur=0.0, exposure=1.0, outside=1.0)
+INK_ONLY = Appearance(ambient=1.0, vignetting=0.0, blur=0.0, exposure=1.0, outside=1.0)
 DATA_SET = 6
 
 
@@ -49,7 +49,7 @@ def elasticity_of(membrane):
 def laplace(membrane, curvature: float) -> float:
     """Relative error of the pressure of a liquid under constant tension, p = T x curvature."""
     elasticity = elasticity_of(membrane)
-    solution = Equilibrium(membrane, elasticity, Liquid(float(membrane.rest_volume))).solve(membrane.rest, 0.1)
+    solution = EquilibriumProblem(membrane, elasticity, Liquid(float(membrane.rest_volume))).solve(membrane.rest, 0.1)
     return solution.pressure / float(elasticity.tension * curvature) - 1
 
 
@@ -61,7 +61,7 @@ def inflation(n: int) -> float:
     x, pressure, errors = cap.rest, exact[0], []
     for s, expected in zip(stretches, exact, strict=True):
         x = torch.where(cap.fixed[:, None], s * cap.rest, x)
-        x, pressure, *_ = Equilibrium(cap, elasticity_of(cap), Liquid(s**3 * float(cap.rest_volume))).solve(x, pressure)
+        x, pressure, *_ = EquilibriumProblem(cap, elasticity_of(cap), Liquid(s**3 * float(cap.rest_volume))).solve(x, pressure)
         errors.append(abs(pressure / expected - 1))
     return max(errors)
 
@@ -74,7 +74,7 @@ def flat_bulge(n: int) -> float:
     along = np.linspace(-side / 2, side / 2, n)
     flat = heightfield(along, along, np.full((n, n), 10.0))
     elasticity = elasticity_of(flat)
-    x = Equilibrium(flat, elasticity, Open()).solve(flat.rest, pressure).vertices
+    x = EquilibriumProblem(flat, elasticity, Open()).solve(flat.rest, pressure).vertices
     return (float(x[n * n // 2, 2]) - 10) * float(elasticity.tension) / (pressure * series) - 1
 
 
@@ -215,17 +215,17 @@ def ink_centroid(ink: np.ndarray, outline: np.ndarray) -> np.ndarray:
 def dot_errors(simulator: Simulator, vertices) -> np.ndarray:
     """Distances in px of the rendered dots' centroids from their outlines', of those that are seen whole."""
     with torch.no_grad():
-        ink, seen = 1 - simulator.renderer(vertices).numpy(), simulator.renderer.dots(vertices).visible.numpy()
+        ink, visible = 1 - simulator.renderer(vertices).numpy(), simulator.renderer.dots(vertices).visible.numpy()
         rings = outlines(simulator, vertices)
     width, height = simulator.sensor.camera.image_size
-    whole = seen & (rings > 1).all((1, 2)) & (rings < [width - 3, height - 3]).all((1, 2))
+    whole = visible & (rings > 1).all((1, 2)) & (rings < [width - 3, height - 3]).all((1, 2))
     return np.array([np.linalg.norm(ink_centroid(ink, ring) - polygon_centroid(ring)) for ring in rings[whole]])
 
 
 def rendered_dots() -> list[dict]:
     rows = []
     for name in NAMES:
-        simulator = Simulator(preset(name), look=INK_ONLY)
+        simulator = Simulator(preset(name), appearance=INK_ONLY)
         membrane, depth = simulator.membrane, 0.05 * simulator.membrane.size
         middle = membrane.rest[membrane.fixed].mean(0).numpy()
         start, travel, *_ = stroke_to(simulator, Sphere(2.5 * depth), middle, (-0.2, 0.1, -1), depth)

@@ -101,7 +101,7 @@ def main():
         paper = ThresholdedDots(markers.rest_image, model, large, markers.polarity)
         for case in (c for c in cases if c["sensor"] == name):
             truth = np.load(args.cases / case["truth"])
-            seen = truth["visible_deformed"].astype(bool) if "visible_deformed" in truth else np.ones(len(model), bool)
+            visible = truth["visible_deformed"].astype(bool) if "visible_deformed" in truth else np.ones(len(model), bool)
             for path in case["images"]:
                 kind = Path(path).stem.rpartition("_")[2] if len(case["images"]) > 1 else "images"
                 image = r.read(args.cases / path)
@@ -109,7 +109,7 @@ def main():
                     pixels, confidence = (a[0].double().numpy() for a in r.locator(image))
                 soft = np.where(confidence[:, None] > FOUND, pixels - r.measured_rest.double().numpy(), np.nan)
                 for method, moved in (("paper", paper(image[0, 0].numpy())), ("locator", soft)):
-                    error = np.linalg.norm(model + moved - truth["uv_deformed"], axis=1)[seen]
+                    error = np.linalg.norm(model + moved - truth["uv_deformed"], axis=1)[visible]
                     errors.setdefault((case["folder"], kind, method), []).append(error)
     rows = []
     for (folder, kind, method), parts in sorted(errors.items()):

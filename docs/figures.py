@@ -26,12 +26,12 @@ from torchmembrane.markers.observer import FOUND
 from torchmembrane.paper.pressed_strip import Disc, PressedStrip
 from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile
 from torchmembrane.paper.strip import Strip
-from torchmembrane.plot.frames import BLUE, GREY, VERMILION
+from torchmembrane.plot.drawing import BLUE, GREY, VERMILION
 from torchmembrane.presets import preset_file
 from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.indenters import Cylinder, Sphere
-from torchmembrane.simulate.look import Look
-from torchmembrane.simulate.press import press
+from torchmembrane.simulate.quasi_static import press
 from torchmembrane.simulate.simulator import Simulator
 
 NOISE = 30.0  # dB below white
@@ -54,7 +54,7 @@ class Shown(NamedTuple):
 
 @cache
 def simulator(sensor: str) -> Simulator:
-    return Simulator(reconstructor(sensor).sensor, look=Look(noise=NOISE))
+    return Simulator(reconstructor(sensor).sensor, appearance=Appearance(noise=NOISE))
 
 
 @cache
@@ -72,9 +72,9 @@ def pressed(sensor: str, *strokes) -> Shown:
         body = body.touching(sim.membrane, unit)
         paths.append([body, body.moved(depth * unit)])
     state = press(sim.membrane, sim.elasticity, paths, **sim.cavity)
-    seen, rest = sim.renderer.dots(state.vertices), sim.rest_dots
+    dots, rest = sim.renderer.dots(state.vertices), sim.rest_dots
     image = sim.image(state.vertices, np.random.default_rng(0)) / 255
-    arrays = (rest.positions, seen.positions, seen.pixels, state.contact_points)
+    arrays = (rest.positions, dots.positions, dots.pixels, state.contact_points)
     return Shown(sensor, image.astype(np.float32), *(np.asarray(a) for a in arrays))
 
 

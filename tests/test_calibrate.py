@@ -28,9 +28,9 @@ from torchmembrane.io.images import to_grey
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
-from torchmembrane.simulate.board import BoardImages
-from torchmembrane.simulate.look import Look
+from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.simulator import Simulator
+from torchmembrane.simulate.target_renderer import TargetRenderer
 from torchmembrane.targets import Checkerboard, DotBoard
 
 SIZE, NOISE = (320, 240), 40.0
@@ -54,7 +54,7 @@ def poses(board, count, depths, rng, tilt=0.45):
 
 def photographed(camera, board, count, depths, rng):
     """The board's points as found in noisy images of it, `[count, D, 2]`."""
-    photograph, found = BoardImages.of(camera), []
+    photograph, found = TargetRenderer.for_camera(camera), []
     for R, t in poses(board, 3 * count, depths, rng):
         try:
             found.append(find_target(to_grey(photograph.image(board, R, t, NOISE, rng=rng)), board))
@@ -108,7 +108,7 @@ def assembled(design):
 
 
 def simulator_of(sensor):
-    return Simulator(sensor, look=Look(noise=NOISE))
+    return Simulator(sensor, appearance=Appearance(noise=NOISE))
 
 
 @pytest.fixture(scope="module")
@@ -179,12 +179,12 @@ def test_board_dots_are_named_right_in_any_turn_and_when_cut(turn):
     camera = Camera("pinhole", SIZE, (150, 150), (160, 120), (-0.1, 0.02))
     R = Rotation.from_euler("xz", [0.3, turn]).as_matrix()
     t = np.array([5.0, 1.0, 13.0])
-    image = BoardImages.of(camera).image(DOTS, R, t, NOISE)
+    image = TargetRenderer.for_camera(camera).image(DOTS, R, t, NOISE)
     pixels = find_target(to_grey(image), DOTS)
     expected = outline_centres(camera.point_to_pixel(torch.from_numpy(DOTS.outlines @ R.T + t))).numpy()
-    seen, inside = np.isfinite(pixels).all(1), ((expected > 8) & (expected < [311, 231])).all(1)
-    assert seen[inside].mean() > 0.97 and seen.sum() < len(seen)
-    assert np.abs(pixels - expected)[seen].max() < 0.12
+    visible, inside = np.isfinite(pixels).all(1), ((expected > 8) & (expected < [311, 231])).all(1)
+    assert visible[inside].mean() > 0.97 and visible.sum() < len(visible)
+    assert np.abs(pixels - expected)[visible].max() < 0.12
 
 
 def test_boards_say_what_is_wrong():
@@ -381,7 +381,7 @@ def test_command_rest_writes_a_sensor_a_report_and_a_figure(design, image, tmp_p
 
 def test_command_camera_leaves_out_images_without_a_board(design, tmp_path, capsys):
     camera = Camera("pinhole", SIZE, (150.0, 150.0), (160.4, 119.2))
-    photograph, rng = BoardImages.of(camera), np.random.default_rng(5)
+    photograph, rng = TargetRenderer.for_camera(camera), np.random.default_rng(5)
     for k, (R, t) in enumerate(poses(CHECKERS, 4, (17, 24), rng)):
         Image.fromarray(photograph.image(CHECKERS, R, t, NOISE, rng=rng)).save(tmp_path / f"{k}.png")
     Image.new("L", SIZE, 100).save(tmp_path / "empty.png")

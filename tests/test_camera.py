@@ -246,8 +246,8 @@ def test_behind_the_camera_is_nan(ports):
     points = torch.tensor([[1.0, 1.0, -5.0], [0.0, 0.0, -5.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
     for lens in ("pinhole", "pinhole k1-k3"):
         assert camera_of(lens, ports).point_to_pixel(points).isnan().all()
-    seen = ~camera_of("fisheye", ports).point_to_pixel(points).isnan().all(-1)
-    assert seen.tolist() == ([True, False, True, False] if ports == "air" else [False] * 4)
+    visible = ~camera_of("fisheye", ports).point_to_pixel(points).isnan().all(-1)
+    assert visible.tolist() == ([True, False, True, False] if ports == "air" else [False] * 4)
 
 
 def test_before_the_last_far_face_is_nan():

@@ -23,7 +23,7 @@ from torchmembrane.io import store
 from torchmembrane.mechanics import hyperelastic
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.sensor import Sensor
-from torchmembrane.simulate import dataset, frames, look, simulator
+from torchmembrane.simulate import appearance, dataset, frames, simulator
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SENSOR = str(EXAMPLES / "sensor.toml")
@@ -230,7 +230,7 @@ def test_the_options_choices_are_what_the_package_has():
     assert choices.ELEMENTS == settings.ELEMENTS and choices.RESULT_FORMATS == store.FORMATS
     assert choices.PRESETS == presets.NAMES and choices.INDENTERS == dataset.KINDS and choices.LEGS == simulator.LEGS
     assert choices.SIMULATION_FORMATS == frames.FORMATS and choices.PORTS == camera.PORTS
-    assert (choices.HIGHLIGHT, choices.BLUR) == (look.Look.highlight, look.Look.blur)
+    assert (choices.HIGHLIGHT, choices.BLUR) == (appearance.Appearance.highlight, appearance.Appearance.blur)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from torchmembrane.estimators.traction_loss import TractionLoss
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.simulate.indenters import Sphere
-from torchmembrane.simulate.press import carried, press
+from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.solve import block_tridiagonal, matrix_products
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import spherical_cap

@@ -6,8 +6,9 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from torchmembrane import MembraneError
-from torchmembrane.simulate.indenters import Box, Cylinder, Mesh, Plane, Sphere, Union, Wedge, facing
+from torchmembrane import MembraneError, simulate
+from torchmembrane.simulate.indenters import Box, Cylinder, Plane, Sphere, Union, Wedge, facing
+from torchmembrane.simulate.mesh_indenter import MeshIndenter
 from torchmembrane.surface.shapes import spherical_cap
 
 ICOSAHEDRON = trimesh.creation.icosahedron()
@@ -19,7 +20,7 @@ EVERY = {
     "wedge": Wedge(opening=60, radius=0.5),
     "box": Box((2.0, 3.0, 1.0), radius=0.2),
     "union": Union([Sphere(1.0, translation=(2.0, 0, 0)), Plane(translation=(0, 0, -1.0))]),
-    "mesh": Mesh(2 * ICOSAHEDRON.vertices, ICOSAHEDRON.faces),
+    "mesh": MeshIndenter(2 * ICOSAHEDRON.vertices, ICOSAHEDRON.faces),
 }
 TURN = torch.from_numpy(Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix())
 
@@ -74,7 +75,7 @@ def test_distances_in_closed_form():
 
 def test_a_mesh_of_a_sphere_is_that_sphere():
     fine = trimesh.creation.icosphere(3, 2.0)
-    mesh, points = Mesh(fine.vertices, fine.faces), 5 * torch.rand(300, 3, dtype=torch.float64) - 2.5
+    mesh, points = MeshIndenter(fine.vertices, fine.faces), 5 * torch.rand(300, 3, dtype=torch.float64) - 2.5
     torch.testing.assert_close(mesh.distance(points), Sphere(2.0).distance(points), rtol=0, atol=0.02)
     far = 20 * points / points.norm(dim=-1, keepdim=True)
     assert (mesh.distance(far) > 15).all() and (mesh.distance(far) < 18.02).all()
@@ -100,7 +101,7 @@ def test_a_mesh_knows_its_inside_at_sharp_edges(outline):
     points = torch.randn(1000, 3, dtype=torch.float64) * torch.tensor([1.5, 0.3, 0.8]) + torch.tensor([0, 0, 1.0])
     solid = trimesh.Trimesh(vertices, triangles)
     inside = torch.from_numpy(solid.contains(points.numpy()))
-    assert inside.sum() > 20 and torch.equal(Mesh(vertices, triangles).distance(points) < 0, inside)
+    assert inside.sum() > 20 and torch.equal(MeshIndenter(vertices, triangles).distance(points) < 0, inside)
 
 
 def test_distance_is_differentiable_in_pose_and_size():
@@ -148,9 +149,26 @@ def test_facing_is_a_rotation_with_that_third_axis():
         (lambda: Box((1.0, 1, 0.1), radius=0.1), "sides"),
         (lambda: Cylinder(1.0, axis=(0, 0, 0)), "not zero"),
         (lambda: Union([]), "no parts"),
-        (lambda: Mesh(ICOSAHEDRON.vertices, ICOSAHEDRON.faces[1:]), "closed mesh"),
+        (lambda: MeshIndenter(ICOSAHEDRON.vertices, ICOSAHEDRON.faces[1:]), "closed mesh"),
     ],
 )
 def test_impossible_bodies_are_refused(make, message):
     with pytest.raises(MembraneError, match=message):
         make()
+
+
+def test_a_truth_names_the_body():
+    """Stored in every simulated frame: other programs read these words."""
+    assert {name: body.kind for name, body in EVERY.items() if name in ("sphere", "plane", "mesh")} == {
+        "sphere": "sphere",
+        "plane": "plane",
+        "mesh": "mesh",
+    }
+
+
+def test_the_namespace_hands_on_every_name_it_lists():
+    assert sorted(simulate.__all__) == sorted(simulate._MODULE_OF)
+    for name in simulate.__all__:
+        assert getattr(simulate, name).__name__ == name
+    with pytest.raises(AttributeError, match="no attribute 'Indentor'"):
+        simulate.Indentor  # noqa: B018

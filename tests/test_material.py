@@ -16,7 +16,7 @@ from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.indenters import Sphere
-from torchmembrane.simulate.press import carried, press
+from torchmembrane.simulate.quasi_static import carried, press
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 CAP = Surface("spherical_cap", {"rim_radius": 12.0, "height": 9.0, "base_z": 3.0})

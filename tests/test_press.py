@@ -8,9 +8,9 @@ from torchmembrane import MembraneError
 from torchmembrane.mechanics.cavity import rest_balance
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate import equilibrium as equilibrium_module
-from torchmembrane.simulate.equilibrium import Equilibrium, Liquid, Open
+from torchmembrane.simulate.equilibrium import EquilibriumProblem, Liquid, Open
 from torchmembrane.simulate.indenters import Plane, Sphere, facing
-from torchmembrane.simulate.press import carried, press, presses
+from torchmembrane.simulate.quasi_static import carried, press, presses
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import half_cylinder, heightfield, spherical_cap
 from torchmembrane.surface.stencil import ONE_RING, apply_stencil, inner, one_ring_edges
@@ -51,7 +51,7 @@ def test_liquid_pressure_is_tension_times_curvature(make, curvature):
     for n in GRIDS:
         membrane = make(n)
         elasticity = elasticity_of(membrane)
-        solution = Equilibrium(membrane, elasticity, Liquid(float(membrane.rest_volume))).solve(membrane.rest, 0.1)
+        solution = EquilibriumProblem(membrane, elasticity, Liquid(float(membrane.rest_volume))).solve(membrane.rest, 0.1)
         errors.append(solution.pressure / float(elasticity.tension * curvature) - 1)
     errors_fall_quadratically(errors, 0.01)
 
@@ -65,7 +65,7 @@ def test_inflated_sphere_follows_its_pressure_curve():
         x, pressure, curve = cap.rest, exact[0], []
         for s in stretches:
             x = torch.where(cap.fixed[:, None], s * cap.rest, x)
-            inflated = Equilibrium(cap, elasticity_of(cap), Liquid(s**3 * float(cap.rest_volume)))
+            inflated = EquilibriumProblem(cap, elasticity_of(cap), Liquid(s**3 * float(cap.rest_volume)))
             x, pressure, *_ = inflated.solve(x, pressure)
             curve.append(pressure)
         errors.append(np.abs(curve / exact - 1).max())
@@ -82,7 +82,7 @@ def test_flat_square_bulges_like_the_fourier_series():
         along = np.linspace(-side / 2, side / 2, n)
         flat = heightfield(along, along, np.full((n, n), 10.0))
         elasticity = elasticity_of(flat)
-        x = Equilibrium(flat, elasticity, Open()).solve(flat.rest, pressure).vertices
+        x = EquilibriumProblem(flat, elasticity, Open()).solve(flat.rest, pressure).vertices
         middle = float(x[n * n // 2, 2]) - 10
         errors.append(middle * float(elasticity.tension) / (pressure * series) - 1)
     errors_fall_quadratically(errors, 0.002)

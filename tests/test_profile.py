@@ -127,7 +127,7 @@ def test_minimum_energy_solves_the_boundary_value_problem():
     assert abs(got.pressure * R - twin.p[0]) < 0.01
 
 
-def seen(discs, noise=2e-4):
+def observed(discs, noise=2e-4):
     truth = PressedStrip(R, discs)
     theta = markers()
     place = truth.positions(np.rad2deg(theta))
@@ -143,7 +143,7 @@ def error(profile, theta, place):
 @pytest.mark.parametrize(("discs", "bound"), [(CYLINDER, 0.07), (OFF_CENTRE, 0.05), (TWO_POINTS, 0.3)])
 def test_force_balance_finds_what_minimum_energy_does_not(discs, bound):
     """Figs. 19 and 20 from the closed form, with noise: shape, force and pressure; least energy hides the press."""
-    truth, theta, psi, place = seen(discs)
+    truth, theta, psi, place = observed(discs)
     least = MinimumEnergyProfile(R, SOFT, 61)(theta, psi)
     estimator = ForceBalanceProfile(R, SOFT, 61, 4e-4)
     found = estimator(theta, psi)
@@ -155,7 +155,7 @@ def test_force_balance_finds_what_minimum_energy_does_not(discs, bound):
 
 
 def test_mirrored_markers_give_the_mirrored_strip():
-    _, theta, psi, _ = seen(OFF_CENTRE)
+    _, theta, psi, _ = observed(OFF_CENTRE)
     for estimator in (MinimumEnergyProfile(R, SOFT, 41), ForceBalanceProfile(R, SOFT, 41, 4e-4)):
         one, other = estimator(theta, psi), estimator(np.pi - theta[::-1], np.pi - psi[::-1])
         mirrored = other.nodes.flip(0) * torch.tensor([-1.0, 1.0])

@@ -11,9 +11,9 @@ from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
-from torchmembrane.simulate.look import Look, blurred, noisy, scattered
+from torchmembrane.simulate.appearance import Appearance, blurred, diffuse_light, noisy
 from torchmembrane.simulate.pattern import Dots, Painted, Speckle, pattern_of
-from torchmembrane.simulate.raster import seen_triangles
+from torchmembrane.simulate.raster import visible_triangles
 from torchmembrane.simulate.render import Renderer, render
 
 SIZE = (160, 120)
@@ -26,7 +26,7 @@ CAMERAS = {
 }
 RADIUS, CENTRE = 10.0, np.array([0.0, 0.0, 12.0])  # of the cap's sphere
 DOTS = [(0, 0, 1), (0.5, 0.1, 1), (-0.3, 0.5, 1), (0.1, -0.55, 1), (-0.6, -0.4, 1.2)]
-PLAIN = Look(ambient=1.0, vignetting=0.0, blur=0.0, exposure=1.0, outside=0.0)
+PLAIN = Appearance(ambient=1.0, vignetting=0.0, blur=0.0, exposure=1.0, outside=0.0)
 
 
 def cap_sensor(camera, kind="dots", image=None) -> Sensor:
@@ -93,7 +93,7 @@ def test_a_dot_s_centroid_is_that_of_its_projected_outline(name):
 
 def test_more_samples_converge():
     sensor = cap_sensor(CAMERAS["fisheye"])
-    images = {s: render(sensor, sensor.membrane.rest, look=PLAIN, samples=s) for s in (1, 2, 4, 12)}
+    images = {s: render(sensor, sensor.membrane.rest, appearance=PLAIN, samples=s) for s in (1, 2, 4, 12)}
     errors = [(images[s] - images[12]).square().mean().sqrt() for s in (1, 2, 4)]
     assert errors[0] > 1.6 * errors[1] > 1.6**2 * errors[2] and errors[2] < 0.01
 
@@ -110,7 +110,7 @@ def test_every_sample_sees_the_nearest_triangle_that_faces_it():
         covered = (torch.stack(sides) > 0).all(0) & (depth[k] < nearest)
         expected, nearest = torch.where(covered, k, expected), torch.where(covered, depth[k], nearest)
     assert (expected >= 0).float().mean() > 0.5
-    assert torch.equal(seen_triangles(corners, depth, 24, 20), expected)
+    assert torch.equal(visible_triangles(corners, depth, 24, 20), expected)
 
 
 def test_a_mesh_leaves_no_gaps_and_counts_no_sample_twice():
@@ -121,17 +121,17 @@ def test_a_mesh_leaves_no_gaps_and_counts_no_sample_twice():
     grid[1:-1, 1:-1] += (torch.rand(7, 7, 2, dtype=torch.float64) - 0.5) * (torch.rand(7, 7, 1) > 0.4)
     a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
     corners = torch.cat([torch.stack([a, b, c], -2).reshape(-1, 3, 2), torch.stack([a, c, d], -2).reshape(-1, 3, 2)])
-    seen = seen_triangles(corners, torch.ones(len(corners)), 20, 20)
+    seen = visible_triangles(corners, torch.ones(len(corners)), 20, 20)
     assert (seen[:16, :16] >= 0).all() and (seen >= 0).sum() == 16**2
-    alone = sum((seen_triangles(t[None], torch.ones(1), 20, 20) >= 0).long() for t in corners)
+    alone = sum((visible_triangles(t[None], torch.ones(1), 20, 20) >= 0).long() for t in corners)
     assert alone.max() == 1
 
 
 def test_lambert_s_law_and_vignetting_on_a_flat_plate():
     camera = Camera("pinhole", SIZE, (100, 100), (79.5, 59.5))
     sensor, light = plate_sensor(camera), np.array([5.0, -3.0, 2.0])
-    look = Look(lights=[light], ambient=0.0, vignetting=0.3, blur=0.0, exposure=0.5)
-    image = render(sensor, sensor.membrane.rest, pattern=Dots.of(sensor, missing=[0]), look=look, samples=2).numpy()
+    appearance = Appearance(lights=[light], ambient=0.0, vignetting=0.3, blur=0.0, exposure=0.5)
+    image = render(sensor, sensor.membrane.rest, pattern=Dots.of(sensor, missing=[0]), appearance=appearance, samples=2).numpy()
     v, u = np.mgrid[10:110, 10:150]
     points = 20 * np.stack([(u - 79.5) / 100, (v - 59.5) / 100, np.ones(u.shape)], -1)
     ray = light - points
@@ -143,19 +143,21 @@ def test_lambert_s_law_and_vignetting_on_a_flat_plate():
 
 def test_light_falls_with_the_square_of_the_distance_and_the_cosine():
     up, lights = torch.tensor([[0.0, 0, -1]]), torch.zeros(1, 3)
-    near, far = scattered(torch.tensor([[0.0, 0, 2]]), up, lights), scattered(torch.tensor([[0.0, 0, 4]]), up, lights)
-    tilted = scattered(torch.tensor([[0.0, 0, 2]]), torch.tensor([[0.6, 0, -0.8]]), lights)
+    near, far = diffuse_light(torch.tensor([[0.0, 0, 2]]), up, lights), diffuse_light(torch.tensor([[0.0, 0, 4]]), up, lights)
+    tilted = diffuse_light(torch.tensor([[0.0, 0, 2]]), torch.tensor([[0.6, 0, -0.8]]), lights)
     assert near / far == pytest.approx(4) and tilted / near == pytest.approx(0.8)
-    assert scattered(torch.tensor([[0.0, 0, 2]]), -up, lights) == 0
+    assert diffuse_light(torch.tensor([[0.0, 0, 2]]), -up, lights) == 0
 
 
 def test_a_highlight_lies_where_the_plate_mirrors_the_light():
     camera = Camera("pinhole", SIZE, (100, 100), (79.5, 59.5))
-    sensor, look = (
+    sensor, appearance = (
         plate_sensor(camera, [(-9.0, -5, 20)]),
         {"lights": [(6.0, 2.0, 0.0)], "exposure": 0.3, "vignetting": 0, "blur": 0},
     )
-    mat, shiny = (render(sensor, sensor.membrane.rest, look=Look(highlight=h, **look), samples=1) for h in (0.0, 1.0))
+    mat, shiny = (
+        render(sensor, sensor.membrane.rest, appearance=Appearance(highlight=h, **appearance), samples=1) for h in (0.0, 1.0)
+    )
     v, u = divmod(int((shiny - mat).argmax()), SIZE[0])
     assert abs(u - (79.5 + 15)) <= 1 and abs(v - (59.5 + 5)) <= 1  # half way to the light: (3, 1, 20)
 
@@ -166,7 +168,7 @@ def test_painting_moves_with_the_material():
     sensor = plate_sensor(camera, [(0.0, 0, 20), (5.0, 3, 20)])
     shifted = sensor.membrane.rest + torch.tensor([1.2, -0.8, 0.0])
     for pattern in (Dots.of(sensor, (1.0, 1.0)), Speckle(1.0, seed=3)):
-        rest, moved = Renderer(sensor, pattern=pattern, look=PLAIN)(torch.stack([sensor.membrane.rest, shifted]))
+        rest, moved = Renderer(sensor, pattern=pattern, appearance=PLAIN)(torch.stack([sensor.membrane.rest, shifted]))
         assert rest[20:100, 20:140].std() > 0.05
         torch.testing.assert_close(moved[16:96, 26:146], rest[20:100, 20:140], atol=0.02, rtol=0)
 
@@ -174,7 +176,10 @@ def test_painting_moves_with_the_material():
 def test_missing_dots_are_not_painted_and_the_others_stay():
     sensor = cap_sensor(CAMERAS["fisheye"])
     x = sensor.membrane.rest
-    full, without = Renderer(sensor, look=PLAIN)(x), Renderer(sensor, pattern=pattern_of(sensor, missing=[1]), look=PLAIN)(x)
+    full, without = (
+        Renderer(sensor, appearance=PLAIN)(x),
+        Renderer(sensor, pattern=pattern_of(sensor, missing=[1]), appearance=PLAIN)(x),
+    )
     u, v = Renderer(sensor).dots(x).pixels[1].round().long()
     assert full[v, u] == pytest.approx(0.12, abs=1e-3) and without[v, u] == pytest.approx(1.0, abs=1e-3)
     changed = torch.nonzero(full != without)
@@ -184,7 +189,7 @@ def test_missing_dots_are_not_painted_and_the_others_stay():
 def test_light_dots_on_dark_ground():
     sensor = plate_sensor(CAMERAS["fisheye"])
     light = replace(sensor, markers=replace(sensor.markers, polarity="light"))
-    image = render(light, light.membrane.rest, look=PLAIN)
+    image = render(light, light.membrane.rest, appearance=PLAIN)
     assert image[61, 79] == pytest.approx(1.0, abs=1e-3) and image[30, 30] == pytest.approx(0.2, abs=1e-3)
 
 
@@ -212,7 +217,7 @@ def test_a_dot_behind_a_ridge_is_hidden():
 def test_grains_are_the_same_for_a_seed_and_band_limited():
     sensor = plate_sensor(CAMERAS["fisheye"])
     one, again, other = (
-        render(sensor, sensor.membrane.rest, pattern=Speckle(1.0, seed), look=PLAIN, samples=1) for seed in (1, 1, 2)
+        render(sensor, sensor.membrane.rest, pattern=Speckle(1.0, seed), appearance=PLAIN, samples=1) for seed in (1, 1, 2)
     )
     assert torch.equal(one, again) and (one - other).abs().max() > 0.3
     patch = one[30:94, 40:104] - one[30:94, 40:104].mean()
@@ -224,14 +229,14 @@ def test_grains_are_the_same_for_a_seed_and_band_limited():
 
 def test_a_painted_rest_image_is_seen_again_at_rest():
     camera = CAMERAS["pinhole"]
-    look = Look(blur=0.0)
+    appearance = Appearance(blur=0.0)
     plain = cap_sensor(camera)
-    image = render(plain, plain.membrane.rest, pattern=Speckle(0.8), look=look)
+    image = render(plain, plain.membrane.rest, pattern=Speckle(0.8), appearance=appearance)
     sensor = cap_sensor(camera, "texture", image.numpy())
     assert isinstance(pattern_of(sensor), Painted)
-    inside = render(plain, plain.membrane.rest, pattern=Dots.of(plain, missing=range(5)), look=look) > 0.4
+    inside = render(plain, plain.membrane.rest, pattern=Dots.of(plain, missing=range(5)), appearance=appearance) > 0.4
     assert inside.float().mean() > 0.15
-    again = render(sensor, sensor.membrane.rest, look=look)
+    again = render(sensor, sensor.membrane.rest, appearance=appearance)
     assert (again - image)[inside].square().mean().sqrt() < 0.25 * image[inside].std()
 
 
@@ -272,7 +277,7 @@ def test_wrong_arguments_are_refused():
         (lambda: Dots.of(sensor, (0.0, 0.0)), "radii"),
         (lambda: Dots([[0, 0, 1]], [1], ground=0.0), "ground"),
         (lambda: Speckle(0.0), "size"),
-        (lambda: Look(vignetting=2.0), "vignetting"),
+        (lambda: Appearance(vignetting=2.0), "vignetting"),
         (lambda: pattern_of(cap_sensor(CAMERAS["pinhole"], "texture", np.zeros((120, 160))), missing=[0]), "no dots"),
     ):
         with pytest.raises(MembraneError, match=expected.replace("[", r"\[")):

@@ -14,7 +14,7 @@ from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.markers.screening import MismatchScreen
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
-from torchmembrane.simulate.press import carried, press
+from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.surface.shapes import spherical_cap
 
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
@@ -86,12 +86,12 @@ def test_the_surface_error_grows_by_less_than_a_fifth(pressed, estimator):
     points, elasticity = dome.closest_points(dots.numpy()), ElasticEnergy(dome, "neo_hookean", 1.3)
     vertex_pixels = CAMERA.point_to_pixel(dome.rest)
 
-    def error(seen, confidence):
+    def error(observed, confidence):
         if estimator == "force-balance":
             balance = ForceBalance(dome, elasticity, points, dots, 0.1 / 168)
-            x = balance(balance.prepare(CAMERA, seen, confidence)).vertices
+            x = balance(balance.prepare(CAMERA, observed, confidence)).vertices
         else:
-            flow = FlowInterpolation(dome, points)(seen - rest, confidence)
+            flow = FlowInterpolation(dome, points)(observed - rest, confidence)
             least = MinimumEnergy(dome, elasticity, CAMERA.pixel_to_ray(vertex_pixels))
             x = least(Observation(*CAMERA.pixel_to_ray(vertex_pixels + flow), confidence)).vertices
         u = (x - dome.rest)[:, torch.from_numpy(points.vertices.astype(int))]
@@ -99,13 +99,13 @@ def test_the_surface_error_grows_by_less_than_a_fifth(pressed, estimator):
         return (placed - moved).square().sum((-1, -2)).sqrt()
 
     screen = MismatchScreen(rest.numpy(), anchors.numpy())
-    seen = torch.stack([pixels] + [mismatched(rest, pixels, seed)[0] for seed in range(3)])
-    one = torch.ones(seen.shape[:2], dtype=torch.float64)
-    screened = screen(seen - rest, one)
-    clean, *spoiled = error(seen, torch.where(screened > 0.5, screened, 0.0))
+    observed = torch.stack([pixels] + [mismatched(rest, pixels, seed)[0] for seed in range(3)])
+    one = torch.ones(observed.shape[:2], dtype=torch.float64)
+    screened = screen(observed - rest, one)
+    clean, *spoiled = error(observed, torch.where(screened > 0.5, screened, 0.0))
     assert max(spoiled) < 1.2 * clean
     if estimator == "minimum-energy":  # force balance has robust weights of its own
-        assert min(error(seen, one)[1:]) > 1.2 * clean
+        assert min(error(observed, one)[1:]) > 1.2 * clean
 
 
 def test_too_few_markers_are_refused():

@@ -13,7 +13,7 @@ from torchmembrane.estimators.segmentation import PolarAngle, Segmentation, peak
 from torchmembrane.estimators.settings import MinimumEnergySettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
-from torchmembrane.simulate.press import carried, press
+from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.surface.shapes import half_cylinder, spherical_cap
 
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
@@ -71,7 +71,7 @@ def make(base_z, **options):
     return Segmentation(MinimumEnergy(dome, ElasticEnergy(dome, "neo_hookean", 1.3), rays, settings=settings), rays)
 
 
-def seen(base_z, *presses):
+def observed(base_z, *presses):
     """Rays of the 17 x 17 grid from noisy markers of balls pressed on a 33 x 33 one, and the balls' contact points."""
     fine, dome = spherical_cap(12, 9, base_z, FINE), spherical_cap(12, 9, base_z, (17, 17))
     paths = []
@@ -94,7 +94,7 @@ def batch(rays):
 
 @pytest.fixture(scope="module")
 def off_axis():
-    return seen(FAR, ((-0.55, 0.1, -0.83), 3.0))
+    return observed(FAR, ((-0.55, 0.1, -0.83), 3.0))
 
 
 def test_one_contact_off_the_axis(off_axis):
@@ -111,7 +111,7 @@ def test_one_contact_off_the_axis(off_axis):
 
 
 def test_two_contacts():
-    rays, places = seen(FAR, ((-0.6, 0.0, -0.8), 2.0), ((0.6, 0.0, -0.8), 2.0))
+    rays, places = observed(FAR, ((-0.6, 0.0, -0.8), 2.0), ((0.6, 0.0, -0.8), 2.0))
     got = make(FAR)(*batch(rays)).contacts.points[0]
     gap = torch.cdist(got[:2], places)
     assert gap.amin(0).max() < 2.5 and gap.argmin(0).tolist() in ([0, 1], [1, 0])
@@ -120,7 +120,7 @@ def test_two_contacts():
 
 @pytest.mark.parametrize("base_z", [3.0, 24.0])
 def test_a_press_along_the_axis_is_divergent_flow(base_z, off_axis):
-    rays, (place,) = seen(base_z, ((0.0, 0.0, -1.0), 2.0))
+    rays, (place,) = observed(base_z, ((0.0, 0.0, -1.0), 2.0))
     segmentation = make(base_z)
     assert segmentation.divergence(rays.direction[None]) > 0.9
     first = segmentation.by_polar_angle(rays.direction[None]).points[0]
@@ -132,7 +132,7 @@ def test_no_flow_is_no_contact_and_a_batch_is_its_frames(off_axis):
     """Also where another frame goes round in circles: one that has settled stays."""
     segmentation = make(FAR, smoothing=1.0)
     still = central(segmentation.membrane.rest)
-    restless, _ = seen(FAR, ((-0.3, 0.2, -0.8), 2.0), ((0.4, 0.0, -0.8), 1.0))
+    restless, _ = observed(FAR, ((-0.3, 0.2, -0.8), 2.0), ((0.4, 0.0, -0.8), 1.0))
     both = segmentation(*(torch.stack(three) for three in zip(still, off_axis[0], restless, strict=True)))
     assert both.contacts.points[0].isnan().all() and (both.contacts.region[0] == 0).all()
     assert both.settled.tolist() == [True, True, False]

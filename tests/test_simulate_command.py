@@ -17,7 +17,7 @@ from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate import dataset
-from torchmembrane.simulate.frames import Frames, FrameTable
+from torchmembrane.simulate.frames import SimulatedFrames, SimulatedFrameTable
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.simulator import Simulator
 
@@ -133,7 +133,7 @@ def test_a_path_gives_frames_and_a_video(sensor_path, tmp_path, capsys):
     for video in ((), ("--video",)):
         code, said, errors = run(capsys, "simulate", sensor_path, *SPHERE, *path, *video, "--out", tmp_path / f"o{len(video)}")
         assert code == 0 and "6 frames" in said and "frame/s" in errors, errors
-    frames = dict(Frames(tmp_path / "o0"))
+    frames = dict(SimulatedFrames(tmp_path / "o0"))
     assert list(frames) == [f"press_{k:06d}" for k in range(6)]
     force = np.array([frame.truth["force"] for frame in frames.values()])
     assert force[1, 2] < force[0, 2] < 0 and force[3, 0] > 10 * abs(force[1, 0])
@@ -162,7 +162,7 @@ def test_processes_and_formats_do_not_change_a_data_set(sensor_path, tmp_path, c
     call = ("simulate", sensor_path, "--random", "2", "--indenter", "sphere,plane", "--noise", "35")
     assert run(capsys, *call, "--jobs", "1", "--out", tmp_path / "png")[0] == 0
     assert run(capsys, *call, "--jobs", "2", "--format", "parquet", "--out", tmp_path / "rows")[0] == 0
-    files, rows = dict(Frames(tmp_path / "png")), dict(FrameTable(tmp_path / "rows"))
+    files, rows = dict(SimulatedFrames(tmp_path / "png")), dict(SimulatedFrameTable(tmp_path / "rows"))
     assert list(files) == list(rows) == ["s0_000000", "s0_000001"]
     for name in files:
         assert np.array_equal(files[name].image, rows[name].image) and same(files[name].truth, rows[name].truth)
@@ -181,7 +181,7 @@ def test_presses_that_fail_are_reported_and_give_1(sensor_path, tmp_path, capsys
     monkeypatch.setattr(dataset, "random_stroke", refuse_first)
     code, said, errors = run(capsys, "simulate", sensor_path, "--random", "2", "--jobs", "1", "--out", tmp_path)
     assert code == 1 and "1 made, 1 failed" in said and "s0_000000" in errors and "too stiff" in errors
-    assert set(dict(Frames(tmp_path))) == {"s0_000001"}
+    assert set(dict(SimulatedFrames(tmp_path))) == {"s0_000001"}
 
 
 def test_a_folder_of_another_look_or_sensor_is_refused(sensor_path, tmp_path, capsys):

@@ -1,5 +1,8 @@
 """Figures say what a frame holds: where, how deep, in which unit, and in words if there is no surface."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -9,6 +12,8 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.io.status import Status
 from torchmembrane.io.store import Mesh
 from torchmembrane.plot import frames as view
+from torchmembrane.plot.drawing import save
+from torchmembrane.plot.sensor import sensor_figure
 from torchmembrane.sensor.parts import Cavity, Markers, Material
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.shapes import spherical_cap
@@ -157,7 +162,7 @@ def test_a_fourth_panel_shows_where_and_how_hard_something_pushes(mesh):
     (panel,) = drawing.axes[3:4]
     assert len(view.figure(pressed(mesh), mesh).axes) < len(drawing.axes)
     assert panel.get_title() == "Force 5 N (3, 0, -4)"
-    assert panel.child_axes[0].get_xlabel() == "push on the membrane [N/mm²]"
+    assert panel.child_axes[0].get_xlabel() == "compressive normal traction [N/mm²]"
     (mark,) = (line for line in panel.get_lines() if line.get_marker() == "x")
     np.testing.assert_allclose(np.ravel(mark.get_data()), mesh.vertex_pixels[DENT])
     (arrow,) = (text for text in panel.texts if text.arrow_patch is not None)
@@ -172,7 +177,7 @@ def test_a_fourth_panel_shows_where_and_how_hard_something_pushes(mesh):
 def test_saved_as_png_1600_wide_whole_or_not_at_all(mesh, tmp_path):
     from PIL import Image
 
-    view.save(view.figure(pressed(mesh), mesh), tmp_path / "a.png")
+    save(view.figure(pressed(mesh), mesh), tmp_path / "a.png")
     assert Image.open(tmp_path / "a.png").size == (1600, 600)
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
@@ -182,7 +187,7 @@ def test_a_sensor_is_drawn_with_rays_that_bend_at_ports():
     membrane = spherical_cap(12.0, 6.0, 20.0, grid=(9, 9))
     markers = Markers("dots", positions=membrane.rest[membrane.free_vertices].numpy())
     sensor = Sensor("cap", "mm", camera, membrane, Material("harmonic", 1.2), Cavity("liquid"), markers)
-    side, space, image = view.sensor_figure(sensor).axes
+    side, space, image = sensor_figure(sensor).axes
     assert "[mm]" in side.get_xlabel() and "[mm]" in space.get_zlabel() and image.get_xlabel() == "u [px]"
     assert {"camera", "port", "viewing rays", "rest surface"} <= set(labels(side))
     rays = next(c for c in side.collections if c.get_segments() and len(c.get_segments()[0]) == 3).get_segments()
@@ -205,11 +210,18 @@ def test_figures_belong_to_no_window(mesh):
 def test_contacts_are_marked_where_they_are(mesh):
     frame = pressed(mesh)
     axes = Figure().add_subplot()
-    view.draw_map(axes, frame, mesh)
+    view.draw_displacement(axes, frame, mesh)
     unmarked = len(axes.lines)
     frame["contact_points"][0] = frame["vertices"][DENT]
     axes = Figure().add_subplot()
-    view.draw_map(axes, frame, mesh)
+    view.draw_displacement(axes, frame, mesh)
     crosses = [line for line in axes.lines if line.get_marker() == "x"]
     assert len(axes.lines) == unmarked + 1 and len(crosses) == 1
     np.testing.assert_allclose(crosses[0].get_xydata()[0], mesh.vertex_pixels[DENT])
+
+
+def test_matplotlib_is_loaded_only_to_draw():
+    code = (
+        "import sys, torchmembrane.cli.main; sys.exit(int('matplotlib' in sys.modules or 'torchmembrane.plot' in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -8,19 +8,32 @@ import numpy as np
 from .errors import MembraneError
 
 OUTLINE = 8  # points of a dot's outline
-MARKS = ((0, 0), (3, 0), (0, 2))  # large dots, in steps from the middle one: they tell place and turn, also in part of a board
+MARKS = ((0, 0), (3, 0), (0, 2))  # large dots, in steps from the middle one: they mark place and turn, also in part of a board
 LARGE = 1.7  # radius of a large dot over that of the others
 
 
 @dataclass(frozen=True)
 class Checkerboard:
-    """Squares, `columns x rows` inner corners, `square` long; the corner before the first one belongs to a dark square."""
+    """A checkerboard; the corner before the first inner one belongs to a dark square.
+
+    Args:
+        columns: of inner corners.
+        rows: of inner corners.
+        square: side of a square, length unit.
+
+    Raises:
+        MembraneError: fewer than 3 x 3 inner corners, or no positive length.
+
+    Example:
+        >>> Checkerboard(3, 3, 5.0).points[:2].tolist()
+        [[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]
+    """
 
     columns: int
     rows: int
     square: float
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _expect(
             self, self.columns >= 3 and self.rows >= 3 and self.square > 0, "3 x 3 inner corners or more, a positive length"
         )
@@ -49,18 +62,29 @@ class Checkerboard:
 
 @dataclass(frozen=True)
 class DotBoard:
-    """`columns x rows` dots, `pitch` apart, of `radius` (default 0.22 pitches); three larger ones mark place and turn.
+    """A board of dots; three larger ones mark place and turn.
 
-    >>> DotBoard(9, 7, 2.0).points[DotBoard(9, 7, 2.0).large].tolist()
-    [[0.0, 0.0, 0.0], [6.0, 0.0, 0.0], [0.0, 4.0, 0.0]]
+    Args:
+        columns: of dots.
+        rows: of dots.
+        pitch: between their centres, length unit.
+        radius: of the small ones; default: 0.22 pitches.
+
+    Raises:
+        MembraneError: fewer than 8 x 6 dots, no positive pitch, or dots that touch.
+
+    Example:
+        >>> board = DotBoard(9, 7, 2.0)
+        >>> board.points[board.large].tolist()
+        [[0.0, 0.0, 0.0], [6.0, 0.0, 0.0], [0.0, 4.0, 0.0]]
     """
 
     columns: int
     rows: int
     pitch: float
-    radius: float | None = None
+    radius: float = None  # type: ignore[assignment]  # 0.22 pitches once constructed
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         right = self.columns >= 8 and self.rows >= 6 and self.pitch > 0
         _expect(self, right, "8 x 6 dots or more, a positive pitch")
         if self.radius is None:
@@ -84,6 +108,7 @@ class DotBoard:
 
     @property
     def radii(self) -> np.ndarray:
+        """Of the dots, `[D]`."""
         return self.radius * np.where(self.large, LARGE, 1.0)
 
     @cached_property
@@ -94,6 +119,7 @@ class DotBoard:
         return self.points[:, None] + self.radii[:, None, None] * circle
 
     def reflectance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """What is printed at `x, y`: dots 0.1, the ground 0.9."""
         i, j = np.rint(x / self.pitch), np.rint(y / self.pitch)
         first, last = self.steps.min(0), self.steps.max(0)
         here = (i >= first[0]) & (i <= last[0]) & (j >= first[1]) & (j <= last[1])
@@ -103,14 +129,16 @@ class DotBoard:
 
     @property
     def extent(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the printed page, `[2]` each."""
         return self.pitch * (self.steps.min(0) - 1.0), self.pitch * (self.steps.max(0) + 1.0)
 
 
 def _lattice(columns: int, rows: int) -> np.ndarray:
+    """Whole steps `[D, 3]` of a lattice, row by row, in the plane z = 0."""
     j, i = np.mgrid[:rows, :columns]
     return np.stack([i.ravel(), j.ravel(), 0 * i.ravel()], -1).astype(float)
 
 
-def _expect(board, right: bool, expected: str) -> None:
+def _expect(board: Checkerboard | DotBoard, right: bool, expected: str) -> None:
     if not right:
         raise MembraneError(f"{board}; expected {expected}")

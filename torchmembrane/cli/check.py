@@ -39,7 +39,8 @@ def run(arguments: Namespace) -> int:
     frame = None if reconstructor is None else rest_frame(reconstructor)
     print("\n".join(described(sensor, reconstructor, frame)))
     if arguments.out:
-        from ..plot.frames import save, sensor_figure
+        from ..plot.drawing import save
+        from ..plot.sensor import sensor_figure
 
         save(sensor_figure(sensor, reconstructor, frame), arguments.out)
         print(f"drawn in {arguments.out}")

@@ -13,10 +13,11 @@ from tqdm import tqdm
 from ..errors import MembraneError
 from ..presets import sensor_file
 from ..sensor.sensor import Sensor
+from ..simulate.appearance import Appearance
 from ..simulate.dataset import KINDS, Plan, make_frames, stroke_to
 from ..simulate.frames import Video, open_frames
-from ..simulate.indenters import Box, Cylinder, Indenter, Mesh, Plane, Sphere, Wedge
-from ..simulate.look import Look
+from ..simulate.indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge
+from ..simulate.mesh_indenter import MeshIndenter
 from ..simulate.simulator import Simulator, Stroke
 
 
@@ -24,8 +25,8 @@ def simulate(arguments: Namespace) -> int:
     """Simulate what the arguments ask for; returns the exit code."""
     torch.set_num_threads(1)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
-    look = Look(noise=arguments.noise, highlight=arguments.highlight, blur=arguments.blur)
-    simulator = Simulator(sensor, arguments.grid, look, arguments.dots, arguments.missing)
+    appearance = Appearance(noise=arguments.noise, highlight=arguments.highlight, blur=arguments.blur)
+    simulator = Simulator(sensor, arguments.grid, appearance, arguments.dots, arguments.missing)
     return (_random if arguments.random else _single)(arguments, simulator)
 
 
@@ -99,7 +100,7 @@ def _body(arguments: Namespace) -> Indenter:
         return Box(torch.tensor(_needed(arguments, "sides"), dtype=torch.float64), _needed(arguments, "radius"))
     if not Path(kind).is_file():
         raise MembraneError(f"--indenter {kind!r}: neither a file nor one of {', '.join(KINDS)}")
-    return Mesh.read(kind)
+    return MeshIndenter.read(kind)
 
 
 def _needed(arguments: Namespace, name: str) -> Any:

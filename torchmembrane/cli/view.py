@@ -32,7 +32,8 @@ def run(arguments: Namespace) -> int:
     from ..io.images import read_image
     from ..io.results import load_frame
     from ..io.store import MESH, Mesh
-    from ..plot.frames import figure, save, show
+    from ..plot.drawing import save, show
+    from ..plot.frames import figure
 
     frame, mesh = load_frame(arguments.result), Mesh.load(arguments.mesh or arguments.result.parent / MESH)
     vertices, expected = len(frame["vertices"]), len(mesh.rest_vertices)

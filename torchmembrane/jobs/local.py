@@ -115,7 +115,8 @@ class _ResultFolder:
             self.summary.add_unreadable(frame.name, frame.file, frame.reason)
             return UNREADABLE
         if self.figures:
-            from ..plot.frames import figure, save
+            from ..plot.drawing import save
+            from ..plot.frames import figure
 
             save(figure(result, self.mesh, frame.image[0, 0].cpu().numpy(), frame.name), self.path / f"{frame.name}.png")
         self.frames.write(frame.name, result)

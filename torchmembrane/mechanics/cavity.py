@@ -1,5 +1,7 @@
 """What the fluid asks of the enclosed volume: kept (liquid), pressure x volume kept (gas), or free at rest pressure (open)."""
 
+from typing import TypeVar
+
 import torch
 from torch import Tensor, nn
 
@@ -7,6 +9,36 @@ from ..errors import MembraneError
 from ..surface.membrane import Membrane
 
 FILLINGS = ("liquid", "gas", "open")
+
+
+Scalar = TypeVar("Scalar", float, Tensor)
+
+
+def gas_law_step(
+    rise: Scalar, pressure: Scalar, rest_pressure: Scalar, absolute: Scalar, volume: Scalar
+) -> tuple[Scalar, Scalar]:
+    """The law of a gas, `absolute pressure x volume = constant`, linearised in the pressure.
+
+    The law is `p = p0 + P (V_gas / (V_gas + rise) - 1)`. A step of a solve that ends on it has
+    `volume step + C (pressure step) = c`.
+
+    Args:
+        rise: of the cavity's volume above that at rest, `[...]`.
+        pressure: pressure difference across the membrane, `[...]`.
+        rest_pressure: p0, pressure difference at rest.
+        absolute: P, the gas's absolute pressure at rest, force / length^2.
+        volume: V_gas, the gas's volume at rest, length^3.
+
+    Returns:
+        Target `c` and compliance `C`, `[...]` each.
+
+    Example:
+        >>> gas_law_step(0.0, 0.0, 1.0, 4.0, 100.0)
+        (25.0, 25.0)
+    """
+    ratio = volume / (volume + rise)
+    compliance = volume / (absolute * ratio**2)
+    return compliance * (rest_pressure + absolute * (ratio - 1) - pressure), compliance
 
 
 class CavityLaw(nn.Module):
@@ -34,10 +66,7 @@ class CavityLaw(nn.Module):
         """
         if self.filling == "liquid":
             return -rise, rise.new_zeros(())
-        absolute, volume = self.gas.unbind()
-        ratio = volume / (volume + rise)
-        compliance = volume / (absolute * ratio**2)
-        return compliance * (self.rest_pressure + absolute * (ratio - 1) - pressure), compliance
+        return gas_law_step(rise, pressure, self.rest_pressure, *self.gas.unbind())
 
     def target_volume(self, volume: Tensor, pressure: Tensor) -> Tensor:
         """The volume that the law asks for at this pressure, `[...]` (an open cavity: any)."""

@@ -1,7 +1,7 @@
 """The paper's own unknown: heights at fixed (x, y), `z = s(x, y) + psi(x, y)` (eqs. 5-10, 14, 18, 22; Appendix D).
 
-A piece of the membrane with rest slopes `s_x, s_y` moves by the plane map A to x', where the surface has the slopes of `s +
-psi`:
+A piece of the membrane with rest slopes `s_x, s_y` moves by the plane map A to x', where the surface has the slopes of
+`s + psi`:
 
     tr(A^T H A adj G) = m_xx psi_x^2 + m_xy psi_x psi_y + m_yy psi_y^2 + m_x psi_x + m_y psi_y + m_0    (eqs. 55-62)
 
@@ -27,7 +27,13 @@ STEEPEST = 20.0  # slope of a rest surface that heights can describe
 
 
 class Coefficients(NamedTuple):
-    """`m_xx, m_yy, m_xy, m_x, m_y, m_0` of eqs. 57-62, each `[...]`."""
+    """`m_xx, m_yy, m_xy, m_x, m_y, m_0` of eqs. 57-62, each `[...]`.
+
+    Example:
+        >>> m = coefficients(torch.eye(2), torch.zeros(2))
+        >>> m(torch.tensor([0.3, 0.4])).item()  # 2 + the squared slope
+        2.25
+    """
 
     xx: Tensor
     yy: Tensor
@@ -43,23 +49,41 @@ class Coefficients(NamedTuple):
 
 
 def adjugate(matrix: Tensor) -> Tensor:
-    """`adj M = det M M^-1` of `[..., 2, 2]`."""
+    """`adj M = det M M^-1` of `[..., 2, 2]`.
+
+    Example:
+        >>> adjugate(torch.tensor([[1.0, 2.0], [3.0, 4.0]])).tolist()
+        [[4.0, -2.0], [-3.0, 1.0]]
+    """
     (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
     return torch.stack([torch.stack([d, -b], -1), torch.stack([-c, a], -1)], -2)
 
 
 def metric(slope: Tensor) -> Tensor:
-    """First fundamental form of a graph with slopes `[..., 2]` (eqs. 9, 10), `[..., 2, 2]`."""
+    """First fundamental form of a graph with slopes `[..., 2]` (eqs. 9, 10), `[..., 2, 2]`.
+
+    Example:
+        >>> metric(torch.tensor([1.0, 2.0])).tolist()
+        [[2.0, 2.0], [2.0, 5.0]]
+    """
     return torch.eye(2, dtype=slope.dtype, device=slope.device) + slope[..., :, None] * slope[..., None, :]
 
 
 def coefficients(A: Tensor, rest_slope: Tensor, slope: Tensor | None = None) -> Coefficients:
-    """Eqs. 57-62: with `N = A adj(G) A^T`,
+    """The coefficients of eqs. 57-62.
+
+    With `N = A adj(G) A^T`:
 
         m_xx = N_11, m_yy = N_22, m_xy = 2 N_12, m_x = 2 (N_11 s_x + N_12 s_y), m_y = 2 (N_12 s_x + N_22 s_y),
         m_0 = N_11 (1 + s_x^2) + 2 N_12 s_x s_y + N_22 (1 + s_y^2)
 
-    Arguments: `A [..., 2, 2]`, slopes of s at x, `[..., 2]`, and at x' (default: the same, as the paper prints it).
+    Args:
+        A: plane map, `[..., 2, 2]`.
+        rest_slope: slopes of s at x, `[..., 2]`.
+        slope: slopes of s at x', `[..., 2]`; default: the same, as the paper prints it.
+
+    Returns:
+        The coefficients, each `[...]`.
     """
     N = A @ adjugate(metric(rest_slope)) @ A.mT
     p, q = (rest_slope if slope is None else slope).unbind(-1)
@@ -69,9 +93,17 @@ def coefficients(A: Tensor, rest_slope: Tensor, slope: Tensor | None = None) -> 
 
 
 def form_matrix(m: Coefficients, dx: float, dy: float) -> Tensor:
-    """Eq. 63: the form in `(psi_ij, psi_i,j+1, psi_i+1,j, 1)` for forward differences, `[..., 4, 4]`, x along i.
+    """Eq. 63: the form in `(psi_ij, psi_i,j+1, psi_i+1,j, 1)` for forward differences, x along i.
 
     As printed the linear terms stand above the diagonal only.
+
+    Args:
+        m: the coefficients.
+        dx: spacing along i.
+        dy: spacing along j.
+
+    Returns:
+        The matrix, `[..., 4, 4]`.
     """
     none = torch.zeros_like(m.one)
     xx, yy, half = m.xx / dx**2, m.yy / dy**2, m.xy / (2 * dx * dy)
@@ -88,18 +120,43 @@ def form_matrix(m: Coefficients, dx: float, dy: float) -> Tensor:
 class MongeMinimumEnergy(nn.Module):
     """The minimum-energy estimator with heights at fixed (x, y) as unknowns, harmonic material, liquid filling; for study.
 
-    Arguments: membrane; `ElasticEnergy` ("harmonic"); rest rays `origins`, `directions [V, 3]`; steps: 1 is the paper's (eqs.
-    18, 22,
-    about psi = 0), more repeat it about the surface found. Calling it with the rays of one frame gives the `Equilibrium`, its
-    vertices the material points: where their rays meet the surface found. Raises `MembraneError` for a surface that is no graph
-    over (x, y). A rest load in psi is subtracted, so that zero flow gives exactly psi = 0.
+    `|Q psi - gamma|^2 + s |S psi|^2` with the volume kept: Q is the derivative of the pieces' 3 x 2 maps in psi; what is of
+    second order in psi in them, the rays meeting a tilted surface, is left out. A rest load in psi is subtracted, so that zero
+    flow gives exactly psi = 0.
 
-    `|Q psi - gamma|^2 + s |S psi|^2`: Q is the derivative of the pieces' 3 x 2 maps in psi; what is of second order in psi in
-    them, the rays meeting a tilted surface, is left out. Where rays meet the surface between the fixed points, waves of one
-    point's length are hardly seen: it needs the smoother of eq. 28, `smoothing` s over the rest tension.
+    Args:
+        membrane: at rest.
+        elasticity: its elastic energy, "harmonic".
+        rest_rays: of the vertices at rest, `(origins, directions)`, `[V, 3]` each.
+        steps: 1 is the paper's (eqs. 18, 22, about psi = 0); more repeat it about the surface found.
+        smoothing: s over the rest tension.
+
+    Raises:
+        MembraneError: the surface is no graph over (x, y).
+
+    Limitations:
+        Where rays meet the surface between the fixed points, waves of one point's length hardly change what is observed: it
+        needs the smoother of eq. 28.
+
+    Example:
+        >>> from torchmembrane.surface.shapes import spherical_cap
+        >>> cap = spherical_cap(12, 5, 10, (5, 5))
+        >>> rays = torch.zeros_like(cap.rest), cap.rest
+        >>> estimator = MongeMinimumEnergy(cap, ElasticEnergy(cap, "harmonic"), rays)
+        >>> bool((estimator(*rays).vertices - cap.rest).abs().max() < 1e-9)
+        True
     """
 
-    def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, rest_rays, steps=1, smoothing=0.1):
+    v: Tensor
+
+    def __init__(
+        self,
+        membrane: Membrane,
+        elasticity: ElasticEnergy,
+        rest_rays: tuple[Tensor, Tensor],
+        steps: int = 1,
+        smoothing: float = 0.1,
+    ) -> None:
         super().__init__()
         self.membrane, self.steps = membrane, steps
         self.rest_pressure, _ = rest_balance(membrane, elasticity)
@@ -125,6 +182,15 @@ class MongeMinimumEnergy(nn.Module):
         self.rest_load = -Q.T @ gamma - self.rest_pressure * self.v
 
     def forward(self, origins: Tensor, directions: Tensor) -> Equilibrium:
+        """The equilibrium of one frame.
+
+        Args:
+            origins: of the vertices' rays, `[V, 3]`.
+            directions: of the vertices' rays, `[V, 3]`.
+
+        Returns:
+            The `Equilibrium`; its vertices are the material points, where their rays meet the surface found.
+        """
         psi, pressure, step = self.heights(origins, directions)
         x = self.material(psi, self._cells(psi, origins, directions), origins, directions)
         return Equilibrium(x, pressure, self.membrane.volume(self.surface(psi)), torch.zeros_like(x), step)
@@ -144,7 +210,10 @@ class MongeMinimumEnergy(nn.Module):
     def _linearised(self, psi: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """`Q` and `gamma` of `|Q step - gamma|^2` about psi (eq. 18)."""
         cell = self._cells(psi, origins, directions)
-        maps = lambda y: (self.weight * self.maps(self.material(y, cell, origins, directions))).flatten()  # noqa: E731
+
+        def maps(y: Tensor) -> Tensor:
+            return (self.weight * self.maps(self.material(y, cell, origins, directions))).flatten()
+
         return torch.func.jacfwd(maps)(psi), -maps(psi)
 
     def surface(self, psi: Tensor) -> Tensor:
@@ -166,8 +235,10 @@ class MongeMinimumEnergy(nn.Module):
         return torch.where(self.membrane.fixed[:, None], self.membrane.rest, origins + reach * directions)
 
     def maps(self, x: Tensor) -> Tensor:
-        """The pieces' maps into space, `[A; slope'.A] adj(G)^1/2 / det(G)^1/4`, `[..., 3, 2]`: half their squares is the energy
-        of Appendix D for each unit of `dx dy`."""
+        """The pieces' maps into space, `[A; slope'.A] adj(G)^1/2 / det(G)^1/4`, of vertices `[V, 3]`: `[..., 3, 2]`.
+
+        Half their squares is the energy of Appendix D for each unit of `dx dy`.
+        """
         edges = _edges(x, self.membrane.grid)
         A = (self.rest_plane @ edges[..., :2]).mT
         slope = torch.linalg.solve(edges[..., :2], edges[..., 2:])
@@ -178,5 +249,6 @@ class MongeMinimumEnergy(nn.Module):
 
 
 def _edges(x: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Both edges from the first corner of every triangle, `[m-1, n-1, 2, 2, 3]`."""
     p = triangles_of(corners(x, grid))
     return p[..., 1:, :] - p[..., :1, :]

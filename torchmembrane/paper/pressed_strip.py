@@ -17,7 +17,16 @@ FLATTEST = 1e4  # largest radius of a free arc looked for, over the strip's
 
 
 class Disc(NamedTuple):
-    """A cylinder seen along its axis: `centre (x, y)` and `radius` (0: a point)."""
+    """A cylinder seen along its axis.
+
+    Attributes:
+        centre: `(x, y)`.
+        radius: 0 for a point.
+
+    Example:
+        >>> Disc.pressed(15.0, 0.0, 4.0, 5.0).centre
+        (np.float64(16.0), np.float64(0.0))
+    """
 
     centre: tuple[float, float]
     radius: float
@@ -30,7 +39,14 @@ class Disc(NamedTuple):
 
 
 class Arc(NamedTuple):
-    """Part of a circle: centre `[2]`, radius, angles from where to where (decreasing on a disc)."""
+    """Part of a circle.
+
+    Attributes:
+        centre: `[2]`.
+        radius: of the circle.
+        start: angle where the arc begins, radians.
+        end: angle where it ends; on a disc it is the smaller one.
+    """
 
     centre: np.ndarray
     radius: float
@@ -39,9 +55,11 @@ class Arc(NamedTuple):
 
     @property
     def length(self) -> float:
+        """Of the arc."""
         return self.radius * abs(self.end - self.start)
 
     def points(self, share: np.ndarray) -> np.ndarray:
+        """Points `[..., 2]` at shares `[...]` of the arc's length."""
         angle = self.start + share * (self.end - self.start)
         return self.centre + self.radius * np.stack([np.cos(angle), np.sin(angle)], -1)
 
@@ -53,22 +71,31 @@ class Arc(NamedTuple):
 
 
 class PressedStrip:
-    """The semicircle of `radius` around the origin (ends on the x axis), pressed by `discs`, its area kept.
+    """The semicircle around the origin (ends on the x axis), pressed by discs, its area kept.
 
-    Raises `MembraneError` where a disc does not touch, or where no free arcs of less than half a circle enclose the area.
+    Args:
+        radius: of the semicircle.
+        discs: that press it, none inside another's contact.
 
-    >>> lifted = PressedStrip(15.0, [Disc.pressed(15.0, 90, 4.0, 5.0)])
-    >>> lifted.positions(np.array([0.0, 90.0, 180.0])).round(6).tolist()
-    [[15.0, 0.0], [0.0, 11.0], [-15.0, 0.0]]
+    Raises:
+        MembraneError: a disc does not touch, or no free arcs of less than half a circle enclose the area.
+
+    Example:
+        >>> lifted = PressedStrip(15.0, [Disc.pressed(15.0, 90, 4.0, 5.0)])
+        >>> lifted.positions(np.array([0.0, 90.0, 180.0])).round(6).tolist()
+        [[15.0, 0.0], [0.0, 11.0], [-15.0, 0.0]]
     """
 
-    def __init__(self, radius: float, discs: Sequence[Disc]):
+    def __init__(self, radius: float, discs: Sequence[Disc]) -> None:
         self.radius = radius
         order = sorted(discs, key=lambda disc: np.arctan2(disc.centre[1], disc.centre[0]))
         self.bodies = [Disc((radius, 0.0), 0.0), *order, Disc((-radius, 0.0), 0.0)]
         target = np.pi * radius**2 / 2
         least = max(_gap(a, b) / 2 - (a.radius + b.radius) / 2 for a, b in zip(self.bodies, self.bodies[1:], strict=False))
-        excess = lambda free: sum(arc.area for arc in self._arcs(free)) - target  # noqa: E731
+
+        def excess(free: float) -> float:
+            return sum(arc.area for arc in self._arcs(free)) - target
+
         tightest = max(least, 0.0) * (1 + 1e-9) + 1e-9 * radius
         if excess(tightest) < 0:
             raise MembraneError(f"PressedStrip: no arcs of less than half a circle enclose {target:.4g}; press less deep")
@@ -107,7 +134,7 @@ class PressedStrip:
         return place
 
     def pressure(self, strip: Strip) -> float:
-        """Of the fluid, `T / R` of the free arcs."""
+        """Of the fluid, `T / R` of the free arcs, force / length^2."""
         return strip.tension(self.stretch) / self.free_radius
 
     def forces(self, strip: Strip) -> np.ndarray:
@@ -115,13 +142,20 @@ class PressedStrip:
         tension, pressure = strip.tension(self.stretch), self.pressure(strip)
         forces = []
         for before, arc, after in zip(self.arcs[::2], self.arcs[1::2], self.arcs[2::2], strict=False):
-            tangent = lambda angle: np.array([-np.sin(angle), np.cos(angle)])  # noqa: E731
             chord = arc.points(np.array([1.0]))[0] - arc.points(np.array([0.0]))[0]
-            forces.append(-tension * (tangent(after.start) - tangent(before.end)) - pressure * np.array([chord[1], -chord[0]]))
+            forces.append(
+                -tension * (_tangent(after.start) - _tangent(before.end)) - pressure * np.array([chord[1], -chord[0]])
+            )
         return np.array(forces)
 
 
+def _tangent(angle: float) -> np.ndarray:
+    """Unit vector `[2]` along a circle at that angle, counterclockwise."""
+    return np.array([-np.sin(angle), np.cos(angle)])
+
+
 def _gap(a: Disc, b: Disc) -> float:
+    """Distance between two centres."""
     return float(np.hypot(b.centre[0] - a.centre[0], b.centre[1] - a.centre[1]))
 
 

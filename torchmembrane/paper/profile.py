@@ -1,7 +1,7 @@
 """One dimension (Appendix A): a flat membrane against a convex obstacle, and a semicircle from its image.
 
 Flat (eqs. 30-31): free parts are parabolas of one curvature `p / T`, tangent to the obstacle where they meet it.
-Semicircle (eqs. 32-37): seen from its centre, a material point at rest at angle theta is seen at `psi = g(theta)`; its radius u
+Semicircle (eqs. 32-37): from its centre, a material point at rest at angle theta is observed at `psi = g(theta)`; its radius u
 is asked for. In theta
 
     E = 1/2 int 1/r [(u g')^2 + (du/dtheta)^2] dtheta,    area 1/2 int u^2 g' dtheta kept,    u(0) = u(pi) = r
@@ -23,12 +23,24 @@ from ..errors import MembraneError
 from .strip import Strip, area, around, outward
 
 NEWTON_STEPS = 12
-STEPS, FALL, EPS, PULL = 40, 0.7, (5.0, 0.1), 100.0  # as in `force_balance`
+STEPS = 40  # of the reweighted Gauss-Newton method
+GNC_SHARE, EPS = (
+    0.7,
+    (5.0, 0.1),
+)  # graduated non-convexity: eps over the rest pressure, from first to last in that share of steps
+TENSILE = 100.0  # penalty of tensile normal traction
 LONGEST_STEP = 0.02  # over the strip's length
 
 
 class Obstacle(NamedTuple):
-    """A convex body above the line: its lower boundary `height(x)` with `slope(x)` on `[left, right]`, lowest point at 0."""
+    """A convex body above the line, its lowest point at height 0.
+
+    Attributes:
+        height: of its lower boundary at x.
+        slope: of that boundary at x.
+        left: least x of the body.
+        right: largest x of the body.
+    """
 
     height: Callable[[float], float]
     slope: Callable[[float], float]
@@ -37,6 +49,7 @@ class Obstacle(NamedTuple):
 
     @classmethod
     def disc(cls, centre: float, radius: float) -> "Obstacle":
+        """A disc with its centre at x = `centre`."""
         return cls(
             lambda x: radius - np.sqrt(radius**2 - (x - centre) ** 2),
             lambda x: (x - centre) / np.sqrt(radius**2 - (x - centre) ** 2),
@@ -46,7 +59,13 @@ class Obstacle(NamedTuple):
 
 
 class FlatContact(NamedTuple):
-    """A pressed flat membrane: contact `(c1, c2)`, `curvature` p / T of the free parts, and `height(x)` of all of it."""
+    """A pressed flat membrane.
+
+    Attributes:
+        contact: `(c1, c2)`, its ends.
+        curvature: p / T of the free parts.
+        height: of the membrane at x.
+    """
 
     contact: tuple[float, float]
     curvature: float
@@ -54,14 +73,23 @@ class FlatContact(NamedTuple):
 
 
 def flat_contact(obstacle: Obstacle, span: float, depth: float) -> FlatContact:
-    """The membrane over `[0, span]` pressed `depth` down by an obstacle, the area below it kept (eqs. 30-31).
+    """The flat membrane pressed by an obstacle, the area below it kept (eqs. 30-31).
 
     For a curvature of the free parts, each end of the contact is where the parabola from the rim meets the obstacle
     tangentially; it is unique, as the tangents of a convex body meet the rim's vertical in order. The area fixes the curvature.
 
-    >>> state = flat_contact(Obstacle.disc(50.0, 20.0), 100.0, 4.0)
-    >>> abs(round(sum(state.contact) / 2, 6)), round(float(state.height(np.array([50.0]))[0]), 6)
-    (50.0, -4.0)
+    Args:
+        obstacle: that presses it.
+        span: the membrane lies over `[0, span]`.
+        depth: how far the obstacle's lowest point goes down.
+
+    Raises:
+        MembraneError: no positive depth, or the lowest point is not over the membrane.
+
+    Example:
+        >>> state = flat_contact(Obstacle.disc(50.0, 20.0), 100.0, 4.0)
+        >>> abs(round(sum(state.contact) / 2, 6)), round(float(state.height(np.array([50.0]))[0]), 6)
+        (50.0, -4.0)
     """
     lowest = brentq(obstacle.slope, obstacle.left + 1e-9 * span, obstacle.right - 1e-9 * span)
     if not (depth > 0 and 0 < lowest < span):
@@ -71,7 +99,10 @@ def flat_contact(obstacle: Obstacle, span: float, depth: float) -> FlatContact:
 
     def ends(curvature: float) -> tuple[float, float]:
         left, right = max(obstacle.left, 0.0), min(obstacle.right, span)
-        meets = lambda x, d: obstacle.height(x) - depth + d * obstacle.slope(x) - curvature * d**2 / 2  # noqa: E731
+
+        def meets(x: float, d: float) -> float:
+            return obstacle.height(x) - depth + d * obstacle.slope(x) - curvature * d**2 / 2
+
         inset = 1e-12 * span
         return (
             brentq(lambda x: meets(x, -x), left + inset, lowest, xtol=1e-14),
@@ -93,18 +124,27 @@ def flat_contact(obstacle: Obstacle, span: float, depth: float) -> FlatContact:
     curvature = brentq(enclosed, 0.0, high, xtol=1e-16)
     c1, c2 = ends(curvature)
 
+    def free(distance: np.ndarray, width: float, level: float) -> np.ndarray:
+        return distance * (level / width + curvature / 2 * (width - distance))
+
     def height(x: np.ndarray) -> np.ndarray:
-        rim = lambda distance, width, level: distance * (level / width + curvature / 2 * (width - distance))  # noqa: E731
         body = np.array([obstacle.height(np.clip(v, c1, c2)) for v in x]) - depth
-        left, right = rim(x, c1, obstacle.height(c1) - depth), rim(span - x, span - c2, obstacle.height(c2) - depth)
+        left, right = free(x, c1, obstacle.height(c1) - depth), free(span - x, span - c2, obstacle.height(c2) - depth)
         return np.where(x < c1, left, np.where(x > c2, right, body))
 
     return FlatContact((c1, c2), curvature, height)
 
 
-class Profile(NamedTuple):
-    """A reconstructed strip, a semicircle of `radius` at rest: `nodes [N, 2]`, `pressure`, contact `traction [N, 2]` on it
-    (force / length; zero for minimum energy), and the nodes' `angle [N]` at rest, radians."""
+class StripProfile(NamedTuple):
+    """A reconstructed strip, a semicircle at rest.
+
+    Attributes:
+        nodes: `[N, 2]`.
+        pressure: of the fluid, force / length^2.
+        traction: `[N, 2]`, contact force on the strip over length; zero for minimum energy.
+        angle: `[N]`, of the nodes at rest, radians.
+        radius: of the semicircle.
+    """
 
     nodes: Tensor
     pressure: float
@@ -122,33 +162,53 @@ class Profile(NamedTuple):
 class _Semicircle:
     """Rest nodes at equal angles around the origin, the free ones' index, rest pressure and length."""
 
-    def __init__(self, radius: float, strip: Strip, nodes: int):
+    def __init__(self, radius: float, strip: Strip, nodes: int) -> None:
         self.radius, self.strip = radius, strip
         self.angle = torch.linspace(0, torch.pi, nodes, dtype=torch.float64)
         self.rest = around(radius, self.angle)
         self.rest_area = area(self.rest)
-        self.energy = lambda x: strip.energy(x, self.rest)
         self.length = radius * torch.pi
         self.share = self.length / (nodes - 1)
-        force, push = torch.func.grad(self.energy)(self.rest), torch.func.grad(area)(self.rest)
-        self.rest_pressure = float((force * push)[1:-1].sum() / push[1:-1].square().sum())
+        force, v = torch.func.grad(self.energy)(self.rest), torch.func.grad(area)(self.rest)
+        self.rest_pressure = float((force * v)[1:-1].sum() / v[1:-1].square().sum())
+
+    def energy(self, x: Tensor) -> Tensor:
+        """Elastic energy `[]` of the nodes at `x [N, 2]`."""
+        return self.strip.energy(x, self.rest)
 
 
 class MinimumEnergyProfile(_Semicircle):
     """Least energy on the observed rays (eqs. 35-37), area kept; Newton's method on `u`.
 
-    Arguments: `radius` of the semicircle, its `Strip`, number of `nodes`. Calling it with the rest angles `theta [M]` and the
-    observed angles `psi [M]` of markers (radians) gives a `Profile`; between markers `g` is a cubic spline.
+    Called with markers' angles it gives a `StripProfile`; between markers `g` is a cubic spline.
+
+    Args:
+        radius: of the semicircle.
+        strip: its material.
+        nodes: how many.
+
+    Example:
+        >>> theta = np.linspace(0.3, 2.8, 7)
+        >>> found = MinimumEnergyProfile(15.0, Strip(), 9)(theta, theta)
+        >>> bool((found.nodes - found.nodes.flip(0) * torch.tensor([-1.0, 1.0])).abs().max() < 1e-9)
+        True
     """
 
-    def __call__(self, theta: np.ndarray, psi: np.ndarray) -> Profile:
+    def __call__(self, theta: np.ndarray, psi: np.ndarray) -> StripProfile:
+        """The strip whose markers at rest angles `theta [M]` are observed at angles `psi [M]`, radians."""
         ends = np.array([0.0, np.pi])
         order = np.argsort(np.append(ends, theta))
         g = CubicSpline(np.append(ends, theta)[order], np.append(ends, psi)[order])
-        seen = torch.from_numpy(g(self.angle.numpy()))
-        u, pressure = torch.full_like(seen, self.radius), self.rest_pressure
+        observed = torch.from_numpy(g(self.angle.numpy()))
+        u, pressure = torch.full_like(observed, self.radius), self.rest_pressure
         free = slice(1, -1)
-        energy, enclosed = (lambda v, f=f: f(around(v, seen)) for f in (self.energy, area))
+
+        def energy(u: Tensor) -> Tensor:
+            return self.energy(around(u, observed))
+
+        def enclosed(u: Tensor) -> Tensor:
+            return area(around(u, observed))
+
         for _ in range(NEWTON_STEPS):
             v = torch.func.grad(enclosed)(u)[free]
             load = torch.func.grad(energy)(u)[free]
@@ -157,46 +217,76 @@ class MinimumEnergyProfile(_Semicircle):
             step = torch.linalg.solve(kkt, torch.cat([pressure * v - load, (self.rest_area - enclosed(u))[None]]))
             u[free] += step[:-1]
             pressure = pressure + float(step[-1])
-        return Profile(around(u, seen), pressure, torch.zeros_like(self.rest), self.angle, self.radius)
+        return StripProfile(around(u, observed), pressure, torch.zeros_like(self.rest), self.angle, self.radius)
+
+
+class StripObservation(NamedTuple):
+    """M markers on the strip and the rays on which they are observed.
+
+    Attributes:
+        bulge: `[M, 2]`, from the chord between nodes to the marker.
+        weights: `[M, N]`, of the nodes.
+        across: `[M, 2]`, unit vectors across the rays.
+    """
+
+    bulge: Tensor
+    weights: Tensor
+    across: Tensor
 
 
 class ForceBalanceProfile(_Semicircle):
-    """Sparse inward contact forces, as `ForceBalance` in two dimensions: every node has two equations and is seen on a ray.
+    """Sparse inward contact forces, as `ForceBalance` in two dimensions: every node has two equations and lies on a ray.
 
-    Arguments as for `MinimumEnergyProfile`; `noise` of a marker's angle, radians; `sparsity` b of `beta = b / (p0 x length)`,
-    `friction` kappa. Solved from the rest shape.
-    Wrong for contacts closer than about a tenth of the length; for a harmonic strip under two points (a strip without its
-    thickness can hide them from its centre, unless tangential forces are very dear).
+    Solved from the rest shape.
+
+    Args:
+        radius: of the semicircle.
+        strip: its material.
+        nodes: how many.
+        noise: standard deviation of a marker's angle, radians.
+        sparsity: b of `beta = b / (p0 x length)`.
+        friction: kappa, penalty of tangential over normal traction.
+
+    Limitations:
+        Contacts closer than about a tenth of the length are not resolved. Under two points a harmonic strip is ambiguous: a
+        strip without its thickness can hide them from its centre, unless the penalty of tangential forces is very large.
     """
 
-    def __init__(self, radius: float, strip: Strip, nodes: int, noise: float, sparsity=100.0, friction=30.0):
+    def __init__(
+        self, radius: float, strip: Strip, nodes: int, noise: float, sparsity: float = 100.0, friction: float = 30.0
+    ) -> None:
         super().__init__(radius, strip, nodes)
         self.noise, self.friction = noise, friction
         self.beta = sparsity / (self.rest_pressure * self.length)
         self.enclosed_hessian = torch.func.hessian(area)(self.rest).reshape(2 * nodes, 2 * nodes)
 
-    def __call__(self, theta: np.ndarray, psi: np.ndarray) -> Profile:
+    def __call__(self, theta: np.ndarray, psi: np.ndarray) -> StripProfile:
+        """The strip whose markers at rest angles `theta [M]` are observed at angles `psi [M]`, radians."""
         weights = torch.from_numpy(_hat_weights(self.angle.numpy(), theta))
-        seen = around(self.radius, torch.from_numpy(theta)) - weights @ self.rest, weights
+        bulge = around(self.radius, torch.from_numpy(theta)) - weights @ self.rest
         across = torch.from_numpy(np.stack([-np.sin(psi), np.cos(psi)], -1))
+        observation = StripObservation(bulge, weights, across)
         x, pressure = self.rest, torch.tensor(self.rest_pressure, dtype=torch.float64)
         first, last = (eps * self.rest_pressure for eps in EPS)
         for k in range(STEPS):
-            x, pressure = self._step(x, pressure, seen, across, first * (last / first) ** min(1, k / (FALL * (STEPS - 1))))
-        return Profile(x, float(pressure), self._force(x, pressure) / self.share, self.angle, self.radius)
+            eps = first * (last / first) ** min(1, k / (GNC_SHARE * (STEPS - 1)))
+            x, pressure = self._step(x, pressure, observation, eps)
+        return StripProfile(x, float(pressure), self._force(x, pressure) / self.share, self.angle, self.radius)
 
     def _force(self, x: Tensor, pressure: Tensor) -> Tensor:
+        """What the nodes leave out of balance, `[N, 2]`: the contact forces; zero at the ends."""
         force = torch.func.grad(self.energy)(x) - pressure * torch.func.grad(area)(x)
         force[[0, -1]] = 0
         return force
 
     def _traction(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
+        """Normal (tensile positive) and tangential traction `[N]` each."""
         q, n = self._force(x, pressure) / self.share, outward(x)
         return (q * n).sum(-1), q[:, 0] * n[:, 1] - q[:, 1] * n[:, 0]
 
-    def _angles(self, x: Tensor, seen: tuple[Tensor, Tensor], across: Tensor) -> tuple[Tensor, Tensor]:
+    def _angles(self, x: Tensor, observation: StripObservation) -> tuple[Tensor, Tensor]:
         """Angles `[M]` between rays and modelled markers, and their derivatives `[M, 2 N]`."""
-        bulge, weights = seen
+        bulge, weights, across = observation
         marker = bulge + weights @ x
         distance = marker.norm(dim=-1, keepdim=True)
         along = marker / distance
@@ -204,7 +294,7 @@ class ForceBalanceProfile(_Semicircle):
         slope = (across - angle[:, None] * along) / distance
         return angle, (weights[:, :, None] * slope[:, None]).flatten(1)
 
-    def _step(self, x, pressure, seen, across, eps):
+    def _step(self, x: Tensor, pressure: Tensor, observation: StripObservation, eps: float) -> tuple[Tensor, Tensor]:
         """One reweighted Gauss-Newton step, the area linearised, the longest move capped."""
         N = len(x)
         free = slice(2, 2 * N - 2)
@@ -213,11 +303,11 @@ class ForceBalanceProfile(_Semicircle):
         A = torch.cat([H[:, free], -v.reshape(-1, 1)], 1)[free]
         n, (q_n, q_t) = outward(x), self._traction(x, pressure)
         t = torch.stack([n[:, 1], -n[:, 0]], -1)
-        w_n = torch.where(q_n < 0, (q_n**2 + eps**2).rsqrt(), PULL / eps)
+        w_n = torch.where(q_n < 0, (q_n**2 + eps**2).rsqrt(), TENSILE / eps)
         w_t = self.friction * (q_t**2 + eps**2).rsqrt()
         W = (w_n[:, None, None] * n[:, :, None] * n[:, None] + w_t[:, None, None] * t[:, :, None] * t[:, None])[1:-1]
         W = torch.block_diag(*(self.beta / self.share * W))
-        angle, J = self._angles(x, seen, across)
+        angle, J = self._angles(x, observation)
         J = torch.cat([J[:, free], J.new_zeros(len(J), 1)], 1) / self.noise
         M = A.T @ W @ A + J.T @ J
         load = A.T @ (W @ self._force(x, pressure)[1:-1].flatten()) + J.T @ (angle / self.noise)

@@ -1,93 +1,31 @@
-"""What a calibration found: numbers with uncertainties as text and JSON, and figures."""
+"""Figures of what a calibration found: residuals, correlations, a surface's correction, a material's likelihood, a layout."""
 
-import json
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from .frames import BLUE, GREY, VERMILION, save
+from ..io.report import Report
+from ..sensor.sensor import Sensor
+from .drawing import BLUE, GREY, VERMILION
 
-INDISTINGUISHABLE = 0.95  # correlation above which two settings are said to be hardly distinguishable
 PARAMETERS_DRAWN = 24
 GAINS = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000])
 
 
-class Report(NamedTuple):
-    """A calibration's numbers and what they leave.
-
-    names, units, design (value before), values, deviations: `[n]` each; correlations `[n, n]`; pixels and residuals `[N, 2]`
-    px, of all points used; noise: of one residual, px; notes: lines for people.
-    """
-
-    title: str
-    names: list[str]
-    units: list[str]
-    design: np.ndarray
-    values: np.ndarray
-    deviations: np.ndarray
-    correlations: np.ndarray
-    pixels: np.ndarray
-    residuals: np.ndarray
-    noise: float
-    notes: list[str]
-
-    @classmethod
-    def of(cls, title, names, units, design, fit, pixels, residuals, notes=()) -> "Report":
-        """From a `Fit` whose first numbers are those of `names`; pixels and residuals `[..., 2]`, NaN where not used."""
-        n = len(names)
-        covariance, deviations = fit.covariance[:n, :n], fit.deviations[:n]
-        correlations = covariance / np.maximum(np.outer(deviations, deviations), 1e-300)
-        used = np.isfinite(residuals).all(-1)
-        return cls(
-            title, list(names), list(units), np.asarray(design, float), fit.values[:n], deviations, correlations,
-            pixels[used], residuals[used], fit.noise, list(notes),
-        )  # fmt: skip
-
-    @classmethod
-    def without_parameters(cls, title: str, notes=()) -> "Report":
-        """Of a calibration that gives a surface, and no numbers."""
-        numbers, none = np.zeros(0), np.zeros((0, 2))
-        return cls(title, [], [], numbers, numbers, numbers, np.zeros((0, 0)), none, none, 0.0, list(notes))
-
-    @property
-    def confused(self) -> list[tuple[str, str, float]]:
-        """Pairs that the data hardly distinguish, with their correlation."""
-        rows, columns = np.nonzero(np.triu(np.abs(self.correlations) > INDISTINGUISHABLE, 1))
-        return [(self.names[i], self.names[j], float(self.correlations[i, j])) for i, j in zip(rows, columns, strict=True)]
-
-    @property
-    def lines(self) -> list[str]:
-        rows = zip(self.names, self.values, self.deviations, self.units, self.design, strict=True)
-        lines = [f"  {name:<16}{value:>12.5f} ± {sd:<10.2g}{unit:<7} (before: {old:g})" for name, value, sd, unit, old in rows]
-        if len(self.residuals):
-            rms = float(np.sqrt((self.residuals**2).mean()))
-            lines.append(
-                f"  residuals: {len(self.residuals)} points, {rms:.3f} px rms, at most {np.abs(self.residuals).max():.3f} px"
-            )
-        lines += [f"  hardly distinguishable: {a} and {b} (correlation {c:+.4f})" for a, b, c in self.confused]
-        return [self.title, *lines, *(f"  {note}" for note in self.notes)]
-
-    def write(self, folder: Path, drawing: Figure) -> None:
-        """`report.json` and `report.png` in the folder."""
-        rows = zip(self.names, self.values, self.deviations, self.units, self.design, strict=True)
-        content = {
-            "title": self.title,
-            "parameters": {n: dict(value=v, deviation=s, unit=u, before=b) for n, v, s, u, b in rows},
-            "correlations": self.correlations.tolist(),
-            "hardly_told_apart": self.confused,
-            "points": len(self.residuals),
-            "noise_px": self.noise,
-            "notes": self.notes,
-        }
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "report.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
-        save(drawing, folder / "report.png")
-
-
 def fit_figure(report: Report, image_size: tuple[int, int]) -> Figure:
-    """Residuals in the image (arrows, magnified), their scatter, and the correlations of what was fitted."""
+    """Residuals in the image (arrows, magnified), their scatter, and the correlations of what was fitted.
+
+    Args:
+        report: the calibration's numbers.
+        image_size: width and height of the image, px.
+
+    Example:
+        >>> report = Report("lens", ["focal"], ["px"], *np.ones((3, 1)), np.eye(1), np.ones((4, 2)), np.eye(4, 2), 0.5, [])
+        >>> [axes.get_title() for axes in fit_figure(report, (640, 480)).axes[1:3]]
+        ['residuals; circles: 1 and 3 x 0.500 px', 'correlations']
+    """
     drawing = Figure(figsize=(15, 4.6), layout="constrained")
     drawing.suptitle(report.title)
     axes = drawing.subplots(1, 3, width_ratios=(1.3, 1, 1.15))
@@ -97,7 +35,8 @@ def fit_figure(report: Report, image_size: tuple[int, int]) -> Figure:
     return drawing
 
 
-def draw_residuals(axes, report: Report, image_size: tuple[int, int]) -> None:
+def draw_residuals(axes: Axes, report: Report, image_size: tuple[int, int]) -> None:
+    """Residuals as arrows at their pixels, magnified by the largest of `GAINS` that keeps them short."""
     width, height = image_size
     typical = np.sqrt((report.residuals**2).sum(-1).mean()) if len(report.residuals) else 1.0
     gain = max(GAINS[GAINS <= max(1.0, 0.03 * width / max(typical, 1e-9))])
@@ -106,7 +45,8 @@ def draw_residuals(axes, report: Report, image_size: tuple[int, int]) -> None:
     axes.set_title(f"measured less modelled, x {gain:g}")
 
 
-def draw_scatter(axes, report: Report) -> None:
+def draw_scatter(axes: Axes, report: Report) -> None:
+    """Residuals as points, with circles of one and three standard deviations of the noise."""
     angle = np.linspace(0, 2 * np.pi, 200)
     axes.plot(*report.residuals.T, ".", ms=2, color=BLUE)
     for times in (1, 3):
@@ -116,7 +56,8 @@ def draw_scatter(axes, report: Report) -> None:
     axes.axvline(0, color=GREY, lw=0.5)
 
 
-def draw_correlations(axes, report: Report) -> None:
+def draw_correlations(axes: Axes, report: Report) -> None:
+    """The matrix of correlations of the first `PARAMETERS_DRAWN` parameters."""
     names = report.names[:PARAMETERS_DRAWN]
     n = len(names)
     shown = axes.imshow(report.correlations[:n, :n], vmin=-1, vmax=1, cmap="RdBu")
@@ -126,10 +67,15 @@ def draw_correlations(axes, report: Report) -> None:
     axes.figure.colorbar(shown, ax=axes, shrink=0.8)
 
 
-def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarray, correction, unit: str) -> Figure:
+def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarray, correction: Any, unit: str) -> Figure:
     """Residuals in the image where there are any, and how far the surface was moved and how surely, seen along the axis.
 
-    Arguments: `places [V, 3]` of the surface's vertices, its `Correction`.
+    Args:
+        report: the calibration's numbers.
+        image_size: width and height of the image, px.
+        places: `[V, 3]`, the surface's vertices.
+        correction: its `offsets [V]` along the normals and their `deviations [V]`.
+        unit: of lengths.
     """
     panels = 3 if len(report.residuals) else 2
     drawing = Figure(figsize=(5 * panels, 4.6), layout="constrained")
@@ -138,19 +84,26 @@ def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarr
     if panels == 3:
         draw_residuals(axes[0], report, image_size)
     offset = np.abs(correction.offsets).max()
-    for ax, values, title, options in (
+    maps: list[tuple[Axes, np.ndarray, str, dict[str, Any]]] = [
         (axes[-2], correction.offsets, "moved outwards", dict(cmap="RdBu", vmin=-offset, vmax=offset)),
         (axes[-1], correction.deviations, "standard deviation", dict(cmap="viridis")),
-    ):
-        shown = ax.tripcolor(*places[:, :2].T, values, shading="gouraud", **options)
+    ]
+    for ax, values, title, options in maps:
+        shown = ax.tripcolor(places[:, 0], places[:, 1], values, shading="gouraud", **options)
         ax.set(aspect="equal", xlabel=f"x, {unit}", ylabel=f"y, {unit}", title=f"{title}, {unit}")
         ax.invert_yaxis()
         drawing.colorbar(shown, ax=ax, shrink=0.8)
     return drawing
 
 
-def material_figure(report: Report, found, names: list[str]) -> Figure:
-    """Losses over the prestretch and the estimate, and forces found and measured where any are, of a `MaterialFit`."""
+def material_figure(report: Report, found: Any, names: list[str]) -> Figure:
+    """Losses over the prestretch with the estimate, and forces found over forces measured where there are any.
+
+    Args:
+        report: the calibration's numbers, the prestretch first.
+        found: a material's fit: its `profile` (prestretches `[S]`, losses `[S, B]` of B images) and `forces [B, 2]`.
+        names: of the B images.
+    """
     known = np.isfinite(found.forces).all(1)
     panels = 2 if known.any() else 1
     drawing = Figure(figsize=(1 + 6 * panels, 4.6), layout="constrained")
@@ -179,8 +132,14 @@ def material_figure(report: Report, found, names: list[str]) -> Figure:
     return drawing
 
 
-def layout_figure(title: str, sensor, dots) -> Figure:
-    """The wanted pattern in the image, and its dots on the rest surface, from above and from the side."""
+def layout_figure(title: str, sensor: Sensor, dots: Any) -> Figure:
+    """The wanted pattern in the image, and its dots on the rest surface, from above and from the side.
+
+    Args:
+        title: of the figure.
+        sensor: the sensor that is to bear the dots.
+        dots: their `pixels [D, 2]` as wanted, `positions [D, 3]` on the rest surface and `radii [D]`.
+    """
     drawing = Figure(figsize=(15, 4.6), layout="constrained")
     drawing.suptitle(title)
     axes = drawing.subplots(1, 3)

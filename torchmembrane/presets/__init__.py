@@ -10,7 +10,18 @@ PREFIX = "preset:"
 
 
 def preset_file(name: str) -> Path:
-    """The `sensor.toml` of a preset, one of `NAMES`."""
+    """The `sensor.toml` of a preset.
+
+    Args:
+        name: one of `NAMES`.
+
+    Raises:
+        MembraneError: no preset has this name.
+
+    Example:
+        >>> preset_file("bubble").name
+        'sensor.toml'
+    """
     if name not in NAMES:
         raise MembraneError(f"preset {name!r}: no such sensor; expected one of {', '.join(NAMES)}")
     return Path(__file__).parent / name / "sensor.toml"
@@ -19,12 +30,33 @@ def preset_file(name: str) -> Path:
 def preset(name: str) -> Sensor:
     """A sensor that comes with the package.
 
-    >>> preset("bubble").camera.model
-    'pinhole'
+    Args:
+        name: "fingertip", "bubble" or "half_cylinder".
+
+    Returns:
+        The sensor, with marker list and rest image.
+
+    Raises:
+        MembraneError: no preset has this name.
+
+    Example:
+        >>> preset("bubble").camera.model
+        'pinhole'
     """
     return Sensor.from_file(preset_file(name))
 
 
 def sensor_file(text: str) -> Path:
-    """The file that an argument names: a path, or `preset:NAME`."""
+    """The file that an argument names.
+
+    Args:
+        text: a path, or `preset:NAME`.
+
+    Raises:
+        MembraneError: no preset has this name.
+
+    Example:
+        >>> sensor_file("my/sensor.toml").name, sensor_file("preset:bubble").parent.name
+        ('sensor.toml', 'bubble')
+    """
     return preset_file(text.removeprefix(PREFIX)) if text.startswith(PREFIX) else Path(text)

@@ -1,5 +1,6 @@
 """How the presets are made: `python -m torchmembrane.presets.design` writes their files anew."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from ..sensor.factories import elastic_energy
 from ..sensor.parts import METRE, Cavity, Markers, Material, Surface
 from ..sensor.sensor import Sensor
 from ..sensor.toml import default_grid
-from ..simulate.look import Look, noisy
+from ..simulate.appearance import noisy
 from ..simulate.render import Renderer
 from . import NAMES
 
@@ -66,13 +67,22 @@ def write(folder: Path) -> None:
         globals()[name]().to_file(folder / name)
 
 
-def _sensor(name, camera, surface, material, positions, sizes, gas=False) -> Sensor:
+def _sensor(
+    name: str,
+    camera: Camera,
+    surface: Surface,
+    material: Material,
+    positions: np.ndarray,
+    sizes: list[str],
+    gas: bool = False,
+) -> Sensor:
+    """A sensor with the rest image that the renderer makes of it."""
     markers = Markers("dots", "dark", positions, sizes)
     membrane = surface.membrane(default_grid(markers))
     blank = Sensor(name, "mm", camera, membrane, material, Cavity("liquid"), markers, surface)
     if gas:
         blank = replace(blank, cavity=Cavity("gas", AIR + _overpressure(blank)))
-    image = noisy(Renderer(blank, look=Look())(membrane.rest), NOISE, np.random.default_rng(0))
+    image = noisy(Renderer(blank)(membrane.rest), NOISE, np.random.default_rng(0))
     return replace(blank, markers=replace(markers, rest_image=to_grey((255 * image).round().byte().numpy())))
 
 
@@ -82,7 +92,7 @@ def _overpressure(sensor: Sensor) -> float:
     return float(round(float(rest_pressure) * METRE["mm"] ** 2 / 100))
 
 
-def _dome_dots(semi_axes, opening: float, base_z: float, spacing: float) -> tuple[np.ndarray, list[str]]:
+def _dome_dots(semi_axes: Sequence[float], opening: float, base_z: float, spacing: float) -> tuple[np.ndarray, list[str]]:
     """A square pattern, its pitch measured along the surface from the pole: positions `[D, 3]` and sizes, in turns."""
     a, b, c = semi_axes
     i, j = _lattice(opening * max(a, b) / spacing)
@@ -94,7 +104,10 @@ def _dome_dots(semi_axes, opening: float, base_z: float, spacing: float) -> tupl
     return points[kept].round(5), _sizes((i + j)[kept])
 
 
-def _cylinder_dots(radius, length, half_angle, base_z, spacing) -> tuple[np.ndarray, list[str]]:
+def _cylinder_dots(
+    radius: float, length: float, half_angle: float, base_z: float, spacing: float
+) -> tuple[np.ndarray, list[str]]:
+    """A square pattern on the unrolled cylinder: positions `[D, 3]` and sizes, in turns."""
     i, j = _lattice(length / spacing)
     x, angle = i * spacing, j * spacing / radius
     points = np.stack([x, radius * np.sin(angle), base_z + radius * (np.cos(angle) - np.cos(half_angle))], -1)
@@ -103,8 +116,10 @@ def _cylinder_dots(radius, length, half_angle, base_z, spacing) -> tuple[np.ndar
 
 
 def _lattice(reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Whole steps `i, j` of a square lattice, up to `reach` from its middle both ways."""
     steps = np.arange(-int(reach), int(reach) + 1)
-    return tuple(a.ravel() for a in np.meshgrid(steps, steps, indexing="ij"))
+    i, j = np.meshgrid(steps, steps, indexing="ij")
+    return i.ravel(), j.ravel()
 
 
 def _sizes(order: np.ndarray) -> list[str]:

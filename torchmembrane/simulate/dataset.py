@@ -11,9 +11,9 @@ import torch
 from tqdm import tqdm
 
 from ..errors import MembraneError
-from .frames import Frames
+from .frames import SimulatedFrames
 from .indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge, facing
-from .simulator import Frame, Simulator, Stroke
+from .simulator import SimulatedFrame, Simulator, Stroke
 
 ATTEMPTS = 10
 RADIUS = (0.06, 0.25)  # of spheres and cylinders, over the square root of the rest area; evenly in the logarithm
@@ -23,10 +23,22 @@ DEPTH = (0.01, 0.1)
 OFF_RIM = 0.15  # least distance from the rim of the point that is aimed at
 TILT = 20.0  # degrees, between the motion and the normal there, at most
 KINDS = ("sphere", "cylinder", "wedge", "box", "plane")
+NO_SLIDE = np.zeros(3)
 
 
 class Plan(NamedTuple):
-    """What the presses of a data set share: `kinds` of indenters, `friction`, `seed`, longest travel in a step."""
+    """What the presses of a data set share.
+
+    Attributes:
+        kinds: of indenters, some of `KINDS`.
+        friction: Coulomb's coefficient.
+        seed: of presses and noise.
+        increment: longest travel in a step, length unit; None: as of `presses`.
+
+    Example:
+        >>> Plan(kinds=("sphere",), seed=1).friction
+        0.0
+    """
 
     kinds: Sequence[str] = KINDS
     friction: float = 0.0
@@ -34,23 +46,33 @@ class Plan(NamedTuple):
     increment: float | None = None
 
 
-class Outcome(NamedTuple):
-    """How many frames of a data set were made, failed, and were there before."""
+class DatasetOutcome(NamedTuple):
+    """How many frames of a data set were made, failed, and were there before.
+
+    Attributes:
+        made: now.
+        failed: now.
+        skipped: there before.
+    """
 
     made: int
     failed: int
     skipped: int
 
 
-def random_frame(simulator: Simulator, plan: Plan, number: int) -> Frame:
-    """The data set's frame of that number. Strokes that the membrane cannot follow are drawn again."""
+def random_frame(simulator: Simulator, plan: Plan, number: int) -> SimulatedFrame:
+    """The data set's frame of that number. Strokes that the membrane cannot follow are drawn again.
+
+    Raises:
+        MembraneError: none of `ATTEMPTS` strokes could be followed.
+    """
     rng = np.random.default_rng([plan.seed, number])
     for _ in range(ATTEMPTS):
         try:
             stroke = random_stroke(simulator, plan, rng)
             (state,) = simulator.presses(stroke, ("push",), increment=plan.increment)
         except MembraneError as error:
-            reason = error
+            reason = str(error)
         else:
             return simulator.frame(state, stroke, rng)
     raise MembraneError(f"none of {ATTEMPTS} random strokes could be followed; the last one: {reason}")
@@ -63,7 +85,7 @@ def random_stroke(simulator: Simulator, plan: Plan, rng: np.random.Generator) ->
     off_rim = np.linalg.norm(X[:, None] - X[fixed], axis=-1).min(1) > OFF_RIM * size
     weight = np.where(off_rim, membrane.rest_area.numpy(), 0.0)
     target = rng.choice(len(X), p=weight / weight.sum())
-    kind = plan.kinds[rng.integers(len(plan.kinds))]
+    kind = plan.kinds[int(rng.integers(len(plan.kinds)))]
     body, turn, depth = _random_body(kind, size, rng), rng.uniform(0, 2 * np.pi), size * rng.uniform(*DEPTH)
     axis, tilt = rng.normal(size=3), 0.0 if kind == "plane" else np.tan(np.deg2rad(TILT * rng.random() ** 0.5))
     across = np.cross(normals[target], axis)
@@ -71,10 +93,30 @@ def random_stroke(simulator: Simulator, plan: Plan, rng: np.random.Generator) ->
     return stroke_to(simulator, body, X[target], travel, depth, turn=turn, friction=plan.friction)
 
 
-def stroke_to(simulator: Simulator, body: Indenter, aim, travel, depth, turn=0.0, slide=(0, 0, 0), friction=0.0) -> Stroke:
-    """The stroke of a body that moves along `travel [3]` to the point `aim [3]`, from where it first touches.
+def stroke_to(
+    simulator: Simulator,
+    body: Indenter,
+    aim: np.ndarray,
+    travel: np.ndarray,
+    depth: float,
+    turn: float = 0.0,
+    slide: np.ndarray = NO_SLIDE,
+    friction: float = 0.0,
+) -> Stroke:
+    """The stroke of a body that moves towards a point, from where it first touches.
 
-    `turn`: radians about `travel`, from the pose that `facing` gives. Raises where it does not meet the surface.
+    Args:
+        simulator: whose membrane it touches.
+        body: in any pose.
+        aim: `[3]`, the point it moves to.
+        travel: `[3]`, the direction in which it moves.
+        depth: how far from the first touch, length unit.
+        turn: radians about `travel`, from the pose that `facing` gives.
+        slide: `[3]`, how it moves then.
+        friction: Coulomb's coefficient.
+
+    Raises:
+        MembraneError: the body does not meet the surface.
     """
     travel = np.asarray(travel, float) / np.linalg.norm(travel)
     c, s = np.cos(turn), np.sin(turn)
@@ -84,6 +126,7 @@ def stroke_to(simulator: Simulator, body: Indenter, aim, travel, depth, turn=0.0
 
 
 def _random_body(kind: str, size: float, rng: np.random.Generator) -> Indenter:
+    """A body of that kind, of random size."""
     radius = size * np.exp(rng.uniform(*np.log(RADIUS)))
     edge = size * rng.uniform(*EDGE)
     if kind == "sphere":
@@ -97,13 +140,29 @@ def _random_body(kind: str, size: float, rng: np.random.Generator) -> Indenter:
     return Plane()
 
 
+def _report(line: str) -> None:
+    tqdm.write(line, file=sys.stderr)
+
+
 def make_frames(
-    simulator: Simulator, plan: Plan, count: int, frames: Frames, jobs: int = 1,
-    report: Callable[[str], None] = lambda line: tqdm.write(line, file=sys.stderr),
-) -> Outcome:  # fmt: skip
-    """Make the frames 0 to `count - 1` of a data set that `frames` does not hold yet, in `jobs` processes.
+    simulator: Simulator,
+    plan: Plan,
+    count: int,
+    frames: SimulatedFrames,
+    jobs: int = 1,
+    report: Callable[[str], None] = _report,
+) -> DatasetOutcome:
+    """Make the frames 0 to `count - 1` of a data set that `frames` does not hold yet.
 
     A press that fails is reported and left out; the same call tries it again. Interrupted, what is done so far is kept.
+
+    Args:
+        simulator: that makes them.
+        plan: what the presses share.
+        count: of the data set's frames.
+        frames: where they are kept.
+        jobs: processes.
+        report: takes a line for each press that fails.
     """
     names = {number: f"s{plan.seed}_{number:06d}" for number in range(count)}
     held = frames.names()
@@ -120,10 +179,12 @@ def make_frames(
                 frames.write(names[number], made)
     finally:
         frames.flush()
-    return Outcome(len(wanted) - failed, failed, skipped)
+    return DatasetOutcome(len(wanted) - failed, failed, skipped)
 
 
-def _in_processes(simulator: Simulator, plan: Plan, numbers: Sequence[int], jobs: int) -> Iterator[tuple[int, Frame | str]]:
+def _in_processes(
+    simulator: Simulator, plan: Plan, numbers: Sequence[int], jobs: int
+) -> Iterator[tuple[int, SimulatedFrame | str]]:
     jobs = min(jobs, len(numbers))
     if jobs <= 1:
         yield from ((number, _frame_or_reason(simulator, plan, number)) for number in numbers)
@@ -133,18 +194,23 @@ def _in_processes(simulator: Simulator, plan: Plan, numbers: Sequence[int], jobs
         yield from pool.imap(_work, numbers)
 
 
+_simulator: Simulator
+_plan: Plan
+
+
 def _begin(simulator: Simulator, plan: Plan) -> None:
+    """Start a worker process: what `_work` needs, once."""
     global _simulator, _plan
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     torch.set_num_threads(1)
     _simulator, _plan = simulator, plan
 
 
-def _work(number: int) -> tuple[int, Frame | str]:
+def _work(number: int) -> tuple[int, SimulatedFrame | str]:
     return number, _frame_or_reason(_simulator, _plan, number)
 
 
-def _frame_or_reason(simulator: Simulator, plan: Plan, number: int) -> Frame | str:
+def _frame_or_reason(simulator: Simulator, plan: Plan, number: int) -> SimulatedFrame | str:
     try:
         return random_frame(simulator, plan, number)
     except MembraneError as error:

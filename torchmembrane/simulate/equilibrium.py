@@ -5,7 +5,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -14,10 +14,11 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..mechanics.cavity import gas_law_step
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..surface.membrane import Membrane
 from ..surface.topology import corners, triangles_of
-from .contact import Contact
+from .frictional_contact import FrictionalContact
 
 FORCE_TOLERANCE = 1e-9  # over modulus x edge length
 VOLUME_TOLERANCE = 1e-11  # over the volume at rest
@@ -26,18 +27,35 @@ NEWTON_STEPS = 40
 HALVINGS = 6
 
 
+class Filling(Protocol):
+    """What fills the cavity: the law between its volume and the pressure difference across the membrane."""
+
+    def gap(self, volume: float, pressure: float) -> tuple[float, float]:
+        """How much volume is missing at this pressure, and the compliance C: `v . dx + C dp = gap` in each Newton step."""
+
+
 class Liquid(NamedTuple):
-    """The volume is kept."""
+    """The volume is kept.
+
+    Attributes:
+        volume: that is kept, length^3.
+    """
 
     volume: float
 
     def gap(self, volume: float, pressure: float) -> tuple[float, float]:
-        """How much volume is missing at this pressure, and the compliance C: `v . dx + C dp = gap` in each Newton step."""
         return self.volume - volume, 0.0
 
 
 class Gas(NamedTuple):
-    """Absolute pressure x volume is kept: `p = p0 + P (V_gas / (V_gas + V - V0) - 1)`."""
+    """Absolute pressure x volume is kept: `p = p0 + P (V_gas / (V_gas + V - V0) - 1)`.
+
+    Attributes:
+        rest_pressure: p0, pressure difference at rest, force / length^2.
+        rest_volume: V0, between the rest surface and the camera, length^3.
+        absolute: P, absolute pressure at rest.
+        gas_volume: V_gas, of the gas at rest.
+    """
 
     rest_pressure: float
     rest_volume: float
@@ -45,9 +63,7 @@ class Gas(NamedTuple):
     gas_volume: float
 
     def gap(self, volume: float, pressure: float) -> tuple[float, float]:
-        ratio = self.gas_volume / (self.gas_volume + volume - self.rest_volume)
-        compliance = self.gas_volume / (self.absolute * ratio**2)
-        return compliance * (self.rest_pressure + self.absolute * (ratio - 1) - pressure), compliance
+        return gas_law_step(volume - self.rest_volume, pressure, self.rest_pressure, self.absolute, self.gas_volume)
 
 
 class Open(NamedTuple):
@@ -58,35 +74,68 @@ class Open(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """`vertices [V, 3]`, pressure difference, the contacts with their forces, Newton steps taken."""
+    """What `EquilibriumProblem.solve` finds.
+
+    Attributes:
+        vertices: `[V, 3]`.
+        pressure: difference across the membrane, force / length^2.
+        contacts: with their forces.
+        iterations: Newton steps taken.
+    """
 
     vertices: Tensor
     pressure: float
-    contacts: Sequence[Contact]
+    contacts: Sequence[FrictionalContact]
     iterations: int
 
 
-class Equilibrium:
-    """Newton's method on one membrane.
+class EquilibriumProblem:
+    """The equilibrium of one membrane, solved by Newton's method.
 
-    Arguments: the membrane, its `elasticity`, the `cavity` (`Liquid`, `Gas`, `Open`), a dead `load [V, 3]` (default: none).
     Element Hessians are exact; where the step they give does not descend, their convex part. The line search is on the slope
     of the potential along the step, its volume term augmented; the bordered matrix is never factored.
+
+    Args:
+        membrane: at rest.
+        elasticity: its elastic energy.
+        cavity: `Liquid`, `Gas` or `Open`.
+        load: dead load on the vertices, `[V, 3]`, force; default: none.
+
+    Example:
+        >>> from torchmembrane.surface.shapes import spherical_cap
+        >>> cap = spherical_cap(12, 9, 15, (9, 9))
+        >>> elasticity = ElasticEnergy(cap, "neo_hookean", 1.3)
+        >>> found = EquilibriumProblem(cap, elasticity, Liquid(float(cap.rest_volume))).solve(cap.rest, 0.1)
+        >>> round(found.pressure / float(2 * elasticity.tension / 12.5), 1)  # Laplace's law
+        1.0
     """
 
-    def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, cavity, load: Tensor | None = None):
-        self.membrane, self.elasticity, self.cavity, self.free = membrane, elasticity, cavity, membrane.free_vertices
+    def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, cavity: Filling, load: Tensor | None = None) -> None:
+        self.membrane, self.elasticity, self.cavity, self.free = membrane, elasticity, cavity, membrane.free
         self.load = torch.zeros_like(membrane.rest) if load is None else load
-        self.matrix = _Pattern(membrane)
+        self.matrix = _SparsityPattern(membrane)
         modulus = float(2 * (elasticity.c1 + elasticity.c2) + elasticity.tension.abs())
         self.force_scale = modulus * membrane.size / len(membrane.rest) ** 0.5
         self.vertex_stiffness = float(self.matrix(elasticity.hessian_blocks(membrane.rest)).diagonal().mean())
 
-    def solve(self, x: Tensor, pressure: float, contacts: Sequence[Contact] = ()) -> Solution:
-        """Equilibrium from a start `x [V, 3]`, whose rim stays where it is. Raises `MembraneError` if none is found."""
+    def solve(self, x: Tensor, pressure: float, contacts: Sequence[FrictionalContact] = ()) -> Solution:
+        """The equilibrium near a start.
+
+        Args:
+            x: vertices to start from, `[V, 3]`; the rim stays where it is.
+            pressure: difference across the membrane there.
+            contacts: indenters, at the pose that the equilibrium is sought for.
+
+        Returns:
+            The equilibrium, converged.
+
+        Raises:
+            MembraneError: none is found.
+        """
         for iteration in range(NEWTON_STEPS):
             projected = [contact.projected(x[self.free]) for contact in contacts]
-            residual = np.abs(self._out_of_balance(x, pressure, [contact.force(x[self.free]) for contact in projected])).max()
+            forces = [contact.force(x[self.free]) for contact in projected]
+            residual = np.abs(self._imbalance(x, pressure, forces)).max()
             change = max((p.distance_from(c) for p, c in zip(projected, contacts, strict=True)), default=0.0)
             settled = max(residual, change) <= FORCE_TOLERANCE * self.force_scale
             if settled and abs(self._gap(x, pressure)[0]) <= VOLUME_TOLERANCE * float(self.membrane.rest_volume):
@@ -100,38 +149,41 @@ class Equilibrium:
             f"{self.force_scale:.3g} is one element's tension; expected a start near it: take smaller steps"
         )
 
-    def _out_of_balance(self, x, pressure, pushes):
-        """`grad U - h - p grad V - contact forces` on the free degrees of freedom; `pushes [F, 3]` of each indenter."""
+    def _imbalance(self, x: Tensor, pressure: float, contact_forces: Sequence[Tensor]) -> np.ndarray:
+        """`grad U - h - p grad V - contact forces` on the free degrees of freedom, `[3 F]`; `contact_forces [F, 3]` each."""
         field = self.elasticity.gradient(x) - self.load - pressure * self.membrane.volume_gradient(x)
-        return (field[self.free] - sum(pushes)).numpy().ravel()
+        return (field[self.free] - sum(contact_forces)).numpy().ravel()
 
-    def _gap(self, x, pressure):
+    def _gap(self, x: Tensor, pressure: float) -> tuple[float, float]:
         return self.cavity.gap(float(self.membrane.volume(x)), pressure)
 
-    def _step(self, x, pressure, contacts, positive):
+    def _step(
+        self, x: Tensor, pressure: float, contacts: Sequence[FrictionalContact], positive: bool
+    ) -> tuple[Tensor, float, list[FrictionalContact]] | None:
         """One Newton step: vertices, pressure and contacts, or None where it does not descend."""
         active = [contact.active_set(x[self.free]) for contact in contacts]
         each = list(zip(contacts, active, strict=True))
         blocks = self.elasticity.hessian_blocks(x, positive) - pressure * self.membrane.volume_hessian_blocks(x)
-        K = self.matrix(blocks, sum(contact.stiffness_blocks(x[self.free], a) for contact, a in each))
+        touching = [contact.stiffness_blocks(x[self.free], a) for contact, a in each]
+        K = self.matrix(blocks, torch.stack(touching).sum(0) if touching else 0)
         linear = [contact.linearised(a).force(x[self.free]) for contact, a in each]
-        push, (gap, compliance) = self.membrane.volume_gradient(x)[self.free].numpy().ravel(), self._gap(x, pressure)
+        v, (gap, compliance) = self.membrane.volume_gradient(x)[self.free].numpy().ravel(), self._gap(x, pressure)
         try:
-            y, g = _solved(K, np.stack([-self._out_of_balance(x, pressure, linear), push], 1)).T
+            y, g = _solved(K, np.stack([-self._imbalance(x, pressure, linear), v], 1)).T
         except RuntimeError:  # exactly singular
             return None
-        softness = push @ g
-        rise = (gap - push @ y) / (softness + compliance)
+        softness = v @ g
+        rise = (gap - v @ y) / (softness + compliance)
         direction, pressure = y + rise * g, pressure + rise
         move = torch.zeros_like(x)
         move[self.free] = torch.from_numpy(direction.reshape(-1, 3))
         contacts = [contact.linearised(a, move[self.free]) for contact, a in each]
 
-        def slope(x):
+        def slope(x: Tensor) -> float:
             """Of the potential along the step, with the multipliers it gave: volume and active contacts are augmented."""
             gap, compliance = self._gap(x, pressure)
             held = [contact.held(x[self.free], a) for contact, a in zip(contacts, active, strict=True)]
-            return direction @ self._out_of_balance(x, pressure + gap / (compliance + abs(softness)), held)
+            return float(direction @ self._imbalance(x, pressure + gap / (compliance + abs(softness)), held))
 
         start, share = slope(x), min(1.0, LONGEST_STEP * self.membrane.size / float(move.norm(dim=-1).max()))
         for _ in range(HALVINGS if start < 0 else 0):
@@ -142,14 +194,15 @@ class Equilibrium:
 
 
 def _solved(K: csc_matrix, loads: np.ndarray) -> np.ndarray:
+    """`K^-1 loads` by a sparse LU factorisation; raises `RuntimeError` where K is exactly singular."""
     return splu(K, "MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options={"SymmetricMode": True}).solve(loads)
 
 
-class _Pattern:
+class _SparsityPattern:
     """Sum of triangle blocks and free vertices' blocks on the free degrees of freedom, with a sparsity pattern found once."""
 
-    def __init__(self, membrane: Membrane):
-        V, free = len(membrane.rest), membrane.free_vertices.numpy()
+    def __init__(self, membrane: Membrane) -> None:
+        V, free = len(membrane.rest), membrane.free.numpy()
         number = np.full(V, -1)
         number[free] = np.arange(len(free))
         triangles = triangles_of(corners(torch.arange(V)[:, None], membrane.grid)).reshape(-1, 3).numpy()

@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -14,7 +15,7 @@ from ..io.atomic import whole_file
 from ..io.optional import load_pyarrow, load_pyav
 from ..io.results import save_frame
 from ..sensor.sensor import Sensor
-from .simulator import Frame, Simulator
+from .simulator import SimulatedFrame, Simulator
 
 SENSOR, SETTINGS, REST = "sensor.toml", "simulation.json", "rest_truth.npz"
 CONSTANT = ("dots_nominal", "uv_nominal", "visible_nominal", "vertices_nominal", "triangles", "p0")
@@ -22,10 +23,14 @@ PART_ROWS = 64
 FORMATS = ("png", "parquet")
 
 
-class Frames:
-    """Frames as NAME.png and NAME_truth.npz in a folder."""
+class SimulatedFrames:
+    """Frames as NAME.png and NAME_truth.npz in a folder.
 
-    def __init__(self, folder: Path):
+    Args:
+        folder: that exists.
+    """
+
+    def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def names(self) -> set[str]:
@@ -33,40 +38,45 @@ class Frames:
         found = {path.name.removesuffix("_truth.npz") for path in self.folder.glob("*_truth.npz")}
         return {name for name in found if (self.folder / f"{name}.png").exists()}
 
-    def write(self, name: str, frame: Frame) -> None:
+    def write(self, name: str, frame: SimulatedFrame) -> None:
+        """Write a frame's image and truth."""
         _write(self.folder / f"{name}.png", png(frame.image))
         self.write_truth(name, frame)
 
-    def write_truth(self, name: str, frame: Frame) -> None:
+    def write_truth(self, name: str, frame: SimulatedFrame) -> None:
+        """Write a frame's truth alone."""
         save_frame(self.folder / f"{name}_truth.npz", frame.truth)
 
     def flush(self) -> None:
         """Nothing is held back."""
 
-    def __iter__(self) -> Iterator[tuple[str, Frame]]:
+    def __iter__(self) -> Iterator[tuple[str, SimulatedFrame]]:
         """Names and frames in name order."""
         for name in sorted(self.names()):
             with np.load(self.folder / f"{name}_truth.npz") as truth:
-                yield name, Frame(np.asarray(Image.open(self.folder / f"{name}.png")), dict(truth))
+                yield name, SimulatedFrame(np.asarray(Image.open(self.folder / f"{name}.png")), dict(truth))
 
 
-class FrameTable(Frames):
+class SimulatedFrameTable(SimulatedFrames):
     """Frames as rows of `frames/part-*.parquet`: `name`, `image` (a PNG file's bytes), and the truth, arrays as flat lists.
 
     The schema's metadata hold the arrays' shapes (`shapes`, JSON). What is the same in all frames stands in `rest_truth.npz`.
     Rows are held back until `PART_ROWS` of them make a file; `flush` writes the rest.
+
+    Args:
+        folder: that exists.
     """
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.arrow, self.parquet = load_pyarrow()
-        self.waiting: dict[str, Frame] = {}
+        self.waiting: dict[str, SimulatedFrame] = {}
 
     def names(self) -> set[str]:
         parts = (self.parquet.read_table(part, columns=["name"])["name"].to_pylist() for part in self._parts())
         return {name for part in parts for name in part} | set(self.waiting)
 
-    def write(self, name: str, frame: Frame) -> None:
+    def write(self, name: str, frame: SimulatedFrame) -> None:
         self.waiting[name] = frame
         if not (self.folder / REST).exists():
             save_frame(self.folder / REST, {key: frame.truth[key] for key in CONSTANT})
@@ -91,7 +101,7 @@ class FrameTable(Frames):
             self.parquet.write_table(table, partial)
         self.waiting = {}
 
-    def __iter__(self) -> Iterator[tuple[str, Frame]]:
+    def __iter__(self) -> Iterator[tuple[str, SimulatedFrame]]:
         with np.load(self.folder / REST) as file:
             constant = dict(file)
         for part in self._parts():
@@ -100,17 +110,23 @@ class FrameTable(Frames):
             for row in table.to_pylist():
                 truth = {key: np.asarray(row[key]).reshape(shape) for key, shape in shapes.items()}
                 truth = {key: a.astype(np.float32) if a.dtype.kind == "f" else a for key, a in truth.items()}
-                yield row["name"], Frame(np.asarray(Image.open(io.BytesIO(row["image"]))), truth | constant)
+                yield row["name"], SimulatedFrame(np.asarray(Image.open(io.BytesIO(row["image"]))), truth | constant)
 
     def _parts(self) -> list[Path]:
         return sorted((self.folder / "frames").glob("part-*.parquet"))
 
 
 class Video:
-    """An H.264 video `path`, written image by image."""
+    """An H.264 video, written image by image in a `with` block.
 
-    def __init__(self, path: Path, rate: int = 25):
-        self.path, self.rate, self.container = path, rate, None
+    Args:
+        path: of the file.
+        rate: images a second.
+    """
+
+    def __init__(self, path: Path, rate: int = 25) -> None:
+        self.path, self.rate = path, rate
+        self.container: Any = None
 
     def __enter__(self) -> "Video":
         self.av = load_pyav()
@@ -126,25 +142,32 @@ class Video:
             self.stream.pix_fmt = "yuv420p" if even else "yuv444p"
         self.container.mux(self.stream.encode(self.av.VideoFrame.from_ndarray(image, format="gray")))
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.container is not None:
             self.container.mux(self.stream.encode())
             self.container.close()
 
 
-def open_frames(folder: Path, simulator: Simulator, settings: dict, format: str = "png") -> Frames:
+def open_frames(folder: Path, simulator: Simulator, settings: dict[str, Any], format: str = "png") -> SimulatedFrames:
     """The frames of a folder that is made if need be, with the sensor as simulated: its rest image from the same light.
 
-    Raises `MembraneError` for a folder made with another sensor, look or `settings`, or with other contents.
+    Args:
+        folder: new, or of the same simulation.
+        simulator: that makes the frames.
+        settings: what else all frames have in common; kept in the folder.
+        format: "png" or "parquet".
+
+    Raises:
+        MembraneError: the folder was made with another sensor, appearance or `settings`, or has other contents.
     """
     settings = settings | {"sensor": simulator.sensor.fingerprint, "grid": list(simulator.grid), "format": format}
-    settings = json.loads(json.dumps(settings | asdict(simulator.look) | simulator.pattern.described()))
+    settings = json.loads(json.dumps(settings | asdict(simulator.appearance) | simulator.pattern.described()))
     _check(folder, settings)
     if not (folder / SETTINGS).exists():
         folder.mkdir(parents=True, exist_ok=True)
         simulated(simulator).to_file(folder / SENSOR)
         _write(folder / SETTINGS, json.dumps(settings, indent=1).encode())
-    return FrameTable(folder) if format == "parquet" else Frames(folder)
+    return SimulatedFrameTable(folder) if format == "parquet" else SimulatedFrames(folder)
 
 
 def simulated(simulator: Simulator) -> Sensor:
@@ -154,13 +177,19 @@ def simulated(simulator: Simulator) -> Sensor:
 
 
 def png(image: np.ndarray) -> bytes:
-    """An image `[H, W]` uint8 as a PNG file's content."""
+    """An image `[H, W]` uint8 as a PNG file's content.
+
+    Example:
+        >>> png(np.zeros((2, 3), np.uint8))[1:4]
+        b'PNG'
+    """
     file = io.BytesIO()
     Image.fromarray(image).save(file, "png")
     return file.getvalue()
 
 
-def _check(folder: Path, settings: dict) -> None:
+def _check(folder: Path, settings: dict[str, Any]) -> None:
+    """Refuse a folder that is not of these settings."""
     if folder.exists() and not folder.is_dir():
         raise MembraneError(f"--out {folder}: is a file; expected a folder, new or of earlier simulations of this sensor")
     if not (folder / SETTINGS).exists():

@@ -17,9 +17,22 @@ from ..surface.membrane import Membrane
 
 APPROACH_STEPS = 10_000
 
+Vector = Tensor | np.ndarray | Sequence[float]
 
-def facing(direction) -> Tensor:
-    """A rotation `[3, 3]` whose third axis is `direction [3]`, the first as near to x as can be (to y for x itself)."""
+
+def facing(direction: Vector) -> Tensor:
+    """A rotation that turns a body's +z to a direction.
+
+    Args:
+        direction: `[3]`, of any length.
+
+    Returns:
+        The rotation `[3, 3]`: its third column is the direction, its first as near to x as can be (to y for x itself).
+
+    Example:
+        >>> facing((0, 0, -2.0))[:, 2].tolist()
+        [0.0, 0.0, -1.0]
+    """
     z = torch.nn.functional.normalize(torch.as_tensor(direction, dtype=torch.float64), dim=-1)
     x = torch.tensor([1.0, 0, 0] if abs(float(z[0])) < 0.9 else [0, 1.0, 0], dtype=torch.float64)
     x = torch.nn.functional.normalize(x - (x @ z) * z, dim=-1)
@@ -30,14 +43,18 @@ def facing(direction) -> Tensor:
 class Indenter:
     """A rigid body; subclasses give `local_distance(points [..., 3]) -> [...]` in the body's own frame.
 
-    Arguments of all: `translation [3]` (length unit), `rotation [3, 3]`, both in the camera's frame.
-    Raises `MembraneError` for a rotation that is none, and for sizes that are not positive.
+    Args:
+        translation: `[3]`, length unit, in the camera's frame.
+        rotation: `[3, 3]`, to the camera's frame.
+
+    Raises:
+        MembraneError: `rotation` is not a rotation, or a size is not positive.
     """
 
-    translation: Tensor = field(default=(0.0, 0.0, 0.0), kw_only=True)
-    rotation: Tensor = field(default=((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0)), kw_only=True)
+    translation: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64), kw_only=True)
+    rotation: Tensor = field(default_factory=lambda: torch.eye(3, dtype=torch.float64), kw_only=True)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("translation", "rotation"):
             object.__setattr__(self, name, torch.as_tensor(getattr(self, name), dtype=torch.float64))
         R = self.rotation.detach()
@@ -48,7 +65,13 @@ class Indenter:
                 "right-handed orthonormal [3, 3]; `facing(direction)` makes one"
             )
 
+    @property
+    def kind(self) -> str:
+        """The body's name in a frame's truth: sphere, plane, mesh ..."""
+        return type(self).__name__.removesuffix("Indenter").lower()
+
     def local_distance(self, points: Tensor) -> Tensor:
+        """Signed distance of points given in the body's own frame, `[..., 3]` to `[...]`."""
         raise NotImplementedError
 
     def distance(self, points: Tensor) -> Tensor:
@@ -67,11 +90,12 @@ class Indenter:
             (normal,) = torch.autograd.grad(distance.sum(), points, create_graph=True)
         return distance, normal
 
-    def at(self, translation, rotation=None) -> "Indenter":
-        """The same body at another place."""
-        return replace(self, translation=translation, rotation=self.rotation if rotation is None else rotation)
+    def at(self, translation: Vector, rotation: Tensor | None = None) -> "Indenter":
+        """The same body at another place, `translation [3]`, turned by `rotation [3, 3]` (default: as before)."""
+        place = torch.as_tensor(translation, dtype=torch.float64)
+        return replace(self, translation=place, rotation=self.rotation if rotation is None else rotation)
 
-    def moved(self, offset) -> "Indenter":
+    def moved(self, offset: Vector) -> "Indenter":
         """The same body, translated by `offset [3]`."""
         return self.at(self.translation + torch.as_tensor(offset, dtype=torch.float64))
 
@@ -81,11 +105,17 @@ class Indenter:
         rotation = torch.from_numpy(Slerp([0, 1], turns)(share).as_matrix().copy())
         return self.at(torch.lerp(self.translation, other.translation, share), rotation)
 
-    def touching(self, membrane: Membrane, direction) -> "Indenter":
-        """The body moved along `direction [3]` from far outside until it just touches the rest surface's vertices.
+    def touching(self, membrane: Membrane, direction: Vector) -> "Indenter":
+        """The body moved from far outside until it just touches the rest surface's vertices.
 
-        Conservative advancement: a step by the smallest distance never goes too far. Raises where it passes by
-        or faces away.
+        Conservative advancement: a step by the smallest distance never goes too far.
+
+        Args:
+            membrane: at rest.
+            direction: `[3]`, along which it moves.
+
+        Raises:
+            MembraneError: it passes by, or faces away.
         """
         d = torch.nn.functional.normalize(torch.as_tensor(direction, dtype=torch.float64), dim=-1)
         far = float((membrane.rest - self.translation).norm(dim=-1).max()) + membrane.size
@@ -102,7 +132,7 @@ class Indenter:
             "outside; expected a body that faces it: change the direction, turn the body, or move it sideways"
         )
 
-    def _positive(self, **values) -> None:
+    def _positive(self, **values: Tensor | float) -> None:
         for name, value in values.items():
             if not (torch.as_tensor(value) > 0).all():
                 raise MembraneError(f"{type(self).__name__}: {name} = {value}; expected a positive length")
@@ -110,15 +140,19 @@ class Indenter:
 
 @dataclass(frozen=True, eq=False)
 class Sphere(Indenter):
-    """A ball of `radius` around the origin.
+    """A ball around the origin.
 
-    >>> Sphere(2.0, translation=(0, 0, 5)).distance(torch.tensor([0.0, 0, 10])).item()
-    3.0
+    Args:
+        radius: length unit.
+
+    Example:
+        >>> Sphere(2.0, translation=(0, 0, 5)).distance(torch.tensor([0.0, 0, 10])).item()
+        3.0
     """
 
     radius: float
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
         self._positive(radius=self.radius)
 
@@ -130,8 +164,9 @@ class Sphere(Indenter):
 class Plane(Indenter):
     """The half space `z <= 0`: a plate that presses along its outward normal, the third axis of its rotation.
 
-    >>> Plane(rotation=facing((0, 0, -1))).distance(torch.tensor([0.0, 0, 10])).item()
-    -10.0
+    Example:
+        >>> Plane(rotation=facing((0, 0, -1))).distance(torch.tensor([0.0, 0, 10])).item()
+        -10.0
     """
 
     def local_distance(self, points: Tensor) -> Tensor:
@@ -140,13 +175,23 @@ class Plane(Indenter):
 
 @dataclass(frozen=True, eq=False)
 class Cylinder(Indenter):
-    """A cylinder of `radius` about `axis [3]` through the origin, endless, or `length` long with flat ends."""
+    """A cylinder about an axis through the origin.
+
+    Args:
+        radius: length unit.
+        axis: its direction, `[3]`; default: x.
+        length: between its flat ends; default: endless.
+
+    Example:
+        >>> Cylinder(2.0, length=6.0).distance(torch.tensor([[0.0, 0, 4], [6.0, 0, 0]])).tolist()
+        [2.0, 3.0]
+    """
 
     radius: float
-    axis: Tensor = (1.0, 0.0, 0.0)
+    axis: Tensor = field(default_factory=lambda: torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
     length: float | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
         self._positive(radius=self.radius, **({} if self.length is None else {"length": self.length}))
         axis = torch.as_tensor(self.axis, dtype=torch.float64)
@@ -159,17 +204,26 @@ class Cylinder(Indenter):
         across = norm(points - along * self.axis) - self.radius
         if self.length is None:
             return across
-        return _box(torch.stack([across, along.squeeze(-1).abs() - self.length / 2], -1))
+        return box_distance(torch.stack([across, along.squeeze(-1).abs() - self.length / 2], -1))
 
 
 @dataclass(frozen=True, eq=False)
 class Wedge(Indenter):
-    """A straight edge along x, its tip at the origin pointing to +z, `opening` degrees wide and rounded with `radius`."""
+    """A straight edge along x, its tip at the origin pointing to +z.
+
+    Args:
+        opening: between its flanks, degrees.
+        radius: of its rounded edge, length unit.
+
+    Example:
+        >>> round(Wedge(90.0, 0.5).distance(torch.tensor([0.0, 0, 2])).item(), 6)
+        2.0
+    """
 
     opening: float
     radius: float
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
         self._positive(radius=self.radius)
         if not 0 < self.opening < 180:
@@ -184,12 +238,21 @@ class Wedge(Indenter):
 
 @dataclass(frozen=True, eq=False)
 class Box(Indenter):
-    """A box of side lengths `sides [3]` around the origin, its edges and corners rounded with `radius`."""
+    """A box around the origin, its edges and corners rounded.
+
+    Args:
+        sides: `[3]`, length unit.
+        radius: of edges and corners.
+
+    Example:
+        >>> Box((4.0, 4.0, 2.0), 0.5).distance(torch.tensor([[0.0, 0, 3], [0.0, 0, 0]])).tolist()
+        [2.0, -1.0]
+    """
 
     sides: Tensor
     radius: float
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
         self._positive(radius=self.radius)
         object.__setattr__(self, "sides", torch.as_tensor(self.sides, dtype=torch.float64))
@@ -197,16 +260,25 @@ class Box(Indenter):
             raise MembraneError(f"Box: sides {self.sides.tolist()}, radius {self.radius}; expected three sides >= 2 radius")
 
     def local_distance(self, points: Tensor) -> Tensor:
-        return _box(points.abs() - (self.sides / 2 - self.radius)) - self.radius
+        return box_distance(points.abs() - (self.sides / 2 - self.radius)) - self.radius
 
 
 @dataclass(frozen=True, eq=False)
 class Union(Indenter):
-    """Several bodies, `parts`, joined to one rigid body."""
+    """Several bodies joined to one rigid body.
+
+    Args:
+        parts: the bodies, each in its pose within the whole.
+
+    Example:
+        >>> pair = Union([Sphere(1.0, translation=(-2, 0, 0)), Sphere(1.0, translation=(2, 0, 0))])
+        >>> pair.distance(torch.tensor([5.0, 0, 0])).item()
+        2.0
+    """
 
     parts: Sequence[Indenter]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
         if not self.parts:
             raise MembraneError("Union: no parts; expected at least one indenter")
@@ -215,83 +287,12 @@ class Union(Indenter):
         return torch.stack([part.distance(points) for part in self.parts], -1).amin(-1)
 
 
-@dataclass(frozen=True, eq=False)
-class Mesh(Indenter):
-    """A closed triangle mesh: `vertices [N, 3]`, `triangles [M, 3]` wound outwards; through trimesh (extra `mesh`).
-
-    Exact within the mesh's bounding box, enlarged by a quarter of its longest side; farther away the distance to that box's
-    content, a lower bound. The normal turns at edges without being differentiable there.
-    """
-
-    vertices: np.ndarray
-    triangles: np.ndarray
-
-    def __post_init__(self):
-        super().__post_init__()
-        body = _trimesh().Trimesh(np.asarray(self.vertices, float), np.asarray(self.triangles), process=True)
-        if not body.is_volume:
-            raise MembraneError(
-                f"Mesh: {len(body.vertices)} vertices, {len(body.faces)} triangles, watertight: {body.is_watertight}; "
-                "expected a closed mesh wound outwards: repair it"
-            )
-        object.__setattr__(self, "_body", body)
-        object.__setattr__(self, "_normals", _feature_normals(body))
-
-    @classmethod
-    def read(cls, path, **pose) -> "Mesh":
-        """The closed mesh in a file (STL, OBJ, PLY ...), in the file's own length unit."""
-        body = _trimesh().load_mesh(path)
-        return cls(body.vertices, body.faces, **pose)
-
-    def local_distance(self, points: Tensor) -> Tensor:
-        low, high = torch.from_numpy(self._body.bounds.copy()).to(points)
-        box = _box((points - (low + high) / 2).abs() - (high - low) / 2)
-        near = box.detach() < (high - low).max() / 4
-        closest, normal = self._closest(points[near].detach().double().numpy())
-        exact = ((points[near] - torch.from_numpy(closest).to(points)) * torch.from_numpy(normal).to(points)).sum(-1)
-        return box.masked_scatter(near, exact)
-
-    def _closest(self, points):
-        """Closest surface points and the distance's gradient, its sign by the feature's normal (Baerentzen, Aanaes 2005)."""
-        if not len(points):
-            return points, points
-        closest, distance, triangle = self._body.nearest.on_surface(points)
-        weights = _trimesh().triangles.points_to_barycentric(self._body.triangles[triangle], closest)
-        least, most = weights.min(1), weights.max(1)
-        feature = np.where(most > 1 - 1e-6, 4 + weights.argmax(1), np.where(least < 1e-6, 1 + weights.argmin(1), 0))
-        outward = self._normals[triangle, feature]
-        away = points - closest
-        side = np.where((away * outward).sum(1) < 0, -1.0, 1.0)
-        on_surface = distance < 1e-9 * self._body.scale
-        return closest, np.where(on_surface[:, None], outward, (side / np.maximum(distance, 1e-300))[:, None] * away)
-
-
-def _feature_normals(body) -> np.ndarray:
-    """Unit normals `[M, 7, 3]` of each triangle, the edges opposite its corners, and its corners (weighted by angle)."""
-    faces = body.face_normals
-    edges = np.zeros((len(body.edges_unique), 3))
-    np.add.at(edges, body.faces_unique_edges, faces[:, None])
-    normals = np.concatenate(
-        [faces[:, None], edges[np.roll(body.faces_unique_edges, -1, 1)], body.vertex_normals[body.faces]], axis=1
-    )
-    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-
-
-def _trimesh():
-    try:
-        import rtree  # noqa: F401
-        import trimesh
-    except ImportError as error:
-        raise MembraneError(f"Mesh: {error.name} is missing; install the extra: pip install torchmembrane[mesh]") from error
-    return trimesh
-
-
 def norm(vectors: Tensor) -> Tensor:
     """Length `[...]`; zero, with zero gradient, for the zero vector."""
     square = (vectors * vectors).sum(-1)
     return torch.where(square > 0, square, 1).sqrt() * (square > 0)
 
 
-def _box(excess: Tensor) -> Tensor:
-    """Distance to a box by how far a point exceeds each side, `[..., C]` to `[...]`."""
+def box_distance(excess: Tensor) -> Tensor:
+    """Signed distance to a box by how far a point exceeds each side, `[..., C]` to `[...]`."""
     return norm(excess.clamp_min(0)) + excess.amax(-1).clamp_max(0)

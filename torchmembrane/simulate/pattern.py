@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..errors import MembraneError
@@ -17,7 +18,13 @@ WAVES = 96  # of a speckle
 
 
 class Canvas(NamedTuple):
-    """The rest surface as it is painted on: `vertices [V, 3]`, their `pixels [V, 2]`, the grey of `white` there `[V]`."""
+    """The rest surface as it is painted on.
+
+    Attributes:
+        vertices: `[V, 3]`.
+        pixels: where they are in the image, `[V, 2]`.
+        white: grey of a white membrane there, `[V]`.
+    """
 
     vertices: Tensor
     pixels: Tensor
@@ -30,7 +37,19 @@ class Dots:
 
     A disc is all material whose rest distance from `positions[d]`, in the tangent plane there, is at most `radii[d]`.
 
-    positions: `[D, 3]` at rest; radii: `[D]`, length unit; missing: dots that are not painted; ground: around them.
+    Args:
+        positions: centres at rest, `[D, 3]`, length unit.
+        radii: `[D]`, length unit.
+        missing: dots that are not painted.
+        ink: reflectance of the discs.
+        ground: reflectance around them.
+
+    Raises:
+        MembraneError: radii, reflectances or missing dots that make no sense.
+
+    Example:
+        >>> Dots(np.zeros((2, 3)), np.array([0.3, 0.5]), missing=[1]).described()
+        {'dot_radii': [0.3, 0.5], 'missing': [1], 'ink': 0.12}
     """
 
     positions: np.ndarray
@@ -40,7 +59,7 @@ class Dots:
     ground: float = 1.0
     cell = 2.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         object.__setattr__(self, "positions", np.asarray(self.positions, float))
         object.__setattr__(self, "radii", np.asarray(self.radii, float))
         count = len(self.positions)
@@ -52,27 +71,44 @@ class Dots:
             raise MembraneError(f"Dots: missing = {list(self.missing)}; expected numbers of dots, 0 to {count - 1}")
 
     @classmethod
-    def of(cls, sensor: Sensor, radii: tuple[float, float] | None = None, missing: Sequence[int] = ()) -> "Dots":
+    def of(cls, sensor: Sensor, radii: Sequence[float] | None = None, missing: Sequence[int] = ()) -> "Dots":
         """The dots that a sensor lists; `radii` of small and large ones, default 0.16 and 0.27 of their spacing."""
         positions, sizes = sensor.markers.positions, sensor.markers.sizes
+        if positions is None or sizes is None:
+            raise MembraneError(f"sensor {sensor.name!r} lists no dots; expected markers.file with their rest positions")
         spacing = (float(sensor.membrane.rest_area.sum()) / len(positions)) ** 0.5
         default = [share * spacing for share in DOT_RADIUS.values()]
         radius = dict(zip(DOT_RADIUS, radii or default, strict=True))
         tones = {"dark": (0.12, 1.0), "light": (1.0, 0.2)}[sensor.markers.polarity]
-        return cls(positions, [radius[size] for size in sizes], tuple(missing), *tones)
+        return cls(positions, np.array([radius[size] for size in sizes]), tuple(missing), *tones)
 
-    def described(self) -> dict:
+    def described(self) -> dict[str, Any]:
+        """What a data set's settings keep of the pattern."""
         return {"dot_radii": sorted(set(self.radii.tolist())), "missing": list(self.missing), "ink": self.ink}
 
     def albedo(self, canvas: Canvas) -> Tensor:
+        """Reflectance `[V]` of the ground; discs are drawn sample by sample."""
         return torch.full_like(canvas.white, self.ground)
 
 
 @dataclass(frozen=True)
 class Speckle:
-    """Random grains of a mean `size` (length unit), the same for the same `seed`.
+    """Random grains, the same for the same `seed`.
 
     The sum of plane waves `cos(k . X + phase)` over rest positions X, 1.4 to 4 grains long, made steeper by tanh.
+
+    Args:
+        size: mean size of a grain, length unit.
+        seed: of the waves.
+        dark: reflectance of the darkest grains.
+
+    Raises:
+        MembraneError: a size that is not positive.
+
+    Example:
+        >>> canvas = Canvas(torch.rand(100, 3), torch.zeros(100, 2), torch.ones(100))
+        >>> bool((Speckle(0.1).albedo(canvas) >= 0.15).all())
+        True
     """
 
     size: float
@@ -80,11 +116,12 @@ class Speckle:
     dark: float = 0.15
     cell = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.size > 0:
             raise MembraneError(f"Speckle: size = {self.size}; expected a positive length")
 
     def albedo(self, canvas: Canvas) -> Tensor:
+        """Reflectance `[V]`."""
         rng = np.random.default_rng(self.seed)
         direction = rng.normal(size=(WAVES, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -97,15 +134,21 @@ class Speckle:
 
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """What a rest image `[height, width]` shows, taken onto the rest surface and freed of the light that falls on it."""
+    """What a rest image shows, taken onto the rest surface and freed of the light that falls on it.
+
+    Args:
+        image: the rest image, `[height, width]`, grey 0..1.
+    """
 
     image: np.ndarray
     cell = 1.0
 
-    def described(self) -> dict:
+    def described(self) -> dict[str, Any]:
+        """What a data set's settings keep of the pattern."""
         return {}
 
     def albedo(self, canvas: Canvas) -> Tensor:
+        """Reflectance `[V]`."""
         height, width = self.image.shape
         image = torch.from_numpy(self.image).to(canvas.white)
         place = (2 * canvas.pixels.nan_to_num(-1e3) + 1) / canvas.pixels.new_tensor([width, height]) - 1
@@ -113,10 +156,75 @@ class Painted:
         return (grey[0, 0, 0] / canvas.white.clamp_min(1e-3)).clamp(0, 2)
 
 
-def pattern_of(sensor: Sensor, radii: tuple[float, float] | None = None, missing: Sequence[int] = ()) -> Dots | Painted:
-    """A sensor's markers: the dots that it lists, else what its rest image shows."""
+def pattern_of(sensor: Sensor, radii: Sequence[float] | None = None, missing: Sequence[int] = ()) -> Dots | Painted:
+    """A sensor's markers: the dots that it lists, else what its rest image shows.
+
+    Args:
+        sensor: the sensor.
+        radii: of small and large dots, length unit; default: 0.16 and 0.27 of their spacing.
+        missing: dots that are not painted.
+
+    Raises:
+        MembraneError: radii or missing dots are given and the sensor lists none.
+
+    Example:
+        >>> from torchmembrane.presets import preset
+        >>> type(pattern_of(preset("bubble"))).__name__
+        'Dots'
+    """
     if sensor.markers.positions is not None:
         return Dots.of(sensor, radii, missing)
     if radii or len(missing):
         raise MembraneError(f"sensor {sensor.name!r} lists no dots; expected neither radii nor missing dots, or list them")
+    if sensor.markers.rest_image is None:
+        raise MembraneError(f"sensor {sensor.name!r} has neither listed dots nor a rest image; expected one of them, to paint")
     return Painted(sensor.markers.rest_image)
+
+
+def inside_unit_disc(place: Tensor, slope: Tensor) -> Tensor:
+    """How much of each sample lies within the unit disc, its outline taken as straight.
+
+    Args:
+        place: of the samples, in units of the disc's radius, `[S, 2]`.
+        slope: its derivative in the image, `[S, 2, 2]`.
+
+    Returns:
+        Shares, `[S]`.
+
+    Example:
+        >>> inside_unit_disc(torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]), 0.1 * torch.eye(2).expand(3, 2, 2)).tolist()
+        [1.0, 0.5, 0.0]
+    """
+    rho = place.norm(dim=-1).clamp_min(1e-6)
+    per_sample = (slope * (place / rho[:, None])[..., None]).sum(-2).norm(dim=-1).clamp_min(1e-12)
+    return (0.5 + (1 - rho) / per_sample).clamp(0, 1)
+
+
+def dot_coordinates(
+    corners: np.ndarray, positions: np.ndarray, normals: np.ndarray, radii: np.ndarray
+) -> tuple[Tensor, Tensor]:
+    """Triangles that a dot may touch, and their corners in its tangent plane.
+
+    Args:
+        corners: of the triangles, `[T, 3, 3]`.
+        positions: of the dots, `[D, 3]`.
+        normals: there, `[D, 3]`.
+        radii: `[D]`.
+
+    Returns:
+        Which triangles, `[T]` bool, and their corners in units of the dot's radius, `[I, 3, 2]`.
+    """
+    middle = corners.mean(1)
+    reach = np.linalg.norm(corners - middle[:, None], axis=-1).max(1)
+    nearest = cKDTree(positions).query(middle, k=min(4, len(positions)))
+    distance, dot = (np.asarray(a).reshape(len(middle), -1) for a in nearest)
+    best = (distance - radii[dot]).argmin(1)[:, None]
+    distance, dot = (np.take_along_axis(a, best, 1)[:, 0] for a in (distance, dot))
+    inked = distance < radii[dot] + 2 * reach
+    dot = dot[inked]
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    axes = np.stack([first, np.cross(normals, first)], -1) / radii[:, None, None]
+    place = (corners[inked] - positions[dot][:, None]) @ axes[dot]
+    return torch.from_numpy(inked), torch.from_numpy(place)

@@ -1,17 +1,38 @@
-"""Which triangle of a projected mesh is seen at every sample of an image: spans of rows, all triangles at once."""
+"""Which triangle of a projected mesh is visible at every sample of an image, and values that are linear on triangles.
+
+Triangles are cut into spans of rows, all of them at once.
+"""
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 
-def seen_triangles(corners: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
+def visible_triangles(corners: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
     """The nearest triangle that covers each point `(u, v)` of a grid of `height x width` integers.
 
     A triangle covers the points on its edges that face left or up, so that neighbours neither overlap nor leave gaps.
 
-    Arguments: `corners [T, 3, 2]`: only triangles that turn from +u to +v are seen, which those of an outward surface do from
-    inside, and none with a corner that is NaN; `depth [T]`, one for each triangle.
-    Returns indices of triangles, int64 `[height, width]`, -1 where there is none. Wrong where triangles pierce each other.
+    Args:
+        corners: `[T, 3, 2]`. Only triangles that turn from +u to +v are visible, which those of an outward surface do from
+            inside, and none with a corner that is NaN.
+        depth: `[T]`, one for each triangle.
+        width: of the image.
+        height: of the image.
+
+    Returns:
+        Indices of triangles, int64 `[height, width]`, -1 where there is none.
+
+    Limitations:
+        Triangles that pierce each other are ordered by `depth`, not at every point.
+
+    Example:
+        >>> corners = torch.tensor([[[0.0, 0], [3, 0], [0, 3]]])
+        >>> visible_triangles(corners, torch.ones(1), 4, 3)
+        tensor([[ 0,  0,  0, -1],
+                [ 0,  0, -1, -1],
+                [ 0, -1, -1, -1]])
     """
     u, v = corners.unbind(-1)
     turns = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (v[:, 1] - v[:, 0]) * (u[:, 2] - u[:, 0])
@@ -31,7 +52,7 @@ def seen_triangles(corners: Tensor, depth: Tensor, width: int, height: int) -> T
 def _spans(corners: Tensor, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Every row that a triangle meets: triangle, row, and the u between which it lies there, `[S]` each.
 
-    Edges are followed from their upper end, by whichever triangle, so that both triangles of an edge see it at the same u.
+    Edges are followed from their upper end, by whichever triangle, so that both triangles of an edge have it at the same u.
     """
     corners = corners.gather(1, corners[..., 1].argsort(dim=1, stable=True)[..., None].expand(-1, -1, 2))
     top, middle, bottom = corners.unbind(1)
@@ -54,4 +75,33 @@ def _line(upper: Tensor, lower: Tensor) -> Tensor:
 
 
 def _u_at(line: Tensor, v: Tensor) -> Tensor:
+    """The u of lines `[S, 3]` at `v [S]`."""
     return line[:, 0] + (v - line[:, 1]) * line[:, 2]
+
+
+class LinearOnTriangles(NamedTuple):
+    """Values that are linear on triangles in the image: `value + slope (place - corner)`, float32.
+
+    Attributes:
+        value: `[T, C]`, at each triangle's first corner.
+        slope: `[T, C, 2]`, their derivative in the image.
+        corner: `[T, 2]`, the first corner.
+    """
+
+    value: Tensor
+    slope: Tensor
+    corner: Tensor
+
+    @classmethod
+    def of(cls, corners: Tensor, values: Tensor) -> "LinearOnTriangles":
+        """From corners `[T, 3, 2]` and the values there `[T, 3, C]`."""
+        (a, b), (c, d) = ((corners[:, k] - corners[:, 0]).unbind(-1) for k in (1, 2))
+        det = a * d - b * c
+        inverse = torch.stack([d, -b, -c, a], -1).unflatten(-1, (2, 2)) / torch.where(det == 0, 1.0, det)[:, None, None]
+        rise = (values[:, 1:] - values[:, :1]).mT
+        return cls(values[:, 0].float(), (rise @ inverse.mT).float(), corners[:, 0].float())
+
+    def at(self, triangle: Tensor, place: Tensor) -> Tensor:
+        """Values `[S, C]` at the points `place [S, 2]` of the image in `triangle [S]`."""
+        step = place - self.corner[triangle]
+        return self.value[triangle] + (self.slope[triangle] * step[:, None]).sum(-1)

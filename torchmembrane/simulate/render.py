@@ -1,31 +1,36 @@
 """Images of a deformed membrane as its camera sees them: the pattern on the material, light, lens and chip.
 
 The surface is refined by bicubic splines until its facets are about as small as pixels, projected, and sampled `s x s` times a
-pixel; each sample finds the triangle it sees and, linear in it, place on the material and brightness.
+pixel; each sample finds the triangle that is visible there and, linear in it, place on the material and brightness.
 """
 
 import copy
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.interpolate import make_interp_spline
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..sensor.sensor import Sensor
-from ..surface.tangent import tangent_axes
-from .look import BRIGHT, Look, blurred, mirrored, scattered, vignette
-from .pattern import Canvas, Dots, Painted, Speckle, pattern_of
-from .raster import seen_triangles
+from .appearance import BRIGHT, DEFAULT_APPEARANCE, Appearance, blurred, diffuse_light, specular_light, vignette
+from .pattern import Canvas, Dots, Painted, Speckle, dot_coordinates, inside_unit_disc, pattern_of
+from .raster import LinearOnTriangles, visible_triangles
 
 FINEST_GRID = 513
 
 
-class SeenDots(NamedTuple):
-    """Dots of a deformed membrane: `positions [..., D, 3]`, the `pixels [..., D, 2]` of their centres, `visible [..., D]`."""
+class RenderedDots(NamedTuple):
+    """Dots of a deformed membrane.
+
+    Attributes:
+        positions: of their centres, `[..., D, 3]`.
+        pixels: of their centres, `[..., D, 2]`.
+        visible: `[..., D]` bool, in the image and not hidden.
+    """
 
     positions: Tensor
     pixels: Tensor
@@ -35,68 +40,98 @@ class SeenDots(NamedTuple):
 class Renderer(nn.Module):
     """Images of one sensor.
 
-    Arguments
-        sensor      camera, rest surface, and the markers from which comes the default pattern
-        grid        `(m, n)` of the vertices that will be drawn, default the sensor's solver grid
-        pattern     `Dots`, `Speckle` or `Painted`, default `pattern_of(sensor)`
-        look        light, lens and chip (noise is not added here: see `noisy`)
-        samples     s: samples along a pixel's side
+    Args:
+        sensor: camera, rest surface, and the markers from which comes the default pattern.
+        grid: `(m, n)` of the vertices that will be drawn; default: the sensor's solver grid.
+        pattern: `Dots`, `Speckle` or `Painted`; default: `pattern_of(sensor)`.
+        appearance: light, lens and chip; noise is not added here (see `noisy`).
+        samples: s, along a pixel's side.
 
-    Raises `MembraneError` where the rest surface is nowhere in the image.
+    Raises:
+        MembraneError: the rest surface is nowhere in the image.
 
-    >>> from torchmembrane.presets import preset
-    >>> sensor = preset("fingertip")
-    >>> Renderer(sensor)(sensor.membrane.rest).shape
-    torch.Size([480, 640])
+    Example:
+        >>> from torchmembrane.presets import preset
+        >>> sensor = preset("fingertip")
+        >>> Renderer(sensor, samples=1)(sensor.membrane.rest).shape
+        torch.Size([480, 640])
     """
 
-    def __init__(self, sensor: Sensor, grid=None, pattern: Dots | Speckle | Painted | None = None, look=Look(), samples=4):  # noqa: B008
+    coarse_rest: Tensor
+    spline_0: Tensor
+    spline_1: Tensor
+    lights: Tensor
+    unit_light: Tensor
+    rest_pixels: Tensor
+    albedo: Tensor
+    dot_vertices: Tensor
+    dot_weights: Tensor
+    dot_rest: Tensor
+    inked: Tensor
+    dot_place: Tensor
+    dot_row: Tensor
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        grid: Sequence[int] | None = None,
+        pattern: Dots | Speckle | Painted | None = None,
+        appearance: Appearance = DEFAULT_APPEARANCE,
+        samples: int = 4,
+    ) -> None:
         super().__init__()
-        self.camera, self.look, self.samples = copy.deepcopy(sensor.camera), look, samples
-        coarse = sensor.surface.membrane(tuple(grid or sensor.membrane.grid))
+        self.camera, self.appearance, self.samples = copy.deepcopy(sensor.camera), appearance, samples
+        m, n = grid or sensor.membrane.grid
+        coarse = sensor.surface.membrane((m, n))
         pattern = pattern or pattern_of(sensor)
         self.grid = coarse.grid
         self.surface = sensor.surface.membrane(_fine_grid(sensor, pattern.cell))
         self.register_buffer("coarse_rest", coarse.rest)
         for axis in (0, 1):
             self.register_buffer(f"spline_{axis}", _spline_matrix(coarse.grid[axis], self.surface.grid[axis]))
-        self.register_buffer("lights", look.lights_for(coarse))
+        self.register_buffer("lights", appearance.lights_for(coarse))
         self._expose()
         self._paint(pattern)
 
     def _expose(self) -> None:
+        """Scale the light so that the white membrane at rest is as grey as asked."""
         X, pixels = self.surface.rest, self.camera.point_to_pixel(self.surface.rest)
-        seen = ((pixels > -0.5) & (pixels < pixels.new_tensor(self.camera.image_size) - 0.5)).all(-1)
-        if not seen.any():
+        visible = ((pixels > -0.5) & (pixels < pixels.new_tensor(self.camera.image_size) - 0.5)).all(-1)
+        if not visible.any():
             raise MembraneError(
                 "Renderer: no part of the rest surface lies in the image; check the camera and the rest surface"
             )
-        light = scattered(X, -self.surface.rest_normals, self.lights)
-        self.register_buffer("unit_light", light[seen].quantile(BRIGHT).clamp_min(1e-12))
+        light = diffuse_light(X, -self.surface.rest_normals, self.lights)
+        self.register_buffer("unit_light", light[visible].quantile(BRIGHT).clamp_min(1e-12))
         self.register_buffer("rest_pixels", pixels)
 
-    def _paint(self, pattern) -> None:
+    def _paint(self, pattern: Dots | Speckle | Painted) -> None:
+        """Reflectances of the ground, and which triangles bear ink."""
         X, corners = self.surface.rest, self.surface.rest[self.surface.triangles]
-        white = self._light(X)[..., 0] * vignette(self.rest_pixels, self.camera, self.look.vignetting)
+        white = self._light(X)[..., 0] * vignette(self.rest_pixels, self.camera, self.appearance.vignetting)
         self.register_buffer("albedo", pattern.albedo(Canvas(X, self.rest_pixels, white)))
-        self.ink, dots = 1.0, pattern if isinstance(pattern, Dots) else None
-        positions = np.zeros((0, 3)) if dots is None else dots.positions
+        self.ink, dots = 1.0, pattern if isinstance(pattern, Dots) else Dots(np.zeros((0, 3)), np.zeros(0))
+        positions, missing = dots.positions, set(dots.missing)
         points = self.surface.closest_points(positions)
         self.register_buffer("dot_vertices", torch.from_numpy(points.vertices))
         self.register_buffer("dot_weights", torch.from_numpy(points.weights))
         self.register_buffer("dot_rest", torch.from_numpy(positions))
-        painted = [] if dots is None else [d for d in range(len(positions)) if d not in set(dots.missing)]
+        painted = [d for d in range(len(positions)) if d not in missing]
         inked, place = torch.zeros(len(corners), dtype=torch.bool), torch.zeros(0, 3, 2, dtype=torch.float64)
         if painted:
             self.ink = dots.ink / dots.ground
             normals = (self.surface.rest_normals[self.dot_vertices] * self.dot_weights[..., None]).sum(1).numpy()
-            inked, place = _dot_coordinates(corners.numpy(), positions[painted], normals[painted], dots.radii[painted])
+            inked, place = dot_coordinates(corners.numpy(), positions[painted], normals[painted], dots.radii[painted])
         self.register_buffer("inked", inked)
         self.register_buffer("dot_place", place)
         self.register_buffer("dot_row", inked.cumsum(0) - 1)
 
     def fine_vertices(self, vertices: Tensor) -> Tensor:
-        """The refined surface that is drawn: displacements by bicubic splines, `[..., V, 3]` to `[..., W, 3]`."""
+        """The refined surface that is drawn: displacements by bicubic splines, `[..., V, 3]` to `[..., W, 3]`.
+
+        Raises:
+            MembraneError: the vertices are not on the renderer's grid.
+        """
         if vertices.shape[-2:] != self.coarse_rest.shape:
             raise MembraneError(
                 f"Renderer: vertices {list(vertices.shape)}; expected [..., {len(self.coarse_rest)}, 3], on the grid "
@@ -106,138 +141,125 @@ class Renderer(nn.Module):
         fine = (self.spline_0 @ displacement @ self.spline_1.mT).movedim(-3, -1)
         return self.surface.rest + fine.flatten(-3, -2)
 
-    def dots(self, vertices: Tensor) -> SeenDots:
-        """Where the centres of the pattern's dots are and which of them are seen (in the image, and not hidden)."""
+    def dots(self, vertices: Tensor) -> RenderedDots:
+        """Where the centres of the pattern's dots are and which of them are visible, of the membrane at `[..., V, 3]`."""
         x = self.fine_vertices(vertices)
         displacement = ((x - self.surface.rest)[..., self.dot_vertices, :] * self.dot_weights[..., None]).sum(-2)
         positions = self.dot_rest + displacement
         pixels = self.camera.point_to_pixel(positions)
-        hidden = [self._seen_range(*pair) < 0.99 * p.norm(dim=-1) for *pair, p in _each(x, pixels, positions)]
+        hidden = [self._visible_range(*pair) < 0.99 * p.norm(dim=-1) for *pair, p in _each(x, pixels, positions)]
         size = pixels.new_tensor(self.camera.image_size)
         visible = ((pixels > -0.5) & (pixels < size - 0.5)).all(-1) & ~torch.stack(hidden).view(pixels.shape[:-1])
-        return SeenDots(positions, pixels, visible)
+        return RenderedDots(positions, pixels, visible)
 
     def forward(self, vertices: Tensor) -> Tensor:
-        """Images `[..., H, W]`, float32 in 0..1, of the membrane at `vertices [..., V, 3]` on the grid; no noise."""
+        """Images without noise.
+
+        Args:
+            vertices: of the membrane on the grid, `[..., V, 3]`.
+
+        Returns:
+            Images, `[..., H, W]`, float32 in 0..1.
+        """
         x = self.fine_vertices(vertices)
         light = self._light(x)
         images = torch.stack([self._sharp(*pair) for pair in _each(x, light)])
         images = images.view(*vertices.shape[:-2], *images.shape[-2:])
         width, height = self.camera.image_size
         v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-        images = images * vignette(torch.stack([u, v], -1).to(images), self.camera, self.look.vignetting)
-        return blurred(images, self.look.blur).clamp(0, 1)
+        images = images * vignette(torch.stack([u, v], -1).to(images), self.camera, self.appearance.vignetting)
+        return blurred(images, self.appearance.blur).clamp(0, 1)
 
     def depth(self, vertices: Tensor) -> Tensor:
-        """Depth images `[..., H, W]`: z along the axis of what is seen at each pixel's centre, NaN beside the membrane."""
+        """Depth images of the membrane: z along the axis of what is visible at each pixel's centre.
+
+        Args:
+            vertices: of the membrane on the grid, `[..., V, 3]`.
+
+        Returns:
+            Depths, length unit, `[..., H, W]`; NaN beside the membrane.
+        """
         images = [self._depth(x) for (x,) in _each(self.fine_vertices(vertices))]
         return torch.stack(images).view(*vertices.shape[:-2], *images[0].shape)
 
     def _depth(self, x: Tensor) -> Tensor:
-        corners, seen = self._seen(x, samples=1)
-        sample = torch.nonzero(seen.view(-1) >= 0).squeeze(-1)
-        place = torch.stack([sample % seen.shape[1], sample // seen.shape[1]], -1).float()
-        linear = _Linear.of(corners, x[self.surface.triangles][..., 2:])
-        image = torch.full(seen.shape, torch.nan, device=seen.device)
-        image.view(-1)[sample] = linear.at(seen.view(-1)[sample], place).squeeze(-1)
+        corners, visible = self._visible(x, samples=1)
+        sample = torch.nonzero(visible.view(-1) >= 0).squeeze(-1)
+        place = torch.stack([sample % visible.shape[1], sample // visible.shape[1]], -1).float()
+        linear = LinearOnTriangles.of(corners, x[self.surface.triangles][..., 2:])
+        image = torch.full(visible.shape, torch.nan, device=visible.device)
+        image.view(-1)[sample] = linear.at(visible.view(-1)[sample], place).squeeze(-1)
         return image
 
     def _light(self, x: Tensor) -> Tensor:
         """Grey of a white membrane and of the highlights on it, `[..., W, 2]`."""
-        look, inward = self.look, -self.surface.normals(x)
-        direct = scattered(x, inward, self.lights) / self.unit_light
+        appearance, inward = self.appearance, -self.surface.normals(x)
+        direct = diffuse_light(x, inward, self.lights) / self.unit_light
         shine = torch.zeros_like(direct)
-        if look.highlight:
-            shine = mirrored(x, inward, self.lights, look.shininess) / self.unit_light
-        return look.exposure * torch.stack([look.ambient + (1 - look.ambient) * direct, look.highlight * shine], -1)
+        if appearance.highlight:
+            shine = specular_light(x, inward, self.lights, appearance.shininess) / self.unit_light
+        return appearance.exposure * torch.stack(
+            [appearance.ambient + (1 - appearance.ambient) * direct, appearance.highlight * shine], -1
+        )
 
-    def _seen(self, x: Tensor, samples: int) -> tuple[Tensor, Tensor]:
-        """Corners `[T, 3, 2]` of the projected triangles in samples, and which of them each sample sees, `[H s, W s]`."""
+    def _visible(self, x: Tensor, samples: int) -> tuple[Tensor, Tensor]:
+        """Corners `[T, 3, 2]` of the projected triangles in samples, and which of them is visible in each, `[H s, W s]`."""
         width, height = self.camera.image_size
         corners = ((self.camera.point_to_pixel(x) + 0.5) * samples - 0.5)[self.surface.triangles]
         depth = x.norm(dim=-1)[self.surface.triangles].mean(-1)
-        return corners, seen_triangles(corners, depth, samples * width, samples * height)
+        return corners, visible_triangles(corners, depth, samples * width, samples * height)
 
-    def _seen_range(self, x: Tensor, pixels: Tensor) -> Tensor:
-        """How far one sees at `pixels [D, 2]`: to the farthest of the 3 x 3 pixels around each, `[D]`."""
-        _, seen = self._seen(x, samples=1)
-        ranges = F.pad(x.norm(dim=-1)[self.surface.triangles].mean(-1), (0, 1), value=torch.inf)[seen]
-        last = torch.tensor(seen.shape[::-1], device=seen.device) - 1
-        steps = torch.cartesian_prod(*2 * [torch.arange(-1, 2, device=seen.device)])
+    def _visible_range(self, x: Tensor, pixels: Tensor) -> Tensor:
+        """Range of what is visible at `pixels [D, 2]`: the farthest of the 3 x 3 pixels around each, `[D]`."""
+        _, visible = self._visible(x, samples=1)
+        ranges = F.pad(x.norm(dim=-1)[self.surface.triangles].mean(-1), (0, 1), value=torch.inf)[visible]
+        last = torch.tensor(visible.shape[::-1], device=visible.device) - 1
+        steps = torch.cartesian_prod(*2 * [torch.arange(-1, 2, device=visible.device)])
         around = pixels.nan_to_num(0.0).round().long() + steps[:, None]
         u, v = around.clamp_min(0).minimum(last).unbind(-1)
         return ranges[v, u].amax(0)
 
     def _sharp(self, x: Tensor, light: Tensor) -> Tensor:
         """One image `[H, W]` before lens and chip: the mean of the samples of each pixel."""
-        corners, seen = self._seen(x, self.samples)
-        sample = torch.nonzero(seen.view(-1) >= 0).squeeze(-1)
-        triangle = seen.view(-1)[sample]
-        place = torch.stack([sample % seen.shape[1], sample // seen.shape[1]], -1).float()
+        corners, visible = self._visible(x, self.samples)
+        sample = torch.nonzero(visible.view(-1) >= 0).squeeze(-1)
+        triangle = visible.view(-1)[sample]
+        place = torch.stack([sample % visible.shape[1], sample // visible.shape[1]], -1).float()
         brightness = torch.stack([self.albedo * light[:, 0], light[:, 1]], -1)[self.surface.triangles]
-        grey, shine = _Linear.of(corners, brightness).at(triangle, place).unbind(-1)
+        grey, shine = LinearOnTriangles.of(corners, brightness).at(triangle, place).unbind(-1)
         near = torch.nonzero(self.inked[triangle]).squeeze(-1)
         if len(near):
-            linear = _Linear.of(corners[self.inked], self.dot_place)
+            linear = LinearOnTriangles.of(corners[self.inked], self.dot_place)
             row = self.dot_row[triangle[near]]
-            covered = _inside_unit_disc(linear.at(row, place[near]), linear.slope[row])
+            covered = inside_unit_disc(linear.at(row, place[near]), linear.slope[row])
             grey[near] *= 1 + (self.ink - 1) * covered
-        image = torch.full(seen.shape, self.look.outside, device=seen.device)
+        image = torch.full(visible.shape, self.appearance.outside, device=visible.device)
         image.view(-1)[sample] = grey + shine
         return F.avg_pool2d(image[None, None], self.samples)[0, 0]
 
 
-class _Linear(NamedTuple):
-    """Values linear on triangles in the image: `value + slope (place - corner)`, float32, `[T, C]`, `[T, C, 2]`, `[T, 2]`."""
+def render(
+    sensor: Sensor,
+    vertices: Tensor,
+    grid: Sequence[int] | None = None,
+    pattern: Dots | Speckle | Painted | None = None,
+    appearance: Appearance = DEFAULT_APPEARANCE,
+    samples: int = 4,
+) -> Tensor:
+    """Images of a sensor's membrane.
 
-    value: Tensor
-    slope: Tensor
-    corner: Tensor
+    Args:
+        sensor: as of `Renderer`, as are the other arguments.
+        vertices: of the membrane on the grid, `[..., V, 3]`.
+        grid: of the vertices.
+        pattern: on the membrane.
+        appearance: light, lens and chip.
+        samples: along a pixel's side.
 
-    @classmethod
-    def of(cls, corners: Tensor, values: Tensor) -> "_Linear":
-        """From corners `[T, 3, 2]` and the values there `[T, 3, C]`."""
-        (a, b), (c, d) = ((corners[:, k] - corners[:, 0]).unbind(-1) for k in (1, 2))
-        det = a * d - b * c
-        inverse = torch.stack([d, -b, -c, a], -1).unflatten(-1, (2, 2)) / torch.where(det == 0, 1.0, det)[:, None, None]
-        rise = (values[:, 1:] - values[:, :1]).mT
-        return cls(values[:, 0].float(), (rise @ inverse.mT).float(), corners[:, 0].float())
-
-    def at(self, triangle: Tensor, place: Tensor) -> Tensor:
-        """Values `[S, C]` at `place [S, 2]` in `triangle [S]`."""
-        step = place - self.corner[triangle]
-        return self.value[triangle] + (self.slope[triangle] * step[:, None]).sum(-1)
-
-
-def render(sensor: Sensor, vertices: Tensor, grid=None, pattern=None, look=Look(), samples=4) -> Tensor:  # noqa: B008
-    """Images `[..., H, W]` of a sensor's membrane at `vertices [..., V, 3]`; arguments as of `Renderer`."""
-    return Renderer(sensor, grid, pattern, look, samples)(vertices)
-
-
-def _inside_unit_disc(place: Tensor, slope: Tensor) -> Tensor:
-    """How much of each sample lies within the unit disc, `[S]`, from its outline taken as straight.
-
-    Arguments: the samples' `place [S, 2]` in units of the disc's radius, and its derivative `[S, 2, 2]` in the image.
+    Returns:
+        Images, `[..., H, W]`, float32 in 0..1.
     """
-    rho = place.norm(dim=-1).clamp_min(1e-6)
-    per_sample = (slope * (place / rho[:, None])[..., None]).sum(-2).norm(dim=-1).clamp_min(1e-12)
-    return (0.5 + (1 - rho) / per_sample).clamp(0, 1)
-
-
-def _dot_coordinates(corners: np.ndarray, positions, normals, radii) -> tuple[Tensor, Tensor]:
-    """Triangles `[T]` bool that a dot may touch, and their corners in its tangent plane in units of its radius, `[I, 3, 2]`."""
-    middle = corners.mean(1)
-    reach = np.linalg.norm(corners - middle[:, None], axis=-1).max(1)
-    distance, dot = cKDTree(positions).query(middle, k=min(4, len(positions)))
-    distance, dot = distance.reshape(len(middle), -1), dot.reshape(len(middle), -1)
-    best = (distance - radii[dot]).argmin(1)[:, None]
-    distance, dot = (np.take_along_axis(a, best, 1)[:, 0] for a in (distance, dot))
-    inked = distance < radii[dot] + 2 * reach
-    dot = dot[inked]
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    axes = tangent_axes(normals).swapaxes(1, 2) / radii[:, None, None]
-    place = (corners[inked] - positions[dot][:, None]) @ axes[dot]
-    return torch.from_numpy(inked), torch.from_numpy(place)
+    return Renderer(sensor, grid, pattern, appearance, samples)(vertices)
 
 
 def _fine_grid(sensor: Sensor, cell: float) -> tuple[int, int]:
@@ -245,7 +267,8 @@ def _fine_grid(sensor: Sensor, cell: float) -> tuple[int, int]:
     m, n = sensor.membrane.grid
     pixels = sensor.camera.point_to_pixel(sensor.membrane.rest).unflatten(0, (m, n)).nan_to_num(0.0)
     steps = [pixels.diff(dim=axis).norm(dim=-1).amax(1 - axis).sum() for axis in (0, 1)]
-    return tuple(int(np.clip(float(length) / cell, size, FINEST_GRID)) + 1 for length, size in zip(steps, (m, n), strict=True))
+    fine = [int(np.clip(float(length) / cell, size, FINEST_GRID)) + 1 for length, size in zip(steps, (m, n), strict=True)]
+    return fine[0], fine[1]
 
 
 def _spline_matrix(coarse: int, fine: int) -> Tensor:
@@ -254,6 +277,6 @@ def _spline_matrix(coarse: int, fine: int) -> Tensor:
     return torch.from_numpy(spline(np.linspace(0, coarse - 1, fine)))
 
 
-def _each(*batches: Tensor):
+def _each(*batches: Tensor) -> Iterator[tuple[Tensor, ...]]:
     """The images of a batch one by one: an image is some million samples, enough to keep any device busy."""
     return zip(*(batch.reshape(-1, *batch.shape[-2:]) for batch in batches), strict=True)

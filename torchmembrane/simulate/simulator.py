@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from math import gcd
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,10 +13,10 @@ from ..errors import MembraneError
 from ..io.images import to_grey
 from ..sensor.factories import cavity_filling, elastic_energy
 from ..sensor.sensor import Sensor
+from .appearance import DEFAULT_APPEARANCE, Appearance, noisy
 from .indenters import Indenter
-from .look import Look, noisy
 from .pattern import pattern_of
-from .press import Press, presses
+from .quasi_static import Press, presses
 from .render import Renderer
 
 LEGS = ("push", "slide", "release")
@@ -27,11 +27,18 @@ LIFT = 0.05  # above the first touch, over the surface's size, where a release e
 class Stroke(NamedTuple):
     """One indenter's motion from its first touch, lengths in the sensor's unit.
 
-    indenter   where it first touches
-    travel     `[3]` unit vector along which it pushes
-    depth      how far
-    slide      `[3]` how it moves then
-    friction   Coulomb's coefficient
+    Attributes:
+        indenter: where it first touches.
+        travel: `[3]`, unit vector along which it pushes.
+        depth: how far.
+        slide: `[3]`, how it moves then.
+        friction: Coulomb's coefficient.
+
+    Example:
+        >>> from torchmembrane.simulate import Sphere
+        >>> stroke = Stroke(Sphere(4.0), np.array([0.0, 0.0, -1.0]), 2.0)
+        >>> [pose.translation[2].item() for pose in stroke.poses(["push", "release"], frames=2, lift=1.0)]
+        [-1.0, -2.0, -0.5, 1.0]
     """
 
     indenter: Indenter
@@ -42,28 +49,40 @@ class Stroke(NamedTuple):
 
     def poses(self, legs: Sequence[str], frames: int, lift: float) -> list[Indenter]:
         """`frames` evenly spaced poses on each of the `legs`, "push", "slide", "release"; the release ends `lift` above."""
-        offsets, here = [], np.zeros(3)
+        offsets: list[np.ndarray] = []
+        here = np.zeros(3)
         motion = {"push": self.depth * self.travel, "slide": self.slide, "release": -(self.depth + lift) * self.travel}
         for leg in legs:
             offsets += [here + motion[leg] * k / frames for k in range(1, frames + 1)]
             here = offsets[-1]
         return [self.indenter.moved(offset) for offset in offsets]
 
-    def described(self) -> dict:
+    def described(self) -> dict[str, Any]:
+        """The stroke as a frame's truth keeps it."""
         sizes = {
             key: np.asarray(value).tolist()
             for key, value in vars(self.indenter).items()
             if key in ("radius", "axis", "length", "opening", "sides")
         }
         return {
-            "indenter": type(self.indenter).__name__.lower(), **sizes, "travel": self.travel.tolist(), "depth": self.depth,
-            "slide": self.slide.tolist(), "friction": self.friction, "touch": self.indenter.translation.tolist(),
+            "indenter": self.indenter.kind,
+            **sizes,
+            "travel": self.travel.tolist(),
+            "depth": self.depth,
+            "slide": self.slide.tolist(),
+            "friction": self.friction,
+            "touch": self.indenter.translation.tolist(),
             "rotation": self.indenter.rotation.tolist(),
-        }  # fmt: skip
+        }
 
 
-class Frame(NamedTuple):
-    """`image [H, W]` uint8, and what is true in it, by the names of `Simulator.frame`."""
+class SimulatedFrame(NamedTuple):
+    """An image with what is true in it.
+
+    Attributes:
+        image: `[H, W]` uint8.
+        truth: arrays by the names of `Simulator.frame`.
+    """
 
     image: np.ndarray
     truth: dict[str, np.ndarray]
@@ -72,19 +91,35 @@ class Frame(NamedTuple):
 class Simulator:
     """Presses and images of one sensor.
 
-    Arguments
-        sensor     a `Sensor`
-        grid       of the equilibrium; default about 38 a side, finer than the solver's, no line in common but the rim
-        look       light, lens, chip
-        radii      of small and large dots, length unit; default as in `Dots.of`
-        missing    dots that are not painted
+    A gas without modulus acts as a liquid.
 
-    A gas without modulus acts as a liquid. Raises `MembraneError` for a grid that is the sensor's own.
+    Args:
+        sensor: the sensor.
+        grid: of the equilibrium; default: about 38 a side, finer than the solver's, no line in common but the rim.
+        appearance: light, lens and chip.
+        radii: of small and large dots, length unit; default: as in `Dots.of`.
+        missing: dots that are not painted.
+
+    Raises:
+        MembraneError: the grid is not finer than the sensor's own.
+
+    Example:
+        >>> from torchmembrane.presets import preset
+        >>> Simulator(preset("fingertip")).grid
+        (38, 38)
     """
 
-    def __init__(self, sensor: Sensor, grid=None, look=Look(), radii=None, missing=()):  # noqa: B008
-        self.sensor, self.look = sensor, look
-        self.grid = tuple(grid or map(_finer, sensor.membrane.grid))
+    def __init__(
+        self,
+        sensor: Sensor,
+        grid: Sequence[int] | None = None,
+        appearance: Appearance = DEFAULT_APPEARANCE,
+        radii: Sequence[float] | None = None,
+        missing: Sequence[int] = (),
+    ) -> None:
+        self.sensor, self.appearance = sensor, appearance
+        m, n = grid or map(_finer, sensor.membrane.grid)
+        self.grid = (m, n)
         if any(mine <= solver for mine, solver in zip(self.grid, sensor.membrane.grid, strict=True)):
             raise MembraneError(
                 f"Simulator: grid {list(self.grid)}; expected a finer one than the sensor's, {list(sensor.membrane.grid)}: "
@@ -94,22 +129,34 @@ class Simulator:
         self.elasticity = elastic_energy(sensor, self.membrane)
         self.cavity = cavity_filling(sensor, self.membrane)._asdict()
         self.pattern = pattern_of(sensor, radii, missing)
-        self.renderer = Renderer(sensor, self.grid, self.pattern, look)
+        self.renderer = Renderer(sensor, self.grid, self.pattern, appearance)
         self.rest_dots = self.renderer.dots(self.membrane.rest)
 
     def image(self, vertices: torch.Tensor, rng: np.random.Generator) -> np.ndarray:
         """The membrane at `vertices [V, 3]` as the chip delivers it, uint8 `[H, W]`; `rng` makes the noise."""
         with torch.no_grad():
-            return (255 * noisy(self.renderer(vertices), self.look.noise, rng)).round().byte().cpu().numpy()
+            return (255 * noisy(self.renderer(vertices), self.appearance.noise, rng)).round().byte().cpu().numpy()
 
     def rest_image(self) -> np.ndarray:
         """The image at rest, float32 `[H, W]`, as a sensor keeps it."""
         return to_grey(self.image(self.membrane.rest, np.random.default_rng(REST_NOISE)))
 
-    def presses(self, stroke: Stroke, legs: Sequence[str], frames: int = 1, increment=None) -> Iterator[Press]:
-        """Equilibria along a stroke; raises `MembraneError` where it never touches or the membrane cannot follow.
+    def presses(self, stroke: Stroke, legs: Sequence[str], frames: int = 1, increment: float | None = None) -> Iterator[Press]:
+        """Equilibria along a stroke.
 
         The motion starts at the first touch, which is no frame: with friction the force depends on the path from there.
+
+        Args:
+            stroke: the motion.
+            legs: of the stroke, some of "push", "slide", "release".
+            frames: on each leg.
+            increment: longest travel in one step; default: as of `presses`.
+
+        Yields:
+            The equilibrium at each frame.
+
+        Raises:
+            MembraneError: the indenter never touches, or the membrane cannot follow.
         """
         poses = [stroke.indenter, *stroke.poses(legs, frames, LIFT * self.membrane.size)]
         states = presses(self.membrane, self.elasticity, [poses], friction=stroke.friction, increment=increment, **self.cavity)
@@ -122,27 +169,43 @@ class Simulator:
         if not touched:
             raise MembraneError("simulate: the indenter never touches the membrane; expected a depth that presses it in")
 
-    def frame(self, state: Press, stroke: Stroke, rng: np.random.Generator) -> Frame:
+    def frame(self, state: Press, stroke: Stroke, rng: np.random.Generator) -> SimulatedFrame:
         """The image of an equilibrium and its truth.
 
-        dots_nominal, dots_deformed `[D, 3]`, uv_nominal, uv_deformed `[D, 2]` px (of the dots' centres: the centre of the
-        outline lies some 0.1 px from it), visible_nominal, visible_deformed `[D]`; vertices_nominal, vertices_deformed
-        `[V, 3]`, triangles `[T, 3]`, contact_mask `[V]`, traction `[V, 3]`; p, p0 pressure difference now and at rest; force
-        `[3]` on the membrane, force_each `[I, 3]`, contact_centroid_each `[I, 3]`; stroke: JSON.
+        Args:
+            state: the equilibrium.
+            stroke: that led to it.
+            rng: of the image's noise.
+
+        Returns:
+            The image with its truth: dots_nominal, dots_deformed `[D, 3]`, uv_nominal, uv_deformed `[D, 2]` px (of the dots'
+            centres: the centre of the outline lies some 0.1 px from it), visible_nominal, visible_deformed `[D]`;
+            vertices_nominal, vertices_deformed `[V, 3]`, triangles `[T, 3]`, contact_mask `[V]`, traction `[V, 3]`; p, p0
+            pressure difference now and at rest; force `[3]` on the membrane, force_each `[I, 3]`, contact_centroid_each
+            `[I, 3]`; stroke: JSON.
         """
         dots, rest = self.renderer.dots(state.vertices), self.rest_dots
         truth = {
-            "dots_nominal": rest.positions, "dots_deformed": dots.positions,
-            "uv_nominal": rest.pixels, "uv_deformed": dots.pixels,
-            "visible_nominal": rest.visible, "visible_deformed": dots.visible,
-            "vertices_nominal": self.membrane.rest, "vertices_deformed": state.vertices,
-            "triangles": self.membrane.triangles.int(), "contact_mask": state.contact, "traction": state.traction,
-            "p": state.pressure, "p0": state.rest_pressure,
-            "force": state.force, "force_each": state.forces, "contact_centroid_each": state.contact_points,
-        }  # fmt: skip
+            "dots_nominal": rest.positions,
+            "dots_deformed": dots.positions,
+            "uv_nominal": rest.pixels,
+            "uv_deformed": dots.pixels,
+            "visible_nominal": rest.visible,
+            "visible_deformed": dots.visible,
+            "vertices_nominal": self.membrane.rest,
+            "vertices_deformed": state.vertices,
+            "triangles": self.membrane.triangles.int(),
+            "contact_mask": state.contact,
+            "traction": state.traction,
+            "p": state.pressure,
+            "p0": state.rest_pressure,
+            "force": state.force,
+            "force_each": state.forces,
+            "contact_centroid_each": state.contact_points,
+        }
         arrays = {key: np.asarray(value) for key, value in truth.items()}
         arrays = {key: a.astype(np.float32) if a.dtype.kind == "f" else a for key, a in arrays.items()}
-        return Frame(self.image(state.vertices, rng), arrays | {"stroke": np.array(json.dumps(stroke.described()))})
+        return SimulatedFrame(self.image(state.vertices, rng), arrays | {"stroke": np.array(json.dumps(stroke.described()))})
 
 
 def _finer(count: int) -> int:

@@ -8,7 +8,8 @@ import numpy as np
 from ...calibrate.camera import CameraFit, Views, lens_from_views, ports_from_views
 from ...camera.model import Camera
 from ...errors import MembraneError
-from ...plot.calibration import Report, fit_figure
+from ...io.report import Report
+from ...plot.calibration import fit_figure
 from ...sensor.sensor import Sensor
 from ...targets import Checkerboard, DotBoard
 from .files import read_sensor, read_targets, write_calibrated

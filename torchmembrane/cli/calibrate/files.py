@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from ...calibrate.detection import find_target
 from ...errors import MembraneError
 from ...io.images import read_image
+from ...io.report import Report
 from ...jobs.inputs import find_inputs
-from ...plot.calibration import Report
 from ...presets import sensor_file
 from ...sensor.sensor import Sensor
 from ...targets import Checkerboard, DotBoard

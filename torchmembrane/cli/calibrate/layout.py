@@ -6,7 +6,7 @@ from dataclasses import replace
 from ...calibrate.layout import layout_for_pixels, pixel_lattice, read_pixels, write_layout, write_svg
 from ...errors import MembraneError
 from ...plot.calibration import layout_figure
-from ...plot.frames import save
+from ...plot.drawing import save
 from ...sensor.parts import Markers
 from .files import read_sensor
 

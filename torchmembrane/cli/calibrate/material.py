@@ -6,8 +6,9 @@ import numpy as np
 import torch
 
 from ...calibrate.material import STRETCHES, material_from_images
+from ...io.report import Report
 from ...jobs.inputs import find_inputs
-from ...plot.calibration import Report, material_figure
+from ...plot.calibration import material_figure
 from .files import read_forces, read_sensor, read_sensor_image, write_calibrated
 
 

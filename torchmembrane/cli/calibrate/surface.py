@@ -11,7 +11,8 @@ from ...calibrate.rest import rest_from_image
 from ...calibrate.surface import Correction, fine_surface
 from ...calibrate.views import rest_from_views
 from ...io.images import read_image
-from ...plot.calibration import Report, fit_figure, surface_figure
+from ...io.report import Report
+from ...plot.calibration import fit_figure, surface_figure
 from ...sensor.sensor import Sensor
 from .files import read_depth, read_motions, read_sensor, write_calibrated
 

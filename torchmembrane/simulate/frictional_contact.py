@@ -21,13 +21,19 @@ SAME_SIDE = 0.5  # cosine between an indenter's normals at one vertex before and
 
 
 class ActiveSet(NamedTuple):
-    """The touching vertices (`index [A]`) of a Newton step and their state, from which the law there is linear in the step.
+    """The touching vertices of a Newton step and their state, from which the law there is linear in the step.
 
-    phi `[A]`, n `[A, 3]`: distance and normal; slip `[A, 3]` so far; sticks `[A]`; e `[A, 3]`: direction of T where it slips;
-    turning `[A]`: stiffness against turning it.
+    Attributes:
+        vertices: `[A]`, which of the free vertices touch.
+        phi: `[A]`, their distance.
+        n: `[A, 3]`, the indenter's normal there.
+        slip: `[A, 3]`, so far.
+        sticks: `[A]` bool.
+        e: `[A, 3]`, direction of T where it slips.
+        turning: `[A]`, stiffness against turning that direction.
     """
 
-    index: Tensor
+    vertices: Tensor
     phi: Tensor
     n: Tensor
     slip: Tensor
@@ -36,11 +42,21 @@ class ActiveSet(NamedTuple):
     turning: Tensor
 
 
-class Contact(NamedTuple):
+class FrictionalContact(NamedTuple):
     """One indenter during one increment of its motion, against F free vertices `x [F, 3]`.
 
-    `normal [F]`: N; `tangential [F, 3]`: T; `anchor [F, 3]`: where the vertices would be had they stuck, which slip is
-    counted from; `weight`: c; `friction`: mu.
+    Attributes:
+        indenter: at the end of the increment.
+        normal: `[F]`, N, compressive positive.
+        tangential: `[F, 3]`, T.
+        anchor: `[F, 3]`, where the vertices would be had they stuck; slip is counted from there.
+        weight: c, force / length.
+        friction: mu.
+
+    Reference:
+        P. Alart, A. Curnier: A mixed formulation for frictional contact problems prone to Newton like solution methods, 1991.
+        S. Hueber, G. Stadler, B. Wohlmuth: A primal-dual active set algorithm for three-dimensional contact problems with
+        Coulomb friction, 2008.
     """
 
     indenter: Indenter
@@ -51,15 +67,17 @@ class Contact(NamedTuple):
     friction: float
 
     @classmethod
-    def begun(cls, indenter: Indenter, x: Tensor, weight: float, friction: float) -> "Contact":
+    def at_first_pose(cls, indenter: Indenter, x: Tensor, weight: float, friction: float) -> "FrictionalContact":
         """No force yet, the indenter at its first pose."""
         return cls(indenter, torch.zeros_like(x[:, 0]), torch.zeros_like(x), x, weight, friction)
 
-    def carried_to(self, pose: Indenter, x: Tensor) -> "Contact":
+    def carried_to(self, pose: Indenter, x: Tensor) -> "FrictionalContact":
         """The next increment: the indenter moves to `pose`, from an equilibrium `x` in which this contact held.
 
-        A vertex that it meets on the way is carried along only from where it is met. Raises `MembraneError` where the indenter
-        may overtake a vertex, which then would end up inside it, or on another side.
+        A vertex that it meets on the way is carried along only from where it is met.
+
+        Raises:
+            MembraneError: the indenter may overtake a vertex, which then would end up inside it, or on another side.
         """
         (before, n_before), (after, n_after) = (self._distance_and_normal(body, x) for body in (self.indenter, pose))
         turn = pose.rotation @ self.indenter.rotation.T
@@ -67,12 +85,12 @@ class Contact(NamedTuple):
         travel = along - x
         reached = (before < travel.norm(dim=-1)) & ((n_before * travel).sum(-1) > 0)
         if (reached & ((n_before * n_after).sum(-1) < SAME_SIDE)).any():
-            raise MembraneError("Contact: an indenter overtakes the membrane; expected smaller steps, which it can follow")
+            raise MembraneError("press: an indenter overtakes the membrane; expected smaller steps, which it can follow")
         met = (-after / (before - after).clamp_min(1e-300)).clamp(0, 1)
         share = torch.where(self.normal > 0, 1.0, met)[:, None]
         return self._replace(indenter=pose, tangential=self.tangential @ turn.T, anchor=x + share * travel)
 
-    def projected(self, x: Tensor) -> "Contact":
+    def projected(self, x: Tensor) -> "FrictionalContact":
         """The contact with the projections of N and T at `x`; in equilibrium they are N and T."""
         index, phi, n = self._touching(x)
         normal = self.normal[index] - self.weight * phi
@@ -86,13 +104,13 @@ class Contact(NamedTuple):
         n = self.indenter.normal(x[index]).detach()
         return torch.zeros_like(x).index_copy(0, index, self.normal[index, None] * n + self.tangential[index])
 
-    def distance_from(self, other: "Contact") -> float:
+    def distance_from(self, other: "FrictionalContact") -> float:
         """Largest difference of a nodal force component."""
         normal, tangential = self.normal - other.normal, self.tangential - other.tangential
         return float(torch.cat([normal, tangential.ravel()]).abs().max())
 
     def active_set(self, x: Tensor) -> ActiveSet:
-        """Who touches at `x`, and who of them sticks."""
+        """Which vertices touch at `x`, and which of them stick."""
         index, phi, n = self._touching(x)
         trial = self._trial(x, index, n)
         size, bound = norm(trial), self.friction * self.normal[index].clamp_min(0)
@@ -101,9 +119,9 @@ class Contact(NamedTuple):
         e = trial / size.clamp_min(1e-300)[:, None]
         return ActiveSet(index, phi, n, (x - self.anchor)[index], size <= bound, e, turning)
 
-    def linearised(self, active: ActiveSet, move: Tensor | float = 0.0) -> "Contact":
+    def linearised(self, active: ActiveSet, move: Tensor | float = 0.0) -> "FrictionalContact":
         """The contact with the forces that the law, linearised, gives the active vertices after a `move [F, 3]`."""
-        rigid, index, n, e = RIGID * self.weight, active.index, active.n, active.e
+        rigid, index, n, e = RIGID * self.weight, active.vertices, active.n, active.e
         move = torch.broadcast_to(torch.as_tensor(move, dtype=n.dtype), self.tangential.shape)[index]
         normal = self.normal[index] - rigid * (active.phi + (n * move).sum(-1))
         if self.friction == 0:
@@ -115,23 +133,22 @@ class Contact(NamedTuple):
 
     def stiffness_blocks(self, x: Tensor, active: ActiveSet) -> Tensor:
         """Minus the derivative of each vertex's linearised force in its own move, `[F, 3, 3]`; not symmetric with friction."""
-        outer = lambda p, q: p[:, :, None] * q[:, None, :]  # noqa: E731
-        rigid, index, n, e = RIGID * self.weight, active.index, active.n, active.e
-        blocks = rigid * outer(n, n) - self.normal[index, None, None] * self._curvature(x[index])
+        rigid, index, n, e = RIGID * self.weight, active.vertices, active.n, active.e
+        blocks = rigid * _outer(n, n) - self.normal[index, None, None] * self._curvature(x[index])
         if self.friction:
-            plane = torch.eye(3, dtype=x.dtype) - outer(n, n)
-            slips = self.friction * rigid * outer(e, n) + active.turning[:, None, None] * (plane - outer(e, e))
+            plane = torch.eye(3, dtype=x.dtype) - _outer(n, n)
+            slips = self.friction * rigid * _outer(e, n) + active.turning[:, None, None] * (plane - _outer(e, e))
             blocks = blocks + torch.where(active.sticks[:, None, None], rigid * plane, slips)
         return torch.zeros(len(x), 3, 3, dtype=x.dtype).index_copy(0, index, blocks)
 
     def held(self, x: Tensor, active: ActiveSet) -> Tensor:
-        """Forces `[F, 3]` at `x` if nobody else touches: N and T, less c times what penetrates, or slips though stuck."""
-        phi, n = self._distance_and_normal(self.indenter, x[active.index])
-        force = (self.normal[active.index] - self.weight * phi)[:, None] * n + self.tangential[active.index]
+        """Forces `[F, 3]` at `x` if no other vertex touches: N and T, less c times what penetrates, or slips though stuck."""
+        phi, n = self._distance_and_normal(self.indenter, x[active.vertices])
+        force = (self.normal[active.vertices] - self.weight * phi)[:, None] * n + self.tangential[active.vertices]
         if self.friction:
-            slip = _tangential((x - self.anchor)[active.index], n)
+            slip = _tangential((x - self.anchor)[active.vertices], n)
             force = force - self.weight * torch.where(active.sticks[:, None], slip, 0.0)
-        return torch.zeros_like(x).index_copy(0, active.index, force)
+        return torch.zeros_like(x).index_copy(0, active.vertices, force)
 
     @staticmethod
     def _distance_and_normal(body: Indenter, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -145,7 +162,7 @@ class Contact(NamedTuple):
     def _trial(self, x: Tensor, index: Tensor, n: Tensor) -> Tensor:
         return _tangential(self.tangential[index] - GENTLE * self.weight * (x - self.anchor)[index], n)
 
-    def _with(self, index: Tensor, normal: Tensor, tangential: Tensor) -> "Contact":
+    def _with(self, index: Tensor, normal: Tensor, tangential: Tensor) -> "FrictionalContact":
         zeros = torch.zeros_like
         return self._replace(
             normal=zeros(self.normal).index_copy(0, index, normal),
@@ -162,5 +179,11 @@ class Contact(NamedTuple):
         return torch.stack(rows, 1)
 
 
+def _outer(p: Tensor, q: Tensor) -> Tensor:
+    """`p q^T` of `[A, 3]` and `[A, 3]`, `[A, 3, 3]`."""
+    return p[:, :, None] * q[:, None, :]
+
+
 def _tangential(vectors: Tensor, n: Tensor) -> Tensor:
+    """The part of `vectors [A, 3]` across unit `n [A, 3]`."""
     return vectors - (vectors * n).sum(-1, keepdim=True) * n

@@ -1,0 +1,122 @@
+"""What a calibration found: values with standard deviations and correlations, as text and as JSON."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ..calibrate.fit import Fit
+
+HIGH_CORRELATION = 0.95  # above it two parameters are said to be hard to identify separately
+
+
+class Report(NamedTuple):
+    """A calibration's values, how sure they are, and the residuals that they leave.
+
+    Attributes:
+        title: what was calibrated.
+        names: `[n]`, the parameters.
+        units: `[n]`, theirs.
+        design: `[n]`, their values before.
+        values: `[n]`, as found.
+        deviations: `[n]`, standard deviations.
+        correlations: `[n, n]`.
+        pixels: `[N, 2]` px, of all points used.
+        residuals: `[N, 2]` px, there.
+        noise: standard deviation of one residual, px.
+        notes: lines for people.
+
+    Example:
+        >>> none = np.zeros((0, 2))
+        >>> numbers = np.array([[380.0], [385.3], [0.2]])
+        >>> found = Report("lens", ["fx"], ["px"], *numbers, np.eye(1), none, none, 0.0, [])
+        >>> print("\\n".join(found.lines))
+        lens
+          fx                 385.30000 ± 0.2       px      (before: 380)
+    """
+
+    title: str
+    names: list[str]
+    units: list[str]
+    design: np.ndarray
+    values: np.ndarray
+    deviations: np.ndarray
+    correlations: np.ndarray
+    pixels: np.ndarray
+    residuals: np.ndarray
+    noise: float
+    notes: list[str]
+
+    @classmethod
+    def of(
+        cls,
+        title: str,
+        names: Sequence[str],
+        units: Sequence[str],
+        design: np.ndarray,
+        fit: "Fit",
+        pixels: np.ndarray,
+        residuals: np.ndarray,
+        notes: Sequence[str] = (),
+    ) -> "Report":
+        """From a `Fit` whose first parameters are those of `names`; pixels and residuals `[..., 2]`, NaN where not used."""
+        n = len(names)
+        covariance, deviations = fit.covariance[:n, :n], fit.deviations[:n]
+        correlations = covariance / np.maximum(np.outer(deviations, deviations), 1e-300)
+        used = np.isfinite(residuals).all(-1)
+        return cls(
+            title,
+            list(names),
+            list(units),
+            np.asarray(design, float),
+            fit.values[:n],
+            deviations,
+            correlations,
+            pixels[used],
+            residuals[used],
+            fit.noise,
+            list(notes),
+        )
+
+    @classmethod
+    def without_parameters(cls, title: str, notes: Sequence[str] = ()) -> "Report":
+        """Of a calibration that gives a surface, and no parameters."""
+        numbers, none = np.zeros(0), np.zeros((0, 2))
+        return cls(title, [], [], numbers, numbers, numbers, np.zeros((0, 0)), none, none, 0.0, list(notes))
+
+    @property
+    def confounded(self) -> list[tuple[str, str, float]]:
+        """Pairs of parameters that the data hardly identify separately, with their correlation."""
+        rows, columns = np.nonzero(np.triu(np.abs(self.correlations) > HIGH_CORRELATION, 1))
+        return [(self.names[i], self.names[j], float(self.correlations[i, j])) for i, j in zip(rows, columns, strict=True)]
+
+    @property
+    def lines(self) -> list[str]:
+        """The report as text."""
+        rows = zip(self.names, self.values, self.deviations, self.units, self.design, strict=True)
+        lines = [f"  {name:<16}{value:>12.5f} ± {sd:<10.2g}{unit:<7} (before: {old:g})" for name, value, sd, unit, old in rows]
+        if len(self.residuals):
+            rms = float(np.sqrt((self.residuals**2).mean()))
+            lines.append(
+                f"  residuals: {len(self.residuals)} points, {rms:.3f} px rms, at most {np.abs(self.residuals).max():.3f} px"
+            )
+        lines += [f"  hard to identify separately: {a} and {b} (correlation {c:+.4f})" for a, b, c in self.confounded]
+        return [self.title, *lines, *(f"  {note}" for note in self.notes)]
+
+    def write(self, folder: Path) -> None:
+        """Write `report.json` in the folder, which is made if need be."""
+        rows = zip(self.names, self.values, self.deviations, self.units, self.design, strict=True)
+        content = {
+            "title": self.title,
+            "parameters": {n: dict(value=v, deviation=s, unit=u, before=b) for n, v, s, u, b in rows},
+            "correlations": self.correlations.tolist(),
+            "hardly_told_apart": self.confounded,
+            "points": len(self.residuals),
+            "noise_px": self.noise,
+            "notes": self.notes,
+        }
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "report.json").write_text(json.dumps(content, indent=1), encoding="utf-8")

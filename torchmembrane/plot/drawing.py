@@ -1,0 +1,110 @@
+"""What the figures share: colours, rows of panels, axes in pixels and in lengths, grids as lines; writing and showing.
+
+A figure here is a matplotlib `Figure` that belongs to no window, so that drawing needs no display.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec
+
+from ..io.atomic import whole_file
+from ..surface.topology import rim_loop
+
+BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # distinct with any colour vision
+Grid = tuple[int, int] | np.ndarray
+
+LINES = 16  # of a grid that are drawn each way, at most about
+
+
+def save(drawing: Figure, path: str | Path) -> None:
+    """Write a figure as PNG, whole or not at all.
+
+    Args:
+        drawing: the figure.
+        path: the file; its folder is made if need be.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     save(Figure(), Path(folder) / "empty.png")
+        ...     [path.name for path in Path(folder).iterdir()]
+        ['empty.png']
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as partial:
+        drawing.savefig(partial, format="png")
+
+
+def show(drawing: Figure) -> None:
+    """Open a window with the figure and wait until it is closed."""
+    from matplotlib import pyplot
+
+    window = pyplot.figure(figsize=tuple(drawing.get_size_inches()))
+    drawing.set_canvas(window.canvas)
+    window.canvas.figure = drawing
+    pyplot.show()
+
+
+def panels(count: int) -> tuple[Figure, GridSpec]:
+    """A figure with places for `count` panels in a row."""
+    drawing = Figure(figsize=(16 * count / 3, 6), dpi=100)
+    return drawing, drawing.add_gridspec(
+        1, count, left=0.135 / count, right=1 - 0.045 / count, top=0.87, bottom=0.19, wspace=0.2
+    )
+
+
+def image_axes(axes: Axes, size: np.ndarray | tuple[int, int], image: np.ndarray | None) -> None:
+    """Axes in pixels of an image of `size` (width, height), v downwards, over the image if there is one."""
+    width, height = size
+    if image is not None:
+        axes.imshow(image, cmap="gray", vmin=-1, vmax=1, interpolation="nearest")
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="u [px]", ylabel="v [px]")
+    axes.set_aspect("equal", anchor="N")
+
+
+def side_axes(axes: Axes, letter: str, unit: str) -> None:
+    """Axes of a side view: the axis `letter` to the right, z upwards."""
+    axes.set_aspect("equal", anchor="N")
+    axes.margins(0.06)
+    axes.set(xlabel=f"{letter} [{unit}]", ylabel=f"z, away from the camera [{unit}]")
+    axes.grid(lw=0.3, alpha=0.5)
+
+
+def legend_below(axes: Axes) -> None:
+    """The legend, below the axes."""
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=4, ncols=2, frameon=False)
+
+
+def few_lines(points: np.ndarray, grid: Grid) -> np.ndarray:
+    """Points `[V, 2]` of a grid as a lattice `[m, n, 2]` of at most about `LINES` lines each way."""
+    m, n = (max(1, (size - 1) // LINES) for size in grid)
+    return points.reshape(*grid, 2)[::m, ::n]
+
+
+def mesh_lines(points: np.ndarray, grid: Grid, **style) -> LineCollection:
+    """Rows and columns of a grid of points `[V, 2]`."""
+    lattice = few_lines(points, grid)
+    return LineCollection([*lattice, *lattice.swapaxes(0, 1)], **style)
+
+
+def line_through(vertex: int, X: np.ndarray, grid: Grid, across: int) -> np.ndarray:
+    """Of the row and the column of a vertex the one that runs along the axis `across`: vertex indices."""
+    index = np.arange(len(X)).reshape(grid)
+    i, j = divmod(vertex, grid[1])
+    return max(index[i], index[:, j], key=lambda line: np.ptp(X[line, across]))
+
+
+def closed_rim(grid: Grid) -> np.ndarray:
+    """Vertex indices once around the grid's border and back to the first.
+
+    Example:
+        >>> closed_rim((3, 3)).tolist()
+        [0, 3, 6, 7, 8, 5, 2, 1, 0]
+    """
+    m, n = grid
+    return np.append(rim_loop((int(m), int(n))), 0)

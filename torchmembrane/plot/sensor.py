@@ -1,0 +1,119 @@
+"""A sensor as it was understood: its rays from the side, its rest surface in space, its markers in the rest image."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from ..camera.model import Camera
+from ..sensor.sensor import Sensor
+from .drawing import (
+    BLUE,
+    GREY,
+    LINES,
+    VERMILION,
+    closed_rim,
+    image_axes,
+    legend_below,
+    line_through,
+    mesh_lines,
+    panels,
+    side_axes,
+)
+
+if TYPE_CHECKING:
+    from ..reconstruct import Reconstructor
+
+
+def sensor_figure(
+    sensor: Sensor, reconstructor: "Reconstructor | None" = None, frame: dict[str, np.ndarray] | None = None
+) -> Figure:
+    """Side view with rays, rest surface in space, and what is projected into the rest image.
+
+    Args:
+        sensor: the sensor.
+        reconstructor: its `Reconstructor`, if there is one: its markers are drawn.
+        frame: the result of its rest image, if there is one: the markers found are drawn.
+
+    Returns:
+        A figure of three panels.
+
+    Example:
+        >>> from torchmembrane.presets import preset
+        >>> [axes.get_title() for axes in sensor_figure(preset("bubble")).axes]
+        ['From the side', 'Rest surface', 'Rest image']
+    """
+    drawing, places = panels(3)
+    drawing.suptitle(f"Sensor {sensor.name!r}", fontsize=14)
+    X, grid = sensor.membrane.rest.numpy(), sensor.membrane.grid
+    markers = sensor.markers.positions if reconstructor is None else reconstructor.rest_markers.cpu().numpy()
+    _draw_rays(drawing.add_subplot(places[0]), sensor, X)
+    _draw_space(drawing.add_subplot(places[1], projection="3d"), X, grid, markers, sensor.length_unit)
+    _draw_projection(drawing.add_subplot(places[2]), sensor, reconstructor, frame)
+    return drawing
+
+
+def _draw_rays(axes: Axes, sensor: Sensor, X: np.ndarray) -> None:
+    grid, (m, n) = sensor.membrane.grid, sensor.membrane.grid
+    across = int(np.ptp(X[:, 1]) > np.ptp(X[:, 0]))
+    plane, line = [across, 2], line_through(m // 2 * n + n // 2, X, grid, across)
+    axes.add_collection(mesh_lines(X[:, plane], grid, color=GREY, lw=0.6))
+    ends = X[line[:: max(1, len(line) // LINES)]]
+    path = np.stack([np.zeros_like(ends), ends], 1)
+    for number, port in enumerate(sensor.camera.ports):
+        label = "port" if number == 0 else None
+        axes.axhspan(port.distance, port.distance + port.thickness, color=BLUE, alpha=0.2, lw=0, label=label)
+        if number == len(sensor.camera.ports) - 1:
+            path = np.insert(path, 1, _leaves_port(sensor.camera, ends, port.distance + port.thickness), 1)
+    axes.add_collection(LineCollection([*path[..., plane]], colors=VERMILION, linewidths=0.8))
+    axes.plot([], [], color=VERMILION, lw=0.8, label="viewing rays")
+    axes.plot(*X[line][:, plane].T, color="k", lw=2, label="rest surface")
+    axes.plot(0, 0, "^", ms=11, color="k", label="camera")
+    side_axes(axes, "xy"[across], sensor.length_unit)
+    axes.set_title("From the side")
+    legend_below(axes)
+
+
+def _leaves_port(camera: Camera, points: np.ndarray, depth: float) -> np.ndarray:
+    """Where the rays to points `[N, 3]` cross the plane `z = depth`."""
+    with torch.no_grad():
+        origin, direction = (a.numpy() for a in camera.pixel_to_ray(camera.point_to_pixel(torch.from_numpy(points))))
+    return origin + direction * ((depth - origin[:, 2:]) / direction[:, 2:])
+
+
+def _draw_space(axes: Any, X: np.ndarray, grid: tuple[int, int], markers: np.ndarray | None, unit: str) -> None:
+    """The rest surface and its markers `[D, 3]` on three-dimensional axes."""
+    axes.plot_wireframe(*X.T.reshape(3, *grid), color=BLUE, lw=0.5, rcount=LINES + 1, ccount=LINES + 1)
+    if markers is not None:
+        size = 3 if len(markers) < 300 else 1.5
+        axes.plot(*np.asarray(markers).T, "o", ms=size, color="k", label=f"markers ({len(markers)})")
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.14), frameon=False)
+    axes.set_aspect("equal")
+    axes.set_box_aspect(axes.get_box_aspect(), zoom=0.85)
+    axes.locator_params(nbins=4)
+    axes.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]", zlabel=f"z [{unit}]")
+    axes.xaxis.labelpad = axes.yaxis.labelpad = 8
+    axes.view_init(elev=22, azim=-60)
+    axes.set_title("Rest surface")
+
+
+def _draw_projection(
+    axes: Axes, sensor: Sensor, reconstructor: "Reconstructor | None", frame: dict[str, np.ndarray] | None
+) -> None:
+    grid, image = sensor.membrane.grid, sensor.markers.rest_image
+    with torch.no_grad():
+        pixels = sensor.camera.point_to_pixel(sensor.membrane.rest).numpy()
+    image_axes(axes, sensor.camera.image_size, image)
+    axes.add_collection(mesh_lines(pixels, grid, color=BLUE, lw=0.4))
+    axes.plot(*pixels[closed_rim(grid)].T, color=BLUE, lw=1.8, label="rim and grid, projected")
+    if frame is not None and reconstructor is not None:
+        place, found = reconstructor.measured_rest.cpu().numpy(), frame["confidence"] > 0
+        size, label = 6 if len(found) < 300 else 2.5, f"markers found ({found.sum()})"
+        axes.plot(*place[found].T, "o", ms=size, mfc="none", mec=VERMILION, mew=1, label=label)
+        if not found.all():
+            axes.plot(*place[~found].T, "x", ms=7, mec="k", mew=1.6, label=f"not found ({(~found).sum()})")
+    axes.set_title("Rest image" if image is not None else "Image (no rest image)")
+    legend_below(axes)

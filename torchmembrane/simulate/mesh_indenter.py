@@ -1,0 +1,113 @@
+"""A rigid indenter given as a closed triangle mesh; through trimesh (extra `mesh`)."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import MembraneError
+from .indenters import Indenter, box_distance
+
+
+@dataclass(frozen=True, eq=False)
+class MeshIndenter(Indenter):
+    """A body with the surface of a closed triangle mesh.
+
+    Distances are exact within the mesh's bounding box, enlarged by a quarter of its longest side; farther away they are the
+    distance to that box's content, a lower bound. The normal turns at edges without being differentiable there.
+
+    Args:
+        vertices: `[N, 3]`, length unit.
+        triangles: `[M, 3]`, wound outwards.
+
+    Raises:
+        MembraneError: the mesh is not closed, or trimesh is not installed.
+
+    Reference:
+        J. A. Baerentzen, H. Aanaes: Signed distance computation using the angle weighted pseudonormal, 2005.
+
+    Example:
+        >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        >>> body = MeshIndenter(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+        >>> round(body.distance(torch.tensor([0.2, 0.2, -0.1])).item(), 6)
+        0.1
+    """
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+
+    _body: Any = field(init=False, repr=False)
+    _normals: np.ndarray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        body = _trimesh().Trimesh(np.asarray(self.vertices, float), np.asarray(self.triangles), process=True)
+        if not body.is_volume:
+            raise MembraneError(
+                f"MeshIndenter: {len(body.vertices)} vertices, {len(body.faces)} triangles, watertight: {body.is_watertight}; "
+                "expected a closed mesh wound outwards: repair it"
+            )
+        object.__setattr__(self, "_body", body)
+        object.__setattr__(self, "_normals", _feature_normals(body))
+
+    @classmethod
+    def read(cls, path: str | Path, **pose: Any) -> "MeshIndenter":
+        """The closed mesh in a file.
+
+        Args:
+            path: an STL, OBJ or PLY file, in the sensor's length unit.
+            pose: `translation`, `rotation`.
+
+        Raises:
+            MembraneError: the mesh is not closed, or trimesh is not installed.
+        """
+        body = _trimesh().load_mesh(path)
+        return cls(body.vertices, body.faces, **pose)
+
+    def local_distance(self, points: Tensor) -> Tensor:
+        low, high = torch.from_numpy(self._body.bounds.copy()).to(points)
+        box = box_distance((points - (low + high) / 2).abs() - (high - low) / 2)
+        near = box.detach() < (high - low).max() / 4
+        closest, normal = self._closest(points[near].detach().double().numpy())
+        exact = ((points[near] - torch.from_numpy(closest).to(points)) * torch.from_numpy(normal).to(points)).sum(-1)
+        return box.masked_scatter(near, exact)
+
+    def _closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Closest surface points and the distance's gradient, its sign by the feature's normal; `[P, 3]` each."""
+        if not len(points):
+            return points, points
+        closest, distance, triangle = self._body.nearest.on_surface(points)
+        weights = _trimesh().triangles.points_to_barycentric(self._body.triangles[triangle], closest)
+        least, most = weights.min(1), weights.max(1)
+        feature = np.where(most > 1 - 1e-6, 4 + weights.argmax(1), np.where(least < 1e-6, 1 + weights.argmin(1), 0))
+        outward = self._normals[triangle, feature]
+        away = points - closest
+        side = np.where((away * outward).sum(1) < 0, -1.0, 1.0)
+        on_surface = distance < 1e-9 * self._body.scale
+        return closest, np.where(on_surface[:, None], outward, (side / np.maximum(distance, 1e-300))[:, None] * away)
+
+
+def _feature_normals(body: Any) -> np.ndarray:
+    """Unit normals `[M, 7, 3]` of each triangle, the edges opposite its corners, and its corners (weighted by angle)."""
+    faces = body.face_normals
+    edges = np.zeros((len(body.edges_unique), 3))
+    np.add.at(edges, body.faces_unique_edges, faces[:, None])
+    normals = np.concatenate(
+        [faces[:, None], edges[np.roll(body.faces_unique_edges, -1, 1)], body.vertex_normals[body.faces]], axis=1
+    )
+    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+def _trimesh() -> ModuleType:
+    try:
+        import rtree  # noqa: F401
+        import trimesh
+    except ImportError as error:
+        raise MembraneError(
+            f"MeshIndenter: {error.name} is missing; install the extra: pip install torchmembrane[mesh]"
+        ) from error
+    return trimesh
