@@ -54,7 +54,7 @@ class Press(NamedTuple):
 def press(membrane: Membrane, elasticity: ElasticEnergy, paths, **options) -> Press:
     """The last state of `presses`, which takes the same arguments: a membrane pressed by indenters.
 
-    >>> from torchmembrane.shapes import spherical_cap
+    >>> from torchmembrane.surface.shapes import spherical_cap
     >>> from torchmembrane.simulate.indenters import Sphere
     >>> dome = spherical_cap(12, 9, 3, (9, 9))
     >>> ball = Sphere(4.0).touching(dome, (0, 0, -1))
