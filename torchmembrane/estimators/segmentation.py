@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..camera.model import Rays
 from ..errors import MembraneError
 from ..surface.membrane import Membrane
 from .base import Equilibrium, Observation
@@ -88,7 +89,7 @@ class Segmentation:
     Wrong when contacts are closer than about a fifth of the surface's size, and for the depth: see `MinimumEnergy`.
     """
 
-    def __init__(self, estimator: MinimumEnergy, rest_rays, count=4, rounds=8):
+    def __init__(self, estimator: MinimumEnergy, rest_rays: Rays | tuple[Tensor, Tensor], count: int = 4, rounds: int = 8):
         if rounds < 1:
             raise MembraneError(f"Segmentation: rounds = {rounds}; expected at least 1")
         self.estimator, self.membrane, self.count, self.rounds = estimator, estimator.membrane, count, rounds
@@ -113,8 +114,7 @@ class Segmentation:
 
     def by_polar_angle(self, directions: Tensor) -> Contacts:
         """Eq. 29 alone: contacts on the rest surface, for rays `[B, V, 3]`."""
-        moves = ~self.membrane.fixed
-        bulge = self.polar.bulge(directions) * moves
+        bulge = self.polar.bulge(directions) * ~self.membrane.fixed
         outward = self.divergence(directions)
         region = _regions(bulge, self.membrane, self.count)
         if self.axis_region is not None:
@@ -156,7 +156,7 @@ def _axis_region(membrane: Membrane) -> Tensor | None:
 def _regions(bulge: Tensor, membrane: Membrane, count: int) -> Tensor:
     """Numbered regions around the persistent peaks of `bulge [B, V]`, strongest first, `[B, V]`."""
     m, n = membrane.grid
-    neighbours = [[] for _ in range(m * n)]
+    neighbours: list[list[int]] = [[] for _ in range(m * n)]
     for a, b, c in membrane.triangles.tolist():
         for p, q in ((a, b), (b, c), (c, a)):
             neighbours[p].append(q)
@@ -171,7 +171,8 @@ def peaks(height: np.ndarray, neighbours: list[list[int]], count: int, least: fl
     Vertices join in order of height; where two hills meet, the lower one is part of the higher unless it stands above the
     saddle by `PERSISTENCE` of the highest. A region is what lies above `SHARE` of its own peak.
     """
-    hill, top = np.full(len(height), -1), {}
+    hill = np.full(len(height), -1)
+    top: dict[int, int] = {}
     highest = height.max()
     for vertex in np.argsort(-height):
         if height[vertex] < least:
