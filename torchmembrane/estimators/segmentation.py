@@ -141,7 +141,8 @@ class Segmentation:
         weight = bulge * self.membrane.rest_area
         numbers = torch.arange(1, self.count + 1)
         weight = weight[:, None] * (region[:, None] == numbers[:, None])
-        return weight @ x / weight.sum(-1, keepdim=True)
+        centroids: Tensor = weight @ x / weight.sum(-1, keepdim=True)
+        return centroids
 
 
 def _axis_region(membrane: Membrane) -> Tensor | None:
@@ -150,7 +151,7 @@ def _axis_region(membrane: Membrane) -> Tensor | None:
     if not np.isfinite(hit.distance[0]):
         return None
     centre = membrane.rest.new_tensor([0.0, 0.0, float(hit.distance[0])])
-    return (membrane.rest - centre).norm(dim=-1) < ON_AXIS * membrane.size
+    return torch.linalg.vector_norm(membrane.rest - centre, dim=-1) < ON_AXIS * membrane.size
 
 
 def _regions(bulge: Tensor, membrane: Membrane, count: int) -> Tensor:
@@ -174,10 +175,10 @@ def peaks(height: np.ndarray, neighbours: list[list[int]], count: int, least: fl
     hill = np.full(len(height), -1)
     top: dict[int, int] = {}
     highest = height.max()
-    for vertex in np.argsort(-height):
+    for vertex in np.argsort(-height).tolist():
         if height[vertex] < least:
             break
-        around = sorted({hill[k] for k in neighbours[vertex] if hill[k] >= 0}, key=lambda h: -height[top[h]])
+        around = sorted({int(hill[k]) for k in neighbours[vertex] if hill[k] >= 0}, key=lambda h: -height[top[h]])
         if not around:
             hill[vertex], top[vertex] = vertex, vertex
             continue

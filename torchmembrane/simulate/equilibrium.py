@@ -111,7 +111,7 @@ class EquilibriumProblem:
     """
 
     def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, cavity: Filling, load: Tensor | None = None) -> None:
-        self.membrane, self.elasticity, self.cavity, self.free = membrane, elasticity, cavity, membrane.free
+        self.membrane, self.elasticity, self.cavity, self.free = membrane, elasticity, cavity, membrane.free_vertices
         self.load = torch.zeros_like(membrane.rest) if load is None else load
         self.matrix = _SparsityPattern(membrane)
         modulus = float(2 * (elasticity.c1 + elasticity.c2) + elasticity.tension.abs())
