@@ -46,14 +46,19 @@ class Segmented(NamedTuple):
 class PolarAngle:
     """Eq. 29 for points of a rest surface: grid vertices or markers.
 
-    Arguments: `points [N, 3]` at rest, outward unit `normals [N, 3]` there, and their rest rays, `origins` and unit `directions
-    [N, 3]`.
-    Wrong where the rays run along the normals (a camera near the centre of curvature): an inward displacement does not turn
-    them, what is seen is the stretch around it.
+    Args:
+        points: `[N, 3]` at rest.
+        normals: outward unit normals there, `[N, 3]`.
+        origins: of their rest rays, `[N, 3]`.
+        directions: unit directions of their rest rays, `[N, 3]`.
+
+    Limitations:
+        Where the rays run along the normals (a camera near the centre of curvature) an inward displacement does not turn them:
+        only the stretch around it is visible.
     """
 
     def __init__(self, points: Tensor, normals: Tensor, origins: Tensor, directions: Tensor):
-        self.range = ((points - origins) * directions).sum(-1)
+        self.range: Tensor = ((points - origins) * directions).sum(-1)
         self.rest = polar_angle(directions)
         self.sign = torch.sign((normals * growing_polar_angle(directions)).sum(-1))
 
@@ -80,13 +85,19 @@ def growing_polar_angle(directions: Tensor) -> Tensor:
 class Segmentation:
     """Contacts from the rays of a sensor's grid vertices.
 
-    Arguments: the `MinimumEnergy` estimator, the rest rays of its vertices (`origins`, `directions [V, 3]`), and how many
-    contacts are reported. Calling it with the rays now, `[B, V, 3]` each, runs the loop:
+    Calling it with the rays now, `[B, V, 3]` each, runs the loop:
 
         regions that bulge in by eq. 29 (or the axis, where the flow diverges everywhere); then, until they stay,
         reconstruct with the smoother relaxed there, take the displacement along the surface's normals, and from it the regions.
 
-    Wrong when contacts are closer than about a fifth of the surface's size, and for the depth: see `MinimumEnergy`.
+    Args:
+        estimator: minimum energy on the sensor's grid.
+        rest_rays: the rest rays of its vertices, `origins` and `directions [V, 3]`.
+        count: how many contacts are reported.
+        rounds: of the loop at most.
+
+    Limitations:
+        Contacts closer than about a fifth of the surface's size are one; for the depth see `MinimumEnergy`.
     """
 
     def __init__(self, estimator: MinimumEnergy, rest_rays: Rays | tuple[Tensor, Tensor], count: int = 4, rounds: int = 8):
@@ -133,9 +144,10 @@ class Segmentation:
     def divergence(self, directions: Tensor) -> Tensor:
         """Outward share of the angular flow, `[B]`: 1 where every ray turns away from the axis, -1 where all turn to it."""
         turned = torch.linalg.vector_norm(directions - self.rest_directions, dim=-1)
-        reach = self.polar.range * ~self.membrane.fixed
+        reach: Tensor = self.polar.range * ~self.membrane.fixed
         least = LEAST * self.membrane.size
-        return -(reach * self.polar.change(directions)).sum(-1) / (reach * turned).sum(-1).clamp_min(least)
+        outward: Tensor = -(reach * self.polar.change(directions)).sum(-1) / (reach * turned).sum(-1).clamp_min(least)
+        return outward
 
     def _centroids(self, x: Tensor, region: Tensor, bulge: Tensor) -> Tensor:
         weight = bulge * self.membrane.rest_area
@@ -151,7 +163,8 @@ def _axis_region(membrane: Membrane) -> Tensor | None:
     if not np.isfinite(hit.distance[0]):
         return None
     centre = membrane.rest.new_tensor([0.0, 0.0, float(hit.distance[0])])
-    return torch.linalg.vector_norm(membrane.rest - centre, dim=-1) < ON_AXIS * membrane.size
+    near: Tensor = torch.linalg.vector_norm(membrane.rest - centre, dim=-1) < ON_AXIS * membrane.size
+    return near
 
 
 def _regions(bulge: Tensor, membrane: Membrane, count: int) -> Tensor:

@@ -202,7 +202,7 @@ class _SparsityPattern:
     """Sum of triangle blocks and free vertices' blocks on the free degrees of freedom, with a sparsity pattern found once."""
 
     def __init__(self, membrane: Membrane) -> None:
-        V, free = len(membrane.rest), membrane.free.numpy()
+        V, free = len(membrane.rest), membrane.free_vertices.numpy()
         number = np.full(V, -1)
         number[free] = np.arange(len(free))
         triangles = triangles_of(corners(torch.arange(V)[:, None], membrane.grid)).reshape(-1, 3).numpy()
