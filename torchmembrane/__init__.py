@@ -61,7 +61,7 @@ _HOMES = {
     "Tracker": "track",
     "export": "onnx.export",
     "preset": "presets",
-    "read_results": "io.store",
+    "read_results": "io.read",
 }
 _NAMESPACES = ("calibrate", "simulate")
 
