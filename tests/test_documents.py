@@ -1,14 +1,15 @@
-"""Changelog, guide for contributors and citation say what is there."""
+"""Changelog, guide for contributors, glossary and citation say what is there."""
 
 import re
 import tomllib
-from pathlib import Path
 
 import pytest
+from quoted_names import PAGES, ROOT, meant_by, quoted, quoted_paths
 
-ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 CHANGELOG = (ROOT / "CHANGELOG.md").read_text()
+GLOSSARY = (ROOT / "docs" / "glossary.md").read_text()
+MATHEMATICS = (ROOT / "docs" / "mathematics.md").read_text()
 MOVED = re.findall(r"^\| `(torchmembrane[\w.]*)` \| `(torchmembrane[\w.]*)` \|$", CHANGELOG, re.M)
 
 
@@ -107,3 +108,42 @@ def test_drawn_layers_are_the_checked_ones():
 def test_linked_files_exist(page):
     targets = re.findall(r"\]\(([^)#:]+)\)", (ROOT / page).read_text())
     assert targets and not [target for target in targets if not (ROOT / target).exists()]
+
+
+def glossary() -> list[tuple[str, list[str], list[str]]]:
+    """Of each line: the field's word, names of the code, symbols."""
+    rows = [
+        [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in GLOSSARY.splitlines() if line.startswith("| ")
+    ]
+    assert all(len(row) == 4 for row in rows)
+    return [(row[0], *(re.findall(r"`([^`]+)`", cell) for cell in row[2:])) for row in rows if row[0] != "the field's word"]
+
+
+FIELD_S_WORDS = """traction field; force distribution; shear; marker displacement; marker flow; reference; undeformed;
+no-contact; wrench; contact patch; contact mask; indentation depth; inverse finite elements; incipient slip; prestretch;
+marker-based visuotactile sensor; bearing; GNC; IRLS; tangent stiffness; one-ring"""
+
+
+@pytest.mark.parametrize("word", re.split(r";\s", FIELD_S_WORDS))
+def test_glossary_has_the_field_s_words(word):
+    assert any(word in row[0] for row in glossary())
+
+
+@pytest.mark.parametrize("word, names, symbols", glossary(), ids=lambda value: value if isinstance(value, str) else "")
+def test_glossary_names_the_code_and_the_symbols(word, names, symbols):
+    assert names
+    for name in names:
+        meant_by(name)
+    assert not [symbol for symbol in symbols if not re.search(rf"(?<!\w){re.escape(symbol)}(?!\w)", MATHEMATICS)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_named_code_exists(page):
+    for name in quoted(page.read_text()):
+        meant_by(name)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_named_files_exist(page):
+    folders = (ROOT, ROOT / "torchmembrane")
+    assert not [path for path in quoted_paths(page.read_text()) if not any((folder / path).exists() for folder in folders)]
