@@ -66,11 +66,33 @@ _HOMES = {
 _NAMESPACES = ("calibrate", "simulate")
 
 __all__ = [
-    "Camera", "Cavity", "ElasticEnergy", "Estimator", "ForceBalance", "ForceBalanceSettings", "Markers", "Material", "Membrane",
-    "MembraneError", "MinimumEnergy", "MinimumEnergySettings", "Port", "Reconstruction", "Reconstructor", "Sensor",
-    "StandardDeviations", "Status", "Surface", "Tracker", "__version__", "calibrate", "export", "preset", "read_results",
+    "Camera",
+    "Cavity",
+    "ElasticEnergy",
+    "Estimator",
+    "ForceBalance",
+    "ForceBalanceSettings",
+    "Markers",
+    "Material",
+    "Membrane",
+    "MembraneError",
+    "MinimumEnergy",
+    "MinimumEnergySettings",
+    "Port",
+    "Reconstruction",
+    "Reconstructor",
+    "Sensor",
+    "StandardDeviations",
+    "Status",
+    "Surface",
+    "Tracker",
+    "__version__",
+    "calibrate",
+    "export",
+    "preset",
+    "read_results",
     "simulate",
-]  # fmt: skip
+]
 
 
 def __getattr__(name: str) -> object:
