@@ -95,7 +95,7 @@ def _add_appearance(add: Add) -> None:
     add("--dots", metavar="SMALL,LARGE", type=radii, help="their radii (default: 0.16 and 0.27 of their spacing)")
     missing = numbers("numbers of dots, as 0,17,18")
     add("--missing", metavar="I,J", type=missing, default=(), help="dots that are not painted, from 0")
-    add("--grid", metavar="M,N", type=grid, help="of the equilibrium (default: 38 a side, or finer than the sensor's)")
+    add("--grid", metavar="M,N", type=grid, help="of the equilibrium (default: 38 per side, or finer than the sensor's)")
 
 
 def run(arguments: Namespace) -> int:

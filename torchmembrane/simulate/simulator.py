@@ -95,7 +95,7 @@ class Simulator:
 
     Args:
         sensor: the sensor.
-        grid: of the equilibrium; default: about 38 a side, finer than the solver's, no line in common but the rim.
+        grid: of the equilibrium; default: about 38 per side, finer than the solver's, no line in common but the rim.
         appearance: light, lens and chip.
         radii: of small and large dots, length unit; default: as in `Dots.of`.
         missing: dots that are not painted.
