@@ -29,7 +29,7 @@ class Stroke(NamedTuple):
 
     Attributes:
         indenter: where it first touches.
-        travel: `[3]`, unit vector along which it pushes.
+        travel: `[3]`, unit vector along which it presses.
         depth: how far.
         slide: `[3]`, how it moves then.
         friction: Coulomb's coefficient.
