@@ -72,8 +72,8 @@ def test_every_module_has_its_layer():
 def loaded(*arguments: str) -> set[str]:
     """The heavy packages that `python *arguments` has imported when it ends."""
     command = [sys.executable, "-X", "importtime", *arguments]
-    report = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stderr
-    names = {line.rpartition("|")[2].strip().partition(".")[0] for line in report.splitlines() if line.startswith("import time:")}
+    lines = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stderr.splitlines()
+    names = {line.rpartition("|")[2].strip().partition(".")[0] for line in lines if line.startswith("import time:")}
     assert "torchmembrane" in names
     return names & set(HEAVY)
 
