@@ -49,7 +49,7 @@ def add_parser(commands: Any) -> None:
     """Add the command's parser."""
     add = add_command(commands, "simulate", run, PURPOSE, EXAMPLES)
     add_sensor(add)
-    add("--out", metavar="DIR", type=Path, required=True, help="folder of the frames: new, or of the same sensor, light and lens")
+    add("--out", metavar="DIR", type=Path, required=True, help="folder of frames: new, or of the same sensor and appearance")
     add("--name", default="press", help="of a single press' files (default: %(default)s)")
     _add_press(add)
     _add_sequence(add)
