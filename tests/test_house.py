@@ -23,7 +23,7 @@ HEAVY = ("torch", "kornia", "scipy", "matplotlib", "tqdm")
 CONSTANT = r"`((?:[a-z_]+\.)*(?:[A-Z][A-Z0-9_]+|(?:[A-Z]\w+Settings)?\.[a-z]\w*))`"
 NUMBER = r"-?[0-9.]+(?:e-?[0-9]+)?"
 QUOTED = re.compile(rf"{CONSTANT}\s=\s({NUMBER}(?:,\s{NUMBER})*)")
-"""A constant, or a setting and its default, as documents quote them: the name, as much of its module as tells it apart, then
+"""A constant, or a setting and its default, as documents quote them: the name, as much of its module as identifies it, then
 the value or values. `.name`: a setting that only one class has."""
 NAMED = re.compile(CONSTANT)
 
@@ -72,8 +72,8 @@ def test_every_module_has_its_layer():
 def loaded(*arguments: str) -> set[str]:
     """The heavy packages that `python *arguments` has imported when it ends."""
     command = [sys.executable, "-X", "importtime", *arguments]
-    told = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stderr
-    names = {line.rpartition("|")[2].strip().partition(".")[0] for line in told.splitlines() if line.startswith("import time:")}
+    lines = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stderr.splitlines()
+    names = {line.rpartition("|")[2].strip().partition(".")[0] for line in lines if line.startswith("import time:")}
     assert "torchmembrane" in names
     return names & set(HEAVY)
 
@@ -150,8 +150,8 @@ def written_out(value: ast.expr):
 def meant(name: str, known: dict[str, object]) -> list[str]:
     """The constants of this name in modules below those that it mentions.
 
-    >>> meant("balance.REACH", {"estimators.balance.prices.REACH": 0.04, "markers.texture.REACH": 7})
-    ['estimators.balance.prices.REACH']
+    >>> meant("balance.REACH", {"estimators.balance.losses.REACH": 0.04, "markers.texture.REACH": 7})
+    ['estimators.balance.losses.REACH']
     """
     *above, last = name.lstrip(".").split(".")
     full_names = [full for full in known if full.split(".")[-1] == last]

@@ -19,7 +19,7 @@ DIR then holds
   mesh.npz       rest surface, triangles, units
   summary.csv    one row per frame
   NAME.png       its figure (--figures)
-Frames of a video are called STEM_000000, STEM_000001 ... The same command again goes on after an
+Frames of a video are called STEM_000000, STEM_000001 ... The same command again continues after an
 interruption: finished frames are skipped, failed ones tried again. In Python,
 torchmembrane.read_results(DIR) gives the frames one by one, by name, or as one batch.
 

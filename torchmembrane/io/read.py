@@ -17,7 +17,7 @@ def read_results(folder: str | Path) -> "Results":
 
     Only names and `mesh.npz` are read now; frames are read where they are asked for. Frames that failed are among them, NaN,
     with their status; images that could not be read have no frame (`summary.csv` lists them). Frames that are written to the
-    folder later are not seen.
+    folder later are not included.
 
     Args:
         folder: what `torchmembrane reconstruct --out` was given.

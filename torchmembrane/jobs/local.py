@@ -45,7 +45,7 @@ def reconstruct_files(
     """Reconstruct all frames of `inputs` that have no finished result in the folder `out` yet.
 
     A file that cannot be read stands in summary.csv with status -1 and has no result. Interrupted at any point, `out`
-    holds what is done so far and the same call goes on from there.
+    holds what is done so far and the same call continues from there.
 
     Args:
         reconstructor: a `Reconstructor`.
