@@ -157,10 +157,14 @@ class Reconstructor(nn.Module):
         """
         self._check_precision()
         with torch.autocast(self.rest_pixels.device.type, enabled=False):
-            grey = grey_batch(images, self.image_size, self.channels, self.rest_pixels)
+            grey = self.grey(images)
             if previous is not None:
                 previous = self._checked(previous, len(grey))
             return self.reconstruct_grey(grey, previous, rest_pixels)
+
+    def grey(self, images: Tensor | np.ndarray) -> Tensor:
+        """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
+        return grey_batch(images, self.image_size, self.channels, self.rest_pixels)
 
     def reconstruct_grey(
         self, grey: Tensor, previous: Reconstruction | None = None, rest_pixels: Tensor | None = None

@@ -5,7 +5,6 @@ import torch
 from torch import Tensor
 
 from .errors import MembraneError
-from .io.intake import grey_batch
 from .io.results import Reconstruction
 from .io.status import Status
 from .reconstruct import Reconstructor
@@ -78,8 +77,7 @@ class Tracker:
         self._before = None
 
     def _one(self, frame: Tensor | np.ndarray) -> Tensor:
-        r = self.reconstructor
-        images = grey_batch(frame, r.image_size, r.channels, r.rest_pixels)
+        images = self.reconstructor.grey(frame)
         if len(images) != 1:
             raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
         return images
