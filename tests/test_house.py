@@ -5,6 +5,7 @@ Layers and types are checked by `make lint`.
 
 import ast
 import functools
+import importlib
 import re
 import subprocess
 import sys
@@ -174,6 +175,32 @@ def test_named_constants_exist(path):
     """Those with their module or class; a bare `NAME` may as well stand for a file's or an argument's."""
     known = constants()
     assert not [name for name in NAMED.findall(path.read_text()) if name.find(".") > 0 and len(meant(name, known)) != 1]
+
+
+EXAMPLES_LEFT_OUT = {
+    "Estimator": "a protocol",
+    "ForceBalance": "built by Reconstructor, whose example runs it",
+    "MinimumEnergy": "built by Reconstructor",
+    "export": "takes half a minute",
+    "material_from_images": "some twenty force balances",
+    "material_from_pixels": "some twenty force balances",
+    "rest_from_views": "needs images taken from several places, which take seconds to render",
+}
+"""Public names whose docstrings run no example, and why; records, whose docstrings list their fields, need none either."""
+
+
+def is_record(value: object) -> bool:
+    """Whether it is a class of named fields whose docstring says what they are."""
+    return isinstance(value, type) and issubclass(value, tuple)
+
+
+@pytest.mark.parametrize("face", ["torchmembrane", "torchmembrane.simulate", "torchmembrane.calibrate"])
+def test_public_names_have_an_example(face):
+    module = importlib.import_module(face)
+    public = {name: getattr(module, name) for name in module.__all__}
+    shown = {name: value for name, value in public.items() if callable(value) and not is_record(value)}
+    without = {name for name, value in shown.items() if ">>>" not in (value.__doc__ or "")}
+    assert len(shown) > 5 and without == EXAMPLES_LEFT_OUT.keys() & shown.keys()
 
 
 @pytest.mark.parametrize("page, at_least", [("conventions.md", 9), ("mathematics.md", 20), ("force_balance.md", 9)])

@@ -61,6 +61,17 @@ def reconstruct_files(
 
     Raises:
         MembraneError: `out` is refused, or a package for videos or Parquet is missing.
+
+    Example:
+        >>> import tempfile
+        >>> from dataclasses import replace
+        >>> from torchmembrane import Reconstructor, Sensor
+        >>> from torchmembrane.jobs.inputs import find_inputs
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> sensor = replace(sensor, markers=replace(sensor.markers, rest_image=None))  # quicker, less accurate
+        >>> reconstructor, images = Reconstructor(sensor), find_inputs(["examples/rest.png"])
+        >>> reconstruct_files(reconstructor, images, tempfile.mkdtemp(), Settings.of(reconstructor, "npz"))
+        FrameCounts(reconstructed=1, not_converged=0, failed=0, skipped=0)
     """
     out, report = Path(out), report or _write_line
     mesh = Mesh.of(reconstructor, settings)
