@@ -83,7 +83,9 @@ def dense(system, matrix):
         full[k, :, k] = block
     for (k, further_in), block in zip(block_tridiagonal.coupled(blocks), beside, strict=True):
         full[k, :, further_in], full[further_in, :, k] = block, block.mT
-    columns = system.in_blocks(torch.eye(scale.shape[1], dtype=scale.dtype)[None])[0][system.place].movedim(0, 1).flatten(1)
+    columns = (
+        system.in_blocks(torch.eye(scale.shape[1], dtype=scale.dtype)[None])[0][system.block_of_row].movedim(0, 1).flatten(1)
+    )
     return columns @ full.flatten(2).flatten(0, 1) @ columns.T / (scale * scale.T)
 
 

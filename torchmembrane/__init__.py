@@ -61,16 +61,38 @@ _HOMES = {
     "Tracker": "track",
     "export": "onnx.export",
     "preset": "presets",
-    "read_results": "io.store",
+    "read_results": "io.read",
 }
 _NAMESPACES = ("calibrate", "simulate")
 
 __all__ = [
-    "Camera", "Cavity", "ElasticEnergy", "Estimator", "ForceBalance", "ForceBalanceSettings", "Markers", "Material", "Membrane",
-    "MembraneError", "MinimumEnergy", "MinimumEnergySettings", "Port", "Reconstruction", "Reconstructor", "Sensor",
-    "StandardDeviations", "Status", "Surface", "Tracker", "__version__", "calibrate", "export", "preset", "read_results",
+    "Camera",
+    "Cavity",
+    "ElasticEnergy",
+    "Estimator",
+    "ForceBalance",
+    "ForceBalanceSettings",
+    "Markers",
+    "Material",
+    "Membrane",
+    "MembraneError",
+    "MinimumEnergy",
+    "MinimumEnergySettings",
+    "Port",
+    "Reconstruction",
+    "Reconstructor",
+    "Sensor",
+    "StandardDeviations",
+    "Status",
+    "Surface",
+    "Tracker",
+    "__version__",
+    "calibrate",
+    "export",
+    "preset",
+    "read_results",
     "simulate",
-]  # fmt: skip
+]
 
 
 def __getattr__(name: str) -> object:

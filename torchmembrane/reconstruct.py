@@ -2,6 +2,7 @@
 
 import copy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -102,7 +103,7 @@ class Reconstructor(nn.Module):
             vertex_pixels=vertex_pixels,
             marker_noise=MARKER_NOISE[sensor.markers.kind],
         )
-        self.estimator = _of(problem, estimator, settings)
+        self.estimator = _estimator(problem, estimator, settings)
         self.register_buffer("vertex_pixels", vertex_pixels)
         self.register_buffer("rest_markers", positions)
         self.register_buffer("marker_vertices", torch.from_numpy(markers.points.vertices.astype(np.int64)))
@@ -110,7 +111,7 @@ class Reconstructor(nn.Module):
         self.to(dtype)
 
     @classmethod
-    def from_file(cls, path: str | Path, estimator: str = "force-balance", **options) -> "Reconstructor":
+    def from_file(cls, path: str | Path, estimator: str = "force-balance", **options: Any) -> "Reconstructor":
         """The reconstructor of a sensor file; options as for the class."""
         return cls(Sensor.from_file(path), estimator, **options)
 
@@ -156,10 +157,14 @@ class Reconstructor(nn.Module):
         """
         self._check_precision()
         with torch.autocast(self.rest_pixels.device.type, enabled=False):
-            grey = grey_batch(images, self.image_size, self.channels, self.rest_pixels)
+            grey = self.grey(images)
             if previous is not None:
                 previous = self._checked(previous, len(grey))
             return self.reconstruct_grey(grey, previous, rest_pixels)
+
+    def grey(self, images: Tensor | np.ndarray) -> Tensor:
+        """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
+        return grey_batch(images, self.image_size, self.channels, self.rest_pixels)
 
     def reconstruct_grey(
         self, grey: Tensor, previous: Reconstruction | None = None, rest_pixels: Tensor | None = None
@@ -297,12 +302,13 @@ class Reconstructor(nn.Module):
         return previous
 
 
-def _of(
-    problem: Problem, estimator: str, settings: ForceBalanceSettings | MinimumEnergySettings | None
+def _estimator(
+    problem: Problem, name: str, settings: ForceBalanceSettings | MinimumEnergySettings | None
 ) -> ForceBalance | MinimumEnergy:
-    kind = ESTIMATORS[estimator]
+    kind: Any = ESTIMATORS[name]
     if settings is not None and not isinstance(settings, kind.Settings):
         raise MembraneError(
-            f"Reconstructor: settings are {type(settings).__name__}; expected {kind.Settings.__name__} for {estimator}"
+            f"Reconstructor: settings are {type(settings).__name__}; expected {kind.Settings.__name__} for {name}"
         )
-    return kind.of(problem, settings)
+    built: ForceBalance | MinimumEnergy = kind.of(problem, settings)
+    return built

@@ -5,7 +5,6 @@ import torch
 from torch import Tensor
 
 from .errors import MembraneError
-from .io.intake import grey_batch
 from .io.results import Reconstruction
 from .io.status import Status
 from .reconstruct import Reconstructor
@@ -32,7 +31,9 @@ class Tracker:
 
     def __init__(self, reconstructor: Reconstructor):
         self.reconstructor = reconstructor
-        self.reset()
+        self._before: Reconstruction | None = None
+        self._latest: Tensor | None = None
+        self._rest_pixels: Tensor | None = None
 
     def __call__(self, frame: Tensor | np.ndarray) -> Reconstruction:
         """The frame's result, a batch of one.
@@ -45,7 +46,7 @@ class Tracker:
         """
         images = self._one(frame)
         with torch.no_grad():
-            result = self.reconstructor(images, self._before, self._rest_pixels)
+            result: Reconstruction = self.reconstructor(images, self._before, self._rest_pixels)
         self._latest = images
         follows = self.reconstructor.estimator.takes_start and Status(int(result.status[0])).has_surface
         self._before = result if follows else None
@@ -53,9 +54,7 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget the frames before, and what `rezero` took for rest."""
-        self._before: Reconstruction | None = None
-        self._latest: Tensor | None = None
-        self._rest_pixels: Tensor | None = None
+        self._before = self._latest = self._rest_pixels = None
 
     def rezero(self, frame: Tensor | np.ndarray | None = None) -> None:
         """Take a frame without contact, default the latest, for the rest state: what drifted since the rest image is nulled.
@@ -78,8 +77,7 @@ class Tracker:
         self._before = None
 
     def _one(self, frame: Tensor | np.ndarray) -> Tensor:
-        r = self.reconstructor
-        images = grey_batch(frame, r.image_size, r.channels, r.rest_pixels)
+        images = self.reconstructor.grey(frame)
         if len(images) != 1:
             raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
         return images

@@ -69,7 +69,7 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
     mask = rim_mask(sensor, sensor.camera.point_to_pixel(sensor.membrane.rest))
     margin = MARGIN * pitch * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
     around = np.rint(pixels[:, None] + margin).astype(int)
-    inside = ((around >= 0) & (around < [width, height])).all(-1)
+    inside = np.all((around >= 0) & (around < [width, height]), axis=-1)
     u, v = np.where(inside[..., None], around, 0).transpose(2, 0, 1)
     kept = (inside & mask[v, u]).all(1)
     return pixels[kept], np.where((i + j) % 2 == 0, "large", "small")[kept].tolist()

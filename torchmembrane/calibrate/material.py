@@ -181,6 +181,7 @@ class Presses:
     def explained(self, stretch: float, modulus: float) -> tuple[ForceBalance, Equilibrium]:
         """The estimator with this material, and what it finds."""
         r, known = self.reconstructor, self.reconstructor.estimator
+        assert isinstance(known, ForceBalance)  # as `_reconstructor` chooses
         cavity, membrane = known.cavity, known.membrane
         elasticity = elastic_energy(r.sensor, membrane, prestretch=stretch, modulus=modulus)
         points = SurfacePoints(r.marker_vertices.numpy(), r.marker_weights.numpy(), np.zeros(len(r.rest_markers)))

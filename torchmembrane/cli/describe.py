@@ -112,8 +112,8 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
     markers = sensor.markers
     lines = [f"{markers.kind}, {markers.polarity}"]
     if markers.positions is not None:
-        large = sum(size == "large" for size in markers.sizes)
-        lines[0] += f", {len(markers.positions)} listed: {large} large, {len(markers.sizes) - large} small"
+        listed, large = len(markers.positions), sum(size == "large" for size in markers.sizes or ())
+        lines[0] += f", {listed} listed: {large} large, {listed - large} small"
     if reconstructor is not None and markers.positions is None:
         lines[0] += f", {len(reconstructor.rest_pixels)} placed on the rest surface from the rest image"
     if frame is None or reconstructor is None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from ..errors import MembraneError
 from ..presets import sensor_file
@@ -59,6 +58,8 @@ def _single(arguments: Namespace, simulator: Simulator) -> int:
 
 
 def _film(arguments: Namespace, simulator: Simulator, stroke: Stroke) -> int:
+    from tqdm import tqdm
+
     rng, total = np.random.default_rng(arguments.seed), len(arguments.path) * arguments.frames
     states = simulator.presses(stroke, arguments.path, arguments.frames, arguments.increment)
     states = chain([next(states)], states)  # a press that cannot begin leaves no folder

@@ -54,6 +54,9 @@ class LocalAffineMaps(nn.Module):
     points `[..., V, q]` returns `A [..., m-1, n-1, q, p]`, `b [..., m-1, n-1, q]`.
     """
 
+    points: Tensor
+    inverse_moment: Tensor
+
     def __init__(self, points: Tensor, grid: tuple[int, int]):
         super().__init__()
         self.grid = grid

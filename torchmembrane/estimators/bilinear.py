@@ -57,7 +57,8 @@ def _cells(points: np.ndarray) -> list[list[int]]:
         if quality > 0 and free[k] and free[other]:
             free[[k, other]] = False
             cells.append(quadrilateral)
-    return cells + mesh.simplices[free].tolist()
+    triangles: list[list[int]] = mesh.simplices[free].tolist()
+    return cells + triangles
 
 
 def _squareness(p: np.ndarray) -> float:

@@ -76,4 +76,5 @@ class ContactForce(nn.Module):
         m, n = self.membrane.grid
         steps = apply_stencil(step.mT, self.kernels, (m - 2, n - 2))
         steps = steps.unflatten(-1, (len(self.kernels), -1)).flatten(2, 3)
-        return (stiffness.flatten(2, 3)[:, None] * steps[:, :, None]).sum(3)
+        changed: Tensor = (stiffness.flatten(2, 3)[:, None] * steps[:, :, None]).sum(3)
+        return changed

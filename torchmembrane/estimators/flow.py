@@ -37,7 +37,8 @@ class VertexFlow(nn.Module):
 
     def forward(self, pixels: Tensor, confidence: Tensor) -> Tensor:
         """Pixels `[B, V, 2]` of the vertices, from those of the markers `[B, D, 2]` and their confidence `[B, D]`."""
-        return self.vertex_pixels + self.interpolation(pixels - self.rest_pixels, confidence)
+        moved: Tensor = self.vertex_pixels + self.interpolation(pixels - self.rest_pixels, confidence)
+        return moved
 
 
 class FlowInterpolation(nn.Module):
@@ -49,9 +50,19 @@ class FlowInterpolation(nn.Module):
     `z = H (c s + (1 - c) z)`, `H = W R`. Only lost markers are unknowns, so a few conjugate-gradient steps solve it. With
     `kind = "bilinear"` (the paper's) the flow is bilinear between the dots instead; a lost dot then has the smooth flow.
 
-    Arguments: membrane, the markers' `SurfacePoints`, `kind`. Calling it with `displacement [..., D, 2]` (px) and
-    `confidence [..., D]` gives the flow `[..., V, 2]` (px).
+    Args:
+        membrane: the rest surface on the solver's grid.
+        markers: the markers as points of it.
+        kind: "smooth" | "bilinear".
+        steps: of the conjugate gradients.
+
+    Raises:
+        MembraneError: an unknown kind, or fewer than three markers.
     """
+
+    spread: Tensor
+    influence: Tensor
+    bilinear: Tensor
 
     def __init__(self, membrane: Membrane, markers: SurfacePoints, kind: str = "smooth", steps: int = 12):
         super().__init__()
@@ -73,6 +84,7 @@ class FlowInterpolation(nn.Module):
             self.register_buffer("bilinear", torch.from_numpy(bilinear_matrix(membrane, markers)))
 
     def forward(self, displacement: Tensor, confidence: Tensor) -> Tensor:
+        """The flow `[..., V, 2]` px, from `displacement [..., D, 2]` px and `confidence [..., D]` of the markers."""
         c, displacement = confidence[..., None, :], displacement.mT
         H, lost = self.influence, (1 - c).clamp_min(1e-12).sqrt()  # H is symmetric
         observed = c * torch.where(c > 0, displacement, 0.0)

@@ -189,6 +189,7 @@ class ForceBalance(nn.Module):
     @piece
     def refined(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
         """Surface and pressure of `coarse` on this grid: the displacement is bilinear between its lines."""
+        assert self.coarse is not None  # only called with what it has found
         u = (x - self.coarse.membrane.rest).unflatten(1, self.coarse.membrane.grid).permute(0, 3, 1, 2)
         u = F.interpolate(u, self.membrane.grid, mode="bilinear", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
         return self.membrane.rest + u * self.equations.forces.free, pressure
@@ -197,11 +198,11 @@ class ForceBalance(nn.Module):
         self, x: Tensor, pressure: Tensor, measured: Bearings, schedule: list[tuple[float, float]], one_factor: bool = False
     ) -> Equilibrium:
         """The steps of a schedule; `one_factor`: all with that of the first."""
-        state, factor = (x, pressure, x), None
+        before, factor = x, None
         if one_factor:
-            *state, factor = self._first(x, pressure, measured, *schedule[0])
+            x, pressure, before, factor = self._first(x, pressure, measured, *schedule[0])
             schedule = schedule[1:]
-        return self.equilibrium(*repeated(self._next, schedule, state, measured, factor))
+        return self.equilibrium(*repeated(self._next, schedule, (x, pressure, before), measured, factor))
 
     @piece
     def _first(
@@ -223,9 +224,9 @@ class ForceBalance(nn.Module):
         self, x: Tensor, pressure: Tensor, measured: Bearings, tau: float, outlier: float, factor: Factor | None
     ) -> tuple[Tensor, Tensor, Factor | None]:
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself."""
-        scales = (torch.as_tensor(scale, dtype=x.dtype, device=x.device) for scale in (tau, outlier))
+        scales = [torch.as_tensor(scale, dtype=x.dtype, device=x.device) for scale in (tau, outlier)]
         step = self.step if torch.compiler.is_exporting() else self._compiled_once
-        taken: tuple[Tensor, Tensor, Factor | None] = step(x, pressure, measured, *scales, factor)
+        taken: tuple[Tensor, Tensor, Factor | None] = step(x, pressure, measured, scales[0], scales[1], factor)
         return taken
 
     @torch.compiler.nested_compile_region
@@ -298,7 +299,8 @@ class ForceBalance(nn.Module):
         measured = equations.bearings.measured(observation)
         traction, normal = inner(found.traction, grid).mT, inner(self.membrane.normals(found.vertices), grid).mT
         misfit = measured.weight * equations.bearings.angles(found.vertices, measured)[0].square().sum(1)
-        return Cauchy(self.settings.outlier).loss(misfit).sum(-1) + equations.loss(traction, normal)
+        objective: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1) + equations.loss(traction, normal)
+        return objective
 
     def standard_deviations(
         self, x: Tensor, pressure: Tensor, observation: Observation, marker_noise: float | Tensor

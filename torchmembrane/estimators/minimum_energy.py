@@ -142,10 +142,10 @@ class MinimumEnergy(nn.Module):
         """
         if start is not None:
             raise MembraneError("MinimumEnergy: starts from rest always; leave the start out")
-        *state, origins, directions = self.start(observation.origins, observation.directions, relaxed)
+        t, latest, changes, origins, directions = self.start(observation.origins, observation.directions, relaxed)
         for _ in range((self.steps if relaxed is None else self.settings.relaxed_steps) - 1):
-            state = self.step(*state, origins, directions, relaxed)
-        return self.equilibrium(state[0], origins, directions, relaxed)
+            t, latest, changes = self.step(t, latest, changes, origins, directions, relaxed)
+        return self.equilibrium(t, origins, directions, relaxed)
 
     @piece
     def start(

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..camera.model import Rays
 from ..errors import MembraneError
 from ..surface.membrane import Membrane
 from .base import Equilibrium, Observation
@@ -45,14 +46,19 @@ class Segmented(NamedTuple):
 class PolarAngle:
     """Eq. 29 for points of a rest surface: grid vertices or markers.
 
-    Arguments: `points [N, 3]` at rest, outward unit `normals [N, 3]` there, and their rest rays, `origins` and unit `directions
-    [N, 3]`.
-    Wrong where the rays run along the normals (a camera near the centre of curvature): an inward displacement does not turn
-    them, what is seen is the stretch around it.
+    Args:
+        points: `[N, 3]` at rest.
+        normals: outward unit normals there, `[N, 3]`.
+        origins: of their rest rays, `[N, 3]`.
+        directions: unit directions of their rest rays, `[N, 3]`.
+
+    Limitations:
+        Where the rays run along the normals (a camera near the centre of curvature) an inward displacement does not turn them:
+        only the stretch around it is visible.
     """
 
     def __init__(self, points: Tensor, normals: Tensor, origins: Tensor, directions: Tensor):
-        self.range = ((points - origins) * directions).sum(-1)
+        self.range: Tensor = ((points - origins) * directions).sum(-1)
         self.rest = polar_angle(directions)
         self.sign = torch.sign((normals * growing_polar_angle(directions)).sum(-1))
 
@@ -79,16 +85,22 @@ def growing_polar_angle(directions: Tensor) -> Tensor:
 class Segmentation:
     """Contacts from the rays of a sensor's grid vertices.
 
-    Arguments: the `MinimumEnergy` estimator, the rest rays of its vertices (`origins`, `directions [V, 3]`), and how many
-    contacts are reported. Calling it with the rays now, `[B, V, 3]` each, runs the loop:
+    Calling it with the rays now, `[B, V, 3]` each, runs the loop:
 
         regions that bulge in by eq. 29 (or the axis, where the flow diverges everywhere); then, until they stay,
         reconstruct with the smoother relaxed there, take the displacement along the surface's normals, and from it the regions.
 
-    Wrong when contacts are closer than about a fifth of the surface's size, and for the depth: see `MinimumEnergy`.
+    Args:
+        estimator: minimum energy on the sensor's grid.
+        rest_rays: the rest rays of its vertices, `origins` and `directions [V, 3]`.
+        count: how many contacts are reported.
+        rounds: of the loop at most.
+
+    Limitations:
+        Contacts closer than about a fifth of the surface's size are one; for the depth see `MinimumEnergy`.
     """
 
-    def __init__(self, estimator: MinimumEnergy, rest_rays, count=4, rounds=8):
+    def __init__(self, estimator: MinimumEnergy, rest_rays: Rays | tuple[Tensor, Tensor], count: int = 4, rounds: int = 8):
         if rounds < 1:
             raise MembraneError(f"Segmentation: rounds = {rounds}; expected at least 1")
         self.estimator, self.membrane, self.count, self.rounds = estimator, estimator.membrane, count, rounds
@@ -113,8 +125,7 @@ class Segmentation:
 
     def by_polar_angle(self, directions: Tensor) -> Contacts:
         """Eq. 29 alone: contacts on the rest surface, for rays `[B, V, 3]`."""
-        moves = ~self.membrane.fixed
-        bulge = self.polar.bulge(directions) * moves
+        bulge = self.polar.bulge(directions) * ~self.membrane.fixed
         outward = self.divergence(directions)
         region = _regions(bulge, self.membrane, self.count)
         if self.axis_region is not None:
@@ -133,15 +144,17 @@ class Segmentation:
     def divergence(self, directions: Tensor) -> Tensor:
         """Outward share of the angular flow, `[B]`: 1 where every ray turns away from the axis, -1 where all turn to it."""
         turned = torch.linalg.vector_norm(directions - self.rest_directions, dim=-1)
-        reach = self.polar.range * ~self.membrane.fixed
+        reach: Tensor = self.polar.range * ~self.membrane.fixed
         least = LEAST * self.membrane.size
-        return -(reach * self.polar.change(directions)).sum(-1) / (reach * turned).sum(-1).clamp_min(least)
+        outward: Tensor = -(reach * self.polar.change(directions)).sum(-1) / (reach * turned).sum(-1).clamp_min(least)
+        return outward
 
     def _centroids(self, x: Tensor, region: Tensor, bulge: Tensor) -> Tensor:
         weight = bulge * self.membrane.rest_area
         numbers = torch.arange(1, self.count + 1)
         weight = weight[:, None] * (region[:, None] == numbers[:, None])
-        return weight @ x / weight.sum(-1, keepdim=True)
+        centroids: Tensor = weight @ x / weight.sum(-1, keepdim=True)
+        return centroids
 
 
 def _axis_region(membrane: Membrane) -> Tensor | None:
@@ -150,13 +163,14 @@ def _axis_region(membrane: Membrane) -> Tensor | None:
     if not np.isfinite(hit.distance[0]):
         return None
     centre = membrane.rest.new_tensor([0.0, 0.0, float(hit.distance[0])])
-    return (membrane.rest - centre).norm(dim=-1) < ON_AXIS * membrane.size
+    near: Tensor = torch.linalg.vector_norm(membrane.rest - centre, dim=-1) < ON_AXIS * membrane.size
+    return near
 
 
 def _regions(bulge: Tensor, membrane: Membrane, count: int) -> Tensor:
     """Numbered regions around the persistent peaks of `bulge [B, V]`, strongest first, `[B, V]`."""
     m, n = membrane.grid
-    neighbours = [[] for _ in range(m * n)]
+    neighbours: list[list[int]] = [[] for _ in range(m * n)]
     for a, b, c in membrane.triangles.tolist():
         for p, q in ((a, b), (b, c), (c, a)):
             neighbours[p].append(q)
@@ -171,12 +185,13 @@ def peaks(height: np.ndarray, neighbours: list[list[int]], count: int, least: fl
     Vertices join in order of height; where two hills meet, the lower one is part of the higher unless it stands above the
     saddle by `PERSISTENCE` of the highest. A region is what lies above `SHARE` of its own peak.
     """
-    hill, top = np.full(len(height), -1), {}
+    hill = np.full(len(height), -1)
+    top: dict[int, int] = {}
     highest = height.max()
-    for vertex in np.argsort(-height):
+    for vertex in np.argsort(-height).tolist():
         if height[vertex] < least:
             break
-        around = sorted({hill[k] for k in neighbours[vertex] if hill[k] >= 0}, key=lambda h: -height[top[h]])
+        around = sorted({int(hill[k]) for k in neighbours[vertex] if hill[k] >= 0}, key=lambda h: -height[top[h]])
         if not around:
             hill[vertex], top[vertex] = vertex, vertex
             continue

@@ -39,8 +39,8 @@ class ForceBalanceSettings:
         largest_volume_error: volume error of a converged solution, over the rest volume.
 
     Example:
-        >>> ForceBalanceSettings(steps=12).gnc_schedule(3, (4.0, 0.4))
-        [(4.0, 50.0), (0.4, 5.0), (0.4, 5.0)]
+        >>> ForceBalanceSettings(steps=12).gnc_schedule(2, (4.0, 0.4))
+        [(4.0, 50.0), (0.4, 5.0)]
     """
 
     steps: int = 8

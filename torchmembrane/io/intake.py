@@ -72,7 +72,7 @@ def _planes(pixels: Tensor, size: tuple[int, int]) -> list[Tensor]:
 def _refusal(shape: tuple[int, ...], size: tuple[int, int]) -> str:
     height, width = size
     said = f"images {list(shape)}; expected {SHAPES} with H = {height}, W = {width}"
-    if len(shape) == 4 and shape[-3:-1] == size[::-1] or shape[-2:] == size[::-1]:
+    if size[::-1] in (shape[-2:], shape[-3:-1]):
         return f"{said}: rows and columns are exchanged; swap them, images.swapaxes(-1, -2), or (-2, -3) with channels last"
     if shape[-2:] == size or shape[-3:-1] == size:
         return f"{said}: other than one or three channels; give grey or colour, without alpha"

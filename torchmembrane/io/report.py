@@ -3,14 +3,36 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from ..calibrate.fit import Fit
+from numpy.typing import ArrayLike
 
 HIGH_CORRELATION = 0.95  # above it two parameters are said to be hard to identify separately
+
+
+class Estimate(Protocol):
+    """What a report takes from a fit, such as `calibrate.Fit`."""
+
+    @property
+    def values(self) -> np.ndarray:
+        """The unknowns as found, `[n]`."""
+        ...
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of the values, `[n, n]`."""
+        ...
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """Standard deviations of the values, `[n]`."""
+        ...
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of one residual."""
+        ...
 
 
 class Report(NamedTuple):
@@ -56,8 +78,8 @@ class Report(NamedTuple):
         title: str,
         names: Sequence[str],
         units: Sequence[str],
-        design: np.ndarray,
-        fit: "Fit",
+        design: ArrayLike,
+        fit: Estimate,
         pixels: np.ndarray,
         residuals: np.ndarray,
         notes: Sequence[str] = (),

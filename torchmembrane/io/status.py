@@ -15,7 +15,7 @@ class Status(IntEnum):
 
     text: str
 
-    def __new__(cls, value: int, text: str) -> "Status":
+    def __new__(cls, value: int, text: str = "") -> "Status":
         status = int.__new__(cls, value)
         status._value_, status.text = value, text
         return status

@@ -12,10 +12,20 @@ class AffineQuadrilaterals(nn.Module):
 
     The map is fitted in the plane of the quadrilateral (spanned by its diagonals; in space G of eq. 16 is singular), so that
     `A [3, 2] = sum_k x_k g_k^T` with constant `g_k`, and `E = 1/2 tension sum area tr(A^T A)` (eq. 12 with its 1/2).
-    It is blind to the hourglass mode: use it with the smoother (eq. 28).
+
+    Args:
+        membrane: the rest surface.
+        tension: of the rest state, force / length.
+
+    Limitations:
+        It is blind to the hourglass mode: use it with the smoother (eq. 28).
     """
 
-    def __init__(self, membrane: Membrane, tension: float = 1.0):
+    map_weights: Tensor
+    tension: Tensor
+    area: Tensor
+
+    def __init__(self, membrane: Membrane, tension: float | Tensor = 1.0):
         super().__init__()
         self.grid = membrane.grid
         p = corners(membrane.rest, self.grid)
@@ -36,7 +46,7 @@ class AffineQuadrilaterals(nn.Module):
 
     def affine_maps(self, x: Tensor) -> Tensor:
         """Linear parts `A [..., m-1, n-1, 3, 2]` of the maps from each quadrilateral's rest plane."""
-        return torch.einsum("...kc,...ka->...ca", corners(x, self.grid), self.map_weights)
+        return corners(x, self.grid).mT @ self.map_weights
 
     def energy(self, x: Tensor) -> Tensor:
         """`1/2 tension sum area tr(A^T A)`, `[..., V, 3]` to `[...]`; less the rest's, as `ElasticEnergy`'s harmonic energy."""
@@ -46,7 +56,7 @@ class AffineQuadrilaterals(nn.Module):
     def gradient(self, x: Tensor) -> Tensor:
         """`dE/dx`, `[..., V, 3]`."""
         maps = self.affine_maps(x) * (self.tension * self.area)[..., None, None]
-        return corners_to_vertices(torch.einsum("...ca,...ka->...kc", maps, self.map_weights), self.grid)
+        return corners_to_vertices(self.map_weights @ maps.mT, self.grid)
 
     def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
         """Corner matrices `[..., m-1, n-1, 4, 4]` of `K = L o (R R^T)`, exactly quadratic: `x` is not looked at."""

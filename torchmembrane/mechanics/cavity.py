@@ -1,6 +1,6 @@
 """What the fluid asks of the enclosed volume: kept (liquid), pressure x volume kept (gas), or free at rest pressure (open)."""
 
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -44,11 +44,27 @@ def gas_law_step(
 class CavityLaw(nn.Module):
     """The cavity's law, linearised for one step of a solve.
 
-    Arguments: membrane; the pressure difference at rest `[]`; `filling`; for a gas its absolute pressure at rest
-    (force / length^2) and volume (length^3).
+    Args:
+        membrane: the rest surface.
+        rest_pressure: the pressure difference at rest, `[]`.
+        filling: "liquid" (volume kept), "gas" (pressure x volume kept) or "open" (pressure stays at rest).
+        gas: of a gas, its absolute pressure at rest (force / length^2) and volume (length^3).
+
+    Raises:
+        MembraneError: an unknown filling, or a gas without its numbers.
     """
 
-    def __init__(self, membrane: Membrane, rest_pressure: Tensor, filling="liquid", gas: tuple[float, float] | None = None):
+    rest_pressure: Tensor
+    rest_volume: Tensor
+    gas: Tensor
+
+    def __init__(
+        self,
+        membrane: Membrane,
+        rest_pressure: Tensor,
+        filling: str = "liquid",
+        gas: tuple[float, float] | None = None,
+    ):
         super().__init__()
         if filling not in FILLINGS:
             raise MembraneError(f"CavityLaw: filling = {filling!r}; expected one of {', '.join(FILLINGS)}")
@@ -66,7 +82,8 @@ class CavityLaw(nn.Module):
         """
         if self.filling == "liquid":
             return -rise, rise.new_zeros(())
-        return gas_law_step(rise, pressure, self.rest_pressure, *self.gas.unbind())
+        absolute, volume = self.gas.unbind()
+        return gas_law_step(rise, pressure, self.rest_pressure, absolute, volume)
 
     def target_volume(self, volume: Tensor, pressure: Tensor) -> Tensor:
         """The volume that the law asks for at this pressure, `[...]` (an open cavity: any)."""
@@ -82,13 +99,21 @@ class CavityLaw(nn.Module):
         return (volume - self.target_volume(volume, pressure)) / self.rest_volume
 
 
-def rest_balance(membrane: Membrane, energy) -> tuple[Tensor, Tensor]:
+class HasGradient(Protocol):
+    """An energy: of triangles, or the paper's element."""
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """Its derivative in the vertices, `[..., V, 3]`."""
+        ...
+
+
+def rest_balance(membrane: Membrane, energy: HasGradient) -> tuple[Tensor, Tensor]:
     """Rest pressure `p0 []` and rest load `h = grad U(X) - p0 grad V(X)` of the free vertices, `[V, 3]`, zero on the rim.
 
     `p0` weights both with the normals, so that spurious tangential parts have zero weight; `energy`: an `ElasticEnergy` or the
     paper's element.
     """
-    force, push = energy.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
+    force, of_fluid = energy.gradient(membrane.rest), membrane.volume_gradient(membrane.rest)
     normal, free = membrane.rest_normals, membrane.free_vertices
-    p0 = (force * normal)[free].sum() / (push * normal)[free].sum()
-    return p0, torch.where(membrane.fixed[:, None], 0.0, force - p0 * push)
+    p0 = (force * normal)[free].sum() / (of_fluid * normal)[free].sum()
+    return p0, torch.where(membrane.fixed[:, None], 0.0, force - p0 * of_fluid)

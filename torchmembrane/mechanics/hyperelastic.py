@@ -7,7 +7,6 @@ that is already stretched) unless these are given; the prestretch `l` is that of
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -15,6 +14,7 @@ from ..errors import MembraneError
 from ..surface.membrane import Membrane
 from ..surface.stencil import apply_stencil, one_ring_edges, stencil_kernels
 from ..surface.topology import corners, triangles_of
+from .metric import adjugate, determinant, edge_vectors, metric, metric_constants, tensile_part
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 _FIRST = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -54,15 +54,53 @@ class Strain(NamedTuple):
 class ElasticEnergy(nn.Module):
     """The membrane's elastic energy `U(x)`, its gradient, and its stiffness along given directions.
 
-    Arguments: the membrane; `model` harmonic | neo_hookean | mooney_rivlin; `prestretch` l; `modulus` = shear modulus x
-    thickness at rest (force / length); `c2_ratio` = C2 / C1.
-
     harmonic       `W = mu/2 l^2 (I - 2)` (eq. 11 with the 1/2 and the area element that the printed formula lacks)
     neo_hookean    `W = mu/2 (l^2 I + 1 / (l^4 D) - 3)`
     mooney_rivlin  `W = C1 (I1 - 3) + C2 (I2 - 3)`, `I1 = l^2 I + 1 / (l^4 D)`, `I2 = l^4 D + I / (l^2 D)`, `2 (C1 + C2) = mu`
+
+    Args:
+        membrane: the rest surface.
+        model: "harmonic" | "neo_hookean" | "mooney_rivlin".
+        prestretch: l, of the rest state.
+        modulus: mu, shear modulus x thickness at rest, force / length.
+        c2_ratio: C2 / C1, Mooney-Rivlin only.
+
+    Raises:
+        MembraneError: an unknown model.
+
+    Example:
+        >>> from torchmembrane.surface.shapes import spherical_cap
+        >>> dome = spherical_cap(12, 9, 3, (9, 9))
+        >>> elasticity = ElasticEnergy(dome, "neo_hookean", prestretch=1.3)
+        >>> list(elasticity.gradient(dome.rest).shape), bool(elasticity.energy(1.01 * dome.rest) > elasticity.energy(dome.rest))
+        ([81, 3], True)
     """
 
-    def __init__(self, membrane: Membrane, model="neo_hookean", prestretch=1.0, modulus=1.0, c2_ratio=0.0):
+    prestretch: Tensor
+    c1: Tensor
+    c2: Tensor
+    area: Tensor
+    twice_12: Tensor
+    bend: Tensor
+    metric_to_pairs: Tensor
+    stress_to_pairs: Tensor
+    sides: Tensor
+    first: Tensor
+    missing: Tensor
+    half_over_det: Tensor
+    force_of_I: Tensor
+    force_of_D: Tensor
+    heron: Tensor
+    total: Tensor
+
+    def __init__(
+        self,
+        membrane: Membrane,
+        model: str = "neo_hookean",
+        prestretch: float = 1.0,
+        modulus: float = 1.0,
+        c2_ratio: float = 0.0,
+    ):
         super().__init__()
         if model not in MODELS:
             raise MembraneError(f"ElasticEnergy: model = {model!r}; expected one of {', '.join(MODELS)}")
@@ -70,39 +108,41 @@ class ElasticEnergy(nn.Module):
         c2 = modulus / 2 * c2_ratio / (1 + c2_ratio) if model == "mooney_rivlin" else 0.0
         for name, value in (("prestretch", prestretch), ("c1", modulus / 2 - c2), ("c2", c2)):
             self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
-        self._register_rest("", _edges(membrane.rest, self.grid))
-        self._register_rest(
-            "around_", apply_stencil(membrane.rest, one_ring_edges(), self.grid, border=False).unflatten(-1, (2, -1))
-        )
-        for name, constant in _metric_constants().items():
+        self._register_rest("", edge_vectors(membrane.rest, self.grid))
+        around = apply_stencil(membrane.rest, one_ring_edges(), self.grid, border=False)
+        self._register_rest("around_", around.unflatten(-1, (2, -1)))
+        for name, constant in metric_constants().items():
             self.register_buffer(name, constant)
-        self._register_ring(membrane)
+        self._register_one_ring(membrane)
 
     def _register_rest(self, which: str, edges: Tensor) -> None:
-        metric = _metric(edges)
-        det = _determinant(metric)
-        for name, value in Rest(_adjugate(metric) / det, det, det.sqrt() / 2)._asdict().items():
+        g = metric(edges)
+        det = determinant(g)
+        for name, value in Rest(adjugate(g) / det, det, det.sqrt() / 2)._asdict().items():
             self.register_buffer(f"{which}{name}", value)
 
     def _rest(self, which: str = "") -> Rest:
         return Rest(*(getattr(self, f"{which}{name}") for name in Rest._fields))
 
-    def _register_ring(self, membrane: Membrane) -> None:
+    def _register_one_ring(self, membrane: Membrane) -> None:
         """Of the six triangles around every vertex, `[6 V]` in all: sides (two from the vertex, the one across), constants."""
         own, ring = stencil_kernels()[:1], stencil_kernels()[1:]
         following = ring.roll(-1, 0)
         self.register_buffer("sides", torch.cat([ring - own, following - own, following - ring]))
-        sides = lambda x: apply_stencil(x, self.sides, self.grid).unflatten(-1, (3, -1))  # noqa: E731
-        missing = (sides(torch.ones_like(membrane.rest)) != 0).any(0).any(0)
-        e1, e2, _ = sides(membrane.rest).unbind(-2)
+        beyond, rest = (
+            apply_stencil(x, self.sides, self.grid).unflatten(-1, (3, -1))
+            for x in (torch.ones_like(membrane.rest), membrane.rest)
+        )
+        missing = (beyond != 0).any(0).any(0)
+        e1, e2, _ = rest.unbind(-2)
         g11, g12, g22 = (e1 * e1).sum(0), (e1 * e2).sum(0), (e2 * e2).sum(0)
         det = torch.where(missing, 1.0, g11 * g22 - g12**2)
         twice_area = torch.where(missing, 0.0, det.sqrt())
         self.register_buffer("first", torch.stack([g22 - g12, g11 - g12, g12]) / det)  # I is their sum over the sides' squares
         self.register_buffer("missing", missing.double())
         self.register_buffer("half_over_det", torch.where(missing, 0.0, 0.5 / det))
-        self.register_buffer("pull_of_first", -twice_area * self.first[:2])
-        self.register_buffer("pull_of_slope", -twice_area / det)
+        self.register_buffer("force_of_I", -twice_area * self.first[:2])
+        self.register_buffer("force_of_D", -twice_area / det)
         self.register_buffer("heron", 0.5 - torch.eye(3, dtype=torch.float64))
         self.register_buffer("total", torch.ones(1, 3, dtype=torch.float64))
 
@@ -113,12 +153,12 @@ class ElasticEnergy(nn.Module):
 
     def strain(self, x: Tensor) -> Strain:
         """The strain of `x [..., V, 3]`: of all triangles, `T = 2 (m-1) (n-1)`."""
-        return self._strain(_edges(x, self.grid), self._rest())
+        return self._strain(edge_vectors(x, self.grid), self._rest())
 
     def _strain(self, edges: Tensor, rest: Rest) -> Strain:
-        metric = _metric(edges)
-        first = (self.twice_12 * rest.inverse_metric * metric).sum(-2, keepdim=True)
-        return Strain(edges, _adjugate(metric), first, _determinant(metric) / rest.det)
+        g = metric(edges)
+        first = (self.twice_12 * rest.inverse_metric * g).sum(-2, keepdim=True)
+        return Strain(edges, adjugate(g), first, determinant(g) / rest.det)
 
     def density(self, I: Tensor, D: Tensor) -> Tensor:  # noqa: E741
         """Energy per rest area `W(I, D)`."""
@@ -127,8 +167,8 @@ class ElasticEnergy(nn.Module):
             return c1 * l2 * (I - 2)
         return c1 * (l2 * I + 1 / (l2**2 * D) - 3) + c2 * (l2**2 * D + I / (l2 * D) - 3)
 
-    def slopes(self, I: Tensor, D: Tensor) -> tuple[Tensor, Tensor]:  # noqa: E741
-        """First derivatives of `density` in `I` and `D`; what is constant is a scalar."""
+    def first_derivatives(self, I: Tensor, D: Tensor) -> tuple[Tensor, Tensor]:  # noqa: E741
+        """First derivatives of `density`, `dW/dI` and `dW/dD`; what is constant is a scalar."""
         l2, c1, c2 = self.prestretch**2, self.c1, self.c2
         if self.model == "harmonic":
             return c1 * l2, torch.zeros_like(l2)
@@ -141,7 +181,7 @@ class ElasticEnergy(nn.Module):
     def derivatives(self, I: Tensor, D: Tensor) -> Derivatives:  # noqa: E741
         """First and second derivatives of `density`; what is constant is a scalar."""
         l2, c1, c2 = self.prestretch**2, self.c1, self.c2
-        zero, (w_I, w_D) = torch.zeros_like(l2), self.slopes(I, D)
+        zero, (w_I, w_D) = torch.zeros_like(l2), self.first_derivatives(I, D)
         if self.model == "harmonic":
             return Derivatives(w_I, w_D, zero, zero, zero)
         if self.model == "neo_hookean":
@@ -161,11 +201,11 @@ class ElasticEnergy(nn.Module):
         batch, V = x.shape[:-2], x.shape[-2]
         e = apply_stencil(x, self.sides, self.grid)
         squared = (self.total @ (e * e)).reshape(*batch, 3, 6 * V)
-        slope = self.heron @ squared  # det dD/dl
-        D = self.total @ (squared * slope) * self.half_over_det + self.missing
-        w_I, w_D = self.slopes(self.total @ (self.first * squared), D)
-        pull = self.pull_of_first * w_I + self.pull_of_slope * w_D * slope[..., :2, :]
-        return (e[..., : 12 * V].reshape(*batch, 3, 12, V) * pull.reshape(*batch, 1, 12, V)).sum(-2).mT
+        dD = self.heron @ squared  # det dD/dl
+        D = self.total @ (squared * dD) * self.half_over_det + self.missing
+        w_I, w_D = self.first_derivatives(self.total @ (self.first * squared), D)
+        of_sides = self.force_of_I * w_I + self.force_of_D * w_D * dD[..., :2, :]
+        return (e[..., : 12 * V].reshape(*batch, 3, 12, V) * of_sides.reshape(*batch, 1, 12, V)).sum(-2).mT
 
     def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
         """Positive semi-definite stiffness of displacements along one direction a vertex.
@@ -178,7 +218,7 @@ class ElasticEnergy(nn.Module):
         d = triangles_of(corners(directions, self.grid))
         return self._quadrilaterals(torch.einsum("...kilj,...ki,...lj->...kl", H, d, d))
 
-    def hessian_blocks(self, x: Tensor, positive=False) -> Tensor:
+    def hessian_blocks(self, x: Tensor, positive: bool = False) -> Tensor:
         """Second derivatives of every triangle's energy in its nine vertex coordinates, `[..., m-1, n-1, 2, 9, 9]`.
 
         Arguments: `x [..., V, 3]`. Exact; with `positive` the convex part: compression and (Mooney-Rivlin) the term of `D`
@@ -193,7 +233,7 @@ class ElasticEnergy(nn.Module):
         return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
     def one_ring(self, edges: Tensor) -> tuple[Tensor, Tensor]:
-        """What inner vertices' forces and slopes are made of, at their six neighbours: `s [..., 6, N]`, `H [..., 3, 3, 6, N]`.
+        """Inner vertices' forces and tangent stiffness, by their six neighbours: `s [..., 6, N]`, `H [..., 3, 3, 6, N]`.
 
         The force (as `gradient`) is `sum_i s_i (x_i - x_k)` over the six neighbours; its derivative in neighbour `i` is `H_i`,
         in the vertex itself minus the sum of the six. `edges [..., 3, 2, 6 N]`, from `one_ring_edges`. A neighbour is the
@@ -205,7 +245,7 @@ class ElasticEnergy(nn.Module):
         one = torch.eye(3, dtype=edges.dtype, device=edges.device)[..., None, None]
         return stress[..., 0, 0, :, :], blocks + stress * one
 
-    def _pairs(self, strain: Strain, rest: Rest, positive=False, count=3) -> tuple[Tensor, Tensor]:
+    def _pairs(self, strain: Strain, rest: Rest, positive: bool = False, count: int = 3) -> tuple[Tensor, Tensor]:
         """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2), or the first `count` of these pairs:
         `B [..., count, 3, 3, T]` and `S [..., count, 1, 1, T]` of `B + S 1`.
 
@@ -214,14 +254,13 @@ class ElasticEnergy(nn.Module):
         """
         e, adjugate, I, D = strain  # noqa: E741
         w, q = self.derivatives(I, D), self.twice_12 / rest.det * adjugate
-        outer = lambda a, b: (a[..., :, None, :] * b[..., None, :, :]).flatten(-3, -2)  # noqa: E731
         stress = 2 * rest.area * rest.inverse_metric * w.I + 2 * rest.area / rest.det * w.D * adjugate
-        Q = outer(q, rest.area * w.DD * q) + rest.area / rest.det * (w.convex_D if positive else w.D) * self.bend
+        Q = _outer(q, rest.area * w.DD * q) + rest.area / rest.det * (w.convex_D if positive else w.D) * self.bend
         if self.model == "mooney_rivlin":
             p = rest.area * w.ID * self.twice_12 * rest.inverse_metric
-            Q = Q + outer(p, q) + outer(q, p)
+            Q = Q + _outer(p, q) + _outer(q, p)
         T = (self.metric_to_pairs[: 4 * count] @ Q).unflatten(-2, (count, 2, 1, 2))
-        S = (self.stress_to_pairs[:count] @ (_tension(stress) if positive else stress))[..., None, None, :]
+        S = (self.stress_to_pairs[:count] @ (tensile_part(stress) if positive else stress))[..., None, None, :]
         first, second = (T * e[..., None, None, :, :, :]).sum(-2).unbind(-3)
         e1, e2 = e[..., None, :, None, :, :].unbind(-2)
         return e1 * first[..., None, :, :] + e2 * second[..., None, :, :], S
@@ -239,57 +278,10 @@ class ElasticEnergy(nn.Module):
         return 2 * (w.I + w.D)
 
 
-def _cells(grid) -> tuple[int, int]:
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    """Products of the entries of `[..., 3, T]`, `[..., 9, T]`."""
+    return (a[..., :, None, :] * b[..., None, :, :]).flatten(-3, -2)
+
+
+def _cells(grid: tuple[int, int]) -> tuple[int, int]:
     return grid[0] - 1, grid[1] - 1
-
-
-def _edges(x: Tensor, grid) -> Tensor:
-    g = x.transpose(-2, -1).unflatten(-1, grid)
-    a, b, c, d = g[..., :-1, :-1], g[..., 1:, :-1], g[..., 1:, 1:], g[..., :-1, 1:]
-    ac = c - a
-    return torch.stack([torch.stack([b - a, ac], -3), torch.stack([ac, d - a], -3)], -4).flatten(-3)
-
-
-def _metric(edges: Tensor) -> Tensor:
-    e1, e2 = edges.split(1, -2)
-    return (torch.cat([e1, e1, e2], -2) * torch.cat([e1, e2, e2], -2)).sum(-3)
-
-
-def _adjugate(metric: Tensor) -> Tensor:
-    g11, g12, g22 = metric.split(1, -2)
-    return torch.cat([g22, -g12, g11], -2)
-
-
-def _determinant(metric: Tensor) -> Tensor:
-    g11, g12, g22 = metric.split(1, -2)
-    return g11 * g22 - g12 * g12
-
-
-def _metric_constants() -> dict[str, Tensor]:
-    """What is constant in second derivatives by the metric's entries 11, 12, 22.
-
-    `twice_12 [3]`; `bend [9]`, those of the determinant; `metric_to_pairs [12, 9]`, from any such to `T_cd` of
-    `ElasticEnergy._pairs`;
-    `stress_to_pairs [3, 3]`, likewise for the stress.
-    """
-    slopes = np.zeros((2, 3, 2))  # d g / d e_a = sum_c slopes[a, g, c] e_c
-    slopes[0, 0, 0] = slopes[1, 2, 1] = 2.0
-    slopes[0, 1, 1] = slopes[1, 1, 0] = 1.0
-    edges = np.einsum("agc,bhd->abcdgh", slopes, slopes).reshape(2, 2, 4, 9)
-    to_pairs = np.stack([-edges.sum(0)[0], -edges.sum(0)[1], edges[0, 1]]).reshape(12, 9)
-    return dict(
-        twice_12=torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)[:, None],
-        bend=torch.tensor([0.0, 0, 1, 0, -2, 0, 1, 0, 0], dtype=torch.float64)[:, None],
-        metric_to_pairs=torch.from_numpy(to_pairs),
-        stress_to_pairs=torch.tensor([[-1.0, -1, 0], [0, -1, -1], [0, 1, 0]], dtype=torch.float64),
-    )
-
-
-def _tension(stress: Tensor) -> Tensor:
-    """The positive semi-definite part of symmetric 2 x 2 matrices given as (11, 12, 22), `[..., 3, T]`."""
-    s11, s12, s22 = stress.split(1, -2)
-    mean, half = (s11 + s22) / 2, (s11 - s22) / 2
-    radius = (half**2 + s12**2).clamp_min(torch.finfo(stress.dtype).tiny).sqrt()
-    high, low = (mean + radius).clamp_min(0), (mean - radius).clamp_min(0)
-    centre, slope = (high + low) / 2, (high - low) / (2 * radius)
-    return torch.cat([centre + slope * half, slope * s12, centre - slope * half], -2)

@@ -5,12 +5,15 @@ The reconstructor is called with `Value`s: what it and its parts mark as a `piec
 
 import json
 from collections.abc import Callable, Sequence
+from inspect import unwrap
 from pathlib import Path
+from types import MethodType
+from typing import Any
 
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, helper
+from onnx import TensorProto
 from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten, tree_leaves, tree_map, tree_unflatten
 
@@ -20,7 +23,7 @@ from ..io.status import Status
 from ..io.store import FORMATS, Mesh, Settings
 from ..pieces import Value
 from ..reconstruct import Reconstructor
-from .graph import Assembly, traced
+from .graph import Assembly, described, traced
 
 FORMAT = 1
 EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
@@ -29,7 +32,7 @@ EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
 class Known(Value):
     """A value by its name in the graph, with an example to trace with."""
 
-    def __init__(self, graph: "Tracer", name: str, example: Tensor):
+    def __init__(self, graph: "Tracer", name: str, example: Tensor) -> None:
         super().__init__(graph)
         self.name, self.example = name, example
 
@@ -37,7 +40,12 @@ class Known(Value):
 class Piece(nn.Module):
     """A method with the module whose buffers it uses; `arranged` makes its arguments of the tensors among them."""
 
-    def __init__(self, owner: nn.Module | None, function: Callable, arranged: Callable = lambda *tensors: tensors):
+    def __init__(
+        self,
+        owner: nn.Module | None,
+        function: Callable[..., Any],
+        arranged: Callable[..., Sequence[Any]] = lambda *tensors: tensors,
+    ) -> None:
         super().__init__()
         self.owner, self.function, self.arranged = owner, function, arranged
 
@@ -51,28 +59,32 @@ class Tracer:
     Nodes are named after the part of the package that they come from.
     """
 
-    def __init__(self):
-        self.assembly, self.traced = Assembly(), {}
+    def __init__(self) -> None:
+        self.assembly = Assembly()
+        self.traced: dict[tuple[Any, ...], onnx.ModelProto] = {}
 
     def given(self, name: str, example: Tensor) -> Known:
         """An input of the graph."""
         return Known(self, name, example)
 
-    def call(self, owner: nn.Module | None, function: Callable, inputs: Sequence):
+    def call(self, owner: nn.Module | None, function: Callable[..., Any], inputs: Sequence[Any]) -> Any:
         """Values of `function(owner, *inputs)`."""
         model, names, found = self._trace(owner, function, inputs)
         return self._known(found, self.assembly.append(model, names))
 
-    def repeat(self, step: Callable, rows: Sequence[tuple[float, ...]], state: Sequence, given: Sequence) -> Sequence:
+    def repeat(
+        self, step: Callable[..., Any], rows: Sequence[tuple[float, ...]], state: Sequence[Any], given: Sequence[Any]
+    ) -> Any:
         """Values after a loop of a bound piece, as `pieces.repeated`."""
-        tables = [np.array(column, np.float32) for column in zip(*rows, strict=True)]
-        row = [Known(self, "", torch.as_tensor(table[0])) for table in tables]
-        model, names, found = self._trace(step.__self__, step.__func__.__wrapped__, [*state, *given, *row])
-        tables = {name: table for (name, _), table in zip(reversed(names.items()), reversed(tables), strict=False)}
+        assert isinstance(step, MethodType) and isinstance(step.__self__, nn.Module)
+        columns = [np.array(column, np.float32) for column in zip(*rows, strict=True)]
+        row = [Known(self, "", torch.as_tensor(column[0])) for column in columns]
+        model, names, found = self._trace(step.__self__, unwrap(step.__func__), [*state, *given, *row])
+        tables = dict(zip(reversed(names), reversed(columns), strict=False))
         names = {name: here for name, here in names.items() if name not in tables}
         return self._known(found, self.assembly.repeat(model, names, len(rows), tables))
 
-    def unless(self, done: Known, values: Sequence, otherwise: Callable[[], Sequence]) -> Sequence:
+    def unless(self, done: Known, values: Sequence[Known], otherwise: Callable[[], Sequence[Known]]) -> Sequence[Known]:
         """Values after a conditional, as `pieces.unless`."""
         condition = self.call(None, _everywhere, (done,))
         names = {k: value.name for k, value in enumerate(values)}
@@ -80,15 +92,18 @@ class Tracer:
             names |= {k: value.name for k, value in enumerate(otherwise())}
         return [Known(self, names[k], value.example) for k, value in enumerate(values)]
 
-    def _trace(self, owner, function, inputs) -> tuple[onnx.ModelProto, dict[str, str], Sequence]:
+    def _trace(
+        self, owner: nn.Module | None, function: Callable[..., Any], inputs: Sequence[Any]
+    ) -> tuple[onnx.ModelProto, dict[str, str], Any]:
         """The piece as a model, the names that its inputs have here, and examples of its outputs."""
         leaves, structure = tree_flatten(tuple(inputs))
-        places = {k: leaf for k, leaf in enumerate(leaves) if isinstance(leaf, Value)}
+        places = {k: leaf for k, leaf in enumerate(leaves) if isinstance(leaf, Known)}
         fixed = {k: leaf for k, leaf in enumerate(leaves) if k not in places}
 
-        def arranged(*tensors):
+        def arranged(*tensors: Tensor) -> Sequence[Any]:
             known = fixed | dict(zip(places, tensors, strict=True))
-            return tree_unflatten([known[k] for k in range(len(known))], structure)
+            arguments: Sequence[Any] = tree_unflatten([known[k] for k in range(len(known))], structure)
+            return arguments
 
         names = {f"input {k}": value.name for k, value in places.items()}
         examples = {f"input {k}": value.example.clone() for k, value in places.items()}  # one tensor twice is traced as one
@@ -102,13 +117,13 @@ class Tracer:
             self.traced[key] = traced(Piece(owner, function, arranged), examples, outputs)
         return self.traced[key], names, found
 
-    def _known(self, found, names: dict[str, str]):
+    def _known(self, found: Any, names: dict[str, str]) -> Any:
         """The values of such names, arranged as the examples `found` are."""
-        names = iter(names.values())
-        return tree_map(lambda example: Known(self, next(names), example), found)
+        each = iter(names.values())
+        return tree_map(lambda example: Known(self, next(each), example), found)
 
 
-def _everywhere(_, done):
+def _everywhere(_: None, done: Tensor) -> Tensor:
     return done.all()
 
 
@@ -137,7 +152,8 @@ def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = F
         )
     width, height = reconstructor.image_size
     image = torch.rand(EXAMPLES, 1, height, width, generator=torch.Generator().manual_seed(0)).to(reconstructor.rest_pixels)
-    tracer, before = Tracer(), dict.fromkeys(Reconstruction._fields)
+    tracer = Tracer()
+    before: dict[str, Any] = dict.fromkeys(Reconstruction._fields)
     inputs = [tracer.given("image", image)]
     if tracking:
         membrane = reconstructor.estimator.membrane
@@ -148,7 +164,8 @@ def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = F
         }
         inputs += [tracer.given(name, rest[name.removeprefix("previous_")]) for name in previous_of(reconstructor)]
         before |= {value.name.removeprefix("previous_"): value for value in inputs[1:]}
-    result = reconstructor.reconstruct_grey(inputs[0], Reconstruction(**before) if tracking else None)
+    grey: Any = inputs[0]  # stands for a tensor
+    result: Any = reconstructor.reconstruct_grey(grey, Reconstruction(**before) if tracking else None)
     model = _finished(tracer, inputs, result, reconstructor)
     onnx.save(model, path)
     return model
@@ -160,15 +177,17 @@ def previous_of(reconstructor: Reconstructor) -> tuple[str, ...]:
     return names[: 3 if reconstructor.observer.locator.follows else 2]
 
 
-def _finished(tracer: Tracer, inputs: list[Known], result: Reconstruction, reconstructor: Reconstructor) -> onnx.ModelProto:
-    def described(name: str, value: Known, kind: int) -> onnx.ValueInfoProto:
-        return helper.make_tensor_value_info(name, kind, ["batch", *value.example.shape[1:]])
+def _finished(tracer: Tracer, inputs: list[Known], result: Any, reconstructor: Reconstructor) -> onnx.ModelProto:
+    """The model, its values described, from a `Reconstruction` of `Known` values."""
+
+    def of_batch(name: str, value: Known, kind: int) -> onnx.ValueInfoProto:
+        return described(name, kind, ["batch", *value.example.shape[1:]])
 
     outputs = []
     for name, value in result._asdict().items():
         tracer.assembly.named(value.name, name)
-        outputs.append(described(name, value, TensorProto.INT32 if name == "status" else TensorProto.FLOAT))
-    given = [described(value.name, value, TensorProto.FLOAT) for value in inputs]
+        outputs.append(of_batch(name, value, TensorProto.INT32 if name == "status" else TensorProto.FLOAT))
+    given = [of_batch(value.name, value, TensorProto.FLOAT) for value in inputs]
     mesh = Mesh.of(reconstructor, Settings.of(reconstructor, FORMATS[0]))._asdict()
     plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in mesh.items()}
     texts = {str(status.value): status.text for status in Status}

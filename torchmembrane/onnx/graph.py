@@ -2,7 +2,9 @@
 
 import logging
 import warnings
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import onnx
@@ -36,9 +38,18 @@ def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporter about itself
         program = torch.onnx.export(
-            module.eval(), tuple(inputs.values()), input_names=list(inputs), output_names=outputs, opset_version=OPSET,
-            dynamic_shapes=(shapes,), dynamo=True, external_data=False, verbose=False, optimize=False,
-        )  # fmt: skip
+            module.eval(),
+            tuple(inputs.values()),
+            input_names=list(inputs),
+            output_names=outputs,
+            opset_version=OPSET,
+            dynamic_shapes=(shapes,),
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+            optimize=False,
+        )
+    assert program is not None  # it is None only of the exporter before dynamo
     common.InlinePass()(program.model)
     fold_constants_ir(program.model)
     _plain_reshapes(program.model.graph)
@@ -51,10 +62,11 @@ def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> 
 def _plain_reshapes(graph: ir.Graph) -> None:
     """Shapes of which one length depends on the batch, put together at every run, become constants with -1 for it."""
     for node in list(graph):
-        shape = node.inputs[1].producer() if node.op_type == "Reshape" else None
+        lengths_of = node.inputs[1] if node.op_type == "Reshape" else None
+        shape = None if lengths_of is None else lengths_of.producer()
         if shape is None or shape.op_type != "Concat":
             continue
-        lengths = [ir.convenience.get_const_tensor(part) for part in shape.inputs]
+        lengths = [None if part is None else ir.convenience.get_const_tensor(part) for part in shape.inputs]
         if sum(length is None for length in lengths) == 1:
             known = np.concatenate([[-1] if length is None else length.numpy() for length in lengths])
             constant = ir.node("Constant", [], {"value": ir.tensor(known)})
@@ -70,9 +82,9 @@ class Assembly:
     `append` and `repeat` take a model from `traced` and the names that its inputs have here, and return its outputs' names.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
-        self.constants: dict[tuple, TensorProto] = {}
+        self.constants: dict[tuple[Any, ...], TensorProto] = {}
         self.pieces, self.part = 0, ""
 
     def append(self, piece: onnx.ModelProto, names: dict[str, str]) -> dict[str, str]:
@@ -110,22 +122,18 @@ class Assembly:
         ]
         go_on = helper.make_node("Identity", [f"{k}/on"], [f"{k}/still"])
         kinds = {value.name: value.type.tensor_type.elem_type for value in piece.graph.input}
-        described = lambda name, kind: helper.make_tensor_value_info(name, kind, None)  # noqa: E731
-        body = helper.make_graph(
-            [*rows, *nodes, go_on], "step",
-            [helper.make_tensor_value_info(f"{k}/step", TensorProto.INT64, []),
-             helper.make_tensor_value_info(f"{k}/on", TensorProto.BOOL, []),
-             *(described(inside[name], kinds[name]) for name in state)],
-            [helper.make_tensor_value_info(f"{k}/still", TensorProto.BOOL, []),
-             *(described(here, kinds[name]) for name, here in zip(state, outputs.values(), strict=True))],
-        )  # fmt: skip
+        counter = [described(f"{k}/step", TensorProto.INT64, []), described(f"{k}/on", TensorProto.BOOL, [])]
+        entering = [described(inside[name], kinds[name]) for name in state]
+        leaving = [described(here, kinds[name]) for name, here in zip(state, outputs.values(), strict=True)]
+        still = described(f"{k}/still", TensorProto.BOOL, [])
+        body = helper.make_graph([*rows, *nodes, go_on], "step", [*counter, *entering], [still, *leaving])
         last = {name: f"{here}/last" for name, here in outputs.items()}
         trips = [self.constant(np.array(steps)), self.constant(np.array(True))]
         self.nodes.append(helper.make_node("Loop", [*trips, *(names[name] for name in state)], list(last.values()), body=body))
         return last
 
     @contextmanager
-    def unless(self, condition: str, names: dict[str, str]):
+    def unless(self, condition: str, names: dict[Any, str]) -> Iterator[None]:
         """Pieces appended inside run where `condition` (bool) is false only.
 
         `names` of float values here; inside they are to be given the names of what replaces them. On leaving they become those
@@ -134,17 +142,18 @@ class Assembly:
         k, before, outside = f"{self.part}/{self.pieces}", dict(names), self.nodes
         self.nodes = []
         yield
-        described = lambda names: [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in names]  # noqa: E731
         same = [helper.make_node("Identity", [name], [f"{k}/{i}/same"]) for i, name in enumerate(before.values())]
         branches = dict(
-            then_branch=helper.make_graph(same, "then", [], described(node.output[0] for node in same)),
-            else_branch=helper.make_graph(self.nodes, "else", [], described(names.values())),
+            then_branch=helper.make_graph(same, "then", [], [described(node.output[0]) for node in same]),
+            else_branch=helper.make_graph(self.nodes, "else", [], [described(name) for name in names.values()]),
         )
         names |= {name: f"{k}/{i}/either" for i, name in enumerate(names)}
         self.nodes = [*outside, helper.make_node("If", [condition], list(names.values()), **branches)]
 
-    def model(self, inputs, outputs, metadata: dict[str, str]) -> onnx.ModelProto:
-        """The whole as a checked model; `inputs` and `outputs` are ONNX value descriptions."""
+    def model(
+        self, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto], metadata: dict[str, str]
+    ) -> onnx.ModelProto:
+        """The whole as a checked model of such inputs and outputs, with metadata."""
         graph = helper.make_graph(self.nodes, "torchmembrane", inputs, outputs, list(self.constants.values()))
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="torchmembrane")
         model.ir_version = IR_VERSION
@@ -167,6 +176,12 @@ class Assembly:
             node.output[:] = [known[name] for name in node.output]
             node.name = next(filter(None, node.output))
         return nodes, {value.name: known[value.name] for value in piece.graph.output}
+
+
+def described(name: str, kind: int = TensorProto.FLOAT, shape: Sequence[str | int] | None = None) -> onnx.ValueInfoProto:
+    """A value's description, as ONNX declares it: its name, element type and shape (None: not said; strings: free lengths)."""
+    description: onnx.ValueInfoProto = helper.make_tensor_value_info(name, kind, shape)
+    return description
 
 
 def _bare(node: onnx.NodeProto) -> onnx.NodeProto:

@@ -110,7 +110,7 @@ def _draw_projection(
     axes.add_collection(mesh_lines(pixels, grid, color=BLUE, lw=0.4))
     axes.plot(*pixels[closed_rim(grid)].T, color=BLUE, lw=1.8, label="rim and grid, projected")
     if frame is not None and reconstructor is not None:
-        place, found = reconstructor.measured_rest.cpu().numpy(), frame["confidence"] > 0
+        place, found = reconstructor.observer.measured_rest.cpu().numpy(), frame["confidence"] > 0
         size, label = 6 if len(found) < 300 else 2.5, f"markers found ({found.sum()})"
         axes.plot(*place[found].T, "o", ms=size, mfc="none", mec=VERMILION, mew=1, label=label)
         if not found.all():

@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from ..camera.model import Camera
 from ..io.images import to_grey
@@ -63,6 +62,8 @@ def half_cylinder() -> Sensor:
 
 def write(folder: Path) -> None:
     """The files of every preset: `NAME/sensor.toml`, `sensor_dots.csv`, `sensor_rest.png`."""
+    from tqdm import tqdm
+
     for name in tqdm(NAMES, desc="presets", unit="sensor"):
         globals()[name]().to_file(folder / name)
 

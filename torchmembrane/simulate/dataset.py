@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from ..errors import MembraneError
 from .frames import SimulatedFrames
@@ -141,6 +140,8 @@ def _random_body(kind: str, size: float, rng: np.random.Generator) -> Indenter:
 
 
 def _report(line: str) -> None:
+    from tqdm import tqdm
+
     tqdm.write(line, file=sys.stderr)
 
 
@@ -164,6 +165,8 @@ def make_frames(
         jobs: processes.
         report: takes a line for each press that fails.
     """
+    from tqdm import tqdm
+
     names = {number: f"s{plan.seed}_{number:06d}" for number in range(count)}
     held = frames.names()
     wanted = [number for number, name in names.items() if name not in held]

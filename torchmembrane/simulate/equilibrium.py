@@ -111,7 +111,7 @@ class EquilibriumProblem:
     """
 
     def __init__(self, membrane: Membrane, elasticity: ElasticEnergy, cavity: Filling, load: Tensor | None = None) -> None:
-        self.membrane, self.elasticity, self.cavity, self.free = membrane, elasticity, cavity, membrane.free
+        self.membrane, self.elasticity, self.cavity, self.free = membrane, elasticity, cavity, membrane.free_vertices
         self.load = torch.zeros_like(membrane.rest) if load is None else load
         self.matrix = _SparsityPattern(membrane)
         modulus = float(2 * (elasticity.c1 + elasticity.c2) + elasticity.tension.abs())
@@ -202,7 +202,7 @@ class _SparsityPattern:
     """Sum of triangle blocks and free vertices' blocks on the free degrees of freedom, with a sparsity pattern found once."""
 
     def __init__(self, membrane: Membrane) -> None:
-        V, free = len(membrane.rest), membrane.free.numpy()
+        V, free = len(membrane.rest), membrane.free_vertices.numpy()
         number = np.full(V, -1)
         number[free] = np.arange(len(free))
         triangles = triangles_of(corners(torch.arange(V)[:, None], membrane.grid)).reshape(-1, 3).numpy()

@@ -136,7 +136,8 @@ def presses(
     problem = EquilibriumProblem(membrane, elasticity, _cavity(membrane, rest_pressure, filling, gas), load)
     x, pressure = membrane.rest, rest_pressure
     contacts: Sequence[FrictionalContact] = [
-        FrictionalContact.at_first_pose(path[0], x[membrane.free], problem.vertex_stiffness, friction) for path in paths
+        FrictionalContact.at_first_pose(path[0], x[membrane.free_vertices], problem.vertex_stiffness, friction)
+        for path in paths
     ]
     for poses in zip(*paths, strict=True):
         x, pressure, contacts, iterations = _moved(problem, x, pressure, contacts, poses, increment)

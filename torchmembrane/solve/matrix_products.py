@@ -15,7 +15,8 @@ LARGEST_CONDITION = 1e4  # of a leaf, Jacobi-scaled
 
 def schulz_scales(condition: float, rounding: float) -> list[float]:
     """By what to scale `X` before every step, for eigenvalues of `A X` from `1 / condition` to 1 at first."""
-    low, scales = 1 / condition, []
+    low = 1 / condition
+    scales: list[float] = []
     while not scales or 1 - low > rounding:
         scales.append(2 / (1 + low))
         low = 1 - (1 - scales[-1] * low) ** 2

@@ -3,6 +3,7 @@
 from itertools import groupby
 from math import prod
 from operator import itemgetter
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -17,27 +18,38 @@ NEAR = ((0, 0), (0, 1), (1, 0), (1, 1))  # from a vertex to itself and to its ne
 
 
 class StencilSystem(nn.Module):
-    """Three unknowns an inner vertex of an `m x n` grid, those of two grid rows a block; the matrix is block tridiagonal.
+    """Three unknowns per inner vertex of an `m x n` grid, one block per two grid rows; the matrix is block tridiagonal.
 
-    Arguments: the grid and `free [N]` bool, the inner vertices that move. Columns of those that do not must be zero.
     Vectors are fields `[3, N]` over the inner vertices, flattened. Sums are gathered, not scattered, three numbers at a time:
     where they come from is known beforehand.
+
+    Args:
+        grid: `(m, n)`.
+        free: `[N]` bool, which inner vertices are free. Columns of the others must be zero.
     """
+
+    order: Tensor
+    block_of_row: Tensor
+    product_sources: Tensor
+    scatter_index: Tensor
+    ends: Tensor
+    one: Tensor
+    fixed: Tensor
 
     def __init__(self, grid: tuple[int, int], free: Tensor):
         super().__init__()
         m, n = grid
         self.count, self.blocks, self.block_size = (m - 2) * (n - 2), (m - 1) // 2, 6 * (n - 2)
-        groups = _ways()
-        ways = [way for group in groups for way, _ in group]
-        sources = [np.stack([_product_sources(grid, way) for way in group], 1) for group in groups]
+        groups = _offsets()
+        offsets = [offset for group in groups for offset, _ in group]
+        sources = [np.stack([_product_sources(grid, *joined) for joined in group], 1) for group in groups]
         self.sizes = [source.shape for source in sources]
         for name, index in (
             ("order", np.array(block_tridiagonal.inwards(self.blocks))),
-            ("place", np.argsort(block_tridiagonal.inwards(self.blocks))),
+            ("block_of_row", np.argsort(block_tridiagonal.inwards(self.blocks))),
             ("product_sources", np.concatenate([source.ravel() for source in sources])),
-            ("places", _places(grid, ways, free.cpu().numpy(), self.blocks).ravel()),
-            ("ends", np.concatenate([_Inner.of(grid).beside(way) for way in ways])),
+            ("scatter_index", _scatter_index(grid, offsets, free.cpu().numpy(), self.blocks).ravel()),
+            ("ends", np.concatenate([_Inner.of(grid).beside(offset) for offset in offsets])),
         ):
             self.register_buffer(name, torch.from_numpy(index.astype(np.int32)))
         self.register_buffer("one", torch.eye(3, dtype=torch.float64))
@@ -60,7 +72,7 @@ class StencilSystem(nn.Module):
         one = self.one.to(blocks).expand(blocks.shape[0], 3, 3)
         entries = torch.cat([blocks.flatten(1, 3), blocks.transpose(2, 4).flatten(1, 3), one], 1)
         s = self.block_size
-        matrix = entries.index_select(1, self.places).flatten(1).unflatten(1, (-1, s, s))
+        matrix = entries.index_select(1, self.scatter_index).flatten(1).unflatten(1, (-1, s, s))
         return *matrix.split([self.blocks, self.blocks - 1], 1), scale.mT.flatten(1)[:, None]
 
     def factor(self, matrix: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, ...]:
@@ -84,11 +96,11 @@ class StencilSystem(nn.Module):
 
     def from_blocks(self, blocks: Tensor) -> Tensor:
         """`in_blocks` undone."""
-        unknowns = blocks.index_select(1, self.place).transpose(1, 2).flatten(-2)[..., : 3 * self.count]
+        unknowns = blocks.index_select(1, self.block_of_row).transpose(1, 2).flatten(-2)[..., : 3 * self.count]
         return unknowns.unflatten(-1, (-1, 3)).mT.flatten(-2)
 
 
-def _elimination():
+def _elimination() -> ModuleType:
     return matrix_products if torch.compiler.is_exporting() else block_tridiagonal
 
 
@@ -100,56 +112,57 @@ class _Inner(NamedTuple):
     size: tuple[int, int]
 
     @classmethod
-    def of(cls, grid):
+    def of(cls, grid: tuple[int, int]) -> "_Inner":
         size = (grid[0] - 2, grid[1] - 2)
-        return cls(*(index.ravel() for index in np.indices(size)), size)
+        row, column = np.indices(size)
+        return cls(row.ravel(), column.ravel(), size)
 
-    def at(self, row, column):
+    def at(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
         inside = (row >= 0) & (row < self.size[0]) & (column >= 0) & (column < self.size[1])
         return np.where(inside, row * self.size[1] + column, -1)
 
-    def beside(self, way):
-        """The number of every vertex' neighbour on its way; of some vertex where there is none."""
-        return self.at(self.row + way[0], self.column + way[1]).clip(min=0)
+    def beside(self, offset: tuple[int, int]) -> np.ndarray:
+        """The number of every vertex' neighbour at an offset; of some vertex where there is none."""
+        return self.at(self.row + offset[0], self.column + offset[1]).clip(min=0)
 
 
-def _ways() -> list[list[tuple[tuple[int, int], list[tuple[int, int]]]]]:
-    """Ways between two vertices of a stencil, none beside its reverse, and the pairs of slots they join, grouped by how many.
+def _offsets() -> list[list[tuple[tuple[int, int], list[tuple[int, int]]]]]:
+    """Offsets between two vertices of a stencil, none beside its opposite, and the pairs of slots they join, by how many.
 
-    The first group is a vertex's way to itself, the second those to its neighbours: together `NEAR`.
+    The first group is a vertex's offset to itself, the second those to its neighbours: together `NEAR`.
     """
-    pairs = {}
+    pairs: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for a, start in enumerate(STENCIL):
         for b, end in enumerate(STENCIL):
             pairs.setdefault((end[0] - start[0], end[1] - start[1]), []).append((a, b))
-    forth = sorted((-len(found), way, found) for way, found in pairs.items() if way >= (0, 0))
-    return [[(way, found) for _, way, found in group] for _, group in groupby(forth, key=itemgetter(0))]
+    upper = sorted((-len(found), offset, found) for offset, found in pairs.items() if offset >= (0, 0))
+    return [[(offset, found) for _, offset, found in group] for _, group in groupby(upper, key=itemgetter(0))]
 
 
 _ZERO = STENCIL.index((-1, -1))  # the first inner vertex's column for this neighbour, on the border, is zero
 
 
-def _product_sources(grid, way) -> np.ndarray:
-    """Where in products `[N, 21, 7]` the rows of the block between a vertex and that on its `way` have their parts:
+def _product_sources(grid: tuple[int, int], offset: tuple[int, int], pairs: list[tuple[int, int]]) -> np.ndarray:
+    """Where in products `[N, 21, 7]` the rows of the block between a vertex and that at an `offset` from it have their parts:
     `[K, 3, N]`."""
     inner, component, slots = _Inner.of(grid), np.arange(3)[:, None], len(STENCIL)
-    (di, dj), pairs = way
+    di, dj = offset
     sources = []
     for a, b in pairs:
         i, j = STENCIL[a]
         row, other = inner.at(inner.row - i, inner.column - j), inner.at(inner.row + di, inner.column + dj)
-        place = (row * 3 * slots + 3 * a + component) * slots + b
-        sources.append(np.where((row >= 0) & (other >= 0), place, 3 * _ZERO * slots + _ZERO))
+        source = (row * 3 * slots + 3 * a + component) * slots + b
+        sources.append(np.where((row >= 0) & (other >= 0), source, 3 * _ZERO * slots + _ZERO))
     return np.stack(sources)
 
 
-def _places(grid, ways, free, blocks) -> np.ndarray:
+def _scatter_index(grid: tuple[int, int], offsets: list[tuple[int, int]], free: np.ndarray, blocks: int) -> np.ndarray:
     """Where three neighbouring entries of the blocks on the diagonal, then of those beside it, are, `[2 blocks - 1, s, s / 3]`:
-    in the blocks' rows `[ways, 3, N]`, their columns `[ways, 3, N]`, a one's rows, one after another."""
+    in the blocks' rows `[offsets, 3, N]`, their columns `[offsets, 3, N]`, a one's rows, one after another."""
     inner, N, s = _Inner.of(grid), len(free), 6 * (grid[1] - 2)
     number = np.full((5, 5), -1)
-    for k, way in enumerate(ways):
-        number[way] = k  # negative indices wrap: the way back has its own place
+    for k, offset in enumerate(offsets):
+        number[offset] = k  # negative indices wrap: the opposite offset has its own place
     unknown = np.arange(blocks * s).reshape(blocks, s)
     rows, columns = np.array([(k, k) for k in block_tridiagonal.inwards(blocks)] + block_tridiagonal.coupled(blocks)).T
     p, c = np.divmod(unknown[rows][:, :, None], 3)
@@ -158,8 +171,8 @@ def _places(grid, ways, free, blocks) -> np.ndarray:
     i, j = (index[q.clip(max=N - 1)] - index[p.clip(max=N - 1)] for index in (inner.row, inner.column))
     close = used[0] & used[1] & (abs(i) <= 2) & (abs(j) <= 2)
     i, j = np.where(close, i, 0), np.where(close, j, 0)
-    forth, back = number[i, j], number[-i, -j]
-    entry = np.where(forth >= 0, (3 * forth + c) * N + p, (3 * (len(ways) + back) + c) * N + q)
-    zero, one = (3 * ways.index((2, 2)) + 1) * N - 1, 6 * len(ways) * N + c
-    entry = np.where(close & ((forth >= 0) | (back >= 0)), entry, zero)
+    upper, lower = number[i, j], number[-i, -j]
+    entry = np.where(upper >= 0, (3 * upper + c) * N + p, (3 * (len(offsets) + lower) + c) * N + q)
+    zero, one = (3 * offsets.index((2, 2)) + 1) * N - 1, 6 * len(offsets) * N + c
+    entry = np.where(close & ((upper >= 0) | (lower >= 0)), entry, zero)
     return np.where((p == q) & ~used[0], one, entry)

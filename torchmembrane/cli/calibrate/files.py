@@ -4,18 +4,22 @@ import csv
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from ...calibrate.detection import find_target
 from ...errors import MembraneError
 from ...io.images import read_image
 from ...io.report import Report
 from ...jobs.inputs import find_inputs
+from ...plot.drawing import save
 from ...presets import sensor_file
 from ...sensor.sensor import Sensor
 from ...targets import Checkerboard, DotBoard
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def read_sensor(arguments: Namespace) -> Sensor:
@@ -23,10 +27,11 @@ def read_sensor(arguments: Namespace) -> Sensor:
     return Sensor.from_file(sensor_file(arguments.sensor))
 
 
-def write_calibrated(arguments: Namespace, sensor: Sensor, report: Report, drawing: Figure) -> int:
+def write_calibrated(arguments: Namespace, sensor: Sensor, report: Report, drawing: "Figure") -> int:
     """Write the calibrated sensor and its report, print what was found; returns the exit code."""
     path = sensor.to_file(arguments.out)
-    report.write(arguments.out, drawing)
+    report.write(arguments.out)
+    save(drawing, arguments.out / "report.png")
     print("\n".join([*report.lines, f"calibrated sensor: {path}; report.json and report.png beside it"]))
     return 0
 

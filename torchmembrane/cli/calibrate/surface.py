@@ -1,10 +1,10 @@
 """The steps `rest`, `views` and `depth`: the rest surface and its dots from images of the membrane at rest."""
 
 from argparse import Namespace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 from ...calibrate.depth import rest_from_depth
 from ...calibrate.rest import rest_from_image
@@ -15,6 +15,9 @@ from ...io.report import Report
 from ...plot.calibration import fit_figure, surface_figure
 from ...sensor.sensor import Sensor
 from .files import read_depth, read_motions, read_sensor, write_calibrated
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def rest(arguments: Namespace) -> int:
@@ -58,13 +61,13 @@ def depth(arguments: Namespace) -> int:
     notes = [
         f"{len(found.deviations)} squares of depths, each known to {np.median(found.deviations):.4f} {unit}",
         _moved(found.surface, unit),
-        f"{len(found.sensor.markers.positions)} dots placed on the surface",
+        f"{len(found.sensor.markers.sizes or ())} dots placed on the surface",
     ]
     report = Report.without_parameters("rest surface from a depth image", notes)
     return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface))
 
 
-def _drawn(sensor: Sensor, report: Report, surface: Correction) -> Figure:
+def _drawn(sensor: Sensor, report: Report, surface: Correction) -> "Figure":
     vertices = fine_surface(sensor).rest.numpy()
     return surface_figure(report, sensor.camera.image_size, vertices, surface, sensor.length_unit)
 

@@ -1,0 +1,238 @@
+"""What `import torchmembrane as tm` gives: images as cameras give them, streams, results that move; wrong calls in words."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import torchmembrane as tm
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+NAMES = ("press_on_axis", "two_contacts", "flat_plate")
+
+
+@pytest.fixture(scope="module")
+def sensor():
+    whole = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
+    return replace(whole, membrane=whole.membrane.resampled((9, 9)))
+
+
+@pytest.fixture(scope="module")
+def reconstructor(sensor):
+    return tm.Reconstructor(sensor)
+
+
+@pytest.fixture(scope="module")
+def photographs():
+    """Grey, as a camera of 8 bits gives it, `[3, H, W]`."""
+    return np.stack([np.asarray(Image.open(EXAMPLES / f"{name}.png").convert("L")) for name in NAMES])
+
+
+@pytest.fixture(scope="module")
+def result(reconstructor, photographs):
+    with torch.no_grad():
+        return reconstructor(photographs)
+
+
+def test_every_name_is_there_and_no_other_is():
+    assert all(getattr(tm, name) is not None for name in tm.__all__) and set(tm.__all__) <= set(dir(tm))
+    with pytest.raises(AttributeError, match="no attribute 'Reconstruktor'"):
+        tm.Reconstruktor  # noqa: B018
+
+
+def as_given(grey: np.ndarray) -> dict:
+    """The same three frames, or the first one, in every accepted form."""
+    tensor, colour = torch.from_numpy(grey.copy()), np.repeat(grey[..., None], 3, -1)
+    return {
+        "[H, W]": grey[0],
+        "[H, W] flipped, of negative strides": np.flip(np.flip(grey[0])),
+        "[H, W, 3]": colour[0],
+        "[B, H, W]": grey,
+        "[B, 1, H, W]": tensor[:, None],
+        "[B, 3, H, W]": tensor[:, None].expand(-1, 3, -1, -1),
+        "[B, H, W, 1]": grey[..., None],
+        "[B, H, W, 3]": colour,
+        "float32": tensor / 255.0,
+        "float64": grey / 255.0,
+        "uint16": (grey.astype(np.uint16) * 257),
+        "big-endian uint16": (grey.astype(np.uint16) * 257).astype(">u2"),
+    }
+
+
+@pytest.mark.parametrize("form", list(as_given(np.zeros((1, 2, 2), np.uint8))))
+def test_images_are_taken_as_cameras_give_them(reconstructor, photographs, result, form):
+    images = as_given(photographs)[form]
+    with torch.no_grad():
+        got = reconstructor.observer(reconstructor.grey(images))
+        expected = reconstructor.observer(reconstructor.grey(photographs[: len(got.status)]))
+    torch.testing.assert_close(got.displacement, expected.displacement, rtol=0, atol=1e-3)
+    assert got.status.tolist() == expected.status.tolist()
+
+
+@pytest.mark.parametrize(("channels", "weights"), [("rgb", (0.299, 0.587, 0.114)), ("bgr", (0.114, 0.587, 0.299))])
+def test_the_order_of_channels_is_said_once(sensor, channels, weights):
+    made = tm.Reconstructor(sensor, channels=channels)
+    width, height = sensor.camera.image_size
+    for c, weight in enumerate(weights):
+        image = np.zeros((height, width, 3), np.uint8)
+        image[..., c] = 255
+        torch.testing.assert_close(made.grey(image)[0, 0, 0, 0], torch.tensor(weight))
+
+
+@pytest.mark.parametrize(
+    ("shape", "said"),
+    [
+        ((640, 480), "rows and columns are exchanged"),
+        ((640, 480, 3), "rows and columns are exchanged"),
+        ((2, 3, 640, 480), "rows and columns are exchanged"),
+        ((480, 640, 4), "without alpha"),
+        ((2, 2, 480, 640), "one or three channels"),
+        ((240, 320), "320 x 240 px, expected 640 x 480"),
+        ((1, 240, 320, 3), "320 x 240 px, expected 640 x 480"),
+        ((480,), "expected"),
+        ((1, 1, 1, 480, 640), "expected"),
+    ],
+)
+def test_other_shapes_are_refused_in_words(reconstructor, shape, said):
+    with pytest.raises(tm.MembraneError, match=said):
+        reconstructor(np.zeros(shape, np.uint8))
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.complex64, bool, object])
+def test_other_types_are_refused_in_words(reconstructor, dtype):
+    with pytest.raises(tm.MembraneError, match="expected uint8, uint16, or float"):
+        reconstructor(np.zeros((480, 640), dtype))
+
+
+def test_wrong_words_are_refused(sensor):
+    for wrong, said in (
+        (dict(estimator="guess"), "expected one of force-balance, minimum-energy"),
+        (dict(channels="gbr"), "expected 'rgb' or 'bgr'"),
+        (dict(dtype=torch.float16), "expected torch.float32 or torch.float64"),
+        (dict(settings=tm.MinimumEnergySettings()), "expected ForceBalanceSettings for force-balance"),
+    ):
+        with pytest.raises(tm.MembraneError, match=said):
+            tm.Reconstructor(sensor, **wrong)
+    for wrong in (dict(flow="cubic"), dict(element="hexagon"), dict(volume="guessed")):
+        with pytest.raises(tm.MembraneError, match="expected one of"):
+            tm.MinimumEnergySettings(**wrong)
+    with pytest.raises(tm.MembraneError, match="steps = 1; expected at least 2"):
+        tm.ForceBalanceSettings(steps=1)
+
+
+def test_half_precision_images_are_taken_and_half_precision_modules_are_not(sensor, photographs, result):
+    made = tm.Reconstructor(sensor)
+    images = torch.from_numpy(photographs / 255.0)
+    with torch.no_grad():
+        got = made(images.half())
+        with pytest.raises(tm.MembraneError, match=r"call \.float\(\)"):
+            made.half()(images)
+    assert (got.vertices - result.vertices).abs().max() < 0.02
+    with pytest.raises(tm.MembraneError, match=r"call \.float\(\)"):
+        made.from_pixels(made.rest_pixels)
+
+
+@pytest.mark.parametrize("estimator", ["force-balance", "minimum-energy"])
+def test_autocast_changes_nothing(sensor, photographs, estimator):
+    made = tm.Reconstructor(sensor, estimator)
+    with torch.no_grad():
+        expected = made(photographs[:1])
+        with torch.autocast("cpu", torch.bfloat16):
+            got, again = made(photographs[:1]), made.from_pixels(expected.pixels)
+    for field, value in expected._asdict().items():
+        torch.testing.assert_close(got._asdict()[field], value, equal_nan=True)
+    assert again.vertices.dtype == torch.float32 and (again.vertices - expected.vertices).abs().max() < 1e-2
+
+
+@pytest.mark.parametrize("estimator", ["force-balance", "minimum-energy"])
+def test_an_empty_batch_gives_an_empty_result(sensor, estimator):
+    made = tm.Reconstructor(sensor, estimator)
+    for got in (made(np.zeros((0, 480, 640), np.uint8)), made.from_pixels(torch.zeros(0, 121, 2))):
+        shapes = [tuple(field.shape) for field in got]
+        assert all(shape[0] == 0 for shape in shapes) and shapes[0] == (0, 81, 3) and got.status.dtype == torch.int32
+
+
+def test_confidence_outside_its_range_is_refused(reconstructor):
+    pixels = reconstructor.rest_pixels
+    for wrong in (1.5, -0.1, torch.nan):
+        confidence = torch.ones(len(pixels))
+        confidence[7] = wrong
+        with pytest.raises(tm.MembraneError, match="confidence outside 0..1"):
+            reconstructor.from_pixels(pixels, confidence)
+    with pytest.raises(tm.MembraneError, match=r"confidence \[7\]; expected \[1, 121\]"):
+        reconstructor.from_pixels(pixels, torch.ones(7))
+    with pytest.raises(tm.MembraneError, match="rest_pixels"):
+        reconstructor.from_pixels(pixels, rest_pixels=pixels[:7])
+
+
+def test_a_foreign_or_stale_previous_is_refused_in_words(sensor, reconstructor, photographs, result):
+    with pytest.raises(tm.MembraneError, match="one earlier result of this sensor and grid for each image"):
+        reconstructor(photographs[:2], result)
+    surface = sensor.surface.membrane((9, 9))
+    moved = tm.Membrane(surface.rest.reshape(9, 9, 3).numpy() + np.array([0, 0, 0.5]))
+    other = replace(sensor, membrane=moved, surface=None, markers=replace(sensor.markers, positions=None, sizes=None))
+    foreign = result._replace(vertices=result.vertices + torch.tensor([0, 0, 0.5]))
+    assert other.membrane.rest.shape == sensor.membrane.rest.shape
+    with pytest.raises(tm.MembraneError, match="the rim of previous is 0.5 mm off"):
+        reconstructor(photographs, foreign)
+    least = tm.Reconstructor(sensor, "minimum-energy")
+    with pytest.raises(tm.MembraneError, match="starts from rest always"):
+        least(photographs, result)
+    failed = result._replace(vertices=result.vertices * torch.nan, pixels=result.pixels * torch.nan)
+    with torch.no_grad():
+        assert (reconstructor(photographs, failed.to(torch.float64)).status >= 0).all()  # NaN: from rest
+
+
+def test_a_result_moves_and_keeps_its_meaning(result):
+    double = result.to(torch.float64)
+    assert double.vertices.dtype == torch.float64 and double.status.dtype == torch.int32
+    assert isinstance(double, tm.Reconstruction) and len(result) == 15 and result[0] is result.vertices
+    arrays = result.cpu().numpy()
+    assert all(isinstance(array, np.ndarray) for array in arrays) and arrays.status.dtype == np.int32
+    frame = result.frame(1)
+    assert frame.keys() == result._asdict().keys()
+    np.testing.assert_array_equal(frame["vertices"], arrays.vertices[1])
+
+
+def test_a_status_is_its_number_and_says_its_text(result):
+    assert [int(status) for status in tm.Status] == list(range(7)) and tm.Status(3) == 3
+    assert all(tm.Status(int(code)) is tm.Status.OK for code in result.status)
+    assert tm.Status.NOT_CONVERGED.has_surface and not tm.Status.BAD_VALUES.has_surface
+    assert len({status.text for status in tm.Status}) == 7
+
+
+def test_a_tracker_gives_what_frames_with_their_previous_give(reconstructor, photographs, result):
+    tracker = tm.Tracker(reconstructor)
+    first, second = tracker(photographs[0]), tracker(photographs[1])
+    torch.testing.assert_close(first.vertices, result.vertices[:1], rtol=0, atol=1e-4)
+    with torch.no_grad():
+        expected = reconstructor(photographs[1], first)
+    torch.testing.assert_close(second.vertices, expected.vertices)
+    dark = tracker(np.zeros((480, 640), np.uint8))
+    assert dark.status.tolist() == [tm.Status.BLANK]
+    again = tracker(photographs[1])  # from rest again
+    torch.testing.assert_close(again.vertices, result.vertices[1:2], rtol=0, atol=1e-4)
+    tracker.reset()
+    torch.testing.assert_close(tracker(photographs[0]).vertices, first.vertices)
+    with pytest.raises(tm.MembraneError, match="2 frames; expected one"):
+        tracker(photographs[:2])
+
+
+def test_rezero_nulls_what_has_drifted_since_the_rest_image(sensor):
+    """The whole image a pixel to the right: as seen, a press; after taking such a frame for rest, none."""
+    made = tm.Reconstructor(sensor)
+    rest = np.asarray(Image.open(EXAMPLES / "rest.png").convert("L"))
+    drifted = np.roll(rest, 1, axis=1)
+    tracker = tm.Tracker(made)
+    with pytest.raises(tm.MembraneError, match="no frame yet"):
+        tracker.rezero()
+    before = tracker(drifted)
+    tracker.rezero()
+    after = tracker(drifted)
+    assert before.displacement.abs().max() > 0.05
+    assert after.displacement.abs().max() < 1e-3 and after.residual.max() < 0.02
+    with pytest.raises(tm.MembraneError, match="expected a frame without contact"):
+        tracker.rezero(np.zeros((480, 640), np.uint8))

@@ -1,0 +1,61 @@
+"""Edges of triangles, their metrics and what is constant in derivatives by the metric; symmetric 2 x 2 as (11, 12, 22)."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..linalg import symmetric_determinant
+
+
+def edge_vectors(x: Tensor, grid: tuple[int, int]) -> Tensor:
+    """The two edges from the first vertex of all triangles, `[..., V, 3]` to `[..., 3, 2, T]`."""
+    g = x.transpose(-2, -1).unflatten(-1, grid)
+    a, b, c, d = g[..., :-1, :-1], g[..., 1:, :-1], g[..., 1:, 1:], g[..., :-1, 1:]
+    ac = c - a
+    return torch.stack([torch.stack([b - a, ac], -3), torch.stack([ac, d - a], -3)], -4).flatten(-3)
+
+
+def metric(edges: Tensor) -> Tensor:
+    """Entries (11, 12, 22) of the metric of two edges `[..., 3, 2, T]`, `[..., 3, T]`."""
+    e1, e2 = edges.split(1, -2)
+    return (torch.cat([e1, e1, e2], -2) * torch.cat([e1, e2, e2], -2)).sum(-3)
+
+
+def adjugate(g: Tensor) -> Tensor:
+    """Entries (11, 12, 22) of the adjugates of symmetric matrices given so, `[..., 3, T]`."""
+    g11, g12, g22 = g.split(1, -2)
+    return torch.cat([g22, -g12, g11], -2)
+
+
+def determinant(g: Tensor) -> Tensor:
+    """Determinants `[..., 1, T]` of symmetric matrices `[..., 3, T]`."""
+    return symmetric_determinant(*g.split(1, -2))
+
+
+def metric_constants() -> dict[str, Tensor]:
+    """What is constant in second derivatives by the metric's entries 11, 12, 22.
+
+    `twice_12 [3]`; `bend [9]`, those of the determinant; `metric_to_pairs [12, 9]`, from any such to `T_cd` of
+    `ElasticEnergy._pairs`; `stress_to_pairs [3, 3]`, likewise for the stress.
+    """
+    dg = np.zeros((2, 3, 2))  # d g / d e_a = sum_c dg[a, g, c] e_c
+    dg[0, 0, 0] = dg[1, 2, 1] = 2.0
+    dg[0, 1, 1] = dg[1, 1, 0] = 1.0
+    edges = np.einsum("agc,bhd->abcdgh", dg, dg).reshape(2, 2, 4, 9)
+    to_pairs = np.stack([-edges.sum(0)[0], -edges.sum(0)[1], edges[0, 1]]).reshape(12, 9)
+    return dict(
+        twice_12=torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)[:, None],
+        bend=torch.tensor([0.0, 0, 1, 0, -2, 0, 1, 0, 0], dtype=torch.float64)[:, None],
+        metric_to_pairs=torch.from_numpy(to_pairs),
+        stress_to_pairs=torch.tensor([[-1.0, -1, 0], [0, -1, -1], [0, 1, 0]], dtype=torch.float64),
+    )
+
+
+def tensile_part(stress: Tensor) -> Tensor:
+    """The positive semi-definite part of symmetric 2 x 2 matrices given as (11, 12, 22), `[..., 3, T]`."""
+    s11, s12, s22 = stress.split(1, -2)
+    mean, half = (s11 + s22) / 2, (s11 - s22) / 2
+    radius = (half**2 + s12**2).clamp_min(torch.finfo(stress.dtype).tiny).sqrt()
+    high, low = (mean + radius).clamp_min(0), (mean - radius).clamp_min(0)
+    centre, ratio = (high + low) / 2, (high - low) / (2 * radius)
+    return torch.cat([centre + ratio * half, ratio * s12, centre - ratio * half], -2)
