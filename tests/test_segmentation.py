@@ -64,11 +64,11 @@ def test_a_line_of_hills_is_cut_where_they_stand_alone():
     assert (peaks(-np.abs(heights), line, 4, 0.5) == 0).all()
 
 
-def make(base_z, **options):
+def make(base_z, model="neo_hookean", **options):
     dome = spherical_cap(12, 9, base_z, (17, 17))
     rays = central(dome.rest)
     settings = MinimumEnergySettings(**{"smoothing": 0.1, **options})
-    return Segmentation(MinimumEnergy(dome, ElasticEnergy(dome, "neo_hookean", 1.3), rays, settings=settings), rays)
+    return Segmentation(MinimumEnergy(dome, ElasticEnergy(dome, model, 1.3), rays, settings=settings), rays)
 
 
 def observed(base_z, *presses):
