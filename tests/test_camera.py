@@ -155,7 +155,46 @@ def test_light_takes_the_fastest_way_through_all_layers(name):
     crossings = minimize(optical_path_and_gradient, start, jac=True, options={"gtol": 1e-12}).x
     camera = camera_of("pinhole", name, focal=(400.0, 400.0), centre=(0.0, 0.0))
     pixel = camera.point_to_pixel(torch.tensor([0.0, rho, z], dtype=torch.float64))
-    assert_close(pixel, torch.tensor([0.0, 400 * crossings[0] / heights[0]], dtype=torch.float64), 1e-6)
+    fastest = torch.tensor([0.0, 400 * crossings[0] / heights[0]], dtype=torch.float64)
+    assert_close(pixel, fastest, 1e-6)
+    ray = camera.pixel_to_ray(fastest)
+    for depth, crossing in ((faces[-1], crossings[-1]), (z, rho)):  # where it leaves the last layer, and the point itself
+        t = (depth - ray.origin[2]) / ray.direction[2]
+        expected = torch.tensor([0.0, crossing, depth], dtype=torch.float64)
+        assert_close(ray.origin + t * ray.direction, expected, 1e-6)
+
+
+@pytest.mark.parametrize("name", ["port", "stack"])
+def test_the_optical_length_is_stationary_along_the_ray_of_a_pixel(lens, name):
+    """Fermat at the last face: the optical length from the lens to a point of the ray by way of where the ray crosses it.
+
+    What lies before the face is the way of least time from the lens to the crossing, found by a minimiser of its own.
+    """
+    camera, far = camera_of(lens, name), sum(PORTS[name][-1][:2])
+    faces, index = [0.0], []
+    for distance, thickness, n in PORTS[name]:
+        faces += [distance, distance + thickness]
+        index += [1.0, n]
+    heights, index = np.diff(faces), np.array(index)
+    heights, index = heights[heights > 0], index[heights > 0]
+
+    def to_face(rho):
+        def optical_path_and_gradient(crossings):
+            steps = np.diff([0.0, *crossings, rho])
+            lengths = np.hypot(heights, steps)
+            return index @ lengths, -np.diff(index * steps / lengths)
+
+        start = rho * np.cumsum(heights)[:-1] / far
+        return minimize(optical_path_and_gradient, start, jac=True, options={"gtol": 1e-12}).fun
+
+    for pixel in pixels_near((3,), 150.0):
+        origin, direction = (a.numpy() for a in camera.pixel_to_ray(pixel))
+        crossing = origin + (far - origin[2]) / direction[2] * direction
+        point, radius, h = crossing + 7.0 * direction, np.hypot(*crossing[:2]), 1e-4
+        outwards = np.array([*crossing[:2] / radius, 0.0])
+        through = [to_face(radius + s) + 1.33 * np.linalg.norm(point - crossing - s * outwards) for s in (h, 0.0, -h)]
+        assert abs(through[0] - through[2]) < 2e-6 * h and through[0] + through[2] > 2 * through[1]
+        assert radius > 0.3 and abs(crossing[0] * direction[1] - crossing[1] * direction[0]) < 1e-12
 
 
 def test_layers_of_air_do_nothing(lens):

@@ -53,6 +53,40 @@ def test_energy_density_is_that_of_the_principal_stretches():
     assert float(AffineQuadrilaterals(plane, mu * l**2).energy(x)) == pytest.approx(6 * closed["harmonic"])
 
 
+def test_principal_stretches_are_the_singular_values_of_the_deformation_gradient(membrane):
+    """Eqs. 43-44: of F from the plane of each listed triangle, by QR and SVD; `I = l1^2 + l2^2`, `D = l1^2 l2^2`."""
+    x = torch.stack([stretched(membrane), stretched(membrane, 0.8, 0.4)])
+    got = ElasticEnergy(membrane, **ELASTIC).principal_stretches(x)
+    assert got.shape == (2, len(membrane.triangles), 2)
+    a, b, c = membrane.rest.numpy()[membrane.triangles.numpy()].swapaxes(0, 1)
+    A, B, C = x.numpy()[:, membrane.triangles.numpy()].transpose(2, 0, 1, 3)
+    _, plane = np.linalg.qr(np.stack([b - a, c - a], -1))
+    F = np.stack([B - A, C - A], -1) @ np.linalg.inv(plane)
+    np.testing.assert_allclose(got.numpy(), np.linalg.svd(F, compute_uv=False), rtol=1e-7)
+    squared, order = got**2, lambda invariant: invariant[:, 0].unflatten(-1, (2, -1)).mT.flatten(-2)
+    strain = ElasticEnergy(membrane, **ELASTIC).strain(x)
+    torch.testing.assert_close(squared.sum(-1), order(strain.I))
+    torch.testing.assert_close(squared.prod(-1), order(strain.D))
+    stretching = (membrane.area_vectors(membrane.rest).norm(dim=-1).flatten() * (squared.sum(-1) - 2)).sum(-1) / 2
+    torch.testing.assert_close(ElasticEnergy(membrane, "harmonic").energy(x), stretching)
+
+
+def test_principal_stretches_of_a_pure_stretch_and_of_a_turned_surface(membrane):
+    """Relative to rest whatever the prestretch: (a, b) of a plane stretched so, 1 at rest, no change by a rotation."""
+    X = np.stack(np.meshgrid(np.linspace(0, 2, 4), np.linspace(0, 3, 5), [5.0], indexing="ij"), -1)[:, :, 0]
+    plane = Membrane(X)
+    turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64)).Q
+    for prestretch in (1.0, 1.4):
+        elasticity = ElasticEnergy(plane, "neo_hookean", prestretch)
+        for a, b in ((0.9, 1.3), (1.3, 0.9), (0.05, 3.0)):
+            got = elasticity.principal_stretches(plane.rest * torch.tensor([a, b, 1.0]).double() @ turn + 4.0)
+            torch.testing.assert_close(got, torch.tensor([max(a, b), min(a, b)]).double().expand(24, 2), rtol=1e-6, atol=0)
+    elasticity, x = ElasticEnergy(membrane), stretched(membrane)
+    at_rest = elasticity.principal_stretches(membrane.rest)
+    torch.testing.assert_close(at_rest, torch.ones_like(at_rest), rtol=0, atol=1e-7)
+    torch.testing.assert_close(elasticity.principal_stretches(x @ turn), elasticity.principal_stretches(x), rtol=1e-8, atol=0)
+
+
 def test_gradient_is_autograd_of_energy(membrane):
     for energy in elements(membrane):
         x = stretched(membrane).requires_grad_()

@@ -201,6 +201,16 @@ def test_rest_rays_give_the_rest_surface_without_forces(options):
     assert result.traction.abs().max() < 1e-6 * estimator.reference
 
 
+@pytest.mark.parametrize("n", [13, 17])
+def test_the_rim_stays_exactly_where_it_is(pressed, n):
+    """Appendix B: also where all the markers are turned, on one grid and by way of a coarser one."""
+    estimator, (origins, directions) = make(n), pressed[0]
+    turned = torch.nn.functional.normalize(directions + torch.tensor([0.03, -0.02, 0.0]), dim=-1)
+    rim, x = estimator.membrane.fixed, estimator(seen(origins, turned)).vertices[0]
+    assert torch.equal(x[rim], estimator.membrane.rest[rim])
+    assert (x - estimator.membrane.rest)[~rim].norm(dim=-1).median() > 0.1
+
+
 def relative(estimator, result, positions, moved):
     got = estimator.equations.bearings.markers(result.vertices)[0]
     return float((got - moved).norm() / (moved - positions).norm())

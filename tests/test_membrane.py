@@ -40,10 +40,32 @@ def test_gathers_and_sums_are_adjoint(membrane):
 
 
 def test_structured_triangles_are_the_listed_ones(membrane):
+    """Eq. 8: quadrilateral by quadrilateral, split from (i, j) to (i+1, j+1), both halves turned outwards: written out here."""
+    m, n = membrane.grid
+    listed = []
+    for i in range(m - 1):
+        for j in range(n - 1):
+            a, b, c, d = i * n + j, (i + 1) * n + j, (i + 1) * n + j + 1, i * n + j + 1
+            listed += [(a, b, c), (a, c, d)]
+    p = membrane.rest.numpy()[np.array(listed)]
+    seen_from_behind = np.einsum("tk,tk->t", np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), p.mean(1)) < 0
+    assert seen_from_behind.all() or not seen_from_behind.any()
+    listed = [(a, c, b) if seen_from_behind[0] else (a, b, c) for a, b, c in listed]
+    assert membrane.triangles.tolist() == [list(triangle) for triangle in listed]
     x = moved(membrane)
-    a, b, c = x[membrane.triangles].unbind(1)
-    listed = torch.linalg.cross(b - a, c - a) / 2
-    torch.testing.assert_close(membrane.area_vectors(x).reshape(-1, 3), listed)
+    p = x.numpy()[np.array(listed)]
+    area_vectors = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]) / 2
+    np.testing.assert_allclose(membrane.area_vectors(x).reshape(-1, 3).numpy(), area_vectors, atol=1e-12)
+    volume = np.einsum("tk,tk->", p[:, 0], np.cross(p[:, 1], p[:, 2])) / 6
+    assert float(membrane.volume(x)) == pytest.approx(volume)
+
+
+def test_quadrilaterals_have_the_corners_of_equation_8():
+    """(i, j), (i+1, j), (i+1, j+1), (i, j+1), once around."""
+    places = torch.tensor([[i, j] for i in range(4) for j in range(6)])
+    at = corners(places, (4, 6))
+    for i, j in ((0, 0), (2, 4), (1, 3)):
+        assert at[i, j].tolist() == [[i, j], [i + 1, j], [i + 1, j + 1], [i, j + 1]]
 
 
 def test_volume_gradient_is_autograd_of_volume(membrane):

@@ -108,6 +108,18 @@ def test_no_displacement_without_flow(model):
     assert (balanced.nodes - around(R, balanced.angle)).abs().max() < 1e-6
 
 
+@pytest.mark.parametrize("model", ["harmonic", "neo_hookean"])
+def test_material_points_lie_on_the_rays_on_which_they_are_observed(model):
+    """Eqs. 32-33: the node at rest at theta is found at the angle `g(theta)`, whatever its radius."""
+    got = MinimumEnergyProfile(R, Strip(model), 61)(markers(60), bent(markers(60)))
+    psi = torch.atan2(got.nodes[:, 1], got.nodes[:, 0]).numpy()
+    np.testing.assert_allclose(psi, bent(got.angle.numpy()), atol=1e-5)
+    assert np.abs(psi - got.angle.numpy()).max() > 0.1 and (got.nodes.norm(dim=-1) - R).abs().max() > 0.3
+    at_nodes = got.angle.numpy()[1:-1:5]
+    few = MinimumEnergyProfile(R, Strip(model), 61)(at_nodes, at_nodes + 0.02)
+    np.testing.assert_allclose(np.arctan2(*few.nodes.numpy()[1:-1:5, ::-1].T), at_nodes + 0.02, atol=1e-12)
+
+
 def test_minimum_energy_solves_the_boundary_value_problem():
     """Euler's equation of eqs. 35-37, `u'' = g'^2 u - p r / T u g'`, with u = r (not 0) at the ends, by collocation."""
     ode = lambda a, y, p: np.stack([y[1], slope_of_bent(a) ** 2 * y[0] - p[0] * y[0] * slope_of_bent(a),  # noqa: E731

@@ -3,18 +3,25 @@
 import dataclasses
 import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 
 from torchmembrane import MembraneError
+from torchmembrane.estimators.bilinear import bilinear_matrix
+from torchmembrane.estimators.minimum_energy import grid_laplacian
 from torchmembrane.estimators.settings import MinimumEnergySettings
 from torchmembrane.io import results
 from torchmembrane.io.status import Status
+from torchmembrane.mechanics.affine_quadrilateral import AffineQuadrilaterals
+from torchmembrane.mechanics.cavity import rest_balance
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity
 from torchmembrane.sensor.sensor import Sensor
+from torchmembrane.surface.projection import SurfacePoints
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PAPERS = "minimum-energy"
@@ -232,6 +239,97 @@ def test_the_papers_variants_agree_with_each_other(sensor, options, images, resu
     assert (got.status == Status.OK).all()
     assert (got.vertices - result.vertices).norm(dim=-1).max() < 1.5
     assert ((got.displacement * result.displacement).sum((1, 2)) > 0).all()
+
+
+class Solved(NamedTuple):
+    """A harmonic reconstructor in double precision, what it finds from the exact pixels of a press, and on which rays.
+
+    `vertices [V, 3]`, `volume_error` and `pressure []`; the vertices' ray origins and directions `[V, 3]`, on the rim where it
+    rests and zero; ranges at rest `t_rest [V, 1]` and the change of them `psi [V, 1]`; `flow [D, 2]` of the markers, px.
+    """
+
+    made: Reconstructor
+    vertices: torch.Tensor
+    volume_error: torch.Tensor
+    pressure: torch.Tensor
+    origins: torch.Tensor
+    directions: torch.Tensor
+    t_rest: torch.Tensor
+    psi: torch.Tensor
+    flow: torch.Tensor
+
+
+def solved(sensor, **settings):
+    made = Reconstructor(
+        sensor, PAPERS, model="harmonic", settings=MinimumEnergySettings(steps=60, **settings), dtype=torch.float64
+    )
+    got = made.from_pixels(torch.from_numpy(truth("two_contacts")["uv_deformed"].copy()))
+    assert got.status.tolist() == [Status.OK] and (got.confidence == 1).all()
+    membrane, x, flow = made.estimator.membrane, got.vertices[0], got.pixels[0] - made.rest_pixels
+    rays, rest = made.observation(flow[None], got.confidence), made.camera.pixel_to_ray(made.vertex_pixels)
+    rim = membrane.fixed[:, None]
+    origins, directions = torch.where(rim, membrane.rest, rays.origins[0]), torch.where(rim, 0.0, rays.directions[0])
+    t_rest = ((membrane.rest - rest.origin) * rest.direction).sum(-1, keepdim=True)
+    psi = torch.where(rim, 0.0, ((x - origins) * directions).sum(-1, keepdim=True) - t_rest)
+    return Solved(made, x, got.volume_error[0], got.pressure[0], origins, directions, t_rest, psi, flow)
+
+
+@pytest.fixture(scope="module")
+def plain(sensor):
+    return solved(sensor)
+
+
+@pytest.fixture(scope="module")
+def papers(sensor):
+    """Everything as the paper has it, the smoother stronger than by default."""
+    return solved(sensor, element="quadrilateral", volume="linear", flow="bilinear", smoothing=2.0)
+
+
+def test_the_linear_volume_reaches_the_estimator_and_is_off_by_what_it_leaves_out(plain, papers):
+    """Eq. 21, about the rest ranges on the rays now: the cubic's second and third order are left out, and nothing else."""
+    membrane = papers.made.estimator.membrane
+
+    def volume(share):
+        return membrane.volume(papers.origins + (papers.t_rest + share * papers.psi) * papers.directions)
+
+    second = torch.func.grad(torch.func.grad(volume))
+    zero = torch.zeros((), dtype=torch.float64)
+    quadratic, cubic = second(zero) / 2, torch.func.grad(second)(zero) / 6
+    error = papers.volume_error * membrane.rest_volume
+    assert abs(plain.volume_error) < 1e-12 and abs(papers.volume_error) > 1e-6
+    torch.testing.assert_close(error, quadratic + cubic, rtol=1e-4, atol=0)
+    torch.testing.assert_close(error, quadratic, rtol=0.1, atol=0)
+
+
+def test_bilinear_flow_reaches_the_estimator(plain, papers):
+    """Section 5: the vertices lie on the rays of their rest pixels moved by the bilinear matrix, not by the smooth flow."""
+    made, free = papers.made, papers.made.estimator.membrane.free_vertices
+    points = SurfacePoints(made.marker_vertices.numpy(), made.marker_weights.numpy(), np.zeros(len(made.marker_vertices)))
+    moved = made.vertex_pixels + torch.from_numpy(bilinear_matrix(made.estimator.membrane, points)) @ papers.flow
+    seen, smooth = (made.camera.point_to_pixel(one.vertices)[free] for one in (papers, plain))
+    torch.testing.assert_close(seen, moved[free], rtol=0, atol=1e-6)
+    assert (smooth - moved[free]).abs().max() > 0.5
+
+
+@pytest.mark.parametrize(("which", "element", "smoothing"), [("plain", "triangle", 0.0), ("papers", "quadrilateral", 2.0)])
+def test_element_and_smoother_reach_the_estimator(sensor, request, which, element, smoothing):
+    """No force is left along the rays of the energy asked for, built here: of another element or weight there is."""
+    one = request.getfixturevalue(which)
+    membrane, x = one.made.estimator.membrane, one.vertices
+    triangles = ElasticEnergy(membrane, "harmonic", sensor.material.prestretch, sensor.material.modulus)
+    energies = {"triangle": triangles, "quadrilateral": AffineQuadrilaterals(membrane, triangles.tension)}
+    start = one.origins + one.t_rest * one.directions
+    bend = grid_laplacian(grid_laplacian(one.psi, membrane.grid), membrane.grid)[:, 0]
+
+    def left_over(energy, weight):
+        load = rest_balance(membrane, energy)[1]
+        of_fluid = one.pressure * membrane.volume_gradient(start if which == "papers" else x)
+        force = ((energy.gradient(x) - load - of_fluid) * one.directions).sum(-1)
+        return float((force + weight * triangles.tension * bend)[membrane.free_vertices].abs().max())
+
+    found = {(name, weight): left_over(energy, weight) for name, energy in energies.items() for weight in (0.0, 0.1, 2.0)}
+    right = found.pop((element, smoothing))
+    assert right < 1e-7 < 1e-3 < min(found.values()), (right, found)
 
 
 def test_gradients_flow_from_the_surface_to_the_image(reconstructor, images):

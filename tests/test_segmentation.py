@@ -171,6 +171,35 @@ def test_a_press_along_the_axis_is_divergent_flow(base_z, off_axis):
     assert make(FAR).divergence(off_axis[0].direction[None]) < 0.8
 
 
+def mirrored_dent(tilt, depth, n=33):
+    """A dome with its part beyond a plane mirrored in it: dome, surface, axis, which vertices, how far they are beyond it.
+
+    A sphere's normal `n` becomes `2 (n.e) e - n` there, so that the mean of both runs along the plane's normal `e` everywhere.
+    """
+    dome = spherical_cap(12, 9, FAR, (n, n))
+    axis = torch.tensor([np.sin(tilt), 0.0, np.cos(tilt)], dtype=torch.float64)
+    beyond = (dome.rest - torch.tensor([0.0, 0.0, FAR + 9 - 12.5])) @ axis - (12.5 - depth)
+    dent = beyond > 0
+    return dome, dome.rest - 2 * beyond.clamp_min(0)[:, None] * axis, axis, dent, beyond
+
+
+def test_a_steep_dent_bulges_along_the_mean_of_both_normals():
+    """The sphere's mirror image, 35 degrees off the axis: a displacement known exactly, along the mean normals exactly.
+
+    Along the rest normals its edge would seem a quarter shallower.
+    """
+    dome, x, axis, dent, beyond = mirrored_dent(np.deg2rad(35), 2.5)
+    rays = central(dome.rest)
+    got = Segmentation(dome, rays).by_normals(x[None])
+    well_inside = dent & (beyond > 0.4)
+    along_rest = -((x - dome.rest) * dome.rest_normals).sum(-1)
+    assert well_inside.sum() > 60 and (along_rest / (2 * beyond))[well_inside].min() < 0.85
+    torch.testing.assert_close(got.bulge[0, well_inside], 2 * beyond[well_inside], rtol=0.01, atol=0)
+    assert torch.equal(got.region[0] > 0, got.bulge[0] > 0.5 * got.bulge.max()) and got.points[0, 1:].isnan().all()
+    place = got.points[0, 0] - torch.tensor([0.0, 0.0, FAR + 9 - 12.5])
+    assert (place - (place @ axis) * axis).norm() < 0.1
+
+
 def test_no_flow_is_no_contact_and_a_batch_is_its_frames(off_axis):
     """Also where another frame goes round in circles."""
     segmentation = make(FAR)

@@ -155,6 +155,33 @@ class ElasticEnergy(nn.Module):
         """The strain of `x [..., V, 3]`: of all triangles, `T = 2 (m-1) (n-1)`."""
         return self._strain(edge_vectors(x, self.grid), self._rest())
 
+    def principal_stretches(self, x: Tensor) -> Tensor:
+        """How much every triangle is stretched along its two principal directions, relative to the rest state.
+
+        The singular values of the deformation gradient F (eqs. 43, 44): with the invariants `I` and `D` of `C = F^T F` their
+        squares are `(I + sqrt(I^2 - 4 D)) / 2` and `D` over that. Relative to the unstretched membrane: times the prestretch.
+
+        Args:
+            x: vertices `[..., V, 3]`.
+
+        Returns:
+            `[..., T, 2]`, largest first, triangles in the order of `Membrane.triangles`.
+
+        Limitations:
+            Where both are equal they are not differentiable, and right to the root of the rounding error only.
+
+        Example:
+            >>> from torchmembrane.surface.shapes import heightfield
+            >>> plane = heightfield([0, 1, 2], [0, 1, 2], torch.full((3, 3), 5.0))
+            >>> x = plane.rest * torch.tensor([0.9, 1.2, 1.0])
+            >>> ElasticEnergy(plane).principal_stretches(x)[0].round(decimals=6).tolist()
+            [1.2, 0.9]
+        """
+        _, _, I, D = self.strain(x)  # noqa: E741
+        larger = (I + (I * I - 4 * D).clamp_min(0).sqrt()) / 2
+        squared = torch.cat([larger, D / larger], -2).unflatten(-1, (2, -1))  # first and second halves of all quadrilaterals
+        return squared.transpose(-3, -1).flatten(-3, -2).sqrt()
+
     def _strain(self, edges: Tensor, rest: Rest) -> Strain:
         g = metric(edges)
         first = (self.twice_12 * rest.inverse_metric * g).sum(-2, keepdim=True)
