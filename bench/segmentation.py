@@ -17,13 +17,13 @@ from accuracy import cases_in
 from record import write
 
 import torchmembrane as tm
-from torchmembrane.estimators.segmentation import Segmentation, Segmented
+from torchmembrane.estimators.segmentation import Segmented, reconstruct_and_segment
 from torchmembrane.markers.observer import FOUND
 
-NOISE, NONE_FOUND = 0.05, 10.0
+NOISE, NONE_FOUND, ROUNDS = 0.05, 10.0, 8
 LOOPS = {
-    "loop, paper": dict(model="harmonic", settings=tm.MinimumEnergySettings(element="quadrilateral", volume="linear")),
-    "loop, material": dict(),
+    "loop, paper": dict(estimator="paper"),
+    "loop, material": dict(estimator="minimum-energy"),
 }
 
 
@@ -38,7 +38,7 @@ def contact_error(found: np.ndarray, true: np.ndarray) -> float:
 def segmented(r: tm.Reconstructor, pixels: torch.Tensor, confidence: torch.Tensor) -> Segmented:
     found = (confidence > FOUND).to(confidence)
     rays = r.observation(torch.where(found[..., None] > 0, pixels - r.rest_pixels, 0.0), found)
-    return Segmentation(r.estimator, r.camera.pixel_to_ray(r.vertex_pixels))(rays.origins, rays.directions)
+    return reconstruct_and_segment(r.estimator, r.estimator.segmentation, rays, ROUNDS)
 
 
 def main():
@@ -65,7 +65,7 @@ def main():
             row = dict(case=case["case"], sensor=case["folder"], contacts=len(place))
             for name, options in LOOPS.items():
                 path = args.cases / case["sensor"]
-                r = tm.Reconstructor.from_file(path, "minimum-energy", dtype=torch.float64, **options)
+                r = tm.Reconstructor.from_file(path, dtype=torch.float64, **options)
                 got = segmented(r, pixels.double(), confidence.double())
                 row["eq. 29"] = contact_error(got.first.points[0].numpy(), place)
                 row[name] = contact_error(got.contacts.points[0].numpy(), place)

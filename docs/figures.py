@@ -21,7 +21,7 @@ from PIL import Image
 
 from torchmembrane import Reconstruction, Reconstructor, Status
 from torchmembrane.estimators.flow import FlowInterpolation
-from torchmembrane.estimators.segmentation import PolarAngle, Segmentation, Segmented
+from torchmembrane.estimators.segmentation import PolarAngle, Segmented, reconstruct_and_segment
 from torchmembrane.markers.observer import FOUND
 from torchmembrane.paper.pressed_strip import Disc, PressedStrip
 from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile
@@ -31,6 +31,7 @@ from torchmembrane.presets import preset_file
 from torchmembrane.simulate import Appearance, Cylinder, Simulator, Sphere, press
 
 NOISE = 30.0  # dB below white
+ROUNDS = 8  # of the reconstruct / segment loop
 ESTIMATORS = {"minimum energy": "minimum-energy", "force balance": "force-balance"}
 MISMATCHED = 0.05
 MAGNIFICATIONS, LONGEST_ARROW = (2, 3, 5, 10), 60  # px
@@ -180,7 +181,7 @@ def segmented(shown: Shown, result: Reconstruction) -> Segmented:
     """The segmentation loop's outcome."""
     r = reconstructor(shown.sensor)
     rays = r.observation(result.pixels - r.rest_pixels, result.confidence)
-    return Segmentation(r.estimator, r.camera.pixel_to_ray(r.vertex_pixels))(rays.origins, rays.directions)
+    return reconstruct_and_segment(r.estimator, r.estimator.segmentation, rays, ROUNDS)
 
 
 def contact_words(found: np.ndarray, true: np.ndarray) -> str:

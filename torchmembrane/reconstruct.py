@@ -127,7 +127,7 @@ class Reconstructor(nn.Module):
 
     @property
     def finds_contacts(self) -> bool:
-        """Whether tractions, contacts and standard deviations are found."""
+        """Whether tractions and standard deviations are found."""
         return self.estimator.finds_contacts
 
     def read(self, *paths: str | Path) -> Tensor:

@@ -73,6 +73,7 @@ class PaperEstimator(nn.Module):
     finds_contacts: ClassVar[bool] = False
     takes_start: ClassVar[bool] = False
     element: ClassVar[str] = "quadrilateral"
+    volume: ClassVar[str] = "linear"
     Settings: ClassVar[type[PaperSettings]] = PaperSettings
     rest_range: Tensor
     rest_load: Tensor
@@ -110,6 +111,16 @@ class PaperEstimator(nn.Module):
         return cls(problem.membrane, problem.elasticity, rays, problem.filling, problem.gas, settings, flow)
 
     @property
+    def flow_kind(self) -> str:
+        """The flow between the markers: "bilinear" or "smooth"."""
+        return self.settings.flow
+
+    @property
+    def smoothing_weight(self) -> float:
+        """The weight of the smoother of eq. 28."""
+        return self.settings.smoothing
+
+    @property
     def rest_pressure(self) -> Tensor:
         """Pressure difference across the membrane at rest, `[]`."""
         return self.cavity.rest_pressure
@@ -129,7 +140,7 @@ class PaperEstimator(nn.Module):
         """
         if start is not None:
             raise MembraneError("PaperEstimator: starts from rest always; leave the start out")
-        found = reconstruct_and_segment(self.solve, self.segmentation, observation, self.settings.rounds)
+        found = reconstruct_and_segment(self, self.segmentation, observation, self.settings.rounds)
         return found.surface._replace(relative_step=found.moved)
 
     @piece
@@ -179,8 +190,7 @@ class PaperEstimator(nn.Module):
 
     def contacts(self, found: Equilibrium) -> Contacts:
         """Where the membrane bulges in along its normals."""
-        regions = self.segmentation.by_normals(found.vertices)
-        return Contacts((regions.region > 0).to(found.vertices.dtype), regions.points)
+        return self.segmentation.contacts(found.vertices)
 
 
 def _corner_values(field: Tensor, grid: tuple[int, int]) -> Tensor:

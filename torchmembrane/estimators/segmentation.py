@@ -15,7 +15,7 @@ from ..camera.model import Rays
 from ..errors import MembraneError
 from ..pieces import piece
 from ..surface.membrane import Membrane
-from .base import CONTACT_POINTS, Equilibrium, Observation
+from .base import CONTACT_POINTS, Contacts, Equilibrium, Observation
 from .regions import persistent_regions
 
 LEAST = 1e-3  # smallest peak that is a contact, over the surface's size
@@ -45,7 +45,7 @@ class Segmented(NamedTuple):
 class RelaxedEstimator(Protocol):
     """An estimator whose smoother leaves contacts alone."""
 
-    def __call__(self, observation: Observation, *, relaxed: Tensor) -> Equilibrium:
+    def solve(self, observation: Observation, relaxed: Tensor) -> Equilibrium:
         """The surface; `relaxed [B, V]` bool: vertices in contact."""
         ...
 
@@ -134,6 +134,23 @@ class Segmentation(nn.Module):
         region = self._regions(bulge)
         return ContactRegions(bulge, region, self._centroids(x, region, bulge.clamp_min(0)))
 
+    @piece
+    def moved(self, before: Tensor, after: Tensor) -> Tensor:
+        """By how much points `[B, P, 3]` moved at most, over the surface's size, `[B]`; infinite where one came or went."""
+        distance = torch.linalg.vector_norm(after - before, dim=-1).nan_to_num().amax(-1)
+        same = (after.isnan() == before.isnan()).flatten(1).all(1)
+        return torch.where(same, distance / self.membrane.size, torch.inf)
+
+    @piece
+    def in_contact(self, region: Tensor) -> Tensor:
+        """`[B, V]` bool, from the numbers of regions."""
+        return region > 0
+
+    def contacts(self, x: Tensor) -> Contacts:
+        """`by_normals` as results have it: 1 in a contact, else 0."""
+        regions = self.by_normals(x)
+        return Contacts((regions.region > 0).to(x.dtype), regions.points)
+
     def divergence(self, directions: Tensor) -> Tensor:
         """Outward share of the angular flow, `[B]`: 1 where every ray turns away from the axis, -1 where all turn to it."""
         turned = torch.linalg.vector_norm(directions - self.rest_directions, dim=-1)
@@ -176,11 +193,9 @@ def reconstruct_and_segment(
         raise MembraneError(f"reconstruct_and_segment: rounds = {rounds}; expected at least 1")
     first = before = contacts = segmentation.by_polar_angle(observation.directions)
     for _ in range(rounds):
-        surface = estimator(observation, relaxed=contacts.region > 0)
+        surface = estimator.solve(observation, segmentation.in_contact(contacts.region))
         before, contacts = contacts, segmentation.by_normals(surface.vertices)
-    moved = torch.linalg.vector_norm(contacts.points - before.points, dim=-1).nan_to_num().amax(-1)
-    same = (contacts.points.isnan() == before.points.isnan()).flatten(1).all(1)
-    return Segmented(surface, contacts, first, torch.where(same, moved / segmentation.membrane.size, torch.inf))
+    return Segmented(surface, contacts, first, segmentation.moved(before.points, contacts.points))
 
 
 def _axis_region(membrane: Membrane) -> Tensor:
