@@ -19,11 +19,13 @@ import numpy as np
 import torch
 from record import write
 
-from torchmembrane.reconstruct import Reconstructor
+import torchmembrane as tm
 
 ESTIMATORS = {
     "harmonic, quadrilaterals, linear volume (the paper)": dict(
-        estimator="minimum-energy", model="harmonic", element="quadrilateral", volume="linear"
+        estimator="minimum-energy",
+        model="harmonic",
+        settings=tm.MinimumEnergySettings(element="quadrilateral", volume="linear"),
     ),
     "harmonic, triangles": dict(estimator="minimum-energy", model="harmonic"),
     "the sensor's material": dict(estimator="minimum-energy"),
@@ -50,31 +52,31 @@ def main():
     markers, surface = {}, {}
     for name in sorted({case["sensor"] for case in cases}):
         for label, options in ESTIMATORS.items():
-            reconstructor = Reconstructor.from_file(args.cases / name, **options)
+            reconstructor = tm.Reconstructor.from_file(args.cases / name, **options)
             for case in (c for c in cases if c["sensor"] == name):
                 score(reconstructor, args.cases, case, label, markers, surface)
     table = []
     for (folder, kind), groups in sorted(markers.items()):
         error, visible = (np.concatenate(part) for part in zip(*groups, strict=True))
         found = np.isfinite(error)
-        row = dict(
-            sensor=folder, images=kind, median=np.median(error[found]), p95=np.percentile(error[found], 95),
-            found=found.sum() / visible.sum(), wrong=int((error[found] > 3).sum()),
-        )  # fmt: skip
+        median, p95 = np.median(error[found]), np.percentile(error[found], 95)
+        share, wrong = found.sum() / visible.sum(), int((error[found] > 3).sum())
+        row = dict(sensor=folder, images=kind, median=median, p95=p95, found=share, wrong=wrong)
         table.append({k: v if isinstance(v, str) else float(v) for k, v in row.items()})
-        print(
-            "{sensor:18s} {images:8s} median {median:.3f} px, 95 % {p95:.3f} px, found {found:.4f}, wrong {wrong}".format(**row)
-        )
+        print(f"{folder:18s} {kind:8s} median {median:.3f} px, 95 % {p95:.3f} px, found {share:.4f}, wrong {wrong}")
     for (label, kind), values in sorted(surface.items()):
         what = "" if ": " in label else "surface error / displacement "
         print(f"{label}, {kind}: {what}{np.nanmedian(values):.3f} in the median, {np.nanmax(values):.3f} at worst")
     write(args.json, dict(markers=table, surface={f"{a}, {b}": v for (a, b), v in surface.items()}))
 
 
-def score(reconstructor, root: Path, case: dict, label: str, markers: dict, surface: dict) -> None:
+def score(reconstructor: tm.Reconstructor, root: Path, case: dict, label: str, markers: dict, surface: dict) -> None:
     truth = np.load(root / case["truth"])
     X, Y = truth["dots_nominal"].astype(float), truth["dots_deformed"].astype(float)
-    relative = lambda result: float(np.sqrt(((result.markers[0].numpy() - Y) ** 2).sum() / ((Y - X) ** 2).sum()))  # noqa: E731
+
+    def relative(result: tm.Reconstruction) -> float:
+        return float(np.sqrt(((result.markers[0].numpy() - Y) ** 2).sum() / ((Y - X) ** 2).sum()))
+
     exact = torch.from_numpy(truth["uv_deformed"].astype(np.float32))
     with torch.no_grad():
         surface.setdefault((label, "exact markers"), []).append(relative(reconstructor.from_pixels(exact)))
@@ -91,7 +93,7 @@ def score(reconstructor, root: Path, case: dict, label: str, markers: dict, surf
                 markers.setdefault((case["folder"], kind), []).append((error[visible], np.ones(visible.sum())))
 
 
-def contact_errors(result, truth) -> dict[str, float]:
+def contact_errors(result: tm.Reconstruction, truth) -> dict[str, float]:
     """Relative error of the force vector and of the pressure change; distance of contacts, the larger of both ways."""
     force, change = truth["force"], float(truth["p"] - truth["p0"])
     points, places = result.contact_points[0].numpy(), truth["contact_centroid_each"]

@@ -8,7 +8,10 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import splu
 
-from torchmembrane.estimators.force_balance import LONGEST_STEP, ForceBalance
+from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.bearings import Bearings
+from torchmembrane.estimators.force_balance import ForceBalance
+from torchmembrane.estimators.robust import Cauchy
 from torchmembrane.surface.stencil import inner, pad_border
 from torchmembrane.surface.topology import corners, triangles_of
 
@@ -20,7 +23,7 @@ def dofs(vertices: np.ndarray) -> np.ndarray:
 
 
 class BalanceTwin:
-    """Surface and pressure from one frame's rays `[D, 3]` and weights `[D]`, from rest; `estimator` in float64."""
+    """Surface and pressure from one frame's observation, rays `[D, 3]`, from rest; `estimator` in float64."""
 
     def __init__(self, estimator: ForceBalance):
         self.estimator, grid = estimator, estimator.membrane.grid
@@ -28,38 +31,40 @@ class BalanceTwin:
         index = torch.arange(grid[0] * grid[1])[:, None]
         triangle = dofs(triangles_of(corners(index, grid)).reshape(-1, 3).numpy())
         self.row, self.column = np.repeat(triangle, 9, 1).ravel(), np.tile(triangle, (1, 9)).ravel()
-        points = estimator.membrane.closest_points(estimator.positions.numpy())
+        points = estimator.membrane.closest_points(estimator.equations.bearings.positions.numpy())
         self.marker_weights, marker = points.weights, dofs(points.vertices)
         self.marker_row = np.repeat(np.arange(2 * len(marker)), 9)
         self.marker_column = np.repeat(marker, 2, 0).ravel()
         self.free = dofs(estimator.membrane.free_vertices.numpy()[:, None]).ravel()
         self.count = 3 * len(index)
 
-    def __call__(self, origins, directions, weight) -> tuple[np.ndarray, float]:
-        e = self.estimator
-        seen = e.observation(origins[None], directions[None], weight[None])
+    def __call__(self, observation: Observation) -> tuple[np.ndarray, float]:
+        e, single = self.estimator, Observation(*(part[None] for part in observation))
+        measured = e.equations.bearings.measured(single)
         if self.coarse is None:
-            x, pressure = e.at_rest(weight[None])
+            x, pressure = e.at_rest(single.confidence)
         else:
-            surface, pressure = self.coarse(origins, directions, weight)
+            surface, pressure = self.coarse(observation)
             x, pressure = e.refined(torch.from_numpy(surface)[None], torch.tensor([pressure]).double())
-        for tau, outlier in e.falls():
-            x, pressure = self.step(x, pressure, seen, tau, outlier)
+        for tau, outlier in e.schedule():
+            x, pressure = self.step(x, pressure, measured, tau, outlier)
         return x[0].numpy(), float(pressure)
 
-    def step(self, x, pressure, seen, tau, outlier):
+    def step(self, x: torch.Tensor, pressure, measured: Bearings, tau: float, outlier: float):
         e, free, count = self.estimator, self.free, self.count
-        force = e.contact_force(x, pressure)
-        inner_weights = e.force_weights(*(inner(field, e.membrane.grid).mT for field in (e.membrane.normals(x), force)), tau)
+        forces, bearings, loss = e.equations.forces, e.equations.bearings, e.equations.loss
+        force, normals = forces(x, pressure), e.membrane.normals(x)
+        inner_weights = loss.weights(*(inner(field, e.membrane.grid).mT for field in (normals, force)), tau)
         weights = pad_border(inner_weights.flatten(1, 2).mT, e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
         blocks = e.elasticity.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)
-        angle, slope = e.angles(x, seen)
-        slope = slope.movedim(-1, 1).numpy()[..., None, :] * self.marker_weights[:, None, :, None]
-        certainty = np.repeat(e.marker_weights_at(angle, seen, outlier)[0].numpy(), 2)
-        v = (e.membrane.volume_gradient(x) * e.moves)[0].numpy().ravel()
+        angle, jacobian = bearings.angles(x, measured)
+        jacobian = jacobian.movedim(-1, 1).numpy()[..., None, :] * self.marker_weights[:, None, :, None]
+        certainty = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
+        certainty = np.repeat(certainty[0].numpy(), 2)
+        v = (e.membrane.volume_gradient(x) * forces.free)[0].numpy().ravel()
         f, r = force[0].numpy().ravel(), angle[0].mT.numpy().ravel()
         A = sparse.csr_matrix((blocks.numpy().ravel(), (self.row, self.column)), shape=(count, count))[free][:, free]
-        J = sparse.csr_matrix((slope.ravel(), (self.marker_row, self.marker_column)), shape=(len(r), count))[:, free]
+        J = sparse.csr_matrix((jacobian.ravel(), (self.marker_row, self.marker_column)), shape=(len(r), count))[:, free]
         W = sparse.bsr_matrix((weights, np.arange(count // 3), np.arange(count // 3 + 1))).tocsr()[free][:, free]
         AW, Jw = A.T @ W, J.T @ sparse.diags(certainty)
         M = AW @ A + Jw @ J
@@ -75,5 +80,5 @@ class BalanceTwin:
         move = np.zeros(count)
         move[free] = -Mg - rise * Mm - multiplier * Mn
         move = move.reshape(-1, 3)
-        share = min(1.0, LONGEST_STEP * e.size / np.linalg.norm(move, axis=1).max())
+        share = min(1.0, e.settings.longest_step * e.size / np.linalg.norm(move, axis=1).max())
         return x + share * torch.from_numpy(move), pressure + share * rise

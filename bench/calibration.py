@@ -20,30 +20,30 @@ from record import write
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from torchmembrane.calibrate.camera import Views, lens_from_views, ports_from_views
-from torchmembrane.calibrate.depth import rest_from_depth
-from torchmembrane.calibrate.detection import find_target
-from torchmembrane.calibrate.layout import layout_for_pixels, pixel_lattice
-from torchmembrane.calibrate.material import material_from_images
-from torchmembrane.calibrate.rest import rest_from_image
+from torchmembrane import Camera, Markers, MembraneError, Reconstructor, Surface, preset
+from torchmembrane.calibrate import (
+    Checkerboard,
+    DotBoard,
+    Views,
+    find_target,
+    layout_for_pixels,
+    lens_from_views,
+    material_from_images,
+    pixel_lattice,
+    ports_from_views,
+    rest_from_depth,
+    rest_from_image,
+    rest_from_views,
+)
 from torchmembrane.calibrate.surface import fine_surface, surface_projection
-from torchmembrane.calibrate.views import rest_from_views
-from torchmembrane.camera.model import Camera
-from torchmembrane.errors import MembraneError
 from torchmembrane.io.images import to_grey
 from torchmembrane.io.report import Report
 from torchmembrane.markers.dots.pattern import find_dots
 from torchmembrane.plot.calibration import fit_figure, layout_figure, surface_figure
 from torchmembrane.plot.drawing import save
-from torchmembrane.presets import preset
-from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.parts import Markers, Surface
-from torchmembrane.simulate.appearance import Appearance
+from torchmembrane.simulate import Appearance, Plane, Simulator, Sphere
 from torchmembrane.simulate.dataset import stroke_to
-from torchmembrane.simulate.indenters import Plane, Sphere
-from torchmembrane.simulate.simulator import Simulator
 from torchmembrane.simulate.target_renderer import TargetRenderer
-from torchmembrane.targets import Checkerboard, DotBoard
 
 NOISE = 40.0
 LENSES = {
@@ -75,19 +75,15 @@ def lens(seeds, figures):
 
 def ports(seeds, figures):
     board = DotBoard(17, 13, 2.0)
-    for model, values in LENSES.items():
-        make = lambda p, air=False, model=model, values=values: Camera(  # noqa: E731
-            model, (640, 480), *values, [(p["port_distance"], p["port_thickness"], p["port_index"])],
-            1.0 if air else p["medium_index"],
-        )  # fmt: skip
+    for model in LENSES:
         for seed in range(seeds):
             rng, sets = np.random.default_rng(seed), []
             for air in (True, False):
-                sets.append(poses_seen(TargetRenderer.for_camera(make(PORT, air)), board, 6, (14, 22), 0.1, rng))
+                sets.append(poses_seen(TargetRenderer.for_camera(behind_port(model, PORT, air)), board, 6, (14, 22), 0.1, rng))
             pixels, filled = np.concatenate(sets), np.arange(12) >= 6
             for label, chosen in (("air", ~filled), ("medium", filled), ("both", filled | True)):
                 views = Views(pixels[chosen], filled[chosen])
-                found = ports_from_views(make(GUESS), board, views)
+                found = ports_from_views(behind_port(model, GUESS), board, views)
                 expected = [PORT[name] for name in found.names]
                 yield row(f"ports, {model}, {label}", seed, found.names, found.fit, expected)
                 if seed == seeds - 1:
@@ -95,6 +91,12 @@ def ports(seeds, figures):
                     title = f"{model} through a port, images in {label.replace('both', 'air and medium')}"
                     report = Report.of(title, found.names, found.names, start, found.fit, pixels[chosen], found.residuals)
                     draw(figures, f"ports_{model}_{label}", report)
+
+
+def behind_port(lens_model: str, port: dict[str, float], air: bool = False) -> Camera:
+    """A camera of `LENSES` behind a flat port, in air or in the medium."""
+    layer = (port["port_distance"], port["port_thickness"], port["port_index"])
+    return Camera(lens_model, (640, 480), *LENSES[lens_model], [layer], 1.0 if air else port["medium_index"])
 
 
 def rest(seeds, figures):
@@ -105,8 +107,8 @@ def rest(seeds, figures):
             image = rest_image(truth, seed)
             found = rest_from_image(bare(design), image)
             record = row(f"rest, {name}", seed, found.names, found.fit, [0.8, 0.6, 0.0, *OFFSET])
-            off = lambda sensor: rms(sensor.markers.positions - truth.markers.positions)  # noqa: B023, E731
-            yield record | dict(dots_before=off(design), dots_after=off(found.sensor))
+            before, after = (rms(s.markers.positions - truth.markers.positions) for s in (design, found.sensor))
+            yield record | dict(dots_before=before, dots_after=after)
         title, start = f"{name}: rest surface from one image", np.zeros(6)
         report = Report.of(title, found.names, found.names, start, found.fit, found.pixels, found.residuals)
         draw(figures, f"rest_{name}", report)
@@ -289,9 +291,11 @@ def surface_errors(truth, design, found) -> dict[str, float]:
     after = surface_projection(target, found.surface.vertices[free]).signed_distance
     deviations = found.surface.deviations[free]
     return dict(
-        surface_before=rms(before), surface_after=rms(after), surface_deviation=rms(deviations),
+        surface_before=rms(before),
+        surface_after=rms(after),
+        surface_deviation=rms(deviations),
         surface_beyond_3=float((np.abs(after) > 3 * deviations).mean()),
-    )  # fmt: skip
+    )
 
 
 def row(what: str, seed: int, names, fit, truth) -> dict:
@@ -300,16 +304,13 @@ def row(what: str, seed: int, names, fit, truth) -> dict:
     print(f"{what}, seed {seed}: noise {fit.noise:.3f} px, worst error / deviation {worst(error, deviations):.2f}")
     for name, e, sd in list(zip(names, error, deviations, strict=True))[:9]:
         print(f"    {name:16s} error {e:+.5f}  deviation {sd:.5f}")
-    return dict(
-        what=what, seed=seed, noise=fit.noise, names=list(names), error=error.tolist(), deviation=deviations.tolist(),
-        worst=worst(error, deviations),
-    )  # fmt: skip
+    errors = dict(error=error.tolist(), deviation=deviations.tolist(), worst=worst(error, deviations))
+    return dict(what=what, seed=seed, noise=fit.noise, names=list(names), **errors)
 
 
 def rms(values) -> float:
-    return float(
-        np.sqrt((np.asarray(values, float) ** 2).sum(-1).mean() if np.ndim(values) > 1 else (np.asarray(values) ** 2).mean())
-    )
+    squares = np.asarray(values, float) ** 2
+    return float(np.sqrt((squares.sum(-1) if squares.ndim > 1 else squares).mean()))
 
 
 def worst(error, deviations) -> float:

@@ -17,8 +17,8 @@ import torch
 from accuracy import cases_in
 from record import write
 
-from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.sensor import Sensor
+import torchmembrane as tm
+from torchmembrane.estimators.base import Observation
 
 CONVERGED = 60
 
@@ -34,12 +34,11 @@ def main():
     torch.set_num_threads(1)
     cases, found, rows = cases_in(args.cases), {}, []
     for name in sorted({case["sensor"] for case in cases}):
-        sensor = Sensor.from_file(args.cases / name)
+        sensor = tm.Sensor.from_file(args.cases / name)
         sensor = replace(sensor, membrane=sensor.surface.membrane((args.grid, args.grid)))
         pixels = [np.load(args.cases / case["truth"])["uv_deformed"] for case in cases if case["sensor"] == name]
         for model in (None, "harmonic"):
-            reconstructor = Reconstructor(sensor, "minimum-energy", model=model, dtype=torch.float64)
-            for key, values in errors(reconstructor, torch.from_numpy(np.array(pixels, float)), args.steps).items():
+            for key, values in errors(sensor, model, torch.from_numpy(np.array(pixels, float)), args.steps).items():
                 found.setdefault((model or "the sensor's", *key), []).append(values)
     for (model, precision, steps), values in found.items():
         error, relative_step = torch.cat(values, 1)
@@ -50,21 +49,28 @@ def main():
 
 
 @torch.no_grad()
-def errors(reconstructor: Reconstructor, pixels: torch.Tensor, counts: list[int]) -> dict:
+def errors(sensor: tm.Sensor, model: str | None, pixels: torch.Tensor, counts: list[int]) -> dict:
     """`[2, presses]` error and relative step for each precision and number of steps."""
-    origins, directions = reconstructor.rays(pixels - reconstructor.rest_pixels, torch.ones_like(pixels[..., 0]))
-    origins, estimator, found = origins.expand(directions.shape), reconstructor.estimator, {}
-    rms = lambda x: x.norm(dim=-1).square().mean(-1).sqrt()  # noqa: E731
-    estimator.steps = CONVERGED
-    exact = estimator(origins, directions).vertices
-    displacement = rms(exact - estimator.membrane.rest)
+    converged, found = with_steps(sensor, model, CONVERGED, torch.float64), {}
+    observation = converged.observation(pixels - converged.rest_pixels, torch.ones_like(pixels[..., 0]))
+    exact = converged.estimator(observation).vertices
+    displacement = rms(exact - converged.estimator.membrane.rest)
     for dtype in (torch.float64, torch.float32):
-        estimator.to(dtype)
-        for estimator.steps in counts:
-            got = estimator(origins.to(dtype), directions.to(dtype))
+        for steps in counts:
+            estimator = with_steps(sensor, model, steps, dtype).estimator
+            got = estimator(Observation(*(part.to(dtype) for part in observation)))
             error = rms(got.vertices.double() - exact) / displacement
-            found[str(dtype)[6:], estimator.steps] = torch.stack([error, got.relative_step.double()])
+            found[str(dtype)[6:], steps] = torch.stack([error, got.relative_step.double()])
     return found
+
+
+def with_steps(sensor: tm.Sensor, model: str | None, steps: int, dtype: torch.dtype) -> tm.Reconstructor:
+    settings = tm.MinimumEnergySettings(steps=steps)
+    return tm.Reconstructor(sensor, "minimum-energy", settings=settings, model=model, dtype=dtype)
+
+
+def rms(x: torch.Tensor) -> torch.Tensor:
+    return x.norm(dim=-1).square().mean(-1).sqrt()
 
 
 if __name__ == "__main__":

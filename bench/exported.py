@@ -22,9 +22,9 @@ import torch
 from accuracy import cases_in
 from record import write
 
-from torchmembrane.io.results import Reconstruction
-from torchmembrane.onnx.export import export, previous_of
-from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
+import torchmembrane as tm
+from torchmembrane.onnx.export import previous_of
+from torchmembrane.reconstruct import ESTIMATORS
 
 BATCHES = (1, 3, 16)
 
@@ -32,7 +32,7 @@ BATCHES = (1, 3, 16)
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", type=Path)
-    parser.add_argument("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0])
+    parser.add_argument("--estimator", choices=ESTIMATORS, default=next(iter(ESTIMATORS)))
     parser.add_argument("--tracking", action="store_true", help="every frame from its own result, as if it came again")
     parser.add_argument("--only", nargs="*", help="sensors to take, by parts of their file names")
     parser.add_argument("--threads", type=int, default=1)
@@ -51,10 +51,10 @@ def main():
 
 
 def measure(sensor: Path, files: list[Path], estimator: str, tracking: bool, threads: int) -> dict:
-    reconstructor = Reconstructor.from_file(sensor, estimator=estimator)
+    reconstructor = tm.Reconstructor.from_file(sensor, estimator)
     with tempfile.TemporaryDirectory() as folder:
         path, start = Path(folder) / "model.onnx", time.perf_counter()
-        model = export(reconstructor, path, tracking=tracking)
+        model = tm.export(reconstructor, path, tracking=tracking)
         row = dict(export_seconds=time.perf_counter() - start, megabytes=path.stat().st_size / 1e6, nodes=count(model.graph))
         start = time.perf_counter()
         session = open_session(path, threads)
@@ -91,7 +91,7 @@ def seconds(call, scale: float, repeats: int = 20) -> dict[str, float]:
     return dict(best=min(times), median=float(np.median(times)))
 
 
-def given(reconstructor, images, tracking: bool) -> tuple[dict[str, np.ndarray], Reconstruction | None]:
+def given(reconstructor, images, tracking: bool) -> tuple[dict[str, np.ndarray], tm.Reconstruction | None]:
     """A model's inputs, and the result that it starts from."""
     if not tracking:
         return {"image": images.numpy()}, None
@@ -112,7 +112,7 @@ def differences(reconstructor, session, images, tracking: bool) -> dict:
             feed, before = given(reconstructor, part, tracking)
             with torch.no_grad():
                 expected = reconstructor(part, before) if tracking else reconstructor(part)
-            got = Reconstruction(*session.run(list(Reconstruction._fields), feed))
+            got = tm.Reconstruction(*session.run(list(tm.Reconstruction._fields), feed))
             statuses_equal &= got.status.tolist() == expected.status.tolist()
             for name in ("vertices", "markers", "pixels", "force"):
                 mine, theirs = getattr(got, name), getattr(expected, name).numpy()

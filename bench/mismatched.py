@@ -17,8 +17,8 @@ from accuracy import cases_in
 from record import write
 from scipy.spatial import cKDTree
 
+import torchmembrane as tm
 from torchmembrane.markers.observer import FOUND
-from torchmembrane.reconstruct import Reconstructor
 
 SHARE, NOISE, ALLOWED = 0.05, 0.05, 0.2
 
@@ -32,11 +32,11 @@ def mismatched(rest: np.ndarray, pixels: np.ndarray, rng) -> tuple[np.ndarray, n
     return wrong, np.isin(np.arange(len(rest)), bad)
 
 
-def believed(r: Reconstructor, flow: torch.Tensor):
+def believed(r: tm.Reconstructor, flow: torch.Tensor) -> tm.Reconstruction:
     """What `from_pixels` makes of displacements `[B, D, 2]` px, but for its screen."""
     one = torch.ones_like(flow[..., 0])
-    given = (one,) if r.finds_contacts else ()
-    return r.result(r.estimator(*r.rays(flow, one), *given), flow, one, torch.zeros(len(flow), dtype=torch.long))
+    found = r.estimator(r.observation(flow, one))
+    return r.result(found, flow, one, torch.full((len(flow),), tm.Status.OK.value))
 
 
 def grown(errors: np.ndarray, clean: np.ndarray) -> str:
@@ -57,14 +57,14 @@ def main():
         X, Y, exact = (truth[name].astype(float) for name in ("dots_nominal", "dots_deformed", "uv_deformed"))
         pixels, *others = (exact + NOISE * np.random.default_rng(k).standard_normal(exact.shape) for k in range(1 + n))
         for estimator in ("minimum-energy", "force-balance"):
-            r = Reconstructor.from_file(args.cases / case["sensor"], estimator=estimator)
+            r = tm.Reconstructor.from_file(args.cases / case["sensor"], estimator)
             rest = r.rest_pixels.double().numpy()
             draws = [mismatched(rest, pixels, np.random.default_rng(k)) for k in range(n)]
             wrong, bad = (np.stack(each) for each in zip(*draws, strict=True))
             observed = torch.from_numpy(np.stack([pixels, *others, *wrong]))
             flow = (observed - torch.from_numpy(rest)).to(r.rest_pixels)
             with torch.no_grad():
-                suspect = (r.screen(flow, torch.ones_like(flow[..., 0])) < FOUND).numpy()
+                suspect = (r.observer.screen(flow, torch.ones_like(flow[..., 0])) < FOUND).numpy()
                 results = r.from_pixels(observed), believed(r, flow[-n:])
             error, spoiled = (np.sqrt(((x.markers.numpy() - Y) ** 2).sum((1, 2)) / ((Y - X) ** 2).sum()) for x in results)
             row = dict(clean=error[0], noise=error[1:-n], believed=np.nan_to_num(spoiled, nan=np.inf), screened=error[-n:])
@@ -74,9 +74,9 @@ def main():
     for estimator in ("minimum-energy", "force-balance"):
         mine = [row for row in rows if row["estimator"] == estimator]
         clean, noise, spoiled, screened = (np.array([row[key] for row in mine]) for key in list(mine[0])[2:])
-        print(f"{estimator}: medians {np.median(clean):.3f} clean, {np.median(spoiled):.3f} mismatched, "
-              f"{np.median(screened):.3f} screened; means {np.append(clean[:, None], noise, 1).mean():.3f} without mismatches, "
-              f"{screened.mean():.3f} screened; of {screened.size}, growth")  # fmt: skip
+        medians = f"{np.median(clean):.3f} clean, {np.median(spoiled):.3f} mismatched, {np.median(screened):.3f} screened"
+        means = f"{np.append(clean[:, None], noise, 1).mean():.3f} without mismatches, {screened.mean():.3f} screened"
+        print(f"{estimator}: medians {medians}; means {means}; of {screened.size}, growth")
         for what, errors in {"mismatched": spoiled, "screened": screened, "other noise": noise}.items():
             print(f"    {what}: {grown(errors, clean)}")
     print("{2} mismatched markers, {0} missed; {1} right ones distrusted".format(*counts))

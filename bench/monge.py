@@ -9,6 +9,7 @@ its pressure change over the rest pressure.
 
 import argparse
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,20 +17,25 @@ import torch
 from accuracy import cases_in
 from record import write
 
-from torchmembrane.errors import MembraneError
-from torchmembrane.estimators.minimum_energy import MinimumEnergy
+import torchmembrane as tm
+from torchmembrane.estimators.base import Equilibrium, Observation
 from torchmembrane.paper.monge import MongeMinimumEnergy
-from torchmembrane.reconstruct import Reconstructor
 
 
-def forms(reconstructor: Reconstructor) -> dict:
-    membrane, elasticity = reconstructor.estimator.membrane, reconstructor.estimator.energy
+def forms(reconstructor: tm.Reconstructor) -> dict[str, Callable[[Observation], Equilibrium]]:
+    membrane, elasticity = reconstructor.estimator.membrane, reconstructor.estimator.elasticity
     rest_rays = reconstructor.camera.pixel_to_ray(reconstructor.vertex_pixels)
+
+    def at_fixed_points(steps: int) -> Callable[[Observation], Equilibrium]:
+        monge = MongeMinimumEnergy(membrane, elasticity, rest_rays, steps)
+        return lambda observation: monge(observation.origins[0], observation.directions[0])
+
+    linear = tm.MinimumEnergySettings(volume="linear")
     return {
         "material, exact volume": reconstructor.estimator,
-        "material, linear volume": MinimumEnergy(membrane, elasticity, rest_rays, volume="linear"),
-        "fixed x y, once (eq. 22)": MongeMinimumEnergy(membrane, elasticity, rest_rays),
-        "fixed x y, five times": MongeMinimumEnergy(membrane, elasticity, rest_rays, steps=5),
+        "material, linear volume": tm.MinimumEnergy(membrane, elasticity, rest_rays, settings=linear),
+        "fixed x y, once (eq. 22)": at_fixed_points(1),
+        "fixed x y, five times": at_fixed_points(5),
     }
 
 
@@ -41,27 +47,25 @@ def main():
     warnings.simplefilter("ignore")
     rows = []
     for case in cases_in(args.cases):
-        r = Reconstructor.from_file(
-            args.cases / case["sensor"], estimator="minimum-energy", model="harmonic", dtype=torch.float64
-        )
+        r = tm.Reconstructor.from_file(args.cases / case["sensor"], "minimum-energy", model="harmonic", dtype=torch.float64)
         truth = np.load(args.cases / case["truth"])
         X, Y = (torch.from_numpy(truth[key].astype(float)) for key in ("dots_nominal", "dots_deformed"))
         pixels = torch.from_numpy(truth["uv_deformed"].astype(float))[None]
         try:
             estimators = forms(r)
-        except MembraneError as error:
+        except tm.MembraneError as error:
             print(f"{case['case']} {case['folder']}: left out, {str(error).partition(';')[0]}")
             continue
         with torch.no_grad():
-            flow = r.flow(pixels - r.rest_pixels, torch.ones(pixels.shape[:2], dtype=torch.float64))[0]
-            observed = r.camera.pixel_to_ray(r.vertex_pixels + flow)
-            first = r.estimator(*observed).vertices
+            observation = r.observation(pixels - r.rest_pixels, torch.ones(pixels.shape[:2], dtype=torch.float64))
+            first = r.estimator(observation).vertices
             for name, estimator in estimators.items():
-                got = estimator(*observed)
-                moved = (got.vertices - r.estimator.membrane.rest)[r.marker_vertices]
+                got = estimator(observation)
+                vertices = got.vertices.reshape(first.shape)
+                moved = (vertices - r.estimator.membrane.rest)[0, r.marker_vertices]
                 markers = r.rest_markers + (r.marker_weights[..., None] * moved).sum(-2)
                 error = float(((markers - Y).square().sum() / (Y - X).square().sum()).sqrt())
-                apart = float((got.vertices - first).square().sum(-1).mean().sqrt())
+                apart = float((vertices - first).square().sum(-1).mean().sqrt())
                 rise = float(got.pressure / r.estimator.rest_pressure - 1)
                 rows.append(dict(case=case["case"], form=name, error=error, apart=apart, pressure=rise))
     for name in dict.fromkeys(row["form"] for row in rows):

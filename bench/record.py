@@ -25,13 +25,21 @@ def median_seconds(function, repeats: int = 7) -> tuple[float, float]:
 
 
 def write(path: Path | None, results: dict) -> None:
-    """Print the results, and write them with the machine's description if a path is given."""
-    machine = dict(
-        processor=platform.processor() or platform.machine(), cores=os.cpu_count(), torch_threads=torch.get_num_threads(),
-        python=platform.python_version(), cuda=torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        **{name: version(name) for name in ("torch", "kornia", "numpy", "scipy", "torchmembrane")},
-    )  # fmt: skip
+    """Write the results with the machine's description, if a path is given."""
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(dict(machine=machine, **results), indent=1))
+        path.write_text(json.dumps(dict(machine=machine(), **results), indent=1))
         print(f"written to {path}")
+
+
+def machine() -> dict:
+    """The processor, and the versions of what was measured."""
+    versions = {name: version(name) for name in ("torch", "kornia", "numpy", "scipy", "torchmembrane")}
+    return dict(
+        processor=platform.processor() or platform.machine(),
+        cores=os.cpu_count(),
+        torch_threads=torch.get_num_threads(),
+        python=platform.python_version(),
+        cuda=torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        **versions,
+    )

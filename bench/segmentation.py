@@ -16,13 +16,14 @@ import torch
 from accuracy import cases_in
 from record import write
 
-from torchmembrane.estimators.segmentation import Segmentation
-from torchmembrane.reconstruct import Reconstructor
+import torchmembrane as tm
+from torchmembrane.estimators.segmentation import Segmented, reconstruct_and_segment
+from torchmembrane.markers.observer import FOUND
 
-NOISE, NONE_FOUND = 0.05, 10.0
+NOISE, NONE_FOUND, ROUNDS = 0.05, 10.0, 8
 LOOPS = {
-    "loop, paper": dict(model="harmonic", element="quadrilateral", volume="linear"),
-    "loop, material": dict(),
+    "loop, paper": dict(estimator="paper"),
+    "loop, material": dict(estimator="minimum-energy"),
 }
 
 
@@ -34,11 +35,10 @@ def contact_error(found: np.ndarray, true: np.ndarray) -> float:
     return float(max(gap.min(0).mean(), gap.min(1).mean()))
 
 
-def segmented(reconstructor: Reconstructor, pixels: torch.Tensor, confidence: torch.Tensor):
-    found = (confidence > 0.5).to(confidence)
-    flow = reconstructor.flow(torch.where(found[..., None] > 0, pixels - reconstructor.rest_pixels, 0.0), found)
-    pixel_to_ray, vertices = reconstructor.camera.pixel_to_ray, reconstructor.vertex_pixels
-    return Segmentation(reconstructor.estimator, pixel_to_ray(vertices))(*pixel_to_ray(vertices + flow))
+def segmented(r: tm.Reconstructor, pixels: torch.Tensor, confidence: torch.Tensor) -> Segmented:
+    found = (confidence > FOUND).to(confidence)
+    rays = r.observation(torch.where(found[..., None] > 0, pixels - r.rest_pixels, 0.0), found)
+    return reconstruct_and_segment(r.estimator, r.estimator.segmentation, rays, ROUNDS)
 
 
 def main():
@@ -52,7 +52,7 @@ def main():
     for case in cases_in(args.cases):
         truth = np.load(args.cases / case["truth"])
         place = truth["contact_centroid_each"]
-        balance = Reconstructor.from_file(args.cases / case["sensor"], estimator="force-balance")
+        balance = tm.Reconstructor.from_file(args.cases / case["sensor"])
         with torch.no_grad():
             if args.images:
                 result = balance(balance.read(args.cases / case["images"][-1]))
@@ -64,9 +64,8 @@ def main():
                 result = balance.from_pixels(pixels)
             row = dict(case=case["case"], sensor=case["folder"], contacts=len(place))
             for name, options in LOOPS.items():
-                r = Reconstructor.from_file(
-                    args.cases / case["sensor"], estimator="minimum-energy", dtype=torch.float64, **options
-                )
+                path = args.cases / case["sensor"]
+                r = tm.Reconstructor.from_file(path, dtype=torch.float64, **options)
                 got = segmented(r, pixels.double(), confidence.double())
                 row["eq. 29"] = contact_error(got.first.points[0].numpy(), place)
                 row[name] = contact_error(got.contacts.points[0].numpy(), place)

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from record import write
 
-from torchmembrane.reconstruct import Reconstructor
+import torchmembrane as tm
 
 
 def rms(field) -> float:
@@ -30,15 +30,16 @@ def main():
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
-    reconstructor, truth = Reconstructor.from_file(args.folder / "sensor.toml"), np.load(args.folder / "truth.npz")
+    reconstructor, truth = tm.Reconstructor.from_file(args.folder / "sensor.toml"), np.load(args.folder / "truth.npz")
+    observer = reconstructor.observer
     found, seconds, previous = {"cold": [], "warm": []}, {"cold": 0.0, "warm": 0.0}, None
     with torch.no_grad():
         for path in sorted(args.folder.glob("[0-9]*.png")):
-            displacement, confidence, _ = reconstructor.observe(reconstructor.read(path))
-            pixels = displacement + reconstructor.observer.measured_rest
+            displacement, confidence, _ = observer(reconstructor.read(path))
+            pixels = displacement + observer.measured_rest
             for name, start in (("cold", None), ("warm", previous)):
                 began = time.process_time()
-                result = reconstructor.from_pixels(pixels, confidence, reconstructor.observer.measured_rest, start)
+                result = reconstructor.from_pixels(pixels, confidence, observer.measured_rest, start)
                 seconds[name] += time.process_time() - began
                 found[name].append(result)
             previous = result

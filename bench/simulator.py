@@ -17,17 +17,13 @@ import numpy as np
 import torch
 from record import write
 
-from torchmembrane import MembraneError
-from torchmembrane.mechanics.hyperelastic import ElasticEnergy
-from torchmembrane.presets import NAMES, preset
+from torchmembrane import ElasticEnergy, MembraneError, Sensor, preset
+from torchmembrane.presets import NAMES
 from torchmembrane.sensor.factories import elastic_energy
-from torchmembrane.sensor.sensor import Sensor
-from torchmembrane.simulate.appearance import Appearance
+from torchmembrane.simulate import Appearance, Cylinder, Plane, Simulator, Sphere, facing, press
 from torchmembrane.simulate.dataset import Plan, random_frame, stroke_to
 from torchmembrane.simulate.equilibrium import EquilibriumProblem, Liquid, Open
-from torchmembrane.simulate.indenters import Cylinder, Plane, Sphere, facing
-from torchmembrane.simulate.quasi_static import carried, press
-from torchmembrane.simulate.simulator import Simulator
+from torchmembrane.simulate.quasi_static import carried
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, heightfield, spherical_cap
 
 PRESTRETCH, GRIDS = 1.3, (17, 33, 65)
@@ -116,10 +112,8 @@ def presses_of_a_dome() -> list[dict]:
     press(dome, elasticity, straight(dome, 0.5))  # warm-up
     for friction in (0.0, FRICTION):
         seconds, state = processor_seconds(lambda mu=friction: press(dome, elasticity, straight(dome), friction=mu))
-        row = dict(
-            friction=friction, imbalance=state.imbalance, volume_error=state.volume_error, penetration=state.penetration,
-            steps=state.iterations, seconds=seconds,
-        )  # fmt: skip
+        row = {name: getattr(state, name) for name in ("imbalance", "volume_error", "penetration")}
+        row |= dict(friction=friction, steps=state.iterations, seconds=seconds)
         rows.append(row)
         print(
             "press of 3 mm, friction {friction}: unbalanced force {imbalance:.0e}, volume off by {volume_error:.0e}, "

@@ -14,6 +14,7 @@ import copy
 import time
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +24,8 @@ from balance_twin import BalanceTwin
 from record import median_seconds, write
 from scipy.sparse.linalg import splu
 
-from torchmembrane.mechanics.hyperelastic import ElasticEnergy
-from torchmembrane.reconstruct import Reconstructor
+import torchmembrane as tm
+from torchmembrane.estimators.base import Observation
 from torchmembrane.surface.topology import corners
 
 
@@ -34,8 +35,7 @@ def scipy_twin(reconstructor):
     index = corners(torch.arange(len(membrane.rest))[:, None], membrane.grid)[..., 0].reshape(-1, 4).numpy()
     up = torch.zeros_like(membrane.rest)
     up[:, 2] = 1
-    elasticity = ElasticEnergy(reconstructor.sensor.membrane, "harmonic", reconstructor.sensor.material.prestretch)
-    local = elasticity.to(up.dtype).stiffness_along(membrane.rest, up).reshape(-1, 4, 4).numpy().astype(float)
+    local = estimator.elasticity.stiffness_along(membrane.rest, up).reshape(-1, 4, 4).numpy().astype(float)
     row, column = np.repeat(index, 4, 1).ravel(), np.tile(index, (1, 4)).ravel()
     free, fixed = membrane.free_vertices.numpy(), membrane.fixed.numpy()
     rest_range = estimator.rest_range.numpy().astype(float)
@@ -60,31 +60,34 @@ def scipy_twin(reconstructor):
 
 def minimum_energy(args):
     for label, options in (
-        ("harmonic, linear volume (the paper)", dict(model="harmonic", volume="linear")),
+        (
+            "harmonic, linear volume (the paper)",
+            dict(model="harmonic", settings=tm.MinimumEnergySettings(volume="linear")),
+        ),
         ("the sensor's material, exact volume", {}),
     ):
-        reconstructor = Reconstructor.from_file(args.sensor, estimator="minimum-energy", **options).to(args.device)
+        reconstructor = tm.Reconstructor.from_file(args.sensor, "minimum-energy", **options).to(args.device)
+        locator, estimator = reconstructor.observer.locator, reconstructor.estimator
         image = reconstructor.read(args.image)
         with torch.no_grad():
             for batch in args.batches:
                 images = image.expand(batch, -1, -1, -1).contiguous()
-                pixels, confidence = reconstructor.observer.locator(images)
-                displacement = pixels - reconstructor.observer.measured_rest
-                flow = reconstructor.flow(displacement, confidence)
-                rays = reconstructor.camera.pixel_to_ray(reconstructor.vertex_pixels + flow)
+                displacement, confidence, _ = reconstructor.observer(images)
+                pixels = reconstructor.rest_pixels + displacement
+                observation = reconstructor.observation(displacement, confidence)
                 parts = dict(
-                    markers=lambda images=images, r=reconstructor: r.locator(images),
-                    flow=lambda s=displacement, c=confidence, r=reconstructor: r.flow(s, c),
-                    solve=lambda rays=rays, r=reconstructor: r.estimator(*rays),
-                    whole=lambda images=images, r=reconstructor: r(images),
+                    markers=partial(locator, images),
+                    flow=partial(estimator.flow, pixels, confidence),
+                    solve=partial(estimator, observation),
+                    whole=partial(reconstructor, images),
                 )
                 times = {name: [1000 * t / batch for t in median_seconds(part)] for name, part in parts.items()}
                 yield dict(estimator=label, batch=batch, milliseconds_a_frame=times)
                 print(f"{label}, batch {batch}: " + ", ".join(f"{k} {t[0]:.2f} ms" for k, t in times.items()), flush=True)
             if options and args.device == "cpu":
-                twin, d = scipy_twin(reconstructor), rays[1][0].double().numpy()
-                gap = np.abs(twin(d) - reconstructor.estimator(rays[0][:1], rays[1][:1]).vertices[0].numpy()).max()
-                seconds = median_seconds(lambda twin=twin, d=d: twin(d))
+                twin, d = scipy_twin(reconstructor), observation.directions[0].double().numpy()
+                gap = np.abs(twin(d) - estimator(observation).vertices[0].numpy()).max()
+                seconds = median_seconds(partial(twin, d))
                 yield dict(estimator="scipy twin", batch=1, milliseconds_a_frame=dict(solve=[1000 * s for s in seconds]))
                 print(f"scipy twin of the same solve, a frame: {1000 * seconds[0]:.2f} ms (largest difference {gap:.1e})")
 
@@ -102,30 +105,30 @@ def least_milliseconds(functions: dict, turns: int) -> dict[str, float]:
 
 
 def force_balance(args):
-    sensor = Reconstructor.from_file(args.sensor).sensor
-    reconstructor = Reconstructor(replace(sensor, membrane=sensor.surface.membrane((17, 17))))
+    sensor = tm.Sensor.from_file(args.sensor)
+    reconstructor = tm.Reconstructor(replace(sensor, membrane=sensor.surface.membrane((17, 17))))
     estimator, exact = reconstructor.estimator, copy.deepcopy(reconstructor.estimator).double()
-    displacement, confidence, _ = reconstructor.observe(reconstructor.read(args.image))
-    frame = (*reconstructor.rays(displacement, confidence), confidence)
-    twin, single = BalanceTwin(exact), [a[0].double() for a in frame]
-    gap = np.abs(twin(*single)[0] - estimator(*frame).vertices[0].numpy()).max()
-    functions, batches = {"scipy twin, cold": lambda: twin(*single)}, {}
+    displacement, confidence, _ = reconstructor.observer(reconstructor.read(args.image))
+    frame = reconstructor.observation(displacement, confidence)
+    twin, single = BalanceTwin(exact), Observation(*(part[0].double() for part in frame))
+    gap = np.abs(twin(single)[0] - estimator(frame).vertices[0].numpy()).max()
+    functions, batches = {"scipy twin, cold": partial(twin, single)}, {}
     for batch in args.batches:
-        frames = [a.expand(batch, *a.shape[1:]).contiguous() for a in frame]
-        start = estimator(*frames)[:2]
-        functions[f"batch {batch}, cold"] = lambda frames=frames: estimator(*frames)
-        functions[f"batch {batch}, warm"] = lambda frames=frames, start=start: estimator(*frames, start)
+        frames = Observation(*(part.expand(batch, *part.shape[1:]).contiguous() for part in frame))
+        start = estimator(frames)[:2]
+        functions[f"batch {batch}, cold"] = partial(estimator, frames)
+        functions[f"batch {batch}, warm"] = partial(estimator, frames, start)
         batches |= {f"batch {batch}, cold": batch, f"batch {batch}, warm": batch}
         if args.compiled:
             compiled = torch.compile(estimator, fullgraph=True)
-            functions[f"batch {batch}, compiled, cold"] = lambda frames=frames, f=compiled: f(*frames)
-            functions[f"batch {batch}, compiled, warm"] = lambda frames=frames, start=start, f=compiled: f(*frames, start)
+            functions[f"batch {batch}, compiled, cold"] = partial(compiled, frames)
+            functions[f"batch {batch}, compiled, warm"] = partial(compiled, frames, start)
             batches |= {f"batch {batch}, compiled, cold": batch, f"batch {batch}, compiled, warm": batch}
     times = {name: value / batches.get(name, 1) for name, value in least_milliseconds(functions, 5).items()}
     for name, value in times.items():
         ratio = value / times["scipy twin, cold"]
         print(
-            f"force balance, 17 x 17, {len(single[2])} dots, {name}: {value:.1f} ms a frame, {ratio:.2f} of the twin",
+            f"force balance, 17 x 17, {len(single.confidence)} dots, {name}: {value:.1f} ms a frame, {ratio:.2f} of the twin",
             flush=True,
         )
         yield dict(estimator="force balance", what=name, milliseconds_a_frame=value, of_the_twin=ratio)

@@ -17,8 +17,8 @@ from record import write
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+import torchmembrane as tm
 from torchmembrane.markers.observer import FOUND
-from torchmembrane.reconstruct import Reconstructor
 
 REACH = 0.75  # of the distance to the nearest dot of its size: how far a dot is looked for
 NEIGHBOURS = 4  # matched large dots that predict a small one
@@ -95,7 +95,7 @@ def main():
     warnings.simplefilter("ignore")
     errors, cases = {}, cases_in(args.cases)
     for name in sorted({case["sensor"] for case in cases}):
-        r = Reconstructor.from_file(args.cases / name)
+        r = tm.Reconstructor.from_file(args.cases / name)
         markers, model = r.sensor.markers, r.rest_pixels.double().numpy()
         large = np.array([size == "large" for size in markers.sizes])
         paper = ThresholdedDots(markers.rest_image, model, large, markers.polarity)
@@ -106,8 +106,8 @@ def main():
                 kind = Path(path).stem.rpartition("_")[2] if len(case["images"]) > 1 else "images"
                 image = r.read(args.cases / path)
                 with torch.no_grad():
-                    pixels, confidence = (a[0].double().numpy() for a in r.locator(image))
-                soft = np.where(confidence[:, None] > FOUND, pixels - r.measured_rest.double().numpy(), np.nan)
+                    pixels, confidence = (a[0].double().numpy() for a in r.observer.locator(image))
+                soft = np.where(confidence[:, None] > FOUND, pixels - r.observer.measured_rest.double().numpy(), np.nan)
                 for method, moved in (("paper", paper(image[0, 0].numpy())), ("locator", soft)):
                     error = np.linalg.norm(model + moved - truth["uv_deformed"], axis=1)[visible]
                     errors.setdefault((case["folder"], kind, method), []).append(error)

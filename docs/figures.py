@@ -19,22 +19,19 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
+from torchmembrane import Reconstruction, Reconstructor, Status
 from torchmembrane.estimators.flow import FlowInterpolation
-from torchmembrane.estimators.segmentation import PolarAngle, Segmentation
-from torchmembrane.io.results import Reconstruction
+from torchmembrane.estimators.segmentation import PolarAngle, Segmented, reconstruct_and_segment
 from torchmembrane.markers.observer import FOUND
 from torchmembrane.paper.pressed_strip import Disc, PressedStrip
 from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile
 from torchmembrane.paper.strip import Strip
 from torchmembrane.plot.drawing import BLUE, GREY, VERMILION
 from torchmembrane.presets import preset_file
-from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.simulate.appearance import Appearance
-from torchmembrane.simulate.indenters import Cylinder, Sphere
-from torchmembrane.simulate.quasi_static import press
-from torchmembrane.simulate.simulator import Simulator
+from torchmembrane.simulate import Appearance, Cylinder, Simulator, Sphere, press
 
 NOISE = 30.0  # dB below white
+ROUNDS = 8  # of the reconstruct / segment loop
 ESTIMATORS = {"minimum energy": "minimum-energy", "force balance": "force-balance"}
 MISMATCHED = 0.05
 MAGNIFICATIONS, LONGEST_ARROW = (2, 3, 5, 10), 60  # px
@@ -86,8 +83,12 @@ def reconstructed(sensor: str, strokes, estimator: str) -> Reconstruction:
 
 def error_words(shown: Shown, result: Reconstruction) -> str:
     """The error at the dots and their displacement, in words."""
-    rms = lambda a: float(np.sqrt((a**2).sum(1).mean()))  # noqa: E731
-    error, moved = rms(result.markers[0].numpy() - shown.dots), rms(shown.dots - shown.rest_dots)
+    return relative_words(result.markers[0].numpy() - shown.dots, shown.dots - shown.rest_dots)
+
+
+def relative_words(error: np.ndarray, moved: np.ndarray) -> str:
+    """Rms of errors and of displacements, `[D, ...]`, in words."""
+    error, moved = (float(np.sqrt((a**2).sum(1).mean())) for a in (error, moved))
     return f"error {error:.3f} of {moved:.3f} mm ({100 * error / moved:.0f} %)"
 
 
@@ -176,13 +177,11 @@ def figure_6() -> Figure:
     return drawing
 
 
-def segmented(shown: Shown, result: Reconstruction):
-    """Rays of the grid now, and the segmentation loop's outcome."""
+def segmented(shown: Shown, result: Reconstruction) -> Segmented:
+    """The segmentation loop's outcome."""
     r = reconstructor(shown.sensor)
-    pixel_to_ray, vertices = r.camera.pixel_to_ray, r.vertex_pixels
-    found = r.flow(result.pixels - r.rest_pixels, result.confidence)
-    rays = pixel_to_ray(vertices + found)
-    return rays, Segmentation(r.estimator, pixel_to_ray(vertices))(*rays)
+    rays = r.observation(result.pixels - r.rest_pixels, result.confidence)
+    return reconstruct_and_segment(r.estimator, r.estimator.segmentation, rays, ROUNDS)
 
 
 def contact_words(found: np.ndarray, true: np.ndarray) -> str:
@@ -203,9 +202,9 @@ def draw_contacts(axes, shown: Shown, values, points, title: str, words: str, sy
     draw_image(axes, np.ones_like(shown.image), title)
     axes.tricontourf(*place.T, triangles, values, levels=levels, cmap=colours)
     axes.plot(*r.rest_pixels.numpy().T, "o", ms=3, mfc="none", mec="0.6", mew=0.5)
-    pixel = lambda xyz: camera.point_to_pixel(torch.as_tensor(np.asarray(xyz), dtype=torch.float64)).numpy()  # noqa: E731
-    axes.plot(*pixel(points).T, "x", ms=11, mew=2.5, color="k", label="found")
-    axes.plot(*pixel(shown.contacts).T, "o", ms=14, mew=2, mfc="none", mec="k", label="true")
+    found, true = (camera.point_to_pixel(torch.as_tensor(a, dtype=torch.float64)).numpy() for a in (points, shown.contacts))
+    axes.plot(*found.T, "x", ms=11, mew=2.5, color="k", label="found")
+    axes.plot(*true.T, "o", ms=14, mew=2, mfc="none", mec="k", label="true")
     axes.legend(fontsize=8, loc="lower left", labelspacing=1.4, borderpad=0.9)
     axes.set_xlabel(words, fontsize=10)
 
@@ -214,7 +213,7 @@ def figure_8() -> Figure:
     """Initial segmentation: motion of the dots, change of the polar angle, the region that bulges in."""
     shown, result = pressed("bubble", *BUBBLE), reconstructed("bubble", BUBBLE, "minimum-energy")
     r = reconstructor("bubble")
-    rays, got = segmented(shown, result)
+    got = segmented(shown, result)
     drawing = Figure(figsize=(15, 4.4), dpi=100, layout="constrained")
     a, b, c = drawing.subplots(1, 3)
     draw_matches(a, shown, measured_flow(shown, result), "(a) matches")
@@ -240,7 +239,7 @@ def contacts_figure(name: str, sensor: str, strokes) -> Figure:
     """Eq. 29 alone, the reconstruct and segment loop, and force balance's tractions."""
     shown = pressed(sensor, *strokes)
     least, balance = (reconstructed(sensor, strokes, e) for e in ESTIMATORS.values())
-    _, got = segmented(shown, least)
+    got = segmented(shown, least)
     drawing = Figure(figsize=(15, 4.6), dpi=100, layout="constrained")
     drawing.suptitle(name)
     a, b, c = drawing.subplots(1, 3)
@@ -286,7 +285,7 @@ def figure_16() -> Figure:
     flow = right.clone()
     flow[bad] = rest[near] + right[near] - rest[bad]
     believed = torch.ones(1, len(rest))
-    trusts = {"believed": believed, "screened": r.screen(flow[None], believed)}
+    trusts = {"believed": believed, "screened": r.observer.screen(flow[None], believed)}
     drawing = Figure(figsize=(16, 8.6), dpi=100, layout="constrained")
     for axes, (name, trust) in zip(drawing.subplots(2, 3), trusts.items(), strict=True):
         kept = trust[0] > FOUND
@@ -303,9 +302,8 @@ def figure_16() -> Figure:
 def from_flow(r: Reconstructor, flow: torch.Tensor, trust: torch.Tensor) -> Reconstruction:
     """Displacements `[B, D, 2]` px and confidence `[B, D]`, as they are given: no screen."""
     with torch.no_grad():
-        usable, trust, status = r.judge(flow, trust, torch.zeros(len(flow), dtype=torch.long))
-        given = (trust,) if r.finds_contacts else ()
-        return r.result(r.estimator(*r.rays(usable, trust), *given), flow, trust, status)
+        usable, trust, status = r.observer.judge(flow, trust, torch.full((len(flow),), Status.OK.value))
+        return r.result(r.estimator(r.observation(usable, trust)), flow, trust, status)
 
 
 def profile_figure(name: str, discs: list[Disc], radius=15.0, noise=2e-4) -> Figure:
@@ -320,8 +318,6 @@ def profile_figure(name: str, discs: list[Disc], radius=15.0, noise=2e-4) -> Fig
     for axes, title, estimator in zip(drawing.subplots(1, 2), ESTIMATORS, estimators, strict=True):
         got = estimator(theta, psi)
         rest = radius * np.stack([np.cos(theta), np.sin(theta)], -1)
-        rms = lambda a: float(np.sqrt((a**2).sum(1).mean()))  # noqa: E731
-        error, moved = rms(got.at(theta) - place), rms(place - rest)
         axes.add_collection(LineCollection([[(0, 0), p] for p in place], colors=GREY, linewidths=0.4))
         axes.plot(*estimator.rest.T, "--", color="k", lw=0.8, label="at rest")
         axes.plot(*truth.positions(np.linspace(0, 180, 721)).T, color=VERMILION, lw=2.5, label="true")
@@ -333,7 +329,7 @@ def profile_figure(name: str, discs: list[Disc], radius=15.0, noise=2e-4) -> Fig
         axes.set_aspect("equal")
         axes.set(title=title, xlim=(-1.25 * radius, 1.25 * radius), ylim=(-0.5, 1.35 * radius))
         axes.set_ylabel("mm", fontsize=10)
-        axes.set_xlabel(f"mm\nerror {error:.3f} of {moved:.3f} mm ({100 * error / moved:.0f} %)", fontsize=10)
+        axes.set_xlabel(f"mm\n{relative_words(got.at(theta) - place, place - rest)}", fontsize=10)
         axes.legend(fontsize=8, loc="lower center", frameon=False)
     return drawing
 

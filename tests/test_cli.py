@@ -227,7 +227,8 @@ def test_help_loads_nothing_heavy(arguments):
 
 def test_the_options_choices_are_what_the_package_has():
     assert choices.ESTIMATORS == tuple(reconstruct.ESTIMATORS) and choices.ENERGIES == hyperelastic.MODELS
-    assert choices.ELEMENTS == settings.ELEMENTS and choices.RESULT_FORMATS == store.FORMATS
+    assert (choices.ELEMENTS, choices.VOLUMES, choices.FLOWS) == (settings.ELEMENTS, settings.VOLUMES, settings.FLOWS)
+    assert choices.RESULT_FORMATS == store.FORMATS  # and choices.RESULT_FORMATS == store.FORMATS
     assert choices.PRESETS == presets.NAMES and choices.INDENTERS == dataset.KINDS and choices.LEGS == simulator.LEGS
     assert choices.SIMULATION_FORMATS == frames.FORMATS and choices.PORTS == camera.PORTS
     assert (choices.HIGHLIGHT, choices.BLUR) == (appearance.Appearance.highlight, appearance.Appearance.blur)

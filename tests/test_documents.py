@@ -1,15 +1,18 @@
-"""Changelog, guide for contributors and citation say what is there."""
+"""Changelog, guide for contributors, glossary and citation say what is there."""
 
 import re
 import tomllib
-from pathlib import Path
 
 import pytest
+from quoted_names import PAGES, ROOT, meant_by, quoted, quoted_paths
 
-ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 CHANGELOG = (ROOT / "CHANGELOG.md").read_text()
-MOVED = re.findall(r"^\| `(torchmembrane[\w.]*)` \| `(torchmembrane[\w.]*)` \|$", CHANGELOG, re.M)
+GLOSSARY = (ROOT / "docs" / "glossary.md").read_text()
+MATHEMATICS = (ROOT / "docs" / "mathematics.md").read_text()
+ROWS = [[cell.strip() for cell in line.split("|")[1:-1]] for line in CHANGELOG.splitlines() if line.startswith("| `")]
+MOVED = {before.strip("`"): re.findall(r"`([^`]+)`", now) for before, now in ROWS if before.startswith("`torchmembrane.")}
+RENAMED = {before: now for before, now in ROWS if before.strip("`") not in MOVED}
 
 
 def read_yaml(text: str):
@@ -85,15 +88,20 @@ def test_changelog_begins_with_this_version():
     assert re.search(r"^## \[(.+?)\]", CHANGELOG, re.M)[1] == PROJECT["project"]["version"]
 
 
-@pytest.mark.parametrize("new", sorted({new for _, new in MOVED}))
+@pytest.mark.parametrize("new", sorted({new for modules in MOVED.values() for new in modules}))
 def test_moved_modules_are_where_the_changelog_says(new):
     path = ROOT.joinpath(*new.split("."))
     assert path.with_suffix(".py").exists() or (path / "__init__.py").exists()
 
 
-def test_changelog_lists_no_module_twice():
-    before = [old for old, _ in MOVED]
-    assert len(before) > 30 and len(set(before)) == len(before)
+def test_changelog_lists_no_module_and_no_name_twice():
+    assert len(MOVED) > 40 and len(RENAMED) > 40 and len(ROWS) == len(MOVED) + len(RENAMED)
+
+
+@pytest.mark.parametrize("now", RENAMED.values(), ids=RENAMED)
+def test_new_names_are_where_the_changelog_says(now):
+    for name in quoted(now):
+        meant_by(name)
 
 
 def test_drawn_layers_are_the_checked_ones():
@@ -107,3 +115,42 @@ def test_drawn_layers_are_the_checked_ones():
 def test_linked_files_exist(page):
     targets = re.findall(r"\]\(([^)#:]+)\)", (ROOT / page).read_text())
     assert targets and not [target for target in targets if not (ROOT / target).exists()]
+
+
+def glossary() -> list[tuple[str, list[str], list[str]]]:
+    """Of each line: the field's word, names of the code, symbols."""
+    rows = [
+        [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in GLOSSARY.splitlines() if line.startswith("| ")
+    ]
+    assert all(len(row) == 4 for row in rows)
+    return [(row[0], *(re.findall(r"`([^`]+)`", cell) for cell in row[2:])) for row in rows if row[0] != "the field's word"]
+
+
+FIELD_S_WORDS = """traction field; force distribution; shear; marker displacement; marker flow; reference; undeformed;
+no-contact; wrench; contact patch; contact mask; indentation depth; inverse finite elements; incipient slip; prestretch;
+marker-based visuotactile sensor; bearing; GNC; IRLS; tangent stiffness; one-ring"""
+
+
+@pytest.mark.parametrize("word", re.split(r";\s", FIELD_S_WORDS))
+def test_glossary_has_the_field_s_words(word):
+    assert any(word in row[0] for row in glossary())
+
+
+@pytest.mark.parametrize("word, names, symbols", glossary(), ids=lambda value: value if isinstance(value, str) else "")
+def test_glossary_names_the_code_and_the_symbols(word, names, symbols):
+    assert names
+    for name in names:
+        meant_by(name)
+    assert not [symbol for symbol in symbols if not re.search(rf"(?<!\w){re.escape(symbol)}(?!\w)", MATHEMATICS)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_named_code_exists(page):
+    for name in quoted(page.read_text()):
+        meant_by(name)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_named_files_exist(page):
+    folders = (ROOT, ROOT / "torchmembrane")
+    assert not [path for path in quoted_paths(page.read_text()) if not any((folder / path).exists() for folder in folders)]

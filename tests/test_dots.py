@@ -51,7 +51,7 @@ def scene(arrangement="square", two_sizes=True):
 
 
 def render(pixels, shapes, noise=0.02, seed=0, kept=None):
-    """Grey image `[H, W]`: dark dots, 5 x 5 samples a pixel, on an unevenly lit disc; blur, noise, 8 bit."""
+    """Grey image `[H, W]`: dark dots, 5 x 5 samples per pixel, on an unevenly lit disc; blur, noise, 8 bit."""
     v, u = np.mgrid[: SIZE[1], : SIZE[0]].astype(float)
     x, y = (u - CENTRE[0]) / RADIUS, (v - CENTRE[1]) / RADIUS
     light = 0.7 - 0.25 * (x**2 + y**2) + 0.12 * np.sin(2 * x + 1) + 0.1 * y

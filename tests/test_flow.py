@@ -1,14 +1,20 @@
 """Laws of the local affine maps and of the flow between markers."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.estimators.affine_maps import LocalAffineMaps, affine_fit, weighted_affine_fit
+from torchmembrane.estimators.bilinear import bilinear_matrix
 from torchmembrane.estimators.flow import FlowInterpolation, roughness, weights
+from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.projection import SurfacePoints
 from torchmembrane.surface.shapes import heightfield, spherical_cap
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
 def random(*shape, seed=0):
@@ -132,6 +138,23 @@ def test_bilinear_flow_between_scattered_dots_stays_between_their_values():
     c[7] = 0
     s[7] = torch.nan
     assert FlowInterpolation(cap, points, "bilinear")(s, c).isfinite().all()
+
+
+def test_every_vertex_lies_where_its_bilinear_weights_say():
+    """The example's dots, between which cells are long and skew: a Newton step that has not converged gives no weights."""
+    sensor = Sensor.from_file(EXAMPLES / "sensor.toml")
+    membrane = sensor.membrane
+    points = membrane.closest_points(sensor.markers.positions)
+    matrix = bilinear_matrix(membrane, points)
+    m, n = membrane.grid
+    place = np.stack(np.divmod(np.arange(m * n), n), 1).astype(float)
+    dots = (place[points.vertices] * points.weights[..., None]).sum(1)
+    between = np.isclose(matrix.sum(1), 1.0)  # no share of the rim, whose flow is zero
+    assert between.sum() > 0.5 * m * n and (matrix >= -1e-9).all() and matrix.sum(1).max() < 1 + 1e-9
+    np.testing.assert_allclose((matrix @ dots)[between], place[between], atol=1e-5)
+    short = ~between & ~membrane.fixed.numpy() & (matrix.sum(1) > 0.02)
+    toward = (matrix @ dots)[short] / matrix.sum(1)[short, None] - place[short]
+    assert np.linalg.norm(toward, axis=1).max() < 8
 
 
 def test_an_unknown_kind_of_flow_is_refused():

@@ -5,6 +5,7 @@ Layers and types are checked by `make lint`.
 
 import ast
 import functools
+import importlib
 import re
 import subprocess
 import sys
@@ -23,7 +24,7 @@ HEAVY = ("torch", "kornia", "scipy", "matplotlib", "tqdm")
 CONSTANT = r"`((?:[a-z_]+\.)*(?:[A-Z][A-Z0-9_]+|(?:[A-Z]\w+Settings)?\.[a-z]\w*))`"
 NUMBER = r"-?[0-9.]+(?:e-?[0-9]+)?"
 QUOTED = re.compile(rf"{CONSTANT}\s=\s({NUMBER}(?:,\s{NUMBER})*)")
-"""A constant, or a setting and its default, as documents quote them: the name, as much of its module as tells it apart, then
+"""A constant, or a setting and its default, as documents quote them: the name, as much of its module as identifies it, then
 the value or values. `.name`: a setting that only one class has."""
 NAMED = re.compile(CONSTANT)
 
@@ -72,8 +73,8 @@ def test_every_module_has_its_layer():
 def loaded(*arguments: str) -> set[str]:
     """The heavy packages that `python *arguments` has imported when it ends."""
     command = [sys.executable, "-X", "importtime", *arguments]
-    told = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stderr
-    names = {line.rpartition("|")[2].strip().partition(".")[0] for line in told.splitlines() if line.startswith("import time:")}
+    lines = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stderr.splitlines()
+    names = {line.rpartition("|")[2].strip().partition(".")[0] for line in lines if line.startswith("import time:")}
     assert "torchmembrane" in names
     return names & set(HEAVY)
 
@@ -150,8 +151,8 @@ def written_out(value: ast.expr):
 def meant(name: str, known: dict[str, object]) -> list[str]:
     """The constants of this name in modules below those that it mentions.
 
-    >>> meant("balance.REACH", {"estimators.balance.prices.REACH": 0.04, "markers.texture.REACH": 7})
-    ['estimators.balance.prices.REACH']
+    >>> meant("balance.REACH", {"estimators.balance.losses.REACH": 0.04, "markers.texture.REACH": 7})
+    ['estimators.balance.losses.REACH']
     """
     *above, last = name.lstrip(".").split(".")
     full_names = [full for full in known if full.split(".")[-1] == last]
@@ -174,6 +175,32 @@ def test_named_constants_exist(path):
     """Those with their module or class; a bare `NAME` may as well stand for a file's or an argument's."""
     known = constants()
     assert not [name for name in NAMED.findall(path.read_text()) if name.find(".") > 0 and len(meant(name, known)) != 1]
+
+
+EXAMPLES_LEFT_OUT = {
+    "Estimator": "a protocol",
+    "ForceBalance": "built by Reconstructor, whose example runs it",
+    "MinimumEnergy": "built by Reconstructor",
+    "export": "takes half a minute",
+    "material_from_images": "some twenty force balances",
+    "material_from_pixels": "some twenty force balances",
+    "rest_from_views": "needs images taken from several places, which take seconds to render",
+}
+"""Public names whose docstrings run no example, and why; records, whose docstrings list their fields, need none either."""
+
+
+def is_record(value: object) -> bool:
+    """Whether it is a class of named fields whose docstring says what they are."""
+    return isinstance(value, type) and issubclass(value, tuple)
+
+
+@pytest.mark.parametrize("face", ["torchmembrane", "torchmembrane.simulate", "torchmembrane.calibrate"])
+def test_public_names_have_an_example(face):
+    module = importlib.import_module(face)
+    public = {name: getattr(module, name) for name in module.__all__}
+    shown = {name: value for name, value in public.items() if callable(value) and not is_record(value)}
+    without = {name for name, value in shown.items() if ">>>" not in (value.__doc__ or "")}
+    assert len(shown) > 5 and without == EXAMPLES_LEFT_OUT.keys() & shown.keys()
 
 
 @pytest.mark.parametrize("page, at_least", [("conventions.md", 9), ("mathematics.md", 20), ("force_balance.md", 9)])

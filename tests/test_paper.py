@@ -1,20 +1,15 @@
 """docs/paper.md leaves no equation, section or figure out, and what it names exists."""
 
 import ast
-import importlib
 import re
-from functools import reduce
-from pathlib import Path
 
 import pytest
+from quoted_names import ROOT, meant_by, quoted
 
 from torchmembrane.cli.calibrate import STEPS
 
-ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "paper.md").read_text()
 NAMED_TESTS = sorted(set(re.findall(r"`(test_\w+)::(test_\w+)`", TEXT)))
-MODULES = {path.stem for path in (ROOT / "torchmembrane").iterdir()}
-NAMES = sorted({name for name in re.findall(r"`([a-z_]+(?:\.\w+)+)`", TEXT) if name.split(".")[0] in MODULES})
 
 
 def listed(words: str) -> set[int]:
@@ -39,13 +34,9 @@ def test_every_named_test_exists(module):
     assert {name for where, name in NAMED_TESTS if where == module} <= defined
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quoted(TEXT))
 def test_every_named_function_exists(name):
-    if (ROOT / "torchmembrane" / name).exists():
-        return
-    parts = name.split(".")
-    depth = next(k for k in range(len(parts), 0, -1) if (ROOT / "torchmembrane" / Path(*parts[:k])).with_suffix(".py").exists())
-    assert reduce(getattr, parts[depth:], importlib.import_module("torchmembrane." + ".".join(parts[:depth])))
+    meant_by(name)
 
 
 def test_every_row_names_a_test():

@@ -1,19 +1,66 @@
-"""The README's Python example runs and says what it claims."""
+"""The README's Python example runs and does what it claims."""
 
+import ast
 import re
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+import torchmembrane
+from torchmembrane.cli.main import main
+
 ROOT = Path(__file__).parents[1]
+(CODE,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+PRESSES = ("press_on_axis", "flat_plate")
 
 
-def test_the_python_example_runs(monkeypatch):
-    monkeypatch.chdir(ROOT)
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
-    names: dict = {}
-    exec(compile(code, "README.md", "exec"), names)
-    assert names["result"].status.tolist() == [0, 0]
-    assert list(names["result"].vertices.shape) == [2, 1089, 3]
-    assert list(names["again"].vertices.shape) == [2, 1089, 3]
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+    """The example's names, after it ran where `make demo` has written its results."""
+    folder = tmp_path_factory.mktemp("readme")
+    (folder / "examples").symlink_to(ROOT / "examples")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        files = [f"examples/{name}.png" for name in PRESSES]
+        assert main(["reconstruct", "examples/sensor.toml", *files, "--out", "out/demo", "--device", "cpu"]) == 0
+        names: dict = {}
+        exec(compile(CODE, "README.md", "exec"), names)
+        yield names
+
+
+def test_the_python_example_is_short_and_needs_public_names_only():
+    assert len(CODE.splitlines()) <= 15
+    tree = ast.parse(CODE)
+    (imported,) = (node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom))
+    assert ast.unparse(imported) == "import torchmembrane as tm"
+    assert set(re.findall(r"\btm\.(\w+)", CODE)) <= set(torchmembrane.__all__)
+
+
+def test_the_python_example_runs(example):
+    result = example["result"]
+    assert [torchmembrane.Status(code) for code in result.status.tolist()] == [torchmembrane.Status.OK] * 2
+    assert list(result.vertices.shape) == [2, 1089, 3]
+    assert (result.force[:, 2] < 0).all()  # both press towards the camera
+
+
+def test_the_example_s_gradient_is_finite(example):
+    gradient = example["images"].grad
+    assert gradient.isfinite().all() and (gradient.abs().amax((1, 2, 3)) > 0).all()
+
+
+def test_the_example_s_tracker_follows_the_last_frame(example):
+    last, alone = example["tracker"](example["frame"]), example["result"].frame(1)
+    moved = np.linalg.norm(alone["displacement"])
+    assert np.linalg.norm(last.frame(0)["vertices"] - alone["vertices"]) < 0.1 * moved
+
+
+def test_the_example_reads_back_what_was_found(example):
+    results, found = example["results"], example["result"]
+    assert sorted(results.names) == sorted(PRESSES)
+    for row, name in enumerate(PRESSES):
+        for key, value in found.frame(row).items():
+            np.testing.assert_array_equal(results[name][key], value, err_msg=key)
 
 
 def test_every_linked_file_exists():

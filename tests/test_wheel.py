@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
 PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
-LOOK = """
+PROBE = """
 import importlib.metadata, importlib.resources, json, torchmembrane
 files = importlib.resources.files("torchmembrane")
 presets = [entry.name for entry in (files / "presets").iterdir() if (entry / "sensor.toml").is_file()]
@@ -58,7 +58,7 @@ def installed(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def seen(installed):
-    return json.loads(call(installed / "python", "-c", LOOK, cwd=installed.parent))
+    return json.loads(call(installed / "python", "-c", PROBE, cwd=installed.parent))
 
 
 def test_it_is_the_wheel_that_is_imported(installed, seen):

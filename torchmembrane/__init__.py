@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from .estimators.covariance import StandardDeviations
     from .estimators.force_balance import ForceBalance
     from .estimators.minimum_energy import MinimumEnergy
-    from .estimators.settings import ForceBalanceSettings, MinimumEnergySettings
+    from .estimators.paper import PaperEstimator
+    from .estimators.settings import ForceBalanceSettings, MinimumEnergySettings, PaperSettings
     from .io.read import read_results
     from .io.results import Reconstruction
     from .io.status import Status
@@ -51,6 +52,8 @@ _HOMES = {
     "MembraneError": "errors",
     "MinimumEnergy": "estimators.minimum_energy",
     "MinimumEnergySettings": "estimators.settings",
+    "PaperEstimator": "estimators.paper",
+    "PaperSettings": "estimators.settings",
     "Port": "camera.ports",
     "Reconstruction": "io.results",
     "Reconstructor": "reconstruct",
@@ -78,6 +81,8 @@ __all__ = [
     "MembraneError",
     "MinimumEnergy",
     "MinimumEnergySettings",
+    "PaperEstimator",
+    "PaperSettings",
     "Port",
     "Reconstruction",
     "Reconstructor",

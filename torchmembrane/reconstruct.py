@@ -13,7 +13,8 @@ from .estimators.base import Equilibrium, Observation, Problem
 from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
 from .estimators.minimum_energy import MinimumEnergy
-from .estimators.settings import ForceBalanceSettings, MinimumEnergySettings
+from .estimators.paper import PaperEstimator
+from .estimators.settings import ForceBalanceSettings, MinimumEnergySettings, PaperSettings
 from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
@@ -24,9 +25,12 @@ from .pieces import piece
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
 
-ESTIMATORS: dict[str, type[ForceBalance] | type[MinimumEnergy]] = {
+AnyEstimator = ForceBalance | MinimumEnergy | PaperEstimator
+Settings = ForceBalanceSettings | MinimumEnergySettings | PaperSettings
+ESTIMATORS: dict[str, type[ForceBalance] | type[MinimumEnergy] | type[PaperEstimator]] = {
     "force-balance": ForceBalance,
     "minimum-energy": MinimumEnergy,
+    "paper": PaperEstimator,
 }
 MARKER_NOISE = {"dots": 0.1, "texture": 0.2}  # px, assumed of a marker: twice the locator's, and the grid's error
 LOCATOR_NOISE = 0.5  # of MARKER_NOISE: the locator's own, of which standard deviations speak
@@ -41,8 +45,9 @@ class Reconstructor(nn.Module):
 
     Args:
         sensor: a `Sensor` (`Reconstructor.from_file` reads one).
-        estimator: "force-balance", or "minimum-energy": the paper's; finds no contacts and flattens what is narrow and far.
-        settings: of that estimator, `ForceBalanceSettings` or `MinimumEnergySettings`.
+        estimator: "force-balance"; "minimum-energy", which finds no tractions and flattens what is narrow and far; or "paper",
+            the paper's own: linear, harmonic, with its contact segmentation.
+        settings: of that estimator, `ForceBalanceSettings`, `MinimumEnergySettings` or `PaperSettings`.
         model: the elastic energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin".
         channels: order of the channels of colour images, "rgb" or "bgr".
         dtype: torch.float32 or torch.float64.
@@ -67,7 +72,7 @@ class Reconstructor(nn.Module):
         sensor: Sensor,
         estimator: str = "force-balance",
         *,
-        settings: ForceBalanceSettings | MinimumEnergySettings | None = None,
+        settings: Settings | None = None,
         model: str | None = None,
         channels: Channels = "rgb",
         dtype: torch.dtype = torch.float32,
@@ -122,7 +127,7 @@ class Reconstructor(nn.Module):
 
     @property
     def finds_contacts(self) -> bool:
-        """Whether tractions, contacts and standard deviations are found."""
+        """Whether tractions and standard deviations are found."""
         return self.estimator.finds_contacts
 
     def read(self, *paths: str | Path) -> Tensor:
@@ -302,13 +307,11 @@ class Reconstructor(nn.Module):
         return previous
 
 
-def _estimator(
-    problem: Problem, name: str, settings: ForceBalanceSettings | MinimumEnergySettings | None
-) -> ForceBalance | MinimumEnergy:
+def _estimator(problem: Problem, name: str, settings: Settings | None) -> AnyEstimator:
     kind: Any = ESTIMATORS[name]
     if settings is not None and not isinstance(settings, kind.Settings):
         raise MembraneError(
             f"Reconstructor: settings are {type(settings).__name__}; expected {kind.Settings.__name__} for {name}"
         )
-    built: ForceBalance | MinimumEnergy = kind.of(problem, settings)
+    built: AnyEstimator = kind.of(problem, settings)
     return built

@@ -50,7 +50,7 @@ class Session:
         self._outputs = [output.name for output in self._session.get_outputs()]
 
     def run(self, images, previous: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
-        """Results of a batch, by name, a row a frame: vertices `[B, V, 3]`, ..., status `[B]`.
+        """Results of a batch, by name, one row per frame: vertices `[B, V, 3]`, ..., status `[B]`.
 
         `images`: `[height, width]` or `[B, height, width]` grey, or `[B, height, width, 3]` RGB; uint8, uint16 or float in
         0..1. A frame that cannot be reconstructed has a status and NaN.

@@ -106,6 +106,16 @@ def ports_from_views(camera: Camera, board: DotBoard, views: Views, held: Sequen
     Limitations:
         In air a plate shifts every ray by a length that depends neither on its distance nor on the medium; in a medium its
         thickness and index are not identifiable one by one (docs/calibration.md). Give views of both.
+
+    Example:
+        >>> lens = "pinhole", (320, 240), (150.0, 150.0), (160.0, 120.0)
+        >>> true, guess = (Camera(*lens, ports=[(d, 3.0, 1.49)], medium_index=1.33) for d in (4.0, 4.2))
+        >>> board = DotBoard(9, 7, 2.0)
+        >>> points = torch.from_numpy(board.points) @ rotations(torch.tensor([0.4, 0.3, 0.0]).double()).mT
+        >>> pixels = true.point_to_pixel(points + torch.tensor([0.0, 0.0, 20.0])).numpy()
+        >>> found = ports_from_views(guess, board, Views(pixels[None], np.ones(1, bool)), PORTS[1:])
+        >>> found.names, round(found.camera.ports[0].distance, 1)
+        (['port_distance'], 4.0)
     """
     if not camera.ports:
         raise MembraneError("calibrate ports: the sensor has no ports; expected [[camera.ports]] with design values")

@@ -51,6 +51,20 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> Dep
 
     Limitations:
         Depths farther from the design than a tenth of the surface's size are taken for something else and left out.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from scipy.interpolate import griddata
+        >>> from torchmembrane import Camera
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> image = sensor.markers.rest_image[::2, ::2]  # every other pixel, and a camera that sees them
+        >>> camera = Camera("fisheye", (320, 240), (80.0, 80.0), (161.05, 121.45))
+        >>> design = replace(sensor, camera=camera, markers=replace(sensor.markers, rest_image=image))
+        >>> rest, (v, u) = design.membrane.rest, np.mgrid[:240, :320]
+        >>> depth = griddata(design.camera.point_to_pixel(rest).numpy(), rest[:, 2].numpy(), (u, v))  # NaN beside the membrane
+        >>> found = rest_from_depth(design, depth, image)
+        >>> bool(np.abs(found.surface.offsets).max() < 0.1), len(found.sensor.markers.positions)
+        (True, 121)
     """
     width, height = sensor.camera.image_size
     if depth.shape != (height, width):

@@ -30,14 +30,13 @@ def find_target(image: np.ndarray, board: Checkerboard | DotBoard) -> np.ndarray
 
     Example:
         >>> from torchmembrane.camera.model import Camera
-        >>> from torchmembrane.simulate.board import BoardImages
-        >>> board, camera = DotBoard(9, 7, 2.0), Camera("pinhole", (320, 240), (150.0, 150.0), (160.0, 120.0))
-        >>> image = BoardImages.of(camera).image(board, np.eye(3), np.array([0.0, 0.0, 16.0]))
-        >>> pixels = find_target(image / 255, board)
-        >>> np.isfinite(pixels).all(), pixels[board.large].round(0) + 0.0
-        (np.True_, array([[160., 120.],
-               [216., 120.],
-               [160., 158.]]))
+        >>> from torchmembrane.simulate.target_renderer import TargetRenderer
+        >>> board, camera = DotBoard(8, 6, 2.0), Camera("pinhole", (200, 150), (112.0, 112.0), (100.0, 75.0))
+        >>> image = TargetRenderer.for_camera(camera).image(board, np.eye(3), np.array([-1.0, -1.0, 16.0]))
+        >>> find_target(image / 255, board)[board.large].round(0)  # the three dots that mark the board's place and turn
+        array([[ 93.,  68.],
+               [135.,  68.],
+               [ 93.,  96.]])
     """
     return _find_corners(image, board) if isinstance(board, Checkerboard) else _find_board_dots(image, board)
 

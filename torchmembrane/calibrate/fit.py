@@ -99,13 +99,23 @@ def with_common_errors(found: Fit, jacobian: np.ndarray, errors: np.ndarray) -> 
 
 
 def outliers(residuals: np.ndarray) -> np.ndarray:
-    """Which of the residual vectors `[N, 2]` are mistakes, far beyond the others: `[N]` bool."""
+    """Which of the residual vectors `[N, 2]` are mistakes, far beyond the others: `[N]` bool.
+
+    Example:
+        >>> outliers(np.array([[0.1, 0.0], [0.0, -0.1], [5.0, 0.0], [np.nan, 0.0]]))
+        array([False, False,  True,  True])
+    """
     length = np.linalg.norm(residuals, axis=-1)
     return ~(length <= OUTLIER * max(np.nanmedian(length) / 1.18, 1e-9))  # 1.18: median length for unit deviation in the plane
 
 
 def rotations(vectors: Tensor) -> Tensor:
-    """Rotation matrices of rotation vectors (rad), `[..., 3]` to `[..., 3, 3]`, smooth at 0."""
+    """Rotation matrices of rotation vectors (rad), `[..., 3]` to `[..., 3, 3]`, smooth at 0.
+
+    Example:
+        >>> (rotations(torch.tensor([0.0, 0.0, torch.pi / 2])) @ torch.tensor([1.0, 0.0, 0.0])).round().tolist()
+        [0.0, 1.0, 0.0]
+    """
     x, y, z = vectors.unbind(-1)
     none = torch.zeros_like(x)
     skew = torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).unflatten(-1, (3, 3))
@@ -117,6 +127,11 @@ def outline_centres(pixels: Tensor) -> Tensor:
 
     `c = 2/3 int p (p x p') / int p x p'` about the mean, p' by trigonometric interpolation: exact to high order for dots that
     are small before their distance, whose outlines are nearly ellipses.
+
+    Example:
+        >>> square = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]], dtype=torch.float64)
+        >>> outline_centres(square).tolist()
+        [1.0, 1.0]
     """
     mean = pixels.mean(-2)
     count = pixels.shape[-2]

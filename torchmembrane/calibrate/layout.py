@@ -130,7 +130,26 @@ def _ray_hits(sensor: Sensor, surface: Membrane, pixels: np.ndarray) -> tuple[np
 
 
 def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
-    """A wanted pattern, CSV with the header u,v,size: pixels `[D, 2]` and sizes, small | large."""
+    """A wanted pattern, CSV with the header u,v,size: pixels `[D, 2]` and sizes, small | large.
+
+    Args:
+        path: the file.
+
+    Returns:
+        What `layout_for_pixels` takes.
+
+    Raises:
+        MembraneError: the file is missing, or not such a table.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "wanted.csv"
+        ...     _ = path.write_text("u,v,size\\n320,240,large\\n360,240,small\\n")
+        ...     pixels, sizes = read_pixels(path)
+        >>> pixels.tolist(), sizes
+        ([[320.0, 240.0], [360.0, 240.0]], ['large', 'small'])
+    """
     try:
         rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row]
         header, *body = rows
@@ -150,6 +169,22 @@ def write_layout(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
     """CSV for the machine that makes the dots: `dot,x,y,z,nx,ny,nz,radius,size`.
 
     The origin is at the rim's centre, the axes are parallel to the camera's.
+
+    Args:
+        path: the file.
+        sensor: whose rest surface bears the dots.
+        dots: what to write.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> x, n = sensor.membrane.rest[:1].numpy(), np.array([[0.0, 0.0, 1.0]])
+        >>> dots = FabricationLayout(x, n, np.array([0.3]), ["large"], np.array([[320.0, 240.0]]))
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "layout.csv"
+        ...     write_layout(path, sensor, dots)
+        ...     path.read_text().splitlines()[0]
+        'dot,x,y,z,nx,ny,nz,radius,size'
     """
     rim = sensor.membrane.rest[sensor.membrane.fixed].mean(0).numpy()
     lines = ["dot,x,y,z,nx,ny,nz,radius,size"]

@@ -60,11 +60,15 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
         The surface must have the designed shape; where it has another, use several views or a depth image.
 
     Example:
-        >>> from torchmembrane.io.images import read_image
+        >>> from dataclasses import replace
+        >>> from torchmembrane import Camera
         >>> sensor = Sensor.from_file("examples/sensor.toml")
-        >>> found = rest_from_image(sensor, read_image("examples/rest.png"))
-        >>> np.abs(found.fit.values[3:]).max() < 0.1  # the sensor stands where its file says
-        np.True_
+        >>> image = sensor.markers.rest_image[::2, ::2]  # every other pixel, and a camera that sees them
+        >>> camera = Camera("fisheye", (320, 240), (80.0, 80.0), (161.05, 121.45))
+        >>> design = replace(sensor, camera=camera, markers=replace(sensor.markers, rest_image=image))
+        >>> found = rest_from_image(design, image)
+        >>> bool(np.abs(found.fit.values[3:]).max() < 0.1)  # mm: the sensor stands where its file says
+        True
     """
     if sensor.markers.positions is None:
         raise MembraneError("calibrate rest: the sensor lists no dots; expected [markers] file, or use views or depth")

@@ -15,7 +15,7 @@ from ..surface.membrane import Membrane
 from ..surface.tangent import tangent_axes
 from ..targets import OUTLINE
 
-FINE = 65  # vertices a side of the surface that is calibrated
+FINE = 65  # vertices per side of the surface that is calibrated
 
 
 class SurfaceProjection(NamedTuple):

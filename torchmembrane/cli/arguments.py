@@ -5,7 +5,7 @@ from argparse import Action, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-from .choices import ELEMENTS, ENERGIES, ESTIMATORS
+from .choices import ELEMENTS, ENERGIES, ESTIMATORS, FLOWS, VOLUMES
 
 Add: TypeAlias = Callable[..., Action]
 """A parser's `add_argument`."""
@@ -47,7 +47,11 @@ def add_estimator(add: Add, element: str) -> None:
     """How the surface is found; `element` is the help of --element."""
     add("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="how the surface is found (default: %(default)s)")
     add("--energy", choices=ENERGIES, help="the membrane's elastic energy (default: the sensor file's)")
-    add("--element", choices=ELEMENTS, default=ELEMENTS[0], help=element)
+    add("--element", choices=ELEMENTS, help=element)
+    add("--volume", choices=VOLUMES, help="minimum-energy: its constraint, exact (default) or linearised at rest (eq. 21)")
+    add("--flow", choices=FLOWS, help="between the markers; minimum-energy: smooth (default), paper: bilinear (default)")
+    weight = "weight of the smoother (eq. 28; default: 0.1 for quadrilaterals and paper, else 0)"
+    add("--smoothing", metavar="S", type=not_negative, help=weight)
 
 
 def positive(text: str) -> float:

@@ -1,25 +1,27 @@
 """The reconstructor that a command's options ask for."""
 
 from argparse import Namespace
+from typing import Any
 
 from ..errors import MembraneError
-from ..estimators.settings import MinimumEnergySettings
-from ..reconstruct import Reconstructor
+from ..reconstruct import ESTIMATORS, Reconstructor
 from ..sensor.sensor import Sensor
+
+OPTIONS = ("element", "volume", "flow", "smoothing")
 
 
 def build_reconstructor(sensor: Sensor, arguments: Namespace) -> Reconstructor:
-    """The reconstructor of `--estimator`, `--energy` and `--element`.
+    """The reconstructor of `--estimator`, `--energy`, `--element`, `--volume`, `--flow` and `--smoothing`.
 
     Raises:
-        MembraneError: an element that the estimator does not have.
+        MembraneError: an option that the estimator does not have.
     """
-    settings = None
-    if arguments.estimator == "minimum-energy":
-        settings = MinimumEnergySettings(element=arguments.element)
-    elif arguments.element != "triangle":
+    kind: Any = ESTIMATORS[arguments.estimator].Settings
+    given = {name: getattr(arguments, name) for name in OPTIONS if getattr(arguments, name) is not None}
+    foreign = [name for name in given if name not in kind.__dataclass_fields__]
+    if foreign:
         raise MembraneError(
-            f"--element {arguments.element}: {arguments.estimator} has linear triangles; "
-            "leave it out, or pass --estimator minimum-energy"
+            f"--{foreign[0]} {given[foreign[0]]}: {arguments.estimator} has no such choice; leave it out, or pass "
+            "--estimator minimum-energy"
         )
-    return Reconstructor(sensor, arguments.estimator, settings=settings, model=arguments.energy)
+    return Reconstructor(sensor, arguments.estimator, settings=kind(**given), model=arguments.energy)

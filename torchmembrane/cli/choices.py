@@ -3,9 +3,11 @@
 A test holds every one of them to what the package itself has.
 """
 
-ESTIMATORS = ("force-balance", "minimum-energy")
+ESTIMATORS = ("force-balance", "minimum-energy", "paper")
 ENERGIES = ("harmonic", "neo_hookean", "mooney_rivlin")
 ELEMENTS = ("triangle", "quadrilateral")
+VOLUMES = ("exact", "linear")
+FLOWS = ("smooth", "bilinear")
 RESULT_FORMATS = ("npz", "parquet")
 
 PRESETS = ("fingertip", "bubble", "half_cylinder")

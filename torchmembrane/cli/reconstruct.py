@@ -19,7 +19,7 @@ DIR then holds
   mesh.npz       rest surface, triangles, units
   summary.csv    one row per frame
   NAME.png       its figure (--figures)
-Frames of a video are called STEM_000000, STEM_000001 ... The same command again goes on after an
+Frames of a video are called STEM_000000, STEM_000001 ... The same command again continues after an
 interruption: finished frames are skipped, failed ones tried again. In Python,
 torchmembrane.read_results(DIR) gives the frames one by one, by name, or as one batch.
 
@@ -57,10 +57,9 @@ def run(arguments: Namespace) -> int:
         raise MembraneError("--device cuda: torch sees no CUDA device; pass --device cpu, or install torch with CUDA")
     inputs = find_inputs(arguments.images, arguments.video)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
-    energy = arguments.energy or sensor.material.model
-    settings = Settings(arguments.estimator, energy, arguments.element, arguments.format)
-    check_folder(arguments.out, sensor.fingerprint, settings)
     reconstructor = build_reconstructor(sensor, arguments).to(arguments.device)
+    settings = Settings.of(reconstructor, arguments.format)
+    check_folder(arguments.out, sensor.fingerprint, settings)
     options = {"batch": arguments.batch, "figures": arguments.figures}
     counts = reconstruct_files(reconstructor, inputs, arguments.out, settings, **options)
     unsure = f" ({counts.not_converged} not converged)" if counts.not_converged else ""

@@ -39,7 +39,7 @@ DIR then holds
   sensor.toml       the sensor as simulated, its rest image in the same light: torchmembrane reconstruct DIR/sensor.toml ...
   NAME.png          the image (with --path NAME_000000.png ..., with --video NAME.mp4)
   NAME_truth.npz    surface, dots, forces, pressure (torchmembrane.simulate.simulator.Simulator.frame lists them)
-  sSEED_000000.png ...  and their truths with --random; the same command again goes on after an interruption
+  sSEED_000000.png ...  and their truths with --random; the same command again continues after an interruption
                     (parquet: frames/part-*.parquet, rest_truth.npz)
 
 exit code: 0 all well, 1 some presses of a data set failed, 2 wrong usage, or a press that cannot be"""
@@ -49,7 +49,7 @@ def add_parser(commands: Any) -> None:
     """Add the command's parser."""
     add = add_command(commands, "simulate", run, PURPOSE, EXAMPLES)
     add_sensor(add)
-    add("--out", metavar="DIR", type=Path, required=True, help="folder of the frames: new, or of the same sensor and look")
+    add("--out", metavar="DIR", type=Path, required=True, help="folder of frames: new, or of the same sensor and appearance")
     add("--name", default="press", help="of a single press' files (default: %(default)s)")
     _add_press(add)
     _add_sequence(add)
@@ -72,7 +72,7 @@ def _add_press(add: Add) -> None:
 
 
 def _add_sequence(add: Add) -> None:
-    add("--slide", metavar="X,Y,Z", type=vector, help="how it moves after the push")
+    add("--slide", metavar="X,Y,Z", type=vector, help="how it moves after the press")
     legs = some_of(LEGS, f"legs of {', '.join(LEGS)}, as push,slide,release")
     add("--path", metavar="LEGS", type=legs, help=f"all frames along a path, of {', '.join(LEGS)}, as in push,slide,release")
     add("--frames", metavar="N", type=count, default=10, help="frames on each leg of --path (default: %(default)s)")
@@ -95,7 +95,7 @@ def _add_appearance(add: Add) -> None:
     add("--dots", metavar="SMALL,LARGE", type=radii, help="their radii (default: 0.16 and 0.27 of their spacing)")
     missing = numbers("numbers of dots, as 0,17,18")
     add("--missing", metavar="I,J", type=missing, default=(), help="dots that are not painted, from 0")
-    add("--grid", metavar="M,N", type=grid, help="of the equilibrium (default: 38 a side, or finer than the sensor's)")
+    add("--grid", metavar="M,N", type=grid, help="of the equilibrium (default: 38 per side, or finer than the sensor's)")
 
 
 def run(arguments: Namespace) -> int:

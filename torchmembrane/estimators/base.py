@@ -2,7 +2,6 @@
 
 from typing import ClassVar, NamedTuple, Protocol
 
-import torch
 from torch import Tensor
 
 from ..camera.model import Camera
@@ -75,7 +74,7 @@ class Contacts(NamedTuple):
 class Estimator(Protocol):
     """From what the markers show to the surface: an `nn.Module` of one sensor, batched and differentiable.
 
-    `finds_contacts`: tractions, contacts and standard deviations are found; `takes_start`: `forward` accepts the solution of
+    `finds_contacts`: tractions and standard deviations are found; `takes_start`: `forward` accepts the solution of
     the
     frames before. `reference` is the traction against which tractions are small or large.
     """
@@ -100,9 +99,3 @@ class Estimator(Protocol):
     def contacts(self, found: Equilibrium) -> Contacts:
         """Where something touches."""
         ...
-
-
-def no_contacts(found: Equilibrium) -> Contacts:
-    """The contacts of an estimator that looks for none."""
-    x = found.vertices
-    return Contacts(torch.zeros_like(x[..., 0]), x.new_full((x.shape[0], CONTACT_POINTS, 3), torch.nan))

@@ -13,6 +13,7 @@ from ..surface.projection import SurfacePoints
 
 NEWTON_STEPS = 12
 OUTSIDE = 1e-9
+CONVERGED = 1e-6  # grid steps, by which the interpolated place may miss the point
 
 
 def bilinear_matrix(membrane: Membrane, markers: SurfacePoints) -> np.ndarray:
@@ -86,5 +87,6 @@ def _weights(p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             weights = np.stack([1 - u - v, u, v], 1)
         else:
             weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], 1)
-    inside = np.isfinite(weights).all(1) & (weights > -OUTSIDE).all(1)
+        converged = np.abs(weights @ p - q).max(1) < CONVERGED
+    inside = converged & (weights > -OUTSIDE).all(1)
     return inside, weights

@@ -72,6 +72,9 @@ class ForceBalance(nn.Module):
 
     finds_contacts: ClassVar[bool] = True
     element: ClassVar[str] = "triangle"
+    volume: ClassVar[str] = "exact"
+    flow_kind: ClassVar[str] = "smooth"
+    smoothing_weight: ClassVar[float] = 0.0
     Settings: ClassVar[type[ForceBalanceSettings]] = ForceBalanceSettings
     takes_start: ClassVar[bool] = True
 

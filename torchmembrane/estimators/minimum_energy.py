@@ -19,8 +19,9 @@ from ..solve.anderson import accelerated, first
 from ..solve.kkt import constrained_minimum
 from ..surface.membrane import Membrane
 from ..surface.topology import corners, corners_to_vertices
-from .base import Contacts, Equilibrium, Observation, Problem, no_contacts
+from .base import Contacts, Equilibrium, Observation, Problem
 from .flow import VertexFlow
+from .segmentation import Segmentation
 from .settings import MinimumEnergySettings
 
 CONVERGED = 1e-5  # largest relative step, and volume error where the volume is exact, of a converged surface
@@ -70,6 +71,7 @@ class MinimumEnergy(nn.Module):
         self.settings = settings = settings or MinimumEnergySettings()
         self.membrane, self.elasticity, self.flow = membrane, elasticity, flow
         self.steps = settings.steps
+        self.segmentation = Segmentation(membrane, rest_rays)
         triangles = settings.element == "triangle"
         self.energy = elasticity if triangles else AffineQuadrilaterals(membrane, elasticity.tension)
         origins, directions = rest_rays
@@ -96,6 +98,21 @@ class MinimumEnergy(nn.Module):
         return self.settings.element
 
     @property
+    def volume(self) -> str:
+        """The volume's constraint: "exact" or "linear"."""
+        return self.settings.volume
+
+    @property
+    def flow_kind(self) -> str:
+        """The flow between the markers: "smooth" or "bilinear"."""
+        return self.settings.flow
+
+    @property
+    def smoothing_weight(self) -> float:
+        """The weight of the smoother of eq. 28."""
+        return self.settings.weight_of_smoother
+
+    @property
     def rest_pressure(self) -> Tensor:
         """Pressure difference across the membrane at rest, `[]`."""
         return self.cavity.rest_pressure
@@ -114,8 +131,8 @@ class MinimumEnergy(nn.Module):
         return converged & ~(self.cavity.volume_error(found.volume, found.pressure).abs() > CONVERGED)
 
     def contacts(self, found: Equilibrium) -> Contacts:
-        """None: it is assumed that nothing pushes along the rays."""
-        return no_contacts(found)
+        """Where the membrane bulges in along its normals (section 5.1)."""
+        return self.segmentation.contacts(found.vertices)
 
     def _rest_inverse(self, directions: Tensor) -> Tensor:
         K = self.energy.stiffness_along(self.membrane.rest, directions)
@@ -130,18 +147,20 @@ class MinimumEnergy(nn.Module):
     def _smoother(self, psi: Tensor) -> Tensor:
         return grid_laplacian(psi, self.membrane.grid)
 
-    def forward(
-        self, observation: Observation, start: tuple[Tensor, Tensor] | None = None, relaxed: Tensor | None = None
-    ) -> Equilibrium:
+    def forward(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:
         """The surface on the rays of the grid's vertices.
 
         Args:
             observation: the ray of every vertex now, `[..., V, 3]`.
             start: none: the solve starts from rest always.
-            relaxed: `[..., V]` bool, vertices in contact, where the slope may jump: the smoother of eq. 28 leaves them alone.
         """
         if start is not None:
             raise MembraneError("MinimumEnergy: starts from rest always; leave the start out")
+        return self.solve(observation)
+
+    def solve(self, observation: Observation, relaxed: Tensor | None = None) -> Equilibrium:
+        """The surface; `relaxed [..., V]` bool: vertices in contact, where the slope may jump: the smoother of eq. 28 leaves
+        them alone."""
         t, latest, changes, origins, directions = self.start(observation.origins, observation.directions, relaxed)
         for _ in range((self.steps if relaxed is None else self.settings.relaxed_steps) - 1):
             t, latest, changes = self.step(t, latest, changes, origins, directions, relaxed)

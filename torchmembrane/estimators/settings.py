@@ -117,3 +117,38 @@ class MinimumEnergySettings:
     def weight_of_smoother(self) -> float:
         """`smoothing`, or its default."""
         return (0.1 if self.element == "quadrilateral" else 0.0) if self.smoothing is None else self.smoothing
+
+
+@dataclass(frozen=True)
+class PaperSettings:
+    """Settings of `PaperEstimator`.
+
+    Args:
+        smoothing: weight s of `s |S psi|^2` (eq. 28) over the rest tension.
+        flow: of the grid's vertices, "bilinear" between the dots (section 5), or "smooth".
+        rounds: of the reconstruct / segment loop (section 5.1).
+        free_part_only: take the energy over the free part of the membrane only (section 2, item 1): quadrilaterals that lie
+            wholly in a contact weigh next to nothing.
+
+    Raises:
+        MembraneError: an unknown flow, a weight that is not positive, no rounds.
+
+    Example:
+        >>> PaperSettings(rounds=1).smoothing
+        0.1
+    """
+
+    smoothing: float = 0.1
+    flow: str = "bilinear"
+    rounds: int = 2
+    free_part_only: bool = False
+
+    def __post_init__(self) -> None:
+        if self.flow not in FLOWS:
+            raise MembraneError(f"PaperSettings: flow = {self.flow!r}; expected one of {', '.join(FLOWS)}")
+        if not self.smoothing > 0:
+            raise MembraneError(
+                f"PaperSettings: smoothing = {self.smoothing}; expected more than 0: the element is blind to the hourglass mode"
+            )
+        if self.rounds < 1:
+            raise MembraneError(f"PaperSettings: rounds = {self.rounds}; expected at least 1")

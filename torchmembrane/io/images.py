@@ -16,8 +16,19 @@ def read_image(path: str | Path) -> np.ndarray:
     Grey of 8 and 16 bits and of float (TIFF), RGB, palette, CMYK; alpha is ignored, of several frames the first is taken.
     EXIF orientation is not applied: pixels are the camera's own. Colour of 16 bits arrives as 8 bits (Pillow's limit).
 
+    Args:
+        path: the file.
+
+    Returns:
+        Grey values.
+
     Raises:
         MembraneError: the file is missing, no image, truncated or damaged; names the file and the cause.
+
+    Example:
+        >>> image = read_image("examples/rest.png")
+        >>> image.shape, str(image.dtype), float(image.max()) <= 1
+        ((480, 640), 'float32', True)
     """
     try:
         with Image.open(path) as image:
@@ -38,8 +49,12 @@ def to_grey(array: np.ndarray) -> np.ndarray:
     Raises:
         MembraneError: another shape or type, a value not finite or outside 0..1.
 
-    >>> to_grey(np.array([[[255, 0, 0], [255, 255, 255]]], dtype=np.uint8)).tolist()
-    [[0.29899999499320984, 1.0]]
+    Returns:
+        Grey values.
+
+    Example:
+        >>> to_grey(np.array([[[255, 0, 0], [255, 255, 255]]], dtype=np.uint8)).tolist()
+        [[0.29899999499320984, 1.0]]
     """
     array = np.asarray(array)
     if array.ndim not in (2, 3) or array.size == 0 or array.shape[2:] not in ((), (3,)):
@@ -60,9 +75,23 @@ def to_grey(array: np.ndarray) -> np.ndarray:
 
 
 def write_image(stem: str | Path, grey: np.ndarray) -> Path:
-    """Write grey values `[height, width]` so that `read_image` gives the same bits; returns the path.
+    """Write grey values so that `read_image` gives the same bits.
 
-    PNG of 8 or 16 bits where that holds the values exactly, else a TIFF of floats: `stem` gets `.png` or `.tiff`.
+    PNG of 8 or 16 bits where that holds the values exactly, else a TIFF of floats.
+
+    Args:
+        stem: the file without its ending, `.png` or `.tiff`.
+        grey: `[height, width]` in 0..1.
+
+    Returns:
+        The path.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     path = write_image(f"{folder}/ramp", np.array([[0.0, 0.2, 1.0]], np.float32))
+        ...     path.name, read_image(path).round(1).tolist()
+        ('ramp.png', [[0.0, 0.20000000298023224, 1.0]])
     """
     stem = Path(stem)
     for depth in (np.uint8, np.uint16):

@@ -76,7 +76,7 @@ def _refusal(shape: tuple[int, ...], size: tuple[int, int]) -> str:
         return f"{said}: rows and columns are exchanged; swap them, images.swapaxes(-1, -2), or (-2, -3) with channels last"
     if shape[-2:] == size or shape[-3:-1] == size:
         return f"{said}: other than one or three channels; give grey or colour, without alpha"
-    seen = shape[-3:-1] if shape[-1] in (1, 3) else shape[-2:]
-    if len(seen) == 2:
-        said = f"the image is {seen[1]} x {seen[0]} px, expected {width} x {height} ({said})"
+    given = shape[-3:-1] if shape[-1] in (1, 3) else shape[-2:]
+    if len(given) == 2:
+        said = f"the image is {given[1]} x {given[0]} px, expected {width} x {height} ({said})"
     return f"{said}: use images of this sensor's camera at its calibrated resolution"

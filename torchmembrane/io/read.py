@@ -17,7 +17,7 @@ def read_results(folder: str | Path) -> "Results":
 
     Only names and `mesh.npz` are read now; frames are read where they are asked for. Frames that failed are among them, NaN,
     with their status; images that could not be read have no frame (`summary.csv` lists them). Frames that are written to the
-    folder later are not seen.
+    folder later are not included.
 
     Args:
         folder: what `torchmembrane reconstruct --out` was given.
@@ -29,18 +29,19 @@ def read_results(folder: str | Path) -> "Results":
         MembraneError: the folder holds no results, or not one frame.
 
     Example:
-        >>> import tempfile
-        >>> from torchmembrane.cli.main import main
-        >>> folder = tempfile.mkdtemp()
-        >>> options = ["--estimator", "minimum-energy", "--out", folder]
-        >>> main(["reconstruct", "examples/sensor.toml", "examples/rest.png", *options])  # doctest: +ELLIPSIS
-        frames: 1 reconstructed, 0 failed, 0 finished before; results in ...
-        0
+        Here the folder is written by hand, arrays empty; `torchmembrane reconstruct` writes such folders.
+
+        >>> import numpy as np, tempfile, torch
+        >>> from torchmembrane.io.results import save_frame
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> Mesh(*[np.zeros(0)] * 8, "mm", "N", "finger", "", "force-balance", "neo_hookean", "", "npz").save(folder / MESH)
+        >>> for name in ("rest", "press"):
+        ...     save_frame(folder / f"{name}.npz", Reconstruction(*torch.zeros(15, 1)).frame(0))
         >>> results = read_results(folder)
-        >>> results.names, results["rest"]["vertices"].shape, results.mesh.length_unit
-        (['rest'], (1089, 3), 'mm')
-        >>> [int(frame["status"]) for frame in results], results.batch().vertices.shape
-        ([0], torch.Size([1, 1089, 3]))
+        >>> results.names, results.mesh.length_unit, int(results["press"]["status"])
+        (['press', 'rest'], 'mm', 0)
+        >>> [float(frame["pressure"]) for frame in results], results.batch().pressure
+        ([0.0, 0.0], tensor([0., 0.]))
     """
     return Results(Path(folder))
 

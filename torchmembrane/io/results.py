@@ -54,11 +54,10 @@ class Reconstruction(NamedTuple):
         """One frame as numpy arrays, float32 (status int32), by the names above.
 
         Example:
-            >>> import torchmembrane as tm
-            >>> reconstructor = tm.Reconstructor.from_file("examples/sensor.toml")
-            >>> result = reconstructor(reconstructor.read("examples/press_on_axis.png"))
-            >>> result.frame(0)["force"].shape, result.cpu().numpy().status.tolist()
-            ((3,), [0])
+            >>> batch = Reconstruction(*torch.zeros(15, 2, 3))  # two frames; arrays of other shapes in a real one
+            >>> frame = batch.frame(1)
+            >>> frame["force"].tolist(), str(frame["status"].dtype)
+            ([0.0, 0.0, 0.0], 'int32')
         """
         arrays = {key: value[index].detach().cpu().numpy() for key, value in self._asdict().items()}
         return {key: value.astype(np.int32 if key == "status" else np.float32) for key, value in arrays.items()}
@@ -78,14 +77,37 @@ class Reconstruction(NamedTuple):
 
 
 def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
-    """Write one frame (`Reconstruction.frame`) to `path` (.npz), whole or not at all."""
+    """Write one frame, whole or not at all.
+
+    Args:
+        path: the file, `.npz`.
+        frame: as `Reconstruction.frame` gives it.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> frame = Reconstruction(*torch.ones(15, 1, 3)).frame(0)
+        >>> with TemporaryDirectory() as folder:
+        ...     save_frame(f"{folder}/press.npz", frame)
+        ...     load_frame(f"{folder}/press.npz")["force"].tolist()
+        [1.0, 1.0, 1.0]
+    """
     arrays: dict[str, Any] = frame
     with whole_file(path) as partial, open(partial, "wb") as file:
         np.savez(file, **arrays)
 
 
 def load_frame(path: str | Path) -> dict[str, np.ndarray]:
-    """Read a frame written by `save_frame`; raises `MembraneError` if it is not one."""
+    """Read a frame.
+
+    Args:
+        path: what `save_frame` wrote.
+
+    Returns:
+        Its arrays by name; see `save_frame` for an example.
+
+    Raises:
+        MembraneError: the file is missing, or not a frame.
+    """
     try:
         with np.load(path) as data:
             frame = {k: data[k] for k in Reconstruction._fields}
@@ -99,5 +121,17 @@ def load_frame(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def stack_frames(frames: list[dict[str, np.ndarray]]) -> Reconstruction:
-    """Frames of one sensor as a batch."""
+    """Frames of one sensor as a batch.
+
+    Args:
+        frames: as `Reconstruction.frame` gives them.
+
+    Returns:
+        The batch, in their order, on the CPU.
+
+    Example:
+        >>> first, second = (Reconstruction(*torch.full((15, 1, 3), value)).frame(0) for value in (1.0, 2.0))
+        >>> stack_frames([first, second]).force.tolist()
+        [[1.0, 1.0, 1.0], [2.0, 2.0, 2.0]]
+    """
     return Reconstruction(**{k: torch.from_numpy(np.stack([f[k] for f in frames])) for k in Reconstruction._fields})

@@ -27,11 +27,16 @@ class Settings(NamedTuple):
     energy: str
     element: str
     format: str
+    volume: str = "exact"
+    flow: str = "smooth"
+    smoothing: float = 0.0
 
     @classmethod
     def of(cls, reconstructor: "Reconstructor", format: str) -> "Settings":
         """Those of results that a reconstructor makes."""
-        return cls(reconstructor.estimator_name, reconstructor.model, reconstructor.estimator.element, format)
+        estimator = reconstructor.estimator
+        choices = estimator.element, format, estimator.volume, estimator.flow_kind, estimator.smoothing_weight
+        return cls(reconstructor.estimator_name, reconstructor.model, *choices)
 
 
 class Mesh(NamedTuple):
@@ -47,7 +52,7 @@ class Mesh(NamedTuple):
     image_size      [2]     int64, width and height, px
     length_unit, force_unit, name    of the sensor
     sensor          fingerprint of its file
-    estimator, energy, element, format    the `Settings`
+    estimator, energy, element, format, volume, flow, smoothing    the `Settings`
     """
 
     rest_vertices: np.ndarray
@@ -66,6 +71,9 @@ class Mesh(NamedTuple):
     energy: str
     element: str
     format: str
+    volume: str = "exact"
+    flow: str = "smooth"
+    smoothing: float = 0.0
 
     @classmethod
     def of(cls, reconstructor: "Reconstructor", settings: Settings) -> "Mesh":
@@ -92,12 +100,12 @@ class Mesh(NamedTuple):
         """Read `mesh.npz`; raises `MembraneError` if it is not one."""
         try:
             with np.load(path) as data:
-                arrays = [data[key] for key in cls._fields]
+                found = {key: data[key] for key in cls._fields if key in data or key not in cls._field_defaults}
         except FileNotFoundError as error:
             raise MembraneError(f"{path}: no such file; expected the {MESH} that is written beside results") from error
         except (KeyError, OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
             raise MembraneError(f"{path}: not a {MESH} of torchmembrane ({error})") from error
-        return cls(*(array.item() if array.ndim == 0 else array for array in arrays))
+        return cls(**{key: array.item() if array.ndim == 0 else array for key, array in found.items()})
 
     def save(self, path: str | Path) -> None:
         """Write `mesh.npz`, whole or not at all."""
@@ -106,7 +114,7 @@ class Mesh(NamedTuple):
     @property
     def settings(self) -> Settings:
         """The choices that made the results."""
-        return Settings(self.estimator, self.energy, self.element, self.format)
+        return Settings(*(getattr(self, name) for name in Settings._fields))
 
     def normal_displacement(self, frame: dict[str, np.ndarray]) -> np.ndarray:
         """Displacement along the rest normals, `[V]`, length unit: negative where the membrane is pressed in."""

@@ -45,7 +45,7 @@ def reconstruct_files(
     """Reconstruct all frames of `inputs` that have no finished result in the folder `out` yet.
 
     A file that cannot be read stands in summary.csv with status -1 and has no result. Interrupted at any point, `out`
-    holds what is done so far and the same call goes on from there.
+    holds what is done so far and the same call continues from there.
 
     Args:
         reconstructor: a `Reconstructor`.
@@ -61,6 +61,17 @@ def reconstruct_files(
 
     Raises:
         MembraneError: `out` is refused, or a package for videos or Parquet is missing.
+
+    Example:
+        >>> import tempfile
+        >>> from dataclasses import replace
+        >>> from torchmembrane import Reconstructor, Sensor
+        >>> from torchmembrane.jobs.inputs import find_inputs
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> sensor = replace(sensor, markers=replace(sensor.markers, rest_image=None))  # quicker, less accurate
+        >>> reconstructor, images = Reconstructor(sensor), find_inputs(["examples/rest.png"])
+        >>> reconstruct_files(reconstructor, images, tempfile.mkdtemp(), Settings.of(reconstructor, "npz"))
+        FrameCounts(reconstructed=1, not_converged=0, failed=0, skipped=0)
     """
     out, report = Path(out), report or _write_line
     mesh = Mesh.of(reconstructor, settings)

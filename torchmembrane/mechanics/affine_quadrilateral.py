@@ -53,10 +53,35 @@ class AffineQuadrilaterals(nn.Module):
         maps = self.affine_maps(x)
         return self.tension / 2 * (self.area * ((maps**2).sum((-1, -2)) - 2)).sum((-1, -2))
 
-    def gradient(self, x: Tensor) -> Tensor:
-        """`dE/dx`, `[..., V, 3]`."""
-        maps = self.affine_maps(x) * (self.tension * self.area)[..., None, None]
+    def gradient(self, x: Tensor, weight: Tensor | None = None) -> Tensor:
+        """`dE/dx`, `[..., V, 3]`; `weight [..., m-1, n-1]`: of each quadrilateral's share, default 1."""
+        scale = self.tension * self.area if weight is None else self.tension * self.area * weight
+        maps = self.affine_maps(x) * scale[..., None, None]
         return corners_to_vertices(self.map_weights @ maps.mT, self.grid)
+
+    def local_maps(self, directions: Tensor) -> Tensor:
+        """What each corner's range adds to the map of its quadrilateral (eqs. 15-17): `A = sum_k t_k A_k`.
+
+        The fit `A = F^T G^-1` is linear in the points `t_k d_k` that it maps to; `G^-1` is in the constant weights.
+
+        Args:
+            directions: `[..., V, 3]`, the rays' unit directions.
+
+        Returns:
+            `A_k [..., m-1, n-1, 3, 2, 4]`.
+        """
+        return corners(directions, self.grid).mT[..., :, None, :] * self.map_weights.mT[..., None, :, :]
+
+    def q_blocks(self, directions: Tensor, weight: Tensor | None = None) -> Tensor:
+        """The paper's Q (eq. 18) by quadrilaterals, `[..., m-1, n-1, 6, 4]`: the weighted entries of the map, linear in the
+        ranges of the four corners. Summed over quadrilaterals `Q^T Q = K`.
+
+        Args:
+            directions: `[..., V, 3]`, the rays' unit directions.
+            weight: `[..., m-1, n-1]`, of each quadrilateral's energy, default 1.
+        """
+        scale = self.tension * self.area if weight is None else self.tension * self.area * weight
+        return self.local_maps(directions).flatten(-3, -2) * scale.sqrt()[..., None, None]
 
     def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
         """Corner matrices `[..., m-1, n-1, 4, 4]` of `K = L o (R R^T)`, exactly quadratic: `x` is not looked at."""

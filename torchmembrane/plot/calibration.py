@@ -76,6 +76,14 @@ def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarr
         places: `[V, 3]`, the surface's vertices.
         correction: its `offsets [V]` along the normals and their `deviations [V]`.
         unit: of lengths.
+
+    Example:
+        >>> from torchmembrane.calibrate.surface import Correction
+        >>> places = np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0], [0.0, 1.0, 5.0]])
+        >>> found = Correction(places, np.array([0.0, 0.1, -0.1]), np.full(3, 0.01))
+        >>> drawing = surface_figure(Report.without_parameters("depth"), (640, 480), places, found, "mm")
+        >>> [axes.get_title() for axes in drawing.axes[:2]]
+        ['moved outwards, mm', 'standard deviation, mm']
     """
     panels = 3 if len(report.residuals) else 2
     drawing = Figure(figsize=(5 * panels, 4.6), layout="constrained")
@@ -103,6 +111,15 @@ def material_figure(report: Report, found: Any, names: list[str]) -> Figure:
         report: the calibration's numbers, the prestretch first.
         found: a material's fit: its `profile` (prestretches `[S]`, losses `[S, B]` of B images) and `forces [B, 2]`.
         names: of the B images.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> none, stretches = np.zeros((0, 2)), np.array([1.1, 1.3, 1.5])
+        >>> losses = np.array([[4.0], [0.0], [1.0]])
+        >>> report = Report("material", ["prestretch"], [""], *np.ones((3, 1)), np.eye(1), none, none, 0.0, [])
+        >>> found = SimpleNamespace(profile=(stretches, losses), forces=np.array([[1.0, 1.1]]))
+        >>> [axes.get_xlabel() for axes in material_figure(report, found, ["press.png"]).axes]
+        ['prestretch', 'force found, N']
     """
     known = np.isfinite(found.forces).all(1)
     panels = 2 if known.any() else 1
@@ -139,6 +156,14 @@ def layout_figure(title: str, sensor: Sensor, dots: Any) -> Figure:
         title: of the figure.
         sensor: the sensor that is to bear the dots.
         dots: their `pixels [D, 2]` as wanted, `positions [D, 3]` on the rest surface and `radii [D]`.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> pixels, X = np.array([[320.0, 240.0]]), np.array([[0.0, 0.0, 24.0]])
+        >>> dots = SimpleNamespace(pixels=pixels, positions=X, radii=np.array([0.3]))
+        >>> [axes.get_title() for axes in layout_figure("one dot", sensor, dots).axes]
+        ['wanted in the image', 'to make: along the axis', 'from the side']
     """
     drawing = Figure(figsize=(15, 4.6), layout="constrained")
     drawing.suptitle(title)

@@ -41,6 +41,17 @@ def figure(frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = 
 
     Returns:
         A figure of three panels, or four; of a frame without a surface its flow, and the reason in words.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from torchmembrane import Reconstructor, Sensor
+        >>> from torchmembrane.io.store import Settings
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> reconstructor = Reconstructor(replace(sensor, markers=replace(sensor.markers, rest_image=None)))
+        >>> frame = reconstructor.from_pixels(reconstructor.rest_pixels).frame(0)
+        >>> drawing = figure(frame, Mesh.of(reconstructor, Settings.of(reconstructor, "npz")))
+        >>> [axes.get_title() for axes in drawing.axes[:2]]
+        ['Marker flow', 'Surface, seen along x']
     """
     good = bool(np.isfinite(frame["vertices"]).all())
     forces = good and np.any(frame["traction"])

@@ -16,7 +16,7 @@ from ..errors import MembraneError
 from .indenters import Indenter, norm
 
 RIGID = 1e3  # the linearised contact's stiffness over c: what still yields in one step is gone in the next
-GENTLE = 0.1  # c_t over c: large enough to tell the slip's direction, too small to let what sticks slip at once
+GENTLE = 0.1  # c_t over c: large enough to show the slip's direction, too small to let what sticks slip at once
 SAME_SIDE = 0.5  # cosine between an indenter's normals at one vertex before and after an increment
 
 

@@ -49,6 +49,13 @@ class Indenter:
 
     Raises:
         MembraneError: `rotation` is not a rotation, or a size is not positive.
+
+    Example:
+        >>> class Slab(Indenter):
+        ...     def local_distance(self, points):
+        ...         return points[..., 2].abs() - 1
+        >>> Slab(translation=(0, 0, 5)).distance(torch.tensor([0.0, 0.0, 8.0])).item()
+        2.0
     """
 
     translation: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64), kw_only=True)

@@ -138,6 +138,11 @@ class Painted:
 
     Args:
         image: the rest image, `[height, width]`, grey 0..1.
+
+    Example:
+        >>> canvas = Canvas(torch.zeros(2, 3), torch.tensor([[0.0, 0.0], [1.0, 0.0]]), torch.full((2,), 0.5))
+        >>> Painted(np.array([[0.25, 0.5]], np.float32)).albedo(canvas).tolist()
+        [0.5, 1.0]
     """
 
     image: np.ndarray

@@ -29,7 +29,7 @@ class Stroke(NamedTuple):
 
     Attributes:
         indenter: where it first touches.
-        travel: `[3]`, unit vector along which it pushes.
+        travel: `[3]`, unit vector along which it presses.
         depth: how far.
         slide: `[3]`, how it moves then.
         friction: Coulomb's coefficient.
@@ -95,7 +95,7 @@ class Simulator:
 
     Args:
         sensor: the sensor.
-        grid: of the equilibrium; default: about 38 a side, finer than the solver's, no line in common but the rim.
+        grid: of the equilibrium; default: about 38 per side, finer than the solver's, no line in common but the rim.
         appearance: light, lens and chip.
         radii: of small and large dots, length unit; default: as in `Dots.of`.
         missing: dots that are not painted.

@@ -1,4 +1,4 @@
-// The page: a model and an image in; the surface, and what pushes on it, out.
+// The page: a model and an image in; the surface, and the traction on it, out.
 import { greyOf, pixelsOf } from "./image.js";
 import { Model } from "./model.js";
 import { npz } from "./npz.js";
@@ -20,7 +20,7 @@ async function openModel(file) {
   at("save").disabled = true;
   document.body.classList.remove("failed");
   surface.begin(model.sensor.mesh);
-  showColours("Push on the membrane", null);
+  showColours("Compressive traction", null);
 }
 
 async function openImage(file, name) {
@@ -67,7 +67,7 @@ function showSurface(frame) {
   const contacts = rows(frame.contact_points).filter((point) => point.every(Number.isFinite));
   surface.show(frame.vertices.data, values, most, contacts, forces ? [...frame.force.data] : null);
   const unit = forceUnit === "relative" ? "(relative)" : `[${forceUnit}/${lengthUnit}²]`;
-  showColours(forces ? `Push on the membrane ${unit}` : `Pressed in by [${lengthUnit}]`, most);
+  showColours(forces ? `Compressive traction ${unit}` : `Pressed in by [${lengthUnit}]`, most);
 }
 
 /** The colour bar from 0 to `most`, or without numbers. */
@@ -86,7 +86,7 @@ function showColours(quantity, most) {
   );
 }
 
-/** Components against the outward normals, a number a vertex. */
+/** Components against the outward normals, one number per vertex. */
 const inward = (vectors, normals) => rows(vectors).map((row, k) => -row.reduce((sum, x, c) => sum + x * normals[k][c], 0));
 
 function rows({ data, shape: [count, size] }) {
@@ -107,7 +107,7 @@ async function fetched(path) {
   return response.blob();
 }
 
-/** Jobs run one after another; what goes wrong is said in words. */
+/** Jobs run one after another; failures are shown as messages. */
 let last = Promise.resolve();
 function inTurn(name, job) {
   last = last.then(async () => {

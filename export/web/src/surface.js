@@ -1,4 +1,4 @@
-// The surface in 3-D: coloured by the push on it, over its grid at rest, with contact points and the total force.
+// The surface in 3-D: coloured by the compressive traction on it, over its grid at rest, with contact points and the total force.
 import {
   AmbientLight, BufferAttribute, BufferGeometry, CanvasTexture, ConeGeometry, CylinderGeometry, DirectionalLight, DoubleSide,
   Group, LineBasicMaterial, LineSegments, Mesh, MeshBasicMaterial, MeshLambertMaterial, PerspectiveCamera, Raycaster, Scene,
@@ -93,7 +93,7 @@ export class Surface {
     this.#stale = true;
   }
 
-  /** The total force where its line of action, through the centre of the push, meets the surface from outside. */
+  /** The total force where its line of action, through the centre of pressure, meets the surface from outside. */
   #arrow(skin, centre, direction) {
     skin.updateMatrixWorld();
     const [hit] = new Raycaster(centre.clone().addScaledVector(direction, -4 * this.#radius), direction).intersectObject(skin);

@@ -13,9 +13,9 @@ import onnx
 import torch
 from PIL import Image, PngImagePlugin
 
+from torchmembrane import Reconstructor
 from torchmembrane.io.images import read_image
 from torchmembrane.io.results import save_frame
-from torchmembrane.reconstruct import Reconstructor
 
 
 def main() -> None:

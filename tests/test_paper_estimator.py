@@ -1,0 +1,207 @@
+"""The paper's own estimator: one frame through the chain, every intermediate against its equation; direct against iterated."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import torchmembrane as tm
+from torchmembrane.estimators.affine_maps import affine_fit
+from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.minimum_energy import MinimumEnergy, grid_laplacian
+from torchmembrane.estimators.paper import OCCUPIED, PaperEstimator
+from torchmembrane.estimators.settings import MinimumEnergySettings, PaperSettings
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
+from torchmembrane.surface.membrane import Membrane
+from torchmembrane.surface.shapes import ellipsoid_cap
+from torchmembrane.surface.stencil import inner
+from torchmembrane.surface.topology import corners
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+GRIDS = [(9, 9), (10, 8), (6, 11)]
+
+
+def rest_rays(membrane):
+    return torch.zeros_like(membrane.rest), torch.nn.functional.normalize(membrane.rest, dim=-1)
+
+
+def make(grid=(9, 9), hole=False, **options):
+    cap = ellipsoid_cap((12, 9, 12), 2, grid)
+    if hole:
+        fixed = cap.fixed.clone()
+        fixed[grid[0] // 2 * grid[1] + grid[1] // 2] = True
+        cap = Membrane(cap.rest.reshape(*grid, 3).numpy(), fixed.reshape(grid).numpy())
+    filling, gas = options.pop("filling", "liquid"), options.pop("gas", None)
+    elasticity = ElasticEnergy(cap, "harmonic", 1.2)
+    return PaperEstimator(cap, elasticity, rest_rays(cap), filling, gas, PaperSettings(**options))
+
+
+def observed(membrane, size=0.03, batch=2):
+    """Rays turned smoothly, not at the rim."""
+    origins, directions = rest_rays(membrane)
+    phase = torch.rand(batch, 1, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    turn = torch.sin(5 * membrane.rest[:, [1, 2, 0]] / membrane.size + 6 * phase) * (~membrane.fixed)[:, None]
+    directions = torch.nn.functional.normalize(directions + size * turn, dim=-1)
+    return Observation(origins.expand_as(directions), directions, torch.ones_like(directions[..., 0]))
+
+
+def some_relaxed(membrane, batch=2):
+    relaxed = torch.zeros(batch, len(membrane.rest), dtype=torch.bool)
+    relaxed[1, membrane.free_vertices[5:9]] = True
+    return relaxed
+
+
+def dense(estimator, q, relaxed):
+    """`Q [B, rows, V]` and `S` with the rows of contacts struck out, `[B, V, V]`."""
+    membrane = estimator.membrane
+    index = corners(torch.arange(len(membrane.rest))[:, None], membrane.grid)[..., 0].reshape(-1, 4)
+    Q = torch.zeros(len(q), len(index), 6, len(membrane.rest), dtype=torch.float64)
+    for k, vertices in enumerate(index.tolist()):
+        Q[:, k][..., vertices] = q.flatten(1, 2)[:, k]
+    S = grid_laplacian(torch.eye(len(membrane.rest), dtype=torch.float64), membrane.grid)
+    return Q.flatten(1, 2), S * (~relaxed)[..., None]
+
+
+@pytest.mark.parametrize(("grid", "hole"), [*((grid, False) for grid in GRIDS), ((9, 10), True)])
+def test_one_frame_through_the_chain(grid, hole):
+    """Maps (15-17), Q (18), smoother (28), volume (21), eq. 22 and its KKT system (25-27), from the rays to the surface."""
+    estimator = make(grid, hole)
+    membrane, energy, free = estimator.membrane, estimator.energy, estimator.membrane.free_vertices
+    observation, relaxed = observed(membrane), some_relaxed(membrane)
+    programme, (origins, directions) = estimator.programme(observation, relaxed)
+    t = estimator.rest_range + 0.1 * torch.sin(torch.arange(len(membrane.rest)).double())
+
+    # each quadrilateral's map is the least-squares fit of its corners, eqs. 15-17, in its own rest plane
+    x = t[:, None] * directions
+    maps = (energy.local_maps(directions) * corners(t[:, None], membrane.grid).mT[..., None, :]).sum(-1)
+    p = corners(membrane.rest, membrane.grid)
+    axis = torch.nn.functional.normalize(p[..., 2, :] - p[..., 0, :], dim=-1)
+    normal = torch.linalg.cross(p[..., 2, :] - p[..., 0, :], p[..., 3, :] - p[..., 1, :])
+    across = torch.nn.functional.normalize(torch.linalg.cross(normal, axis), dim=-1)
+    plane = p @ torch.stack([axis, across], -1)
+    torch.testing.assert_close(maps, affine_fit(plane.expand(2, *plane.shape), corners(x, membrane.grid)).A)
+
+    # eq. 18: |Q t|^2 is twice the energy of those maps, and Q^T Q = K
+    Q, S = dense(estimator, programme.q, relaxed)
+    twice = energy.tension * (energy.area * (maps**2).sum((-1, -2))).sum((-1, -2))
+    torch.testing.assert_close((Q @ t).square().sum(-1), twice)
+    torch.testing.assert_close(Q[0], energy.q_matrix(directions[0]))
+
+    # eq. 25: stationary, K psi + s S^T S psi - load = -lambda v; eq. 26: the linear volume is kept
+    found = estimator.solve(observation, relaxed)
+    psi = torch.zeros_like(found.vertices[..., 0])
+    psi[:, free] = ((found.vertices - origins) * directions).sum(-1)[:, free] - estimator.rest_range[free]
+    start = origins + estimator.rest_range[:, None] * directions
+    gamma = -(Q @ estimator.rest_range[:, None]).squeeze(-1) - offset(estimator, Q, origins)
+    smooth = 0.1 * energy.tension * (S.mT @ (S @ psi[..., None])).squeeze(-1)
+    left = (Q.mT @ (Q @ psi[..., None]).squeeze(-1)[..., None]).squeeze(-1) - (Q.mT @ gamma[..., None]).squeeze(-1) + smooth
+    left = left - (estimator.rest_load * directions).sum(-1)
+    v = (membrane.volume_gradient(start) * directions).sum(-1)
+    torch.testing.assert_close(left[:, free], found.pressure[:, None] * v[:, free], rtol=1e-8, atol=1e-9)
+    torch.testing.assert_close((v * psi).sum(-1), membrane.rest_volume - membrane.volume(start))
+    assert (found.vertices[:, membrane.fixed] == membrane.rest[membrane.fixed]).all() and psi.abs().max() > 1e-3
+
+
+def offset(estimator, Q, origins):
+    """What the vertices that stay add to Q t: the maps of the origins, weighted as Q's rows."""
+    energy = estimator.energy
+    maps = energy.affine_maps(origins) * (energy.tension * energy.area).sqrt()[..., None, None]
+    return maps.flatten(1)
+
+
+def test_the_stencil_is_that_of_the_dense_matrix():
+    estimator = make((8, 9))
+    observation, relaxed = observed(estimator.membrane), some_relaxed(estimator.membrane)
+    programme, _ = estimator.programme(observation, relaxed)
+    Q, S = dense(estimator, programme.q, relaxed)
+    M = Q.mT @ Q + 0.1 * estimator.energy.tension * S.mT @ S
+    free = estimator.membrane.free_vertices
+    b = torch.randn(2, 1, len(free), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    solved = estimator.system.substitute(estimator.system.factor(programme.stencil), b)
+    torch.testing.assert_close(solved, torch.linalg.solve(M[:, free][:, :, free], b.mT).mT)
+    torch.testing.assert_close(programme.stencil[:, 0], inner(M.diagonal(dim1=1, dim2=2)[..., None], (8, 9)).squeeze(-1))
+
+
+@pytest.mark.parametrize(
+    ("options", "gap"), [({}, 1e-6), (dict(filling="open"), 1e-6), (dict(filling="gas", gas=(0.1, 2500.0)), 3e-5)]
+)
+def test_the_direct_solve_is_where_the_iterated_one_goes(options, gap):
+    """But for a gas: its law is linearised once here, and anew in every step there."""
+    estimator = make((13, 13), **options)
+    cap, observation = estimator.membrane, observed(estimator.membrane)
+    relaxed = some_relaxed(cap)
+    settings = MinimumEnergySettings("quadrilateral", 0.1, "linear", relaxed_steps=300)
+    iterated = MinimumEnergy(cap, estimator.elasticity, rest_rays(cap), **options, settings=settings)
+    got, expected = estimator.solve(observation, relaxed), iterated.solve(observation, relaxed)
+    torch.testing.assert_close(got.vertices, expected.vertices, rtol=0, atol=gap)
+    torch.testing.assert_close(got.pressure, expected.pressure, rtol=1e-5, atol=gap)
+
+
+def test_zero_flow_gives_exactly_no_displacement_and_no_contact():
+    estimator = make((9, 10))
+    found = estimator(Observation(*(ray[None] for ray in rest_rays(estimator.membrane)), torch.ones(1, 90)))
+    assert (found.vertices - estimator.membrane.rest).abs().max() < 1e-12
+    assert (found.pressure - estimator.rest_pressure).abs().max() < 1e-12 and estimator.is_converged(found).all()
+    contacts = estimator.contacts(found)
+    assert (contacts.indicator == 0).all() and contacts.points.isnan().all()
+
+
+def test_the_energy_over_the_free_part_leaves_out_what_is_covered():
+    """Section 2, item 1: quadrilaterals wholly in a contact weigh next to nothing, all others what they did."""
+    whole, part = make((9, 9)), make((9, 9), free_part_only=True)
+    observation, relaxed = observed(whole.membrane), torch.zeros(2, 81, dtype=torch.bool)
+    block = torch.zeros(9, 9, dtype=torch.bool)
+    block[3:5, 3:6] = True
+    relaxed[1] = block.flatten()
+    q, less = (estimator.programme(observation, relaxed)[0].q for estimator in (whole, part))
+    ratio = less.square().sum((-1, -2)) / q.square().sum((-1, -2))
+    covered = torch.zeros(2, 8, 8, dtype=torch.bool)
+    covered[1, 3, 3:5] = True
+    torch.testing.assert_close(ratio, torch.where(covered, OCCUPIED, 1.0).double())
+    assert (part.solve(observation, relaxed).vertices - whole.solve(observation, relaxed).vertices)[1].abs().max() > 1e-6
+
+
+@pytest.fixture(scope="module")
+def reconstructor():
+    sensor = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
+    return tm.Reconstructor(replace(sensor, membrane=sensor.membrane.resampled((17, 17))), "paper")
+
+
+def test_images_go_through_the_whole_chain(reconstructor):
+    """Bilinear flow at the grid (section 5), then the estimator; contacts near those of an independent program."""
+    names = ("press_on_axis", "two_contacts", "rest")
+    with torch.no_grad():
+        result = reconstructor(reconstructor.read(*(EXAMPLES / f"{name}.png" for name in names)))
+    assert (result.status[[0, 2]] == tm.Status.OK).all() and result.vertices.isfinite().all()
+    flow = reconstructor.estimator.flow
+    u = (result.pixels - reconstructor.rest_pixels)[1]
+    expected = reconstructor.vertex_pixels + flow.interpolation.bilinear @ u
+    torch.testing.assert_close(flow(result.pixels[1:2], torch.ones(1, 121))[0], expected, rtol=0, atol=1e-3)
+    truth = np.load(EXAMPLES / "press_on_axis_truth.npz")["contact_centroid_each"][0]
+    assert np.linalg.norm(result.contact_points[0, 0].numpy() - truth) < 2 and result.contact_points[0, 1:].isnan().all()
+    assert result.contact_points[2].isnan().all() and (result.contact[2] == 0).all() and result.contact[1].sum() > 5
+    assert (result.traction == 0).all() and result.displacement[2].abs().max() < 1e-4
+
+
+def test_wrong_settings_are_refused():
+    for wrong, said in ((dict(flow="cubic"), "one of"), (dict(smoothing=0.0), "more than 0"), (dict(rounds=0), "at least 1")):
+        with pytest.raises(tm.MembraneError, match=said):
+            PaperSettings(**wrong)
+
+
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_gradients_agree_with_finite_differences(rounds):
+    estimator = make((7, 7), rounds=rounds)
+    observation = observed(estimator.membrane, batch=1)
+    direction = torch.randn(observation.directions.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+
+    def height(step):
+        turned = torch.nn.functional.normalize(observation.directions + step * direction, dim=-1)
+        return estimator(observation._replace(directions=turned)).vertices.square().sum()
+
+    step = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(height(step), step)
+    h = 1e-6
+    torch.testing.assert_close(gradient, (height(torch.tensor(h)) - height(torch.tensor(-h))) / (2 * h), rtol=1e-5, atol=0)

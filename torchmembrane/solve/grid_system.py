@@ -1,0 +1,96 @@
+"""Symmetric systems of one unknown per inner vertex of a grid, from 5 x 5 stencils, by elimination over pairs of grid rows."""
+
+from types import ModuleType
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from . import block_tridiagonal, matrix_products
+
+UPPER = ((0, 0), (0, 1), (0, 2), *((i, j) for i in (1, 2) for j in range(-2, 3)))
+"""Offsets from a vertex to itself and to those further on that a stencil joins it with; the others follow by symmetry."""
+
+
+class GridSystem(nn.Module):
+    """`M x = b` on the `N = (m - 2) (n - 2)` inner vertices of an `m x n` grid, row by row; two grid rows are one block.
+
+    Args:
+        grid: `(m, n)`.
+        free: `[N]` bool; the unknowns of the others are zero.
+    """
+
+    order: Tensor
+    block_of_row: Tensor
+    block_rows: Tensor
+    block_columns: Tensor
+    scatter_index: Tensor
+    free: Tensor
+
+    def __init__(self, grid: tuple[int, int], free: Tensor):
+        super().__init__()
+        m, n = grid
+        self.count, self.blocks, self.block_size = (m - 2) * (n - 2), (m - 1) // 2, 2 * (n - 2)
+        order = block_tridiagonal.inwards(self.blocks)
+        pairs = np.array([(k, k) for k in order] + block_tridiagonal.coupled(self.blocks))
+        for name, index in (
+            ("order", np.array(order)),
+            ("block_of_row", np.argsort(order)),
+            ("block_rows", pairs[:, 0]),
+            ("block_columns", pairs[:, 1]),
+            ("scatter_index", _scatter_index((m - 2, n - 2), free.cpu().numpy(), pairs).ravel()),
+        ):
+            self.register_buffer(name, torch.from_numpy(index.astype(np.int32)))
+        self.register_buffer("free", free.double())
+
+    def factor(self, stencil: Tensor) -> tuple[Tensor, ...]:
+        """What `substitute` needs.
+
+        Args:
+            stencil: `[B, 13, N]`, the entries of `M` between every vertex and those at `UPPER` from it; what leads out of the
+                inner vertices, or to one that is not free, is passed over.
+        """
+        scale = torch.where(self.free > 0, stencil[:, 0], 1.0).rsqrt()
+        entries = torch.cat([stencil.flatten(1), torch.zeros_like(scale[:, :1]), torch.ones_like(scale[:, :1])], 1)
+        s = self.block_size
+        matrix = entries.index_select(1, self.scatter_index).unflatten(1, (-1, s, s))
+        by_block = F.pad(scale, (0, self.blocks * s - self.count), value=1.0).unflatten(-1, (self.blocks, s))
+        rows, columns = (by_block.index_select(1, index) for index in (self.block_rows, self.block_columns))
+        matrix = rows[..., None] * matrix * columns[..., None, :]
+        diagonal, beside = matrix.split([self.blocks, self.blocks - 1], 1)
+        pivots, couplings = _elimination().factor(diagonal, beside)
+        return *pivots, *couplings, scale
+
+    def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
+        """Solutions `[B, C, N]` for `loads` of that shape."""
+        *blocks, scale = factor
+        pivots = len(blocks) // 2 + 1  # and a coupling between two
+        scale = (scale * self.free)[:, None]
+        padded = F.pad(scale * loads, (0, self.blocks * self.block_size - self.count))
+        in_blocks = padded.unflatten(-1, (self.blocks, self.block_size)).transpose(1, 2).index_select(1, self.order)
+        x = _elimination().substitute((blocks[:pivots], blocks[pivots:]), in_blocks)
+        return scale * x.index_select(1, self.block_of_row).transpose(1, 2).flatten(-2)[..., : self.count]
+
+
+def _elimination() -> ModuleType:
+    return matrix_products if torch.compiler.is_exporting() else block_tridiagonal
+
+
+def _scatter_index(size: tuple[int, int], free: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Where the entries of the blocks between `pairs [P, 2]` of grid row pairs are, `[P, s, s]`: in the stencil `[13, N]`, a
+    zero after it, a one after that."""
+    N, s = len(free), 2 * size[1]
+    number = np.full((5, 5), -1)
+    for k, offset in enumerate(UPPER):
+        number[offset] = k  # negative indices wrap: the opposite offset has its own place
+    p, q = (s * pairs.T[:, :, None] + np.arange(s))[:, :, :, None]
+    q = q.swapaxes(1, 2)
+    used = [(vertex < N) & free[vertex.clip(max=N - 1)] for vertex in (p, q)]
+    (pi, pj), (qi, qj) = (np.divmod(vertex, size[1]) for vertex in (p, q))
+    i, j = qi - pi, qj - pj
+    close = used[0] & used[1] & (abs(i) <= 2) & (abs(j) <= 2)
+    i, j = np.where(close, i, 0), np.where(close, j, 0)
+    upper, lower = number[i, j], number[-i, -j]
+    entry = np.where(upper >= 0, upper * N + p, lower * N + q)
+    return np.where(close, entry, np.where((p == q) & ~used[0], len(UPPER) * N + 1, len(UPPER) * N))
