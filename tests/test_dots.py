@@ -1,5 +1,7 @@
 """Dots: found and measured in the rest image, located and matched in frames, all through rendered pixels."""
 
+import importlib
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -185,6 +187,40 @@ def test_follows_a_smooth_flow_of_one_and_a_half_pitches(arrangement, two_sizes,
         error = np.linalg.norm(pixels[k].numpy() - truth, axis=1)
         assert confidence[k].min() > 0.5, k
         assert error.max() < 0.5 and np.median(error) < 0.06 and np.percentile(error, 95) < 0.2, k
+
+
+@pytest.fixture
+def thresholded_dots(monkeypatch):
+    """`bench/thresholded_dots.py`, the paper's way to dots."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "bench")
+    return importlib.import_module("thresholded_dots")
+
+
+def test_components_are_the_dark_spots_of_an_image(thresholded_dots):
+    """Section 5: centre of gravity and area of what is darker than the threshold, in a dark and in a light image."""
+    v, u = np.mgrid[:60, :90]
+    spots, image = [(20.0, 15.0, 5.0), (60.5, 40.0, 8.0), (75.0, 12.5, 3.0)], np.full((60, 90), 0.8)
+    inside = [(u - x) ** 2 + (v - y) ** 2 < radius**2 for x, y, radius in spots]
+    image[np.any(inside, 0)] = 0.15
+    image[50, 10] = 0.1  # too small for a dot
+    for grey, polarity in ((image, "dark"), (1 - image, "light")):
+        centre, area = thresholded_dots.components(grey + 0.02 * np.sin(7 * u + 3 * v), polarity)
+        order = np.argsort(centre[:, 0])
+        np.testing.assert_allclose(centre[order], [spot[:2] for spot in spots], atol=1e-9)
+        assert area[order].tolist() == [spot.sum() for spot in inside]
+
+
+@pytest.mark.parametrize("field", [slide, dent])
+def test_threshold_and_components_follow_a_small_flow(thresholded_dots, field):
+    """Section 5: the nearest component of the dot's size, large dots first; all are found, some tenths of a pixel off."""
+    s = scene()
+    paper = thresholded_dots.ThresholdedDots(render(s.pixels, s.shapes, seed=7), s.pixels, s.sizes == 1, "dark")
+    for k, pitches in enumerate((0.0, 0.2, 0.4)):
+        now, shapes = deform(s, field, pitches)
+        error = np.linalg.norm(s.pixels + paper(render(now, shapes, seed=k)) - now, axis=1)
+        assert np.median(error) < 0.25 and error.max() < 0.6, pitches
+    far = deform(s, field, 0.4)[0] - s.pixels
+    assert np.linalg.norm(far, axis=1).max() > 0.3 * PITCH
 
 
 @pytest.mark.parametrize("arrangement, two_sizes", PATTERNS)
