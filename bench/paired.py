@@ -52,7 +52,8 @@ def answer(sensor: str, image: str, names: list[str]) -> None:
         functions = dict(work(sensor, image, names))
         for function in functions.values():  # warm-up
             function()
-        print(json.dumps(sys.modules["torchmembrane"].__path__[0]), flush=True)
+        package = [module for name, module in sys.modules.items() if name.partition(".")[0] == "torchmembrane"]
+        print(json.dumps([module.__file__ for module in package]), flush=True)
         for line in sys.stdin:
             wall, processor = time.perf_counter(), time.process_time()
             functions[line.strip()]()
@@ -71,11 +72,11 @@ class Worker:
             stdout=subprocess.PIPE,
             text=True,
         )
-        package = Path(self._answer())
-        if package != checkout.resolve() / "torchmembrane":
-            raise SystemExit(f"{checkout}: imports {package}; expected a folder that holds torchmembrane/")
+        strangers = [path for path in self._answer() if not Path(path).is_relative_to(checkout.resolve())]
+        if strangers:
+            raise SystemExit(f"{checkout}: imports {strangers[0]}; expected a folder that holds torchmembrane/")
 
-    def _answer(self):
+    def _answer(self) -> list:
         line = self.process.stdout.readline()
         if not line:
             raise SystemExit(f"a worker ended with {self.process.wait()}")
