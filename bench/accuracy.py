@@ -83,7 +83,7 @@ def score(reconstructor: tm.Reconstructor, root: Path, case: dict, label: str, m
         for image in case["images"]:
             kind = Path(image).stem.rpartition("_")[2] if "_" in case["images"][0] and len(case["images"]) > 1 else "images"
             result = reconstructor(reconstructor.read(root / image))
-            if reconstructor.finds_contacts:
+            if reconstructor.finds_tractions:
                 for name, value in contact_errors(result, truth).items():
                     surface.setdefault((f"{label}: {name}", kind), []).append(value)
             surface.setdefault((label, kind), []).append(relative(result))

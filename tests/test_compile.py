@@ -21,7 +21,7 @@ def test_the_compiled_reconstruction_is_one_graph_and_agrees(estimator):
     with torch.no_grad():
         expected = reconstructor(images)
         pairs = [(compiled(images), expected)]
-        if reconstructor.finds_contacts:
+        if reconstructor.finds_tractions:
             pairs.append((compiled(images, expected), reconstructor(images, expected)))
     for got, want in pairs:
         for key, value in want._asdict().items():

@@ -126,9 +126,9 @@ class Reconstructor(nn.Module):
         return self.observer.rest_pixels
 
     @property
-    def finds_contacts(self) -> bool:
+    def finds_tractions(self) -> bool:
         """Whether tractions and standard deviations are found."""
-        return self.estimator.finds_contacts
+        return self.estimator.finds_tractions
 
     def read(self, *paths: str | Path) -> Tensor:
         """Image files as a batch `[B, 1, height, width]` in 0..1, in this module's precision and on its device."""

@@ -74,12 +74,11 @@ class Contacts(NamedTuple):
 class Estimator(Protocol):
     """From what the markers show to the surface: an `nn.Module` of one sensor, batched and differentiable.
 
-    `finds_contacts`: tractions and standard deviations are found; `takes_start`: `forward` accepts the solution of
-    the
-    frames before. `reference` is the traction against which tractions are small or large.
+    `finds_tractions`: tractions and standard deviations are found; `takes_start`: `forward` accepts the solution of
+    the frames before. `reference` is the traction against which tractions are small or large.
     """
 
-    finds_contacts: ClassVar[bool]
+    finds_tractions: ClassVar[bool]
     takes_start: ClassVar[bool]
     membrane: Membrane
     cavity: CavityLaw

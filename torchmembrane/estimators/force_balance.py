@@ -53,7 +53,7 @@ class ForceBalance(nn.Module):
 
     A grid with an odd number of lines, at least 17, holds the estimator on every second line as `coarse`. The reference
     traction
-    `p0` is the rest pressure, or tension / size where that is larger.
+    `p0` is the rest pressure, or tension / size or (C1 + C2) / size where that is larger.
 
     Args:
         membrane: the rest surface on the solver's grid.
@@ -70,7 +70,7 @@ class ForceBalance(nn.Module):
         The press must not be so shallow that its tractions drown in noise; two contacts within `reach` are one.
     """
 
-    finds_contacts: ClassVar[bool] = True
+    finds_tractions: ClassVar[bool] = True
     element: ClassVar[str] = "triangle"
     volume: ClassVar[str] = "exact"
     flow_kind: ClassVar[str] = "smooth"

@@ -48,7 +48,7 @@ class MinimumEnergy(nn.Module):
         narrower than their distance to the camera are flattened.
     """
 
-    finds_contacts: ClassVar[bool] = False
+    finds_tractions: ClassVar[bool] = False
     Settings: ClassVar[type[MinimumEnergySettings]] = MinimumEnergySettings
     takes_start: ClassVar[bool] = False
     rest_range: Tensor

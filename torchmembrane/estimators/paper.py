@@ -70,7 +70,7 @@ class PaperEstimator(nn.Module):
         part of the depth.
     """
 
-    finds_contacts: ClassVar[bool] = False
+    finds_tractions: ClassVar[bool] = False
     takes_start: ClassVar[bool] = False
     element: ClassVar[str] = "quadrilateral"
     volume: ClassVar[str] = "linear"

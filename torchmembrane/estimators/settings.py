@@ -24,7 +24,7 @@ class ForceBalanceSettings:
         fine_tau: the same, from a coarser grid's solution.
         warm_tau: the same, from the solution of the frame before.
         decline: share of the steps over which tau declines.
-        sparsity: loss of the compressive traction p0 on the whole surface, while it is quadratic.
+        sparsity: twice the loss of the compressive traction p0 on the whole surface, while it is quadratic.
         friction: weight of the shear traction's loss over that of the compressive one.
         slip: scale of the shear traction's loss: where it begins to be linear.
         cone: how much less shear weighs where something pushes.
