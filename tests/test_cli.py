@@ -73,13 +73,13 @@ def test_reconstruct_examples_end_to_end(tmp_path, capsys):
 
 def test_options_reach_the_reconstructor(monkeypatch, tmp_path, capsys):
     def refuse(sensor, estimator, *, settings, model):
-        raise MembraneError(f"{sensor.name} {estimator} {model} {settings and settings.element}")
+        raise MembraneError(f"{sensor.name} {estimator} {model} {getattr(settings, 'element', None)}")
 
     monkeypatch.setattr("torchmembrane.cli.build.Reconstructor", refuse)
     call = ("reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")
     assert "nh130 force-balance None None" in run(capsys, *call)[2]
     options = ("--energy", "harmonic", "--element", "quadrilateral")
-    assert "force-balance has linear triangles" in run(capsys, *call, *options)[2]
+    assert "--element quadrilateral: force-balance has no such choice" in run(capsys, *call, *options)[2]
     least = ("--estimator", "minimum-energy", *options)
     assert "nh130 minimum-energy harmonic quadrilateral" in run(capsys, *call, *least)[2]
 

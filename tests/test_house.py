@@ -181,6 +181,7 @@ EXAMPLES_LEFT_OUT = {
     "Estimator": "a protocol",
     "ForceBalance": "built by Reconstructor, whose example runs it",
     "MinimumEnergy": "built by Reconstructor",
+    "PaperEstimator": "built by Reconstructor",
     "export": "takes half a minute",
     "material_from_images": "some twenty force balances",
     "material_from_pixels": "some twenty force balances",

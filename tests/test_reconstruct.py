@@ -308,7 +308,7 @@ def test_bilinear_flow_reaches_the_estimator(plain, papers):
     moved = made.vertex_pixels + torch.from_numpy(bilinear_matrix(made.estimator.membrane, points)) @ papers.flow
     seen, smooth = (made.camera.point_to_pixel(one.vertices)[free] for one in (papers, plain))
     torch.testing.assert_close(seen, moved[free], rtol=0, atol=1e-6)
-    assert (smooth - moved[free]).abs().max() > 0.5
+    assert (smooth - moved[free]).abs().max() > 0.2
 
 
 @pytest.mark.parametrize(("which", "element", "smoothing"), [("plain", "triangle", 0.0), ("papers", "quadrilateral", 2.0)])
