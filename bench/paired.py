@@ -1,11 +1,13 @@
 """Two checkouts of the package against each other: the same work in turn, in one process each.
 
 python bench/paired.py A B [--sensor examples/sensor.toml] [--image examples/two_contacts.png] [--only WORK ...] [--turns 20]
-                       [--json FILE]
+                       [--pairs 5] [--json FILE]
 
 A, B: folders that hold `torchmembrane/`; of the package only what all its versions have is used. One thread. Every turn asks A,
 B, B, A (the next B, A, A, B) for each piece of work, so that what slows the machine slows both alike. Printed for each piece:
-medians of processor and wall time in ms; median and quartiles over the turns of the ratio B / A of both calls' sums.
+medians of processor and wall time in ms; median and quartiles over the turns of the ratio B / A of both calls' sums. Where its
+memory lies makes a process up to a tenth faster or slower for as long as it lives, so the turns are shared out among several
+pairs of processes; what is left of that, a checkout against its own copy shows.
 """
 
 import argparse
@@ -121,12 +123,16 @@ def main():
     parser.add_argument("--image", type=Path, default=Path("examples/two_contacts.png"))
     parser.add_argument("--only", nargs="+", choices=WORK, default=list(WORK), metavar="WORK", help=", ".join(WORK))
     parser.add_argument("--turns", type=int, default=20)
+    parser.add_argument("--pairs", type=int, default=5, help="of processes (default: %(default)s)")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    workers = [Worker(checkout, args.sensor, args.image, args.only) for checkout in args.checkouts]
-    rows = [summary(*item) for item in timed(workers, args.only, args.turns).items()]
-    for worker in workers:
-        worker.close()
+    parts = []
+    for pair in range(args.pairs):
+        workers = [Worker(checkout, args.sensor, args.image, args.only) for checkout in args.checkouts]
+        parts.append(timed(workers, args.only, len(range(pair, args.turns, args.pairs))))
+        for worker in workers:
+            worker.close()
+    rows = [summary(name, np.concatenate([part[name] for part in parts])) for name in args.only]
     for row in rows:
         for kind in ("processor", "wall"):
             found = row[kind]
