@@ -31,7 +31,7 @@ def persistent_regions(height: Tensor, count: int, least: float) -> Tensor:
     """
     m, n = height.shape[1:]
     vertex = torch.arange(m * n, device=height.device)
-    local = height == F.max_pool2d(height[:, None], 3, 1, 1).squeeze(1)
+    local = height == _dilated(height)
     top, place = torch.where(local & (height >= least), height, -torch.inf).flatten(1).topk(min(CANDIDATES, m * n))
     at_peak = (place[..., None] == vertex) & (top > -torch.inf)[..., None]
     passes = _passes(at_peak.unflatten(-1, (m, n)), height).flatten(2)
@@ -63,5 +63,12 @@ def _passes(peaks: Tensor, height: Tensor) -> Tensor:
     """The lowest height on the best path from where `peaks [B, K, m, n]` hold to every vertex, `[B, K, m, n]`."""
     reached = torch.where(peaks, height[:, None], -torch.inf)
     for _ in range(max(height.shape[1:])):
-        reached = torch.minimum(F.max_pool2d(reached, 3, 1, 1), height[:, None])
+        reached = torch.minimum(_dilated(reached), height[:, None])
     return reached
+
+
+def _dilated(height: Tensor) -> Tensor:
+    """The highest of every vertex and its eight neighbours, `[..., m, n]`: as a 3 x 3 max-pooling, which looks at nine each."""
+    wide = F.pad(height, (1, 1, 1, 1), value=-torch.inf)
+    rows = torch.maximum(torch.maximum(wide[..., :-2, :], wide[..., 1:-1, :]), wide[..., 2:, :])
+    return torch.maximum(torch.maximum(rows[..., :-2], rows[..., 1:-1]), rows[..., 2:])

@@ -160,7 +160,7 @@ class Segmentation(nn.Module):
         return outward
 
     def _regions(self, bulge: Tensor) -> Tensor:
-        on_grid = bulge.unflatten(-1, self.membrane.grid)
+        on_grid = bulge.float().unflatten(-1, self.membrane.grid)  # which of them is higher: single precision tells
         regions: Tensor = persistent_regions(on_grid, self.count, LEAST * self.size).flatten(1)
         return regions
 
