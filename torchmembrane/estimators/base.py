@@ -75,7 +75,7 @@ class Estimator(Protocol):
     """From what the markers show to the surface: an `nn.Module` of one sensor, batched and differentiable.
 
     `finds_tractions`: tractions and standard deviations are found; `takes_start`: `forward` accepts the solution of
-    the frames before. `reference` is the traction against which tractions are small or large.
+    the frames before. `element`, `volume`, `flow_kind` and `smoothing_weight` are stored beside the results.
     """
 
     finds_tractions: ClassVar[bool]

@@ -7,32 +7,29 @@ One unknown for each free vertex, its position `t_k` along its ray, `x_k = o_k +
 from typing import ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from ..camera.model import Camera, Rays
+from ..camera.model import Rays
 from ..errors import MembraneError
 from ..mechanics.affine_quadrilateral import AffineQuadrilaterals
-from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..pieces import piece
 from ..solve.anderson import accelerated, first
 from ..solve.kkt import constrained_minimum
 from ..surface.membrane import Membrane
 from ..surface.topology import corners, corners_to_vertices
-from .base import Contacts, Equilibrium, Observation, Problem
+from .base import Equilibrium, Observation
 from .flow import VertexFlow
-from .segmentation import Segmentation
 from .settings import MinimumEnergySettings
+from .vertex_rays import VertexRays
 
 CONVERGED = 1e-5  # largest relative step, and volume error where the volume is exact, of a converged surface
 
 State = tuple[Tensor, Tensor, Tensor]
 
 
-class MinimumEnergy(nn.Module):
+class MinimumEnergy(VertexRays):
     """Surface of least energy on given rays (eqs. 18, 22, 28).
-
-    The rest load `h = grad U(X) - p0 grad V(X)` is subtracted, so that zero flow gives exactly zero displacement.
 
     Args:
         membrane: the rest surface on the solver's grid.
@@ -48,13 +45,9 @@ class MinimumEnergy(nn.Module):
         narrower than their distance to the camera are flattened.
     """
 
-    finds_tractions: ClassVar[bool] = False
     Settings: ClassVar[type[MinimumEnergySettings]] = MinimumEnergySettings
-    takes_start: ClassVar[bool] = False
-    rest_range: Tensor
+    settings: MinimumEnergySettings
     smoothing: Tensor
-    rest_load: Tensor
-    free: Tensor
     inverse: Tensor
 
     def __init__(
@@ -67,30 +60,14 @@ class MinimumEnergy(nn.Module):
         settings: MinimumEnergySettings | None = None,
         flow: VertexFlow | None = None,
     ):
-        super().__init__()
-        self.settings = settings = settings or MinimumEnergySettings()
-        self.membrane, self.elasticity, self.flow = membrane, elasticity, flow
-        self.steps = settings.steps
-        self.segmentation = Segmentation(membrane, rest_rays)
+        settings = settings or MinimumEnergySettings()
         triangles = settings.element == "triangle"
-        self.energy = elasticity if triangles else AffineQuadrilaterals(membrane, elasticity.tension)
-        origins, directions = rest_rays
-        self.register_buffer("rest_range", ((membrane.rest - origins) * directions).sum(-1))
+        energy = elasticity if triangles else AffineQuadrilaterals(membrane, elasticity.tension)
+        super().__init__(membrane, energy, rest_rays, filling, gas, flow)
+        self.settings, self.elasticity, self.steps = settings, elasticity, settings.steps
         self.smooths = settings.weight_of_smoother > 0
         self.register_buffer("smoothing", elasticity.tension * settings.weight_of_smoother)
-        rest_pressure, rest_load = rest_balance(membrane, self.energy)
-        self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
-        self.register_buffer("rest_load", rest_load)
-        self.register_buffer("free", (~membrane.fixed).double())
-        self.register_buffer("inverse", self._rest_inverse(directions))
-
-    @classmethod
-    def of(cls, problem: Problem, settings: MinimumEnergySettings | None = None) -> "MinimumEnergy":
-        """The estimator of a sensor."""
-        settings = settings or MinimumEnergySettings()
-        flow = VertexFlow(problem, settings.flow)
-        rays = problem.camera.pixel_to_ray(problem.vertex_pixels)
-        return cls(problem.membrane, problem.elasticity, rays, problem.filling, problem.gas, settings, flow)
+        self.register_buffer("inverse", self._rest_inverse(rest_rays[1]))
 
     @property
     def element(self) -> str:
@@ -103,25 +80,9 @@ class MinimumEnergy(nn.Module):
         return self.settings.volume
 
     @property
-    def flow_kind(self) -> str:
-        """The flow between the markers: "smooth" or "bilinear"."""
-        return self.settings.flow
-
-    @property
     def smoothing_weight(self) -> float:
         """The weight of the smoother of eq. 28."""
         return self.settings.weight_of_smoother
-
-    @property
-    def rest_pressure(self) -> Tensor:
-        """Pressure difference across the membrane at rest, `[]`."""
-        return self.cavity.rest_pressure
-
-    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor) -> Observation:
-        """The rays of the grid's vertices, moved by the flow of the markers seen at `pixels [B, D, 2]`."""
-        if self.flow is None:
-            raise MembraneError("MinimumEnergy.prepare: made without a flow; pass flow, or give forward the vertices' rays")
-        return Observation(*camera.pixel_to_ray(self.flow(pixels, confidence)), confidence)
 
     def is_converged(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: no step is left and, where the constraint is exact, the volume is what the cavity's law asks for."""
@@ -129,10 +90,6 @@ class MinimumEnergy(nn.Module):
         if self.settings.volume == "linear":
             return converged
         return converged & ~(self.cavity.volume_error(found.volume, found.pressure).abs() > CONVERGED)
-
-    def contacts(self, found: Equilibrium) -> Contacts:
-        """Where the membrane bulges in along its normals (section 5.1)."""
-        return self.segmentation.contacts(found.vertices)
 
     def _rest_inverse(self, directions: Tensor) -> Tensor:
         K = self.energy.stiffness_along(self.membrane.rest, directions)
@@ -189,7 +146,7 @@ class MinimumEnergy(nn.Module):
         """What these ranges amount to, and how far they are from a solution."""
         x = (origins + t[..., None, :] * directions).mT
         move, pressure = self._move(t, origins, directions, relaxed)
-        error = move.abs().amax(-1) / self.membrane.rest_area.sum().sqrt()
+        error = move.abs().amax(-1) / self.membrane.size
         return Equilibrium(x, pressure, self.membrane.volume(x), torch.zeros_like(x), error)
 
     def _move(self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -15,22 +15,22 @@ from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
-from ..camera.model import Camera, Rays
+from ..camera.model import Rays
 from ..errors import MembraneError
 from ..mechanics.affine_quadrilateral import AffineQuadrilaterals
-from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..pieces import piece
 from ..solve.grid_system import GridSystem
 from ..solve.kkt import constrained_minimum
 from ..surface.membrane import Membrane
 from ..surface.stencil import inner, pad_border
-from .base import Contacts, Equilibrium, Observation, Problem
+from .base import Equilibrium, Observation
 from .flow import VertexFlow
-from .segmentation import Segmentation, reconstruct_and_segment
+from .segmentation import reconstruct_and_segment
 from .settings import PaperSettings
+from .vertex_rays import VertexRays
 
 OCCUPIED = 1e-3  # weight of a quadrilateral that lies wholly in a contact, where the energy is the free part's
 CONVERGED = 0.01  # move of the contacts in the last round, over the surface's size, of a converged frame
@@ -53,7 +53,7 @@ class QuadraticProgramme(NamedTuple):
     rise: Tensor
 
 
-class PaperEstimator(nn.Module):
+class PaperEstimator(VertexRays):
     """Surface of least harmonic energy on given rays at the linearised volume, and the contacts (eqs. 14-29, section 5.1).
 
     Args:
@@ -71,14 +71,11 @@ class PaperEstimator(nn.Module):
         contacts of the surface found may be two beside it (`examples/press_on_axis.png`: 6 mm to either side).
     """
 
-    finds_tractions: ClassVar[bool] = False
-    takes_start: ClassVar[bool] = False
     element: ClassVar[str] = "quadrilateral"
     volume: ClassVar[str] = "linear"
     Settings: ClassVar[type[PaperSettings]] = PaperSettings
-    rest_range: Tensor
-    rest_load: Tensor
-    free: Tensor
+    settings: PaperSettings
+    energy: AffineQuadrilaterals
 
     def __init__(
         self,
@@ -90,47 +87,15 @@ class PaperEstimator(nn.Module):
         settings: PaperSettings | None = None,
         flow: VertexFlow | None = None,
     ):
-        super().__init__()
-        self.settings = settings = settings or PaperSettings()
-        self.membrane, self.elasticity, self.flow = membrane, elasticity, flow
-        self.energy = AffineQuadrilaterals(membrane, elasticity.tension)
-        self.segmentation = Segmentation(membrane, rest_rays)
-        rest_pressure, rest_load = rest_balance(membrane, self.energy)
-        self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
-        origins, directions = rest_rays
-        self.register_buffer("rest_range", ((membrane.rest - origins) * directions).sum(-1))
-        self.register_buffer("rest_load", rest_load)
-        self.register_buffer("free", (~membrane.fixed).double())
+        energy = AffineQuadrilaterals(membrane, elasticity.tension)
+        super().__init__(membrane, energy, rest_rays, filling, gas, flow)
+        self.settings, self.elasticity = settings or PaperSettings(), elasticity
         self.system = GridSystem(membrane.grid, inner(self.free[:, None], membrane.grid).squeeze(-1) > 0)
-
-    @classmethod
-    def of(cls, problem: Problem, settings: PaperSettings | None = None) -> "PaperEstimator":
-        """The estimator of a sensor."""
-        settings = settings or PaperSettings()
-        rays = problem.camera.pixel_to_ray(problem.vertex_pixels)
-        flow = VertexFlow(problem, settings.flow)
-        return cls(problem.membrane, problem.elasticity, rays, problem.filling, problem.gas, settings, flow)
-
-    @property
-    def flow_kind(self) -> str:
-        """The flow between the markers: "bilinear" or "smooth"."""
-        return self.settings.flow
 
     @property
     def smoothing_weight(self) -> float:
         """The weight of the smoother of eq. 28."""
         return self.settings.smoothing
-
-    @property
-    def rest_pressure(self) -> Tensor:
-        """Pressure difference across the membrane at rest, `[]`."""
-        return self.cavity.rest_pressure
-
-    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor) -> Observation:
-        """The rays of the grid's vertices, moved by the flow of the markers seen at `pixels [B, D, 2]`."""
-        if self.flow is None:
-            raise MembraneError("PaperEstimator.prepare: made without a flow; pass flow, or give forward the vertices' rays")
-        return Observation(*camera.pixel_to_ray(self.flow(pixels, confidence)), confidence)
 
     def forward(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:
         """The surface on the rays of the grid's vertices.
@@ -188,10 +153,6 @@ class PaperEstimator(nn.Module):
     def is_converged(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: in the last round of the loop the contacts stayed."""
         return found.relative_step <= CONVERGED
-
-    def contacts(self, found: Equilibrium) -> Contacts:
-        """Where the membrane bulges in along its normals."""
-        return self.segmentation.contacts(found.vertices)
 
 
 def _corner_values(field: Tensor, grid: tuple[int, int]) -> Tensor:

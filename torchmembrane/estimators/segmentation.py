@@ -111,7 +111,7 @@ class Segmentation(nn.Module):
 
     def __init__(self, membrane: Membrane, rest_rays: Rays | tuple[Tensor, Tensor], count: int = CONTACT_POINTS):
         super().__init__()
-        self.membrane, self.count, self.size = membrane, count, membrane.size
+        self.membrane, self.count = membrane, count
         self.polar = PolarAngle(membrane.rest, membrane.rest_normals, *rest_rays)
         self.register_buffer("rest_directions", rest_rays[1])
         self.register_buffer("axis_region", _axis_region(membrane))
@@ -139,7 +139,7 @@ class Segmentation(nn.Module):
         """By how much points `[B, P, 3]` moved at most, over the surface's size, `[B]`; infinite where one came or went."""
         distance = torch.linalg.vector_norm(after - before, dim=-1).nan_to_num().amax(-1)
         same = (after.isnan() == before.isnan()).flatten(1).all(1)
-        return torch.where(same, distance / self.size, torch.inf)
+        return torch.where(same, distance / self.membrane.size, torch.inf)
 
     @piece
     def in_contact(self, region: Tensor) -> Tensor:
@@ -155,13 +155,13 @@ class Segmentation(nn.Module):
         """Outward share of the angular flow, `[B]`: 1 where every ray turns away from the axis, -1 where all turn to it."""
         turned = torch.linalg.vector_norm(directions - self.rest_directions, dim=-1)
         reach: Tensor = self.polar.range * ~self.membrane.fixed
-        least = LEAST * self.size
+        least = LEAST * self.membrane.size
         outward: Tensor = -(reach * self.polar.change(directions)).sum(-1) / (reach * turned).sum(-1).clamp_min(least)
         return outward
 
     def _regions(self, bulge: Tensor) -> Tensor:
         on_grid = bulge.float().unflatten(-1, self.membrane.grid)  # which of them is higher: single precision tells
-        regions: Tensor = persistent_regions(on_grid, self.count, LEAST * self.size).flatten(1)
+        regions: Tensor = persistent_regions(on_grid, self.count, LEAST * self.membrane.size).flatten(1)
         return regions
 
     def _centroids(self, x: Tensor, region: Tensor, bulge: Tensor) -> Tensor:

@@ -94,8 +94,5 @@ class AffineQuadrilaterals(nn.Module):
 
         `||Q t||^2 = t^T K t`. Dense: for study and tests, the estimator works with its square.
         """
-        V = self.grid[0] * self.grid[1]
-        one = torch.eye(V, dtype=directions.dtype, device=directions.device)
-        moved = one[..., :, None] * directions[..., None, :, :]
-        maps = self.affine_maps(moved) * (self.tension * self.area).sqrt()[..., None, None]
-        return maps.flatten(-4).mT
+        one = torch.eye(self.grid[0] * self.grid[1], dtype=directions.dtype, device=directions.device)
+        return (self.q_blocks(directions) @ corners(one, self.grid)).flatten(-4, -2)

@@ -37,6 +37,7 @@ class Membrane(nn.Module):
         free_vertices: indices of those that are not fixed.
         rest_area: `[V]`, lumped: a third of the triangles around the vertex.
         rest_normals: `[V, 3]`, outward, of length one.
+        size: square root of the rest area, length unit: against it distances on this surface are small or large.
         rest_volume: `[]`, between the rest surface and the camera's centre.
 
     Raises:
@@ -59,6 +60,7 @@ class Membrane(nn.Module):
     rest_area: Tensor
     rest_normals: Tensor
     rest_volume: Tensor
+    size: float
     chord_kernels: Tensor
     chords_beyond_border: Tensor
     xyz_to_yzxzxy: Tensor
@@ -88,6 +90,7 @@ class Membrane(nn.Module):
         self.register_buffer("fixed", torch.from_numpy(fixed.ravel().copy()))
         self.register_buffer("free_vertices", torch.nonzero(~self.fixed).ravel())
         self.register_buffer("rest_area", self.vertex_area(rest))
+        self.size = float(self.rest_area.sum()) ** 0.5
         self.register_buffer("rest_normals", self.normals(rest))
         self.register_buffer("rest_volume", self.volume(rest))
 
@@ -224,12 +227,6 @@ class Membrane(nn.Module):
         rim = self.rest.cpu().double().numpy()[rim_loop(self.grid)]
         fan = np.cross(rim, np.roll(rim, -1, 0)) @ rim.mean(0)
         return float(self.rest_volume) - abs(float(fan.sum())) / 6
-
-    @property
-    def size(self) -> float:
-        """Square root of the rest area: the length against which distances on this surface are small or large."""
-        size: float = float(self.rest_area.sum()) ** 0.5
-        return size
 
     def resampled(self, grid: tuple[int, int]) -> "Membrane":
         """The same rest surface on another grid whose lines are equally spaced along the surface.
