@@ -234,7 +234,8 @@ class Reconstructor(nn.Module):
         status = torch.where(ok & ~self.estimator.is_converged(found), Status.NOT_CONVERGED.value, status)
         status = torch.where(ok & broken, Status.NO_SOLUTION.value, status)
         gone = (status != Status.OK.value) & (status != Status.NOT_CONVERGED.value)
-        contacts = self.estimator.contacts(found)
+        normals = membrane.normals(x)
+        contacts = self.estimator.contacts(found, normals)
 
         def kept(values: Tensor) -> Tensor:
             return torch.where(gone.reshape(-1, *(1,) * (values.ndim - 1)), torch.nan, values)
@@ -242,7 +243,7 @@ class Reconstructor(nn.Module):
         return Reconstruction(
             vertices=kept(x),
             displacement=kept(u),
-            normals=kept(membrane.normals(x)),
+            normals=kept(normals),
             markers=kept(markers),
             pixels=torch.where(lost[..., None], torch.nan, pixels),
             confidence=confidence,

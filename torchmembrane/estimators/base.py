@@ -95,6 +95,6 @@ class Estimator(Protocol):
         """`[B]` bool."""
         ...
 
-    def contacts(self, found: Equilibrium) -> Contacts:
-        """Where something touches."""
+    def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
+        """Where something touches; `normals [B, V, 3]` of the surface found."""
         ...

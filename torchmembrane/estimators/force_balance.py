@@ -251,9 +251,9 @@ class ForceBalance(nn.Module):
         settings = self.settings
         return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
 
-    def contacts(self, found: Equilibrium) -> Contacts:
+    def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes: the indicator of each vertex, and the centroids of the contact patches."""
-        membrane, normals = self.membrane, self.membrane.normals(found.vertices)
+        membrane = self.membrane
         indicator = contact_indicator(found.traction, normals, self.reference)
         inward = (indicator > 0.5) * (-(found.traction * normals).sum(-1)).clamp_min(0) * membrane.rest_area
         return Contacts(indicator, contact_points(found.vertices, membrane.rest, inward, self.size, CONTACT_POINTS))

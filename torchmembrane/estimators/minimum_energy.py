@@ -7,6 +7,7 @@ One unknown for each free vertex, its position `t_k` along its ray, `x_k = o_k +
 from typing import ClassVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..camera.model import Rays
@@ -156,7 +157,7 @@ class MinimumEnergy(VertexRays):
         load = self.rest_pressure * v + ((self.rest_load - self.energy.gradient(x.mT)).mT * directions).sum(-2)
         if self.smooths:
             load = load - self._smoothing_force(t, relaxed)
-        y, g = (torch.stack([load, v], -2) @ self.inverse).unbind(-2)
+        y, g = F.linear(torch.stack([load, v], -2), self.inverse).unbind(-2)
         if self.cavity.filling == "open":
             return y, self.rest_pressure.expand(rise.shape)
         minimum = constrained_minimum(y, g, v, *self.cavity.condition(rise, self.rest_pressure))

@@ -1,8 +1,8 @@
 """Regions around the persistent peaks of a field on the grid, strongest first: batched, without a loop over frames or vertices.
 
-From a peak the field is climbed down by grey-scale reconstruction (Vincent 1993): dilated by eight neighbours and cut off under
-the field, a fixed number of times, what begins as the peak alone becomes the height of the lowest pass on the best path to it.
-A lower peak stands for itself if it is higher than that pass by `PERSISTENCE` of the highest.
+Every vertex lies in the basin of the peak that the steepest way up from it ends on. The lowest height on the best path between
+two peaks, the pass, is the least of those between neighbouring basins on the way. A lower peak stands for itself if it is
+higher than the pass to a higher one by `PERSISTENCE` of the highest (Edelsbrunner, Letscher and Zomorodian 2002).
 """
 
 import torch
@@ -10,8 +10,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 SHARE = 0.5  # of a region's peak: what lies above it, around the peak, is the region
-CANDIDATES = 16  # local maxima that are looked at, the highest
+CANDIDATES = 32  # peaks that are looked at, the highest
 PERSISTENCE = 0.15  # of the highest peak, by which a peak stands above the pass to a higher one, or it is no contact
+DOUBLINGS = 8  # of the way up: at most 256 steps
+AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 
 
 def persistent_regions(height: Tensor, count: int, least: float) -> Tensor:
@@ -29,21 +31,48 @@ def persistent_regions(height: Tensor, count: int, least: float) -> Tensor:
         >>> persistent_regions(torch.tensor([[[0.0, 4, 10, 9, 4, 8, 7, 7.2, 0]]]), 4, 0.5).tolist()
         [[[0, 0, 1, 1, 0, 2, 2, 2, 0]]]
     """
-    m, n = height.shape[1:]
-    vertex = torch.arange(m * n, device=height.device)
-    local = height == _dilated(height)
-    top, place = torch.where(local & (height >= least), height, -torch.inf).flatten(1).topk(min(CANDIDATES, m * n))
-    at_peak = (place[..., None] == vertex) & (top > -torch.inf)[..., None]
-    passes = _passes(at_peak.unflatten(-1, (m, n)), height).flatten(2)
-    between = passes.gather(2, place[:, None].expand(-1, place.shape[1], -1))
+    n, flat = height.shape[2], height.flatten(1)
+    vertex, summit = torch.arange(flat.shape[1], device=height.device), _summits(height)
+    is_peak = (summit == vertex) & (flat >= least)
+    top, place = torch.where(is_peak, flat, -torch.inf).topk(min(CANDIDATES, len(vertex)))
+    numbers = torch.arange(top.shape[1], device=height.device)
+    basin = torch.full_like(summit, len(numbers)).scatter(1, place, numbers.expand_as(place)).gather(1, summit)
+    between = _passes(basin, height, len(numbers))
     top, chosen = _standing_apart(top, between, count)
-    place = place.gather(1, chosen)[..., None]
-    passes = torch.where(top[..., None] > -torch.inf, passes.gather(1, chosen[..., None].expand(-1, -1, m * n)), -torch.inf)
+    place, top = place.gather(1, chosen)[..., None], top[..., None]
+    passes = F.pad(between, (0, 1), value=-torch.inf).gather(1, chosen[..., None].expand(-1, -1, len(numbers) + 1))
+    passes = torch.minimum(passes.gather(2, basin[:, None].expand(-1, count, -1)), flat[:, None])
+    passes = torch.where(top > -torch.inf, passes, -torch.inf)
     distance = (vertex // n - place // n).square() + (vertex % n - place % n).square()
-    nearest = torch.where(passes >= passes.amax(1, keepdim=True), distance, m * m * n * n).argmin(1)
-    peak, connected = top.gather(1, nearest), passes.gather(1, nearest[:, None]).squeeze(1)
-    region = torch.where((connected > SHARE * peak) & (peak > -torch.inf), nearest + 1, 0)
+    nearest = torch.where(passes >= passes.amax(1, keepdim=True), distance, len(vertex) ** 2).min(1, keepdim=True).indices
+    peak, connected = top.squeeze(2).gather(1, nearest.squeeze(1)), passes.gather(1, nearest).squeeze(1)
+    region = torch.where((connected > SHARE * peak) & (peak > -torch.inf), nearest.squeeze(1) + 1, 0)
     return region.reshape(height.shape)
+
+
+def _summits(height: Tensor) -> Tensor:
+    """The vertex that the steepest way up from every vertex ends on, `[B, m n]`; of equal heights the first is the higher."""
+    m, n = height.shape[1:]
+    wide = F.pad(height, (1, 1, 1, 1), value=-torch.inf)
+    around = torch.stack([wide[:, 1 + i : 1 + i + m, 1 + j : 1 + j + n] for i, j in AROUND], 1).flatten(2)
+    steps = torch.tensor([i * n + j for i, j in AROUND], device=height.device)
+    vertex = torch.arange(m * n, device=height.device)
+    up = (vertex + steps[around.max(1).indices]).clamp(0, m * n - 1)
+    for _ in range(DOUBLINGS):
+        up = up.gather(1, up)
+    return up
+
+
+def _passes(basin: Tensor, height: Tensor, count: int) -> Tensor:
+    """The lowest height on the best path between peaks, `[B, K, K]`, from the basins `[B, m n]` numbered up to `K = count`."""
+    flat = height.flatten(1)[:, None]
+    inside = torch.where(basin[:, None] == torch.arange(count, device=basin.device)[:, None], flat, -torch.inf)
+    beside = torch.minimum(_dilated(inside.unflatten(-1, height.shape[1:])).flatten(2), flat)
+    passes = flat.new_full((*inside.shape[:2], count + 1), -torch.inf)
+    passes = passes.scatter_reduce(2, basin[:, None].expand_as(beside), beside, "amax")[..., :count]
+    for _ in range((count - 1).bit_length()):
+        passes = torch.minimum(passes[..., None], passes[:, None]).amax(2)
+    return passes
 
 
 def _standing_apart(top: Tensor, between: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -57,14 +86,6 @@ def _standing_apart(top: Tensor, between: Tensor, count: int) -> tuple[Tensor, T
         to_it = between.gather(1, k[..., None].expand(-1, -1, top.shape[1])).squeeze(1)
         standing = torch.where(standing - to_it >= margin, standing, -torch.inf)
     return torch.cat(heights, 1), torch.cat(chosen, 1)
-
-
-def _passes(peaks: Tensor, height: Tensor) -> Tensor:
-    """The lowest height on the best path from where `peaks [B, K, m, n]` hold to every vertex, `[B, K, m, n]`."""
-    reached = torch.where(peaks, height[:, None], -torch.inf)
-    for _ in range(max(height.shape[1:])):
-        reached = torch.minimum(_dilated(reached), height[:, None])
-    return reached
 
 
 def _dilated(height: Tensor) -> Tensor:

@@ -128,11 +128,7 @@ class Segmentation(nn.Module):
     @piece
     def by_normals(self, x: Tensor) -> ContactRegions:
         """Contacts of a surface `[B, V, 3]`: where it lies inside the rest surface, along the mean of both normals."""
-        membrane = self.membrane
-        normal = torch.nn.functional.normalize(membrane.normals(x) + membrane.rest_normals, dim=-1)
-        bulge = -((x - membrane.rest) * normal).sum(-1)
-        region = self._regions(bulge)
-        return ContactRegions(bulge, region, self._centroids(x, region, bulge.clamp_min(0)))
+        return self._inside(x, self.membrane.normals(x))
 
     @piece
     def moved(self, before: Tensor, after: Tensor) -> Tensor:
@@ -146,9 +142,9 @@ class Segmentation(nn.Module):
         """`[B, V]` bool, from the numbers of regions."""
         return region > 0
 
-    def contacts(self, x: Tensor) -> Contacts:
-        """`by_normals` as results have it: 1 in a contact, else 0."""
-        regions = self.by_normals(x)
+    def contacts(self, x: Tensor, normals: Tensor) -> Contacts:
+        """`by_normals` as results have it, 1 in a contact, else 0; the surface's `normals [B, V, 3]` are at hand."""
+        regions = self._inside(x, normals)
         return Contacts((regions.region > 0).to(x.dtype), regions.points)
 
     def divergence(self, directions: Tensor) -> Tensor:
@@ -158,6 +154,12 @@ class Segmentation(nn.Module):
         least = LEAST * self.membrane.size
         outward: Tensor = -(reach * self.polar.change(directions)).sum(-1) / (reach * turned).sum(-1).clamp_min(least)
         return outward
+
+    def _inside(self, x: Tensor, normals: Tensor) -> ContactRegions:
+        normal = torch.nn.functional.normalize(normals + self.membrane.rest_normals, dim=-1)
+        bulge = -((x - self.membrane.rest) * normal).sum(-1)
+        region = self._regions(bulge)
+        return ContactRegions(bulge, region, self._centroids(x, region, bulge.clamp_min(0)))
 
     def _regions(self, bulge: Tensor) -> Tensor:
         on_grid = bulge.float().unflatten(-1, self.membrane.grid)  # which of them is higher: single precision tells

@@ -84,6 +84,6 @@ class VertexRays(nn.Module):
             )
         return Observation(*camera.pixel_to_ray(self.flow(pixels, confidence)), confidence)
 
-    def contacts(self, found: Equilibrium) -> Contacts:
-        """Where the membrane bulges in along its normals (section 5.1)."""
-        return self.segmentation.contacts(found.vertices)
+    def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
+        """Where the membrane bulges in along its `normals [B, V, 3]` (section 5.1)."""
+        return self.segmentation.contacts(found.vertices, normals)
