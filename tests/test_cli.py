@@ -20,6 +20,7 @@ from torchmembrane.cli import main as cli
 from torchmembrane.errors import MembraneError
 from torchmembrane.estimators import settings
 from torchmembrane.io import store
+from torchmembrane.markers import placement
 from torchmembrane.mechanics import hyperelastic
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.sensor import Sensor
@@ -72,16 +73,16 @@ def test_reconstruct_examples_end_to_end(tmp_path, capsys):
 
 
 def test_options_reach_the_reconstructor(monkeypatch, tmp_path, capsys):
-    def refuse(sensor, estimator, *, settings, model):
-        raise MembraneError(f"{sensor.name} {estimator} {model} {getattr(settings, 'element', None)}")
+    def refuse(sensor, estimator, *, settings, model, locator):
+        raise MembraneError(f"{sensor.name} {estimator} {model} {getattr(settings, 'element', None)} {locator}")
 
     monkeypatch.setattr("torchmembrane.cli.build.Reconstructor", refuse)
     call = ("reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")
-    assert "nh130 force-balance None None" in run(capsys, *call)[2]
-    options = ("--energy", "harmonic", "--element", "quadrilateral")
+    assert "nh130 force-balance None None fit" in run(capsys, *call)[2]
+    options = ("--locator", "soft", "--energy", "harmonic", "--element", "quadrilateral")
     assert "--element quadrilateral: force-balance has no such choice" in run(capsys, *call, *options)[2]
     least = ("--estimator", "minimum-energy", *options)
-    assert "nh130 minimum-energy harmonic quadrilateral" in run(capsys, *call, *least)[2]
+    assert "nh130 minimum-energy harmonic quadrilateral soft" in run(capsys, *call, *least)[2]
 
 
 def test_some_frames_failed_gives_1_and_says_which(built_once, tmp_path, capsys):
@@ -228,7 +229,8 @@ def test_help_loads_nothing_heavy(arguments):
 def test_the_options_choices_are_what_the_package_has():
     assert choices.ESTIMATORS == tuple(reconstruct.ESTIMATORS) and choices.ENERGIES == hyperelastic.MODELS
     assert (choices.ELEMENTS, choices.VOLUMES, choices.FLOWS) == (settings.ELEMENTS, settings.VOLUMES, settings.FLOWS)
-    assert choices.RESULT_FORMATS == store.FORMATS  # and choices.RESULT_FORMATS == store.FORMATS
+    assert choices.RESULT_FORMATS == store.FORMATS
+    assert choices.LOCATORS == placement.LOCATORS
     assert choices.PRESETS == presets.NAMES and choices.INDENTERS == dataset.KINDS and choices.LEGS == simulator.LEGS
     assert choices.SIMULATION_FORMATS == frames.FORMATS and choices.PORTS == camera.PORTS
     assert (choices.HIGHLIGHT, choices.BLUR) == (appearance.Appearance.highlight, appearance.Appearance.blur)

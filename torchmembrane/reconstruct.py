@@ -20,7 +20,7 @@ from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
 from .io.status import Status
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
-from .markers.placement import place_markers
+from .markers.placement import LOCATORS, place_markers
 from .pieces import piece
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
@@ -51,9 +51,11 @@ class Reconstructor(nn.Module):
         model: the elastic energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin".
         channels: order of the channels of colour images, "rgb" or "bgr".
         dtype: torch.float32 or torch.float64.
+        locator: how markers are found in images: "fit", by least squares, or "soft", by soft-argmax of responses.
 
     Raises:
-        MembraneError: an unknown estimator, settings of another one, a sensor that cannot see its membrane or its markers.
+        MembraneError: an unknown estimator or locator, settings of another one, a sensor that cannot see its membrane or
+            its markers.
 
     Example:
         >>> reconstructor = Reconstructor.from_file("examples/sensor.toml")
@@ -76,10 +78,13 @@ class Reconstructor(nn.Module):
         model: str | None = None,
         channels: Channels = "rgb",
         dtype: torch.dtype = torch.float32,
+        locator: str = LOCATORS[0],
     ):
         super().__init__()
         if estimator not in ESTIMATORS:
             raise MembraneError(f"Reconstructor: estimator = {estimator!r}; expected one of {', '.join(ESTIMATORS)}")
+        if locator not in LOCATORS:
+            raise MembraneError(f"Reconstructor: locator = {locator!r}; expected one of {', '.join(LOCATORS)}")
         if channels not in CHANNELS:
             raise MembraneError(f"Reconstructor: channels = {channels!r}; expected 'rgb' or 'bgr'")
         if dtype not in PRECISIONS:
@@ -92,7 +97,7 @@ class Reconstructor(nn.Module):
             raise MembraneError(
                 f"sensor {sensor.name!r}: parts of the rest surface cannot be imaged by its camera; check the poses"
             )
-        markers, cavity = place_markers(sensor, vertex_pixels), cavity_filling(sensor, membrane, warn=True)
+        markers, cavity = place_markers(sensor, vertex_pixels, locator), cavity_filling(sensor, membrane, warn=True)
         positions, model_pixels = torch.from_numpy(markers.positions), torch.from_numpy(markers.model_pixels)
         rim_pixels, rest_image = vertex_pixels[membrane.fixed].numpy(), sensor.markers.rest_image
         self.observer = MarkerObserver(markers, rim_pixels, sensor.name, dtype, rest_image)

@@ -5,7 +5,7 @@ from argparse import Action, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-from .choices import ELEMENTS, ENERGIES, ESTIMATORS, FLOWS, VOLUMES
+from .choices import ELEMENTS, ENERGIES, ESTIMATORS, FLOWS, LOCATORS, VOLUMES
 
 Add: TypeAlias = Callable[..., Action]
 """A parser's `add_argument`."""
@@ -44,7 +44,7 @@ def add_sensor(add: Add) -> None:
 
 
 def add_estimator(add: Add, element: str) -> None:
-    """How the surface is found; `element` is the help of --element."""
+    """How markers and the surface are found; `element` is the help of --element."""
     add("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="how the surface is found (default: %(default)s)")
     add("--energy", choices=ENERGIES, help="the membrane's elastic energy (default: the sensor file's)")
     add("--element", choices=ELEMENTS, help=element)
@@ -52,6 +52,8 @@ def add_estimator(add: Add, element: str) -> None:
     add("--flow", choices=FLOWS, help="between the markers; minimum-energy: smooth (default), paper: bilinear (default)")
     weight = "weight of the smoother (eq. 28; default: 0.1 for quadrilaterals and paper, else 0)"
     add("--smoothing", metavar="S", type=not_negative, help=weight)
+    how = "how markers are found: least-squares fit, or soft-argmax (default: %(default)s)"
+    add("--locator", choices=LOCATORS, default=LOCATORS[0], help=how)
 
 
 def positive(text: str) -> float:

@@ -11,7 +11,7 @@ OPTIONS = ("element", "volume", "flow", "smoothing")
 
 
 def build_reconstructor(sensor: Sensor, arguments: Namespace) -> Reconstructor:
-    """The reconstructor of `--estimator`, `--energy`, `--element`, `--volume`, `--flow` and `--smoothing`.
+    """The reconstructor of `--estimator`, `--energy`, `--element`, `--volume`, `--flow`, `--smoothing` and `--locator`.
 
     Raises:
         MembraneError: an option that the estimator does not have.
@@ -24,4 +24,5 @@ def build_reconstructor(sensor: Sensor, arguments: Namespace) -> Reconstructor:
             f"--{foreign[0]} {given[foreign[0]]}: {arguments.estimator} has no such choice; leave it out, or pass "
             "--estimator minimum-energy"
         )
-    return Reconstructor(sensor, arguments.estimator, settings=kind(**given), model=arguments.energy)
+    options: Any = {"settings": kind(**given), "model": arguments.energy, "locator": arguments.locator}
+    return Reconstructor(sensor, arguments.estimator, **options)

@@ -4,6 +4,7 @@ A test holds every one of them to what the package itself has.
 """
 
 ESTIMATORS = ("force-balance", "minimum-energy", "paper")
+LOCATORS = ("fit", "soft")
 ENERGIES = ("harmonic", "neo_hookean", "mooney_rivlin")
 ELEMENTS = ("triangle", "quadrilateral")
 VOLUMES = ("exact", "linear")

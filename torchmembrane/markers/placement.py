@@ -1,5 +1,6 @@
 """Markers on the rest surface, and what locates them in an image: built once for a sensor."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from .locator import Locator
 from .texture.locator import TextureLocator
 from .texture.patches import choose_patches
 
+LOCATORS = ("fit", "soft")
 FEWEST_MARKERS = 8
 SMOOTH_GRID = 33
 """Vertices per side of the surface on which markers are placed: the solver's facets are too coarse for oblique rays."""
@@ -42,36 +44,49 @@ class PlacedMarkers:
     locator: Locator
 
 
-def place_markers(sensor: Sensor, vertex_pixels: Tensor) -> PlacedMarkers:
+def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS[0]) -> PlacedMarkers:
     """Place the sensor's markers: listed dots, dots found in the rest image, or texture patches chosen there.
 
     Args:
         sensor: with a list of dots or a rest image.
         vertex_pixels: rest pixels `[V, 2]` of the grid's vertices.
+        locator: how they are found in images: "fit", by least squares, or "soft", by soft-argmax of responses.
 
     Raises:
-        MembraneError: too few markers are found.
+        MembraneError: an unknown locator, or too few markers are found.
     """
+    of_dots, of_texture = _locators(locator)
     anchors = vertex_pixels[sensor.membrane.fixed].numpy()
     markers, (width, height) = sensor.markers, sensor.camera.image_size
-    locator: Locator
+    built: Locator
     if markers.kind == "dots" and markers.positions is not None:
         positions = np.asarray(markers.positions, dtype=float)
         pattern = _listed_pattern(sensor, positions)
-        locator = DotLocator(pattern, (width, height), markers.polarity, anchors)
+        built = of_dots(pattern, (width, height), markers.polarity, anchors)
     else:
         image, mask = markers.rest_image, rim_mask(sensor, vertex_pixels)
         assert image is not None  # or `Markers` has refused it
         if markers.kind == "texture":
             patches = choose_patches(image, mask)
             positions, placed = _place_on_surface(sensor, patches)
-            locator = TextureLocator(image, patches[placed], anchors)
+            built = of_texture(image, patches[placed], anchors)
         else:
             pattern = find_dots(image, markers.polarity, mask)
             positions, placed = _place_on_surface(sensor, pattern.pixels)
             pattern = DotPattern(*(field[placed] for field in pattern))
-            locator = DotLocator(pattern, (width, height), markers.polarity, anchors)
-    return PlacedMarkers(positions, _model_pixels(sensor, positions), sensor.membrane.closest_points(positions), locator)
+            built = of_dots(pattern, (width, height), markers.polarity, anchors)
+    return PlacedMarkers(positions, _model_pixels(sensor, positions), sensor.membrane.closest_points(positions), built)
+
+
+def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]]:
+    """What locates dots and what locates texture."""
+    if name == "fit":
+        return DotLocator, TextureLocator
+    if name == "soft":
+        from .soft import SoftLocator, SoftTextureLocator  # here: kornia takes half a second to load
+
+        return SoftLocator, SoftTextureLocator
+    raise MembraneError(f"place_markers: locator = {name!r}; expected one of {', '.join(LOCATORS)}")
 
 
 def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:

@@ -1,0 +1,198 @@
+"""Dots located softly: large ones coarse to fine, small ones where the large ones predict them."""
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from ...errors import MembraneError
+from ...pieces import piece
+from ..dots.ellipse import draw_dots, log_radii
+from ..dots.flow import FlowAverages
+from ..dots.locator import membrane_mask
+from ..dots.pattern import DotPattern
+from ..neighbourhood import NeighbourFlow, Neighbourhood
+from ..spacing import spacing, thin_out
+from .response import pyramid
+from .search import WIDTH, DotGrowth, DotSearch, Found, predict
+
+NEAR = 1.2  # radii, what a dot found on the coarse level is off at most
+
+MIDDLE = 0.5  # grey of which the logarithm is taken for 0
+DARKEST = 0.15  # of it, what the darkest has at least: noise in the dark weighs no more than that
+REFINEMENTS = 2  # soft-argmaxes on the finest level
+FAINTEST = 0.2  # of a drawn dot's contrast, of a dot that is half believed
+FAINTER = 0.45  # of the mean contrast of the frame's clearer half
+UNLED = 0.4  # share of the large dots around a small one that are found, where it is half believed
+DEVIATION = 0.12  # of the distance to the nearest dot, what is expected between a flow and its neighbours'
+FEWEST = 0.2  # mean confidence of a frame that is half trusted
+LOST = 0.05  # confidence below which a dot is lost
+
+
+class SoftLocator(nn.Module):
+    """Pixels of dots of one size or two by soft-argmax: every step is a smooth function of the image.
+
+    Large dots are grown from the rim inwards on a coarse level, small ones looked for where the large ones around predict
+    them (the paper's multi-scale matching, section 5); then all are refined on a fine level. A dot's weight in a window is
+    a power of its response, a difference of Gaussians at its scale (`search.FINE`: a fixed temperature).
+
+    Args:
+        pattern: the markers in the rest image.
+        image_size: width, height.
+        polarity: "dark" or "light".
+        anchors: pixels `[A, 2]` of the rim, where nothing moves; without them dots are looked for about where they rest.
+
+    Attributes:
+        follows: True; the growth may start from the dots of the frame before.
+
+    Raises:
+        MembraneError: another polarity, fewer than 6 dots, or dots that are not finite.
+
+    Limitations:
+        The error is about 1.7 times that of `DotLocator`, whose ellipses follow the dots' outline; elongated dots near the
+        rim are worst. Where the flow is more than about the spacing of neighbouring dots, or turns or shrinks fast, regions
+        are found one spacing off and believed: `DotLocator` loses most of these. A frame before that is one spacing off is
+        followed. Large dots that are hidden cost the small ones between them.
+
+    Example:
+        >>> rest = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)
+        >>> pattern = DotPattern(rest, np.tile(4.0 * np.eye(2), (12, 1, 1)), np.ones(12, int))
+        >>> image = draw_dots(rest + [2.5, -1.5], pattern.shapes, (100, 80)).float()
+        >>> pixels, confidence = SoftLocator(pattern, (100, 80), "dark")(image)
+        >>> (pixels[0] - torch.tensor(rest)).mean(0).round(decimals=1).tolist(), bool(confidence.min() > 0.9)
+        ([2.5, -1.5], True)
+    """
+
+    follows = True
+    rest: Tensor
+    inside: Tensor
+    large: Tensor
+    small: Tensor
+    order: Tensor
+    lead: Tensor
+    led_by_rim: Tensor
+    is_small: Tensor
+    tolerance: Tensor
+
+    def __init__(self, pattern: DotPattern, image_size: tuple[int, int], polarity: str, anchors: np.ndarray | None = None):
+        super().__init__()
+        if polarity not in ("dark", "light"):
+            raise MembraneError(f'SoftLocator: polarity is {polarity!r}, expected "dark" or "light"')
+        pixels, shapes, sizes = (np.asarray(field) for field in pattern)
+        if len(pixels) < 6 or not (np.isfinite(pixels).all() and np.isfinite(shapes).all()):
+            raise MembraneError(
+                f"SoftLocator: {len(pixels)} dots, {int(np.isnan(pixels).any(1).sum())} of them NaN, expected at least "
+                "6, all finite; leave out dots that are not visible in the rest image"
+            )
+        anchors = np.zeros((0, 2)) if anchors is None else np.asarray(anchors, float)
+        self.polarity = polarity
+        inside = membrane_mask(pixels, anchors if len(anchors) else None, image_size)
+        radii, largest = np.exp(log_radii(shapes)), sizes == sizes.max()
+        others = _other_radii(pixels, radii, largest)
+        nearest, mean = spacing(pixels)
+        large, small = np.flatnonzero(largest), np.flatnonzero(~largest)
+        self.growth = DotGrowth(pixels[large], radii[large], others[large], anchors, inside)
+        self.by_large = DotSearch(radii[small], others[small], 1, 0.2 * nearest[small], inside) if len(small) else None
+        self.refine = DotSearch(radii, others, 0, NEAR * radii, inside)
+        nodes = np.concatenate([pixels, thin_out(anchors, 0.7 * float(np.median(mean)))])
+        self.averages = FlowAverages(pixels, nodes, WIDTH)
+        self.neighbourhood = Neighbourhood(pixels, nodes[len(pixels) :])
+        lead = self.averages.kernel[np.append(largest, np.ones(len(nodes) - len(pixels), bool))]
+        lead, of_rim = np.split(lead / lead.sum(0), [len(large)])
+        self.register_buffer("rest", torch.as_tensor(np.asarray(pixels, float)))
+        self.register_buffer("inside", inside)
+        self.register_buffer("large", torch.as_tensor(large))
+        self.register_buffer("small", torch.as_tensor(small))
+        self.register_buffer("order", torch.as_tensor(np.argsort(np.concatenate([large, small]))))
+        self.register_buffer("lead", torch.as_tensor(lead))
+        self.register_buffer("led_by_rim", torch.as_tensor(of_rim.sum(0)))
+        self.register_buffer("is_small", torch.as_tensor(~largest))
+        self.register_buffer("tolerance", torch.as_tensor(DEVIATION * nearest)[:, None])
+        self._calibrate(draw_dots(pixels, shapes, image_size))
+        self.float()
+
+    def _calibrate(self, drawn: Tensor) -> None:
+        """Take the drawn pattern `[1, 1, H, W]` for what sure dots look like."""
+        self.double()
+        levels = self.levels(drawn)
+        self.growth.search.calibrate(levels, self.growth.pixels)
+        if self.by_large is not None:
+            self.by_large.calibrate(levels, self.rest[self.small])
+        self.refine.calibrate(levels, self.rest)
+
+    @piece
+    def forward(self, image: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Locate the dots in a batch of frames.
+
+        Args:
+            image: `[B, 1, H, W]`, grey in 0..1.
+            previous: pixels `[B, D, 2]` in the frames before, NaN where lost, from which the growth starts; without it
+                from the rim.
+
+        Returns:
+            Pixels `[B, D, 2]` and confidence `[B, D]` in 0..1; a lost dot has confidence 0 and the pixel that its neighbours
+            predict. A frame that holds a value that is not finite has confidence 0 throughout.
+        """
+        finite = image.isfinite()
+        dark = torch.where(finite, 1 - image if self.polarity == "light" else image, 0.0)
+        levels = self.levels(dark)
+        place, weight = self.growth(levels, None if previous is None else previous[:, self.large])
+        if self.by_large is not None:
+            place = self.join(place, self.find_small(levels, self.predict_small(place, weight)).place)
+        found = self.fit(levels, place)
+        return self.judge(levels, found, finite.flatten(1).all(1))
+
+    def levels(self, dark: Tensor) -> list[Tensor]:
+        """Pyramid of the logarithm of images `[B, 1, H, W]`, in which uneven light only adds; zero off the membrane."""
+        return pyramid((dark.clamp(0, 1) / MIDDLE + DARKEST).log() * self.inside)
+
+    def join(self, large: Tensor, small: Tensor) -> Tensor:
+        """Values of all dots in the pattern's order, from those of the large and of the small ones `[B, ...]`."""
+        return torch.cat([large, small], 1)[:, self.order]
+
+    def predict_small(self, place: Tensor, weight: Tensor) -> Tensor:
+        """Where the large dots at `place [B, L, 2]` px, of `weight [B, L]`, predict the small ones: `[B, S, 2]` px."""
+        none = self.rest[self.small].expand(place.shape[0], -1, -1)
+        flow, weight = self.join(place, none) - self.rest, self.join(weight, torch.zeros_like(none[..., 0]))
+        gradient = torch.zeros_like(flow)[..., None].expand(-1, -1, -1, 2)
+        for _ in range(2):  # the first draws the gradient to zero
+            predicted, gradient, _ = predict(self.averages, weight, flow, gradient)
+        return (self.rest + predicted)[:, self.small]
+
+    def find_small(self, levels: list[Tensor], predicted: Tensor) -> Found:
+        """The small dots about `predicted [B, S, 2]` px, on a coarse level."""
+        assert self.by_large is not None
+        return self.by_large(self.by_large.response.maps(levels), predicted)
+
+    def fit(self, levels: list[Tensor], place: Tensor) -> Found:
+        """All dots about `place [B, D, 2]` px on the finest level that suits them, windows moving with them."""
+        maps = self.refine.response.maps(levels)
+        for _ in range(REFINEMENTS):
+            found = self.refine(maps, place)
+            place = found.place
+        return found
+
+    def judge(self, levels: list[Tensor], found: Found, usable: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels and confidence, as `forward` returns them; `usable [B]` says which frames are."""
+        level = found.response.topk(found.response.shape[1] // 2, 1).values.mean(1, keepdim=True)
+        alike = torch.sigmoid(20 * (found.response / (level + 1e-3) - FAINTER))
+        clear = torch.sigmoid(30 * (found.response - FAINTEST)) * alike
+        quality, flow = clear * found.sharpness, found.place - self.rest
+        local: NeighbourFlow = self.neighbourhood(flow, quality, self.tolerance)
+        confidence = quality * local.trust(flow)
+        if self.by_large is not None:
+            led = torch.sigmoid(20 * (confidence[:, self.large] @ self.lead + self.led_by_rim - UNLED))
+            confidence = confidence * torch.where(self.is_small, led, 1.0)
+        confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST)) * usable[:, None]
+        confidence = ((confidence - LOST) / (1 - LOST)).relu()
+        return torch.where(confidence[..., None] > 0, found.place, self.rest + local.flow), confidence
+
+
+def _other_radii(pixels: np.ndarray, radii: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Radii `[D]` that dots of the other size have near each dot, px; NaN where there is one size only."""
+    others = np.full(len(pixels), np.nan)
+    for of in (True, False) if not largest.all() else ():
+        other = np.flatnonzero(largest != of)
+        near = cKDTree(pixels[other]).query(pixels[largest == of], k=[1, 2, 3, 4][: len(other)])[1]
+        others[largest == of] = np.exp(np.log(radii[other])[near].mean(1))
+    return others

@@ -1,0 +1,152 @@
+"""Dots searched for by soft-argmax about their predictions, and grown inwards from the rim."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..dots.flow import FlowAverages
+from ..spacing import spacing, thin_out
+from .argmax import Peak, window_peak
+from .response import DotResponse
+
+COARSE, FINE = (
+    0.25,
+    0.3,
+)  # temperatures of the softmax, of the logarithm of the response: weights are its tenth power, whatever the contrast
+WINDOW = 2.0  # half side of a window, standard deviations of the prediction
+FLOOR = 0.01  # of a drawn dot's response: what is weaker is no peak
+BLUNT = 2.5  # times its spread at rest, of a peak that is half believed
+WIDTH = 1.0  # of the averages that predict, pitches
+UNSUPPORTED = 0.8  # sure nodes, weighted by distance, of a prediction that is half believed
+PER_RING = 2  # steps in which the growth gains a ring: the second settles the flow from which the next is predicted
+SETTLING = 3  # steps after the growth has reached every dot
+FAINT = 0.05  # of a drawn dot's response, of a peak that is half believed in the growth
+
+
+class Found(NamedTuple):
+    """Dots as found: `place [B, D, 2]` px, `response [B, D]` over a drawn dot's, `sharpness [B, D]` of the peak in 0..1."""
+
+    place: Tensor
+    response: Tensor
+    sharpness: Tensor
+
+
+class DotSearch(nn.Module):
+    """Soft-argmax of the dots' responses in windows about where they are predicted, on one level of the pyramid each.
+
+    Args:
+        radii: of the dots `[D]`, px.
+        others: radii that dots of the other size have there `[D]`, px, or NaN.
+        coarser: how many levels of the pyramid above the finest that suits a dot.
+        error: standard deviation of the predictions `[D]`, px.
+        inside: `[1, 1, H, W]`, 1 where the membrane is, else 0.
+
+    Attributes:
+        response: the responses, and windows of them.
+    """
+
+    error: Tensor
+    strength: Tensor
+    spread: Tensor
+
+    def __init__(self, radii: np.ndarray, others: np.ndarray, coarser: int, error: np.ndarray, inside: Tensor):
+        super().__init__()
+        self.temperature = COARSE if coarser else FINE
+        self.response = DotResponse(radii, others, coarser, WINDOW * error, inside)
+        self.register_buffer("error", torch.as_tensor(error))
+        self.register_buffer("strength", torch.ones(len(radii), dtype=torch.float64))
+        self.register_buffer("spread", torch.ones(len(radii), dtype=torch.float64))
+
+    def calibrate(self, levels: list[Tensor], pixels: Tensor) -> None:
+        """Take a drawn pattern's responses, levels of its image, as those of sure dots `pixels [D, 2]`."""
+        for _ in range(2):  # the floor is relative to the strength
+            peak = self._peak(self.response.maps(levels), pixels[None])
+            self.strength, self.spread = peak.strength[0].clamp_min(1e-3), peak.spread[0]
+
+    def forward(self, maps: list[Tensor], predicted: Tensor) -> Found:
+        """The dots about `predicted [B, D, 2]` px, from the responses on each level."""
+        peak = self._peak(maps, predicted)
+        sharpness = torch.sigmoid(4 * (BLUNT - peak.spread / self.spread))
+        return Found(peak.place, (peak.strength / self.strength).relu(), sharpness)
+
+    def _peak(self, maps: list[Tensor], predicted: Tensor) -> Peak:
+        value, middle = self.response.windows(maps, predicted)
+        score = ((value / self.strength[:, None, None]).relu() + FLOOR).log()
+        return window_peak(score, value, middle, self.response.stride, predicted, self.error, self.temperature)
+
+
+class DotGrowth(nn.Module):
+    """Dots of one size found one ring after another from the rim inwards, along the smooth flow.
+
+    Each step predicts every dot from the sure ones around it (locally affine, the rim at rest) and looks for it there.
+    Without anchors all are predicted at rest to begin with.
+
+    Args:
+        pixels: centres `[D, 2]` of the dots at rest, px.
+        radii: `[D]`, px.
+        others: radii that dots of the other size have there `[D]`, px, or NaN.
+        anchors: pixels `[A, 2]` on the rim, where nothing moves; none at all is `[0, 2]`.
+        inside: `[1, 1, H, W]`, 1 where the membrane is, else 0.
+    """
+
+    pixels: Tensor
+    known: Tensor
+
+    def __init__(self, pixels: np.ndarray, radii: np.ndarray, others: np.ndarray, anchors: np.ndarray, inside: Tensor):
+        super().__init__()
+        nearest, mean = spacing(pixels)
+        anchors = thin_out(anchors, 0.7 * float(np.median(mean)))
+        self.search = DotSearch(radii, others, 1, 0.3 * nearest, inside)
+        self.averages = FlowAverages(pixels, np.concatenate([pixels, anchors]), WIDTH)
+        known = np.full(len(pixels), 0.0 if len(anchors) else 1.0)
+        self.steps = PER_RING * self.averages.rings(np.append(known, np.ones(len(anchors)))[None]) + SETTLING
+        self.register_buffer("pixels", torch.as_tensor(pixels))
+        self.register_buffer("known", torch.as_tensor(known))
+
+    def forward(self, levels: list[Tensor], previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Find the dots.
+
+        Args:
+            levels: of the image's pyramid, dots dark.
+            previous: pixels `[B, D, 2]` in the frames before, NaN where lost, to start from.
+
+        Returns:
+            Pixels `[B, D, 2]` and weight `[B, D]` in 0..1.
+        """
+        maps, batch = self.search.response.maps(levels), levels[0].shape[0]
+        weight = self.known.expand(batch, -1)
+        flow = torch.zeros_like(self.pixels).expand(batch, -1, -1)
+        if previous is not None:
+            kept = previous.isfinite().all(-1)
+            flow = torch.where(kept[..., None], previous - self.pixels, 0.0)
+            weight = torch.where(kept, 1.0, weight)
+        gradient = torch.zeros_like(flow)[..., None].expand(-1, -1, -1, 2)
+        for _ in range(self.steps):
+            weight, flow, gradient = self.step(maps, weight, flow, gradient)
+        return self.pixels + flow, weight
+
+    def step(self, maps: list[Tensor], weight: Tensor, flow: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """One step of the growth: weight `[B, D]`, flow `[B, D, 2]` and its gradient `[B, D, 2, 2]` after it."""
+        predicted, gradient, support = predict(self.averages, weight, flow, gradient)
+        found = self.search(maps, self.pixels + predicted)
+        believed = torch.sigmoid(10 * (support - UNSUPPORTED)) * found.response / (found.response + FAINT)
+        return believed * found.sharpness, found.place - self.pixels, gradient
+
+
+def predict(averages: FlowAverages, weight: Tensor, flow: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The flow that the sure dots around each predict, by a weighted affine least-squares fit in closed form.
+
+    Args:
+        averages: over the dots and anchors.
+        weight: `[B, D]` in 0..1.
+        flow: `[B, D, 2]`, px.
+        gradient: `[B, D, 2, 2]`, to which the fit is drawn where the dots around do not fix it.
+
+    Returns:
+        Flow `[B, D, 2]` px, gradient `[B, D, 2, 2]` and support `[B, D]`: the sure nodes around, weighted by distance.
+    """
+    gradient = averages.gradient(weight, flow.mT, gradient.movedim(1, -1))
+    predicted, support = averages.along(weight, flow.mT, gradient)
+    return predicted.mT, gradient.movedim(-1, 1), support
