@@ -106,6 +106,7 @@ class Segmentation(nn.Module):
         Contacts closer than about a fifth of the surface's size are one.
     """
 
+    rest_origins: Tensor
     rest_directions: Tensor
     axis_region: Tensor
 
@@ -113,6 +114,7 @@ class Segmentation(nn.Module):
         super().__init__()
         self.membrane, self.count = membrane, count
         self.polar = PolarAngle(membrane.rest, membrane.rest_normals, *rest_rays)
+        self.register_buffer("rest_origins", rest_rays[0])
         self.register_buffer("rest_directions", rest_rays[1])
         self.register_buffer("axis_region", _axis_region(membrane))
 
@@ -120,14 +122,14 @@ class Segmentation(nn.Module):
     def by_polar_angle(self, directions: Tensor) -> ContactRegions:
         """Eq. 29 alone: contacts on the rest surface, for rays `[B, V, 3]`."""
         bulge = self.polar.bulge(directions) * ~self.membrane.fixed
-        divergent = (self.divergence(directions) > DIVERGENT)[:, None] & (self.axis_region > 0).any()
-        region = torch.where(divergent, self.axis_region, self._regions(bulge))
-        weight = torch.where(divergent, torch.ones_like(bulge), bulge.clamp_min(0))
-        return ContactRegions(bulge, region, self._centroids(self.membrane.rest.expand(len(bulge), -1, -1), region, weight))
+        return self._where(self.membrane.rest.expand(len(bulge), -1, -1), bulge, directions)
 
     @piece
     def by_normals(self, x: Tensor) -> ContactRegions:
-        """Contacts of a surface `[B, V, 3]`: where it lies inside the rest surface, along the mean of both normals."""
+        """Contacts of a surface `[B, V, 3]`: where it lies inside the rest surface, along the mean of both normals.
+
+        Or the axis, where its rays all turn outwards: a dent there is hidden from a camera that looks along the normals.
+        """
         return self._inside(x, self.membrane.normals(x))
 
     @piece
@@ -158,8 +160,14 @@ class Segmentation(nn.Module):
     def _inside(self, x: Tensor, normals: Tensor) -> ContactRegions:
         normal = torch.nn.functional.normalize(normals + self.membrane.rest_normals, dim=-1)
         bulge = -((x - self.membrane.rest) * normal).sum(-1)
-        region = self._regions(bulge)
-        return ContactRegions(bulge, region, self._centroids(x, region, bulge.clamp_min(0)))
+        return self._where(x, bulge, torch.nn.functional.normalize(x - self.rest_origins, dim=-1))
+
+    def _where(self, x: Tensor, bulge: Tensor, directions: Tensor) -> ContactRegions:
+        """The regions of `bulge [B, V]` on `x [B, V, 3]`, or where the flow diverges everywhere the axis'."""
+        divergent = (self.divergence(directions) > DIVERGENT)[:, None] & (self.axis_region > 0).any()
+        region = torch.where(divergent, self.axis_region, self._regions(bulge))
+        weight = torch.where(divergent, torch.ones_like(bulge), bulge.clamp_min(0))
+        return ContactRegions(bulge, region, self._centroids(x, region, weight))
 
     def _regions(self, bulge: Tensor) -> Tensor:
         on_grid = bulge.float().unflatten(-1, self.membrane.grid)  # which of them is higher: single precision tells

@@ -18,11 +18,13 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten, tree_leaves, tree_map, tree_unflatten
 
 from ..errors import MembraneError
+from ..io.atomic import whole_file
 from ..io.results import Reconstruction
 from ..io.status import Status
 from ..io.store import FORMATS, Mesh, Settings
 from ..pieces import Value
 from ..reconstruct import Reconstructor
+from .check import checked
 from .graph import Assembly, described, traced
 
 FORMAT = 1
@@ -114,7 +116,12 @@ class Tracer:
         key = (owner, function, str(structure), *fixed.items(), *(value.shape for value in examples.values()))
         if key not in self.traced:
             outputs = [f"output {k}" for k, _ in enumerate(tree_leaves(found))]
-            self.traced[key] = traced(Piece(owner, function, arranged), examples, outputs)
+            try:
+                self.traced[key] = traced(Piece(owner, function, arranged), examples, outputs)
+            except Exception as error:  # of torch's exporter and of what it calls, which raise what they like
+                reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+                name = getattr(function, "__qualname__", str(function))
+                raise MembraneError(f"export: {name} cannot be written as ONNX: {reason.strip()}") from error
         return self.traced[key], names, found
 
     def _known(self, found: Any, names: dict[str, str]) -> Any:
@@ -128,9 +135,10 @@ def _everywhere(_: None, done: Tensor) -> Tensor:
 
 
 def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = False) -> onnx.ModelProto:
-    """Write the whole reconstruction, image to result, as one ONNX model.
+    """Write the whole reconstruction, image to result, as one ONNX model, if it agrees with torch.
 
-    Standard operators only, float32, batch free. The model's metadata hold `format`, `status_texts` and `mesh` (the fields of
+    Standard operators only, float32, batch free. Run on the sensor at rest and pressed, both simulated, it must give torch's
+    statuses, and vertices within 3e-5 of the surface's size. The model's metadata hold `format`, `status_texts` and `mesh` (the fields of
     `Mesh`) as JSON.
 
     Args:
@@ -144,12 +152,15 @@ def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = F
         Outputs as `Reconstruction`.
 
     Raises:
-        MembraneError: tracking with an estimator that starts from rest always.
+        MembraneError: tracking with an estimator that starts from rest always, a reconstructor of another precision than
+            float32, or one that cannot be written, or is not the same when it is.
     """
     if tracking and not reconstructor.estimator.takes_start:
         raise MembraneError(
             f"export: {reconstructor.estimator_name} starts from rest always; expected force-balance for tracking"
         )
+    if reconstructor.rest_pixels.dtype != torch.float32:
+        raise MembraneError(f"export: the reconstructor is {reconstructor.rest_pixels.dtype}; expected torch.float32")
     width, height = reconstructor.image_size
     image = torch.rand(EXAMPLES, 1, height, width, generator=torch.Generator().manual_seed(0)).to(reconstructor.rest_pixels)
     tracer = Tracer()
@@ -167,7 +178,9 @@ def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = F
     grey: Any = inputs[0]  # stands for a tensor
     result: Any = reconstructor.reconstruct_grey(grey, Reconstruction(**before) if tracking else None)
     model = _finished(tracer, inputs, result, reconstructor)
-    onnx.save(model, path)
+    checked(model.SerializeToString(), reconstructor)
+    with whole_file(path) as partial:
+        onnx.save(model, partial)
     return model
 
 

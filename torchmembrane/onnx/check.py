@@ -1,0 +1,76 @@
+"""A model against the reconstructor that it was made of, on images of the sensor at rest and pressed."""
+
+from typing import NamedTuple
+
+import numpy as np
+import onnxruntime
+import torch
+from torch import Tensor
+
+from ..errors import MembraneError
+from ..io.results import Reconstruction
+from ..reconstruct import Reconstructor
+from ..simulate.dataset import Plan, random_frame
+from ..simulate.simulator import Simulator
+
+LARGEST = 3e-5  # distance between the vertices of both, over the surface's size
+
+
+class Agreement(NamedTuple):
+    """A model beside torch.
+
+    Attributes:
+        distance: the largest between their vertices, length unit.
+        status: of the model's frames.
+        expected: torch's.
+    """
+
+    distance: float
+    status: list[int]
+    expected: list[int]
+
+
+def checked(model: bytes, reconstructor: Reconstructor) -> Agreement:
+    """Run a model and torch on the sensor at rest and pressed by its simulator.
+
+    Raises:
+        MembraneError: they disagree.
+    """
+    found, largest = compare(model, reconstructor, check_images(reconstructor)), LARGEST * reconstructor.estimator.membrane.size
+    if found.status != found.expected or not found.distance <= largest:
+        raise MembraneError(
+            f"export: on images of the sensor at rest and pressed the model is {found.distance:.1e} {reconstructor.sensor.length_unit}"
+            f" from torch, statuses {found.status}, torch's {found.expected}; expected at most {largest:.1e} and the same"
+        )
+    return found
+
+
+def check_images(reconstructor: Reconstructor) -> Tensor:
+    """The sensor at rest and pressed, `[B, 1, H, W]`; at rest alone where its simulator finds no press."""
+    simulator = Simulator(reconstructor.sensor)
+    images = [simulator.rest_image()]
+    try:
+        images.append(random_frame(simulator, Plan(kinds=("sphere",)), 0).image)
+    except MembraneError:
+        pass
+    return torch.cat([reconstructor.grey(image) for image in images])
+
+
+def compare(model: bytes, reconstructor: Reconstructor, images: Tensor) -> Agreement:
+    """Run a model and torch on `images [B, 1, H, W]`: a tracking one from rest, and again from what torch found."""
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3  # its warnings are of its own optimiser
+    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    fields = [given.name.removeprefix("previous_") for given in session.get_inputs()][1:]
+    status, expected_status, distances, previous = [], [], [0.0], None
+    for _ in range(2 if fields else 1):
+        with torch.no_grad():
+            expected = reconstructor.reconstruct_grey(images, previous)
+        before = expected._replace(**{name: torch.full_like(getattr(expected, name), torch.nan) for name in fields})
+        feed = {f"previous_{name}": getattr(previous or before, name).numpy() for name in fields}
+        vertices, statuses = session.run(["vertices", "status"], {"image": images.numpy(), **feed})
+        apart = np.linalg.norm(vertices - expected.vertices.numpy(), axis=-1)
+        distances += [float(apart[k].max()) for k, value in enumerate(statuses) if value == 0 == expected.status[k]]
+        status, expected_status = status + statuses.tolist(), expected_status + expected.status.tolist()
+        previous = expected
+    return Agreement(max(distances), status, expected_status)
