@@ -255,6 +255,29 @@ def test_a_dot_that_is_not_there_is_lost_and_none_of_its_neighbours_is_taken_for
     assert len(set(s.sizes[~kept])) == 2 and np.isnan(error[~kept]).all() and error[kept].max() < 0.6
 
 
+def test_a_dot_is_looked_for_within_three_quarters_of_the_spacing_and_taken_once(thresholded_dots):
+    """One dot alone moves by half or by nine tenths of the spacing, out of the pattern; then one up, where a lost one was."""
+    v, u = np.mgrid[:260, :260]
+    pixels = 40.0 * np.stack(np.meshgrid(np.arange(1, 6), np.arange(1, 6)), -1).reshape(-1, 2) + 10
+    large = np.arange(25) >= 5
+
+    def drawn(centres):
+        radius = np.where(large, 6, 3)
+        return np.where([(np.hypot(u - x, v - y) < r) for (x, y), r in zip(centres, radius, strict=True)], 0.1, 0.9).min(0)
+
+    paper = thresholded_dots.ThresholdedDots(drawn(pixels), pixels, large, "dark")
+    for share, found in ((0.5, True), (0.9, False)):
+        moved = np.zeros_like(pixels)
+        moved[24] = 40 * share
+        moved[24, 0] = 0
+        expected = np.where(found or (np.arange(25) != 24)[:, None], moved, np.nan)
+        np.testing.assert_allclose(paper(drawn(pixels + moved)), expected, atol=1e-9)
+    moved = np.zeros_like(pixels)
+    moved[24, 1], moved[19] = -16, 1000  # up, to where the lost one was
+    expected = np.where((np.arange(25) != 19)[:, None], moved, np.nan)
+    np.testing.assert_allclose(paper(drawn(pixels + moved)), expected, atol=1e-9)
+
+
 @pytest.mark.parametrize("field", [slide, dent])
 def test_threshold_and_components_follow_a_small_flow(thresholded_dots, field):
     """Section 5: the nearest component of the dot's size, large dots first; all are found, some tenths of a pixel off."""

@@ -64,6 +64,7 @@ def test_a_line_of_hills_is_cut_where_they_stand_alone():
     heights = torch.tensor([[[0, 4, 10, 9, 4, 8, 7.2, 7.5, 1, 0, -3, 0.4, 0]]])
     assert persistent_regions(heights, 4, 0.5).tolist() == [[[0, 0, 1, 1, 0, 2, 2, 2, 0, 0, 0, 0, 0]]]
     assert persistent_regions(heights, 1, 0.5).max() == 1
+    assert persistent_regions(heights, 4, 9.0).tolist() == [[[0, 0, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0]]]
     assert (persistent_regions(-heights.abs(), 4, 0.5) == 0).all()
 
 
@@ -190,14 +191,18 @@ def test_all_of_one_long_winding_ridge_is_one_region():
 
 
 def test_frames_that_are_no_surfaces_break_no_others():
-    """Heights NaN or minus infinity, all or some: nothing is found where they are, and in other frames what is found alone."""
+    """Heights NaN or minus infinity, all or some: nothing is found where they are, and in other frames what is found alone.
+
+    Also where one frame is a thousand times as high as the others.
+    """
     good, part, hollow = (smooth_hills(seed, (12, 19)) for seed in (1, 2, 3))
     part[3:6, 4:9], hollow[:5] = torch.nan, -torch.inf
     nothing = torch.full_like(good, torch.nan), torch.full_like(good, -torch.inf), torch.full_like(good, -1.0)
-    region = persistent_regions(torch.stack([nothing[0], good, part, nothing[1], hollow, nothing[2]]), 4, 0.01)
+    frames = [nothing[0], good, part, nothing[1], hollow, nothing[2], 1024 * good]
+    region = persistent_regions(torch.stack(frames), 4, 0.01)
     assert (region[[0, 3, 5]] == 0).all() and (region[2][part.isnan()] == 0).all()
     assert (region >= 0).all() and (region <= 4).all()
-    for k, height in ((1, good), (4, hollow)):
+    for k, height in ((1, good), (4, hollow), (6, good)):
         assert region[k].tolist() == regions_by_hand(height.numpy(), 4, 0.01).tolist() and region[k].max() > 0
 
 
