@@ -210,6 +210,74 @@ def test_components_are_the_dark_spots_of_an_image(thresholded_dots):
         assert area[order].tolist() == [spot.sum() for spot in inside]
 
 
+def test_the_threshold_parts_an_image_with_least_spread(thresholded_dots):
+    """Otsu's: no other level leaves less, with few dark pixels or many; unlike the mean grey where they are few."""
+    rng = np.random.default_rng(0)
+    for dark in (200, 3000, 9000):
+        image = np.concatenate([rng.normal(0.2, 0.03, dark), rng.normal(0.7, 0.04, 10000 - dark)])
+
+        def spread(level, image=image):
+            return sum(((part - part.mean()) ** 2).sum() for part in (image[image < level], image[image >= level]))
+
+        least = min(map(spread, np.linspace(image.min(), image.max(), 400)[1:-1]))
+        found, step = thresholded_dots.otsu(image), np.ptp(image) / 256  # of the histogram
+        assert min(map(spread, np.linspace(found - step, found + step, 9))) < 1.001 * least
+        assert dark > 200 or spread(image.mean()) > 1.3 * least
+
+
+def test_components_are_joined_by_their_sides(thresholded_dots):
+    image = np.full((30, 40), 0.8)
+    image[5:10, 5:10] = image[10:16, 10:16] = 0.1  # corner to corner
+    assert sorted(thresholded_dots.components(image, "dark")[1].tolist()) == [25, 36]
+
+
+def test_small_dots_are_looked_for_where_the_large_ones_around_went(thresholded_dots):
+    """In a flow of more than half the small dots' spacing, where the nearest small one is often another."""
+    s = scene("hexagonal")
+    paper = thresholded_dots.ThresholdedDots(render(s.pixels, s.shapes, seed=7), s.pixels, s.sizes == 1, "dark")
+    now, shapes = deform(s, slide, 0.65)
+    small, large = (cKDTree(s.pixels[s.sizes == size]) for size in (0, 1))
+    moved = np.linalg.norm(now - s.pixels, axis=1)
+    assert moved.max() > 0.6 * small.query(small.data, k=2)[0][:, 1].mean()
+    assert moved.max() < 0.45 * large.query(large.data, k=2)[0][:, 1].mean()
+    error = np.linalg.norm(s.pixels + paper(render(now, shapes, seed=1)) - now, axis=1)
+    assert np.nanmax(error) < 0.6 and np.isfinite(error).mean() > 0.97
+
+
+def test_a_dot_that_is_not_there_is_lost_and_none_of_its_neighbours_is_taken_for_it(thresholded_dots):
+    """Of another size or of its own; all others are found."""
+    s = scene()
+    paper = thresholded_dots.ThresholdedDots(render(s.pixels, s.shapes, seed=7), s.pixels, s.sizes == 1, "dark")
+    now, shapes = deform(s, slide, 0.3)
+    kept = np.ones(len(now), bool)
+    kept[7::9] = False
+    error = np.linalg.norm(s.pixels + paper(render(now, shapes, seed=1, kept=kept)) - now, axis=1)
+    assert len(set(s.sizes[~kept])) == 2 and np.isnan(error[~kept]).all() and error[kept].max() < 0.6
+
+
+def test_a_dot_is_looked_for_within_three_quarters_of_the_spacing_and_taken_once(thresholded_dots):
+    """One dot alone moves by half or by nine tenths of the spacing, out of the pattern; then one up, where a lost one was."""
+    v, u = np.mgrid[:260, :260]
+    pixels = 40.0 * np.stack(np.meshgrid(np.arange(1, 6), np.arange(1, 6)), -1).reshape(-1, 2) + 10
+    large = np.arange(25) >= 5
+
+    def drawn(centres):
+        radius = np.where(large, 6, 3)
+        return np.where([(np.hypot(u - x, v - y) < r) for (x, y), r in zip(centres, radius, strict=True)], 0.1, 0.9).min(0)
+
+    paper = thresholded_dots.ThresholdedDots(drawn(pixels), pixels, large, "dark")
+    for share, found in ((0.5, True), (0.9, False)):
+        moved = np.zeros_like(pixels)
+        moved[24] = 40 * share
+        moved[24, 0] = 0
+        expected = np.where(found or (np.arange(25) != 24)[:, None], moved, np.nan)
+        np.testing.assert_allclose(paper(drawn(pixels + moved)), expected, atol=1e-9)
+    moved = np.zeros_like(pixels)
+    moved[24, 1], moved[19] = -16, 1000  # up, to where the lost one was
+    expected = np.where((np.arange(25) != 19)[:, None], moved, np.nan)
+    np.testing.assert_allclose(paper(drawn(pixels + moved)), expected, atol=1e-9)
+
+
 @pytest.mark.parametrize("field", [slide, dent])
 def test_threshold_and_components_follow_a_small_flow(thresholded_dots, field):
     """Section 5: the nearest component of the dot's size, large dots first; all are found, some tenths of a pixel off."""

@@ -11,7 +11,14 @@ from torchmembrane.linalg import symmetric_adjugate_product, symmetric_determina
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, half_cylinder, heightfield, spherical_cap
 from torchmembrane.surface.tangent import tangent_axes, tangent_frame
-from torchmembrane.surface.topology import corners, corners_to_vertices, rim_loop, triangles_of, triangles_to_corners
+from torchmembrane.surface.topology import (
+    TRIANGLE_CORNERS,
+    corners,
+    corners_to_vertices,
+    rim_loop,
+    triangles_of,
+    triangles_to_corners,
+)
 
 SHAPES = {
     "spherical_cap": lambda n: spherical_cap(12, 9, 15, (n, n)),
@@ -39,9 +46,12 @@ def test_gathers_and_sums_are_adjoint(membrane):
     torch.testing.assert_close(gathered, (x * corners_to_vertices(triangles_to_corners(y), grid)).sum())
 
 
-def test_structured_triangles_are_the_listed_ones(membrane):
+@pytest.mark.parametrize("transposed", [False, True])
+def test_structured_triangles_are_the_listed_ones(membrane, transposed):
     """Eq. 8: quadrilateral by quadrilateral, split from (i, j) to (i+1, j+1), both halves turned outwards: written out here."""
     m, n = membrane.grid
+    if transposed:  # a grid of the other winding
+        m, n, membrane = n, m, Membrane(membrane.rest.reshape(m, n, 3).numpy().transpose(1, 0, 2))
     listed = []
     for i in range(m - 1):
         for j in range(n - 1):
@@ -50,7 +60,8 @@ def test_structured_triangles_are_the_listed_ones(membrane):
     p = membrane.rest.numpy()[np.array(listed)]
     seen_from_behind = np.einsum("tk,tk->t", np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), p.mean(1)) < 0
     assert seen_from_behind.all() or not seen_from_behind.any()
-    listed = [(a, c, b) if seen_from_behind[0] else (a, b, c) for a, b, c in listed]
+    assert seen_from_behind[0] == (membrane.outward < 0) == transposed
+    listed = [(a, c, b) if transposed else (a, b, c) for a, b, c in listed]
     assert membrane.triangles.tolist() == [list(triangle) for triangle in listed]
     x = moved(membrane)
     p = x.numpy()[np.array(listed)]
@@ -66,6 +77,7 @@ def test_quadrilaterals_have_the_corners_of_equation_8():
     at = corners(places, (4, 6))
     for i, j in ((0, 0), (2, 4), (1, 3)):
         assert at[i, j].tolist() == [[i, j], [i + 1, j], [i + 1, j + 1], [i, j + 1]]
+    assert triangles_of(torch.arange(4)[:, None])[..., 0].tolist() == [list(corner) for corner in TRIANGLE_CORNERS]
 
 
 def test_volume_gradient_is_autograd_of_volume(membrane):

@@ -135,6 +135,16 @@ def test_no_flow_no_displacement_and_the_volume_is_linear():
     torch.testing.assert_close(cap.volume(estimator.surface(psi)) - cap.rest_volume, estimator.v @ psi)
 
 
+def test_the_rim_stays_exactly_where_it_is():
+    """Appendix B: whatever is observed at it; and no other ray's point is moved by it."""
+    cap = spherical_cap(12, 7, 15, (9, 9))
+    origins, seen = rays(cap, 0.03)
+    askew = torch.where(cap.fixed[:, None], torch.nn.functional.normalize(seen + 0.05, dim=-1), seen)
+    held, got = (make(cap, steps=2)(origins, directions).vertices for directions in (seen, askew))
+    assert torch.equal(got[cap.fixed], cap.rest[cap.fixed]) and torch.equal(got, held)
+    assert (got - cap.rest)[~cap.fixed].norm(dim=-1).median() > 0.1
+
+
 def test_no_force_is_left_on_the_heights():
     """Repeated, eq. 22 ends at a stationary point of energy, rest load and smoother on the surfaces of this volume."""
     cap = spherical_cap(12, 7, 15, (9, 9))

@@ -1,6 +1,6 @@
 """The paper's own estimator: one frame through the chain, every intermediate against its equation; direct against iterated."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +10,13 @@ import torch
 import torchmembrane as tm
 from torchmembrane.estimators.affine_maps import affine_fit
 from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.flow import FlowInterpolation
 from torchmembrane.estimators.minimum_energy import MinimumEnergy, grid_laplacian
 from torchmembrane.estimators.paper import OCCUPIED, PaperEstimator
 from torchmembrane.estimators.settings import MinimumEnergySettings, PaperSettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
+from torchmembrane.sensor.factories import cavity_filling, elastic_energy
+from torchmembrane.sensor.parts import Cavity
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import ellipsoid_cap
 from torchmembrane.surface.stencil import inner
@@ -67,7 +70,8 @@ def dense(estimator, q, relaxed):
 @pytest.mark.parametrize(("grid", "hole"), [*((grid, False) for grid in GRIDS), ((9, 10), True)])
 def test_one_frame_through_the_chain(grid, hole):
     """Maps (15-17), Q (18), smoother (28), volume (21), eq. 22 and its KKT system (25-27), from the rays to the surface."""
-    estimator = make(grid, hole)
+    weight = 0.3
+    estimator = make(grid, hole, smoothing=weight)
     membrane, energy, free = estimator.membrane, estimator.energy, estimator.membrane.free_vertices
     observation, relaxed = observed(membrane), some_relaxed(membrane)
     programme, (origins, directions) = estimator.programme(observation, relaxed)
@@ -95,7 +99,7 @@ def test_one_frame_through_the_chain(grid, hole):
     psi[:, free] = ((found.vertices - origins) * directions).sum(-1)[:, free] - estimator.rest_range[free]
     start = origins + estimator.rest_range[:, None] * directions
     gamma = -(Q @ estimator.rest_range[:, None]).squeeze(-1) - offset(estimator, Q, origins)
-    smooth = 0.1 * energy.tension * (S.mT @ (S @ psi[..., None])).squeeze(-1)
+    smooth = weight * energy.tension * (S.mT @ (S @ psi[..., None])).squeeze(-1)
     left = (Q.mT @ (Q @ psi[..., None]).squeeze(-1)[..., None]).squeeze(-1) - (Q.mT @ gamma[..., None]).squeeze(-1) + smooth
     left = left - (estimator.rest_load * directions).sum(-1)
     v = (membrane.volume_gradient(start) * directions).sum(-1)
@@ -161,6 +165,54 @@ def test_the_energy_over_the_free_part_leaves_out_what_is_covered():
     covered[1, 3, 3:5] = True
     torch.testing.assert_close(ratio, torch.where(covered, OCCUPIED, 1.0).double())
     assert (part.solve(observation, relaxed).vertices - whole.solve(observation, relaxed).vertices)[1].abs().max() > 1e-6
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 3])
+def test_the_loop_goes_round_as_often_as_it_is_told(rounds):
+    """Section 5.1: contacts of eq. 29; reconstruct with the smoother relaxed there, segment along the normals; again."""
+    estimator = make((13, 13), rounds=rounds)
+    observation, segmentation = observed(estimator.membrane, 0.1, batch=1), estimator.segmentation
+    regions, surfaces, points = [segmentation.by_polar_angle(observation.directions)], [], []
+    for _ in range(4):
+        surfaces.append(estimator.solve(observation, regions[-1].region > 0).vertices)
+        regions.append(segmentation.by_normals(surfaces[-1]))
+        points.append(segmentation.moved(regions[-2].points, regions[-1].points))
+    got = estimator(observation)
+    torch.testing.assert_close(got.vertices, surfaces[rounds - 1])
+    torch.testing.assert_close(got.relative_step, points[rounds - 1])
+    gaps = torch.stack([(one - other).abs().max() for one, other in zip(surfaces[1:], surfaces[:-1], strict=True)])
+    assert gaps[:rounds].min() > 1e-4
+
+
+@pytest.mark.parametrize("cavity", [Cavity("liquid"), Cavity("open"), Cavity("gas", pressure=1000.0)], ids=lambda c: c.filling)
+@pytest.mark.parametrize(("name", "settings", "kind"), [
+    ("paper", PaperSettings(0.7, "smooth", 1), PaperEstimator),
+    ("minimum-energy", MinimumEnergySettings("quadrilateral", 0.7, "linear", "bilinear"), MinimumEnergy),
+])  # fmt: skip
+def test_settings_and_cavity_reach_the_estimator(cavity, name, settings, kind):
+    """What `Reconstructor` finds is what the estimator finds that is built here, on rays of the flow built here; each setting
+    that is not the default matters."""
+    sensor = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
+    membrane = sensor.membrane.resampled((11, 11))
+    sensor = replace(sensor, membrane=membrane, cavity=cavity)
+    made = tm.Reconstructor(sensor, name, settings=settings, dtype=torch.float64)
+    got = made.from_pixels(torch.from_numpy(np.load(EXAMPLES / "two_contacts_truth.npz")["uv_deformed"].copy()))
+    elasticity, pixels = elastic_energy(sensor, membrane), made.camera.point_to_pixel(membrane.rest)
+    markers = membrane.closest_points(sensor.markers.positions)
+
+    def found(settings, filling):
+        flow = FlowInterpolation(membrane, markers, settings.flow)(got.pixels - made.rest_pixels, got.confidence)
+        gas = cavity_filling(sensor, membrane).gas if filling == "gas" else None
+        estimator = kind(membrane, elasticity, made.camera.pixel_to_ray(pixels), filling, gas, settings)
+        return estimator(Observation(*made.camera.pixel_to_ray(pixels + flow), got.confidence)).vertices
+
+    expected = found(settings, cavity.filling)
+    torch.testing.assert_close(got.vertices, expected, rtol=0, atol=1e-9)
+    changed = [one for one in fields(settings) if getattr(settings, one.name) != one.default]
+    others = [(replace(settings, **{one.name: one.default}), cavity.filling) for one in changed]
+    others += [(settings, filling) for filling in ("liquid", "open") if filling != cavity.filling]
+    for other in others:
+        assert (found(*other) - expected).abs().max() > 1e-6, other
 
 
 @pytest.fixture(scope="module")

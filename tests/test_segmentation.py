@@ -1,9 +1,10 @@
 """Laws of eq. 29 and of the reconstruct / segment loop; contacts of presses simulated on another grid."""
 
+import heapq
+
 import numpy as np
 import pytest
 import torch
-from scipy import ndimage
 
 from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
@@ -63,40 +64,146 @@ def test_a_line_of_hills_is_cut_where_they_stand_alone():
     heights = torch.tensor([[[0, 4, 10, 9, 4, 8, 7.2, 7.5, 1, 0, -3, 0.4, 0]]])
     assert persistent_regions(heights, 4, 0.5).tolist() == [[[0, 0, 1, 1, 0, 2, 2, 2, 0, 0, 0, 0, 0]]]
     assert persistent_regions(heights, 1, 0.5).max() == 1
+    assert persistent_regions(heights, 4, 9.0).tolist() == [[[0, 0, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0]]]
     assert (persistent_regions(-heights.abs(), 4, 0.5) == 0).all()
 
 
+def neighbours(vertex, shape):
+    """The up to eight around a vertex, numbered row by row."""
+    i, j = divmod(vertex, shape[1])
+    rows, columns = range(max(i - 1, 0), min(i + 2, shape[0])), range(max(j - 1, 0), min(j + 2, shape[1]))
+    return [r * shape[1] + c for r in rows for c in columns if (r, c) != (i, j)]
+
+
 def flooded(height, count, least):
-    """The same by flooding: vertices join in order of height, hills merge unless they stand above the pass."""
-    m, n = height.shape
-    hill, top = -np.ones((m, n), int), {}
-    for flat in np.argsort(-height, axis=None):
-        i, j = divmod(int(flat), n)
-        if height[i, j] < least:
+    """Peaks that stand for themselves, highest first, by flooding: vertices join in order of height, and where hills meet the
+    lower ones end, unless they stand above the pass. `height [m, n]`; vertices, numbered row by row."""
+    h, hill, standing = height.ravel(), {}, []
+    for vertex in np.argsort(-h, kind="stable").tolist():
+        if h[vertex] == -np.inf:
             break
-        near = hill[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
-        around = sorted({int(h) for h in near.ravel() if h >= 0}, key=lambda h: -top[h])
+        around = sorted({hill[k] for k in neighbours(vertex, height.shape) if k in hill}, key=lambda top: (-h[top], top))
         if not around:
-            top[flat] = height[i, j]
-        hill[i, j] = around[0] if around else flat
+            standing.append(vertex)
+        hill[vertex] = around[0] if around else vertex
         for lower in around[1:]:
-            if top[lower] - height[i, j] < PERSISTENCE * height.max():
-                hill[hill == lower] = around[0]
-    return sorted((top[h] for h in set(hill[hill >= 0].tolist())), reverse=True)[:count]
+            if h[lower] - h[vertex] < PERSISTENCE * h.max():
+                standing.remove(lower)
+                hill |= {k: around[0] for k, top in hill.items() if top == lower}
+    return [top for top in standing if h[top] >= least][:count]
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_the_persistent_peaks_are_those_of_flooding(seed):
-    """On smooth random hills: as many regions as hills that stand alone, each joined with its peak above half of it."""
-    field = torch.randn(1, 1, 7, 7, generator=torch.Generator().manual_seed(seed))
-    height = torch.nn.functional.interpolate(field, (25, 29), mode="bicubic", align_corners=True)[0]
-    region = persistent_regions(height, 4, 0.1)[0]
-    tops = [float(height[0][region == k].max()) for k in range(1, int(region.max()) + 1)]
-    assert tops == pytest.approx(flooded(height[0].double().numpy(), 4, 0.1))
-    for k, top in enumerate(tops, 1):
-        assert float(height[0][region == k].min()) > SHARE * top
-        above, _ = ndimage.label((height[0] > SHARE * top * (1 - 1e-6)).numpy(), np.ones((3, 3)))
-        assert len(np.unique(above[(region == k).numpy()])) == 1
+def best_paths(height, peak):
+    """The lowest height on the best path to a peak, `[m n]`, by Dijkstra's algorithm: the vertex with the best path is next."""
+    h, best, front = height.ravel(), np.full(height.size, -np.inf), [(-height.ravel()[peak], peak)]
+    while front:
+        level, vertex = heapq.heappop(front)
+        if best[vertex] == -np.inf:
+            best[vertex] = -level
+            for k in neighbours(vertex, height.shape):
+                if best[k] == -np.inf and h[k] > -np.inf:
+                    heapq.heappush(front, (max(level, -h[k]), k))
+    return best
+
+
+def regions_by_hand(height, count, least):
+    """The regions by their definition: of the peaks to which the way is best, the nearest; above half of that one."""
+    peaks, n = flooded(height, count, least), height.shape[1]
+    region = np.zeros(height.size, int)
+    paths = [best_paths(height, peak) for peak in peaks]
+    for vertex in range(height.size if peaks else 0):
+        best = max(path[vertex] for path in paths)
+        near = [(vertex // n - peak // n) ** 2 + (vertex % n - peak % n) ** 2 for peak in peaks]
+        k = min((k for k in range(len(peaks)) if paths[k][vertex] == best), key=lambda k: near[k])
+        region[vertex] = (k + 1) * (best > SHARE * height.ravel()[peaks[k]])
+    return region.reshape(height.shape)
+
+
+def smooth_hills(seed, shape, knots=7):
+    field = torch.randn(1, 1, knots, knots, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.interpolate(field, shape, mode="bicubic", align_corners=True)[0, 0]
+
+
+def winding_ridge(shape, along):
+    """A ridge one vertex wide, to and fro over the rows with one row between, of heights as its length goes on; else 0."""
+    m, n = shape
+    path = []
+    for row in range(0, m, 2):
+        columns = range(n) if row % 4 == 0 else range(n - 1, -1, -1)
+        path += [(row, j) for j in columns] + [(row + 1, columns[-1])] * (row + 1 < m)
+    height = torch.zeros(shape)
+    for place, (i, j) in zip(np.linspace(0, 1, len(path)), path, strict=True):
+        height[i, j] = along(place)
+    return height
+
+
+def rippled(seed, knots=24):
+    tops = np.random.default_rng(seed).uniform(0.5, 1, knots)
+    return lambda place: float(np.interp(place * (knots - 1), np.arange(knots), tops))
+
+
+def mesas(seed, shape, count=9):
+    """Flat tops of different heights, some over others."""
+    rng, height = np.random.default_rng(seed), torch.zeros(shape)
+    for top in rng.permutation(np.linspace(0.3, 1, count)):
+        i, j, a, b = rng.integers(0, shape[0] - 2), rng.integers(0, shape[1] - 2), *rng.integers(1, 9, 2)
+        height[i : i + a, j : j + b] = height[i : i + a, j : j + b].clamp_min(float(top))
+    return height
+
+
+def noise(seed, shape):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def hills_with_holes(seed, shape):
+    return torch.where(smooth_hills(20 + seed, shape, 9) < -0.2, -torch.inf, smooth_hills(seed, shape, 9))
+
+
+FIELDS = {
+    "smooth hills": (smooth_hills, [(25, 29), (33, 33), (17, 40), (41, 12)] * 2),
+    "noise": (noise, [(5, 7), (9, 6)] * 10),
+    "a winding ridge of ups and downs": (
+        lambda seed, shape: winding_ridge(shape, rippled(seed)),
+        [(17, 17), (9, 40), (33, 9)] * 2,
+    ),
+    "mesas": (mesas, [(20, 31), (33, 12)] * 4),
+    "hills with holes": (hills_with_holes, [(15, 22)] * 6),
+}
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+def test_regions_are_those_of_flooding_and_of_the_best_paths(kind):
+    make_field, shapes = FIELDS[kind]
+    several = 0
+    for seed, shape in enumerate(shapes):
+        height = make_field(seed, shape)
+        expected = regions_by_hand(height.numpy(), 4, 0.01)
+        assert persistent_regions(height[None], 4, 0.01)[0].tolist() == expected.tolist()
+        several += expected.max() > 1
+    assert several > len(shapes) / 2
+
+
+def test_all_of_one_long_winding_ridge_is_one_region():
+    """The way up from its end has more than 128 steps."""
+    for shape in ((17, 17), (9, 27)):
+        height = winding_ridge(shape, lambda place: 1 - 0.4 * place)
+        assert torch.equal(persistent_regions(height[None], 4, 0.01)[0], (height > 0).long())
+
+
+def test_frames_that_are_no_surfaces_break_no_others():
+    """Heights NaN or minus infinity, all or some: nothing is found where they are, and in other frames what is found alone.
+
+    Also where one frame is a thousand times as high as the others.
+    """
+    good, part, hollow = (smooth_hills(seed, (12, 19)) for seed in (1, 2, 3))
+    part[3:6, 4:9], hollow[:5] = torch.nan, -torch.inf
+    nothing = torch.full_like(good, torch.nan), torch.full_like(good, -torch.inf), torch.full_like(good, -1.0)
+    frames = [nothing[0], good, part, nothing[1], hollow, nothing[2], 1024 * good]
+    region = persistent_regions(torch.stack(frames), 4, 0.01)
+    assert (region[[0, 3, 5]] == 0).all() and (region[2][part.isnan()] == 0).all()
+    assert (region >= 0).all() and (region <= 4).all()
+    for k, height in ((1, good), (4, hollow), (6, good)):
+        assert region[k].tolist() == regions_by_hand(height.numpy(), 4, 0.01).tolist() and region[k].max() > 0
 
 
 def make(base_z):
@@ -219,6 +326,9 @@ def test_a_steep_dent_bulges_along_the_mean_of_both_normals():
     assert torch.equal(got.region[0] > 0, got.bulge[0] > 0.5 * got.bulge.max()) and got.points[0, 1:].isnan().all()
     place = got.points[0, 0] - torch.tensor([0.0, 0.0, FAR + 9 - 12.5])
     assert (place - (place @ axis) * axis).norm() < 0.1
+    weight = torch.where(got.region[0] > 0, beyond * dome.rest_area, 0.0)  # the point lies in the dent, not above it at rest
+    torch.testing.assert_close(got.points[0, 0], weight @ x / weight.sum(), rtol=0, atol=0.02)
+    assert (got.points[0, 0] - weight @ dome.rest / weight.sum()).norm() > 2
 
 
 def test_no_flow_is_no_contact_and_a_batch_is_its_frames(off_axis):
