@@ -1,5 +1,14 @@
+import numpy as np
 import pytest
 import torch
+from PIL import Image
+
+from torchmembrane.camera.model import Camera
+from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.sensor import Sensor
+from torchmembrane.simulate.dataset import stroke_to
+from torchmembrane.simulate.indenters import Sphere
+from torchmembrane.simulate.simulator import Simulator
 
 torch.set_num_threads(1)
 
@@ -7,3 +16,27 @@ torch.set_num_threads(1)
 @pytest.fixture(autouse=True)
 def _seed():
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def small_sensor(tmp_path_factory):
+    """A small cap with 49 dots, an image of 160 x 120 px, and three frames of a press."""
+    surface = Surface("spherical_cap", {"rim_radius": 8.0, "height": 4.0, "base_z": 14.0})
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-5, 5, 7)] * 2))
+    dots = np.stack([x, y, 8 + np.sqrt(100 - x**2 - y**2)], -1)
+    camera, markers = Camera("pinhole", (160, 120), (100, 100), (79, 60)), Markers("dots", "dark", dots)
+    material = Material("neo_hookean", 1.3, shear_modulus=0.3, thickness=0.4)
+    sensor = Sensor("cap", "mm", camera, surface.membrane((9, 9)), material, Cavity("liquid"), markers, surface)
+    path = tmp_path_factory.mktemp("small_sensor")
+    sensor.to_file(path / "sensor.toml")
+    simulator, rng = Simulator(sensor), np.random.default_rng(0)
+    stroke = stroke_to(simulator, Sphere(3.0), np.array([0.0, 1.0, 18.0]), np.array([-0.3, 0.0, -0.95]), 1.2)
+    for k, press in enumerate(simulator.presses(stroke, ["push"], frames=3)):
+        Image.fromarray(simulator.frame(press, stroke, rng).image).save(path / f"press{k}.png")
+    return path
+
+
+@pytest.fixture(scope="session")
+def small_images(small_sensor):
+    """Those three frames."""
+    return [small_sensor / f"press{k}.png" for k in range(3)]

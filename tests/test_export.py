@@ -11,11 +11,9 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from PIL import Image
 from torch import nn
 
 from torchmembrane import MembraneError
-from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.settings import ForceBalanceSettings
 from torchmembrane.io.images import to_grey
@@ -27,44 +25,21 @@ from torchmembrane.onnx.export import Piece
 from torchmembrane.onnx.graph import Assembly, traced
 from torchmembrane.pieces import piece, unless
 from torchmembrane.reconstruct import Reconstructor
-from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
-from torchmembrane.sensor.sensor import Sensor
-from torchmembrane.simulate.dataset import stroke_to
-from torchmembrane.simulate.indenters import Sphere
-from torchmembrane.simulate.simulator import Simulator
 
 ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A small cap with 49 dots, an image of 160 x 120 px, and three frames of a press."""
-    surface = Surface("spherical_cap", {"rim_radius": 8.0, "height": 4.0, "base_z": 14.0})
-    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-5, 5, 7)] * 2))
-    dots = np.stack([x, y, 8 + np.sqrt(100 - x**2 - y**2)], -1)
-    camera, markers = Camera("pinhole", (160, 120), (100, 100), (79, 60)), Markers("dots", "dark", dots)
-    material = Material("neo_hookean", 1.3, shear_modulus=0.3, thickness=0.4)
-    sensor = Sensor("cap", "mm", camera, surface.membrane((9, 9)), material, Cavity("liquid"), markers, surface)
-    path = tmp_path_factory.mktemp("sensor")
-    sensor.to_file(path / "sensor.toml")
-    simulator, rng = Simulator(sensor), np.random.default_rng(0)
-    stroke = stroke_to(simulator, Sphere(3.0), np.array([0.0, 1.0, 18.0]), np.array([-0.3, 0.0, -0.95]), 1.2)
-    for k, press in enumerate(simulator.presses(stroke, ["push"], frames=3)):
-        Image.fromarray(simulator.frame(press, stroke, rng).image).save(path / f"press{k}.png")
-    return path
+def images(small_images):
+    return small_images
 
 
 @pytest.fixture(scope="module")
-def images(folder):
-    return [folder / f"press{k}.png" for k in range(3)]
-
-
-@pytest.fixture(scope="module")
-def reconstructor(folder):
+def reconstructor(small_sensor):
     """With a coarser grid, which only finer ones than this would have; so coarse the default does not settle beside lost
     markers."""
     settings = ForceBalanceSettings(coarsest=5, coarsest_warm=5, fine_steps=12)
-    made = Reconstructor.from_file(folder / "sensor.toml", settings=settings)
+    made = Reconstructor.from_file(small_sensor / "sensor.toml", settings=settings)
     assert made.estimator.coarse.membrane.grid == (5, 5)
     return made
 
@@ -135,8 +110,8 @@ def test_a_tracking_model_starts_from_the_frames_before(model_files, reconstruct
     agree(Reconstruction(*session.run(list(Reconstruction._fields), feed)), expected)
 
 
-def test_minimum_energy_agrees_with_torch(folder):
-    reconstructor = Reconstructor.from_file(folder / "sensor.toml", estimator="minimum-energy")
+def test_minimum_energy_agrees_with_torch(small_sensor):
+    reconstructor = Reconstructor.from_file(small_sensor / "sensor.toml", estimator="minimum-energy")
     estimator, tracer = reconstructor.estimator, export.Tracer()
     flow = 3 * torch.rand(3, 1, 2) * estimator.free[:, None]
     origins, directions = reconstructor.camera.pixel_to_ray(reconstructor.vertex_pixels + flow)
@@ -177,8 +152,8 @@ def test_what_runs_unless_a_condition_holds_runs_only_then():
         np.testing.assert_array_equal(session.run(None, {"x": x})[0], 2 * x if (x > 0).all() else 2 * x - 1)
 
 
-def test_minimum_energy_does_not_track(folder, tmp_path):
-    reconstructor = Reconstructor.from_file(folder / "sensor.toml", estimator="minimum-energy")
+def test_minimum_energy_does_not_track(small_sensor, tmp_path):
+    reconstructor = Reconstructor.from_file(small_sensor / "sensor.toml", estimator="minimum-energy")
     with pytest.raises(MembraneError, match="starts from rest always"):
         export.export(reconstructor, tmp_path / "no.onnx", tracking=True)
 

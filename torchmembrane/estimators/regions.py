@@ -12,7 +12,6 @@ from torch import Tensor
 SHARE = 0.5  # of a region's peak: what lies above it, around the peak, is the region
 CANDIDATES = 32  # peaks that are looked at, the highest
 PERSISTENCE = 0.15  # of the highest peak, by which a peak stands above the pass to a higher one, or it is no contact
-DOUBLINGS = 8  # of the way up: at most 256 steps
 AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 
 
@@ -58,7 +57,7 @@ def _summits(height: Tensor) -> Tensor:
     steps = torch.tensor([i * n + j for i, j in AROUND], device=height.device)
     vertex = torch.arange(m * n, device=height.device)
     up = (vertex + steps[around.max(1).indices]).clamp(0, m * n - 1)
-    for _ in range(DOUBLINGS):
+    for _ in range((m * n).bit_length()):  # each time twice as far
         up = up.gather(1, up)
     return up
 

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..io.results import Reconstruction
 from ..reconstruct import Reconstructor
 from ..simulate.dataset import Plan, random_frame
 from ..simulate.simulator import Simulator
@@ -39,8 +38,8 @@ def checked(model: bytes, reconstructor: Reconstructor) -> Agreement:
     found, largest = compare(model, reconstructor, check_images(reconstructor)), LARGEST * reconstructor.estimator.membrane.size
     if found.status != found.expected or not found.distance <= largest:
         raise MembraneError(
-            f"export: on images of the sensor at rest and pressed the model is {found.distance:.1e} {reconstructor.sensor.length_unit}"
-            f" from torch, statuses {found.status}, torch's {found.expected}; expected at most {largest:.1e} and the same"
+            f"export: on images of the sensor at rest and pressed the model's vertices are {found.distance:.1e} from torch's, "
+            f"its statuses {found.status}, torch's {found.expected}; expected at most {largest:.1e} and the same statuses"
         )
     return found
 
@@ -62,7 +61,9 @@ def compare(model: bytes, reconstructor: Reconstructor, images: Tensor) -> Agree
     options.log_severity_level = 3  # its warnings are of its own optimiser
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     fields = [given.name.removeprefix("previous_") for given in session.get_inputs()][1:]
-    status, expected_status, distances, previous = [], [], [0.0], None
+    status: list[int] = []
+    expected_status: list[int] = []
+    distances, previous = [0.0], None
     for _ in range(2 if fields else 1):
         with torch.no_grad():
             expected = reconstructor.reconstruct_grey(images, previous)

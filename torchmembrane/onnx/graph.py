@@ -4,7 +4,9 @@ import logging
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import onnx
@@ -15,6 +17,7 @@ from onnx_ir import passes
 from onnx_ir.passes import common
 from onnxscript.optimizer import fold_constants_ir
 from torch import Tensor, nn
+from torch.onnx._internal.exporter._registration import ONNXRegistry
 
 OPSET, IR_VERSION = 18, 8
 """onnxruntime reads them from 1.14 on."""
@@ -28,6 +31,8 @@ TIDY = passes.Sequential(
     common.NameFixPass(),
 )
 """What torch's exporter does too, but for its patterns, which take most of its time and change next to nothing here."""
+_registry = staticmethod(cache(ONNXRegistry.from_torchlib))
+"""Torch's exporter reads its operators anew for every model, a second each; nothing here changes them."""
 
 
 def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> onnx.ModelProto:
@@ -35,7 +40,7 @@ def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> 
     batch = torch.export.Dim("batch")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     shapes = tuple({0: batch} if value.ndim else None for value in inputs.values())
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), patch.object(ONNXRegistry, "from_torchlib", _registry):
         warnings.simplefilter("ignore")  # of the exporter about itself
         program = torch.onnx.export(
             module.eval(),
