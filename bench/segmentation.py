@@ -4,10 +4,10 @@ python bench/segmentation.py CASES [--images] [--json FILE]
 
 CASES as for accuracy.py, with `contact_centroid_each [I, 3]` in the truth. Printed: for each case, then in the median and at
 worst, the contact error in the sensor's length unit (the larger of the mean distance from the true contacts to the nearest
-found, and back; 10 where none is found) and the surface's error over its displacement (rms at the markers). The loop is run
-around the paper's estimator, around it with the energy over the free part only (`PaperSettings.free_part_only`), and around
-minimum energy of the sensor's material. From exact markers with 0.05 px noise, or with --images from the last image of every
-case, where the paper's estimator finds them by the soft locator.
+found, and back; 10 where none is found), the surface's error over its displacement (rms at the markers), and of the presses by
+several bodies how many contacts are found. The loop is run around the paper's estimator, around it with the energy over the
+free part only (`PaperSettings.free_part_only`), and around minimum energy of the sensor's material. From exact markers with
+0.05 px noise, or with --images from the last image of every case, where the paper's estimator finds them by the soft locator.
 """
 
 import argparse
@@ -62,15 +62,16 @@ def segmented(r: tm.Reconstructor, seen: tm.Reconstruction, free_part_only=False
     return got, r.result(got.surface, moved, seen.confidence, seen.status)
 
 
-def ways(root: Path, case: dict, images: bool) -> dict[str, tuple[float, float]]:
-    """Of each way the contact error and the surface error."""
+def ways(root: Path, case: dict, images: bool) -> dict[str, tuple[float, float, int]]:
+    """Of each way the contact error, the surface error, and how many contacts are found."""
     truth = np.load(root / case["truth"])
     place = truth["contact_centroid_each"]
     noise = NOISE * np.random.default_rng(0).standard_normal(truth["uv_deformed"].shape)
     found = {}
 
     def keep(name: str, points: torch.Tensor, result: tm.Reconstruction) -> None:
-        found[name] = contact_error(points[0].numpy(), place), surface_error(result, truth)
+        count = int(points[0].isfinite().all(-1).sum())
+        found[name] = contact_error(points[0].numpy(), place), surface_error(result, truth), count
 
     for name in OPTIONS:
         r = reconstructor(root / case["sensor"], name)
@@ -99,13 +100,17 @@ def main():
     for case in sorted(cases_in(args.cases), key=lambda case: case["sensor"]):
         with torch.no_grad():
             found = ways(args.cases, case, args.images)
-        rows.append(dict(case=case["case"], sensor=case["folder"], contacts=len(case.get("indenters", ())), **found))
-        each = (f"{name} {contact:.2f}, {surface:.3f}" for name, (contact, surface) in found.items())
+        true = len(np.load(args.cases / case["truth"])["contact_centroid_each"])
+        rows.append(dict(case=case["case"], sensor=case["folder"], contacts=true, **found))
+        each = (f"{name} {contact:.2f}, {surface:.3f}" for name, (contact, surface, _) in found.items())
         print(case["case"], case["folder"], *each, sep="; ", flush=True)
     for name in found:
-        contact, surface = np.array([row[name] for row in rows]).T
+        contact, surface, count = np.array([row[name] for row in rows]).T
+        true = np.array([row["contacts"] for row in rows])
+        several = [f"{int(n)} of {k}" for n, k in zip(count, true, strict=True) if k > 1]
         of_surface = "" if name == "eq. 29" else f"; surface {np.median(surface):.3f}, {surface.max():.3f}"
         print(f"{name}: contacts {np.median(contact):.2f} in the median, {contact.max():.2f} at worst{of_surface}")
+        print(f"    of several at once: {', '.join(several)}; none at all in {int((count == 0).sum())} presses")
     write(args.json, dict(segmentation=rows))
 
 

@@ -20,7 +20,6 @@ PAGE = Path(__file__).with_name("paper_chain.md")
 CROSSES, LONGER = 4, 6.0  # every so many quadrilaterals a cross; how many times its change is drawn
 CLOSE_UP = (235, 415, 325, 155)  # px: left, right, lower, upper
 SOME_ROWS = 2  # rows of quadrilaterals of which Q is shown
-ROW = 16  # of the grid, through both contacts
 
 
 def page_names() -> dict[str, Any]:
@@ -67,21 +66,21 @@ def dots_figure(names: dict, shown: Shown) -> Figure:
     for what, place in small.items():
         b.plot(*place[0].numpy().T, marks[what][0], ms=6, mfc="none", mec=marks[what][1], mew=1, label=what)
         words.append(f"{what} {np.median(np.linalg.norm(place[0].numpy() - true, axis=1)):.2f} px off")
-    b.set_xlabel("; ".join(words) + " in the median", fontsize=10)
+    b.set_xlabel("; ".join(words) + " in the median, on a coarse level", fontsize=10)
     draw_image(c, shown.image, "all refined, close up")
-    found = names["pixels"][0].numpy()
+    found = rest + names["u"][0].numpy()
     c.plot(*shown.pixels.T, "o", ms=9, mfc="none", mec=BLUE, label="true")
     c.plot(*found.T, "+", ms=9, mec=VERMILION, mew=1.3, label="found")
     c.set(xlim=CLOSE_UP[:2], ylim=CLOSE_UP[2:])
     off = np.linalg.norm(found - shown.pixels, axis=1)
-    c.set_xlabel(f"{np.median(off):.3f} px off in the median, {off.max():.2f} at most", fontsize=10)
+    c.set_xlabel(f"{np.median(off):.3f} px off in the median, {off.max():.2f} at most; against the rest image", fontsize=10)
     for axes in (a, b, c):
         axes.legend(fontsize=8, loc="lower left")
     return drawing
 
 
 def flow_figure(names: dict, shown: Shown) -> Figure:
-    drawing, (a, b) = row_of_panels(2, 5.8)
+    drawing, (a, b) = row_of_panels(2, 6.2)
     r, blank = names["reconstructor"], np.ones_like(shown.image)
     draw_flow(a, 0.6 + 0.4 * shown.image, r.rest_pixels.numpy(), names["u"][0].numpy(), "at the 119 dots", 0.003)
     m, n = names["membrane"].grid
@@ -128,7 +127,9 @@ def stencil_table(axes, values: np.ndarray, title: str) -> None:
     axes.imshow(values, cmap="RdBu_r", vmin=-limit, vmax=limit)
     for (i, j), value in np.ndenumerate(values):
         if abs(value) > 1e-12:
-            axes.text(j, i, f"{value:.3f}", ha="center", va="center", fontsize=9, color="k" if abs(value) < 0.6 * limit else "w")
+            axes.text(
+                j, i, f"{value:.3f}", ha="center", va="center", fontsize=9, color="k" if abs(value) < 0.6 * limit else "w"
+            )
     axes.set_title(title, fontsize=10)
     axes.set_xticks([])
     axes.set_yticks([])
@@ -152,11 +153,11 @@ def q_figure(names: dict, shown: Shown) -> Figure:
     blocks, directions = names["estimator"].energy.q_blocks, names["directions"]
     local = names["estimator"].energy.stiffness_along(names["membrane"].rest, directions)
     gap = float((blocks(directions).mT @ blocks(directions) - local).abs().max() / local.abs().max())
-    b.set_xlabel(f"$Q^TQ$ and the element's K differ by {gap:.0e} of the largest entry at most", fontsize=10)
+    b.set_xlabel(f"differs from the element's K by {gap:.0e}", fontsize=10)
     kept, inner = names["programme"].stencil[0].numpy(), names["membrane"].free_vertices.tolist()
     column = inner.index(at)
     gap = max(abs(kept[k, column] - M[at, at + i * n + j]) for k, (i, j) in enumerate(UPPER)) / M[at, at]
-    c.set_xlabel(f"the stencil that is solved with: off by {gap:.0e}", fontsize=10)
+    c.set_xlabel(f"differs from the stencil in the solve by {gap:.0e}", fontsize=10)
     return drawing
 
 
@@ -193,7 +194,7 @@ def solve_figure(names: dict, shown: Shown) -> Figure:
 
 def contacts_figure(names: dict, shown: Shown) -> Figure:
     """Regions of eq. 29, and those of the surface after the loop."""
-    drawing, panels = row_of_panels(2, 5.2)
+    drawing, panels = row_of_panels(2, 5.6)
     titles = ("first: regions that bulge in by eq. 29", "after the loop: regions of the surface found, along the normals")
     for axes, regions, title in zip(panels, (names["first"], names["loop"].contacts), titles, strict=True):
         points = regions.points[0].numpy()
@@ -219,6 +220,6 @@ def surface_figure(names: dict, shown: Shown) -> Figure:
     b.set_title("the grid's line at y = 0", fontsize=10)
     b.set_xlabel("x, mm", fontsize=10)
     b.set_ylabel("z, mm", fontsize=10)
-    b.legend(fontsize=8, loc="lower center")
-    a.legend(fontsize=8, loc="lower center")
+    for axes in (a, b):
+        axes.legend(fontsize=8, loc="upper left")
     return drawing

@@ -51,16 +51,16 @@ from torchmembrane.plot.drawing import BLUE, GREY, VERMILION
 
 MISMATCHED = 0.05
 WIDTHS = {"width_ratios": (1, 1, 1.4, 1.4, 1.4)}
-COLOURS = 128  # of a picture's file
+COLOURS = 256  # of a picture's file
 
 
 def all_errors(shown: Shown, results: dict[str, Reconstruction]) -> str:
     return "; ".join(f"{title}: {error_words(shown, got)}" for title, got in results.items())
 
 
-def reconstruction_rows(name: str, across: int, *rows: tuple[str, tuple]) -> Figure:
+def reconstruction_rows(name: str, across: int, *rows: tuple[str, tuple], height: float = 3.4) -> Figure:
     """Image, matches, and all reconstructions, a row for each press."""
-    drawing = Figure(figsize=(18, 0.8 + 3.4 * len(rows)), dpi=100, layout="constrained")
+    drawing = Figure(figsize=(18, 0.8 + height * len(rows)), dpi=100, layout="constrained")
     drawing.suptitle(name)
     for axes, (sensor, strokes) in zip(drawing.subplots(len(rows), 5, squeeze=False, gridspec_kw=WIDTHS), rows, strict=True):
         shown = pressed(sensor, *strokes)
@@ -154,7 +154,7 @@ def figure_13() -> Figure:
 
 
 def figure_15() -> Figure:
-    return reconstruction_rows("a larger sensor, filled with air", 0, ("bubble", BUBBLE))
+    return reconstruction_rows("a larger sensor, filled with air", 0, ("bubble", BUBBLE), height=2.4)
 
 
 def figure_16() -> Figure:
