@@ -168,7 +168,8 @@ def figure_16() -> Figure:
     flow[bad] = rest[near] + right[near] - rest[bad]
     believed = torch.ones(1, len(rest))
     trusts = {"believed": believed, "screened": r.observer.screen(flow[None], believed)}
-    drawing = Figure(figsize=(18, 7.6), dpi=100, layout="constrained")
+    drawing = Figure(figsize=(18, 8.0), dpi=100, layout="constrained")
+    drawing.suptitle("markers matched to a neighbour, believed and screened")
     places = drawing.subplots(2, 4, gridspec_kw={"width_ratios": (1, 1.1, 1.1, 1.1)})
     for axes, (name, trust) in zip(places, trusts.items(), strict=True):
         kept = trust[0] > FOUND

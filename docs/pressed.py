@@ -95,7 +95,7 @@ def error_words(shown: Shown, result: Reconstruction) -> str:
     """The error at the dots and their displacement, in words, and the status of a frame that is not well."""
     words = relative_words(result.markers[0].numpy() - shown.dots, shown.dots - shown.rest_dots)
     status = Status(int(result.status[0]))
-    return words if status == Status.OK else f"{words}; {status.text}"
+    return words if status == Status.OK else f"{words}; {status.text.partition(':')[0]}"
 
 
 def relative_words(error: np.ndarray, moved: np.ndarray) -> str:

@@ -71,14 +71,17 @@ def shown(name, *strokes):
 
 
 def test_a_point_indenter_seen_from_the_side():
-    """Fig. 12: all find the dent where it is, both of least energy a fraction of its depth; the liquid is kept."""
+    """Fig. 12: all find a dent where it is, both of least energy a fraction of its depth; the liquid is kept."""
     one = shown("fingertip", (Sphere(2.0, translation=(0, 0, 6)), (-0.35, -0.1, -1.0), 2.0))
     assert one.error(one.balance) < 0.06 and 0.4 < one.error(one.least) < one.error(one.paper) < 0.9
     rest, deepest = one.membrane.rest, (one.truth - one.membrane.rest).norm(dim=-1).argmax()
     sunk, in_truth = one.balance.vertices[0, deepest, 2] - rest[deepest, 2], (one.truth - rest)[deepest, 2]
     assert in_truth < -1 and abs(sunk - in_truth) < 0.1
-    for found in (one.least, one.paper):
-        assert in_truth < 0.5 * in_truth < (found.vertices[0] - rest)[deepest, 2] < 0
+    assert in_truth < 0.5 * in_truth < (one.least.vertices[0] - rest)[deepest, 2] < 0
+    normal, bulge = one.membrane.rest_normals[deepest], {}
+    for name, x in (("truth", one.truth), ("paper", one.paper.vertices[0]), ("least", one.least.vertices[0])):
+        bulge[name] = ((rest - x)[deepest] * normal).sum()
+    assert 0 < bulge["paper"] < bulge["least"] < 0.5 * bulge["truth"]
     assert (one.force() - one.state.force).norm() < 0.1 * one.state.force.norm()
     for found in (one.least, one.balance):
         torch.testing.assert_close(found.volume, one.membrane.rest_volume[None], rtol=1e-6, atol=0)
