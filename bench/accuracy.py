@@ -1,6 +1,6 @@
 """Marker and surface accuracy on rendered cases with truth.
 
-python bench/accuracy.py CASES [--json FILE]
+python bench/accuracy.py CASES [--only NAME ...] [--json FILE]
 
 CASES holds index.json, a list of cases with `sensor`, `images` (files), `truth` (npz with `uv_deformed [D, 2]`, `dots_nominal`
 and `dots_deformed [D, 3]`, optionally `visible_deformed [D]`), `folder`, `case`; or it is a folder like examples/, with
@@ -22,11 +22,7 @@ from record import write
 import torchmembrane as tm
 
 ESTIMATORS = {
-    "harmonic, quadrilaterals, linear volume (the paper)": dict(
-        estimator="minimum-energy",
-        model="harmonic",
-        settings=tm.MinimumEnergySettings(element="quadrilateral", volume="linear"),
-    ),
+    "the paper": dict(estimator="paper", locator="soft"),
     "harmonic, triangles": dict(estimator="minimum-energy", model="harmonic"),
     "the sensor's material": dict(estimator="minimum-energy"),
     "force balance": dict(estimator="force-balance"),
@@ -45,14 +41,15 @@ def cases_in(folder: Path) -> list[dict]:
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", type=Path)
+    parser.add_argument("--only", nargs="*", choices=ESTIMATORS, default=list(ESTIMATORS))
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     cases = cases_in(args.cases)
     markers, surface = {}, {}
     for name in sorted({case["sensor"] for case in cases}):
-        for label, options in ESTIMATORS.items():
-            reconstructor = tm.Reconstructor.from_file(args.cases / name, **options)
+        for label in args.only:
+            reconstructor = tm.Reconstructor.from_file(args.cases / name, **ESTIMATORS[label])
             for case in (c for c in cases if c["sensor"] == name):
                 score(reconstructor, args.cases, case, label, markers, surface)
     table = []

@@ -2,12 +2,11 @@
 
 python bench/locators.py CASES [--json FILE]
 
-CASES as for accuracy.py. `fit` and `soft` are the package's locators; `paper` is threshold, components and the nearest of its
-size (thresholded_dots.py); `opencv` is SimpleBlobDetector with each dot taking the blob nearest to where it was at rest. All
-measure displacements against their own rest image. Printed for each sensor and kind of image: median and 95th percentile of
-the error in px over found visible dots, the share found, how many are over 3 px off; then the
-processor time of a frame in ms on one thread, least of several turns, alone and in a batch of 16 (`paper` and `opencv` take one
-frame after another).
+CASES as for accuracy.py. `fit` and `soft` are the package's locators; `threshold` is threshold, components and the nearest of
+its size (thresholded_dots.py); `opencv` is SimpleBlobDetector with each dot taking the blob nearest to where it was at rest.
+All measure displacements against their own rest image. Printed for each sensor and kind of image: median and 95th percentile
+of the error in px over found visible dots, the share found, how many are over 3 px off; then the processor time of a frame in
+ms on one thread, least of several turns, alone and in a batch of 16 (`threshold` and `opencv` take one frame after another).
 """
 
 import argparse
@@ -26,7 +25,7 @@ from thresholded_dots import ThresholdedDots
 from torchmembrane.markers.observer import FOUND
 from torchmembrane.reconstruct import Reconstructor
 
-METHODS = ("fit", "soft", "paper", "opencv")
+METHODS = ("fit", "soft", "threshold", "opencv")
 BATCHES, TURNS = (1, 16), 5
 
 
@@ -74,9 +73,9 @@ def methods_of(sensor_file):
     fit, soft = (Reconstructor.from_file(sensor_file, "minimum-energy", locator=name) for name in METHODS[:2])
     markers, model = fit.sensor.markers, fit.rest_pixels.double().numpy()
     large = np.array([size == "large" for size in markers.sizes])
-    paper = ThresholdedDots(markers.rest_image, model, large, markers.polarity)
+    threshold = ThresholdedDots(markers.rest_image, model, large, markers.polarity)
     opencv = OpenCvDots(markers.rest_image, model, markers.polarity)
-    return dict(zip(METHODS, (Package(fit), Package(soft), paper, opencv), strict=True)), fit
+    return dict(zip(METHODS, (Package(fit), Package(soft), threshold, opencv), strict=True)), fit
 
 
 def milliseconds(method, image):
@@ -132,12 +131,12 @@ def main():
         row = dict(sensor=folder, images=kind, method=method, median=float(np.median(found)), found=len(found) / len(error))
         rows.append(row | dict(p95=float(np.percentile(found, 95)), wrong=int((found > 3).sum())))
         print(
-            "{sensor:16s} {images:6s} {method:7s} median {median:.3f} px, 95 % {p95:.3f} px, found {found:.4f}, "
+            "{sensor:16s} {images:6s} {method:9s} median {median:.3f} px, 95 % {p95:.3f} px, found {found:.4f}, "
             "wrong {wrong}".format(**rows[-1])
         )
     times = {key: milliseconds(method, image) for key, method in methods.items()}
     for key, each in times.items():
-        print(f"{key:7s} " + ", ".join(f"batch {batch}: {ms:.1f} ms per frame" for batch, ms in each.items()))
+        print(f"{key:9s} " + ", ".join(f"batch {batch}: {ms:.1f} ms per frame" for batch, ms in each.items()))
     write(args.json, dict(dots=rows, milliseconds=times))
 
 

@@ -1,14 +1,19 @@
-"""Where the contacts are, three ways: eq. 29 alone, the paper's loop, and the tractions of force balance.
+"""Where the contacts are: eq. 29 alone, the reconstruct / segment loop, and the tractions of force balance.
 
 python bench/segmentation.py CASES [--images] [--json FILE]
 
-CASES as for accuracy.py, with `contact_centroid_each [I, 3]` in the truth. The contact error is the larger of the mean distance
-from the true contacts to the nearest found, and back; 10 where none is found. From exact markers with 0.05 px noise, or with
---images from the last image of every case.
+CASES as for accuracy.py, with `contact_centroid_each [I, 3]` in the truth. Printed: for each case, then in the median and at
+worst, the contact error in the sensor's length unit (the larger of the mean distance from the true contacts to the nearest
+found, and back; 10 where none is found), the surface's error over its displacement (rms at the markers), and of the presses by
+several bodies how many contacts are found. The loop is run around the paper's estimator, around it with the energy over the
+free part only (`PaperSettings.free_part_only`), and around minimum energy of the sensor's material. From exact markers with
+0.05 px noise, or with --images from the last image of every case, where the paper's estimator finds them by the soft locator.
 """
 
 import argparse
 import warnings
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +23,20 @@ from record import write
 
 import torchmembrane as tm
 from torchmembrane.estimators.segmentation import Segmented, reconstruct_and_segment
-from torchmembrane.markers.observer import FOUND
 
 NOISE, NONE_FOUND, ROUNDS = 0.05, 10.0, 8
-LOOPS = {
-    "loop, paper": dict(estimator="paper"),
-    "loop, material": dict(estimator="minimum-energy"),
+PAPER, FREE, MATERIAL, BALANCE = "loop, paper", "loop, paper, free part only", "loop, material", "force balance"
+OPTIONS = {
+    PAPER: {"estimator": "paper", "locator": "soft"},
+    MATERIAL: {"estimator": "minimum-energy"},
+    BALANCE: {"estimator": "force-balance"},
 }
+
+
+@cache
+def reconstructor(path: Path, name: str) -> tm.Reconstructor:
+    """The sensor's reconstructor, in double precision but for force balance."""
+    return tm.Reconstructor.from_file(path, dtype=torch.float32 if name == BALANCE else torch.float64, **OPTIONS[name])
 
 
 def contact_error(found: np.ndarray, true: np.ndarray) -> float:
@@ -35,10 +47,46 @@ def contact_error(found: np.ndarray, true: np.ndarray) -> float:
     return float(max(gap.min(0).mean(), gap.min(1).mean()))
 
 
-def segmented(r: tm.Reconstructor, pixels: torch.Tensor, confidence: torch.Tensor) -> Segmented:
-    found = (confidence > FOUND).to(confidence)
-    rays = r.observation(torch.where(found[..., None] > 0, pixels - r.rest_pixels, 0.0), found)
-    return reconstruct_and_segment(r.estimator, r.estimator.segmentation, rays, ROUNDS)
+def surface_error(result: tm.Reconstruction, truth) -> float:
+    X, Y = truth["dots_nominal"].astype(float), truth["dots_deformed"].astype(float)
+    return float(np.sqrt(((result.markers[0].numpy() - Y) ** 2).sum() / ((Y - X) ** 2).sum()))
+
+
+def segmented(r: tm.Reconstructor, seen: tm.Reconstruction, free_part_only=False) -> tuple[Segmented, tm.Reconstruction]:
+    """What the loop ends with from the markers of a result, and that surface as a result."""
+    moved, usual = (seen.pixels - r.rest_pixels).nan_to_num(), r.estimator.settings
+    if free_part_only:
+        r.estimator.settings = replace(usual, free_part_only=True)
+    got = reconstruct_and_segment(r.estimator, r.estimator.segmentation, r.observation(moved, seen.confidence), ROUNDS)
+    r.estimator.settings = usual
+    return got, r.result(got.surface, moved, seen.confidence, seen.status)
+
+
+def ways(root: Path, case: dict, images: bool) -> dict[str, tuple[float, float, int]]:
+    """Of each way the contact error, the surface error, and how many contacts are found."""
+    truth = np.load(root / case["truth"])
+    place = truth["contact_centroid_each"]
+    noise = NOISE * np.random.default_rng(0).standard_normal(truth["uv_deformed"].shape)
+    found = {}
+
+    def keep(name: str, points: torch.Tensor, result: tm.Reconstruction) -> None:
+        count = int(points[0].isfinite().all(-1).sum())
+        found[name] = contact_error(points[0].numpy(), place), surface_error(result, truth), count
+
+    for name in OPTIONS:
+        r = reconstructor(root / case["sensor"], name)
+        seen = r(r.read(root / case["images"][-1])) if images else r.from_pixels(torch.from_numpy(truth["uv_deformed"] + noise))
+        if name == BALANCE:
+            keep(name, seen.contact_points, seen)
+            continue
+        got, result = segmented(r, seen)
+        if name == PAPER:
+            keep("eq. 29", got.first.points, result)
+        keep(name, got.contacts.points, result)
+        if name == PAPER:
+            got, result = segmented(r, seen, free_part_only=True)
+            keep(FREE, got.contacts.points, result)
+    return found
 
 
 def main():
@@ -49,33 +97,20 @@ def main():
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     rows = []
-    for case in cases_in(args.cases):
-        truth = np.load(args.cases / case["truth"])
-        place = truth["contact_centroid_each"]
-        balance = tm.Reconstructor.from_file(args.cases / case["sensor"])
+    for case in sorted(cases_in(args.cases), key=lambda case: case["sensor"]):
         with torch.no_grad():
-            if args.images:
-                result = balance(balance.read(args.cases / case["images"][-1]))
-                pixels, confidence = result.pixels, result.confidence
-            else:
-                noise = NOISE * np.random.default_rng(0).standard_normal(truth["uv_deformed"].shape)
-                pixels = torch.from_numpy(truth["uv_deformed"] + noise)[None]
-                confidence = torch.ones(pixels.shape[:2], dtype=torch.float64)
-                result = balance.from_pixels(pixels)
-            row = dict(case=case["case"], sensor=case["folder"], contacts=len(place))
-            for name, options in LOOPS.items():
-                path = args.cases / case["sensor"]
-                r = tm.Reconstructor.from_file(path, dtype=torch.float64, **options)
-                got = segmented(r, pixels.double(), confidence.double())
-                row["eq. 29"] = contact_error(got.first.points[0].numpy(), place)
-                row[name] = contact_error(got.contacts.points[0].numpy(), place)
-        row["traction"] = contact_error(result.contact_points[0].numpy(), place)
-        rows.append(row)
-        print("  ".join(f"{k} {v:.2f}" if isinstance(v, float) else f"{v}" for k, v in row.items()), flush=True)
-    ways = ("eq. 29", *LOOPS, "traction")
-    for way in ways:
-        error = [row[way] for row in rows]
-        print(f"{way}: {np.median(error):.2f} in the median, {np.max(error):.2f} at worst")
+            found = ways(args.cases, case, args.images)
+        true = len(np.load(args.cases / case["truth"])["contact_centroid_each"])
+        rows.append(dict(case=case["case"], sensor=case["folder"], contacts=true, **found))
+        each = (f"{name} {contact:.2f}, {surface:.3f}" for name, (contact, surface, _) in found.items())
+        print(case["case"], case["folder"], *each, sep="; ", flush=True)
+    for name in found:
+        contact, surface, count = np.array([row[name] for row in rows]).T
+        true = np.array([row["contacts"] for row in rows])
+        several = [f"{int(n)} of {k}" for n, k in zip(count, true, strict=True) if k > 1]
+        of_surface = "" if name == "eq. 29" else f"; surface {np.median(surface):.3f}, {surface.max():.3f}"
+        print(f"{name}: contacts {np.median(contact):.2f} in the median, {contact.max():.2f} at worst{of_surface}")
+        print(f"    of several at once: {', '.join(several)}; none at all in {int((count == 0).sum())} presses")
     write(args.json, dict(segmentation=rows))
 
 

@@ -2,11 +2,12 @@
 
 python bench/speed.py [--sensor examples/sensor.toml] [--image examples/two_contacts.png] [--device cpu] [--json FILE]
 
-Minimum energy: the twin solves the same constrained harmonic problem (linear triangles, volume linearised once, eq. 22) as one
-would write it for one frame: sparse assembly and factorisation by scipy. Force balance (17 x 17): cold from rest and warm from
-the solution, beside `balance_twin`, which makes the same steps; processor time, the least of several turns, taken in turn, as
-other programs may share the cores. How accurate that grid is: `ablation.py`, its base row for 17 x 17. With 2000000000 as the
-environment's MALLOC_TRIM_THRESHOLD_ and MALLOC_MMAP_THRESHOLD_ glibc keeps freed memory: a quarter less time in batches.
+The paper: its estimator with the soft locator, stage by stage. Minimum energy: the twin solves the same constrained harmonic
+problem (linear triangles, volume linearised once, eq. 22) as one would write it for one frame: sparse assembly and
+factorisation by scipy. Force balance (17 x 17): cold from rest and warm from the solution, beside `balance_twin`, which makes
+the same steps. The paper and force balance: processor time, the least of several turns, taken in turn, as other programs may
+share the cores. How accurate the 17 x 17 grid is: `ablation.py`, its base row. With 2000000000 as the environment's
+MALLOC_TRIM_THRESHOLD_ and MALLOC_MMAP_THRESHOLD_ glibc keeps freed memory: a quarter less time in batches.
 """
 
 import argparse
@@ -61,7 +62,7 @@ def scipy_twin(reconstructor):
 def minimum_energy(args):
     for label, options in (
         (
-            "harmonic, linear volume (the paper)",
+            "harmonic, triangles, linear volume",
             dict(model="harmonic", settings=tm.MinimumEnergySettings(volume="linear")),
         ),
         ("the sensor's material, exact volume", {}),
@@ -104,6 +105,31 @@ def least_milliseconds(functions: dict, turns: int) -> dict[str, float]:
     return {name: min(values) for name, values in times.items()}
 
 
+def paper(args):
+    """The paper's estimator with the soft locator, stage by stage, one frame."""
+    r = tm.Reconstructor.from_file(args.sensor, "paper", locator="soft")
+    estimator, segmentation, image = r.estimator, r.estimator.segmentation, r.read(args.image)
+    displacement, confidence, _ = r.observer(image)
+    seen = r.observation(displacement, confidence)
+    relaxed = segmentation.in_contact(segmentation.by_polar_angle(seen.directions).region)
+    programme, system = estimator.programme(seen, relaxed)[0], estimator.system
+    factor, loads = system.factor(programme.stencil), torch.stack([programme.load, programme.v], 1)
+    stages = {
+        "dots": partial(r.observer, image),
+        "flow and rays (eq. 2)": partial(r.observation, displacement, confidence),
+        "first contacts (eq. 29)": partial(segmentation.by_polar_angle, seen.directions),
+        "Q, Q^T Q, smoother, volume (eqs. 18, 21, 28)": partial(estimator.programme, seen, relaxed),
+        "factor": partial(system.factor, programme.stencil),
+        "two solves (eqs. 25-27)": partial(system.substitute, factor, loads),
+        "contacts of the surface": partial(segmentation.by_normals, estimator.solve(seen, relaxed).vertices),
+        "the whole loop": partial(estimator, seen),
+        "image to result": partial(r, image),
+    }
+    for stage, milliseconds in least_milliseconds(stages, 15).items():
+        print(f"the paper, {stage}: {milliseconds:.1f} ms", flush=True)
+        yield dict(estimator="the paper", what=stage, milliseconds_a_frame=milliseconds)
+
+
 def force_balance(args):
     sensor = tm.Sensor.from_file(args.sensor)
     reconstructor = tm.Reconstructor(replace(sensor, membrane=sensor.surface.membrane((17, 17))))
@@ -142,13 +168,13 @@ def main():
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--batches", type=int, nargs="*", default=[1, 16, 64])
-    parser.add_argument("--only", choices=("minimum-energy", "force-balance"))
+    parser.add_argument("--only", choices=("paper", "minimum-energy", "force-balance"))
     parser.add_argument("--compiled", action="store_true", help="force balance by torch.compile as well: minutes")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(args.threads)
-    rows, parts = [], (minimum_energy, force_balance)
+    rows, parts = [], (paper, minimum_energy, force_balance)
     with torch.no_grad():
         for part in parts:
             if args.only in (None, part.__name__.replace("_", "-")):

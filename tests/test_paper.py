@@ -1,14 +1,17 @@
-"""docs/paper.md leaves no equation, section or figure out, and what it names exists."""
+"""docs/paper.md leaves no equation, section or figure out, and what it names exists; the worked page runs."""
 
 import ast
 import re
 
 import pytest
+import torch
 from quoted_names import ROOT, meant_by, quoted
 
 from torchmembrane.cli.calibrate import STEPS
+from torchmembrane.surface.topology import corners
 
 TEXT = (ROOT / "docs" / "paper.md").read_text()
+CHAIN = "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "paper_chain.md").read_text(), re.S))
 NAMED_TESTS = sorted(set(re.findall(r"`(test_\w+)::(test_\w+)`", TEXT)))
 
 
@@ -53,3 +56,52 @@ def test_every_named_bench_and_figure_is_made():
     assert all((ROOT / path).exists() for path in set(re.findall(r"bench/\w+\.py", TEXT)))
     made = {int(n) for n in re.findall(r"^def figure_(\d+)", (ROOT / "docs" / "figures.py").read_text(), re.M)}
     assert {int(n) for n in re.findall(r"figures/figure_(\d+)\.png", TEXT)} == made
+
+
+@pytest.fixture(scope="module")
+def chain():
+    """What the worked page's code has defined after it ran."""
+    names: dict = {}
+    exec(compile(CHAIN, "paper_chain.md", "exec"), names)
+    return names
+
+
+def test_the_worked_page_solves_the_paper_s_equations(chain):
+    """Eqs. 14, 18, 25, 26 and 28 hold for its tensors, and by itself it goes the way that the product goes."""
+    Q, K, M, psi, programme = (chain[name] for name in ("Q", "K", "M", "psi", "programme"))
+    estimator, observation, free = chain["estimator"], chain["observation"], chain["membrane"].free_vertices
+    t = estimator.rest_range
+    maps = (chain["A_k"] * corners(t[:, None], chain["membrane"].grid).mT[..., None, :]).sum(-1)
+    energy = estimator.energy.tension * (estimator.energy.area * maps.square().sum((-1, -2))).sum()
+    torch.testing.assert_close((Q @ t).square().sum(), energy)
+    torch.testing.assert_close(t @ K @ t, energy)
+    assert (Q != 0).sum(1).max() == 4 and (K != 0).sum(1).max() == 9 and (M != 0).sum(1).max() == 13
+    stationary = psi[0] @ M[free][:, free] - programme.load[0] + chain["multiplier"] * programme.v[0]
+    assert stationary.abs().max() < 1e-12 and abs(programme.v[0] @ psi[0] + programme.rise[0]) < 1e-10
+    first = estimator.solve(observation, chain["relaxed"])
+    torch.testing.assert_close(chain["pressure"], first.pressure)
+    x = chain["origins"][:, free] + (t[free] + psi)[..., None] * chain["directions"][:, free]
+    torch.testing.assert_close(first.vertices[:, free], x)
+    torch.testing.assert_close(chain["result"].vertices, chain["loop"].surface.vertices)
+    bilinear = estimator.flow.interpolation.bilinear
+    torch.testing.assert_close(chain["flow"][0], bilinear @ chain["u"][0], rtol=0, atol=2e-2)
+
+
+def test_the_worked_page_says_what_it_gives(chain):
+    """The shapes and the error in its comments."""
+    said = []
+    for line in CHAIN.splitlines():
+        code, _, comment = line.partition("  # ")
+        shapes = [ast.literal_eval(shape) for shape in re.findall(r"\[\d+(?:, \d+)*\]", comment)]
+        if shapes and (printed := re.findall(r"([\w.]+)\.shape", code)):
+            said += zip(printed, shapes * len(printed), strict=False)
+        elif shapes and (assigned := re.match(r"(\w+(?:, \w+)*) = ", code)):
+            said += zip(assigned[1].split(", "), shapes + shapes[-1:], strict=False)
+    tensors = {name: eval(name, chain) for name, _ in said}
+    assert len(said) > 20
+    assert {name: list(tensors[name].shape) for name, _ in said if hasattr(tensors[name], "shape")} == {
+        name: shape for name, shape in said if hasattr(tensors[name], "shape")
+    }
+    error, shift = (float(chain[name].square().sum(1).mean().sqrt()) for name in ("error", "shift"))
+    (words,) = re.findall(r"mm\"\)  # ([\d.]+) of ([\d.]+) mm", CHAIN)
+    assert (error, shift) == pytest.approx([float(word) for word in words], abs=2e-3)
