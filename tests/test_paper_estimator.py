@@ -164,6 +164,8 @@ def test_the_energy_over_the_free_part_leaves_out_what_is_covered():
     covered = torch.zeros(2, 8, 8, dtype=torch.bool)
     covered[1, 3, 3:5] = True
     torch.testing.assert_close(ratio, torch.where(covered, OCCUPIED, 1.0).double())
+    still = Observation(*(ray.expand(2, -1, -1) for ray in rest_rays(part.membrane)), torch.ones(2, 81))
+    assert (part.solve(still, relaxed).vertices - part.membrane.rest).abs().max() < 1e-12  # no flow, no displacement
     assert (part.solve(observation, relaxed).vertices - whole.solve(observation, relaxed).vertices)[1].abs().max() > 1e-6
 
 

@@ -135,15 +135,16 @@ class PaperEstimator(VertexRays):
         directions = observation.directions * free
         origins = torch.where(free > 0, observation.origins, membrane.rest)
         start = origins + self.rest_range[:, None] * directions
-        weight = None
+        weight, rest_load = None, self.rest_load
         if self.settings.free_part_only:
             weight = torch.where(_corner_values(relaxed.to(start.dtype), grid).amin(-1) > 0, OCCUPIED, 1.0)
+            rest_load = rest_load + self.energy.gradient(membrane.rest, weight) - self.energy.gradient(membrane.rest)
         q = self.energy.q_blocks(directions, weight)
         stencil = _quadrilaterals_stencil(q.mT @ q, grid)
         stencil = stencil + self.settings.smoothing * self.elasticity.tension * _smoother_stencil(relaxed, grid, self.free)
         of_fluid = membrane.volume_gradient(start)
         v, rise = (of_fluid * directions).sum(-1), (of_fluid * start).sum((-1, -2)) / 3 - membrane.rest_volume
-        load = self.rest_pressure * v + ((self.rest_load - self.energy.gradient(start, weight)) * directions).sum(-1)
+        load = self.rest_pressure * v + ((rest_load - self.energy.gradient(start, weight)) * directions).sum(-1)
 
         def within(field: Tensor) -> Tensor:
             return inner(field[..., None], grid).squeeze(-1)
