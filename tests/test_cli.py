@@ -78,7 +78,7 @@ def test_options_reach_the_reconstructor(monkeypatch, tmp_path, capsys):
 
     monkeypatch.setattr("torchmembrane.cli.build.Reconstructor", refuse)
     call = ("reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")
-    assert "nh130 force-balance None None fit" in run(capsys, *call)[2]
+    assert "nh130 force-balance None None None" in run(capsys, *call)[2]
     options = ("--locator", "soft", "--energy", "harmonic", "--element", "quadrilateral")
     assert "--element quadrilateral: force-balance has no such choice" in run(capsys, *call, *options)[2]
     least = ("--estimator", "minimum-energy", *options)

@@ -51,7 +51,8 @@ class Reconstructor(nn.Module):
         model: the elastic energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin".
         channels: order of the channels of colour images, "rgb" or "bgr".
         dtype: torch.float32 or torch.float64.
-        locator: how markers are found in images: "fit", by least squares, or "soft", by soft-argmax of responses.
+        locator: how markers are found in images: "fit", by least squares, or "soft", by soft-argmax of responses; default:
+            "soft" for "paper", else "fit".
 
     Raises:
         MembraneError: an unknown estimator or locator, settings of another one, a sensor that cannot see its membrane or
@@ -78,11 +79,12 @@ class Reconstructor(nn.Module):
         model: str | None = None,
         channels: Channels = "rgb",
         dtype: torch.dtype = torch.float32,
-        locator: str = LOCATORS[0],
+        locator: str | None = None,
     ):
         super().__init__()
         if estimator not in ESTIMATORS:
             raise MembraneError(f"Reconstructor: estimator = {estimator!r}; expected one of {', '.join(ESTIMATORS)}")
+        locator = locator or ("soft" if estimator == "paper" else "fit")
         if locator not in LOCATORS:
             raise MembraneError(f"Reconstructor: locator = {locator!r}; expected one of {', '.join(LOCATORS)}")
         if channels not in CHANNELS:

@@ -52,8 +52,8 @@ def add_estimator(add: Add, element: str) -> None:
     add("--flow", choices=FLOWS, help="between the markers; minimum-energy: smooth (default), paper: bilinear (default)")
     weight = "weight of the smoother (eq. 28; default: 0.1 for quadrilaterals and paper, else 0)"
     add("--smoothing", metavar="S", type=not_negative, help=weight)
-    how = "how markers are found: least-squares fit, or soft-argmax (default: %(default)s)"
-    add("--locator", choices=LOCATORS, default=LOCATORS[0], help=how)
+    how = "how markers are found: least-squares fit, or soft-argmax (default: soft for paper, else fit)"
+    add("--locator", choices=LOCATORS, help=how)
 
 
 def positive(text: str) -> float:
