@@ -10,6 +10,7 @@ from test_dots import CENTRE, PATTERNS, PITCH, SIZE, batch, deform, dent, measur
 from test_texture import bump, forward, photograph, still
 
 from torchmembrane.errors import MembraneError
+from torchmembrane.io.store import Settings
 from torchmembrane.markers.dots.ellipse import draw_dots
 from torchmembrane.markers.dots.pattern import DotPattern
 from torchmembrane.markers.placement import place_markers
@@ -196,6 +197,7 @@ def test_a_reconstructor_is_built_with_either_locator():
     sensor = Sensor.from_file(EXAMPLE)
     fit, soft = (Reconstructor(sensor, "minimum-energy", locator=name) for name in ("fit", "soft"))
     assert type(soft.observer.locator) is SoftLocator
+    assert [Settings.of(made, "npz").locator for made in (fit, soft)] == ["fit", "soft"]
     image = fit.read("examples/two_contacts.png")
     with torch.no_grad():
         one, other = fit(image), soft(image)
