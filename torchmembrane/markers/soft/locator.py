@@ -120,7 +120,6 @@ class SoftLocator(nn.Module):
             self.by_large.calibrate(levels, self.rest[self.small])
         self.refine.calibrate(levels, self.rest)
 
-    @piece
     def forward(self, image: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Locate the dots in a batch of frames.
 
@@ -133,23 +132,34 @@ class SoftLocator(nn.Module):
             Pixels `[B, D, 2]` and confidence `[B, D]` in 0..1; a lost dot has confidence 0 and the pixel that its neighbours
             predict. A frame that holds a value that is not finite has confidence 0 throughout.
         """
+        levels, usable = self.begin(image)
+        place, weight = self.growth(levels, None if previous is None else self.of_large(previous))
+        if self.by_large is not None:
+            place = self.join(place, self.find_small(levels, self.predict_small(place, weight)))
+        return self.judge(self.fit(levels, place), usable)
+
+    @piece
+    def begin(self, image: Tensor) -> tuple[list[Tensor], Tensor]:
+        """The pyramid, and which frames are usable `[B]`."""
         finite = image.isfinite()
         dark = torch.where(finite, 1 - image if self.polarity == "light" else image, 0.0)
-        levels = self.levels(dark)
-        place, weight = self.growth(levels, None if previous is None else previous[:, self.large])
-        if self.by_large is not None:
-            place = self.join(place, self.find_small(levels, self.predict_small(place, weight)).place)
-        found = self.fit(levels, place)
-        return self.judge(levels, found, finite.flatten(1).all(1))
+        return self.levels(dark), finite.flatten(1).all(1)
+
+    @piece
+    def of_large(self, values: Tensor) -> Tensor:
+        """Of values `[B, D, ...]` those of the large dots."""
+        return values[:, self.large]
 
     def levels(self, dark: Tensor) -> list[Tensor]:
         """Pyramid of the logarithm of images `[B, 1, H, W]`, in which uneven light only adds; zero off the membrane."""
         return pyramid((dark.clamp(0, 1) / MIDDLE + DARKEST).log() * self.inside)
 
+    @piece
     def join(self, large: Tensor, small: Tensor) -> Tensor:
         """Values of all dots in the pattern's order, from those of the large and of the small ones `[B, ...]`."""
         return torch.cat([large, small], 1)[:, self.order]
 
+    @piece
     def predict_small(self, place: Tensor, weight: Tensor) -> Tensor:
         """Where the large dots at `place [B, L, 2]` px, of `weight [B, L]`, predict the small ones: `[B, S, 2]` px."""
         none = self.rest[self.small].expand(place.shape[0], -1, -1)
@@ -159,20 +169,22 @@ class SoftLocator(nn.Module):
             predicted, gradient, _ = predict(self.averages, weight, flow, gradient)
         return (self.rest + predicted)[:, self.small]
 
-    def find_small(self, levels: list[Tensor], predicted: Tensor) -> Found:
-        """The small dots about `predicted [B, S, 2]` px, on a coarse level."""
+    @piece
+    def find_small(self, levels: list[Tensor], predicted: Tensor) -> Tensor:
+        """Pixels `[B, S, 2]` of the small dots about `predicted [B, S, 2]` px, on a coarse level."""
         assert self.by_large is not None
-        return self.by_large(self.by_large.response.maps(levels), predicted)
+        return self.by_large(self.by_large.response.maps(levels), predicted).place
 
     def fit(self, levels: list[Tensor], place: Tensor) -> Found:
         """All dots about `place [B, D, 2]` px on the finest level that suits them, windows moving with them."""
         maps = self.refine.response.maps(levels)
         for _ in range(REFINEMENTS):
-            found = self.refine(maps, place)
+            found: Found = self.refine(maps, place)
             place = found.place
         return found
 
-    def judge(self, levels: list[Tensor], found: Found, usable: Tensor) -> tuple[Tensor, Tensor]:
+    @piece
+    def judge(self, found: Found, usable: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels and confidence, as `forward` returns them; `usable [B]` says which frames are."""
         level = found.response.topk(found.response.shape[1] // 2, 1).values.mean(1, keepdim=True)
         alike = torch.sigmoid(20 * (found.response / (level + 1e-3) - FAINTER))

@@ -1,5 +1,6 @@
 """How strongly an image looks like a dot, each at its own scale: differences of Gaussians on a pyramid."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ import torch
 from kornia.filters import gaussian_blur2d
 from torch import Tensor, nn
 
+from ...pieces import piece
 from ..texture.pyramid import low_pass
 
 LEVELS = 5  # of the pyramid, by halves
@@ -97,6 +99,7 @@ class DotResponse(nn.Module):
         self.register_buffer(f"share{k}", 1 / (gaussians(mask, self.rungs[k]) + LEAST_SHARE))
         self.register_buffer(f"limit{k}", torch.as_tensor(np.array([width, height]) - 1 - self.half_width))
 
+    @piece
     def maps(self, levels: list[Tensor]) -> list[Tensor]:
         """Responses to dark discs on each level in use, one map for each scale: `[B, scales, h, w]`.
 
@@ -112,7 +115,7 @@ class DotResponse(nn.Module):
         above, below = ([at.index(rung + side) for rung in rungs] for side in (1, -1))
         return (mean[:, above] - mean[:, below]) * self.get_buffer(f"mask{k}")
 
-    def windows(self, maps: list[Tensor], centre: Tensor) -> Windows:
+    def windows(self, maps: Sequence[Tensor], centre: Tensor) -> Windows:
         """Each dot's response about `centre [B, D, 2]` px; near the border a window stops where it meets the border."""
         values, middles = [], []
         for k, each in zip(self.levels, maps, strict=True):
