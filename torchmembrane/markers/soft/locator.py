@@ -16,11 +16,11 @@ from ..spacing import spacing, thin_out
 from .response import pyramid
 from .search import WIDTH, DotGrowth, DotSearch, Found, predict
 
-NEAR = 1.2  # radii, what a dot found on the coarse level is off at most
+NEAR = 1.0  # radii, standard deviation of where a dot is expected on the fine level
 
 MIDDLE = 0.5  # grey of which the logarithm is taken for 0
 DARKEST = 0.15  # of it, what the darkest has at least: noise in the dark weighs no more than that
-REFINEMENTS = 2  # soft-argmaxes on the finest level
+REFINEMENTS = 2  # soft-argmaxes on the fine level after the first, each about what the neighbours make of the one before
 FAINTEST = 0.2  # of a drawn dot's contrast, of a dot that is half believed
 FAINTER = 0.45  # of the mean contrast of the frame's clearer half
 UNLED = 0.4  # share of the large dots around a small one that are found, where it is half believed
@@ -93,7 +93,7 @@ class SoftLocator(nn.Module):
         large, small = np.flatnonzero(largest), np.flatnonzero(~largest)
         self.growth = DotGrowth(pixels[large], radii[large], others[large], anchors, inside)
         self.by_large = DotSearch(radii[small], others[small], 1, 0.2 * nearest[small], inside) if len(small) else None
-        self.refine = DotSearch(radii, others, 0, NEAR * radii, inside)
+        self.refine = DotSearch(radii, others, -1, NEAR * radii, inside)
         nodes = np.concatenate([pixels, thin_out(anchors, 0.7 * float(np.median(mean)))])
         self.averages = FlowAverages(pixels, nodes, WIDTH)
         self.neighbourhood = Neighbourhood(pixels, nodes[len(pixels) :])
@@ -176,20 +176,31 @@ class SoftLocator(nn.Module):
         return self.by_large(self.by_large.response.maps(levels), predicted).place
 
     def fit(self, levels: list[Tensor], place: Tensor) -> Found:
-        """All dots about `place [B, D, 2]` px on the finest level that suits them, windows moving with them."""
+        """All dots about `place [B, D, 2]` px on a fine level, each then again about where it and its neighbours put it."""
         maps = self.refine.response.maps(levels)
+        found: Found = self.refine(maps, place)
         for _ in range(REFINEMENTS):
-            found: Found = self.refine(maps, place)
-            place = found.place
+            found = self.refine(maps, self.settle(found))
         return found
+
+    @piece
+    def settle(self, found: Found) -> Tensor:
+        """Pixels `[B, D, 2]` of the dots that belong with their neighbours, of the others where these put them."""
+        flow, quality = found.place - self.rest, self.quality(found)
+        local: NeighbourFlow = self.neighbourhood(flow, quality, self.tolerance)
+        trust = (quality * local.trust(flow))[..., None]
+        return self.rest + trust * flow + (1 - trust) * local.flow
+
+    def quality(self, found: Found) -> Tensor:
+        """How much each dot looks like one, `[B, D]` in 0..1: dark as drawn and as the others, and sharp."""
+        level = found.response.topk(found.response.shape[1] // 2, 1).values.mean(1, keepdim=True)
+        alike = torch.sigmoid(20 * (found.response / (level + 1e-3) - FAINTER))
+        return torch.sigmoid(30 * (found.response - FAINTEST)) * alike * found.sharpness
 
     @piece
     def judge(self, found: Found, usable: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels and confidence, as `forward` returns them; `usable [B]` says which frames are."""
-        level = found.response.topk(found.response.shape[1] // 2, 1).values.mean(1, keepdim=True)
-        alike = torch.sigmoid(20 * (found.response / (level + 1e-3) - FAINTER))
-        clear = torch.sigmoid(30 * (found.response - FAINTEST)) * alike
-        quality, flow = clear * found.sharpness, found.place - self.rest
+        flow, quality = found.place - self.rest, self.quality(found)
         local: NeighbourFlow = self.neighbourhood(flow, quality, self.tolerance)
         confidence = quality * local.trust(flow)
         if self.by_large is not None:

@@ -12,7 +12,7 @@ from ...pieces import piece
 from ..texture.pyramid import low_pass
 
 LEVELS = 5  # of the pyramid, by halves
-FINEST = 1.5  # px of its level, radius of a dot at least where there is such a level
+COARSEST = 1.5  # px, least radius of a dot on the coarsest level that still shows its shape
 RUNG = 1.6**0.5  # ratio of neighbouring Gaussians; a response is the difference of two that are two rungs apart
 LEAST_SHARE = 0.02  # of a Gaussian that is on the membrane, where its mean is taken for one
 OTHER = 0.75  # share of the other size's response that is taken off at most
@@ -59,7 +59,7 @@ class DotResponse(nn.Module):
     Args:
         radii: of the dots `[D]`, px.
         others: radii that dots of the other size have there `[D]`, px; NaN where there is one size only.
-        coarser: how many levels of the pyramid above the finest that suits a dot.
+        coarser: how many levels of the pyramid above the coarsest that still shows a dot's shape (negative: below).
         reach: half side of the windows `[D]`, px.
         inside: `[1, 1, H, W]`, 1 where the membrane is, else 0: what is not has zero weight in the Gaussians.
     """
@@ -70,7 +70,7 @@ class DotResponse(nn.Module):
 
     def __init__(self, radii: np.ndarray, others: np.ndarray, coarser: int, reach: np.ndarray, inside: Tensor):
         super().__init__()
-        level = np.floor(np.log2(np.maximum(radii / FINEST, 1))).astype(int).clip(0, LEVELS - 1 - coarser) + coarser
+        level = (np.floor(np.log2(np.maximum(radii / COARSEST, 1))).astype(int) + coarser).clip(max(coarser, 0), LEVELS - 1)
         stride, masks = 2.0**level, pyramid(inside.double())
         self.levels = [int(k) for k in np.unique(level)]
         fits = min((min(masks[k].shape[-2:]) - 1) // 2 for k in self.levels)

@@ -13,7 +13,7 @@ from ..spacing import spacing, thin_out
 from .argmax import Peak, window_peak
 from .response import DotResponse
 
-COARSE, FINE = 0.25, 0.3
+COARSE, FINE = 0.25, 0.2
 """Temperatures of the softmax, of the logarithm of the response: weights are powers of it, whatever the contrast."""
 WINDOW = 2.0  # half side of a window, standard deviations of the prediction
 FLOOR = 0.01  # of a drawn dot's response: what is weaker is no peak
@@ -39,7 +39,7 @@ class DotSearch(nn.Module):
     Args:
         radii: of the dots `[D]`, px.
         others: radii that dots of the other size have there `[D]`, px, or NaN.
-        coarser: how many levels of the pyramid above the finest that suits a dot.
+        coarser: level of the pyramid, as in `DotResponse`.
         error: standard deviation of the predictions `[D]`, px.
         inside: `[1, 1, H, W]`, 1 where the membrane is, else 0.
 
@@ -53,7 +53,7 @@ class DotSearch(nn.Module):
 
     def __init__(self, radii: np.ndarray, others: np.ndarray, coarser: int, error: np.ndarray, inside: Tensor):
         super().__init__()
-        self.temperature = COARSE if coarser else FINE
+        self.temperature = COARSE if coarser > 0 else FINE
         self.response = DotResponse(radii, others, coarser, WINDOW * error, inside)
         self.register_buffer("error", torch.as_tensor(error))
         self.register_buffer("strength", torch.ones(len(radii), dtype=torch.float64))
