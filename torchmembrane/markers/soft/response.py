@@ -76,7 +76,7 @@ class DotResponse(nn.Module):
         fits = min((min(masks[k].shape[-2:]) - 1) // 2 for k in self.levels)
         self.half_width = max(1, min(int(np.ceil((reach / stride).max())), fits))
         sigma, other = (r / 2**0.5 / stride for r in (radii, np.where(np.isfinite(others), others, radii)))
-        share = np.minimum(disc_response(other, sigma) / DISC, OTHER)
+        share = np.minimum(disc_response(2**0.5 * other, sigma) / DISC, OTHER)
         self.rungs: dict[int, list[int]] = {}
         dots = [np.flatnonzero(level == k) for k in self.levels]
         for k, on_level in zip(self.levels, dots, strict=True):

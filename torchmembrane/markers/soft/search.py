@@ -13,7 +13,7 @@ from ..spacing import spacing, thin_out
 from .argmax import Peak, window_peak
 from .response import DotResponse
 
-COARSE, FINE = 0.25, 0.2
+COARSE, FINE = 0.25, 0.3
 """Temperatures of the softmax, of the logarithm of the response: weights are powers of it, whatever the contrast."""
 WINDOW = 2.0  # half side of a window, standard deviations of the prediction
 FLOOR = 0.01  # of a drawn dot's response: what is weaker is no peak
