@@ -148,7 +148,7 @@ def test_a_dot_s_response_is_its_contrast_and_its_place_does_not_depend_on_it(co
     first = search(maps, torch.tensor([[[70.0, 60.0]]]).double())
     seen = search(maps, first.place)
     assert float(seen.response) == pytest.approx(contrast / 2, rel=0.03)
-    assert 0.04 < (first.place[0, 0] - truth).norm() < 0.12  # drawn to the prediction
+    assert 0.04 < (first.place[0, 0] - truth).norm() < 0.15  # drawn to the prediction
     assert (seen.place[0, 0] - truth).norm() < 0.02
     assert float(seen.sharpness) > 0.98
 
