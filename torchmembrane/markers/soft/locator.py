@@ -30,7 +30,7 @@ LOST = 0.05  # confidence below which a dot is lost
 
 
 class SoftLocator(nn.Module):
-    """Pixels of dots of one size or two by soft-argmax: every step is a smooth function of the image.
+    """Pixels of dots of one size or two by soft-argmax: a piecewise smooth function of the image.
 
     Large dots are grown from the rim inwards on a coarse level, small ones looked for where the large ones around predict
     them (the paper's multi-scale matching, section 5); then all are refined on a fine level. A dot's weight in a window is
@@ -49,10 +49,11 @@ class SoftLocator(nn.Module):
         MembraneError: another polarity, fewer than 6 dots, or dots that are not finite.
 
     Limitations:
-        The error is about 1.7 times that of `DotLocator`, whose ellipses follow the dots' outline; elongated dots near the
+        The error is about 1.6 times that of `DotLocator`, whose ellipses follow the dots' outline; elongated dots near the
         rim are worst. Where the flow is more than about the spacing of neighbouring dots, or turns or shrinks fast, regions
-        are found one spacing off and believed: `DotLocator` loses most of these. A frame before that is one spacing off is
-        followed. Large dots that are hidden cost the small ones between them.
+        are lost, or found one spacing off and believed. A frame before that is one spacing off is followed. Large dots that
+        are hidden cost the small ones between them. Gradients take the windows' whole pixels, the order in medians and what
+        is lost as constant.
 
     Example:
         >>> rest = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)
