@@ -221,6 +221,14 @@ def test_growth_gains_a_ring_with_each_step_and_reaches_the_middle():
     assert state[0].min() > 0.9
 
 
+def test_growth_does_not_believe_what_is_not_there():
+    """Where nothing answers, a weight of 0: not what the support alone would make it."""
+    grown = growth(np.zeros((0, 2)))
+    grown.search.calibrate(pyramid((drawn()[1] / 0.5 + 0.15).log()), grown.pixels)
+    maps, *state = grown.begin(pyramid(torch.zeros(1, 1, 130, 150).double()))
+    assert grown.step(*state, *maps)[0].max() < 1e-6
+
+
 @pytest.mark.parametrize("field, pitches, share", [(slide, 0.8, 0.1), (dent, 0.6, 0.1)])
 def test_large_dots_are_found_first_and_predict_the_small_ones(field, pitches, share):
     """On a rendered press, from the large ones alone: off by a tenth of the spacing at most, where they moved by half of it."""

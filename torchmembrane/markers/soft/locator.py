@@ -184,13 +184,25 @@ class SoftLocator(nn.Module):
             found = self.refine(maps, self.settle(found))
         return found
 
-    @piece
     def settle(self, found: Found) -> Tensor:
         """Pixels `[B, D, 2]` of the dots that belong with their neighbours, of the others where these put them."""
+        return self.mix(found.place, *self.compare(found))
+
+    def judge(self, found: Found, usable: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels and confidence, as `forward` returns them; `usable [B]` says which frames are."""
+        return self.decide(found.place, *self.compare(found), usable)
+
+    @piece
+    def compare(self, found: Found) -> tuple[Tensor, Tensor]:
+        """Where its neighbours put each dot `[B, D, 2]` px, and how much it looks like one and belongs with them `[B, D]`."""
         flow, quality = found.place - self.rest, self.quality(found)
         local: NeighbourFlow = self.neighbourhood(flow, quality, self.tolerance)
-        trust = (quality * local.trust(flow))[..., None]
-        return self.rest + trust * flow + (1 - trust) * local.flow
+        return self.rest + local.flow, quality * local.trust(flow)
+
+    @piece
+    def mix(self, place: Tensor, expected: Tensor, trust: Tensor) -> Tensor:
+        """Between `place` and `expected`, by `trust [B, D]` in the former."""
+        return trust[..., None] * place + (1 - trust[..., None]) * expected
 
     def quality(self, found: Found) -> Tensor:
         """How much each dot looks like one, `[B, D]` in 0..1: dark as drawn and as the others, and sharp."""
@@ -199,17 +211,14 @@ class SoftLocator(nn.Module):
         return torch.sigmoid(30 * (found.response - FAINTEST)) * alike * found.sharpness
 
     @piece
-    def judge(self, found: Found, usable: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels and confidence, as `forward` returns them; `usable [B]` says which frames are."""
-        flow, quality = found.place - self.rest, self.quality(found)
-        local: NeighbourFlow = self.neighbourhood(flow, quality, self.tolerance)
-        confidence = quality * local.trust(flow)
+    def decide(self, place: Tensor, expected: Tensor, confidence: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
+        """As `judge`, from what `compare` gives."""
         if self.by_large is not None:
             led = torch.sigmoid(20 * (confidence[:, self.large] @ self.lead + self.led_by_rim - UNLED))
             confidence = confidence * torch.where(self.is_small, led, 1.0)
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST)) * usable[:, None]
         confidence = ((confidence - LOST) / (1 - LOST)).relu()
-        return torch.where(confidence[..., None] > 0, found.place, self.rest + local.flow), confidence
+        return torch.where(confidence[..., None] > 0, place, expected), confidence
 
 
 def _other_radii(pixels: np.ndarray, radii: np.ndarray, largest: np.ndarray) -> np.ndarray:
