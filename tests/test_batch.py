@@ -291,11 +291,23 @@ def test_another_sensor_s_folder_is_refused_untouched(images, tmp_path):
     assert before == {path: path.read_bytes() for path in (tmp_path / "out").iterdir()}
 
 
-@pytest.mark.parametrize("option, value", [("energy", "harmonic"), ("element", "quadrilateral"), ("format", "parquet")])
+@pytest.mark.parametrize(
+    "option, value", [("energy", "harmonic"), ("element", "quadrilateral"), ("format", "parquet"), ("locator", "soft")]
+)
 def test_other_settings_are_refused(images, tmp_path, option, value):
     reconstruct(images[:1], tmp_path / "out")
     with pytest.raises(MembraneError, match=f"{option} .*{value}.*--{option}"):
         reconstruct(images, tmp_path / "out", NPZ._replace(**{option: value}))
+
+
+def test_a_folder_from_before_there_was_a_choice_of_locators_was_made_with_fit(images, tmp_path):
+    reconstruct(images[:1], tmp_path / "out", NPZ._replace(locator="soft"))
+    path = tmp_path / "out" / "mesh.npz"
+    with np.load(path) as data:
+        older = {key: data[key] for key in data if key != "locator"}
+    assert Mesh.load(path).settings.locator == "soft"
+    np.savez(path, **older)
+    assert Mesh.load(path).settings == NPZ and NPZ.locator == "fit"
 
 
 def test_a_folder_of_other_files_is_refused(images, tmp_path):

@@ -1,22 +1,18 @@
-"""Soft locators: accuracy, laws and gradients, through rendered pixels; the exported model against torch."""
-
-from inspect import unwrap
+"""Soft locators: accuracy, laws and gradients, through rendered pixels."""
 
 import numpy as np
-import onnxruntime
 import pytest
 import torch
 from test_dots import CENTRE, PATTERNS, PITCH, SIZE, batch, deform, dent, measured, render, scene, slide
 from test_texture import bump, forward, photograph, still
 
 from torchmembrane.errors import MembraneError
+from torchmembrane.io.store import Settings
 from torchmembrane.markers.dots.ellipse import draw_dots
 from torchmembrane.markers.dots.pattern import DotPattern
 from torchmembrane.markers.placement import place_markers
 from torchmembrane.markers.soft import SoftLocator, SoftTextureLocator
 from torchmembrane.markers.texture.patches import choose_patches
-from torchmembrane.onnx.export import Piece
-from torchmembrane.onnx.graph import traced
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.sensor import Sensor
 
@@ -168,17 +164,6 @@ def test_gradient_is_that_of_finite_differences():
     assert (image.grad * motion).sum().item() == pytest.approx(0.2, rel=0.1)
 
 
-def test_the_exported_model_agrees():
-    pattern, image = drawn((2.0, -1.5), torch.float32)
-    locate = SoftLocator(pattern, SMALL_SIZE, "dark")
-    images = torch.cat([image, drawn((-1.0, 0.5), torch.float32)[1], 0 * image + 0.5])
-    model = traced(Piece(locate, unwrap(SoftLocator.forward)), {"image": images[:2]}, ["pixels", "confidence"])
-    assert {node.domain for node in model.graph.node} <= {"", "ai.onnx"}
-    session = onnxruntime.InferenceSession(model.SerializeToString())
-    for expected, got in zip(found(locate, images), session.run(None, {"image": images.numpy()}), strict=True):
-        np.testing.assert_allclose(got, expected, atol=1e-3)
-
-
 def test_texture_is_followed_and_a_still_one_does_not_move():
     rest = photograph(still, 0)
     v, u = np.mgrid[: rest.shape[0], : rest.shape[1]]
@@ -192,10 +177,24 @@ def test_texture_is_followed_and_a_still_one_does_not_move():
     assert (confidence[2:] == 0).all() and np.isfinite(places).all()
 
 
+def test_gradient_of_texture_is_that_of_finite_differences():
+    rest = photograph(still, 0)[60:180, 90:230]
+    locate = SoftTextureLocator(rest, choose_patches(rest, np.ones(rest.shape, bool), 60)).double()
+    image, generator = torch.as_tensor(rest, dtype=torch.float64).roll(1, 1)[None, None], torch.Generator().manual_seed(1)
+    weight = torch.randn(locate.rest_pixels.shape, generator=generator, dtype=torch.float64)
+    motion = image.roll(1, 1) - image.roll(-1, 1)  # twice what a pixel to the right makes
+    image.requires_grad_()
+    (locate(image)[0][0] * weight).sum().backward()
+    with torch.no_grad():
+        ahead, behind = ((locate(image + step * motion)[0][0] * weight).sum() for step in (1e-6, -1e-6))
+    assert (image.grad * motion).sum().item() == pytest.approx((ahead - behind).item() / 2e-6, rel=1e-4)
+
+
 def test_a_reconstructor_is_built_with_either_locator():
     sensor = Sensor.from_file(EXAMPLE)
     fit, soft = (Reconstructor(sensor, "minimum-energy", locator=name) for name in ("fit", "soft"))
     assert type(soft.observer.locator) is SoftLocator
+    assert [Settings.of(made, "npz").locator for made in (fit, soft)] == ["fit", "soft"]
     image = fit.read("examples/two_contacts.png")
     with torch.no_grad():
         one, other = fit(image), soft(image)

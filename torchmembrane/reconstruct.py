@@ -91,7 +91,7 @@ class Reconstructor(nn.Module):
             raise MembraneError(f"Reconstructor: channels = {channels!r}; expected 'rgb' or 'bgr'")
         if dtype not in PRECISIONS:
             raise MembraneError(f"Reconstructor: dtype = {dtype}; expected torch.float32 or torch.float64")
-        self.sensor, self.estimator_name, self.channels = sensor, estimator, channels
+        self.sensor, self.estimator_name, self.locator_name, self.channels = sensor, estimator, locator, channels
         self.image_size, self.model = sensor.camera.image_size, model or sensor.material.model
         self.camera, membrane = copy.deepcopy(sensor.camera), copy.deepcopy(sensor.membrane)
         vertex_pixels = self.camera.point_to_pixel(membrane.rest)

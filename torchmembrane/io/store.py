@@ -30,13 +30,22 @@ class Settings(NamedTuple):
     volume: str = "exact"
     flow: str = "smooth"
     smoothing: float = 0.0
+    locator: str = "fit"
 
     @classmethod
     def of(cls, reconstructor: "Reconstructor", format: str) -> "Settings":
         """Those of results that a reconstructor makes."""
         estimator = reconstructor.estimator
-        choices = estimator.element, format, estimator.volume, estimator.flow_kind, estimator.smoothing_weight
-        return cls(reconstructor.estimator_name, reconstructor.model, *choices)
+        return cls(
+            estimator=reconstructor.estimator_name,
+            energy=reconstructor.model,
+            element=estimator.element,
+            format=format,
+            volume=estimator.volume,
+            flow=estimator.flow_kind,
+            smoothing=estimator.smoothing_weight,
+            locator=reconstructor.locator_name,
+        )
 
 
 class Mesh(NamedTuple):
@@ -52,7 +61,7 @@ class Mesh(NamedTuple):
     image_size      [2]     int64, width and height, px
     length_unit, force_unit, name    of the sensor
     sensor          fingerprint of its file
-    estimator, energy, element, format, volume, flow, smoothing    the `Settings`
+    estimator, energy, element, format, volume, flow, smoothing, locator    the `Settings`
     """
 
     rest_vertices: np.ndarray
@@ -74,6 +83,7 @@ class Mesh(NamedTuple):
     volume: str = "exact"
     flow: str = "smooth"
     smoothing: float = 0.0
+    locator: str = "fit"
 
     @classmethod
     def of(cls, reconstructor: "Reconstructor", settings: Settings) -> "Mesh":

@@ -1,4 +1,4 @@
-"""Markers located by soft-argmax of responses, built of kornia's operators and differentiable throughout."""
+"""Markers located by soft-argmax of responses, built of kornia's operators: piecewise differentiable."""
 
 from .locator import SoftLocator
 from .texture import SoftTextureLocator

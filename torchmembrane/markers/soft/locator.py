@@ -16,11 +16,11 @@ from ..spacing import spacing, thin_out
 from .response import pyramid
 from .search import WIDTH, DotGrowth, DotSearch, Found, predict
 
-NEAR = 1.2  # radii, what a dot found on the coarse level is off at most
+NEAR = 1.0  # radii, standard deviation of where a dot is expected on the fine level
 
 MIDDLE = 0.5  # grey of which the logarithm is taken for 0
 DARKEST = 0.15  # of it, what the darkest has at least: noise in the dark weighs no more than that
-REFINEMENTS = 2  # soft-argmaxes on the finest level
+REFINEMENTS = 2  # soft-argmaxes on the fine level after the first, each about what the neighbours make of the one before
 FAINTEST = 0.2  # of a drawn dot's contrast, of a dot that is half believed
 FAINTER = 0.45  # of the mean contrast of the frame's clearer half
 UNLED = 0.4  # share of the large dots around a small one that are found, where it is half believed
@@ -30,7 +30,7 @@ LOST = 0.05  # confidence below which a dot is lost
 
 
 class SoftLocator(nn.Module):
-    """Pixels of dots of one size or two by soft-argmax: every step is a smooth function of the image.
+    """Pixels of dots of one size or two by soft-argmax: a piecewise smooth function of the image.
 
     Large dots are grown from the rim inwards on a coarse level, small ones looked for where the large ones around predict
     them (the paper's multi-scale matching, section 5); then all are refined on a fine level. A dot's weight in a window is
@@ -49,10 +49,11 @@ class SoftLocator(nn.Module):
         MembraneError: another polarity, fewer than 6 dots, or dots that are not finite.
 
     Limitations:
-        The error is about 1.7 times that of `DotLocator`, whose ellipses follow the dots' outline; elongated dots near the
+        The error is about 1.6 times that of `DotLocator`, whose ellipses follow the dots' outline; elongated dots near the
         rim are worst. Where the flow is more than about the spacing of neighbouring dots, or turns or shrinks fast, regions
-        are found one spacing off and believed: `DotLocator` loses most of these. A frame before that is one spacing off is
-        followed. Large dots that are hidden cost the small ones between them.
+        are lost, or found one spacing off and believed. A frame before that is one spacing off is followed. Large dots that
+        are hidden cost the small ones between them. Gradients take the windows' whole pixels, the order in medians and what
+        is lost as constant.
 
     Example:
         >>> rest = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)
@@ -93,7 +94,7 @@ class SoftLocator(nn.Module):
         large, small = np.flatnonzero(largest), np.flatnonzero(~largest)
         self.growth = DotGrowth(pixels[large], radii[large], others[large], anchors, inside)
         self.by_large = DotSearch(radii[small], others[small], 1, 0.2 * nearest[small], inside) if len(small) else None
-        self.refine = DotSearch(radii, others, 0, NEAR * radii, inside)
+        self.refine = DotSearch(radii, others, -1, NEAR * radii, inside)
         nodes = np.concatenate([pixels, thin_out(anchors, 0.7 * float(np.median(mean)))])
         self.averages = FlowAverages(pixels, nodes, WIDTH)
         self.neighbourhood = Neighbourhood(pixels, nodes[len(pixels) :])
@@ -120,7 +121,6 @@ class SoftLocator(nn.Module):
             self.by_large.calibrate(levels, self.rest[self.small])
         self.refine.calibrate(levels, self.rest)
 
-    @piece
     def forward(self, image: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Locate the dots in a batch of frames.
 
@@ -133,23 +133,34 @@ class SoftLocator(nn.Module):
             Pixels `[B, D, 2]` and confidence `[B, D]` in 0..1; a lost dot has confidence 0 and the pixel that its neighbours
             predict. A frame that holds a value that is not finite has confidence 0 throughout.
         """
+        levels, usable = self.begin(image)
+        place, weight = self.growth(levels, None if previous is None else self.of_large(previous))
+        if self.by_large is not None:
+            place = self.join(place, self.find_small(levels, self.predict_small(place, weight)))
+        return self.judge(self.fit(levels, place), usable)
+
+    @piece
+    def begin(self, image: Tensor) -> tuple[list[Tensor], Tensor]:
+        """The pyramid, and which frames are usable `[B]`."""
         finite = image.isfinite()
         dark = torch.where(finite, 1 - image if self.polarity == "light" else image, 0.0)
-        levels = self.levels(dark)
-        place, weight = self.growth(levels, None if previous is None else previous[:, self.large])
-        if self.by_large is not None:
-            place = self.join(place, self.find_small(levels, self.predict_small(place, weight)).place)
-        found = self.fit(levels, place)
-        return self.judge(levels, found, finite.flatten(1).all(1))
+        return self.levels(dark), finite.flatten(1).all(1)
+
+    @piece
+    def of_large(self, values: Tensor) -> Tensor:
+        """Of values `[B, D, ...]` those of the large dots."""
+        return values[:, self.large]
 
     def levels(self, dark: Tensor) -> list[Tensor]:
         """Pyramid of the logarithm of images `[B, 1, H, W]`, in which uneven light only adds; zero off the membrane."""
         return pyramid((dark.clamp(0, 1) / MIDDLE + DARKEST).log() * self.inside)
 
+    @piece
     def join(self, large: Tensor, small: Tensor) -> Tensor:
         """Values of all dots in the pattern's order, from those of the large and of the small ones `[B, ...]`."""
         return torch.cat([large, small], 1)[:, self.order]
 
+    @piece
     def predict_small(self, place: Tensor, weight: Tensor) -> Tensor:
         """Where the large dots at `place [B, L, 2]` px, of `weight [B, L]`, predict the small ones: `[B, S, 2]` px."""
         none = self.rest[self.small].expand(place.shape[0], -1, -1)
@@ -159,33 +170,55 @@ class SoftLocator(nn.Module):
             predicted, gradient, _ = predict(self.averages, weight, flow, gradient)
         return (self.rest + predicted)[:, self.small]
 
-    def find_small(self, levels: list[Tensor], predicted: Tensor) -> Found:
-        """The small dots about `predicted [B, S, 2]` px, on a coarse level."""
+    @piece
+    def find_small(self, levels: list[Tensor], predicted: Tensor) -> Tensor:
+        """Pixels `[B, S, 2]` of the small dots about `predicted [B, S, 2]` px, on a coarse level."""
         assert self.by_large is not None
-        return self.by_large(self.by_large.response.maps(levels), predicted)
+        return self.by_large(self.by_large.response.maps(levels), predicted).place
 
     def fit(self, levels: list[Tensor], place: Tensor) -> Found:
-        """All dots about `place [B, D, 2]` px on the finest level that suits them, windows moving with them."""
+        """All dots about `place [B, D, 2]` px on a fine level, each then again about where it and its neighbours put it."""
         maps = self.refine.response.maps(levels)
+        found: Found = self.refine(maps, place)
         for _ in range(REFINEMENTS):
-            found = self.refine(maps, place)
-            place = found.place
+            found = self.refine(maps, self.settle(found))
         return found
 
-    def judge(self, levels: list[Tensor], found: Found, usable: Tensor) -> tuple[Tensor, Tensor]:
+    def settle(self, found: Found) -> Tensor:
+        """Pixels `[B, D, 2]` of the dots that belong with their neighbours, of the others where these put them."""
+        return self.mix(found.place, *self.compare(found))
+
+    def judge(self, found: Found, usable: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels and confidence, as `forward` returns them; `usable [B]` says which frames are."""
+        return self.decide(found.place, *self.compare(found), usable)
+
+    @piece
+    def compare(self, found: Found) -> tuple[Tensor, Tensor]:
+        """Where its neighbours put each dot `[B, D, 2]` px, and how much it looks like one and belongs with them `[B, D]`."""
+        flow, quality = found.place - self.rest, self.quality(found)
+        local: NeighbourFlow = self.neighbourhood(flow, quality, self.tolerance)
+        return self.rest + local.flow, quality * local.trust(flow)
+
+    @piece
+    def mix(self, place: Tensor, expected: Tensor, trust: Tensor) -> Tensor:
+        """Between `place` and `expected`, by `trust [B, D]` in the former."""
+        return trust[..., None] * place + (1 - trust[..., None]) * expected
+
+    def quality(self, found: Found) -> Tensor:
+        """How much each dot looks like one, `[B, D]` in 0..1: dark as drawn and as the others, and sharp."""
         level = found.response.topk(found.response.shape[1] // 2, 1).values.mean(1, keepdim=True)
         alike = torch.sigmoid(20 * (found.response / (level + 1e-3) - FAINTER))
-        clear = torch.sigmoid(30 * (found.response - FAINTEST)) * alike
-        quality, flow = clear * found.sharpness, found.place - self.rest
-        local: NeighbourFlow = self.neighbourhood(flow, quality, self.tolerance)
-        confidence = quality * local.trust(flow)
+        return torch.sigmoid(30 * (found.response - FAINTEST)) * alike * found.sharpness
+
+    @piece
+    def decide(self, place: Tensor, expected: Tensor, confidence: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
+        """As `judge`, from what `compare` gives."""
         if self.by_large is not None:
             led = torch.sigmoid(20 * (confidence[:, self.large] @ self.lead + self.led_by_rim - UNLED))
             confidence = confidence * torch.where(self.is_small, led, 1.0)
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST)) * usable[:, None]
         confidence = ((confidence - LOST) / (1 - LOST)).relu()
-        return torch.where(confidence[..., None] > 0, found.place, self.rest + local.flow), confidence
+        return torch.where(confidence[..., None] > 0, place, expected), confidence
 
 
 def _other_radii(pixels: np.ndarray, radii: np.ndarray, largest: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """How strongly an image looks like a dot, each at its own scale: differences of Gaussians on a pyramid."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -7,10 +8,11 @@ import torch
 from kornia.filters import gaussian_blur2d
 from torch import Tensor, nn
 
+from ...pieces import piece
 from ..texture.pyramid import low_pass
 
 LEVELS = 5  # of the pyramid, by halves
-FINEST = 1.5  # px of its level, radius of a dot at least where there is such a level
+COARSEST = 1.5  # px, least radius of a dot on the coarsest level that still shows its shape
 RUNG = 1.6**0.5  # ratio of neighbouring Gaussians; a response is the difference of two that are two rungs apart
 LEAST_SHARE = 0.02  # of a Gaussian that is on the membrane, where its mean is taken for one
 OTHER = 0.75  # share of the other size's response that is taken off at most
@@ -57,7 +59,7 @@ class DotResponse(nn.Module):
     Args:
         radii: of the dots `[D]`, px.
         others: radii that dots of the other size have there `[D]`, px; NaN where there is one size only.
-        coarser: how many levels of the pyramid above the finest that suits a dot.
+        coarser: how many levels of the pyramid above the coarsest that still shows a dot's shape (negative: below).
         reach: half side of the windows `[D]`, px.
         inside: `[1, 1, H, W]`, 1 where the membrane is, else 0: what is not has zero weight in the Gaussians.
     """
@@ -68,13 +70,13 @@ class DotResponse(nn.Module):
 
     def __init__(self, radii: np.ndarray, others: np.ndarray, coarser: int, reach: np.ndarray, inside: Tensor):
         super().__init__()
-        level = np.floor(np.log2(np.maximum(radii / FINEST, 1))).astype(int).clip(0, LEVELS - 1 - coarser) + coarser
+        level = (np.floor(np.log2(np.maximum(radii / COARSEST, 1))).astype(int) + coarser).clip(max(coarser, 0), LEVELS - 1)
         stride, masks = 2.0**level, pyramid(inside.double())
         self.levels = [int(k) for k in np.unique(level)]
         fits = min((min(masks[k].shape[-2:]) - 1) // 2 for k in self.levels)
         self.half_width = max(1, min(int(np.ceil((reach / stride).max())), fits))
         sigma, other = (r / 2**0.5 / stride for r in (radii, np.where(np.isfinite(others), others, radii)))
-        share = np.minimum(disc_response(other, sigma) / DISC, OTHER)
+        share = np.minimum(disc_response(2**0.5 * other, sigma) / DISC, OTHER)
         self.rungs: dict[int, list[int]] = {}
         dots = [np.flatnonzero(level == k) for k in self.levels]
         for k, on_level in zip(self.levels, dots, strict=True):
@@ -97,6 +99,7 @@ class DotResponse(nn.Module):
         self.register_buffer(f"share{k}", 1 / (gaussians(mask, self.rungs[k]) + LEAST_SHARE))
         self.register_buffer(f"limit{k}", torch.as_tensor(np.array([width, height]) - 1 - self.half_width))
 
+    @piece
     def maps(self, levels: list[Tensor]) -> list[Tensor]:
         """Responses to dark discs on each level in use, one map for each scale: `[B, scales, h, w]`.
 
@@ -112,7 +115,7 @@ class DotResponse(nn.Module):
         above, below = ([at.index(rung + side) for rung in rungs] for side in (1, -1))
         return (mean[:, above] - mean[:, below]) * self.get_buffer(f"mask{k}")
 
-    def windows(self, maps: list[Tensor], centre: Tensor) -> Windows:
+    def windows(self, maps: Sequence[Tensor], centre: Tensor) -> Windows:
         """Each dot's response about `centre [B, D, 2]` px; near the border a window stops where it meets the border."""
         values, middles = [], []
         for k, each in zip(self.levels, maps, strict=True):

@@ -1,20 +1,20 @@
 """Dots searched for by soft-argmax about their predictions, and grown inwards from the rim."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ...pieces import piece, repeated
 from ..dots.flow import FlowAverages
 from ..spacing import spacing, thin_out
 from .argmax import Peak, window_peak
 from .response import DotResponse
 
-COARSE, FINE = (
-    0.25,
-    0.3,
-)  # temperatures of the softmax, of the logarithm of the response: weights are its tenth power, whatever the contrast
+COARSE, FINE = 0.25, 0.3
+"""Temperatures of the softmax, of the logarithm of the response: weights are powers of it, whatever the contrast."""
 WINDOW = 2.0  # half side of a window, standard deviations of the prediction
 FLOOR = 0.01  # of a drawn dot's response: what is weaker is no peak
 BLUNT = 2.5  # times its spread at rest, of a peak that is half believed
@@ -39,7 +39,7 @@ class DotSearch(nn.Module):
     Args:
         radii: of the dots `[D]`, px.
         others: radii that dots of the other size have there `[D]`, px, or NaN.
-        coarser: how many levels of the pyramid above the finest that suits a dot.
+        coarser: level of the pyramid, as in `DotResponse`.
         error: standard deviation of the predictions `[D]`, px.
         inside: `[1, 1, H, W]`, 1 where the membrane is, else 0.
 
@@ -53,7 +53,7 @@ class DotSearch(nn.Module):
 
     def __init__(self, radii: np.ndarray, others: np.ndarray, coarser: int, error: np.ndarray, inside: Tensor):
         super().__init__()
-        self.temperature = COARSE if coarser else FINE
+        self.temperature = COARSE if coarser > 0 else FINE
         self.response = DotResponse(radii, others, coarser, WINDOW * error, inside)
         self.register_buffer("error", torch.as_tensor(error))
         self.register_buffer("strength", torch.ones(len(radii), dtype=torch.float64))
@@ -65,13 +65,14 @@ class DotSearch(nn.Module):
             peak = self._peak(self.response.maps(levels), pixels[None])
             self.strength, self.spread = peak.strength[0].clamp_min(1e-3), peak.spread[0]
 
-    def forward(self, maps: list[Tensor], predicted: Tensor) -> Found:
+    @piece
+    def forward(self, maps: Sequence[Tensor], predicted: Tensor) -> Found:
         """The dots about `predicted [B, D, 2]` px, from the responses on each level."""
         peak = self._peak(maps, predicted)
         sharpness = torch.sigmoid(4 * (BLUNT - peak.spread / self.spread))
         return Found(peak.place, (peak.strength / self.strength).relu(), sharpness)
 
-    def _peak(self, maps: list[Tensor], predicted: Tensor) -> Peak:
+    def _peak(self, maps: Sequence[Tensor], predicted: Tensor) -> Peak:
         value, middle = self.response.windows(maps, predicted)
         score = ((value / self.strength[:, None, None]).relu() + FLOOR).log()
         return window_peak(score, value, middle, self.response.stride, predicted, self.error, self.temperature)
@@ -115,24 +116,34 @@ class DotGrowth(nn.Module):
         Returns:
             Pixels `[B, D, 2]` and weight `[B, D]` in 0..1.
         """
+        maps, *state = self.begin(levels, previous)
+        weight, flow, _ = repeated(self.step, self.steps, state, *maps)
+        return self.moved(flow), weight
+
+    @piece
+    def begin(self, levels: list[Tensor], previous: Tensor | None = None) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
+        """The responses on each level, and before the first step weight, flow and its gradient, as `step` has them."""
         maps, batch = self.search.response.maps(levels), levels[0].shape[0]
-        weight = self.known.expand(batch, -1)
-        flow = torch.zeros_like(self.pixels).expand(batch, -1, -1)
+        weight = self.known.repeat(batch, 1)
+        flow = torch.zeros_like(self.pixels).repeat(batch, 1, 1)
         if previous is not None:
             kept = previous.isfinite().all(-1)
             flow = torch.where(kept[..., None], previous - self.pixels, 0.0)
             weight = torch.where(kept, 1.0, weight)
-        gradient = torch.zeros_like(flow)[..., None].expand(-1, -1, -1, 2)
-        for _ in range(self.steps):
-            weight, flow, gradient = self.step(maps, weight, flow, gradient)
-        return self.pixels + flow, weight
+        return maps, weight, flow, torch.zeros_like(flow)[..., None].repeat(1, 1, 1, 2)
 
-    def step(self, maps: list[Tensor], weight: Tensor, flow: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    @piece
+    def step(self, weight: Tensor, flow: Tensor, gradient: Tensor, *maps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """One step of the growth: weight `[B, D]`, flow `[B, D, 2]` and its gradient `[B, D, 2, 2]` after it."""
         predicted, gradient, support = predict(self.averages, weight, flow, gradient)
         found = self.search(maps, self.pixels + predicted)
         believed = torch.sigmoid(10 * (support - UNSUPPORTED)) * found.response / (found.response + FAINT)
         return believed * found.sharpness, found.place - self.pixels, gradient
+
+    @piece
+    def moved(self, flow: Tensor) -> Tensor:
+        """Pixels `[B, D, 2]` of the dots after that flow."""
+        return self.pixels + flow
 
 
 def predict(averages: FlowAverages, weight: Tensor, flow: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
