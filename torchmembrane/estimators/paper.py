@@ -67,8 +67,7 @@ class PaperEstimator(VertexRays):
 
     Limitations:
         As `MinimumEnergy`: no force is looked for along the rays, so of a press by something hard it finds where, and only a
-        part of the depth. Of a press on the optical axis it finds next to none: eq. 29 says that it is on the axis, but the
-        contacts of the surface found may be two beside it (`examples/press_on_axis.png`: 6 mm to either side).
+        part of the depth. Of a press on the optical axis it finds next to none: the contact is then a disc around the axis.
     """
 
     element: ClassVar[str] = "quadrilateral"

@@ -103,7 +103,8 @@ class Segmentation(nn.Module):
         count: how many contacts are reported.
 
     Limitations:
-        Contacts closer than about a fifth of the surface's size are one.
+        Contacts closer than about a fifth of the surface's size are one. A contact on the axis that turns all rays outwards is
+        a disc of a tenth of that size, however large it is.
     """
 
     rest_origins: Tensor
