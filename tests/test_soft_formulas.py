@@ -249,6 +249,15 @@ def test_large_dots_are_found_first_and_predict_the_small_ones(field, pitches, s
     assert np.linalg.norm(s.pixels[small] - truth[small], axis=1).max() > 4 * share * PITCH
 
 
+def test_small_dots_are_predicted_along_the_gradient_of_the_large_ones_flow():
+    """From the large ones where they truly are: to 1.2 % of the spacing, median; without a second pass it is 1.7 %."""
+    s = scene()
+    locate, (truth, _) = SoftLocator(measured(s), SIZE, "dark", s.rim), deform(s, slide, 0.8)
+    moved = torch.as_tensor(truth, dtype=torch.float32)[None]
+    predicted = locate.predict_small(locate.of_large(moved), torch.ones(1, len(locate.large)))[0].numpy()
+    assert np.median(np.linalg.norm(predicted - truth[s.sizes == 0], axis=1)) < 0.012 * PITCH
+
+
 def test_values_of_large_and_small_dots_are_joined_in_the_pattern_s_order(square):
     locate, rest, _ = square
     both = torch.arange(2.0 * len(rest)).reshape(1, -1, 2)
