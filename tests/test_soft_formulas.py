@@ -370,3 +370,20 @@ def test_texture_moves_with_the_image():
         pixels, confidence = found(locate, batch(np.roll(rest, shift, (1, 0))))
         error = abs(pixels[0] - at - shift)[inner]
         assert confidence[0, inner].min() > 0.99 and error.max() < 0.2 and np.median(error) < 0.04
+
+
+def test_texture_that_is_covered_or_stays_behind_is_lost():
+    rest = photograph(still, 0)[40:200, 60:260]
+    locate = SoftTextureLocator(rest, choose_patches(rest, np.ones(rest.shape, bool), 200))
+    at, shift = locate.rest_pixels.numpy(), np.array([6, -4])
+    middle = np.linalg.norm(at - [100, 80], axis=1)
+    here, broken = np.s_[80 - 20 : 80 + 16, 100 - 14 : 100 + 26], np.roll(rest, shift, (1, 0))
+    covered, behind = broken.copy(), broken.copy()
+    covered[here] = np.random.default_rng(0).random(covered[here].shape)
+    behind[80 - 15 : 80 + 16, 100 - 15 : 100 + 16] = rest[80 - 15 : 80 + 16, 100 - 15 : 100 + 16]
+    broken[3, 5] = np.nan
+    pixels, confidence = found(locate, batch(covered, behind, broken))
+    assert (confidence[0, middle < 6] == 0).all() and confidence[0, (middle > 45) & (middle < 60)].min() > 0.9
+    assert abs(pixels[0] - at - shift)[middle < 6].max() < 1
+    assert (confidence[1, middle < 5] < 0.05).all() and (middle < 5).any()
+    assert (confidence[2] == 0).all()
