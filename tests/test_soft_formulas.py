@@ -6,15 +6,17 @@ import torch
 from scipy import ndimage
 from test_dots import CENTRE, PITCH, RADIUS, SIZE, batch, deform, dent, measured, render, scene, slide
 from test_soft import GRID, SMALL_SIZE, drawn, found
+from test_texture import photograph, still
 
 from torchmembrane.markers.dots.ellipse import draw_dots
 from torchmembrane.markers.dots.flow import FlowAverages
-from torchmembrane.markers.soft import SoftLocator
+from torchmembrane.markers.soft import SoftLocator, SoftTextureLocator
 from torchmembrane.markers.soft.argmax import window_peak
 from torchmembrane.markers.soft.locator import _other_radii
 from torchmembrane.markers.soft.response import DISC, RUNG, DotResponse, disc_response, pyramid
 from torchmembrane.markers.soft.search import BLUNT, DotGrowth, DotSearch, Found, predict
 from torchmembrane.markers.soft.texture import PatchCorrelation
+from torchmembrane.markers.texture.patches import choose_patches
 
 INNER = ((GRID > 0) & (GRID < [6, 5])).all(1)
 ONE = torch.ones(1, dtype=torch.float64)
@@ -322,6 +324,8 @@ def test_confidence_falls_with_the_frame(square):
     assert 0.4 < float(locate.judge(faint, ONE.bool())[1].median()) < 0.6
     few = seen._replace(sharpness=(torch.arange(42) % 8 == 0).double()[None])
     assert (locate.judge(few, ONE.bool())[1] == 0).all()
+    five = (torch.arange(42) == locate.large[::4, None]).any(0).double()[None]  # large ones, so that none needs to be led
+    assert 0 < five.sum() < 7 and locate.decide(seen.place, seen.place, five, ONE.bool())[1].max() < 0.1
     third = seen._replace(sharpness=seen.sharpness * (torch.arange(42) < 14))
     assert locate.judge(third, ONE.bool())[1][0, :7].min() > 0.5
     led = seen._replace(sharpness=locate.is_small.double()[None])
@@ -355,3 +359,31 @@ def test_correlation_ignores_light_and_follows_the_flow_s_gradient():
             assert peak.strength.min() > 0.8 and peak.strength.max() <= 1 + 1e-6
     _, plain = patches(image[None, None], truth[None], torch.zeros(1, 2, 2, 2).double())
     assert plain.strength.max() < 0.95 * peak.strength.min()
+
+
+def test_texture_moves_with_the_image():
+    rest = photograph(still, 0)[40:200, 60:260]
+    locate = SoftTextureLocator(rest, choose_patches(rest, np.ones(rest.shape, bool), 80))
+    at = locate.rest_pixels.numpy()
+    inner = (abs(at - [100, 80]) < [65, 45]).all(1)
+    for shift in ((9, -6), (-12, 5)):
+        pixels, confidence = found(locate, batch(np.roll(rest, shift, (1, 0))))
+        error = abs(pixels[0] - at - shift)[inner]
+        assert confidence[0, inner].min() > 0.99 and error.max() < 0.2 and np.median(error) < 0.04
+
+
+def test_texture_that_is_covered_or_stays_behind_is_lost():
+    rest = photograph(still, 0)[40:200, 60:260]
+    locate = SoftTextureLocator(rest, choose_patches(rest, np.ones(rest.shape, bool), 200))
+    at, shift = locate.rest_pixels.numpy(), np.array([6, -4])
+    middle = np.linalg.norm(at - [100, 80], axis=1)
+    here, broken = np.s_[80 - 20 : 80 + 16, 100 - 14 : 100 + 26], np.roll(rest, shift, (1, 0))
+    covered, behind = broken.copy(), broken.copy()
+    covered[here] = np.random.default_rng(0).random(covered[here].shape)
+    behind[80 - 15 : 80 + 16, 100 - 15 : 100 + 16] = rest[80 - 15 : 80 + 16, 100 - 15 : 100 + 16]
+    broken[3, 5] = np.nan
+    pixels, confidence = found(locate, batch(covered, behind, broken))
+    assert (confidence[0, middle < 6] == 0).all() and confidence[0, (middle > 45) & (middle < 60)].min() > 0.9
+    assert abs(pixels[0] - at - shift)[middle < 6].max() < 1
+    assert (confidence[1, middle < 5] < 0.05).all() and (middle < 5).any()
+    assert (confidence[2] == 0).all()
