@@ -123,7 +123,7 @@ class Segmentation(nn.Module):
     def by_polar_angle(self, directions: Tensor) -> ContactRegions:
         """Eq. 29 alone: contacts on the rest surface, for rays `[B, V, 3]`."""
         bulge = self.polar.bulge(directions) * ~self.membrane.fixed
-        return self._where(self.membrane.rest.expand(len(bulge), -1, -1), bulge, directions)
+        return self._where(self.membrane.rest.expand(bulge.shape[0], -1, -1), bulge, directions)
 
     @piece
     def by_normals(self, x: Tensor) -> ContactRegions:

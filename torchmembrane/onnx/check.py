@@ -45,11 +45,11 @@ def checked(model: bytes, reconstructor: Reconstructor) -> Agreement:
 
 
 def check_images(reconstructor: Reconstructor) -> Tensor:
-    """The sensor at rest and pressed, `[B, 1, H, W]`; at rest alone where its simulator finds no press."""
+    """The sensor at rest, pressed, and at rest, `[3, 1, H, W]`; once at rest where its simulator finds no press."""
     simulator = Simulator(reconstructor.sensor)
     images = [simulator.rest_image()]
     try:
-        images.append(random_frame(simulator, Plan(kinds=("sphere",)), 0).image)
+        images += [random_frame(simulator, Plan(kinds=("sphere",)), 0).image, images[0]]
     except MembraneError:
         pass
     return torch.cat([reconstructor.grey(image) for image in images])

@@ -36,7 +36,11 @@ _registry = staticmethod(cache(ONNXRegistry.from_torchlib))
 
 
 def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> onnx.ModelProto:
-    """A module as ONNX, its inputs and outputs named in order; the first axis of every input is the batch (of scalars none)."""
+    """A module as ONNX, its inputs and outputs named in order; the first axis of every input is the batch (of scalars none).
+
+    Raises:
+        ValueError: what is traced depends on the batch's length; torch's exporter then keeps that of the example, in silence.
+    """
     batch = torch.export.Dim("batch")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     shapes = tuple({0: batch} if value.ndim else None for value in inputs.values())
@@ -55,6 +59,8 @@ def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> 
             optimize=False,
         )
     assert program is not None  # it is None only of the exporter before dynamo
+    if any(value.shape and isinstance(value.shape[0], int) for value in program.model.graph.inputs):
+        raise ValueError("the traced program holds for this batch alone")
     common.InlinePass()(program.model)
     fold_constants_ir(program.model)
     _plain_reshapes(program.model.graph)
