@@ -14,7 +14,6 @@ import torch
 from torch import nn
 
 from torchmembrane import MembraneError
-from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.settings import ForceBalanceSettings
 from torchmembrane.io.images import to_grey
 from torchmembrane.io.results import Reconstruction, load_frame
@@ -108,27 +107,6 @@ def test_a_tracking_model_starts_from_the_frames_before(model_files, reconstruct
     feed = {"image": images.numpy()}
     feed |= {name: getattr(before, name.removeprefix("previous_")).numpy() for name in export.previous_of(reconstructor)}
     agree(Reconstruction(*session.run(list(Reconstruction._fields), feed)), expected)
-
-
-def test_minimum_energy_agrees_with_torch(small_sensor):
-    reconstructor = Reconstructor.from_file(small_sensor / "sensor.toml", estimator="minimum-energy")
-    estimator, tracer = reconstructor.estimator, export.Tracer()
-    flow = 3 * torch.rand(3, 1, 2) * estimator.free[:, None]
-    origins, directions = reconstructor.camera.pixel_to_ray(reconstructor.vertex_pixels + flow)
-    rays = {"origins": origins.expand(directions.shape).contiguous(), "directions": directions}
-    confidence = torch.ones(directions.shape[:2])
-    found = estimator(Observation(*(tracer.given(name, values[:2]) for name, values in rays.items()), confidence[:2]))
-    tracer.assembly.named(found.vertices.name, "surface")
-    shapes = {name: ["batch", 81, 3] for name in (*rays, "surface")}
-    values = {name: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, s) for name, s in shapes.items()}
-    model = tracer.assembly.model([values[name] for name in rays], [values["surface"]], {})
-    session = opened(model.SerializeToString())
-    with torch.no_grad():
-        expected = estimator(Observation(**rays, confidence=confidence)).vertices
-    assert (expected - estimator.membrane.rest).norm(dim=-1).max() > 0.1
-    for batch in (1, 3):
-        (found,) = session.run(None, {name: values[:batch].numpy() for name, values in rays.items()})
-        np.testing.assert_allclose(found, expected[:batch].numpy(), rtol=0, atol=1e-4)
 
 
 class Search(nn.Module):

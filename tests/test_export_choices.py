@@ -1,52 +1,29 @@
-"""Every choice that the command offers, exported and run; models that cannot be written, or are not the same when they are."""
+"""What the command's choices are put together of, exported and run; models that cannot be written, or are not the same."""
 
 from itertools import product
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 
+from torchmembrane import MembraneError
 from torchmembrane.cli import main as cli
+from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.settings import ELEMENTS, FLOWS, VOLUMES
 from torchmembrane.onnx import check, export
-from torchmembrane.onnx.check import Agreement, check_images, compare
+from torchmembrane.onnx.check import Agreement, check_images, checked
 from torchmembrane.onnx.graph import traced
 from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
 from torchmembrane.sensor.sensor import Sensor
 
-CHOICES = [
-    *(
-        ("minimum-energy", dict(element=element, volume=volume, flow=flow), model)
-        for element, volume, flow, model in (
-            ("triangle", "exact", "smooth", "mooney_rivlin"),
-            ("triangle", "linear", "bilinear", "harmonic"),
-            ("quadrilateral", "exact", "bilinear", None),
-            ("quadrilateral", "linear", "smooth", None),
-        )
-    ),
-    *(("paper", dict(flow=flow), None) for flow in FLOWS),
-]
-"""Every element with every volume, and every flow: between them all that any combination is put together of."""
+SOLVES = [("minimum-energy", dict(element=element, volume=volume)) for element, volume in product(ELEMENTS, VOLUMES)]
 
 
 @pytest.fixture(scope="module")
-def shared(small_sensor):
-    """What finds the markers, one for all, and what it was traced as."""
-    sensor, known, trace = Sensor.from_file(small_sensor / "sensor.toml"), {}, export.traced
-
-    def once(piece, inputs, outputs):
-        key = piece.owner, piece.function, *inputs
-        known[key] = known.get(key) or trace(piece, inputs, outputs)
-        return known[key]
-
-    return sensor, Reconstructor(sensor, "paper", locator="fit").observer, once
-
-
-def test_the_choices_are_all_there_are():
-    chosen = [options for estimator, options, _ in CHOICES if estimator == "minimum-energy"]
-    assert {(c["element"], c["volume"]) for c in chosen} == set(product(ELEMENTS, VOLUMES))
-    assert {c["flow"] for c in chosen} == set(FLOWS)
+def sensor(small_sensor):
+    return Sensor.from_file(small_sensor / "sensor.toml")
 
 
 def nodes(graph):
@@ -56,28 +33,47 @@ def nodes(graph):
             yield from nodes(attribute.g)
 
 
-@pytest.mark.parametrize("estimator, options, model", CHOICES)
-def test_every_choice_of_the_command_agrees_with_torch(shared, small_images, estimator, options, model, tmp_path, monkeypatch):
-    sensor, observer, once = shared
-    made = Reconstructor(sensor, estimator, settings=ESTIMATORS[estimator].Settings(**options), model=model, locator="fit")
-    made.observer = observer
-    images = made.read(*small_images)
-    monkeypatch.setattr(export, "traced", once)
-    monkeypatch.setattr(check, "check_images", lambda reconstructor: images)
-    written = export.export(made, tmp_path / "model.onnx")
-    assert {node.domain for node in nodes(written.graph)} == {""}
-    found = compare((tmp_path / "model.onnx").read_bytes(), made, images)
-    assert found.status == found.expected == [0, 0, 0] and found.distance < 1e-4
-    with torch.no_grad():
-        assert made(images).displacement.norm(dim=-1).max() > 0.05
+def ran(tracer, inputs, output):
+    """What the traced graph gives for `inputs`, alone and together, by the name of one output; its operators are standard."""
+    tracer.assembly.named(output.name, "output")
+    shape = ["batch", *output.example.shape[1:]]
+    described = [
+        onnx.helper.make_tensor_value_info(k, onnx.TensorProto.FLOAT, ["batch", *v.shape[1:]]) for k, v in inputs.items()
+    ]
+    given = onnx.helper.make_tensor_value_info("output", onnx.TensorProto.FLOAT, shape)
+    model = tracer.assembly.model(described, [given], {})
+    assert {node.domain for node in nodes(model.graph)} == {""}
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    for count in (1, 3):
+        yield session.run(None, {name: values[:count].numpy() for name, values in inputs.items()})[0]
 
 
-def test_a_model_is_checked_on_the_sensor_at_rest_and_pressed(shared):
-    sensor, observer, _ = shared
-    made = Reconstructor(sensor, "minimum-energy")
+@pytest.mark.parametrize("estimator, options", [*SOLVES, ("paper", {})])
+def test_every_solve_agrees_with_torch(sensor, estimator, options):
+    made = Reconstructor(sensor, estimator, settings=ESTIMATORS[estimator].Settings(**options), locator="fit")
+    solve, tracer = made.estimator, export.Tracer()
+    flow = 3 * torch.rand(3, 1, 2) * solve.free[:, None]
+    origins, directions = made.camera.pixel_to_ray(made.vertex_pixels + flow)
+    rays = {"origins": origins.expand(directions.shape).contiguous(), "directions": directions}
+    confidence = torch.ones(directions.shape[:2])
+    found = solve(Observation(*(tracer.given(name, values[:2]) for name, values in rays.items()), confidence[:2]))
     with torch.no_grad():
-        rest, pressed, again = made(check_images(made)).displacement.norm(dim=-1).amax(-1)
-    assert max(rest, again) < 0.05 < 0.1 < pressed
+        expected = solve(Observation(**rays, confidence=confidence)).vertices
+    assert (expected - solve.membrane.rest).norm(dim=-1).max() > 0.1
+    for vertices in ran(tracer, rays, found.vertices):
+        np.testing.assert_allclose(vertices, expected[: len(vertices)].numpy(), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("flow", FLOWS)
+def test_every_flow_agrees_with_torch(sensor, flow):
+    made = Reconstructor(sensor, "paper", settings=ESTIMATORS["paper"].Settings(flow=flow), locator="fit")
+    inputs = {"u": 2 * torch.rand(3, 49, 2), "confidence": (torch.rand(3, 49) > 0.1).float()}
+    tracer = export.Tracer()
+    found = made.observation(*(tracer.given(name, values[:2]) for name, values in inputs.items()))
+    with torch.no_grad():
+        expected = made.observation(*inputs.values()).directions
+    for directions in ran(tracer, inputs, found.directions):
+        np.testing.assert_allclose(directions, expected[: len(directions)].numpy(), rtol=0, atol=1e-5)
 
 
 class Doubled(torch.nn.Module):
@@ -90,35 +86,45 @@ def test_what_holds_for_one_batch_only_is_refused():
         traced(Doubled(), {"x": torch.rand(2, 3)}, ["y"])
 
 
-def in_one_line(code, captured):
-    said = captured.err.strip().splitlines()
-    assert code == 2 and len(said) == 1, captured.err
-    return said[0]
+def test_a_model_is_checked_on_the_sensor_at_rest_and_pressed(sensor):
+    made = Reconstructor(sensor, "minimum-energy")
+    with torch.no_grad():
+        rest, pressed, again = made(check_images(made)).displacement.norm(dim=-1).amax(-1)
+    assert max(rest, again) < 0.05 < 0.1 < pressed
 
 
-def test_a_model_that_is_not_the_same_is_not_written(shared, small_sensor, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(export, "traced", shared[2])
-    monkeypatch.setattr(check, "compare", lambda *_: Agreement(0.02, [0, 0], [0, 0]))
-    path = tmp_path / "model.onnx"
-    call = ["export", str(small_sensor / "sensor.toml"), "--estimator", "minimum-energy", "-o", str(path)]
-    assert "2.0e-02 from torch's" in in_one_line(cli.main(call), capsys.readouterr())
-    monkeypatch.setattr(check, "compare", lambda *_: Agreement(0.0, [0, 0], [0, 2]))
-    assert "statuses [0, 0], torch's [0, 2]" in in_one_line(cli.main(call), capsys.readouterr())
-    monkeypatch.setattr(check, "compare", lambda *_: Agreement(np.nan, [0, 0], [0, 0]))
-    assert "nan from torch's" in in_one_line(cli.main(call), capsys.readouterr())
-    assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize(
+    "found, said",
+    [
+        (Agreement(0.02, [0, 0], [0, 0]), "2.0e-02 from torch's"),
+        (Agreement(0.0, [0, 0], [0, 2]), r"statuses \[0, 0\], torch's \[0, 2\]"),
+        (Agreement(np.nan, [0, 0], [0, 0]), "nan from torch's"),
+    ],
+)
+def test_what_is_not_the_same_is_refused(sensor, found, said, monkeypatch):
+    monkeypatch.setattr(check, "compare", lambda *_: found)
+    monkeypatch.setattr(check, "check_images", lambda *_: None)
+    with pytest.raises(MembraneError, match=said):
+        checked(b"", Reconstructor(sensor, "minimum-energy"))
 
 
-def test_what_the_exporter_cannot_write_is_said_in_one_line(small_sensor, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("part", ["traced", "checked"])
+def test_a_failure_is_said_in_one_line_and_nothing_is_written(part, small_sensor, tmp_path, monkeypatch, capsys):
     def refuse(*_):
-        raise onnx.shape_inference.InferenceError("[ShapeInferenceError] ranks differ\n  in node 3\n")
+        if part == "checked":
+            raise MembraneError("export: not the same")
+        raise onnx.shape_inference.InferenceError("\n[ShapeInferenceError] ranks differ\n  in node 3\n")
 
-    monkeypatch.setattr(export, "traced", refuse)
-    call = ["export", str(small_sensor / "sensor.toml"), "-o", str(tmp_path / "model.onnx")]
-    assert "cannot be written as ONNX: [ShapeInferenceError] ranks differ" in in_one_line(cli.main(call), capsys.readouterr())
-    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(export, part, refuse)
+    if part == "checked":
+        monkeypatch.setattr(Reconstructor, "reconstruct_grey", lambda *_: None)
+        monkeypatch.setattr(export, "_finished", lambda *_: onnx.ModelProto())
+    code = cli.main(["export", str(small_sensor / "sensor.toml"), "-o", str(tmp_path / "model.onnx")])
+    said = capsys.readouterr().err.strip().splitlines()
+    assert code == 2 and len(said) == 1 and list(tmp_path.iterdir()) == []
+    assert ("not the same" if part == "checked" else "cannot be written as ONNX: [ShapeInferenceError] ranks differ") in said[0]
 
 
-def test_single_precision_only(shared, tmp_path):
-    with pytest.raises(export.MembraneError, match="float64; expected torch.float32"):
-        export.export(Reconstructor(shared[0], "minimum-energy", dtype=torch.float64), tmp_path / "model.onnx")
+def test_single_precision_only(sensor, tmp_path):
+    with pytest.raises(MembraneError, match=r"float64; expected torch.float32"):
+        export.export(Reconstructor(sensor, "minimum-energy", dtype=torch.float64), tmp_path / "model.onnx")

@@ -49,7 +49,8 @@ def check_images(reconstructor: Reconstructor) -> Tensor:
     simulator = Simulator(reconstructor.sensor)
     images = [simulator.rest_image()]
     try:
-        images += [random_frame(simulator, Plan(kinds=("sphere",)), 0).image, images[0]]
+        with torch.enable_grad():  # the simulator's, whatever the caller's
+            images += [random_frame(simulator, Plan(kinds=("sphere",)), 0).image, images[0]]
     except MembraneError:
         pass
     return torch.cat([reconstructor.grey(image) for image in images])
