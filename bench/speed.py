@@ -2,8 +2,8 @@
 
 python bench/speed.py [--sensor examples/sensor.toml] [--image examples/two_contacts.png] [--device cpu] [--json FILE]
 
-The paper: its estimator with the soft locator, stage by stage. Minimum energy: the twin solves the same constrained harmonic
-problem (linear triangles, volume linearised once, eq. 22) as one would write it for one frame: sparse assembly and
+The paper: its estimator with the soft locator, stage by stage, and `paper_twin` of its solve. Minimum energy: the twin solves
+the same constrained harmonic problem (linear triangles, volume linearised once, eq. 22) as one would write it for one frame: sparse assembly and
 factorisation by scipy. Force balance (17 x 17): cold from rest and warm from the solution, beside `balance_twin`, which makes
 the same steps. The paper and force balance: processor time, the least of several turns, taken in turn, as other programs may
 share the cores. How accurate the 17 x 17 grid is: `ablation.py`, its base row. With 2000000000 as the environment's
@@ -22,6 +22,7 @@ import numpy as np
 import scipy.sparse as sparse
 import torch
 from balance_twin import BalanceTwin
+from paper_twin import PaperTwin
 from record import median_seconds, write
 from scipy.sparse.linalg import splu
 
@@ -114,6 +115,8 @@ def paper(args):
     relaxed = segmentation.in_contact(segmentation.by_polar_angle(seen.directions).region)
     programme, system = estimator.programme(seen, relaxed)[0], estimator.system
     factor, loads = system.factor(programme.stencil), torch.stack([programme.load, programme.v], 1)
+    twin, frame = PaperTwin(estimator), (seen.directions[0].double().numpy(), relaxed[0].numpy())
+    gap = np.abs(twin(*frame) - estimator.solve(seen, relaxed).vertices[0].numpy()).max()
     stages = {
         "dots": partial(r.observer, image),
         "flow and rays (eq. 2)": partial(r.observation, displacement, confidence),
@@ -121,6 +124,8 @@ def paper(args):
         "Q, Q^T Q, smoother, volume (eqs. 18, 21, 28)": partial(estimator.programme, seen, relaxed),
         "factor": partial(system.factor, programme.stencil),
         "two solves (eqs. 25-27)": partial(system.substitute, factor, loads),
+        "the solve, all of these three": partial(estimator.solve, seen, relaxed),
+        "scipy twin of the solve": partial(twin, *frame),
         "contacts of the surface": partial(segmentation.by_normals, estimator.solve(seen, relaxed).vertices),
         "the whole loop": partial(estimator, seen),
         "image to result": partial(r, image),
@@ -128,6 +133,7 @@ def paper(args):
     for stage, milliseconds in least_milliseconds(stages, 15).items():
         print(f"the paper, {stage}: {milliseconds:.1f} ms", flush=True)
         yield dict(estimator="the paper", what=stage, milliseconds_a_frame=milliseconds)
+    print(f"largest difference from the twin: {gap:.1e}")
 
 
 def force_balance(args):
