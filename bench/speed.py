@@ -5,9 +5,9 @@ python bench/speed.py [--sensor examples/sensor.toml] [--image examples/two_cont
 The paper: its estimator with the soft locator, stage by stage, and `paper_twin` of its solve. Minimum energy: the twin solves
 the same constrained harmonic problem (linear triangles, volume linearised once, eq. 22) as one would write it for one frame:
 sparse assembly and factorisation by scipy. Force balance (17 x 17): cold from rest and warm from the solution, beside
-`balance_twin`, which makes the same steps. The paper and force balance: processor time, the least of several turns, taken in turn, as other programs may
-share the cores. How accurate the 17 x 17 grid is: `ablation.py`, its base row. With 2000000000 as the environment's
-MALLOC_TRIM_THRESHOLD_ and MALLOC_MMAP_THRESHOLD_ glibc keeps freed memory: a quarter less time in batches.
+`balance_twin`, which makes the same steps. The paper and force balance: processor time, the least of several turns, taken in
+turn, as other programs may share the cores. How accurate the 17 x 17 grid is: `ablation.py`, its base row. With 2000000000 as
+the environment's MALLOC_TRIM_THRESHOLD_ and MALLOC_MMAP_THRESHOLD_ glibc keeps freed memory: a quarter less time in batches.
 """
 
 import argparse
