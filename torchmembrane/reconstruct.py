@@ -20,7 +20,7 @@ from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
 from .io.status import Status
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
-from .markers.placement import LOCATORS, place_markers
+from .markers.placement import place_markers
 from .pieces import piece
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
@@ -85,8 +85,6 @@ class Reconstructor(nn.Module):
         if estimator not in ESTIMATORS:
             raise MembraneError(f"Reconstructor: estimator = {estimator!r}; expected one of {', '.join(ESTIMATORS)}")
         locator = locator or ("soft" if estimator == "paper" else "fit")
-        if locator not in LOCATORS:
-            raise MembraneError(f"Reconstructor: locator = {locator!r}; expected one of {', '.join(LOCATORS)}")
         if channels not in CHANNELS:
             raise MembraneError(f"Reconstructor: channels = {channels!r}; expected 'rgb' or 'bgr'")
         if dtype not in PRECISIONS:

@@ -86,7 +86,7 @@ def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]
         from .soft import SoftLocator, SoftTextureLocator  # here: kornia takes half a second to load
 
         return SoftLocator, SoftTextureLocator
-    raise MembraneError(f"place_markers: locator = {name!r}; expected one of {', '.join(LOCATORS)}")
+    raise MembraneError(f"Reconstructor: locator = {name!r}; expected one of {', '.join(LOCATORS)}")
 
 
 def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
