@@ -1,24 +1,8 @@
-"""Dots as the paper found them (section 5), beside the locator: threshold, components, nearest of its size, large first.
-
-python bench/thresholded_dots.py CASES [--json FILE]
-
-CASES as for accuracy.py. Printed for each sensor and kind of image, for both: median and 95th percentile of the error in px
-over found visible dots, the share found, how many are over 3 px off. Both measure displacements against their own rest image.
-"""
-
-import argparse
-import warnings
-from pathlib import Path
+"""Dots as the paper found them (section 5): threshold, components, nearest of its size, large ones first."""
 
 import numpy as np
-import torch
-from accuracy import cases_in
-from record import write
 from scipy import ndimage
 from scipy.spatial import cKDTree
-
-import torchmembrane as tm
-from torchmembrane.markers.observer import FOUND
 
 REACH = 0.75  # of the distance to the nearest dot of its size: how far a dot is looked for
 NEIGHBOURS = 4  # matched large dots that predict a small one
@@ -85,44 +69,3 @@ class ThresholdedDots:
             return np.zeros((len(dots), 2))
         near = cKDTree(self.rest[matched]).query(self.rest[dots], k=NEIGHBOURS)[1]
         return moved[matched][near].mean(1)
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("cases", type=Path)
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
-    warnings.simplefilter("ignore")
-    errors, cases = {}, cases_in(args.cases)
-    for name in sorted({case["sensor"] for case in cases}):
-        r = tm.Reconstructor.from_file(args.cases / name)
-        markers, model = r.sensor.markers, r.rest_pixels.double().numpy()
-        large = np.array([size == "large" for size in markers.sizes])
-        paper = ThresholdedDots(markers.rest_image, model, large, markers.polarity)
-        for case in (c for c in cases if c["sensor"] == name):
-            truth = np.load(args.cases / case["truth"])
-            visible = truth["visible_deformed"].astype(bool) if "visible_deformed" in truth else np.ones(len(model), bool)
-            for path in case["images"]:
-                kind = Path(path).stem.rpartition("_")[2] if len(case["images"]) > 1 else "images"
-                image = r.read(args.cases / path)
-                with torch.no_grad():
-                    pixels, confidence = (a[0].double().numpy() for a in r.observer.locator(image))
-                soft = np.where(confidence[:, None] > FOUND, pixels - r.observer.measured_rest.double().numpy(), np.nan)
-                for method, moved in (("paper", paper(image[0, 0].numpy())), ("locator", soft)):
-                    error = np.linalg.norm(model + moved - truth["uv_deformed"], axis=1)[visible]
-                    errors.setdefault((case["folder"], kind, method), []).append(error)
-    rows = []
-    for (folder, kind, method), parts in sorted(errors.items()):
-        error = np.concatenate(parts)
-        found = error[np.isfinite(error)]
-        row = dict(sensor=folder, images=kind, method=method, median=float(np.median(found)), found=len(found) / len(error))
-        rows.append(row | dict(p95=float(np.percentile(found, 95)), wrong=int((found > 3).sum())))
-        print(
-            "{sensor:16s} {images:6s} {method:8s} median {median:.3f} px, 95 % {p95:.3f} px, found {found:.3f}, "
-            "wrong {wrong}".format(**rows[-1])
-        )
-    write(args.json, dict(dots=rows))
-
-
-if __name__ == "__main__":
-    main()

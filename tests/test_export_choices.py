@@ -76,6 +76,25 @@ def test_every_flow_agrees_with_torch(sensor, flow):
         np.testing.assert_allclose(directions, expected[: len(directions)].numpy(), rtol=0, atol=1e-5)
 
 
+def test_nan_beside_a_surface_is_no_agreement(sensor, monkeypatch):
+    class Session:
+        def __init__(self, *_, **__):
+            pass
+
+        def get_inputs(self):
+            return [onnx.helper.make_tensor_value_info("image", onnx.TensorProto.FLOAT, None)]
+
+        def run(self, names, feed):
+            vertices = made.estimator.membrane.rest.numpy() * np.array([1, np.nan])[:, None, None]
+            return vertices, np.zeros(2, np.int32)
+
+    made = Reconstructor(sensor, "minimum-energy")
+    monkeypatch.setattr(check.onnxruntime, "InferenceSession", Session)
+    rest = made.grey(check.Simulator(sensor).rest_image())
+    found = check.compare(b"", made, rest.expand(2, -1, -1, -1))
+    assert found.status == found.expected == [0, 0] and np.isnan(found.distance)
+
+
 class Doubled(torch.nn.Module):
     def forward(self, *x):
         return torch.ones(len(x[0]), 3) * x[0]

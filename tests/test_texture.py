@@ -7,6 +7,7 @@ from scipy.ndimage import correlate1d
 
 from torchmembrane.errors import MembraneError
 from torchmembrane.markers.neighbourhood import Neighbourhood, inverse_2x2
+from torchmembrane.markers.soft import SoftTextureLocator
 from torchmembrane.markers.texture.locator import TextureLocator
 from torchmembrane.markers.texture.patches import choose_patches
 from torchmembrane.markers.texture.pyramid import low_pass_pyramid
@@ -116,15 +117,16 @@ def test_stripes_are_no_texture():
         choose_patches(0.5 + 0.3 * np.sin(U / 3.0), VISIBLE)
 
 
-def test_shapes_are_checked(rest, pixels, locator):
+@pytest.mark.parametrize("kind", [TextureLocator, SoftTextureLocator])
+def test_shapes_are_checked(rest, pixels, kind):
     with pytest.raises(MembraneError, match="mask"):
         choose_patches(rest, VISIBLE.T)
-    with pytest.raises(MembraneError, match="pixels from"):
-        TextureLocator(rest, pixels + 100.0)
-    with pytest.raises(MembraneError, match=r"D > 16"):
-        TextureLocator(rest, pixels[:5])
+    with pytest.raises(MembraneError, match=f"{kind.__name__}: pixels from"):
+        kind(rest, pixels + 100.0)
+    with pytest.raises(MembraneError, match=rf"{kind.__name__}: .* D > 16"):
+        kind(rest, pixels[:5])
     with pytest.raises(MembraneError, match="not resized"):
-        locator(torch.zeros(1, 1, HEIGHT // 2, WIDTH // 2))
+        kind(rest, pixels)(torch.zeros(1, 1, HEIGHT // 2, WIDTH // 2))
 
 
 def test_follows_a_large_smooth_warp(locator, pressed, pixels):

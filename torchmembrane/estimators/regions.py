@@ -45,7 +45,7 @@ def persistent_regions(height: Tensor, count: int, least: float) -> Tensor:
     distance = (vertex // n - place // n).square() + (vertex % n - place % n).square()
     nearest = torch.where(passes >= passes.amax(1, keepdim=True), distance, len(vertex) ** 2).min(1, keepdim=True).indices
     peak, connected = top.squeeze(2).gather(1, nearest.squeeze(1)), passes.gather(1, nearest).squeeze(1)
-    region = torch.where((connected > SHARE * peak) & (peak > -torch.inf), nearest.squeeze(1) + 1, 0)
+    region = torch.where(connected > SHARE * peak, nearest.squeeze(1) + 1, 0)
     return region.reshape(height.shape)
 
 

@@ -118,6 +118,7 @@ class Segmentation(nn.Module):
         self.register_buffer("rest_origins", rest_rays[0])
         self.register_buffer("rest_directions", rest_rays[1])
         self.register_buffer("axis_region", _axis_region(membrane))
+        self.axis_in_view = bool((self.axis_region > 0).any())
 
     @piece
     def by_polar_angle(self, directions: Tensor) -> ContactRegions:
@@ -165,7 +166,7 @@ class Segmentation(nn.Module):
 
     def _where(self, x: Tensor, bulge: Tensor, directions: Tensor) -> ContactRegions:
         """The regions of `bulge [B, V]` on `x [B, V, 3]`, or where the flow diverges everywhere the axis'."""
-        divergent = (self.divergence(directions) > DIVERGENT)[:, None] & (self.axis_region > 0).any()
+        divergent = (self.divergence(directions) > DIVERGENT)[:, None] & self.axis_in_view
         region = torch.where(divergent, self.axis_region, self._regions(bulge))
         weight = torch.where(divergent, torch.ones_like(bulge), bulge.clamp_min(0))
         return ContactRegions(bulge, region, self._centroids(x, region, weight))

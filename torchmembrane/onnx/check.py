@@ -75,4 +75,4 @@ def compare(model: bytes, reconstructor: Reconstructor, images: Tensor) -> Agree
         distances += [float(apart[k].max()) for k, value in enumerate(statuses) if value == 0 == expected.status[k]]
         status, expected_status = status + statuses.tolist(), expected_status + expected.status.tolist()
         previous = expected
-    return Agreement(max(distances), status, expected_status)
+    return Agreement(float(np.max(distances)), status, expected_status)

@@ -138,9 +138,8 @@ def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = F
     """Write the whole reconstruction, image to result, as one ONNX model, if it agrees with torch.
 
     Standard operators only, float32, batch free. Run on the sensor at rest and pressed, both simulated, it must give torch's
-    statuses, and vertices within 3e-5 of the surface's size.
-    The model's metadata hold `format`, `status_texts` and `mesh` (the fields of
-    `Mesh`) as JSON.
+    statuses, and vertices within 3e-5 of the surface's size. The model's metadata hold `format`, `status_texts` and `mesh` (the
+    fields of `Mesh`) as JSON.
 
     Args:
         reconstructor: the sensor's.

@@ -96,7 +96,7 @@ class DotResponse(nn.Module):
         self.register_buffer(f"step{k}", torch.as_tensor((step[:, None] * width + step).ravel()))
         self.register_buffer(f"channel{k}", torch.as_tensor(np.stack(channels)[..., None]))
         self.register_buffer(f"mask{k}", mask)
-        self.register_buffer(f"share{k}", 1 / (gaussians(mask, self.rungs[k]) + LEAST_SHARE))
+        self.register_buffer(f"covered{k}", 1 / (gaussians(mask, self.rungs[k]) + LEAST_SHARE))
         self.register_buffer(f"limit{k}", torch.as_tensor(np.array([width, height]) - 1 - self.half_width))
 
     @piece
@@ -111,7 +111,7 @@ class DotResponse(nn.Module):
     def _dark_blobs(self, k: int, level: Tensor) -> Tensor:
         """Differences of the means over Gaussians two rungs apart, on level `k [B, 1, h, w]`: positive where it is dark."""
         rungs = self.rungs[k]
-        mean, at = gaussians(level, rungs) * self.get_buffer(f"share{k}"), _with_neighbours(rungs)
+        mean, at = gaussians(level, rungs) * self.get_buffer(f"covered{k}"), _with_neighbours(rungs)
         above, below = ([at.index(rung + side) for rung in rungs] for side in (1, -1))
         return (mean[:, above] - mean[:, below]) * self.get_buffer(f"mask{k}")
 

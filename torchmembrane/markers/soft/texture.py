@@ -3,20 +3,17 @@
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from ...errors import MembraneError
 from ...pieces import piece
-from ..neighbourhood import NEIGHBOURS, Neighbourhood
+from ..texture.locator import PatchLocator
 from ..texture.pyramid import low_pass_pyramid, sample
-from ..texture.template import RADIUS, Template, square_offsets
+from ..texture.template import RADIUS, Template, normalised_correlation, square_offsets
 from .argmax import Peak, window_peak
 
 TEMPERATURE = 0.025  # of the softmax, of correlation
 STAGES = ((2, 7, 1.0), (2, 3, 1.0), (1, 3, 0.5), (0, 3, 0.3), (0, 2, 0.3))
 """Level of the pyramid, half side of the shifts tried in px of it, and tolerance of the neighbours' fit in px."""
 LIKENESS = (0.5, 0.3)  # correlation from which a patch is believed, and over which it comes to be wholly so
-LOST_WEIGHT = 1e-3  # of a lost patch's predicted flow in its neighbours' fits
 
 
 class PatchCorrelation(nn.Module):
@@ -39,7 +36,6 @@ class PatchCorrelation(nn.Module):
     def __init__(self, rest: Tensor, centre: Tensor, radius: int, reach: int):
         super().__init__()
         template, side = Template(rest, centre, radius), 2 * radius + 1
-        self.side = 2 * (radius + reach) + 1
         self.register_buffer("centre", centre.clone())
         self.register_buffer("offset", square_offsets(radius + reach))
         self.register_buffer("unit", template.unit.reshape(-1, 1, side, side).clone())
@@ -55,20 +51,14 @@ class PatchCorrelation(nn.Module):
         """
         affine = gradient + torch.eye(2, dtype=flow.dtype, device=flow.device)
         window = sample(image, self.centre + flow, affine, self.offset)
-        window = (window - window.mean(-1, keepdim=True)).unflatten(-1, (self.side, self.side))
-        patches = self.unit.shape[0]
-        weight = self.weight.expand(patches, -1, -1, -1)
-        product = F.conv2d(window, self.unit, groups=patches)
-        mean = F.conv2d(window, weight, groups=patches)
-        variance = F.conv2d(window.square(), weight, groups=patches) - mean.square()
-        correlation = product / (variance.clamp_min(0) + 1e-6).sqrt()
+        correlation = normalised_correlation(window, self.unit, self.weight)
         peak = window_peak(
             correlation, correlation, torch.zeros_like(flow), self.stride, torch.zeros_like(flow), self.error, TEMPERATURE
         )
         return flow + (affine @ peak.place[..., None])[..., 0], peak
 
 
-class SoftTextureLocator(nn.Module):
+class SoftTextureLocator(PatchLocator):
     """Patches of a rest image in other images of the deformed membrane, by soft-argmax of their normalised correlation.
 
     Args:
@@ -76,11 +66,8 @@ class SoftTextureLocator(nn.Module):
         pixels: patch centres `[D, 2]`, px, from `choose_patches`.
         anchors: pixels `[A, 2]` on the rim, where nothing moves, or None.
 
-    Attributes:
-        follows: False; patches are searched for from rest in every frame.
-
     Raises:
-        MembraneError: the image is not `[H, W]`, or there are too few patches.
+        MembraneError: the image is not `[H, W]`, or there are too few patches, or some lie outside the image.
 
     Limitations:
         Patches that moved by more than about 25 px are lost. Less exact than `TextureLocator`, whose last steps fit each
@@ -97,20 +84,9 @@ class SoftTextureLocator(nn.Module):
         (3.0, True)
     """
 
-    follows = False
-    rest_pixels: Tensor
-
     def __init__(self, rest_image: np.ndarray, pixels: np.ndarray, anchors: np.ndarray | None = None):
-        super().__init__()
-        rest_image, pixels = np.asarray(rest_image, float), np.asarray(pixels, float)
-        if rest_image.ndim != 2 or pixels.ndim != 2 or len(pixels) <= NEIGHBOURS:
-            raise MembraneError(
-                f"SoftTextureLocator: rest_image has shape {rest_image.shape} and pixels {pixels.shape}, expected [H, W] "
-                f"and [D, 2] with D > {NEIGHBOURS}; give a grey image and the result of choose_patches"
-            )
-        self.register_buffer("rest_pixels", torch.as_tensor(pixels))
-        self.neighbourhood = Neighbourhood(pixels, np.zeros((0, 2)) if anchors is None else np.asarray(anchors, float))
-        levels = low_pass_pyramid(torch.as_tensor(rest_image)[None, None])
+        super().__init__(rest_image, pixels, anchors)
+        levels = low_pass_pyramid(torch.as_tensor(np.asarray(rest_image, float))[None, None])
         self.stages = nn.ModuleList(
             PatchCorrelation(levels[k], self.rest_pixels / 2**k, RADIUS[k], reach) for k, reach, _ in STAGES
         )
@@ -127,7 +103,11 @@ class SoftTextureLocator(nn.Module):
         Returns:
             Pixels `[B, D, 2]` and confidence `[B, D]` in 0..1; a lost patch has confidence 0 and the pixel that its
             neighbours predict.
+
+        Raises:
+            MembraneError: the image has another size than the rest image.
         """
+        self.check_size(image)
         finite = image.isfinite()
         images = low_pass_pyramid(torch.where(finite, image, 0.0))
         flow = torch.zeros_like(self.rest_pixels).expand(image.shape[0], -1, -1)
@@ -135,9 +115,7 @@ class SoftTextureLocator(nn.Module):
         for (k, _, tolerance), stage in zip(STAGES, self.stages, strict=True):
             found, peak = stage(images[k], flow / 2**k, gradient)
             found, weight = 2**k * found, ((peak.strength - LIKENESS[0]) / LIKENESS[1]).clamp(0, 1)
-            guess = torch.where((weight > 0)[..., None], found, flow)
-            local = self.neighbourhood(guess, weight.clamp_min(LOST_WEIGHT), tolerance)
-            confidence = weight * local.trust(found)
-            flow, gradient = confidence[..., None] * found + (1 - confidence[..., None]) * local.flow, local.gradient
-        confidence = confidence * finite.flatten(1).all(1)[:, None]
+            flow, local = self.settle(found, weight, flow, tolerance)
+            gradient = local.gradient
+        confidence = weight * local.trust(found) * finite.flatten(1).all(1)[:, None]
         return self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow), confidence

@@ -20,10 +20,8 @@ from .template import RADIUS, Search, Template
 LOST_WEIGHT = 1e-3  # of a lost patch's predicted flow in its neighbours' fits: it counts only where none of them is found
 
 
-class TextureLocator(nn.Module):
-    """Find the patches of a rest image again in other images of the deformed membrane.
-
-    A patch is compared up to gain and offset of the light, warped by an affine map (normalised correlation).
+class PatchLocator(nn.Module):
+    """Patches of a rest image: what the locators of texture share.
 
     Args:
         rest_image: `[H, W]`, grey in 0..1.
@@ -32,6 +30,58 @@ class TextureLocator(nn.Module):
 
     Attributes:
         follows: False; patches are searched for from rest in every frame.
+
+    Raises:
+        MembraneError: the image is not `[H, W]`, or there are too few patches, or some lie outside the image.
+    """
+
+    follows = False
+    rest_pixels: Tensor
+
+    def __init__(self, rest_image: np.ndarray, pixels: np.ndarray, anchors: np.ndarray | None = None):
+        super().__init__()
+        name, rest_image, pixels = type(self).__name__, np.asarray(rest_image, float), np.asarray(pixels, float)
+        anchors = np.zeros((0, 2)) if anchors is None else np.asarray(anchors, float)
+        if rest_image.ndim != 2 or pixels.ndim != 2 or pixels.shape[1] != 2 or len(pixels) <= NEIGHBOURS:
+            raise MembraneError(
+                f"{name}: rest_image has shape {rest_image.shape} and pixels {pixels.shape}, expected [H, W] "
+                f"and [D, 2] with D > {NEIGHBOURS}; give a grey image and the result of choose_patches"
+            )
+        if not ((pixels >= 0) & (pixels <= np.array(rest_image.shape)[::-1] - 1)).all():
+            raise MembraneError(
+                f"{name}: pixels from {pixels.min(0)} to {pixels.max(0)}, expected inside the rest image "
+                f"of width and height {rest_image.shape[::-1]}; give (u right, v down) of this very image"
+            )
+        self.size = rest_image.shape
+        self.register_buffer("rest_pixels", torch.as_tensor(pixels))
+        self.neighbourhood = Neighbourhood(pixels, anchors)
+
+    def check_size(self, image: Tensor) -> None:
+        """Refuse an image that is not `[B, 1, H, W]` of the rest image's size."""
+        height, width = self.size
+        if image.ndim != 4 or tuple(image.shape[1:]) != (1, height, width):
+            raise MembraneError(
+                f"{type(self).__name__}: image has shape {tuple(image.shape)}, expected [B, 1, {height}, {width}] "
+                "like the rest image; give grey images from the same camera, not resized"
+            )
+
+    def settle(self, found: Tensor, weight: Tensor, before: Tensor, tolerance: float) -> tuple[Tensor, NeighbourFlow]:
+        """The flow `[B, D, 2]`: `found` where its neighbours bear it out, else what they predict, starting from `before`."""
+        guess = torch.where((weight > 0)[..., None], found, before)
+        local = self.neighbourhood(guess, weight.clamp(min=LOST_WEIGHT), tolerance)
+        trust = (weight * local.trust(found))[..., None]
+        return trust * found + (1 - trust) * local.flow, local
+
+
+class TextureLocator(PatchLocator):
+    """Find the patches of a rest image again in other images of the deformed membrane.
+
+    A patch is compared up to gain and offset of the light, warped by an affine map (normalised correlation).
+
+    Args:
+        rest_image: `[H, W]`, grey in 0..1.
+        pixels: patch centres `[D, 2]`, px, from `choose_patches`.
+        anchors: pixels `[A, 2]` on the rim, where nothing moves, or None.
 
     Raises:
         MembraneError: the image is not `[H, W]`, or there are too few patches, or some lie outside the image.
@@ -52,27 +102,9 @@ class TextureLocator(nn.Module):
         (3.0, True)
     """
 
-    follows = False
-    rest_pixels: Tensor
-
     def __init__(self, rest_image: np.ndarray, pixels: np.ndarray, anchors: np.ndarray | None = None):
-        super().__init__()
-        rest_image, pixels = np.asarray(rest_image, float), np.asarray(pixels, float)
-        anchors = np.zeros((0, 2)) if anchors is None else np.asarray(anchors, float)
-        if rest_image.ndim != 2 or pixels.ndim != 2 or pixels.shape[1] != 2 or len(pixels) <= NEIGHBOURS:
-            raise MembraneError(
-                f"TextureLocator: rest_image has shape {rest_image.shape} and pixels {pixels.shape}, expected [H, W] "
-                f"and [D, 2] with D > {NEIGHBOURS}; give a grey image and the result of choose_patches"
-            )
-        if not ((pixels >= 0) & (pixels <= np.array(rest_image.shape)[::-1] - 1)).all():
-            raise MembraneError(
-                f"TextureLocator: pixels from {pixels.min(0)} to {pixels.max(0)}, expected inside the rest image "
-                f"of width and height {rest_image.shape[::-1]}; give (u right, v down) of this very image"
-            )
-        self.size = rest_image.shape
-        self.register_buffer("rest_pixels", torch.as_tensor(pixels))
-        self.neighbourhood = Neighbourhood(pixels, anchors)
-        levels = enumerate(low_pass_pyramid(torch.as_tensor(rest_image)[None, None]))
+        super().__init__(rest_image, pixels, anchors)
+        levels = enumerate(low_pass_pyramid(torch.as_tensor(np.asarray(rest_image, float))[None, None]))
         templates = [Template(rest, self.rest_pixels / 2**level, RADIUS[level]) for level, rest in levels]
         self.templates = nn.ModuleList(templates)
         self.search = Search(templates[-1])
@@ -93,12 +125,7 @@ class TextureLocator(nn.Module):
         Raises:
             MembraneError: the image has another size than the rest image.
         """
-        height, width = self.size
-        if image.ndim != 4 or tuple(image.shape[1:]) != (1, height, width):
-            raise MembraneError(
-                f"TextureLocator: image has shape {tuple(image.shape)}, expected [B, 1, {height}, {width}] "
-                "like the rest image; give grey images from the same camera, not resized"
-            )
+        self.check_size(image)
         images = low_pass_pyramid(image)
         still = [level.detach() for level in images]
         shift, score = self.search(still[-1])
@@ -111,10 +138,3 @@ class TextureLocator(nn.Module):
         _, local = self.settle(found.detach(), likeness.detach(), flow, 0.3)
         confidence = likeness * local.trust(found)
         return self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow), confidence
-
-    def settle(self, found: Tensor, weight: Tensor, before: Tensor, tolerance: float) -> tuple[Tensor, NeighbourFlow]:
-        """The flow `[B, D, 2]`: `found` where its neighbours bear it out, else what they predict, starting from `before`."""
-        guess = torch.where((weight > 0)[..., None], found, before)
-        local = self.neighbourhood(guess, weight.clamp(min=LOST_WEIGHT), tolerance)
-        trust = (weight * local.trust(found))[..., None]
-        return trust * found + (1 - trust) * local.flow, local

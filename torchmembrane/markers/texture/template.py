@@ -1,5 +1,7 @@
 """Patches of one level of the rest image: searched for by correlation, refined by Gauss-Newton steps."""
 
+from math import isqrt
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -97,6 +99,23 @@ class Template(nn.Module):
         return flow, ((ncc - 0.7) / 0.25).clamp(0, 1)
 
 
+def normalised_correlation(window: Tensor, unit: Tensor, weight: Tensor) -> Tensor:
+    """Correlation in -1..1 of patches with all whole shifts in windows of an image, `[B, D, n - s + 1, n - s + 1]`.
+
+    Args:
+        window: grey `[B, D, n^2]`, rows of u.
+        unit: the patches `[D, 1, s, s]`, weighted, as `Template.unit`.
+        weight: of their pixels `[1, 1, s, s]`, with sum 1.
+    """
+    side, patches = isqrt(window.shape[-1]), unit.shape[0]
+    window = (window - window.mean(-1, keepdim=True)).unflatten(-1, (side, side))
+    weight = weight.expand(patches, -1, -1, -1)
+    product = F.conv2d(window, unit, groups=patches)
+    mean = F.conv2d(window, weight, groups=patches)
+    variance = F.conv2d(window.square(), weight, groups=patches) - mean.square()
+    return product / (variance.clamp(min=0) + 1e-6).sqrt()
+
+
 class Search(nn.Module):
     """Exhaustive normalised correlation of the coarsest templates over all shifts up to `REACH`."""
 
@@ -109,7 +128,6 @@ class Search(nn.Module):
 
     def __init__(self, template: Template):
         super().__init__()
-        self.side = 2 * (RADIUS[-1] + REACH) + 1
         side, shift = 2 * RADIUS[-1] + 1, square_offsets(REACH)
         self.register_buffer("centre", template.centre.clone())
         self.register_buffer("offset", square_offsets(RADIUS[-1] + REACH))
@@ -122,13 +140,7 @@ class Search(nn.Module):
         """Shift `[B, D, 2]` of the highest correlation, px of the level, and a score `[B, D]` in 0..1: high and unique?"""
         still = torch.eye(2, dtype=image.dtype, device=image.device).expand(image.shape[0], 1, 2, 2)
         window = sample(image, self.centre.expand(image.shape[0], -1, -1), still, self.offset)
-        window = (window - window.mean(-1, keepdim=True)).unflatten(-1, (self.side, self.side))
-        patches = self.unit.shape[0]
-        weight = self.weight.expand(patches, -1, -1, -1)
-        product = F.conv2d(window, self.unit, groups=patches)
-        mean = F.conv2d(window, weight, groups=patches)
-        variance = F.conv2d(window.square(), weight, groups=patches) - mean.square()
-        ncc = (product / (variance.clamp(min=0) + 1e-6).sqrt()).flatten(-2)
+        ncc = normalised_correlation(window, self.unit, self.weight).flatten(-2)
         best, at = ncc.max(-1)
         near = self.near[at]
         share = torch.softmax(40 * ncc, -1) * near
