@@ -21,7 +21,6 @@ from record import write
 
 import torchmembrane as tm
 from torchmembrane.markers.observer import FOUND
-from torchmembrane.reconstruct import MARKER_NOISE
 
 GRID = 33
 BASE = tm.ForceBalanceSettings()
@@ -37,7 +36,7 @@ class Variant:
     model: str | None = None
     filling: Callable[[tm.Cavity], tm.Cavity] = lambda cavity: cavity
     grid: int = GRID
-    assumed: float = MARKER_NOISE["dots"]
+    assumed: float = 1.0  # of the noise that markers are known to have
     noise: float = 0.0
     every: int = 1
     exact: bool = False
@@ -61,6 +60,12 @@ VARIANTS = [
     changed("compressive loss", "quadratic: tau = fine_tau = (10, 10)", tau=(10.0, 10.0), fine_tau=(10.0, 10.0)),
     changed("compressive loss", "not graduated: tau = fine_tau = (0.4, 0.4)", tau=(0.4, 0.4), fine_tau=(0.4, 0.4)),
     *each("compressive loss", "sparsity", BASE.sparsity / 4, BASE.sparsity * 4),
+    changed("what tractions are measured against", "p0 everywhere: least_scale = 1", least_scale=1.0),
+    *each("what tractions are measured against", "scale_share", 0.15, 0.6),
+    *each("what tractions are measured against", "far_share", 0.03, 0.3),
+    *each("what tractions are measured against", "scale_reach", 0.04, 0.16),
+    *each("what tractions are measured against", "decrease", 0.3, 20.0),
+    *each("longest step", "longest_step", 0.026, 0.06),
     *each("friction", "friction", 0.0, BASE.friction / 4, BASE.friction * 4),
     *each("friction", "cone", 0.0, 40.0),
     changed("friction", "coarse_cone = 15, coarse_steps = 6", coarse_cone=15.0, coarse_steps=6),
@@ -72,7 +77,7 @@ VARIANTS = [
     *(changed("steps", f"17 x 17, coarsest = 17, steps = {n}", grid=17, coarsest=17, steps=n) for n in (6, 8)),
     *each("surroundings", "reach", 1e-6, 0.08),
     *each("surroundings", "floor", 0.0, 1e-2),
-    *(Variant("marker noise", f"assumed {px:g} px", assumed=px) for px in (0.05, 0.2)),
+    *(Variant("marker noise", f"assumed {share:g} times as large", assumed=share) for share in (0.5, 2)),
     *(Variant("marker noise", f"{px:g} px added", noise=px) for px in (0.1, 0.2, 0.5)),
     *(Variant("number of dots", f"one in {n}", every=n) for n in (2, 4)),
 ]
@@ -82,12 +87,7 @@ def reconstructor_of(sensor: tm.Sensor, variant: Variant) -> tm.Reconstructor:
     markers = replace(sensor.markers, rest_image=None)
     membrane, cavity = sensor.surface.membrane((variant.grid, variant.grid)), variant.filling(sensor.cavity)
     sensor = replace(sensor, membrane=membrane, cavity=cavity, markers=markers)
-    reconstructor = tm.Reconstructor(sensor, settings=variant.settings, model=variant.model)
-    estimator = reconstructor.estimator
-    while estimator is not None:  # the finest grid, then every coarser one
-        estimator.equations.bearings.noise *= variant.assumed / MARKER_NOISE[markers.kind]
-        estimator = estimator.coarse
-    return reconstructor
+    return tm.Reconstructor(sensor, settings=variant.settings, model=variant.model)
 
 
 @dataclass
@@ -104,7 +104,7 @@ def presses_of(root: Path, name: str, cases: list[dict]) -> tuple[tm.Sensor, tor
     observer = locating.observer
     generator = torch.Generator().manual_seed(0)
     for case in (c for c in cases if c["sensor"] == name):
-        displacement, confidence, _ = observer(locating.read(root / case["images"][-1]))
+        displacement, confidence, *_ = observer(locating.read(root / case["images"][-1]))
         noise = torch.randn(displacement.shape, generator=generator)
         pixels = displacement + observer.measured_rest
         presses.append(Press(dict(np.load(root / case["truth"])), pixels, confidence, noise))
@@ -117,17 +117,17 @@ def errors_of(reconstructor: tm.Reconstructor, rest: torch.Tensor, press: Press,
         pixels, rest = (torch.from_numpy(truth[name].astype(np.float32)) for name in ("uv_deformed", "uv_nominal"))
         confidence = torch.ones(1, len(pixels))
     kept = torch.arange(confidence.shape[1]) % variant.every == 0
-    result = unjudged(reconstructor, pixels + variant.noise * press.noise, confidence * kept, rest)
+    result = unjudged(reconstructor, pixels + variant.noise * press.noise, confidence * kept, rest, variant.assumed)
     X, Y = truth["dots_nominal"].astype(float), truth["dots_deformed"].astype(float)
     surface = float(np.sqrt(((result.markers[0].numpy() - Y) ** 2).sum() / ((Y - X) ** 2).sum()))
     return dict(surface=surface, unsettled=int(result.status[0] != 0), **contact_errors(result, truth))
 
 
-def unjudged(reconstructor: tm.Reconstructor, pixels, confidence, rest) -> tm.Reconstruction:
+def unjudged(reconstructor: tm.Reconstructor, pixels, confidence, rest, assumed: float) -> tm.Reconstruction:
     """As `from_pixels`, without asking whether most markers are found: one dot in four is enough here."""
-    displacement, confidence, status = reconstructor.observer.from_pixels(pixels, confidence, rest)
+    displacement, confidence, covariance, status = reconstructor.observer.from_pixels(pixels, confidence, rest)
     usable = torch.where(confidence > FOUND, confidence, 0.0)
-    found = reconstructor.estimator(reconstructor.observation(displacement, usable))
+    found = reconstructor.estimator(reconstructor.observation(displacement, usable, assumed**2 * covariance))
     return reconstructor.result(found, displacement, usable, status)
 
 

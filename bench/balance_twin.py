@@ -54,7 +54,9 @@ class BalanceTwin:
         e, free, count = self.estimator, self.free, self.count
         forces, bearings, loss = e.equations.forces, e.equations.bearings, e.equations.loss
         force, normals = forces(x, pressure), e.membrane.normals(x)
-        inner_weights = loss.weights(*(inner(field, e.membrane.grid).mT for field in (normals, force)), tau)
+        inner_weights = loss.weights(
+            *(inner(field, e.membrane.grid).mT for field in (normals, force)), measured.noise_level, tau
+        )
         weights = pad_border(inner_weights.flatten(1, 2).mT, e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
         blocks = e.elasticity.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)
         angle, jacobian = bearings.angles(x, measured)

@@ -64,7 +64,7 @@ class Package:
 
     def __call__(self, image):
         with torch.no_grad():
-            pixels, confidence = (a[0].double().numpy() for a in self.locate(torch.from_numpy(image)[None, None]))
+            pixels, confidence = (a[0].double().numpy() for a in self.locate(torch.from_numpy(image)[None, None])[:2])
         return np.where(confidence[:, None] > FOUND, pixels - self.rest, np.nan)
 
 

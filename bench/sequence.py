@@ -35,7 +35,7 @@ def main():
     found, seconds, previous = {"cold": [], "warm": []}, {"cold": 0.0, "warm": 0.0}, None
     with torch.no_grad():
         for path in sorted(args.folder.glob("[0-9]*.png")):
-            displacement, confidence, _ = observer(reconstructor.read(path))
+            displacement, confidence, *_ = observer(reconstructor.read(path))
             pixels = displacement + observer.measured_rest
             for name, start in (("cold", None), ("warm", previous)):
                 began = time.process_time()

@@ -74,9 +74,9 @@ def minimum_energy(args):
         with torch.no_grad():
             for batch in args.batches:
                 images = image.expand(batch, -1, -1, -1).contiguous()
-                displacement, confidence, _ = reconstructor.observer(images)
+                displacement, confidence, covariance, _ = reconstructor.observer(images)
                 pixels = reconstructor.rest_pixels + displacement
-                observation = reconstructor.observation(displacement, confidence)
+                observation = reconstructor.observation(displacement, confidence, covariance)
                 parts = dict(
                     markers=partial(locator, images),
                     flow=partial(estimator.flow, pixels, confidence),
@@ -110,8 +110,8 @@ def paper(args):
     """The paper's estimator with the soft locator, stage by stage, one frame."""
     r = tm.Reconstructor.from_file(args.sensor, "paper", locator="soft")
     estimator, segmentation, image = r.estimator, r.estimator.segmentation, r.read(args.image)
-    displacement, confidence, _ = r.observer(image)
-    seen = r.observation(displacement, confidence)
+    displacement, confidence, covariance, _ = r.observer(image)
+    seen = r.observation(displacement, confidence, covariance)
     relaxed = segmentation.in_contact(segmentation.by_polar_angle(seen.directions).region)
     programme, system = estimator.programme(seen, relaxed)[0], estimator.system
     factor, loads = system.factor(programme.stencil), torch.stack([programme.load, programme.v], 1)
@@ -140,8 +140,8 @@ def force_balance(args):
     sensor = tm.Sensor.from_file(args.sensor)
     reconstructor = tm.Reconstructor(replace(sensor, membrane=sensor.surface.membrane((17, 17))))
     estimator, exact = reconstructor.estimator, copy.deepcopy(reconstructor.estimator).double()
-    displacement, confidence, _ = reconstructor.observer(reconstructor.read(args.image))
-    frame = reconstructor.observation(displacement, confidence)
+    displacement, confidence, covariance, _ = reconstructor.observer(reconstructor.read(args.image))
+    frame = reconstructor.observation(displacement, confidence, covariance)
     twin, single = BalanceTwin(exact), Observation(*(part[0].double() for part in frame))
     gap = np.abs(twin(single)[0] - estimator(frame).vertices[0].numpy()).max()
     functions, batches = {"scipy twin, cold": partial(twin, single)}, {}

@@ -73,7 +73,8 @@ def reconstructed(sensor: str, strokes, title: str) -> Reconstruction:
 def from_flow(r: Reconstructor, flow: torch.Tensor, trust: torch.Tensor) -> Reconstruction:
     """Displacements `[B, D, 2]` px and confidence `[B, D]`, as they are given: no screen."""
     with torch.no_grad():
-        usable, trust, status = r.observer.judge(flow, trust, torch.full((len(flow),), Status.OK.value))
+        covariance = r.observer.rest_covariance.expand(len(flow), -1, -1, -1)
+        usable, trust, _, status = r.observer.judge(flow, trust, covariance, torch.full((len(flow),), Status.OK.value))
         return r.result(r.estimator(r.observation(usable, trust)), flow, trust, status)
 
 

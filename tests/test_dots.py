@@ -182,7 +182,7 @@ def test_follows_a_smooth_flow_of_one_and_a_half_pitches(arrangement, two_sizes,
     pattern = measured(s)
     frames = [deform(s, field, pitches) for pitches in (0.0, 0.5, 1.0, 1.5)]
     images = batch(*(render(*frame, seed=k) for k, frame in enumerate(frames)))
-    pixels, confidence = DotLocator(pattern, SIZE, "dark", s.rim)(images)
+    pixels, confidence, _ = DotLocator(pattern, SIZE, "dark", s.rim)(images)
     for k, (truth, _) in enumerate(frames):
         error = np.linalg.norm(pixels[k].numpy() - truth, axis=1)
         assert confidence[k].min() > 0.5, k
@@ -296,13 +296,13 @@ def test_dots_followed_from_the_frame_before_are_those_searched_for(arrangement,
     """Whether they moved little, or so far that they can no longer be followed; dots that were lost are found again."""
     s = scene(arrangement, two_sizes)
     locate = DotLocator(measured(s), SIZE, "dark", s.rim)
-    before, _ = locate(batch(render(*deform(s, slide, 0.2), seed=1)))
+    before, _, _ = locate(batch(render(*deform(s, slide, 0.2), seed=1)))
     before[0, ::9] = torch.nan
     moves = (0.2, 0.4, 0.8, 1.1, 1.4)
     frames = [deform(s, slide, pitches) for pitches in moves]
     images = batch(*(render(*frame, seed=k) for k, frame in enumerate(frames)))
-    pixels, confidence = locate(images, before.expand(len(frames), -1, -1))
-    expected, sure = locate(images)
+    pixels, confidence, _ = locate(images, before.expand(len(frames), -1, -1))
+    expected, sure, _ = locate(images)
     torch.testing.assert_close(confidence, sure, atol=0.02, rtol=0)
     torch.testing.assert_close(pixels, expected, atol=0.03, rtol=0)
     assert confidence.min() > 0.5
@@ -325,7 +325,7 @@ def test_removed_dots_are_lost_and_no_neighbour_takes_their_place(two):
     s, locate = two
     truth, shapes = deform(s, dent, 0.8)
     hidden = np.random.default_rng(3).random(len(truth)) < 0.1
-    pixels, confidence = locate(batch(render(truth, shapes, kept=~hidden)))
+    pixels, confidence, _ = locate(batch(render(truth, shapes, kept=~hidden)))
     assert confidence[0, hidden].max() < 0.1
     assert confidence[0, ~hidden].min() > 0.5
     error = np.linalg.norm(pixels[0].numpy() - truth, axis=1)
@@ -342,7 +342,7 @@ def test_a_dot_out_of_line_with_the_flow_is_not_believed(two):
     moved = truth.copy()
     moved[outlier] += 0.65 * (truth[beside] - truth[outlier])
     kept = np.arange(len(truth)) != beside
-    _, confidence = locate(batch(render(moved, shapes, kept=kept)))
+    _, confidence, _ = locate(batch(render(moved, shapes, kept=kept)))
     assert confidence[0, [outlier, beside]].max() < 0.5
     assert np.delete(confidence[0].numpy(), [outlier, beside]).min() > 0.5
 
@@ -357,7 +357,7 @@ def test_a_bar_beside_a_border_dot_is_not_taken_for_it():
     frame = np.stack([away, away[::-1] * [-1, 1]], -1)
     bar = frame @ np.diag([2.2, 6.0]) @ frame.T
     image = render(np.vstack([truth, truth[corner] + 11 * away]), np.concatenate([shapes, bar[None]]))
-    pixels, confidence = DotLocator(measured(s), SIZE, "dark")(batch(image))
+    pixels, confidence, _ = DotLocator(measured(s), SIZE, "dark")(batch(image))
     error = np.linalg.norm(pixels[0].numpy() - truth, axis=1)
     sure = confidence[0].numpy() > 0.5
     assert error[sure].max() < 0.5 and np.delete(sure, corner).all()
@@ -382,7 +382,7 @@ def test_what_cannot_be_followed_is_lost_and_not_wrong(arrangement, two_sizes):
     s = scene(arrangement, two_sizes)
     frames = [deform(s, field, amount) for field, amount in [(twist, 0.6), (twist, 0.8), (press, 0.6), (slide, 2.5)]]
     images = batch(*(render(*frame, seed=k) for k, frame in enumerate(frames)))
-    pixels, confidence = DotLocator(measured(s), SIZE, "dark", s.rim)(images)
+    pixels, confidence, _ = DotLocator(measured(s), SIZE, "dark", s.rim)(images)
     for k, (truth, _) in enumerate(frames):
         error = np.linalg.norm(pixels[k].numpy() - truth, axis=1)
         assert ((error > 0.3 * PITCH) & (confidence[k].numpy() > 0.5)).sum() <= 1, k
@@ -396,7 +396,7 @@ def test_missing_and_false_dots_do_not_cost_the_others(two):
     false = CENTRE + generator.uniform(-70, 70, (60, 2))
     false = false[cKDTree(truth).query(false)[0] > 0.5 * PITCH][:5]
     places = np.vstack([truth[~hidden], false])
-    pixels, confidence = locate(batch(render(places, np.concatenate([shapes[~hidden], shapes[: len(false)]]))))
+    pixels, confidence, _ = locate(batch(render(places, np.concatenate([shapes[~hidden], shapes[: len(false)]]))))
     assert len(false) == 5 and confidence[0, ~hidden].min() > 0.5
     assert np.linalg.norm(pixels[0].numpy() - truth, axis=1)[~hidden].max() < 0.5
 
@@ -406,7 +406,7 @@ def test_missing_and_false_dots_do_not_cost_the_others(two):
 def test_an_image_without_dots_has_no_confidence(two, value, noise):
     _, locate = two
     image = (value + noise * np.random.default_rng(1).normal(size=SIZE[::-1])).clip(0, 1)
-    pixels, confidence = locate(batch(image))
+    pixels, confidence, _ = locate(batch(image))
     assert confidence.max() < 0.05 and torch.isfinite(pixels).all()
 
 
@@ -454,7 +454,7 @@ def test_a_shifted_image_shifts_the_pixels():
     locate = DotLocator(measured(s), SIZE, "dark")
     image = render(*deform(s, dent, 0.5), noise=0.0)
     shifted = np.roll(image, (-4, 6), (0, 1))
-    pixels, confidence = locate(batch(image, shifted))
+    pixels, confidence, _ = locate(batch(image, shifted))
     assert confidence.min() > 0.5
     difference = pixels[1] - pixels[0] - torch.tensor([6.0, -4.0])
     assert difference.norm(dim=-1).median() < 0.01 and difference.norm(dim=-1).max() < 0.1
@@ -529,7 +529,7 @@ def test_the_fit_does_not_run_off_to_a_neighbour():
     levels = mean_pyramid(batch(render(pixels, shapes), dtype=torch.float64))
     begin = torch.tensor(pixels + [9.0, 0.0])[None]
     fit = EllipseFit(pixels, shapes, SIZE, 0.45, steps=8).double()
-    centre, _, _ = fit(levels, begin, torch.tensor(shapes)[None])
+    centre, *_ = fit(levels, begin, torch.tensor(shapes)[None], torch.zeros(1))
     assert (centre - begin).abs().max() <= 2.7 + 1 + 1e-9
 
 

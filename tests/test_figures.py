@@ -9,6 +9,7 @@ from torchmembrane.estimators.base import Equilibrium, Problem
 from torchmembrane.estimators.force_balance import ForceBalance
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.estimators.paper import PaperEstimator
+from torchmembrane.markers.locator import isotropic
 from torchmembrane.mechanics.cavity import rest_balance
 from torchmembrane.presets import preset
 from torchmembrane.sensor.factories import cavity_filling, elastic_energy
@@ -60,7 +61,7 @@ def shown(name, *strokes):
         positions=dots,
         rest_pixels=pixel(dots),
         vertex_pixels=pixel(membrane.rest),
-        marker_noise=2 * NOISE,
+        rest_covariance=isotropic(dots[:, 0], 2 * NOISE),
     )
     found = []
     for kind in (PaperEstimator, MinimumEnergy, ForceBalance):

@@ -308,7 +308,7 @@ def seen_as(square, moved=0.0, dot=17, **changed):
 def test_confidence_falls_with_what_speaks_against_a_dot(square, changed, least, most):
     locate, rest, _ = square
     moved = torch.tensor([3.0, -2.0]).double()
-    pixels, confidence = locate.judge(seen_as(square, moved, **changed), ONE.bool())
+    pixels, confidence, _ = locate.judge(seen_as(square, moved, **changed), ONE.bool())
     assert least <= float(confidence[0, 17]) <= most
     others = torch.arange(42) != 17
     assert confidence[0, others].min() > 0.95 and (pixels[0, others] - rest[others] - moved).abs().max() < 1e-9

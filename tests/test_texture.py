@@ -86,7 +86,7 @@ def locator(rest, pixels):
 def errors(locator, image, true):
     """Distance [D] to the true pixels and confidence [D]."""
     with torch.no_grad():
-        found, confidence = locator(batch(image))
+        found, confidence, _ = locator(batch(image))
     assert torch.isfinite(found).all() and (confidence >= 0).all() and (confidence <= 1).all()
     return np.linalg.norm(found[0].numpy() - true, axis=1), confidence[0].numpy()
 
@@ -140,7 +140,7 @@ def test_follows_a_large_smooth_warp(locator, pressed, pixels):
 def test_subpixel_shift_is_unbiased(locator, pixels, shift):
     inner = np.linalg.norm((pixels - [160, 120]) / [120, 85], axis=1) < 1
     with torch.no_grad():
-        found, confidence = locator(batch(photograph(lambda points: points - shift, 2)))
+        found, confidence, _ = locator(batch(photograph(lambda points: points - shift, 2)))
     error = (found[0].numpy() - pixels - shift)[inner & (confidence[0].numpy() > 0)]
     assert len(error) > 0.99 * inner.sum()
     assert np.abs(error.mean(0)).max() < 0.01 and np.sqrt((error**2).mean()) < 0.03
@@ -159,7 +159,7 @@ def test_integer_shift_is_followed_exactly(locator, rest, pixels):
 
 def test_gain_and_offset_of_the_light_do_not_matter(locator, pressed):
     with torch.no_grad():
-        found, confidence = locator(batch(pressed, 0.6 * pressed + 0.3))
+        found, confidence, _ = locator(batch(pressed, 0.6 * pressed + 0.3))
     assert (found[0] - found[1]).norm(dim=-1)[confidence[0] > 0].max() < 1e-2
 
 
@@ -226,8 +226,8 @@ def test_lost_patches_near_the_rim_stay_with_the_anchors(rest, locator, pixels):
     near = np.linalg.norm(pixels[:, None] - rim, axis=-1).min(1) < 12
     near &= pixels[:, 0] < 30
     with torch.no_grad():
-        held, confidence = TextureLocator(rest, pixels, rim)(image)
-        free, _ = locator(image)
+        held, confidence, _ = TextureLocator(rest, pixels, rim)(image)
+        free, _, _ = locator(image)
     moved = [(found[0, near] - torch.tensor(pixels[near])).norm(dim=-1) for found in (held, free)]
     assert near.sum() > 2 and (confidence[0, near] == 0).all()
     assert moved[0].median() < 2 < 6 < moved[1].median()
@@ -243,8 +243,8 @@ def test_a_frame_alone_equals_the_frame_in_a_batch(locator, rest, pressed):
 
 def test_float32_agrees_with_float64(rest, pixels, locator, pressed):
     with torch.no_grad():
-        found, confidence = locator(batch(pressed))
-        exact, sure = TextureLocator(rest, pixels).double()(batch(pressed, dtype=torch.float64))
+        found, confidence, _ = locator(batch(pressed))
+        exact, sure, _ = TextureLocator(rest, pixels).double()(batch(pressed, dtype=torch.float64))
     assert (found - exact)[sure > 0].abs().max() < 1e-3 and (confidence - sure).abs().max() < 1e-3
 
 

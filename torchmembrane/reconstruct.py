@@ -32,8 +32,8 @@ ESTIMATORS: dict[str, type[ForceBalance] | type[MinimumEnergy] | type[PaperEstim
     "minimum-energy": MinimumEnergy,
     "paper": PaperEstimator,
 }
-MARKER_NOISE = {"dots": 0.1, "texture": 0.2}  # px, assumed of a marker: twice the locator's, and the grid's error
-LOCATOR_NOISE = 0.5  # of MARKER_NOISE: the locator's own, of which standard deviations speak
+MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
+LEAST_ERROR = 0.02  # px
 OFF_RIM = 1e-3  # largest distance of a previous result's rim from this sensor's, over the surface's size
 PRECISIONS = (torch.float32, torch.float64)
 
@@ -111,7 +111,7 @@ class Reconstructor(nn.Module):
             positions=positions,
             rest_pixels=model_pixels,
             vertex_pixels=vertex_pixels,
-            marker_noise=MARKER_NOISE[sensor.markers.kind],
+            rest_covariance=2 * self.observer.rest_covariance.double() + LEAST_ERROR**2 * torch.eye(2),
         )
         self.estimator = _estimator(problem, estimator, settings)
         self.register_buffer("vertex_pixels", vertex_pixels)
@@ -209,11 +209,10 @@ class Reconstructor(nn.Module):
             return self._solve(flow, previous)
 
     def _solve(self, flow: MarkerFlow, previous: Reconstruction | None) -> Reconstruction:
-        displacement, confidence, status = flow
-        usable, confidence, status = self.observer.judge(displacement, confidence, status)
+        usable, confidence, covariance, status = self.observer.judge(*flow)
         start = None if previous is None else self.start(previous.vertices, previous.pressure)
-        found = self.estimator(self.observation(usable, confidence), start)
-        return self.result(found, displacement, confidence, status)
+        found = self.estimator(self.observation(usable, confidence, covariance), start)
+        return self.result(found, flow.displacement, confidence, status)
 
     @piece
     def start(self, vertices: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
@@ -222,9 +221,14 @@ class Reconstructor(nn.Module):
         return vertices, torch.where(pressure.isfinite(), pressure, self.estimator.rest_pressure)
 
     @piece
-    def observation(self, displacement: Tensor, confidence: Tensor) -> Observation:
-        """What the estimator is given, from the markers' displacements `[B, D, 2]` and confidence `[B, D]`."""
-        return self.estimator.prepare(self.camera, self.rest_pixels + displacement, confidence)
+    def observation(self, displacement: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
+        """What the estimator is given, from the markers' displacements `[B, D, 2]`, confidence `[B, D]` and covariance
+        `[B, D, 2, 2]`; default: that of the rest image's."""
+        covariance = 2 * self.observer.rest_covariance if covariance is None else covariance
+        found = (confidence > 0).to(confidence.dtype)
+        square = (found * displacement.square().sum(-1)).sum(-1) / found.sum(-1).clamp_min(1)
+        error = (LEAST_ERROR**2 + MODEL_ERROR**2 * square)[:, None, None, None] * torch.eye(2).to(covariance)
+        return self.estimator.prepare(self.camera, self.rest_pixels + displacement, confidence, covariance + error)
 
     @piece
     def result(self, found: Equilibrium, displacement: Tensor, confidence: Tensor, status: Tensor) -> Reconstruction:
@@ -279,7 +283,7 @@ class Reconstructor(nn.Module):
         half = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
         after, before = (self.camera.pixel_to_ray(pixels[..., None, :] + step) for step in (half, -half))
         turn = (after.origin - before.origin) / distance + after.direction - before.direction
-        noise = LOCATOR_NOISE * MARKER_NOISE[self.sensor.markers.kind] * turn
+        noise = torch.linalg.cholesky(2 * self.observer.rest_covariance).mT @ turn
         observation = Observation(origins, directions, result.confidence)
         return self.estimator.standard_deviations(result.vertices, result.pressure, observation, noise)
 

@@ -80,8 +80,8 @@ def material_from_images(sensor: Sensor, images: Tensor, forces: np.ndarray | No
     """
     reconstructor = _reconstructor(sensor)
     with torch.no_grad():
-        displacement, confidence, status = reconstructor.observer(images.double())
-        displacement, confidence, status = reconstructor.observer.judge(displacement, confidence, status)
+        flow = reconstructor.observer.judge(*reconstructor.observer(images.double()))
+    displacement, confidence, _, status = flow
     for i in np.flatnonzero(status != Status.OK):
         raise MembraneError(f"calibrate material: image {i + 1}: {Status(int(status[i])).text}; leave it out")
     return _material(sensor, reconstructor, displacement, confidence, forces)

@@ -25,8 +25,7 @@ class Problem(NamedTuple):
     positions       `[D, 3]` their rest positions
     rest_pixels     `[D, 2]` where the model sees them at rest
     vertex_pixels   `[V, 2]` where the model sees the grid's vertices at rest
-    marker_noise    px, standard deviation assumed of a marker: about twice the locator's, to leave room for the grid's own
-                    error
+    rest_covariance `[D, 2, 2]` px^2, of the displacements' noise in a frame like the rest image
     """
 
     camera: Camera
@@ -38,30 +37,35 @@ class Problem(NamedTuple):
     positions: Tensor
     rest_pixels: Tensor
     vertex_pixels: Tensor
-    marker_noise: float
+    rest_covariance: Tensor
 
 
 class Observation(NamedTuple):
-    """Measured rays of a batch: `origins`, unit `directions [B, N, 3]`, and `confidence [B, N]`, 0 for a lost one, else up to
-    1.
+    """Measured rays of a batch, of the markers or of the grid's vertices: as the estimator's `prepare` makes them.
 
-    Of the markers, or of the grid's vertices: as the estimator's `prepare` makes them.
+    origins, directions  `[B, N, 3]`, the latter of length one
+    confidence           `[B, N]`, 0 for a lost one, else up to 1
+    across               `[B, N, 2, 3]`, two vectors across each ray: a small turn of the ray, along them, in standard
+                         deviations of its marker; None: all are as sure, in all directions
     """
 
     origins: Tensor
     directions: Tensor
     confidence: Tensor
+    across: Tensor | None = None
 
 
 class Equilibrium(NamedTuple):
     """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`
-    (zero for minimum energy), and `relative_step [...]`: the last step over the surface's size."""
+    (zero for minimum energy), `relative_step [...]`: the last step over the surface's size, and `reference [..., V]`: the
+    traction against which pushes are measured (None where no tractions are found)."""
 
     vertices: Tensor
     pressure: Tensor
     volume: Tensor
     traction: Tensor
     relative_step: Tensor
+    reference: Tensor | None = None
 
 
 class Contacts(NamedTuple):
@@ -83,8 +87,9 @@ class Estimator(Protocol):
     membrane: Membrane
     cavity: CavityLaw
 
-    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor) -> Observation:
-        """The rays that `forward` needs, from the markers' `pixels [B, D, 2]` and their `confidence [B, D]`."""
+    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
+        """The rays that `forward` needs, from the markers' `pixels [B, D, 2]`, their `confidence [B, D]`, and the `covariance
+        [B, D, 2, 2]` of the pixels, px^2."""
         ...
 
     def __call__(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ..camera.model import Camera
 from ..pieces import piece
 from ..solve.stencil_system import NEAR
 from ..surface.membrane import Membrane
@@ -15,11 +16,53 @@ from .base import Observation
 
 
 class Bearings(NamedTuple):
-    """Measured marker rays: `origins [B, 3, D]`, a basis across each ray `[B, 2, 3, D]`, weights over the variance `[B, D]`."""
+    """Measured marker rays.
+
+    origins      `[B, 3, D]`
+    across       `[B, 2, 3, D]`, two vectors across each ray, along which its turns are measured in standard deviations
+    weight       `[B, D]`, the markers' confidence
+    noise_level  `[B]`, the markers' standard deviations over those at rest
+    """
 
     origins: Tensor
     across: Tensor
     weight: Tensor
+    noise_level: Tensor
+
+
+def marker_rays(camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
+    """The rays of markers, each with its own noise.
+
+    Args:
+        camera: the sensor's.
+        pixels: `[B, D, 2]`.
+        confidence: `[B, D]`.
+        covariance: of the pixels, `[B, D, 2, 2]` px^2.
+
+    Returns:
+        The rays; along `across` a turn has the covariance 1: with the derivative `J [3, 2]` of a ray in its pixel and the
+        covariance `C = L L^T` these are the rows of `L^-1 (J^T J)^-1 J^T`.
+    """
+    half = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
+    steps = torch.cat([torch.zeros_like(half[:1]), half, -half])[:, None]
+    origins, directions = camera.pixel_to_ray(pixels[:, None] + steps)
+    by_u, by_v = (directions[:, 1:3] - directions[:, 3:]).unbind(1)
+    uu, uv, vv = ((a * b).sum(-1, keepdim=True) for a, b in ((by_u, by_u), (by_u, by_v), (by_v, by_v)))
+    area2 = uu * vv - uv * uv
+    in_u, in_v = (vv * by_u - uv * by_v) / area2, (uu * by_v - uv * by_u) / area2  # px of a small turn
+    a, b, c = (covariance[..., i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    first = in_u * a.rsqrt()
+    second = (in_v - b / a * in_u) * (c - b * b / a).rsqrt()
+    across = torch.stack([first, second], 2)
+    direction = directions[:, 0, :, None]
+    across = across - (across * direction).sum(-1, keepdim=True) * direction
+    return Observation(origins[:, 0], directions[:, 0], confidence, across)
+
+
+def _spread(across: Tensor) -> Tensor:
+    """Variance of the turns `[...]` in the geometric mean of both directions, of vectors `[..., 2, 3]` across rays."""
+    area: Tensor = torch.linalg.vector_norm(torch.linalg.cross(across[..., 0, :], across[..., 1, :]), dim=-1)
+    return 1 / area
 
 
 class MarkerBearings(nn.Module):
@@ -29,15 +72,17 @@ class MarkerBearings(nn.Module):
         membrane: the rest surface on the solver's grid.
         markers: the markers as points of it.
         positions: `[D, 3]` their rest positions.
-        noise: standard deviation of a marker's angles, radians.
+        noise: standard deviation of a marker's angles, radians, where an observation does not give it.
+        rest: the markers' rays at rest; None: from the origin, with that noise.
     """
 
     positions: Tensor
+    rest_spread: Tensor
     inner_rest: Tensor
     vertex_shares: Tensor
     pair_shares: Tensor
 
-    def __init__(self, membrane: Membrane, markers: SurfacePoints, positions: Tensor, noise: float):
+    def __init__(self, membrane: Membrane, markers: SurfacePoints, positions: Tensor, noise: float, rest: Observation | None):
         super().__init__()
         self.grid, self.noise = membrane.grid, noise
         self.register_buffer("positions", torch.as_tensor(positions, dtype=torch.float64))
@@ -45,12 +90,19 @@ class MarkerBearings(nn.Module):
         vertex_shares, pair_shares = _shares(membrane, markers)
         self.register_buffer("vertex_shares", vertex_shares)
         self.register_buffer("pair_shares", pair_shares)
+        across = None if rest is None else rest.across
+        spread = torch.tensor(noise**2, dtype=torch.float64) if across is None else _spread(across).mean()
+        self.register_buffer("rest_spread", spread)
 
     @piece
     def measured(self, observation: Observation) -> Bearings:
         """The markers' rays as `angles` takes them."""
-        origins, directions, confidence = observation
-        return Bearings(origins.mT, tangent_frame(directions.mT, dim=1), confidence / self.noise**2)
+        origins, directions, confidence, across = observation
+        if across is None:
+            across = tangent_frame(directions) / self.noise
+        found = (confidence > 0).to(confidence.dtype)
+        spread = (torch.where(found > 0, _spread(across), 0.0)).sum(-1) / found.sum(-1).clamp_min(1)
+        return Bearings(origins.mT, across.movedim(1, -1), confidence, (spread / self.rest_spread).sqrt())
 
     def markers(self, x: Tensor) -> Tensor:
         """The markers' positions on the surface `x [B, V, 3]`, `[B, D, 3]`."""

@@ -9,7 +9,7 @@ LEAST = 0.15
 """Smallest patch that is reported, as a share of the strongest one's force."""
 
 
-def contact_indicator(traction: Tensor, normals: Tensor, reference: float) -> Tensor:
+def contact_indicator(traction: Tensor, normals: Tensor, reference: float | Tensor) -> Tensor:
     """How surely a vertex is pushed: `s / (s + reference / 2)` of the compressive normal traction `s`.
 
     A convex rigid body pushes with at least the fluid's pressure: at a contact the indicator is above 2/3, if the reference is
@@ -18,7 +18,7 @@ def contact_indicator(traction: Tensor, normals: Tensor, reference: float) -> Te
     Args:
         traction: `[B, V, 3]`.
         normals: outward, `[B, V, 3]`.
-        reference: force / length^2.
+        reference: force / length^2, a number or `[B, V]`.
 
     Returns:
         `[B, V]` in 0..1.

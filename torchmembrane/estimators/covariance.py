@@ -42,8 +42,8 @@ class LinearisedSolution(NamedTuple):
     of_pressure: Tensor
 
 
-def spread(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Standard deviations of the inner vertices `[B, 3 N]`, the total force `[B, 3]` and the pressure `[B]`.
+def changes(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor]:
+    """What each load does to the inner vertices, `[B, L, 3 N]`, and to the pressure, `[B, L]`.
 
     Args:
         solution: the linearised solution.
@@ -56,6 +56,13 @@ def spread(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, T
         corner = torch.diag_embed(torch.stack(solution.corner, -1)) - solution.borders @ border.mT
         rise = torch.linalg.solve(corner, -solution.borders @ dx.mT)
         dx, dp = dx - rise.mT @ border, rise[:, 0]
+    return dx, dp
+
+
+def spread(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Standard deviations of the inner vertices `[B, 3 N]`, the total force `[B, 3]` and the pressure `[B]`; arguments as of
+    `changes`."""
+    dx, dp = changes(solution, noise_loads)
     dF = dx @ solution.force.mT - dp[..., None] * solution.of_pressure[:, None]
     return _root_sum_square(dx), _root_sum_square(dF), _root_sum_square(dp)
 

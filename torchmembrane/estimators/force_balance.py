@@ -35,12 +35,13 @@ from ..solve.kkt import BorderedStep, solve_bordered
 from ..surface.membrane import Membrane
 from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner, pad_border
+from ..surface.tangent import tangent_frame
 from .base import CONTACT_POINTS, Contacts, Equilibrium, Observation, Problem
-from .bearings import Bearings, MarkerBearings
-from .contact_force import ContactForce
+from .bearings import Bearings, MarkerBearings, marker_rays
+from .contact_force import ContactForce, Linearised
 from .contact_patches import contact_indicator, contact_points
-from .covariance import LinearisedSolution, StandardDeviations, spread
-from .normal_equations import BalanceEquations
+from .covariance import LinearisedSolution, StandardDeviations, changes, spread
+from .normal_equations import BalanceEquations, NormalEquations
 from .robust import Cauchy
 from .settings import ForceBalanceSettings
 from .traction_loss import TractionLoss
@@ -60,10 +61,11 @@ class ForceBalance(nn.Module):
         elasticity: its material.
         markers: the markers as points of it.
         positions: `[D, 3]`, their rest positions.
-        noise: angular noise of a marker, radians; about twice the locator's, to leave room for the grid's own error.
+        noise: angular noise of a marker, radians, where an observation does not say; with the grid's own error in it.
         filling: the cavity, as for `CavityLaw`.
         gas: a gas' absolute pressure at rest and its volume.
         settings: everything else.
+        rest: the markers' rays at rest with their noise; None: from the origin, with `noise`.
         is_coarse: whether a finer grid follows.
 
     Limitations:
@@ -88,6 +90,7 @@ class ForceBalance(nn.Module):
         filling: str = "liquid",
         gas: tuple[float, float] | None = None,
         settings: ForceBalanceSettings | None = None,
+        rest: Observation | None = None,
         is_coarse: bool = False,
     ):
         super().__init__()
@@ -96,8 +99,8 @@ class ForceBalance(nn.Module):
         self.size = membrane.size
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
-        bearings = MarkerBearings(membrane, markers, positions, noise)
-        self.coarse = self._coarser(membrane, elasticity, bearings, filling, gas)
+        bearings = MarkerBearings(membrane, markers, positions, noise, rest)
+        self.coarse = self._coarser(membrane, elasticity, bearings, filling, gas, rest)
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
@@ -106,13 +109,17 @@ class ForceBalance(nn.Module):
         else:
             self.steps = settings.fine_steps if self.coarse.coarse is None else settings.finer_steps
         self.passes_on_starts = self.coarse is not None and min(self.coarse.membrane.grid) >= settings.coarsest_warm
+        loss.push_noise = self._push_noise(_seen_from_origin(bearings.positions) if rest is None else rest)
 
     @classmethod
     def of(cls, problem: Problem, settings: ForceBalanceSettings | None = None) -> "ForceBalance":
         """The estimator of a sensor."""
-        noise = problem.marker_noise / float(problem.camera.focal.mean())
+        variance = problem.rest_covariance.diagonal(dim1=-2, dim2=-1).mean()
+        noise = float(variance.sqrt() / problem.camera.focal.mean())
+        sure = torch.ones_like(problem.rest_pixels[None, :, 0])
+        rest = marker_rays(problem.camera, problem.rest_pixels[None], sure, problem.rest_covariance[None])
         surface = problem.membrane, problem.elasticity, problem.markers, problem.positions
-        return cls(*surface, noise, problem.filling, problem.gas, settings)
+        return cls(*surface, noise, problem.filling, problem.gas, settings, rest)
 
     def _coarser(
         self,
@@ -121,6 +128,7 @@ class ForceBalance(nn.Module):
         bearings: MarkerBearings,
         filling: str,
         gas: tuple[float, float] | None,
+        rest: Observation | None,
     ) -> "ForceBalance | None":
         grid, positions = membrane.grid, bearings.positions
         if any(count % 2 == 0 or count < 2 * self.settings.coarsest - 1 for count in grid):
@@ -128,8 +136,37 @@ class ForceBalance(nn.Module):
         every_second = Membrane(*(a.unflatten(0, grid)[::2, ::2].numpy() for a in (membrane.rest, membrane.fixed)))
         markers, material = every_second.closest_points(positions.numpy()), elasticity.on(every_second)
         return ForceBalance(
-            every_second, material, markers, positions, bearings.noise, filling, gas, self.settings, is_coarse=True
+            every_second, material, markers, positions, bearings.noise, filling, gas, self.settings, rest, is_coarse=True
         )
+
+    @torch.no_grad()
+    def _push_noise(self, rest: Observation) -> Tensor:
+        """The push `S [N]` that the markers' noise makes at rest, one standard deviation, while all losses are quadratic."""
+        equations, loss = self.equations, self.equations.loss
+        x, pressure = self.membrane.rest[None], self.rest_pressure[None]
+        measured = equations.bearings.measured(rest)
+        at, normal, solution = self._linearised(x, pressure, measured, (torch.inf, torch.inf))
+        noise_loads = torch.einsum("bacd,dn->bdacn", normal.weighted_jacobian, equations.bearings.vertex_shares)
+        dx, dp = changes(solution, noise_loads.flatten(3).flatten(1, 2))
+        dq = equations.forces.change(at.stiffness, dx.unflatten(-1, (3, -1))) - dp[..., None, None] * at.volume[:, None]
+        push = (dq * at.normal[:, None]).sum(2) / (loss.area * self.reference)
+        return (push.square().sum(1) @ loss.surroundings).sqrt()[0]
+
+    def _linearised(
+        self, x: Tensor, pressure: Tensor, measured: Bearings, scales: tuple[float, float], curvature: bool = False
+    ) -> tuple[Linearised, NormalEquations, LinearisedSolution]:
+        """The equations about a surface, and what solves them for small loads."""
+        equations = self.equations
+        at, normal, loads, (_, vWv) = equations.linearised(x, pressure, measured, *scales, curvature=curvature)
+        factor = equations.system.factor(equations.matrix(normal))
+        compliance = self.cavity.condition(self.membrane.volume(x) - self.membrane.rest_volume, pressure)[1]
+        corner = None if self.cavity.filling == "open" else (vWv, compliance.expand_as(vWv))
+        one = torch.eye(3).to(x)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
+        of_force = equations.forces.change(at.stiffness, one).flatten(2)
+        solution = LinearisedSolution(
+            lambda b: equations.system.substitute(factor, b), loads[:, [2, 0]], corner, of_force, at.volume.sum(-1)
+        )
+        return at, normal, solution
 
     @property
     def membrane(self) -> Membrane:
@@ -153,9 +190,11 @@ class ForceBalance(nn.Module):
         if self.coarse is not None:
             self.coarse.set_prestretch(prestretch)
 
-    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor) -> Observation:
-        """The rays of the markers seen at `pixels [B, D, 2]`."""
-        return Observation(*camera.pixel_to_ray(pixels), confidence)
+    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
+        """The rays of the markers seen at `pixels [B, D, 2]`, each with its own noise where its `covariance` is given."""
+        if covariance is None:
+            return Observation(*camera.pixel_to_ray(pixels), confidence)
+        return marker_rays(camera, pixels, confidence, covariance)
 
     def forward(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:
         """The surface that the markers' rays show.
@@ -205,7 +244,8 @@ class ForceBalance(nn.Module):
         if one_factor:
             x, pressure, before, factor = self._first(x, pressure, measured, *schedule[0])
             schedule = schedule[1:]
-        return self.equilibrium(*repeated(self._next, schedule, (x, pressure, before), measured, factor))
+        x, pressure, before = repeated(self._next, schedule, (x, pressure, before), measured, factor)
+        return self.equilibrium(x, pressure, before, measured)
 
     @piece
     def _first(
@@ -239,11 +279,15 @@ class ForceBalance(nn.Module):
         return self.step(x, pressure, measured, tau, outlier, factor)
 
     @piece
-    def equilibrium(self, x: Tensor, pressure: Tensor, before: Tensor) -> Equilibrium:
+    def equilibrium(self, x: Tensor, pressure: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
         """What this surface and pressure amount to; `before`: the surface a step earlier."""
+        membrane, loss = self.membrane, self.equations.loss
         step = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
-        traction = self.equations.forces(x, pressure) / self.membrane.rest_area[:, None]
-        return Equilibrium(x, pressure, self.membrane.volume(x), traction, step)
+        traction = self.equations.forces(x, pressure) / membrane.rest_area[:, None]
+        within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
+        scale = loss.contact_scale(*within, measured.noise_level)
+        reference = self.reference * (1 + pad_border(scale[..., None] - 1, membrane.grid)[..., 0])
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, reference)
 
     def is_converged(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the last step was short and the volume is what the cavity's law asks for."""
@@ -254,7 +298,8 @@ class ForceBalance(nn.Module):
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes: the indicator of each vertex, and the centroids of the contact patches."""
         membrane = self.membrane
-        indicator = contact_indicator(found.traction, normals, self.reference)
+        assert found.reference is not None  # `equilibrium` has set it
+        indicator = contact_indicator(found.traction, normals, found.reference)
         inward = (indicator > 0.5) * (-(found.traction * normals).sum(-1)).clamp_min(0) * membrane.rest_area
         return Contacts(indicator, contact_points(found.vertices, membrane.rest, inward, self.size, CONTACT_POINTS))
 
@@ -302,7 +347,9 @@ class ForceBalance(nn.Module):
         measured = equations.bearings.measured(observation)
         traction, normal = inner(found.traction, grid).mT, inner(self.membrane.normals(found.vertices), grid).mT
         misfit = measured.weight * equations.bearings.angles(found.vertices, measured)[0].square().sum(1)
-        objective: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1) + equations.loss(traction, normal)
+        objective: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1) + equations.loss(
+            traction, normal, measured.noise_level
+        )
         return objective
 
     def standard_deviations(
@@ -323,18 +370,17 @@ class ForceBalance(nn.Module):
         """
         equations = self.equations
         measured = equations.bearings.measured(observation)
-        noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * measured.across.movedim(-1, 1)
+        plain = tangent_frame(observation.directions)
+        noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * plain
         scales = self.settings.tau[1], self.settings.outlier
-        at, normal, loads, (_, vWv) = equations.linearised(x, pressure, measured, *scales, curvature=True)
-        factor = equations.system.factor(equations.matrix(normal))
+        _, normal, solution = self._linearised(x, pressure, measured, scales, curvature=True)
         turned = torch.einsum("bdrj,bajd,bacd->bdrc", noise, measured.across, normal.weighted_jacobian)
         noise_loads = torch.einsum("bdrc,dn->bdrcn", turned, equations.bearings.vertex_shares).flatten(3).flatten(1, 2)
-        compliance = self.cavity.condition(self.membrane.volume(x) - self.membrane.rest_volume, pressure)[1]
-        corner = None if self.cavity.filling == "open" else (vWv, compliance.expand_as(vWv))
-        one = torch.eye(3).to(x)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
-        of_force = equations.forces.change(at.stiffness, one).flatten(2)
-        linear = LinearisedSolution(
-            lambda b: equations.system.substitute(factor, b), loads[:, [2, 0]], corner, of_force, at.volume.sum(-1)
-        )
-        dx, dF, dp = spread(linear, noise_loads)
+        dx, dF, dp = spread(solution, noise_loads)
         return StandardDeviations(pad_border(dx.unflatten(-1, (3, -1)).mT, self.membrane.grid), dF, dp)
+
+
+def _seen_from_origin(positions: Tensor) -> Observation:
+    """Markers at `positions [D, 3]` as a camera without ports sees them."""
+    directions = F.normalize(positions, dim=-1)[None]
+    return Observation(torch.zeros_like(directions), directions, torch.ones_like(directions[..., 0]))

@@ -50,7 +50,7 @@ class BalanceEquations(nn.Module):
     ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor]]:
         """The forces, the normal equations and their loads at a surface; `curvature` as for `TractionLoss.weights`."""
         at = self.forces.linearised(x, pressure)
-        W = self.loss.weights(at.normal, at.force, tau, curvature)
+        W = self.loss.weights(at.normal, at.force, measured.noise_level, tau, curvature)
         angle, jacobian = self.bearings.angles(x, measured)
         weight = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
         normal = self.normal_equations(at, W, jacobian, weight)

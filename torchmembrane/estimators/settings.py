@@ -25,6 +25,13 @@ class ForceBalanceSettings:
         warm_tau: the same, from the solution of the frame before.
         decline: share of the steps over which tau declines.
         sparsity: twice the loss of the compressive traction p0 on the whole surface, while it is quadratic.
+        scale_reach: radius of the wider surroundings whose largest push says what a vertex's tractions are measured against.
+        scale_share: share of that push below which a push is small.
+        far_share: the same of the largest push of the whole surface.
+        noise_share: the same of the push that the markers' noise alone makes, while all losses are quadratic.
+        contact_noise: pushes of so many times the noise's are contacts, if they are large beside those around.
+        least_scale: least of what tractions are measured against, over p0.
+        decrease: how fast that may fall as tau does.
         friction: weight of the shear traction's loss over that of the compressive one.
         slip: scale of the shear traction's loss: where it begins to be linear.
         cone: how much less shear weighs where something pushes.
@@ -51,9 +58,16 @@ class ForceBalanceSettings:
     conjugate_steps: int = 2
     tau: tuple[float, float] = (4.0, 0.4)
     fine_tau: tuple[float, float] = (0.8, 0.4)
-    warm_tau: tuple[float, float] = (1.2, 0.4)
+    warm_tau: tuple[float, float] = (0.6, 0.4)
     decline: float = 0.6
-    sparsity: float = 3200.0
+    sparsity: float = 6400.0
+    scale_reach: float = 0.08
+    scale_share: float = 0.3
+    far_share: float = 0.1
+    noise_share: float = 0.6
+    contact_noise: float = 2.7
+    least_scale: float = 0.02
+    decrease: float = 2.0
     friction: float = 3.75
     slip: float = 0.05
     cone: float = 15.0
@@ -61,7 +75,7 @@ class ForceBalanceSettings:
     reach: float = 0.04
     floor: float = 1e-3
     outlier: float = 5.0
-    longest_step: float = 0.026
+    longest_step: float = 0.04
     coarsest: int = 9
     coarsest_warm: int = 13
     largest_relative_step: float = 2e-3

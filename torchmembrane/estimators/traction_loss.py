@@ -6,6 +6,15 @@ A traction `q` of a vertex has the normal part `q_n` (outward positive: tensile)
 
 `f` Geman-McClure of scale `tau` where the vertex is pushed, `s^2 / 2` where it is pulled, and `kappa = friction / (1 + cone
 S)`. Both ask the vertex's surroundings: `S` is the rms push over a Gaussian neighbourhood, for contacts are patches.
+
+A light touch, smeared over many vertices, pushes with far less than `p0`. So every traction is measured against what can be
+expected around it: not `p0` but `rho p0`, with
+
+    rho = min(1, max(c M, c_far max S, z sigma) / tau_last),
+
+`M` the largest push `S` of the vertex's wider surroundings (a power mean), `sigma` the push that the markers' noise alone
+makes there. The loss is that of `q / rho`: whatever its scale, a touch looks the same, and noise below `z sigma` never looks
+like one. (As iterative reweighting for sparse recovery ties its epsilon to the largest entries: Daubechies et al. 2010.)
 """
 
 import torch
@@ -15,6 +24,10 @@ from ..surface.membrane import Membrane
 from ..surface.stencil import inner
 from .robust import GemanMcClure, PseudoHuber
 from .settings import ForceBalanceSettings
+
+POWER = 4  # of squared pushes, in the mean that stands for the largest around
+BEYOND = 1e6  # over p0: no push comes near it
+TINY = 1e-12  # keeps roots and quotients of what vanishes finite
 
 
 class TractionLoss(nn.Module):
@@ -29,6 +42,8 @@ class TractionLoss(nn.Module):
 
     area: Tensor
     surroundings: Tensor
+    wider: Tensor
+    push_noise: Tensor
 
     def __init__(self, membrane: Membrane, reference: float, cone: float, settings: ForceBalanceSettings):
         super().__init__()
@@ -41,6 +56,9 @@ class TractionLoss(nn.Module):
         self.register_buffer("area", within(membrane.rest_area[:, None]).squeeze(-1))
         surroundings = _gaussian_mean(membrane, settings.reach * self.size)
         self.register_buffer("surroundings", within(within(surroundings).mT).mT)
+        wider = within(within(_gaussian_mean(membrane, settings.scale_reach * self.size)).mT).mT
+        self.register_buffer("wider", wider / wider.sum(0))
+        self.register_buffer("push_noise", torch.zeros_like(self.area))
 
     def parts(self, traction: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Normal part over `p0`, squared shear over `p0^2`, and the mean squared push `S^2` around, each `[B, N]`, of tractions
@@ -56,28 +74,61 @@ class TractionLoss(nn.Module):
         settings = self.settings
         return settings.friction / (1 + self.cone * (push2 + settings.slip**4).sqrt())
 
-    def weights(self, normal: Tensor, force: Tensor, tau: float | Tensor, curvature: bool = False) -> Tensor:
+    def scale2(self, push2: Tensor, noise_level: Tensor, tau: float | Tensor) -> Tensor:
+        """`rho^2 [B, N]`, from `S^2 [B, N]` and the frames' noise over that at rest `[B]`.
+
+        At least as much as the scale `tau` of the step allows: from rest, where nothing pushes yet, it begins at 1.
+        """
+        settings, last = self.settings, self.settings.tau[-1]
+        top = push2.amax(-1, keepdim=True).clamp_min(TINY)
+        around = top * (((push2 / top) ** POWER) @ self.wider).clamp_min(TINY) ** (1 / POWER)
+        noise2 = (settings.noise_share * noise_level[:, None] * self.push_noise).square()
+        expected = torch.maximum((settings.scale_share**2 * around).maximum(settings.far_share**2 * top), noise2)
+        least = (settings.decrease * (torch.as_tensor(tau) / last - 1) + settings.least_scale).clamp_max(1.0)
+        return (expected / last**2).maximum(least.to(push2) ** 2).clamp_max(1.0)
+
+    def contact_scale(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> Tensor:
+        """What a push that is a contact is measured against, over `p0`, `[B, N]`: `rho`, or where noise explains it `BEYOND`.
+
+        Args:
+            traction: `[B, 3, N]`, at a solution.
+            normal: `[B, 3, N]`.
+            noise_level: `[B]`, of the frames over that at rest.
+        """
+        push2 = self.parts(traction, normal)[2]
+        rho = self.scale2(push2, noise_level, self.settings.tau[-1]).sqrt()
+        above = push2 > (self.settings.contact_noise * noise_level[:, None] * self.push_noise).square()
+        return torch.where(above, rho, BEYOND)
+
+    def weights(
+        self, normal: Tensor, force: Tensor, noise_level: Tensor, tau: float | Tensor, curvature: bool = False
+    ) -> Tensor:
         """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, 3, 3, N]`: the parabolas that touch the loss of a force.
 
         Args:
             normal: `[B, 3, N]` of the inner vertices.
             force: `[B, 3, N]`.
+            noise_level: `[B]`, of the frames over that at rest.
             tau: scale of the compressive traction's loss.
             curvature: the curvature of a push's loss instead of its weight, zero where it bends down.
         """
         q_n, shear2, push2 = self.parts(force / self.area, normal)
+        rho2 = self.scale2(push2, noise_level, tau)
+        shear2, push2 = shear2 / rho2, push2 / rho2
         compressive = GemanMcClure(tau)
         pushed = compressive.curvature(push2) if curvature else compressive.weight(push2)
         w_n = self.settings.floor + torch.where(q_n < 0, pushed, 1.0)
         w_t = self.shear_weight(push2) * self.shear.weight(shear2)
-        scale = self.settings.sparsity / (self.reference * self.size) ** 2 / self.area
+        scale = self.settings.sparsity / (self.reference * self.size) ** 2 / self.area / rho2
         one = torch.eye(3, dtype=force.dtype, device=force.device)[..., None]
         along = (scale * (w_n - w_t))[:, None] * normal
         return along[:, :, None] * normal[..., None, :, :] + (scale * w_t)[:, None, None] * one
 
-    def forward(self, traction: Tensor, normal: Tensor) -> Tensor:
+    def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> Tensor:
         """The loss `[B]` of tractions `[B, 3, N]` at the last scale `tau`, each push judged by itself."""
         q_n, shear2, push2_around = self.parts(traction, normal)
+        rho2 = self.scale2(push2_around, noise_level, self.settings.tau[-1])
+        q_n, shear2, push2_around = q_n / rho2.sqrt(), shear2 / rho2, push2_around / rho2
         push2 = (-q_n).clamp_min(0) ** 2
         loss = GemanMcClure(self.settings.tau[-1]).loss(push2) + q_n.clamp_min(0) ** 2 / 2
         loss = loss + self.shear_weight(push2_around) * self.shear.loss(shear2)

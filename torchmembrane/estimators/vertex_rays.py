@@ -76,8 +76,8 @@ class VertexRays(nn.Module):
         """Pressure difference across the membrane at rest, `[]`, force unit per length unit squared."""
         return self.cavity.rest_pressure
 
-    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor) -> Observation:
-        """The rays of the grid's vertices, moved by the flow of the markers seen at `pixels [B, D, 2]`."""
+    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
+        """The rays of the grid's vertices, moved by the flow of the markers seen at `pixels [B, D, 2]`; all are as sure."""
         if self.flow is None:
             raise MembraneError(
                 f"{type(self).__name__}.prepare: made without a flow; pass flow, or give forward the vertices' rays"

@@ -9,10 +9,12 @@ from torch import Tensor, nn
 from ..errors import MembraneError
 from ..io.status import Status
 from ..pieces import piece
-from .locator import Locator
+from .locator import Locator, isotropic
 from .placement import FEWEST_MARKERS, PlacedMarkers
 from .screening import MismatchScreen
 
+NOISE = 0.05
+"""px, standard deviation of a marker in an image where nothing else is known."""
 FOUND = 0.5
 """Confidence above which a marker counts as found."""
 FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5  # of the markers: fewer found are too few, or an image unlike the rest image
@@ -21,10 +23,12 @@ SPARSE = 4  # px: every so many rows and columns are asked whether they are satu
 
 
 class MarkerFlow(NamedTuple):
-    """Of a batch: the markers' `displacement [B, D, 2]` px, their `confidence [B, D]` in 0..1, `status [B]` so far."""
+    """Of a batch: the markers' `displacement [B, D, 2]` px, their `confidence [B, D]` in 0..1, the displacements' `covariance
+    [B, D, 2, 2]` px^2, `status [B]` so far."""
 
     displacement: Tensor
     confidence: Tensor
+    covariance: Tensor
     status: Tensor
 
 
@@ -44,6 +48,7 @@ class MarkerObserver(nn.Module):
 
     rest_pixels: Tensor
     measured_rest: Tensor
+    rest_covariance: Tensor
 
     def __init__(
         self, markers: PlacedMarkers, rim_pixels: np.ndarray, name: str, dtype: torch.dtype, rest_image: np.ndarray | None
@@ -53,24 +58,27 @@ class MarkerObserver(nn.Module):
         self.screen = MismatchScreen(markers.model_pixels, rim_pixels)
         self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
         self.register_buffer("measured_rest", torch.from_numpy(markers.model_pixels))
+        self.register_buffer("rest_covariance", isotropic(self.rest_pixels[:, 0], NOISE))
         self.to(dtype)
         if rest_image is not None:
-            self.measured_rest = self._in_rest_image(torch.from_numpy(rest_image).to(dtype), name)
+            self.measured_rest, self.rest_covariance = self._in_rest_image(torch.from_numpy(rest_image).to(dtype), name)
 
-    def _in_rest_image(self, image: Tensor, name: str) -> Tensor:
-        """The markers in the rest image: subtracted from every frame's, rest offsets are nulled (section 5.2)."""
-        pixels, found = self.locate(image[None, None])
+    def _in_rest_image(self, image: Tensor, name: str) -> tuple[Tensor, Tensor]:
+        """The markers in the rest image, and their covariance: subtracted from every frame's, rest offsets are nulled (5.2)."""
+        with torch.no_grad():
+            pixels, confidence, covariance = self.locator(image[None, None])
+        found = confidence > FOUND
         if found.sum() < max(FEWEST_MARKERS, ALIKE_SHARE * found.shape[1]):
             raise MembraneError(
                 f"sensor {name!r}: only {int(found.sum())} of {found.shape[1]} markers are found in the rest image; "
                 "expected most: check the marker file, the polarity and the camera against the image"
             )
-        return torch.where(found[0, :, None], pixels[0], self.measured_rest)
+        return torch.where(found[0, :, None], pixels[0], self.measured_rest), covariance[0]
 
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels `[B, D, 2]` of the markers in grey images `[B, 1, height, width]`, and which of them are found `[B, D]`."""
         with torch.no_grad():
-            pixels, confidence = self.locator(images)
+            pixels, confidence, _ = self.locator(images)
         return pixels, confidence > FOUND
 
     def forward(self, images: Tensor, previous: Tensor | None = None, rest_pixels: Tensor | None = None) -> MarkerFlow:
@@ -103,12 +111,14 @@ class MarkerObserver(nn.Module):
 
     @piece
     def displaced(
-        self, pixels: Tensor, confidence: Tensor, status: Tensor, rest_pixels: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Displacements and confidence from what the locator makes of images; zero where these hold bad values."""
+        self, pixels: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor, rest_pixels: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Displacements, confidence and covariance from what the locator makes of images; nothing where these hold bad
+        values."""
         bad = (status == Status.BAD_VALUES.value)[:, None]
         rest = self.measured_rest if rest_pixels is None else rest_pixels
-        return torch.where(bad[..., None], 0.0, pixels - rest), torch.where(bad, 0.0, confidence)
+        displacement, confidence = torch.where(bad[..., None], 0.0, pixels - rest), torch.where(bad, 0.0, confidence)
+        return displacement, confidence, self.rest_covariance + torch.where(bad[..., None, None], 0.0, covariance)
 
     def from_pixels(self, pixels: Tensor, confidence: Tensor | None, rest_pixels: Tensor | None) -> MarkerFlow:
         """What markers located elsewhere show, those that belong with no neighbour without confidence.
@@ -128,10 +138,11 @@ class MarkerObserver(nn.Module):
         confidence = torch.where(finite, _checked_confidence(confidence, pixels), 0.0)
         displacement = torch.where(finite[..., None], pixels - rest, 0.0)
         status = torch.zeros_like(confidence[:, 0], dtype=torch.long)
-        return MarkerFlow(displacement, self.screen(displacement, confidence), status)
+        covariance = self.rest_covariance + isotropic(confidence, NOISE)
+        return MarkerFlow(displacement, self.screen(displacement, confidence), covariance, status)
 
     @piece
-    def judge(self, displacement: Tensor, confidence: Tensor, status: Tensor) -> MarkerFlow:
+    def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
         """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""
         found = confidence > FOUND
         count, D = found.sum(-1), found.shape[-1]
@@ -139,7 +150,7 @@ class MarkerObserver(nn.Module):
         few = torch.where(count < max(FEWEST_MARKERS, FEWEST_SHARE * D), Status.TOO_FEW_MARKERS.value, unlike)
         status = torch.where(status == Status.OK.value, few, status)
         usable = (status == Status.OK.value)[:, None, None]
-        return MarkerFlow(displacement * usable, torch.where(found, confidence, 0.0), status)
+        return MarkerFlow(displacement * usable, torch.where(found, confidence, 0.0), covariance, status)
 
 
 def _checked_confidence(confidence: Tensor | None, pixels: Tensor) -> Tensor:

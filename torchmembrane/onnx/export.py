@@ -52,7 +52,8 @@ class Piece(nn.Module):
         self.owner, self.function, self.arranged = owner, function, arranged
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return tuple(tree_leaves(self.function(self.owner, *self.arranged(*tensors))))
+        found = tree_leaves(self.function(self.owner, *self.arranged(*tensors)))
+        return tuple(value for value in found if value is not None)
 
 
 class Tracer:
@@ -115,7 +116,7 @@ class Tracer:
             self.assembly.part = type(owner).__module__.removeprefix("torchmembrane.").partition(".")[0]
         key = (owner, function, str(structure), *fixed.items(), *(value.shape for value in examples.values()))
         if key not in self.traced:
-            outputs = [f"output {k}" for k, _ in enumerate(tree_leaves(found))]
+            outputs = [f"output {k}" for k, _ in enumerate(value for value in tree_leaves(found) if value is not None)]
             try:
                 self.traced[key] = traced(Piece(owner, function, arranged), examples, outputs)
             except Exception as error:  # of torch's exporter and of what it calls, which raise what they like
@@ -127,7 +128,7 @@ class Tracer:
     def _known(self, found: Any, names: dict[str, str]) -> Any:
         """The values of such names, arranged as the examples `found` are."""
         each = iter(names.values())
-        return tree_map(lambda example: Known(self, next(each), example), found)
+        return tree_map(lambda example: None if example is None else Known(self, next(each), example), found)
 
 
 def _everywhere(_: None, done: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ def fingertip() -> Sensor:
         Camera("fisheye", (640, 480), (180.0, 180.0), (321.5, 238.2), (-0.012, 0.002)),
         Surface("ellipsoid_cap", {"semi_axes": semi_axes, "base_z": 3.0}),
         Material("neo_hookean", prestretch=1.25, shear_modulus=0.3, thickness=0.4),
-        *_dome_dots(semi_axes, np.pi / 2, 3.0, spacing=2.1),
+        *dome_dots(semi_axes, np.pi / 2, 3.0, spacing=2.1),
     )
 
 
@@ -43,7 +43,7 @@ def bubble() -> Sensor:
         Camera("pinhole", (640, 480), (440.0, 440.0), (317.8, 241.1), (-0.06, 0.02)),
         Surface("spherical_cap", {"rim_radius": rim, "height": height, "base_z": base_z}),
         Material("neo_hookean", prestretch=1.3, shear_modulus=0.3, thickness=0.3),
-        *_dome_dots((radius,) * 3, np.arctan2(rim, radius - height), base_z, spacing=4.4),
+        *dome_dots((radius,) * 3, np.arctan2(rim, radius - height), base_z, spacing=4.4),
         gas=True,
     )
 
@@ -56,7 +56,7 @@ def half_cylinder() -> Sensor:
         Camera("pinhole", (640, 480), (265.0, 265.0), (322.4, 237.0), ports=[(4.0, 3.0, 1.49)], medium_index=1.33),
         Surface("half_cylinder", {"radius": radius, "length": length, "half_angle": half_angle, "base_z": base_z}),
         Material("mooney_rivlin", prestretch=1.2, c2_ratio=0.1, shear_modulus=0.35, thickness=0.3),
-        *_cylinder_dots(radius, length, np.deg2rad(half_angle), base_z, spacing),
+        *cylinder_dots(radius, length, np.deg2rad(half_angle), base_z, spacing),
     )
 
 
@@ -93,7 +93,7 @@ def _overpressure(sensor: Sensor) -> float:
     return float(round(float(rest_pressure) * METRE["mm"] ** 2 / 100))
 
 
-def _dome_dots(semi_axes: Sequence[float], opening: float, base_z: float, spacing: float) -> tuple[np.ndarray, list[str]]:
+def dome_dots(semi_axes: Sequence[float], opening: float, base_z: float, spacing: float) -> tuple[np.ndarray, list[str]]:
     """A square pattern, its pitch measured along the surface from the pole: positions `[D, 3]` and sizes, in turns."""
     a, b, c = semi_axes
     i, j = _lattice(opening * max(a, b) / spacing)
@@ -105,7 +105,7 @@ def _dome_dots(semi_axes: Sequence[float], opening: float, base_z: float, spacin
     return points[kept].round(5), _sizes((i + j)[kept])
 
 
-def _cylinder_dots(
+def cylinder_dots(
     radius: float, length: float, half_angle: float, base_z: float, spacing: float
 ) -> tuple[np.ndarray, list[str]]:
     """A square pattern on the unrolled cylinder: positions `[D, 3]` and sizes, in turns."""

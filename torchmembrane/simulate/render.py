@@ -279,4 +279,4 @@ def _spline_matrix(coarse: int, fine: int) -> Tensor:
 
 def _each(*batches: Tensor) -> Iterator[tuple[Tensor, ...]]:
     """The images of a batch one by one: an image is some million samples, enough to keep any device busy."""
-    return zip(*(batch.reshape(-1, *batch.shape[-2:]) for batch in batches), strict=True)
+    return zip(*(batch[None].flatten(0, -3) for batch in batches), strict=True)

@@ -12,24 +12,25 @@ from .pyramid import LEVELS
 
 RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level
 FINEST = 2.0  # a dot's short half axis on its level of the pyramid is at least this, where it can be
+MISFIT = 0.02  # of the residual's variance, what differs from image to image besides noise: most of it is the model's, in all
 RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, its slope over the dot, depth, shift, growth
 
 
 def solve_positive(system: Tensor) -> Tensor:
-    """`x [n, ...]` with `matrix x = load` from `system = [matrix, load] [n, n + 1, ...]`: Gauss-Jordan without pivoting.
+    """`x [n, k, ...]` with `matrix x = loads` from `system = [matrix, loads] [n, n + k, ...]`: Gauss-Jordan without pivoting.
 
     The matrix must be positive definite; the batch comes last, so that each row is one long vector.
 
     Example:
         >>> solve_positive(torch.tensor([[2.0, 0.0, 6.0], [0.0, 4.0, 2.0]])).tolist()
-        [3.0, 0.5]
+        [[3.0], [0.5]]
     """
     n = system.shape[0]
     unit = torch.eye(n, dtype=system.dtype, device=system.device).reshape(n, n, *(1,) * (system.ndim - 2))
     for i in range(n):
         column, rest = system.split([1, system.shape[1] - 1], 1)
         system = rest - (column - unit[:, i : i + 1]) * (rest[i : i + 1] / column[i : i + 1])
-    return system[:, 0]
+    return system
 
 
 class Outline(NamedTuple):
@@ -40,6 +41,16 @@ class Outline(NamedTuple):
     by_u: Tensor  # of the template, by the centre
     by_v: Tensor
     by_growth: Tensor
+
+
+class FittedDots(NamedTuple):
+    """Of a batch: `centre [B, D, 2]` px, its `covariance [B, D, 2, 2]` px^2, `growth` of the outline `[B, D]` px, `quality
+    [B, D]` in 0..1."""
+
+    centre: Tensor
+    covariance: Tensor
+    growth: Tensor
+    quality: Tensor
 
 
 class EllipseFit(nn.Module):
@@ -70,6 +81,7 @@ class EllipseFit(nn.Module):
     size: Tensor
     sharpness: Tensor
     ridge: Tensor
+    unit_loads: Tensor
 
     def __init__(
         self, pixels: np.ndarray, shapes: np.ndarray, image_size: tuple[int, int], size_tolerance: float, steps: int = 3
@@ -96,6 +108,7 @@ class EllipseFit(nn.Module):
         ridge = np.diag(RIDGE)[..., None] * np.ones(len(stride))
         ridge[1:3, 1:3] = RIDGE[1] * np.moveaxis(shapes @ shapes.swapaxes(1, 2) / stride[:, None, None] ** 2, 0, -1)
         ridge[4:] *= stride**2
+        self.register_buffer("unit_loads", torch.eye(7, dtype=torch.float64)[:, 4:6, None, None])
         self.register_buffer("ridge", torch.as_tensor(np.concatenate([ridge, np.zeros((7, 1, len(stride)))], 1))[:, :, None])
 
     def _register_levels(self, level: np.ndarray, offset: np.ndarray, sizes: np.ndarray) -> None:
@@ -126,17 +139,18 @@ class EllipseFit(nn.Module):
         values = parts[0] if len(parts) == 1 else torch.cat(parts, 1)[:, self.dot_to_row]
         return values, pixel * stride + (stride - 1) / 2
 
-    def forward(self, levels: list[Tensor], centre: Tensor, shape: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, levels: list[Tensor], centre: Tensor, shape: Tensor, noise: Tensor) -> FittedDots:
         """Fit every dot of a batch of frames.
 
         Args:
             levels: of `mean_pyramid`, dark dots.
             centre: `[B, D, 2]` to begin with, px.
             shape: `[B, D, 2, 2]`, px.
+            noise: `[B]`, standard deviation of a pixel of the finest level.
 
         Returns:
-            Centre `[B, D, 2]`, growth of the outline `[B, D]` px, and quality `[B, D]` in 0..1, from the share of the
-            window's variance explained, the contrast `a / b_0`, and the size against that of `shape` or at rest.
+            The dots; their quality comes from the share of the window's variance explained, the contrast `a / b_0`, and the
+            size against that of `shape` or at rest.
         """
         values, middle = self.windows(levels, centre)
         mean = values.mean(-1, keepdim=True)
@@ -157,15 +171,17 @@ class EllipseFit(nn.Module):
             if fit is not None:
                 weight = weight / self._intrusion(fit, outline.template, window)
             gram = self._gram(outline, window, weight)
-            fit = solve_positive(gram[:7] + self.ridge)  # [7, B, D]
+            fit = solve_positive(gram[:7] + self.ridge)[:, 0]  # [7, B, D]
             change = change + reach * torch.tanh(fit[4:] * _gain(fit) / reach)
             change = torch.maximum(torch.minimum(change, highest), lowest)
         moved, growth = change[:2].movedim(0, -1), change[2]
         assert fit is not None
-        quality = self._quality(gram, fit, offset, mean[..., 0])
+        missed = _missed(gram, fit)
+        quality = self._quality(gram, fit, missed, offset, mean[..., 0])
         grown = torch.minimum(*(torch.log((size + growth) / usual).square() for usual in (size, self.size)))
         quality = quality * torch.exp(-grown / (2 * self.size_tolerance) ** 2)
-        return centre + self.stride[:, None] * moved, self.stride * growth, quality
+        centre = centre + self.stride[:, None] * moved
+        return FittedDots(centre, self._covariance(gram, fit, missed, noise), self.stride * growth, quality)
 
     def _outline(self, offset: Tensor, growth: Tensor, metric: Tensor, count: int) -> Outline:
         """The model's dot on the first `count` pixels of the window, its middle at `offset [2, B, D]` from the centre."""
@@ -197,14 +213,26 @@ class EllipseFit(nn.Module):
         gram = torch.cat([torch.cat([plain.unflatten(-1, (3, 3)), mixed.mT], -1), torch.cat([mixed, own], -1)], -2)
         return gram.movedim((-2, -1), (0, 1))
 
-    def _quality(self, gram: Tensor, fit: Tensor, offset: Tensor, mean: Tensor) -> Tensor:
+    def _covariance(self, gram: Tensor, fit: Tensor, missed: Tensor, noise: Tensor) -> Tensor:
+        """Of the centres, `[B, D, 2, 2]` px^2: the variance of the pixels through the normal equations."""
+        loads = self.unit_loads.expand(-1, -1, *gram.shape[2:])
+        inverse = solve_positive(torch.cat([gram[:7, :7] + self.ridge[:, :7], loads], 1))[4:6]
+        variance = (noise[:, None] / self.stride).square() + MISFIT * missed / (gram[0, 0] - 7).clamp_min(1)
+        return (variance * (self.stride * _gain(fit)).square() * inverse).movedim((0, 1), (-2, -1))
+
+    def _quality(self, gram: Tensor, fit: Tensor, missed: Tensor, offset: Tensor, mean: Tensor) -> Tensor:
         """How well the model explains the window, times whether the dot stands out: `[B, D]` in 0..1."""
-        miss = torch.cat([fit, -torch.ones_like(fit[:1])])
         spread = gram[7, 7] - gram[0, 7].square() / gram[0, 0].clamp_min(1)
-        explained = 1 - ((gram * miss).sum(1) * miss).sum(0) / (spread.clamp_min(0) + 1e-6)
+        explained = 1 - missed / (spread.clamp_min(0) + 1e-6)
         background = (fit[1:3] * offset).sum(0)
         contrast = -fit[3] / (fit[0] - background + mean).clamp_min(1e-2)
         return torch.sigmoid(12 * (explained - 0.6)) * torch.sigmoid(40 * (contrast - 0.12))
+
+
+def _missed(gram: Tensor, fit: Tensor) -> Tensor:
+    """Weighted sum of the squared residuals `[B, D]`."""
+    miss = torch.cat([fit, -torch.ones_like(fit[:1])])
+    return ((gram * miss).sum(1) * miss).sum(0).clamp_min(0)
 
 
 def _gain(fit: Tensor) -> Tensor:

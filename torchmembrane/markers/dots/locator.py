@@ -8,6 +8,8 @@ from torch import Tensor, nn
 
 from ...errors import MembraneError
 from ...pieces import piece
+from ..locator import LocatedMarkers
+from ..noise import pixel_noise
 from ..spacing import safe_length, spacing, square_distance
 from .coherence import Coherence
 from .detect import BlobDetector
@@ -68,7 +70,7 @@ class DotLocator(nn.Module):
         >>> rest = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)
         >>> pattern = DotPattern(rest, np.tile(4.0 * np.eye(2), (12, 1, 1)), np.ones(12, int))
         >>> image = draw_dots(rest + [2.5, -1.5], pattern.shapes, (100, 80)).float()
-        >>> pixels, confidence = DotLocator(pattern, (100, 80), "dark")(image)
+        >>> pixels, confidence, _ = DotLocator(pattern, (100, 80), "dark")(image)
         >>> (pixels[0] - torch.tensor(rest)).mean(0).round(decimals=1).tolist(), bool(confidence.min() > 0.9)
         ([2.5, -1.5], True)
     """
@@ -105,16 +107,13 @@ class DotLocator(nn.Module):
         self.register_buffer("shapes", torch.as_tensor(shapes))
         self.float()
 
-    def forward(self, image: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
         """Locate the dots in a batch of frames.
 
         Args:
             image: `[B, 1, H, W]`, grey in 0..1.
             previous: pixels `[B, D, 2]` in the frames before, NaN where lost, from which the dots are followed; without it
                 from rest.
-
-        Returns:
-            Pixels `[B, D, 2]` and confidence `[B, D]` in 0..1.
         """
         level_0, level_1, level_2, blobs, log_radius, valid = self.begin(image)
         place, certainty, strain = self.match(blobs, log_radius, valid, previous)
@@ -144,15 +143,15 @@ class DotLocator(nn.Module):
         place: Tensor,
         certainty: Tensor,
         strain: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Pixels and confidence, by the fit about where the matcher places the dots."""
+    ) -> LocatedMarkers:
+        """The dots, by the fit about where the matcher places the dots."""
         levels, rest = [level_0, level_1, level_2], self.rest
         _, gradient, _ = self.match.predict(certainty, place - rest, strain)
         shape = self.shapes + gradient.clamp(-0.6, 0.6) @ self.shapes
-        pixels, _, quality = self.fit(levels, place, shape)
+        pixels, covariance, _, quality = self.fit(levels, place, shape, pixel_noise(level_0))
         predicted, _, _ = self.match.predict(certainty * quality, pixels - rest, strain)
         deviation = safe_length(pixels - rest - predicted, -1) / self.match.nearest
         confidence = quality * torch.sigmoid(20 * (OUTLIER - deviation))
         confidence = confidence * self.coherence(pixels, confidence, strain, rest + predicted, blobs, log_radius, valid)
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
-        return torch.where(confidence[..., None] > 0.05, pixels, rest + predicted), confidence
+        return LocatedMarkers(torch.where(confidence[..., None] > 0.05, pixels, rest + predicted), confidence, covariance)

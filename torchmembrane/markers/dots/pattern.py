@@ -37,8 +37,8 @@ def refine(
     """Centres `[D, 2]` fitted to sub-pixel accuracy, the outline's growth `[D]` px, quality `[D]` in 0..1."""
     fit = EllipseFit(pixels, shapes, dark.shape[::-1], tolerance, steps=8)
     levels = mean_pyramid(torch.as_tensor(dark)[None, None])
-    centre, growth, quality = fit(levels, torch.as_tensor(pixels)[None], torch.as_tensor(shapes)[None])
-    return centre[0].numpy(), growth[0].numpy(), quality[0].numpy()
+    found = fit(levels, torch.as_tensor(pixels)[None], torch.as_tensor(shapes)[None], torch.zeros(1))
+    return found.centre[0].numpy(), found.growth[0].numpy(), found.quality[0].numpy()
 
 
 def population(pixels: np.ndarray, shapes: np.ndarray, contrasts: np.ndarray) -> np.ndarray:

@@ -11,11 +11,13 @@ from ..dots.ellipse import draw_dots, log_radii
 from ..dots.flow import FlowAverages
 from ..dots.locator import membrane_mask
 from ..dots.pattern import DotPattern
+from ..locator import LocatedMarkers, isotropic
 from ..neighbourhood import NeighbourFlow, Neighbourhood
 from ..spacing import spacing, thin_out
 from .response import pyramid
 from .search import WIDTH, DotGrowth, DotSearch, Found, predict
 
+NOISE = 0.05  # px, of a dot in an image
 NEAR = 1.0  # radii, standard deviation of where a dot is expected on the fine level
 
 MIDDLE = 0.5  # grey of which the logarithm is taken for 0
@@ -121,7 +123,7 @@ class SoftLocator(nn.Module):
             self.by_large.calibrate(levels, self.rest[self.small])
         self.refine.calibrate(levels, self.rest)
 
-    def forward(self, image: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
         """Locate the dots in a batch of frames.
 
         Args:
@@ -130,8 +132,7 @@ class SoftLocator(nn.Module):
                 from the rim.
 
         Returns:
-            Pixels `[B, D, 2]` and confidence `[B, D]` in 0..1; a lost dot has confidence 0 and the pixel that its neighbours
-            predict. A frame that holds a value that is not finite has confidence 0 throughout.
+            The dots. A frame that holds a value that is not finite has confidence 0 throughout.
         """
         levels, usable = self.begin(image)
         place, weight = self.growth(levels, None if previous is None else self.of_large(previous))
@@ -188,8 +189,8 @@ class SoftLocator(nn.Module):
         """Pixels `[B, D, 2]` of the dots that belong with their neighbours, of the others where these put them."""
         return self.mix(found.place, *self.compare(found))
 
-    def judge(self, found: Found, usable: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels and confidence, as `forward` returns them; `usable [B]` says which frames are."""
+    def judge(self, found: Found, usable: Tensor) -> LocatedMarkers:
+        """What `forward` returns; `usable [B]` says which frames are."""
         return self.decide(found.place, *self.compare(found), usable)
 
     @piece
@@ -211,14 +212,15 @@ class SoftLocator(nn.Module):
         return torch.sigmoid(30 * (found.response - FAINTEST)) * alike * found.sharpness
 
     @piece
-    def decide(self, place: Tensor, expected: Tensor, confidence: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
+    def decide(self, place: Tensor, expected: Tensor, confidence: Tensor, usable: Tensor) -> LocatedMarkers:
         """As `judge`, from what `compare` gives."""
         if self.by_large is not None:
             led = torch.sigmoid(20 * (confidence[:, self.large] @ self.lead + self.led_by_rim - UNLED))
             confidence = confidence * torch.where(self.is_small, led, 1.0)
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST)) * usable[:, None]
         confidence = ((confidence - LOST) / (1 - LOST)).relu()
-        return torch.where(confidence[..., None] > 0, place, expected), confidence
+        pixels = torch.where(confidence[..., None] > 0, place, expected)
+        return LocatedMarkers(pixels, confidence, isotropic(confidence, NOISE))
 
 
 def _other_radii(pixels: np.ndarray, radii: np.ndarray, largest: np.ndarray) -> np.ndarray:

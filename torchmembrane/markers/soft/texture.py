@@ -5,7 +5,8 @@ import torch
 from torch import Tensor, nn
 
 from ...pieces import piece
-from ..texture.locator import PatchLocator
+from ..locator import LocatedMarkers, isotropic
+from ..texture.locator import NOISE, PatchLocator
 from ..texture.pyramid import low_pass_pyramid, sample
 from ..texture.template import RADIUS, Template, normalised_correlation, square_offsets
 from .argmax import Peak, window_peak
@@ -79,7 +80,7 @@ class SoftTextureLocator(PatchLocator):
         >>> rest = gaussian_filter(np.random.default_rng(0).random((80, 100)), 2)
         >>> rest = (rest - rest.min()) / np.ptp(rest)
         >>> locator = SoftTextureLocator(rest, choose_patches(rest, np.ones((80, 100), bool), 200))
-        >>> pixels, confidence = locator(torch.tensor(np.roll(rest, 3, 1)[None, None]).float())
+        >>> pixels, confidence, _ = locator(torch.tensor(np.roll(rest, 3, 1)[None, None]).float())
         >>> (pixels - locator.rest_pixels)[0][:, 0].median().round(decimals=1).item(), bool(confidence.median() > 0.9)
         (3.0, True)
     """
@@ -93,16 +94,12 @@ class SoftTextureLocator(PatchLocator):
         self.to(torch.get_default_dtype())
 
     @piece
-    def forward(self, image: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
         """Locate the patches in a batch of frames.
 
         Args:
             image: `[B, 1, H, W]`, grey in 0..1, of the rest image's size.
             previous: not used, as `follows` says.
-
-        Returns:
-            Pixels `[B, D, 2]` and confidence `[B, D]` in 0..1; a lost patch has confidence 0 and the pixel that its
-            neighbours predict.
 
         Raises:
             MembraneError: the image has another size than the rest image.
@@ -118,4 +115,5 @@ class SoftTextureLocator(PatchLocator):
             flow, local = self.settle(found, weight, flow, tolerance)
             gradient = local.gradient
         confidence = weight * local.trust(found) * finite.flatten(1).all(1)[:, None]
-        return self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow), confidence
+        pixels = self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow)
+        return LocatedMarkers(pixels, confidence, isotropic(confidence, NOISE))

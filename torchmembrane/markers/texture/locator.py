@@ -13,10 +13,12 @@ from torch import Tensor, nn
 
 from ...errors import MembraneError
 from ...pieces import piece
+from ..locator import LocatedMarkers, isotropic
 from ..neighbourhood import NEIGHBOURS, NeighbourFlow, Neighbourhood
 from .pyramid import LEVELS, low_pass_pyramid
 from .template import RADIUS, Search, Template
 
+NOISE = 0.1  # px, of a patch in an image
 LOST_WEIGHT = 1e-3  # of a lost patch's predicted flow in its neighbours' fits: it counts only where none of them is found
 
 
@@ -97,7 +99,7 @@ class TextureLocator(PatchLocator):
         >>> rest = gaussian_filter(np.random.default_rng(0).random((80, 100)), 2)
         >>> rest = (rest - rest.min()) / np.ptp(rest)
         >>> locator = TextureLocator(rest, choose_patches(rest, np.ones((80, 100), bool), 200))
-        >>> pixels, confidence = locator(torch.tensor(np.roll(rest, 3, 1)[None, None]).float())
+        >>> pixels, confidence, _ = locator(torch.tensor(np.roll(rest, 3, 1)[None, None]).float())
         >>> (pixels - locator.rest_pixels)[0][:, 0].median().round(decimals=2).item(), bool(confidence.median() > 0.9)
         (3.0, True)
     """
@@ -111,16 +113,12 @@ class TextureLocator(PatchLocator):
         self.to(torch.get_default_dtype())
 
     @piece
-    def forward(self, image: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
         """Locate the patches in a batch of frames; the gradient takes the last level only, the rest is where to look.
 
         Args:
             image: `[B, 1, H, W]`, grey in 0..1, of the rest image's size.
             previous: not used, as `follows` says.
-
-        Returns:
-            Pixels `[B, D, 2]` and confidence `[B, D]` in 0..1; a lost patch has confidence 0 and the pixel that its
-            neighbours predict.
 
         Raises:
             MembraneError: the image has another size than the rest image.
@@ -137,4 +135,5 @@ class TextureLocator(PatchLocator):
         found, likeness = self.templates[0](images[0], flow, local.gradient, 3)
         _, local = self.settle(found.detach(), likeness.detach(), flow, 0.3)
         confidence = likeness * local.trust(found)
-        return self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow), confidence
+        pixels = self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow)
+        return LocatedMarkers(pixels, confidence, isotropic(confidence, NOISE))

@@ -1,0 +1,186 @@
+"""How far the estimator's answers hold: random sensors, pressed at random, through images.
+
+python bench/range.py DATA [--first 0] [--sensors 10000] [--json FILE]
+
+DATA from random_sensors.py. A press is right where the markers' surface is within a quarter of their displacement and the force
+within a quarter of the true one (a lower bound where `contact_at_rim` says so). Printed: shares right and wrong with status ok,
+and the rest by status, of presses whose contact is no narrower than the dots' spacing, by filling, prestretch, dots, view and
+depth, and of the narrower ones; then what light strokes give, by the share of their largest force; then images at rest.
+"""
+
+import argparse
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+from record import write
+
+import torchmembrane as tm
+
+CLOSE = 0.25
+BANDS = (0, 0.02, 0.05, 0.15, 0.5, 1.01)
+
+
+def quantities(result: tm.Reconstruction, truth: dict) -> dict:
+    """Errors of one frame, over the truth."""
+    X, Y, F = (truth[key].astype(float) for key in ("dots_nominal", "dots_deformed", "force"))
+    got = {name: value[0].numpy() for name, value in result._asdict().items()}
+    row = dict(status=int(got["status"]), residual=float(got["residual"]))
+    if len(X) == len(got["markers"]) and len(X):
+        row["surface"] = float(np.linalg.norm(got["markers"] - Y) / np.linalg.norm(Y - X))
+    else:  # texture: on the surface itself
+        row["surface"] = surface_error(got["displacement"], truth)
+    size = max(float(np.linalg.norm(F)), 1e-12)
+    row |= dict(force=float(np.linalg.norm(got["force"] - F) / size), true_force=size)
+    row["found_force"] = float(np.linalg.norm(got["force"]))
+    points = got["contact_points"][np.isfinite(got["contact_points"][:, 0])]
+    centre = truth["contact_centroid_each"][0]
+    row["points"] = len(points)
+    row["place"] = float(np.linalg.norm(points - centre, axis=1).mean()) if len(points) else np.inf
+    if hasattr(result, "contact_at_rim"):
+        row["at_rim"] = bool((got["contact_at_rim"] == 1).any())
+    return row
+
+
+def surface_error(displacement: np.ndarray, truth: dict) -> float:
+    """Of a surface's vertices, at those of the true one, both on even grids over the same surface."""
+    X, Y = truth["vertices_nominal"], truth["vertices_deformed"]
+    fine, coarse = (round(len(a) ** 0.5) for a in (X, displacement))
+    found = torch.from_numpy(displacement).reshape(1, coarse, coarse, 3).movedim(-1, 1)
+    found = torch.nn.functional.interpolate(found, (fine, fine), mode="bicubic", align_corners=True)
+    return float(np.linalg.norm(found[0].movedim(0, -1).reshape(-1, 3).numpy() - (Y - X)) / np.linalg.norm(Y - X))
+
+
+def contact_width(truth: dict, spacing: float) -> float:
+    """Width of the true contact over the dots' spacing."""
+    touched = truth["contact_mask"].astype(bool)
+    X = truth["vertices_nominal"]
+    n = round(len(X) ** 0.5)
+    grid = X.reshape(n, n, 3)
+    area = np.linalg.norm(np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1)), axis=-1).ravel()
+    return float(np.sqrt(area[touched].sum()) / spacing)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--sensors", type=int, default=10000)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--only", default="press")
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    rows, refused = [], []
+    for folder in sorted(args.data.glob("s[0-9]*")):
+        if not args.first <= int(folder.name[1:]) < args.first + args.sensors:
+            continue
+        files = sorted(path for kind in args.only.split(",") for path in folder.glob(f"{kind}_*.npz"))
+        if not files:
+            continue
+        try:
+            r = tm.Reconstructor.from_file(folder / "sensor.toml")
+        except tm.MembraneError as error:
+            refused.append(f"{folder.name}: {error}")
+            print(refused[-1])
+            continue
+        rows += [row for path in files for row in reconstructed(r, path)]
+    report(rows)
+    write(args.json, dict(rows=rows, refused=refused))
+
+
+def reconstructed(r: tm.Reconstructor, path: Path) -> list[dict]:
+    """What one file's frame gives."""
+    truth = dict(np.load(path))
+    with torch.no_grad():
+        result = r(truth["image"])
+    kind, _, number = path.stem.partition("_")
+    sensor = r.sensor
+    about = dict(
+        sensor=path.parent.name,
+        kind=kind,
+        number=int(number),
+        shape=sensor.surface.shape,
+        filling=sensor.cavity.filling,
+        prestretch=sensor.material.prestretch,
+        markers=sensor.markers.kind,
+        dots=len(r.rest_markers),
+        lens=sensor.camera.model + (" port" if len(sensor.camera.ports) else ""),
+    )
+    if kind == "rest":
+        points = int(torch.isfinite(result.contact_points[0, :, 0]).sum())
+        return [about | dict(status=int(result.status[0]), points=points, found_force=float(result.force[0].norm()))]
+    size = sensor.membrane.size
+    width, height = sensor.camera.image_size
+    seen = ((r.rest_pixels >= 0) & (r.rest_pixels < torch.tensor([width, height]))).all(-1).double().mean()
+    stroke = json.loads(str(truth["stroke"]))
+    spacing = size / len(r.rest_markers) ** 0.5
+    about |= dict(depth=stroke["depth"] / size, body=stroke["indenter"], friction=stroke["friction"], seen=float(seen))
+    X, touched = truth["vertices_nominal"], truth["contact_mask"].astype(bool)
+    rim = r.sensor.membrane.rest.numpy()[r.sensor.membrane.fixed.numpy()]
+    clear = np.linalg.norm(X[touched][:, None] - rim, axis=-1).min() / size if touched.any() else np.nan
+    about |= dict(width=contact_width(truth, spacing), spacing=spacing, clear=float(clear))
+    return [about | quantities(result, truth)]
+
+
+def verdict(row: dict) -> str:
+    """ "right", "wrong" (with status ok), or the status."""
+    right = row["surface"] < CLOSE and (row["force"] < CLOSE or row.get("at_rim", False))
+    if row["status"] == 0:
+        return "right" if right else "wrong"
+    return f"status {row['status']}"
+
+
+def line(name: str, rows: list[dict]) -> None:
+    verdicts = [verdict(row) for row in rows]
+    shares = {v: verdicts.count(v) / len(rows) for v in sorted(set(verdicts))}
+    surface, force = (np.nanmedian([row[key] for row in rows]) for key in ("surface", "force"))
+    print(
+        f"{name:28s} {len(rows):4d}: "
+        + ", ".join(f"{v} {share:.3f}" for v, share in shares.items())
+        + f"; surface {surface:.3f}, force {force:.3f}"
+    )
+
+
+def report(rows: list[dict]) -> None:
+    presses = [row for row in rows if row["kind"] == "press"]
+    wide = [row for row in presses if row["width"] >= 1]
+    if wide:
+        line("all", wide)
+        for key in ("filling", "shape", "markers", "lens", "body"):
+            for value in sorted({row[key] for row in wide}):
+                line(f"{key} {value}", [row for row in wide if row[key] == value])
+        for key, edges in (
+            ("prestretch", (1, 1.02, 1.1, 1.3, 2)),
+            ("dots", (0, 80, 150, 1000)),
+            ("seen", (0, 0.999, 2)),
+            ("depth", (0, 0.05, 0.1, 0.2, 0.4)),
+            ("clear", (0, 0.05, 0.1, 0.2, 1)),
+        ):
+            for low, high in zip(edges[:-1], edges[1:], strict=True):
+                chosen = [row for row in wide if low <= row[key] < high]
+                if chosen:
+                    line(f"{key} {low} to {high}", chosen)
+    narrow = [row for row in presses if row["width"] < 1]
+    if narrow:
+        line("narrower than the spacing", narrow)
+    light = [row for row in rows if row["kind"] == "light"]
+    for low, high in zip(BANDS[:-1], BANDS[1:], strict=True):
+        top = {name: max(row["true_force"] for row in light if row["sensor"] == name) for name in {r["sensor"] for r in light}}
+        chosen = [row for row in light if low < row["true_force"] / top[row["sensor"]] <= high]
+        if chosen:
+            force, surface = (np.nan_to_num([row[key] for row in chosen], nan=9.0) for key in ("force", "surface"))
+            found = np.mean([row["place"] < row["spacing"] for row in chosen])
+            print(
+                f"force {low:.2f} to {high:.2f}: {len(chosen):3d} frames, force {np.median(force):.3f} / "
+                f"{np.percentile(force, 90):.3f}, surface {np.median(surface):.3f} / {np.percentile(surface, 90):.3f}, "
+                f"found {found:.2f}"
+            )
+    rest = [row for row in rows if row["kind"] == "rest"]
+    if rest:
+        print(f"at rest: {len(rest)} frames, {sum(row['points'] > 0 for row in rest)} with a contact")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,158 @@
+"""Light touches: found as soon as the markers can tell them from their noise, and none where there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_force_balance import ONE, SETTINGS, along_y, at_rest, make, seen
+
+from torchmembrane import Reconstructor
+from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.bearings import marker_rays
+from torchmembrane.markers.noise import pixel_noise
+from torchmembrane.presets import preset
+from torchmembrane.simulate import Simulator, Sphere, Stroke
+from torchmembrane.simulate.appearance import Appearance
+
+CAMERAS = {
+    "pinhole": Camera("pinhole", (640, 480), (400, 410), (320, 240), [-0.1, 0.02]),
+    "fisheye": Camera("fisheye", (640, 480), (180, 180), (320, 240), [-0.01, 0.002]),
+    "port": Camera("pinhole", (640, 480), (300, 300), (320, 240), ports=[(2.0, 3.0, 1.49)], medium_index=1.33),
+}
+
+
+def push(estimator, centre, size, radius=2.5, shear=0.0):
+    """Forces `[1, 3, N]` of a patch of pushes of `size` times p0 about `centre`, with `shear` times as much shear."""
+    X, normal = at_rest(estimator)
+    patch = (X - torch.tensor(centre, dtype=X.dtype)).norm(dim=1) < radius
+    traction = patch[:, None] * size * estimator.reference * (-normal + shear * along_y(normal))
+    return (traction * estimator.equations.loss.area[:, None]).mT[None], patch
+
+
+def normal_weights(estimator, force):
+    """Weight of the normal part at every inner vertex, over that of a small traction measured against p0."""
+    _, normal = at_rest(estimator)
+    loss = estimator.equations.loss
+    W = loss.weights(normal.mT, force, ONE, SETTINGS.tau[1])[0].movedim(-1, 0)
+    scale = SETTINGS.sparsity / (estimator.reference * estimator.size) ** 2 / loss.area
+    return (normal[:, None] @ W @ normal[..., None]).ravel() / scale
+
+
+@pytest.mark.parametrize("shear", [0.0, 0.4])
+def test_a_touch_looks_the_same_whatever_its_scale(shear):
+    """The loss is that of tractions over what is around: a hundredth of the tractions weighs ten thousand times as much."""
+    estimator = make(17)
+    loss = estimator.equations.loss
+    loss.settings, loss.push_noise = replace(SETTINGS, least_scale=1e-6), 0 * loss.push_noise
+    _, normal = at_rest(estimator)
+    force, _ = push(estimator, (3.0, 0.0, 11.5), 0.5, shear=shear)
+    strong, light = (loss.weights(normal.mT, share * force, ONE, SETTINGS.tau[1]) for share in (1.0, 0.01))
+    torch.testing.assert_close(light, 1e4 * strong)
+
+
+def test_a_touch_is_seen_beside_one_that_pushes_four_times_as_much_and_a_hundredth_is_not():
+    estimator = make(33)
+    estimator.equations.loss.push_noise *= 0
+    near, far, least = (6.0, 0.0, 10.0), (-6.0, 0.0, 10.0), (0.0, 7.0, 9.5)
+    forces, patches = zip(*(push(estimator, *touch) for touch in ((near, 2.0), (far, 0.5), (least, 0.02))), strict=True)
+    weight = normal_weights(estimator, sum(forces))
+    strong, weak, none = (weight[patch].median() for patch in patches)
+    elsewhere = weight[~sum(patches).bool()].quantile(0.9)
+    assert strong < 0.01 and weak < 0.05 * none and none > 0.9 * elsewhere
+
+
+def test_nothing_is_a_push_that_the_noise_makes_by_itself():
+    """Pushes at the level of the noise weigh nearly as those far below it; ten times as large ones do not."""
+    estimator = make(17)
+    loss = estimator.equations.loss
+    force, patch = push(estimator, (0.0, 0.0, 12.0), 1.0)
+    level = SETTINGS.noise_share * loss.push_noise[patch].mean()
+    far_below, at_noise, above = (normal_weights(estimator, share * level * force)[patch] for share in (0.01, 0.5, 10.0))
+    assert (at_noise > 0.25 * far_below).all() and (above.median() < 0.01 * far_below.median())
+
+
+def test_the_noise_of_pushes_is_what_noisy_markers_make():
+    """One quadratic step from rest, 400 draws of the markers' noise."""
+    estimator, generator = make(13), torch.Generator().manual_seed(0)
+    bearings, loss = estimator.equations.bearings, estimator.equations.loss
+    true = torch.nn.functional.normalize(bearings.positions, dim=-1)
+    plain = bearings.measured(seen(torch.zeros_like(true), true))
+    noise = torch.randn(400, 2, 1, len(true), generator=generator, dtype=torch.float64)
+    turn = (noise * bearings.noise**2 * plain.across).sum(1).mT  # `across` is over the noise
+    rays = torch.nn.functional.normalize(true + 1e-3 * turn, dim=-1)
+    measured = bearings.measured(seen(torch.zeros_like(rays), rays))
+    x, pressure = estimator.at_rest(torch.ones(400, 1, dtype=torch.float64))
+    infinite = torch.tensor(torch.inf, dtype=torch.float64)
+    x, pressure, _ = estimator.step(x, pressure, measured, infinite, infinite)
+    found = estimator.equilibrium(x, pressure, x, measured)
+    _, normal = at_rest(estimator)
+    inner = found.traction.unflatten(1, estimator.membrane.grid)[:, 1:-1, 1:-1].flatten(1, 2)
+    push = 1e3 * (inner * normal).sum(-1) / estimator.reference
+    expected = (push.square().mean(0) @ loss.surroundings).sqrt()
+    torch.testing.assert_close(loss.push_noise, expected, rtol=0.15, atol=0)
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_along_the_two_vectors_across_a_ray_noise_has_the_covariance_one(camera):
+    generator = torch.Generator().manual_seed(1)
+    pixels = torch.tensor([[[320.0, 240.0], [150.0, 300.0], [500.0, 100.0]]], dtype=torch.float64)
+    root = torch.eye(2) + 0.3 * torch.randn(1, 3, 2, 2, generator=generator, dtype=torch.float64)
+    observed = marker_rays(camera, pixels, torch.ones(1, 3), root @ root.mT)
+    step = 1e-3 * root.mT  # rows: independent noises of one standard deviation
+    turned = (camera.pixel_to_ray(pixels[:, :, None] + step).direction - observed.directions[:, :, None]) / 1e-3
+    unit = turned @ observed.across.mT
+    torch.testing.assert_close(unit @ unit.mT, torch.eye(2).expand_as(unit).double(), rtol=0, atol=2e-3)
+    assert (observed.across @ observed.directions[..., None]).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("noise", [0.003, 0.03, 0.1])
+def test_noise_is_measured_beside_edges_and_dots(noise):
+    v, u = np.mgrid[:480, :640]
+    image = 0.5 + 0.0004 * (u - 320) + 0.2 * ((u // 23 + v // 19) % 2)
+    draw = np.random.default_rng(0).normal(size=image.shape)
+    measured = pixel_noise(torch.as_tensor(image + noise * draw)[None, None])
+    assert measured.item() == pytest.approx(noise, rel=0.12)
+
+
+@pytest.fixture(scope="module")
+def fingertip():
+    sensor = preset("fingertip")
+    sensor = replace(sensor, membrane=sensor.surface.membrane((17, 17)))
+    return Simulator(sensor, grid=(31, 31), appearance=Appearance(noise=30.0)), Reconstructor(sensor)
+
+
+def test_covariances_are_the_scatter_of_dots_in_noisy_images(fingertip):
+    simulator, reconstructor = fingertip
+    with torch.no_grad():
+        clean = simulator.renderer(simulator.membrane.rest).numpy()
+    noise = np.random.default_rng(1).normal(0, 10**-1.5, (16, *clean.shape))
+    with torch.no_grad():
+        pixels, _, covariance = reconstructor.observer.locator(torch.from_numpy(clean + noise).float()[:, None])
+    scatter, expected = pixels.var(0).mean(-1), covariance.diagonal(dim1=-2, dim2=-1).mean((0, -1))
+    assert 0.6 < (scatter / expected).sqrt().median() < 1.2
+    assert np.corrcoef(scatter.log(), expected.log())[0, 1] > 0.5
+
+
+def test_at_rest_no_contact_is_found_and_hardly_any_force(fingertip):
+    simulator, reconstructor = fingertip
+    images = [simulator.image(simulator.membrane.rest, np.random.default_rng(k)) for k in range(12)]
+    with torch.no_grad():
+        result = reconstructor(np.stack(images))
+    assert (result.status == 0).all() and result.contact_points.isnan().all()
+    assert result.force.norm(dim=-1).max() < 0.02  # the touch below, of a hundredth of a firm press, takes 0.1
+
+
+def test_a_light_touch_is_found_with_its_force_and_place(fingertip):
+    simulator, reconstructor = fingertip
+    ball, way = Sphere(2.5), np.array([0.3, 0.2, -1.0]) / np.linalg.norm([0.3, 0.2, -1.0])
+    ball = ball.touching(simulator.membrane, way)
+    stroke = Stroke(ball, way, 0.45)
+    (state,) = simulator.presses(stroke, ("push",))
+    frame = simulator.frame(state, stroke, np.random.default_rng(0))
+    with torch.no_grad():
+        result = reconstructor(frame.image)
+    force, place = state.force.numpy(), state.contact_points[0].numpy()
+    assert np.linalg.norm(result.force[0].numpy() - force) < 0.15 * np.linalg.norm(force)
+    assert result.contact_points[0, 1:].isnan().all()
+    assert np.linalg.norm(result.contact_points[0, 0].numpy() - place) < 1.0
