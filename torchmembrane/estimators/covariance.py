@@ -3,8 +3,8 @@
 At the solution a small change `e` of the measured angles moves surface and pressure by
 
     [M  m  n] [dx    ]   [J^T w e]
-    [m' c  0] [dp    ] = [   0   ],    M = A^T W A + J^T w J,
-    [n' 0  C] [lambda]   [   0   ]
+    [m' c  C] [dp    ] = [   0   ],    M = A^T W A + J^T w J,
+    [n' C  0] [lambda]   [   0   ]
 
 with `W` the curvature of a push's loss (flat where it bends down; shear by its parabola), so that noise of covariance S gives
 the sandwich `H^-1 J^T w S w J H^-1`. One load per marker and direction of its noise, all solved with one factor.
@@ -30,7 +30,7 @@ class LinearisedSolution(NamedTuple):
 
     solve        `M^-1` of loads `[B, L, 3 N]`
     borders      `[B, 2, 3 N]`, `m` and `n`: what the pressure and the volume do to the equations
-    corner       `c` and `C`, `[B]` each; None where the pressure is fixed (an open cavity)
+    corner       `c` and the compliance `C`, `[B]` each; None where the pressure is fixed (an open cavity)
     force        `[B, 3, 3 N]`, the total force's derivative in the inner vertices
     of_pressure  `[B, 3]`, minus its derivative in the pressure
     """
@@ -53,7 +53,8 @@ def changes(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, 
     dx, dp = y[:, :-2], torch.zeros_like(noise_loads[..., 0])
     if solution.corner is not None:
         border = y[:, -2:]
-        corner = torch.diag_embed(torch.stack(solution.corner, -1)) - solution.borders @ border.mT
+        c, C = solution.corner
+        corner = torch.stack([c, C, C, torch.zeros_like(C)], -1).unflatten(-1, (2, 2)) - solution.borders @ border.mT
         rise = torch.linalg.solve(corner, -solution.borders @ dx.mT)
         dx, dp = dx - rise.mT @ border, rise[:, 0]
     return dx, dp
