@@ -14,7 +14,7 @@ from torchmembrane.onnx.graph import described
 def located_by_the_exported(locate, images):
     """What onnxruntime finds in `images [B, 1, H, W]` by a locator exported with two of them."""
     tracer, names = Tracer(), ("pixels", "confidence")
-    outputs = locate(tracer.given("image", images[:2]))
+    outputs = locate(tracer.given("image", images[:2]))[:2]
     for name, value in zip(names, outputs, strict=True):
         tracer.assembly.named(value.name, name)
     shapes = [described(n, shape=["batch", *v.example.shape[1:]]) for n, v in zip(names, outputs, strict=True)]

@@ -150,6 +150,18 @@ def test_covariances_are_the_scatter_of_dots_in_noisy_images(fingertip):
     assert np.corrcoef(scatter.log(), expected.log())[0, 1] > 0.5
 
 
+def test_several_rest_images_have_less_noise_than_one(fingertip):
+    simulator, reconstructor = fingertip
+    images = [simulator.image(simulator.membrane.rest, np.random.default_rng(k)) / 255 for k in range(8)]
+    sensor = reconstructor.sensor
+    variances = []
+    for rest in (images[0], np.mean(images, 0)):
+        markers = replace(sensor.markers, rest_image=rest.astype(np.float32))
+        observer = Reconstructor(replace(sensor, markers=markers), "minimum-energy").observer
+        variances.append(observer.rest_covariance.diagonal(dim1=-2, dim2=-1).mean())
+    assert 0.1 < variances[1] / variances[0] < 0.4  # an eighth, and what the dots' model leaves
+
+
 def test_a_marker_that_is_known_badly_moves_nothing(fingertip):
     _, reconstructor = fingertip
     displacement = torch.zeros(1, len(reconstructor.rest_pixels), 2)

@@ -105,6 +105,28 @@ def refusal(path):
     return str(caught.value)
 
 
+@pytest.mark.parametrize("names", ['["rest.png", "more/a.png"]', '["rest.png", "more/*.png"]'])
+def test_several_rest_images_are_averaged(tmp_path, names):
+    path = write(tmp_path, replaced('"rest.png"', names))
+    (tmp_path / "more").mkdir()
+    Image.fromarray(np.full((24, 32), 100, np.uint8)).save(tmp_path / "more" / "a.png")
+    one = np.arange(24 * 32, dtype=np.uint8).reshape(24, 32)
+    sensor = Sensor.from_file(path)
+    np.testing.assert_allclose(sensor.markers.rest_image, (one + 100.0) / 2 / 255, atol=1e-7)
+    again = Sensor.from_file(sensor.to_file(tmp_path / "again" / "sensor.toml"))
+    assert np.array_equal(again.markers.rest_image, sensor.markers.rest_image)
+
+
+def test_rest_images_that_are_none_or_of_two_sizes_are_named(tmp_path):
+    path = write(tmp_path, replaced('"rest.png"', '["rest.png", "none*.png"]'))
+    assert f"expected a file; there is none at {tmp_path / 'none*.png'}: paths are relative" in refusal(path)
+    path.write_text(replaced('"rest.png"', '"*.png"'))
+    Image.fromarray(np.zeros((12, 16), np.uint8)).save(tmp_path / "small.png")
+    assert "small.png is 16 x 12 px; expected 32 x 24" in refusal(path)
+    path.write_text(replaced('"rest.png"', "[]"))
+    assert "rest_image = []; expected a file, or a list of files, in quotes" in refusal(path)
+
+
 def test_reads_what_the_file_says(tmp_path):
     sensor = Sensor.from_file(write(tmp_path))
     assert (sensor.name, sensor.length_unit, sensor.force_unit) == ("fingertip", "mm", "N")

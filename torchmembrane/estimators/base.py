@@ -58,14 +58,14 @@ class Observation(NamedTuple):
 class Equilibrium(NamedTuple):
     """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`
     (zero for minimum energy), `relative_step [...]`: the last step over the surface's size, and `reference [..., V]`: the
-    traction against which pushes are measured (None where no tractions are found)."""
+    traction against which pushes are measured (zero where no tractions are found)."""
 
     vertices: Tensor
     pressure: Tensor
     volume: Tensor
     traction: Tensor
     relative_step: Tensor
-    reference: Tensor | None = None
+    reference: Tensor
 
 
 class Contacts(NamedTuple):

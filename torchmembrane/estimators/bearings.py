@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..camera.model import Camera
@@ -57,6 +58,12 @@ def marker_rays(camera: Camera, pixels: Tensor, confidence: Tensor, covariance: 
     direction = directions[:, 0, :, None]
     across = across - (across * direction).sum(-1, keepdim=True) * direction
     return Observation(origins[:, 0], directions[:, 0], confidence, across)
+
+
+def seen_from_origin(positions: Tensor) -> Observation:
+    """Markers at `positions [D, 3]` as a camera without ports sees them."""
+    directions = F.normalize(positions, dim=-1)[None]
+    return Observation(torch.zeros_like(directions), directions, torch.ones_like(directions[..., 0]))
 
 
 def _spread(across: Tensor) -> Tensor:

@@ -16,6 +16,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..mechanics.cavity import CavityLaw
+from .base import Observation
+from .bearings import Bearings
+from .contact_force import Linearised
+from .normal_equations import BalanceEquations, NormalEquations
+
 
 class StandardDeviations(NamedTuple):
     """Of `vertices [B, V, 3]` (zero where fixed), total `force [B, 3]` and `pressure [B]`."""
@@ -40,6 +46,59 @@ class LinearisedSolution(NamedTuple):
     corner: tuple[Tensor, Tensor] | None
     force: Tensor
     of_pressure: Tensor
+
+
+def linearise(
+    equations: BalanceEquations,
+    cavity: CavityLaw,
+    x: Tensor,
+    pressure: Tensor,
+    measured: Bearings,
+    scales: tuple[float, float],
+    curvature: bool = False,
+) -> tuple[Linearised, NormalEquations, LinearisedSolution]:
+    """The equations about a surface `x [B, V, 3]`, and what solves them for small loads.
+
+    Args:
+        equations: of the force balance.
+        cavity: its law.
+        x: the surface.
+        pressure: `[B]`.
+        measured: the markers' rays.
+        scales: of the losses of tractions and of markers.
+        curvature: as for `TractionLoss.weights`.
+    """
+    at, normal, loads, (_, vWv) = equations.linearised(x, pressure, measured, *scales, curvature=curvature)
+    factor, membrane = equations.system.factor(equations.matrix(normal)), equations.forces.membrane
+    compliance = cavity.condition(membrane.volume(x) - membrane.rest_volume, pressure)[1]
+    corner = None if cavity.filling == "open" else (vWv, compliance.expand_as(vWv))
+    one = torch.eye(3).to(x)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
+    of_force = equations.forces.change(at.stiffness, one).flatten(2)
+    solution = LinearisedSolution(
+        lambda loads: equations.system.substitute(factor, loads), loads[:, [2, 0]], corner, of_force, at.volume.sum(-1)
+    )
+    return at, normal, solution
+
+
+@torch.no_grad()
+def push_noise(equations: BalanceEquations, cavity: CavityLaw, rest: Observation) -> Tensor:
+    """The push `S [N]` that the markers' noise makes at rest, one standard deviation, while all losses are quadratic.
+
+    Args:
+        equations: of the force balance.
+        cavity: its law.
+        rest: the markers' rays at rest.
+    """
+    membrane, loss = equations.forces.membrane, equations.loss
+    measured = equations.bearings.measured(rest)
+    at, normal, solution = linearise(
+        equations, cavity, membrane.rest[None], cavity.rest_pressure[None], measured, (torch.inf, torch.inf)
+    )
+    noise_loads = torch.einsum("bacd,dn->bdacn", normal.weighted_jacobian, equations.bearings.vertex_shares)
+    dx, dp = changes(solution, noise_loads.flatten(3).flatten(1, 2))
+    dq = equations.forces.change(at.stiffness, dx.unflatten(-1, (3, -1))) - dp[..., None, None] * at.volume[:, None]
+    push = (dq * at.normal[:, None]).sum(2) / (loss.area * loss.reference)
+    return (push.square().sum(1) @ loss.surroundings).sqrt()[0]
 
 
 def changes(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor]:

@@ -37,11 +37,11 @@ from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner, pad_border
 from ..surface.tangent import tangent_frame
 from .base import CONTACT_POINTS, Contacts, Equilibrium, Observation, Problem
-from .bearings import Bearings, MarkerBearings, marker_rays
-from .contact_force import ContactForce, Linearised
+from .bearings import Bearings, MarkerBearings, marker_rays, seen_from_origin
+from .contact_force import ContactForce
 from .contact_patches import contact_indicator, contact_points
-from .covariance import LinearisedSolution, StandardDeviations, changes, spread
-from .normal_equations import BalanceEquations, NormalEquations
+from .covariance import StandardDeviations, linearise, push_noise, spread
+from .normal_equations import BalanceEquations
 from .robust import Cauchy
 from .settings import ForceBalanceSettings
 from .traction_loss import TractionLoss
@@ -109,7 +109,8 @@ class ForceBalance(nn.Module):
         else:
             self.steps = settings.fine_steps if self.coarse.coarse is None else settings.finer_steps
         self.passes_on_starts = self.coarse is not None and min(self.coarse.membrane.grid) >= settings.coarsest_warm
-        loss.push_noise = self._push_noise(_seen_from_origin(bearings.positions) if rest is None else rest)
+        rest = seen_from_origin(bearings.positions) if rest is None else rest
+        loss.push_noise = push_noise(self.equations, self.cavity, rest)
 
     @classmethod
     def of(cls, problem: Problem, settings: ForceBalanceSettings | None = None) -> "ForceBalance":
@@ -138,35 +139,6 @@ class ForceBalance(nn.Module):
         return ForceBalance(
             every_second, material, markers, positions, bearings.noise, filling, gas, self.settings, rest, is_coarse=True
         )
-
-    @torch.no_grad()
-    def _push_noise(self, rest: Observation) -> Tensor:
-        """The push `S [N]` that the markers' noise makes at rest, one standard deviation, while all losses are quadratic."""
-        equations, loss = self.equations, self.equations.loss
-        x, pressure = self.membrane.rest[None], self.rest_pressure[None]
-        measured = equations.bearings.measured(rest)
-        at, normal, solution = self._linearised(x, pressure, measured, (torch.inf, torch.inf))
-        noise_loads = torch.einsum("bacd,dn->bdacn", normal.weighted_jacobian, equations.bearings.vertex_shares)
-        dx, dp = changes(solution, noise_loads.flatten(3).flatten(1, 2))
-        dq = equations.forces.change(at.stiffness, dx.unflatten(-1, (3, -1))) - dp[..., None, None] * at.volume[:, None]
-        push = (dq * at.normal[:, None]).sum(2) / (loss.area * self.reference)
-        return (push.square().sum(1) @ loss.surroundings).sqrt()[0]
-
-    def _linearised(
-        self, x: Tensor, pressure: Tensor, measured: Bearings, scales: tuple[float, float], curvature: bool = False
-    ) -> tuple[Linearised, NormalEquations, LinearisedSolution]:
-        """The equations about a surface, and what solves them for small loads."""
-        equations = self.equations
-        at, normal, loads, (_, vWv) = equations.linearised(x, pressure, measured, *scales, curvature=curvature)
-        factor = equations.system.factor(equations.matrix(normal))
-        compliance = self.cavity.condition(self.membrane.volume(x) - self.membrane.rest_volume, pressure)[1]
-        corner = None if self.cavity.filling == "open" else (vWv, compliance.expand_as(vWv))
-        one = torch.eye(3).to(x)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
-        of_force = equations.forces.change(at.stiffness, one).flatten(2)
-        solution = LinearisedSolution(
-            lambda b: equations.system.substitute(factor, b), loads[:, [2, 0]], corner, of_force, at.volume.sum(-1)
-        )
-        return at, normal, solution
 
     @property
     def membrane(self) -> Membrane:
@@ -197,12 +169,7 @@ class ForceBalance(nn.Module):
         return marker_rays(camera, pixels, confidence, covariance)
 
     def forward(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:
-        """The surface that the markers' rays show.
-
-        Args:
-            observation: the markers' measured rays.
-            start: vertices `[B, V, 3]` and pressure `[B]` near the solution, such as the previous frame's.
-        """
+        """The surface that the markers' rays show; `start`: vertices and pressure near it, such as the previous frame's."""
         measured = self.equations.bearings.measured(observation)
         if start is not None and not self.passes_on_starts:
             return self._descend(*start, measured, self.schedule(warm=True), one_factor=True)
@@ -298,7 +265,6 @@ class ForceBalance(nn.Module):
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes: the indicator of each vertex, and the centroids of the contact patches."""
         membrane = self.membrane
-        assert found.reference is not None  # `equilibrium` has set it
         indicator = contact_indicator(found.traction, normals, found.reference)
         inward = (indicator > 0.5) * (-(found.traction * normals).sum(-1)).clamp_min(0) * membrane.rest_area
         return Contacts(indicator, contact_points(found.vertices, membrane.rest, inward, self.size, CONTACT_POINTS))
@@ -373,14 +339,8 @@ class ForceBalance(nn.Module):
         plain = tangent_frame(observation.directions)
         noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * plain
         scales = self.settings.tau[1], self.settings.outlier
-        _, normal, solution = self._linearised(x, pressure, measured, scales, curvature=True)
+        _, normal, solution = linearise(equations, self.cavity, x, pressure, measured, scales, curvature=True)
         turned = torch.einsum("bdrj,bajd,bacd->bdrc", noise, measured.across, normal.weighted_jacobian)
         noise_loads = torch.einsum("bdrc,dn->bdrcn", turned, equations.bearings.vertex_shares).flatten(3).flatten(1, 2)
         dx, dF, dp = spread(solution, noise_loads)
         return StandardDeviations(pad_border(dx.unflatten(-1, (3, -1)).mT, self.membrane.grid), dF, dp)
-
-
-def _seen_from_origin(positions: Tensor) -> Observation:
-    """Markers at `positions [D, 3]` as a camera without ports sees them."""
-    directions = F.normalize(positions, dim=-1)[None]
-    return Observation(torch.zeros_like(directions), directions, torch.ones_like(directions[..., 0]))

@@ -1,5 +1,6 @@
 """Images as grey values: 0.299 R + 0.587 G + 0.114 B in floating point, the same on every path."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,20 @@ def read_image(path: str | Path) -> np.ndarray:
         raise MembraneError(f"{path}: no such image; expected a readable image file, check the path") from error
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise MembraneError(f"{path}: not readable as an image ({error}); expected a whole PNG, JPEG or TIFF") from error
+
+
+def mean_image(paths: Sequence[Path]) -> np.ndarray:
+    """The mean of the grey values of image files of one size, float32 `[height, width]` in 0..1.
+
+    Raises:
+        MembraneError: as `read_image`; or the images differ in size.
+    """
+    images = [read_image(path) for path in paths]
+    for path, image in zip(paths, images, strict=True):
+        if image.shape != images[0].shape:
+            sizes = ["{1} x {0}".format(*shape) for shape in (image.shape, images[0].shape)]
+            raise MembraneError(f"{path} is {sizes[0]} px; expected {sizes[1]} as {paths[0]}: give images of one camera mode")
+    return np.asarray(np.mean(images, 0, dtype=np.float64)).astype(np.float32)
 
 
 def to_grey(array: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ Every message names the file, the table and key, the value that came and what wa
 """
 
 import difflib
+import glob
 import json
 import math
 import tomllib
@@ -121,6 +122,19 @@ class Table:
             raise self.refuse(key, f"a file; there is none at {path}: paths are relative to the sensor file")
         return path
 
+    def files(self, key: str) -> list[Path]:
+        """The paths of the files that `key` names: one, a list, or patterns with `*`, relative to this file's folder."""
+        names = self._get(key, _is_names, "a file, or a list of files, in quotes")
+        paths: list[Path] = []
+        for name in [names] if isinstance(names, str) else names:
+            pattern = name if Path(name).is_absolute() else f"{glob.escape(str(self.path.parent))}/{name}"
+            found = sorted(map(Path, glob.glob(pattern))) if "*" in name else [self.path.parent / name]
+            if not found or not all(path.is_file() for path in found):
+                where = self.path.parent / name
+                raise self.refuse(key, f"a file; there is none at {where}: paths are relative to the sensor file")
+            paths += found
+        return paths
+
     def _list(self, key: str, count: int | None, right: Callable[[object], bool], kind: str) -> list[Any]:
         def right_list(values: object) -> bool:
             return isinstance(values, list) and len(values) == (count or len(values)) and all(map(right, values))
@@ -167,6 +181,11 @@ def _finite(value: object) -> bool:
 
 def _whole(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _is_names(value: object) -> bool:
+    names = [value] if isinstance(value, str) else value
+    return isinstance(names, list) and len(names) > 0 and all(isinstance(name, str) and name for name in names)
 
 
 def _is_table(value: object) -> bool:

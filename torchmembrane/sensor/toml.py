@@ -12,7 +12,7 @@ import numpy as np
 from ..camera.model import Camera
 from ..camera.ports import Port
 from ..errors import MembraneError
-from ..io.images import read_image, write_image
+from ..io.images import mean_image, write_image
 from ..surface.membrane import Membrane
 from .parts import (
     METRE,
@@ -175,12 +175,12 @@ def _read_markers(table: Table) -> tuple[Markers, list[str]]:
     table.allow(("kind", "file", "rest_image", "polarity"))
     kind = table.text("kind", ("dots", "texture"))
     polarity = table.text("polarity", ("dark", "light")) if kind == "dots" or "polarity" in table else "dark"
-    dots, image = (table.file(key) if key in table else None for key in ("file", "rest_image"))
+    dots, images = table.file("file") if "file" in table else None, table.files("rest_image") if "rest_image" in table else []
     if dots and kind == "texture":
         raise table.refuse("file", "none for texture, whose patches are chosen in the rest image: remove it")
     positions, sizes, lines = _read_dots(dots) if dots else (None, None, [])
     with table.naming("rest_image"):
-        return Markers(kind, polarity, positions, sizes, read_image(image) if image else None), lines
+        return Markers(kind, polarity, positions, sizes, mean_image(images) if images else None), lines
 
 
 def _read_dots(path: Path) -> tuple[np.ndarray, list[str], list[str]]:

@@ -61,7 +61,7 @@ class SoftLocator(nn.Module):
         >>> rest = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)
         >>> pattern = DotPattern(rest, np.tile(4.0 * np.eye(2), (12, 1, 1)), np.ones(12, int))
         >>> image = draw_dots(rest + [2.5, -1.5], pattern.shapes, (100, 80)).float()
-        >>> pixels, confidence = SoftLocator(pattern, (100, 80), "dark")(image)
+        >>> pixels, confidence, _ = SoftLocator(pattern, (100, 80), "dark")(image)
         >>> (pixels[0] - torch.tensor(rest)).mean(0).round(decimals=1).tolist(), bool(confidence.min() > 0.9)
         ([2.5, -1.5], True)
     """
