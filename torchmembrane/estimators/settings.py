@@ -58,7 +58,7 @@ class ForceBalanceSettings:
     conjugate_steps: int = 2
     tau: tuple[float, float] = (4.0, 0.4)
     fine_tau: tuple[float, float] = (0.8, 0.4)
-    warm_tau: tuple[float, float] = (0.6, 0.4)
+    warm_tau: tuple[float, float] = (0.8, 0.4)
     decline: float = 0.6
     sparsity: float = 6400.0
     scale_reach: float = 0.08

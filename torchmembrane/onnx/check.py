@@ -65,11 +65,14 @@ def compare(model: bytes, reconstructor: Reconstructor, images: Tensor) -> Agree
     status: list[int] = []
     expected_status: list[int] = []
     distances, previous = [0.0], None
+    if fields:
+        with torch.no_grad():
+            cold = reconstructor.reconstruct_grey(images)
+        previous = cold._replace(**{name: torch.full_like(getattr(cold, name), torch.nan) for name in fields})
     for _ in range(2 if fields else 1):
         with torch.no_grad():
             expected = reconstructor.reconstruct_grey(images, previous)
-        before = expected._replace(**{name: torch.full_like(getattr(expected, name), torch.nan) for name in fields})
-        feed = {f"previous_{name}": getattr(previous or before, name).numpy() for name in fields}
+        feed = {f"previous_{name}": getattr(previous, name).numpy() for name in fields}
         vertices, statuses = session.run(["vertices", "status"], {"image": images.numpy(), **feed})
         apart = np.linalg.norm(vertices - expected.vertices.numpy(), axis=-1)
         distances += [float(apart[k].max()) for k, value in enumerate(statuses) if value == 0 == expected.status[k]]
