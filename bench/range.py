@@ -1,11 +1,11 @@
 """How far the estimator's answers hold: random sensors, pressed at random, through images.
 
-python bench/range.py DATA [--first 0] [--sensors 10000] [--json FILE]
+python bench/range.py DATA [--first 0] [--sensors 10000] [--only press,light,rest] [--json FILE]
 
 DATA from random_sensors.py. A press is right where the markers' surface is within a quarter of their displacement and the force
-within a quarter of the true one (a lower bound where `contact_at_rim` says so). Printed: shares right and wrong with status ok,
-and the rest by status, of presses whose contact is no narrower than the dots' spacing, by filling, prestretch, dots, view and
-depth, and of the narrower ones; then what light strokes give, by the share of their largest force; then images at rest.
+within a quarter of the true one. Printed: shares right and wrong with status ok, and the rest by status, of presses whose contact
+is no narrower than the dots' spacing, by filling, prestretch, dots, view and depth, and of the narrower ones; then what light
+strokes give, by the share of their largest force; then images at rest.
 """
 
 import argparse
@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from bands import by_force
 from record import write
 
 import torchmembrane as tm
 
 CLOSE = 0.25
-BANDS = (0, 0.02, 0.05, 0.15, 0.5, 1.01)
 
 
 def quantities(result: tm.Reconstruction, truth: dict) -> dict:
@@ -39,8 +39,6 @@ def quantities(result: tm.Reconstruction, truth: dict) -> dict:
     centre = truth["contact_centroid_each"][0]
     row["points"] = len(points)
     row["place"] = float(np.linalg.norm(points - centre, axis=1).mean()) if len(points) else np.inf
-    if hasattr(result, "contact_at_rim"):
-        row["at_rim"] = bool((got["contact_at_rim"] == 1).any())
     return row
 
 
@@ -126,7 +124,7 @@ def reconstructed(r: tm.Reconstructor, path: Path) -> list[dict]:
 
 def verdict(row: dict) -> str:
     """ "right", "wrong" (with status ok), or the status."""
-    right = row["surface"] < CLOSE and (row["force"] < CLOSE or row.get("at_rim", False))
+    right = row["surface"] < CLOSE and row["force"] < CLOSE
     if row["status"] == 0:
         return "right" if right else "wrong"
     return f"status {row['status']}"
@@ -165,18 +163,7 @@ def report(rows: list[dict]) -> None:
     narrow = [row for row in presses if row["width"] < 1]
     if narrow:
         line("narrower than the spacing", narrow)
-    light = [row for row in rows if row["kind"] == "light"]
-    for low, high in zip(BANDS[:-1], BANDS[1:], strict=True):
-        top = {name: max(row["true_force"] for row in light if row["sensor"] == name) for name in {r["sensor"] for r in light}}
-        chosen = [row for row in light if low < row["true_force"] / top[row["sensor"]] <= high]
-        if chosen:
-            force, surface = (np.nan_to_num([row[key] for row in chosen], nan=9.0) for key in ("force", "surface"))
-            found = np.mean([row["place"] < row["spacing"] for row in chosen])
-            print(
-                f"force {low:.2f} to {high:.2f}: {len(chosen):3d} frames, force {np.median(force):.3f} / "
-                f"{np.percentile(force, 90):.3f}, surface {np.median(surface):.3f} / {np.percentile(surface, 90):.3f}, "
-                f"found {found:.2f}"
-            )
+    by_force([row | dict(found=row["place"] < row["spacing"]) for row in rows if row["kind"] == "light"])
     rest = [row for row in rows if row["kind"] == "rest"]
     if rest:
         print(f"at rest: {len(rest)} frames, {sum(row['points'] > 0 for row in rest)} with a contact")

@@ -1,13 +1,19 @@
 """Standard deviations against the scatter of estimates from noisy markers; gradients against finite differences."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
+from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.force_balance import ForceBalance
 from torchmembrane.estimators.settings import ForceBalanceSettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
+from torchmembrane.presets import preset
+from torchmembrane.simulate import Simulator, Stroke
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
@@ -135,3 +141,23 @@ def test_gradients_in_the_prestretch_agree_with_finite_differences(filling):
     given = prestretch.clone().requires_grad_()
     gradients = torch.stack([torch.autograd.grad(a, given, retain_graph=True)[0] for a in answers(given)])
     torch.testing.assert_close(gradients, along(answers, prestretch, torch.ones(())), rtol=1e-6, atol=1e-8)
+
+
+def test_deviations_are_of_the_weights_of_the_solve():
+    """Every second marker is known badly: the force scatters as little as is said, not as if all were trusted alike."""
+    sensor = preset("fingertip")
+    sensor = replace(sensor, membrane=sensor.surface.membrane((17, 17)))
+    simulator, reconstructor = Simulator(sensor, grid=(25, 25)), Reconstructor(sensor, dtype=torch.float64)
+    observer, generator = reconstructor.observer, torch.Generator().manual_seed(3)
+    noise = 0.02 + 0.5 * (torch.arange(len(reconstructor.rest_pixels)) % 2).double()[:, None]
+    observer.rest_covariance = (0.5 * noise**2)[..., None] * torch.eye(2, dtype=torch.float64)
+    way = np.array([0.0, 0.0, -1.0])
+    stroke = Stroke(Sphere(4.0).touching(simulator.membrane, way), way, 1.5)
+    (state,) = simulator.presses(stroke, ("push",))
+    exact = torch.from_numpy(simulator.frame(state, stroke, np.random.default_rng(0)).truth["uv_deformed"])
+    pixels = exact + noise * torch.randn(96, *exact.shape, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        result = reconstructor.from_pixels(pixels)
+        deviations = reconstructor.standard_deviations(result)
+    scatter, said = result.force.std(0).norm(), deviations.force.square().mean(0).sum().sqrt()
+    assert 0.6 < said / scatter < 1.5

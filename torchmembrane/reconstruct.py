@@ -227,7 +227,8 @@ class Reconstructor(nn.Module):
         covariance = 2 * self.observer.rest_covariance if covariance is None else covariance
         found = (confidence > 0).to(confidence.dtype)
         square = (found * displacement.square().sum(-1)).sum(-1) / found.sum(-1).clamp_min(1)
-        error = (LEAST_ERROR**2 + MODEL_ERROR**2 * square)[:, None, None, None] * torch.eye(2).to(covariance)
+        one = torch.eye(2, dtype=covariance.dtype, device=covariance.device)
+        error = (LEAST_ERROR**2 + MODEL_ERROR**2 * square)[:, None, None, None] * one
         return self.estimator.prepare(self.camera, self.rest_pixels + displacement, confidence, covariance + error)
 
     @piece
@@ -284,7 +285,7 @@ class Reconstructor(nn.Module):
         after, before = (self.camera.pixel_to_ray(pixels[..., None, :] + step) for step in (half, -half))
         turn = (after.origin - before.origin) / distance + after.direction - before.direction
         noise = torch.linalg.cholesky(2 * self.observer.rest_covariance).mT @ turn
-        observation = Observation(origins, directions, result.confidence)
+        observation = self.observation(pixels - self.rest_pixels, result.confidence)
         return self.estimator.standard_deviations(result.vertices, result.pressure, observation, noise)
 
     def _check_precision(self) -> None:

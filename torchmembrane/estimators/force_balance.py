@@ -170,12 +170,14 @@ class ForceBalance(nn.Module):
 
     def forward(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:
         """The surface that the markers' rays show; `start`: vertices and pressure near it, such as the previous frame's."""
-        measured = self.equations.bearings.measured(observation)
+        return self._solved(self.equations.bearings.measured(observation), start)
+
+    def _solved(self, measured: Bearings, start: tuple[Tensor, Tensor] | None) -> Equilibrium:
         if start is not None and not self.passes_on_starts:
             return self._descend(*start, measured, self.schedule(warm=True), one_factor=True)
         if self.coarse is None:
-            return self._descend(*self.at_rest(observation.confidence), measured, self.schedule())
-        coarse = self.coarse(observation, None if start is None else self.coarsened(*start))
+            return self._descend(*self.at_rest(measured.weight), measured, self.schedule())
+        coarse = self.coarse._solved(measured, None if start is None else self.coarsened(*start))
         return self._descend(*self.refined(coarse.vertices, coarse.pressure), measured, self.schedule())
 
     def schedule(self, warm: bool = False) -> list[tuple[float, float]]:

@@ -44,6 +44,9 @@ def read_image(path: str | Path) -> np.ndarray:
 def mean_image(paths: Sequence[Path]) -> np.ndarray:
     """The mean of the grey values of image files of one size, float32 `[height, width]` in 0..1.
 
+    Args:
+        paths: one file or more.
+
     Raises:
         MembraneError: as `read_image`; or the images differ in size.
     """

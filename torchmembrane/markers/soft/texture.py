@@ -5,8 +5,8 @@ import torch
 from torch import Tensor, nn
 
 from ...pieces import piece
-from ..locator import LocatedMarkers, isotropic
-from ..texture.locator import NOISE, PatchLocator
+from ..locator import LocatedMarkers
+from ..texture.locator import PatchLocator
 from ..texture.pyramid import low_pass_pyramid, sample
 from ..texture.template import RADIUS, Template, normalised_correlation, square_offsets
 from .argmax import Peak, window_peak
@@ -87,7 +87,7 @@ class SoftTextureLocator(PatchLocator):
 
     def __init__(self, rest_image: np.ndarray, pixels: np.ndarray, anchors: np.ndarray | None = None):
         super().__init__(rest_image, pixels, anchors)
-        levels = low_pass_pyramid(torch.as_tensor(np.asarray(rest_image, float))[None, None])
+        levels = self.rest_levels(rest_image)
         self.stages = nn.ModuleList(
             PatchCorrelation(levels[k], self.rest_pixels / 2**k, RADIUS[k], reach) for k, reach, _ in STAGES
         )
@@ -115,5 +115,4 @@ class SoftTextureLocator(PatchLocator):
             flow, local = self.settle(found, weight, flow, tolerance)
             gradient = local.gradient
         confidence = weight * local.trust(found) * finite.flatten(1).all(1)[:, None]
-        pixels = self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow)
-        return LocatedMarkers(pixels, confidence, isotropic(confidence, NOISE))
+        return self.located(found, confidence, local)

@@ -58,6 +58,11 @@ class PatchLocator(nn.Module):
         self.register_buffer("rest_pixels", torch.as_tensor(pixels))
         self.neighbourhood = Neighbourhood(pixels, anchors)
 
+    @staticmethod
+    def rest_levels(rest_image: np.ndarray) -> list[Tensor]:
+        """The pyramid of the rest image `[H, W]`, each level `[1, 1, H, W]` in double precision."""
+        return low_pass_pyramid(torch.as_tensor(np.asarray(rest_image, float))[None, None])
+
     def check_size(self, image: Tensor) -> None:
         """Refuse an image that is not `[B, 1, H, W]` of the rest image's size."""
         height, width = self.size
@@ -73,6 +78,11 @@ class PatchLocator(nn.Module):
         local = self.neighbourhood(guess, weight.clamp(min=LOST_WEIGHT), tolerance)
         trust = (weight * local.trust(found))[..., None]
         return trust * found + (1 - trust) * local.flow, local
+
+    def located(self, found: Tensor, confidence: Tensor, local: NeighbourFlow) -> LocatedMarkers:
+        """The patches with the flow `found [B, D, 2]`, or what their neighbours predict where the `confidence [B, D]` is 0."""
+        pixels = self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow)
+        return LocatedMarkers(pixels, confidence, isotropic(confidence, NOISE))
 
 
 class TextureLocator(PatchLocator):
@@ -106,7 +116,7 @@ class TextureLocator(PatchLocator):
 
     def __init__(self, rest_image: np.ndarray, pixels: np.ndarray, anchors: np.ndarray | None = None):
         super().__init__(rest_image, pixels, anchors)
-        levels = enumerate(low_pass_pyramid(torch.as_tensor(np.asarray(rest_image, float))[None, None]))
+        levels = enumerate(self.rest_levels(rest_image))
         templates = [Template(rest, self.rest_pixels / 2**level, RADIUS[level]) for level, rest in levels]
         self.templates = nn.ModuleList(templates)
         self.search = Search(templates[-1])
@@ -134,6 +144,4 @@ class TextureLocator(PatchLocator):
             flow, local = self.settle(2**level * found, likeness, flow, tolerance)
         found, likeness = self.templates[0](images[0], flow, local.gradient, 3)
         _, local = self.settle(found.detach(), likeness.detach(), flow, 0.3)
-        confidence = likeness * local.trust(found)
-        pixels = self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow)
-        return LocatedMarkers(pixels, confidence, isotropic(confidence, NOISE))
+        return self.located(found, likeness * local.trust(found), local)
