@@ -3,9 +3,9 @@
 python bench/range.py DATA [--first 0] [--sensors 10000] [--only press,light,rest] [--json FILE]
 
 DATA from random_sensors.py. A press is right where the markers' surface is within a quarter of their displacement and the force
-within a quarter of the true one. Printed: shares right and wrong with status ok, and the rest by status, of presses whose contact
-is no narrower than the dots' spacing, by filling, prestretch, dots, view and depth, and of the narrower ones; then what light
-strokes give, by the share of their largest force; then images at rest.
+within a quarter of the true one. Printed: shares right and wrong with status ok, and the rest by status, of presses whose
+contact is no narrower than the dots' spacing, by filling, prestretch, dots, view and depth, and of the narrower ones; then what
+light strokes give, by the share of their largest force; then images at rest.
 """
 
 import argparse
