@@ -3,9 +3,10 @@
 python bench/range.py DATA [--first 0] [--sensors 10000] [--only press,light,rest] [--json FILE]
 
 DATA from random_sensors.py. A press is right where the markers' surface is within a quarter of their displacement and the force
-within a quarter of the true one. Printed: shares right and wrong with status ok, and the rest by status, of presses whose
-contact is no narrower than the dots' spacing, by filling, prestretch, dots, view and depth, and of the narrower ones; then what
-light strokes give, by the share of their largest force; then images at rest.
+within a quarter of the true one, or said to be a lower bound, by `contact_at_rim`. Printed: shares right and wrong with status
+ok, and the rest by status, of presses whose contact is no narrower than the dots' spacing, by filling, prestretch, dots, view
+and depth, and of the narrower ones; how often `contact_at_rim` is said of contacts clear of the rim; then what light strokes
+give, by the share of their largest force; then images at rest.
 """
 
 import argparse
@@ -37,7 +38,7 @@ def quantities(result: tm.Reconstruction, truth: dict) -> dict:
     row["found_force"] = float(np.linalg.norm(got["force"]))
     points = got["contact_points"][np.isfinite(got["contact_points"][:, 0])]
     centre = truth["contact_centroid_each"][0]
-    row["points"] = len(points)
+    row |= dict(points=len(points), at_rim=bool((got["contact_at_rim"] == 1).any()), coverage=float(got["coverage"]))
     row["place"] = float(np.linalg.norm(points - centre, axis=1).mean()) if len(points) else np.inf
     return row
 
@@ -118,13 +119,13 @@ def reconstructed(r: tm.Reconstructor, path: Path) -> list[dict]:
     X, touched = truth["vertices_nominal"], truth["contact_mask"].astype(bool)
     rim = r.sensor.membrane.rest.numpy()[r.sensor.membrane.fixed.numpy()]
     clear = np.linalg.norm(X[touched][:, None] - rim, axis=-1).min() / size if touched.any() else np.nan
-    about |= dict(width=contact_width(truth, spacing), spacing=spacing, clear=float(clear))
+    about |= dict(width=contact_width(truth, spacing), spacing=spacing, size=size, clear=float(clear))
     return [about | quantities(result, truth)]
 
 
 def verdict(row: dict) -> str:
     """ "right", "wrong" (with status ok), or the status."""
-    right = row["surface"] < CLOSE and row["force"] < CLOSE
+    right = row["surface"] < CLOSE and (row["force"] < CLOSE or row["at_rim"])
     if row["status"] == 0:
         return "right" if right else "wrong"
     return f"status {row['status']}"
@@ -160,6 +161,8 @@ def report(rows: list[dict]) -> None:
                 chosen = [row for row in wide if low <= row[key] < high]
                 if chosen:
                     line(f"{key} {low} to {high}", chosen)
+        off_rim = [row["at_rim"] for row in wide if row["clear"] > max(0.1, row["spacing"] / row["size"])]
+        print(f"contact_at_rim of {len(off_rim)} contacts 0.1 of the size and a spacing clear of it: {np.mean(off_rim):.3f}")
     narrow = [row for row in presses if row["width"] < 1]
     if narrow:
         line("narrower than the spacing", narrow)

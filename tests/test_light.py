@@ -87,7 +87,7 @@ def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
     measured = bearings.measured(seen(torch.zeros_like(rays), rays))
     x, pressure = estimator.at_rest(torch.ones(2 * D, 1, dtype=torch.float64))
     infinite = torch.tensor(torch.inf, dtype=torch.float64)
-    x, pressure, _ = estimator.step(x, pressure, measured, infinite, infinite)
+    x, pressure, _ = estimator.descent.step(x, pressure, measured, infinite, infinite)
     traction = estimator.equilibrium(x, pressure, x, measured).traction
     _, normal = at_rest(estimator)
     push = (inner(traction, estimator.membrane.grid) * normal).sum(-1) / estimator.reference / small

@@ -190,7 +190,7 @@ def test_a_foreign_or_stale_previous_is_refused_in_words(sensor, reconstructor, 
 def test_a_result_moves_and_keeps_its_meaning(result):
     double = result.to(torch.float64)
     assert double.vertices.dtype == torch.float64 and double.status.dtype == torch.int32
-    assert isinstance(double, tm.Reconstruction) and len(result) == 15 and result[0] is result.vertices
+    assert isinstance(double, tm.Reconstruction) and len(result) == 23 and result[0] is result.vertices
     arrays = result.cpu().numpy()
     assert all(isinstance(array, np.ndarray) for array in arrays) and arrays.status.dtype == np.int32
     frame = result.frame(1)
@@ -199,10 +199,10 @@ def test_a_result_moves_and_keeps_its_meaning(result):
 
 
 def test_a_status_is_its_number_and_says_its_text(result):
-    assert [int(status) for status in tm.Status] == list(range(7)) and tm.Status(3) == 3
+    assert [int(status) for status in tm.Status] == list(range(9)) and tm.Status(3) == 3
     assert all(tm.Status(int(code)) is tm.Status.OK for code in result.status)
     assert tm.Status.NOT_CONVERGED.has_surface and not tm.Status.BAD_VALUES.has_surface
-    assert len({status.text for status in tm.Status}) == 7
+    assert len({status.text for status in tm.Status}) == 9
 
 
 def test_a_tracker_gives_what_frames_with_their_previous_give(reconstructor, photographs, result):

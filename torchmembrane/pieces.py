@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, ParamSpec, Protocol, TypeVar
 
+import torch
+
 Inputs = ParamSpec("Inputs")
 Output = TypeVar("Output")
 
@@ -101,6 +103,30 @@ def unless(done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[An
         return otherwise()
     written: Sequence[Any] = graph.unless(done, values, otherwise)
     return written
+
+
+def mended(
+    done: Any, values: Sequence[Any], again: Callable[..., Sequence[Any]], given: Sequence[Any], chosen: Callable[..., Any]
+) -> Sequence[Any]:
+    """Take `values` in the rows where `done` holds, else what `again(*given)` gives.
+
+    Tensors: nothing is worked out where all is done, and only the rows that are not where some are; a compiled graph, which has
+    no such branch, takes `values`. A graph works all rows out if one is not done.
+
+    Args:
+        done: `[B]` bool.
+        values: what there is, each `[B, ...]`.
+        again: gives values of the same number and shapes.
+        given: what it needs, each `[B, ...]`.
+        chosen: a piece, `chosen(done, values, others)`: `values` where `done` holds, else `others`.
+    """
+    if _graph(values) is not None:
+        return unless(done, values, lambda: chosen(done, values, again(*given)))
+    if torch.compiler.is_compiling() or bool(done.all()):
+        return values
+    rows = (~done).nonzero().ravel()
+    others = again(*(one[rows] for one in given))
+    return [value.index_copy(0, rows, other) for value, other in zip(values, others, strict=True)]
 
 
 def _graph(values: Sequence[Any]) -> Graph | None:

@@ -19,6 +19,7 @@ from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
 from .io.status import Status
+from .markers.coverage import Coverage
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
 from .markers.placement import place_markers
 from .pieces import piece
@@ -34,6 +35,7 @@ ESTIMATORS: dict[str, type[ForceBalance] | type[MinimumEnergy] | type[PaperEstim
 }
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
 LEAST_ERROR = 0.02  # px
+LEAST_COVERAGE = 0.88  # less of what the markers see at rest is a part hidden
 OFF_RIM = 1e-3  # largest distance of a previous result's rim from this sensor's, over the surface's size
 PRECISIONS = (torch.float32, torch.float64)
 
@@ -114,6 +116,7 @@ class Reconstructor(nn.Module):
             rest_covariance=2 * self.observer.rest_covariance.double() + LEAST_ERROR**2 * torch.eye(2),
         )
         self.estimator = _estimator(problem, estimator, settings)
+        self.coverage = Coverage(membrane, positions, self.observer.seen_at_rest)
         self.register_buffer("vertex_pixels", vertex_pixels)
         self.register_buffer("rest_markers", positions)
         self.register_buffer("marker_vertices", torch.from_numpy(markers.points.vertices.astype(np.int64)))
@@ -241,11 +244,18 @@ class Reconstructor(nn.Module):
         pixels = self.rest_pixels + displacement
         miss2 = torch.where(lost, 0.0, ((self.camera.point_to_pixel(markers) - pixels) ** 2).sum(-1))
         ok, broken = status == Status.OK.value, ~x.flatten(1).isfinite().all(1)
-        status = torch.where(ok & ~self.estimator.is_converged(found), Status.NOT_CONVERGED.value, status)
-        status = torch.where(ok & broken, Status.NO_SOLUTION.value, status)
-        gone = (status != Status.OK.value) & (status != Status.NOT_CONVERGED.value)
+        coverage = self.coverage(confidence)
+        for of_this, value in (
+            (~self.estimator.is_converged(found), Status.NOT_CONVERGED.value),
+            (coverage < LEAST_COVERAGE, Status.HIDDEN.value),
+            (~self.estimator.is_explained(found), Status.UNEXPLAINED.value),
+            (broken, Status.NO_SOLUTION.value),
+        ):
+            status = torch.where(ok & of_this, value, status)
+        gone = ~(ok & ~broken)
         normals = membrane.normals(x)
-        contacts = self.estimator.contacts(found, normals)
+        contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
+        force, moment = load.sum(1), torch.linalg.cross(x, load).sum(1)
 
         def kept(values: Tensor) -> Tensor:
             return torch.where(gone.reshape(-1, *(1,) * (values.ndim - 1)), torch.nan, values)
@@ -260,12 +270,20 @@ class Reconstructor(nn.Module):
             traction=kept(found.traction),
             contact=kept(contacts.indicator),
             contact_points=kept(contacts.points),
-            force=kept((found.traction * membrane.rest_area[:, None]).sum(1)),
+            force=kept(force),
             pressure=kept(found.pressure),
             pressure_change=kept(found.pressure - self.estimator.rest_pressure),
             volume_error=kept(self.estimator.cavity.volume_error(found.volume, found.pressure)),
             residual=kept((miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()),
             status=status.to(torch.int32),
+            wrench=kept(torch.cat([force, moment], -1)),
+            contact_force=kept(contacts.force),
+            contact_normal=kept(contacts.normal),
+            contact_area=kept(contacts.area),
+            contact_slip=kept(contacts.slip),
+            contact_curvature=kept(contacts.curvature),
+            contact_at_rim=kept(contacts.at_rim),
+            coverage=kept(coverage),
         )
 
     def standard_deviations(self, result: Reconstruction) -> StandardDeviations:

@@ -10,7 +10,7 @@ import numpy as np
 
 from .session import EdgeError, Session, grey
 
-FINISHED = (0, 3)  # ok, and not converged: the answer is kept
+FINISHED = (0, 3, 7, 8)  # ok; not converged, unexplained, partly hidden: the answer is kept
 MESH = "mesh.npz"
 
 

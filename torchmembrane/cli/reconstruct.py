@@ -62,7 +62,9 @@ def run(arguments: Namespace) -> int:
     check_folder(arguments.out, sensor.fingerprint, settings)
     options = {"batch": arguments.batch, "figures": arguments.figures}
     counts = reconstruct_files(reconstructor, inputs, arguments.out, settings, **options)
-    unsure = f" ({counts.not_converged} not converged)" if counts.not_converged else ""
+    doubts = ("not converged", counts.not_converged), ("unexplained", counts.unexplained), ("partly hidden", counts.hidden)
+    said = ", ".join(f"{count} {doubt}" for doubt, count in doubts if count)
+    unsure = f" ({said})" if said else ""
     print(
         f"frames: {counts.reconstructed} reconstructed{unsure}, {counts.failed} failed, "
         f"{counts.skipped} finished before; results in {arguments.out}"

@@ -57,8 +57,9 @@ class Observation(NamedTuple):
 
 class Equilibrium(NamedTuple):
     """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`
-    (zero for minimum energy), `relative_step [...]`: the last step over the surface's size, and `reference [..., V]`: the
-    traction against which pushes are measured (zero where no tractions are found)."""
+    (zero for minimum energy), `relative_step [...]`: the last step over the surface's size, `reference [..., V]`: the traction
+    against which pushes are measured (zero where no tractions are found), and `misfit [...]`: rms of the markers' angles off
+    their rays, in standard deviations (zero where the surface is on every ray)."""
 
     vertices: Tensor
     pressure: Tensor
@@ -66,13 +67,30 @@ class Equilibrium(NamedTuple):
     traction: Tensor
     relative_step: Tensor
     reference: Tensor
+    misfit: Tensor
 
 
 class Contacts(NamedTuple):
-    """Where something touches: `indicator [B, V]` in 0..1 and `points [B, 4, 3]`, strongest first, NaN-padded."""
+    """Where something touches, and what that tells: of P = 4 patches, strongest first, NaN-padded.
+
+    indicator  `[B, V]` in 0..1
+    points     `[B, P, 3]`, the patches' centroids
+    force      `[B, P, 3]`, on the membrane; NaN where no tractions are found, as the slip
+    normal     `[B, P, 3]`, mean outward normal of the membrane there
+    area       `[B, P]`
+    slip       `[B, P]`, shear force over normal force
+    curvature  `[B, P, 2]`, principal curvatures of the surface there, positive where the object bulges into the membrane
+    at_rim     `[B, P]`, 1 where the patch reaches the rim, else 0
+    """
 
     indicator: Tensor
     points: Tensor
+    force: Tensor
+    normal: Tensor
+    area: Tensor
+    slip: Tensor
+    curvature: Tensor
+    at_rim: Tensor
 
 
 class Estimator(Protocol):
@@ -98,6 +116,10 @@ class Estimator(Protocol):
 
     def is_converged(self, found: Equilibrium) -> Tensor:
         """`[B]` bool."""
+        ...
+
+    def is_explained(self, found: Equilibrium) -> Tensor:
+        """`[B]` bool: a surface of this sensor can move as the markers do."""
         ...
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:

@@ -124,6 +124,11 @@ class MarkerBearings(nn.Module):
         angle = (measured.across * along).sum(2, keepdim=True)
         return angle.squeeze(2), (measured.across - angle * along) / distance[:, None]
 
+    def misfit(self, x: Tensor, measured: Bearings, outlier: float) -> Tensor:
+        """Rms of the markers' angles off their rays `[B]`, in standard deviations, each counted as `outlier` at most."""
+        angles2 = self.angles(x, measured)[0].square().mean(1).clamp_max(outlier**2)
+        return ((measured.weight * angles2).sum(-1) / measured.weight.sum(-1).clamp_min(1)).sqrt()
+
 
 def _shares(membrane: Membrane, markers: SurfacePoints) -> tuple[Tensor, Tensor]:
     """Every marker's share in what is summed at the inner vertices, `[D, N]`, and at them with those at `NEAR`, `[D, 4 N]`."""

@@ -1,12 +1,29 @@
-"""Contact patches from tractions: where something pushes, and the patches' centroids."""
+"""Contact patches from tractions: where something pushes, the patches' centroids, and what each tells of what touches.
+
+Every vertex belongs to the patch that is nearest to it on the rest surface, with all of its traction: the patches' forces add
+up to the total force, also where the estimate smears a push over the contact's edge.
+"""
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from ..solve.elimination import solve_positive
+from ..surface.membrane import Membrane
+from ..surface.tangent import tangent_frame
+from .base import CONTACT_POINTS, Contacts
 
 PATCH = 0.1
 """Radius of a patch over the surface's size; what lies within it counts as one contact."""
 LEAST = 0.15
 """Smallest patch that is reported, as a share of the strongest one's force."""
+PUSHED = 0.5
+"""Indicator above which a vertex is in contact."""
+RIM = 0.08
+"""Over the surface's size: a push within it, or within the markers' spacing, of the rim may go on beyond the rim."""
+RIM_SHARE = 0.1
+"""Share of a patch's push there, above which the patch reaches the rim."""
+LEAST_STEPS = 2.0
+"""Grid steps that a patch spans at least where curvatures are told."""
 
 
 def contact_indicator(traction: Tensor, normals: Tensor, reference: float | Tensor) -> Tensor:
@@ -32,8 +49,8 @@ def contact_indicator(traction: Tensor, normals: Tensor, reference: float | Tens
     return inward / (inward + reference / 2)
 
 
-def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, size: float, count: int) -> Tensor:
-    """Force-weighted centroids of the contact patches.
+def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, size: float, count: int) -> tuple[Tensor, Tensor]:
+    """Force-weighted centroids of the contact patches, and whose every vertex is.
 
     A patch is what lies within `PATCH` x size of the strongest concentration of force; it is taken away before the next is
     looked for.
@@ -46,18 +63,114 @@ def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, size: f
         count: how many are looked for.
 
     Returns:
-        `[B, count, 3]`, strongest first, NaN where there is none.
+        `[B, count, 3]`, strongest first, NaN where there is none; and `[B, count, V]`, 1 where of all patches this is the
+        nearest at rest, else 0.
     """
     distance2 = ((rest[:, None] - rest) ** 2).sum(-1)
     near = torch.exp(-distance2 / (2 * (PATCH * size) ** 2))
-    load, found, forces = inward_force, [], []
+    load, found, forces, away = inward_force, [], [], []
     for _ in range(count):
-        patch = near[(load @ near).argmax(-1)]
+        peak = (load @ near).argmax(-1)
+        patch = near[peak]
         weight = load * patch
         force = weight.sum(-1, keepdim=True)
         found.append((weight[..., None] * vertices).sum(1) / force.clamp_min(torch.finfo(load.dtype).tiny))
         forces.append(force)
+        away.append(distance2[peak])
         load = load * (1 - patch.sqrt().sqrt())  # a Gaussian twice as wide
     points, strengths = torch.stack(found, 1), torch.stack(forces, 1)
     present = (strengths > LEAST * strengths[:, :1]) & (strengths > 0)
-    return torch.where(present, points, torch.nan)
+    nearest = torch.where(present, torch.stack(away, 1), torch.inf).argmin(1, keepdim=True)
+    mine = (nearest == torch.arange(count, device=nearest.device)[:, None]) & present
+    return torch.where(present, points, torch.nan), mine.to(load.dtype)
+
+
+class ContactPatches(nn.Module):
+    """What contact patches tell of the bodies that touch.
+
+    Args:
+        membrane: the rest surface on the solver's grid.
+        spacing: of the markers on it, length unit; 0 where it does not limit what is resolved.
+    """
+
+    at_rim: Tensor
+
+    def __init__(self, membrane: Membrane, spacing: float = 0.0):
+        super().__init__()
+        self.membrane = membrane
+        m, n = membrane.grid
+        self.least_span = max(LEAST_STEPS * membrane.size / ((m - 1) * (n - 1)) ** 0.5, spacing)
+        from_rim = torch.cdist(membrane.rest, membrane.rest[membrane.fixed]).amin(1)
+        self.register_buffer("at_rim", (from_rim < max(RIM * membrane.size, spacing)).double())
+
+    def pushes(self, x: Tensor, normals: Tensor, traction: Tensor, reference: Tensor) -> Contacts:
+        """Where tractions push, and what that tells; `reference [B, V]` is what they are large beside, the others as below."""
+        indicator = contact_indicator(traction, normals, reference)
+        inward = (indicator > PUSHED) * (-(traction * normals).sum(-1)).clamp_min(0) * self.membrane.rest_area
+        points, mine = contact_points(x, self.membrane.rest, inward, self.membrane.size, CONTACT_POINTS)
+        contacts: Contacts = self(x, normals, traction, indicator, points, mine)
+        return contacts
+
+    def forward(
+        self, x: Tensor, normals: Tensor, traction: Tensor, indicator: Tensor, points: Tensor, mine: Tensor
+    ) -> Contacts:
+        """Force, normal, area, slip, curvatures of every patch, and whether it reaches the rim.
+
+        Args:
+            x: the surface `[B, V, 3]`.
+            normals: its outward normals `[B, V, 3]`.
+            traction: contact force per rest area, `[B, V, 3]`.
+            indicator: of contact, `[B, V]`.
+            points: the patches' centroids `[B, P, 3]`, NaN where there is none.
+            mine: `[B, P, V]`, 1 where a vertex is the patch's, else 0.
+        """
+        here = torch.isfinite(points[..., 0])
+        load = traction * self.membrane.rest_area[:, None]
+        inward = -(load * normals).sum(-1)
+        shear = load + inward[..., None] * normals
+        pushed = mine * (indicator > PUSHED).to(mine.dtype)[:, None]
+        push = pushed * inward.clamp_min(0)[:, None]
+        tiny = torch.finfo(push.dtype).tiny
+        area = pushed * self.membrane.vertex_area(x)[:, None]
+        strong = push * (push / self.membrane.rest_area)
+        strong = strong / strong.sum(-1, keepdim=True).clamp_min(tiny)
+        normal = torch.nn.functional.normalize(strong @ normals, dim=-1)
+        force, normal_force = mine @ load, (mine @ inward[..., None])[..., 0]
+        slip = torch.linalg.vector_norm(mine @ shear, dim=-1) / torch.where(normal_force > 0, normal_force, 1.0)
+        at_rim = ((push @ self.at_rim) > RIM_SHARE * push.sum(-1)).to(push.dtype)
+
+        def kept(values: Tensor, where: Tensor = here) -> Tensor:
+            return torch.where(where.reshape(*where.shape, *(1,) * (values.ndim - 2)), values, torch.nan)
+
+        curvature, span = self._curvature(x, normal, strong, area / area.sum(-1, keepdim=True).clamp_min(tiny))
+        return Contacts(
+            indicator=indicator,
+            points=points,
+            force=kept(force),
+            normal=kept(normal),
+            area=kept(area.sum(-1)),
+            slip=kept(slip, here & (normal_force > 0)),
+            curvature=kept(curvature, here & (span >= self.least_span)),
+            at_rim=kept(at_rim),
+        )
+
+    def _curvature(self, x: Tensor, normal: Tensor, strong: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+        """Principal curvatures `[B, P, 2]`, the larger first, positive where the surface is hollow seen from outside, and the
+        diameter `[B, P]` of a disc that spreads as the patch; weights `strong` and `share [B, P, V]` add up to 1 each.
+
+        A quadratic height over the plane across `normal [B, P, 3]`, by weighted least squares.
+        """
+        axes = torch.cat([tangent_frame(normal), normal[:, :, None]], 2)
+        local = (axes.flatten(1, 2) @ x.mT).unflatten(1, (-1, 3))
+        u, v, z = (local - (share[:, :, None] * local).sum(-1, keepdim=True)).unbind(2)
+        spread = (share * (u * u + v * v)).sum(-1, keepdim=True).clamp_min((1e-6 * self.membrane.size) ** 2).sqrt()
+        u, v = u / spread, v / spread
+        terms = torch.stack([torch.ones_like(u), u, v, u * u / 2, u * v, v * v / 2, z / spread], 2)
+        gram = ((strong[:, :, None] * terms) @ terms.mT).movedim((-2, -1), (0, 1))
+        ridge = 1e-6 * torch.eye(6, 7, dtype=x.dtype, device=x.device)[..., None, None]
+        _, by_u, by_v, uu, uv, vv = solve_positive(gram[:6] + ridge)[:, 0].unbind(0)
+        steep = 1 + by_u * by_u + by_v * by_v
+        mean = ((1 + by_v * by_v) * uu - 2 * by_u * by_v * uv + (1 + by_u * by_u) * vv) / (2 * steep * steep.sqrt())
+        gauss = (uu * vv - uv * uv) / (steep * steep)
+        apart = (mean * mean - gauss).clamp_min(1e-12).sqrt()
+        return torch.stack([mean + apart, mean - apart], -1) / spread, 8**0.5 * spread[..., 0]

@@ -29,24 +29,24 @@ from torch import Tensor, nn
 from ..camera.model import Camera
 from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
-from ..pieces import piece, repeated
-from ..solve.conjugate_gradient import conjugate_gradient
-from ..solve.kkt import BorderedStep, solve_bordered
+from ..pieces import mended, piece
 from ..surface.membrane import Membrane
 from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner, pad_border
 from ..surface.tangent import tangent_frame
-from .base import CONTACT_POINTS, Contacts, Equilibrium, Observation, Problem
+from .base import Contacts, Equilibrium, Observation, Problem
 from .bearings import Bearings, MarkerBearings, marker_rays, seen_from_origin
 from .contact_force import ContactForce
-from .contact_patches import contact_indicator, contact_points
+from .contact_patches import ContactPatches
 from .covariance import StandardDeviations, linearise, push_noise, spread
+from .descent import Descent
 from .normal_equations import BalanceEquations
 from .robust import Cauchy
 from .settings import ForceBalanceSettings
 from .traction_loss import TractionLoss
 
-Factor = tuple[Tensor, ...]
+RESOLVED = 17
+"""Lines of a grid whose own error is small beside the markers'; a coarser one's grows as the square of its step."""
 
 
 class ForceBalance(nn.Module):
@@ -104,6 +104,8 @@ class ForceBalance(nn.Module):
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
+        self.descent = Descent(self.equations, self.cavity, settings)
+        self.patches = ContactPatches(membrane, self.size / len(bearings.positions) ** 0.5)
         if self.coarse is None:
             self.steps = settings.coarse_steps if is_coarse else settings.steps
         else:
@@ -170,22 +172,38 @@ class ForceBalance(nn.Module):
 
     def forward(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:
         """The surface that the markers' rays show; `start`: vertices and pressure near it, such as the previous frame's."""
-        return self._solved(self.equations.bearings.measured(observation), start)
+        measured = self.equations.bearings.measured(observation)
+        found = self._solved(measured, start)
+        again = mended(self.is_converged(found), found, self._patiently, measured, self.chosen)
+        return Equilibrium(*again)
 
-    def _solved(self, measured: Bearings, start: tuple[Tensor, Tensor] | None) -> Equilibrium:
+    def _patiently(self, *measured: Tensor) -> Equilibrium:
+        """From rest, in many small steps: deep presses need them."""
+        return self._solved(Bearings(*measured), None, patient=True)
+
+    @piece
+    def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
+        """`values` in the rows where `done [B]` holds, else `others`."""
+        rows = [done.reshape(-1, *(1,) * (value.ndim - 1)) for value in values]
+        return Equilibrium(*(torch.where(*each) for each in zip(rows, values, others, strict=True)))
+
+    def _solved(self, measured: Bearings, start: tuple[Tensor, Tensor] | None, patient: bool = False) -> Equilibrium:
         if start is not None and not self.passes_on_starts:
             return self._descend(*start, measured, self.schedule(warm=True), one_factor=True)
+        schedule = self.schedule(patient=patient)
         if self.coarse is None:
-            return self._descend(*self.at_rest(measured.weight), measured, self.schedule())
-        coarse = self.coarse._solved(measured, None if start is None else self.coarsened(*start))
-        return self._descend(*self.refined(coarse.vertices, coarse.pressure), measured, self.schedule())
+            return self._descend(*self.at_rest(measured.weight), measured, schedule)
+        coarse = self.coarse._solved(measured, None if start is None else self.coarsened(*start), patient)
+        return self._descend(*self.refined(coarse.vertices, coarse.pressure), measured, schedule)
 
-    def schedule(self, warm: bool = False) -> list[tuple[float, float]]:
-        """`tau` and `R` of every step on this grid; `warm`: with a start."""
+    def schedule(self, warm: bool = False, patient: bool = False) -> list[tuple[float, float]]:
+        """`tau` and `R` of every step on this grid; `warm`: with a start; `patient`: a second time, from rest."""
         settings = self.settings
         if warm and not self.passes_on_starts:
             return settings.gnc_schedule(settings.warm_steps, settings.warm_tau)
-        return settings.gnc_schedule(self.steps, settings.tau if self.coarse is None else settings.fine_tau)
+        steps = settings.patience * self.steps if patient else self.steps
+        finer = settings.patient_tau if patient else settings.fine_tau
+        return settings.gnc_schedule(steps, settings.tau if self.coarse is None else finer)
 
     @piece
     def at_rest(self, confidence: Tensor) -> tuple[Tensor, Tensor]:
@@ -209,43 +227,8 @@ class ForceBalance(nn.Module):
         self, x: Tensor, pressure: Tensor, measured: Bearings, schedule: list[tuple[float, float]], one_factor: bool = False
     ) -> Equilibrium:
         """The steps of a schedule; `one_factor`: all with that of the first."""
-        before, factor = x, None
-        if one_factor:
-            x, pressure, before, factor = self._first(x, pressure, measured, *schedule[0])
-            schedule = schedule[1:]
-        x, pressure, before = repeated(self._next, schedule, (x, pressure, before), measured, factor)
+        x, pressure, before = self.descent(x, pressure, measured, schedule, one_factor)
         return self.equilibrium(x, pressure, before, measured)
-
-    @piece
-    def _first(
-        self, x: Tensor, pressure: Tensor, measured: Bearings, tau: float, outlier: float
-    ) -> tuple[Tensor, Tensor, Tensor, Factor | None]:
-        """Surface, pressure and the surface before; the factor of the step's matrix."""
-        after, pressure, factor = self._traced_once(x, pressure, measured, tau, outlier, None)
-        return after, pressure, x, factor
-
-    @piece
-    def _next(
-        self, x: Tensor, pressure: Tensor, before: Tensor, measured: Bearings, factor: Factor | None, tau: float, outlier: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Surface, pressure and the surface before."""
-        after, pressure, _ = self._traced_once(x, pressure, measured, tau, outlier, factor)
-        return after, pressure, x
-
-    def _traced_once(
-        self, x: Tensor, pressure: Tensor, measured: Bearings, tau: float, outlier: float, factor: Factor | None
-    ) -> tuple[Tensor, Tensor, Factor | None]:
-        """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself."""
-        scales = [torch.as_tensor(scale, dtype=x.dtype, device=x.device) for scale in (tau, outlier)]
-        step = self.step if torch.compiler.is_exporting() else self._compiled_once
-        taken: tuple[Tensor, Tensor, Factor | None] = step(x, pressure, measured, scales[0], scales[1], factor)
-        return taken
-
-    @torch.compiler.nested_compile_region
-    def _compiled_once(
-        self, x: Tensor, pressure: Tensor, measured: Bearings, tau: Tensor, outlier: Tensor, factor: Factor | None
-    ) -> tuple[Tensor, Tensor, Factor | None]:
-        return self.step(x, pressure, measured, tau, outlier, factor)
 
     @piece
     def equilibrium(self, x: Tensor, pressure: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
@@ -256,58 +239,24 @@ class ForceBalance(nn.Module):
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
         scale = loss.contact_scale(*within, measured.noise_level)
         reference = self.reference * (1 + pad_border(scale[..., None] - 1, membrane.grid)[..., 0])
-        return Equilibrium(x, pressure, membrane.volume(x), traction, step, reference)
+        misfit = self.equations.bearings.misfit(x, measured, self.settings.outlier)
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, reference, misfit)
 
+    @piece
     def is_converged(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the last step was short and the volume is what the cavity's law asks for."""
         error = self.cavity.volume_error(found.volume, found.pressure).abs()
         settings = self.settings
         return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
 
+    def is_explained(self, found: Equilibrium) -> Tensor:
+        """`[B]` bool: the markers are off their rays by no more than their noise and the model's error."""
+        coarse = max(1.0, (RESOLVED - 1) / (min(self.membrane.grid) - 1))
+        return ~(found.misfit > self.settings.largest_misfit * coarse**2)
+
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
-        """Where something pushes: the indicator of each vertex, and the centroids of the contact patches."""
-        membrane = self.membrane
-        indicator = contact_indicator(found.traction, normals, found.reference)
-        inward = (indicator > 0.5) * (-(found.traction * normals).sum(-1)).clamp_min(0) * membrane.rest_area
-        return Contacts(indicator, contact_points(found.vertices, membrane.rest, inward, self.size, CONTACT_POINTS))
-
-    def step(
-        self, x: Tensor, pressure: Tensor, measured: Bearings, tau: Tensor, outlier: Tensor, factor: Factor | None = None
-    ) -> tuple[Tensor, Tensor, Factor | None]:
-        """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped.
-
-        Also returns the factor of its matrix if it made one: with the `factor` of a step near this one it makes none.
-        """
-        equations = self.equations
-        _, normal, loads, corner = equations.linearised(x, pressure, measured, tau, outlier)
-        made = None
-        if factor is None:
-            made = equations.system.factor(equations.matrix(normal))
-            solved = equations.system.substitute(made, loads)
-        else:
-            known = factor
-            solved = conjugate_gradient(
-                lambda u: equations.product(normal, u),
-                lambda r: equations.system.substitute(known, r),
-                loads,
-                self.settings.conjugate_steps,
-            )
-        move, rise = self._bordered_step(x, pressure, loads, solved, corner)
-        move = move.unflatten(-1, (3, -1)).mT
-        longest = torch.linalg.vector_norm(move, dim=-1).amax(-1)
-        cap = self.settings.longest_step * self.size
-        share = (cap / longest.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1.0)
-        return x + pad_border(share[:, None, None] * move, self.membrane.grid), pressure + share * rise, made
-
-    def _bordered_step(
-        self, x: Tensor, pressure: Tensor, loads: Tensor, solved: Tensor, corner: tuple[Tensor, Tensor]
-    ) -> BorderedStep:
-        """Step `d` and rise of the pressure: `M d + m dp + n lambda = -g` with the rows of the pressure and of the volume."""
-        if self.cavity.filling == "open":
-            return BorderedStep(-solved[:, 1], torch.zeros_like(pressure))
-        fWv, vWv = corner
-        target, compliance = self.cavity.condition(self.membrane.volume(x) - self.membrane.rest_volume, pressure)
-        return solve_bordered(loads, solved, vWv, fWv, compliance, target)
+        """Where something pushes."""
+        return self.patches.pushes(found.vertices, normals, found.traction, found.reference)
 
     def objective(self, found: Equilibrium, observation: Observation) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and the loss of the tractions."""

@@ -16,6 +16,7 @@ from ..errors import MembraneError
 from ..pieces import piece
 from ..surface.membrane import Membrane
 from .base import CONTACT_POINTS, Contacts, Equilibrium, Observation
+from .contact_patches import ContactPatches
 from .regions import persistent_regions
 
 LEAST = 1e-3  # smallest peak that is a contact, over the surface's size
@@ -118,6 +119,7 @@ class Segmentation(nn.Module):
         self.register_buffer("rest_origins", rest_rays[0])
         self.register_buffer("rest_directions", rest_rays[1])
         self.register_buffer("axis_region", _axis_region(membrane))
+        self.patches = ContactPatches(membrane)
         self.axis_in_view = bool((self.axis_region > 0).any())
 
     @piece
@@ -149,7 +151,10 @@ class Segmentation(nn.Module):
     def contacts(self, x: Tensor, normals: Tensor) -> Contacts:
         """`by_normals` as results have it, 1 in a contact, else 0; the surface's `normals [B, V, 3]` are at hand."""
         regions = self._inside(x, normals)
-        return Contacts((regions.region > 0).to(x.dtype), regions.points)
+        indicator, numbers = (regions.region > 0).to(x.dtype), torch.arange(1, self.count + 1, device=x.device)
+        mine = (regions.region[:, None] == numbers[:, None]).to(x.dtype)
+        contacts: Contacts = self.patches(x, normals, -normals, indicator, regions.points, mine)  # as if pushed evenly
+        return contacts._replace(force=torch.nan * contacts.force, slip=torch.nan * contacts.slip)
 
     def divergence(self, directions: Tensor) -> Tensor:
         """Outward share of the angular flow, `[B]`: 1 where every ray turns away from the axis, -1 where all turn to it."""

@@ -23,6 +23,8 @@ class ForceBalanceSettings:
         tau: first and last scale of the compressive traction's loss, from rest.
         fine_tau: the same, from a coarser grid's solution.
         warm_tau: the same, from the solution of the frame before.
+        patience: so many times the steps, from rest, where these do not converge.
+        patient_tau: as `fine_tau`, then.
         decline: share of the steps over which tau declines.
         sparsity: twice the loss of the compressive traction p0 on the whole surface, while it is quadratic.
         scale_reach: radius of the wider surroundings whose largest push says what a vertex's tractions are measured against.
@@ -44,6 +46,8 @@ class ForceBalanceSettings:
         coarsest_warm: fewest lines of a coarser grid that is given the solution of the frame before.
         largest_relative_step: rms of the last step of a converged solution.
         largest_volume_error: volume error of a converged solution, over the rest volume.
+        largest_misfit: rms of the markers' angles off their rays where a surface of this sensor explains them, over their
+            noise and the model's error; on grids of fewer than `force_balance.RESOLVED` lines more.
 
     Example:
         >>> ForceBalanceSettings(steps=12).gnc_schedule(2, (4.0, 0.4))
@@ -59,6 +63,8 @@ class ForceBalanceSettings:
     tau: tuple[float, float] = (4.0, 0.4)
     fine_tau: tuple[float, float] = (0.8, 0.4)
     warm_tau: tuple[float, float] = (0.8, 0.4)
+    patience: int = 3
+    patient_tau: tuple[float, float] = (2.0, 0.4)
     decline: float = 0.6
     sparsity: float = 6400.0
     scale_reach: float = 0.08
@@ -80,6 +86,7 @@ class ForceBalanceSettings:
     coarsest_warm: int = 13
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3
+    largest_misfit: float = 1.3
 
     def __post_init__(self) -> None:
         for name in ("steps", "coarse_steps", "fine_steps", "finer_steps", "warm_steps"):

@@ -84,6 +84,10 @@ class VertexRays(nn.Module):
             )
         return Observation(*camera.pixel_to_ray(self.flow(pixels, confidence)), confidence)
 
+    def is_explained(self, found: Equilibrium) -> Tensor:
+        """`[B]` bool: always, for the surface is on every ray."""
+        return ~found.misfit.isnan()
+
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where the membrane bulges in along its `normals [B, V, 3]` (section 5.1)."""
         return self.segmentation.contacts(found.vertices, normals)

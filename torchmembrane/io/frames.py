@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import MembraneError
 from .atomic import whole_file
 from .optional import load_pyarrow
-from .results import Reconstruction, load_frame, save_frame
+from .results import Reconstruction, completed, load_frame, save_frame
 from .store import MESH, Mesh, check_folder
 
 PART_ROWS = 256
@@ -162,7 +162,7 @@ class FrameTable:
             column = table[key].combine_chunks()
             values = (column.flatten() if shape else column).to_numpy(zero_copy_only=False)
             columns[key] = values.reshape(len(table), *shape)
-        return {name: {k: v[i] for k, v in columns.items()} for i, name in enumerate(table["name"].to_pylist())}
+        return {name: completed({k: v[i] for k, v in columns.items()}) for i, name in enumerate(table["name"].to_pylist())}
 
     def _save(self, table: Any, part: Path) -> None:
         with whole_file(part) as partial:

@@ -30,6 +30,16 @@ class Reconstruction(NamedTuple):
     volume_error      [B]        (V - V_target) / V_rest
     residual          [B]        rms distance of measured from modelled marker pixels, px
     status            [B] int32  0 ok; texts in `Status`
+    wrench            [B, 6]     total contact force, and its moment about the origin of the camera's frame (force x length)
+    contact_force     [B, 4, 3]  force of each patch of `contact_points`, in their order, NaN-padded as all of `contact_`; NaN
+                                 where no tractions are found
+    contact_normal    [B, 4, 3]  mean outward normal of the membrane in the patch
+    contact_area      [B, 4]     of the patch, deformed
+    contact_slip      [B, 4]     shear force over normal force of the patch
+    contact_curvature [B, 4, 2]  principal curvatures of the surface in the patch (1 / length), the larger first, positive where
+                                 the object bulges into the membrane; NaN where the patch is too narrow to tell
+    contact_at_rim    [B, 4]     1 where the patch reaches the fixed rim, its force is then a lower bound; else 0
+    coverage          [B]        share of the membrane's area that found markers see, of what they see at rest
 
     A frame without a surface has NaN in every floating array but `pixels` and `confidence`, which keep what was found.
     """
@@ -49,18 +59,31 @@ class Reconstruction(NamedTuple):
     volume_error: Tensor
     residual: Tensor
     status: Tensor
+    wrench: Tensor
+    contact_force: Tensor
+    contact_normal: Tensor
+    contact_area: Tensor
+    contact_slip: Tensor
+    contact_curvature: Tensor
+    contact_at_rim: Tensor
+    coverage: Tensor
 
     def frame(self, index: int) -> dict[str, np.ndarray]:
         """One frame as numpy arrays, float32 (status int32), by the names above.
 
         Example:
-            >>> batch = Reconstruction(*torch.zeros(15, 2, 3))  # two frames; arrays of other shapes in a real one
+            >>> batch = Reconstruction(*torch.zeros(23, 2, 3))  # two frames; arrays of other shapes in a real one
             >>> frame = batch.frame(1)
             >>> frame["force"].tolist(), str(frame["status"].dtype)
             ([0.0, 0.0, 0.0], 'int32')
         """
         arrays = {key: value[index].detach().cpu().numpy() for key, value in self._asdict().items()}
         return {key: value.astype(np.int32 if key == "status" else np.float32) for key, value in arrays.items()}
+
+    def split_traction(self) -> tuple[Tensor, Tensor]:
+        """The push `[B, V]`, compressive normal traction, and the shear `[B, V, 3]`: `traction = shear - push normals`."""
+        push = -(self.traction * self.normals).sum(-1)
+        return push, self.traction + push[..., None] * self.normals
 
     def to(self, *args: Any, **kwargs: Any) -> "Reconstruction":
         """All arrays as `torch.Tensor.to` gives them: another device or precision; the status stays an integer."""
@@ -76,6 +99,19 @@ class Reconstruction(NamedTuple):
         return Reconstruction(**{key: value.detach().cpu().numpy() for key, value in self._asdict().items()})
 
 
+ADDED: dict[str, tuple[int, ...]] = {
+    "wrench": (6,),
+    "contact_force": (0, 3),
+    "contact_normal": (0, 3),
+    "contact_area": (0,),
+    "contact_slip": (0,),
+    "contact_curvature": (0, 2),
+    "contact_at_rim": (0,),
+    "coverage": (),
+}
+"""Arrays that results did not always hold, with their shapes: 0 stands for as many as there are `contact_points`."""
+
+
 def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
     """Write one frame, whole or not at all.
 
@@ -85,7 +121,7 @@ def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
 
     Example:
         >>> from tempfile import TemporaryDirectory
-        >>> frame = Reconstruction(*torch.ones(15, 1, 3)).frame(0)
+        >>> frame = Reconstruction(*torch.ones(23, 1, 3)).frame(0)
         >>> with TemporaryDirectory() as folder:
         ...     save_frame(f"{folder}/press.npz", frame)
         ...     load_frame(f"{folder}/press.npz")["force"].tolist()
@@ -110,7 +146,7 @@ def load_frame(path: str | Path) -> dict[str, np.ndarray]:
     """
     try:
         with np.load(path) as data:
-            frame = {k: data[k] for k in Reconstruction._fields}
+            frame = completed({k: data[k] for k in data})
     except FileNotFoundError as error:
         raise MembraneError(f"{path}: no such file; expected a result NAME.npz") from error
     except (KeyError, OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
@@ -118,6 +154,18 @@ def load_frame(path: str | Path) -> dict[str, np.ndarray]:
             f"{path}: not a result of torchmembrane ({error}); expected the arrays of Reconstruction"
         ) from error
     return frame
+
+
+def completed(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A frame that was stored before there were all of these arrays: those that it lacks are NaN.
+
+    Raises:
+        KeyError: it lacks one that there always was.
+    """
+    count = frame["contact_points"].shape[0]
+    shapes = {name: tuple(count if n == 0 else n for n in shape) for name, shape in ADDED.items()}
+    added = {name: np.full(shape, np.nan, np.float32) for name, shape in shapes.items()}
+    return {key: frame[key] if key in frame or key not in added else added[key] for key in Reconstruction._fields}
 
 
 def stack_frames(frames: list[dict[str, np.ndarray]]) -> Reconstruction:
@@ -130,7 +178,7 @@ def stack_frames(frames: list[dict[str, np.ndarray]]) -> Reconstruction:
         The batch, in their order, on the CPU.
 
     Example:
-        >>> first, second = (Reconstruction(*torch.full((15, 1, 3), value)).frame(0) for value in (1.0, 2.0))
+        >>> first, second = (Reconstruction(*torch.full((23, 1, 3), value)).frame(0) for value in (1.0, 2.0))
         >>> stack_frames([first, second]).force.tolist()
         [[1.0, 1.0, 1.0], [2.0, 2.0, 2.0]]
     """

@@ -14,7 +14,7 @@ from .status import Status
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
 
-FINISHED = (Status.OK, Status.NOT_CONVERGED)
+FINISHED = tuple(status for status in Status if status.has_surface)
 """Status of frames that are not tried again."""
 FORMATS = ("npz", "parquet")
 MESH = "mesh.npz"

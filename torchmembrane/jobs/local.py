@@ -24,10 +24,13 @@ if TYPE_CHECKING:
 
 
 class FrameCounts(NamedTuple):
-    """How many frames of a call were reconstructed (some without convergence), failed, and were skipped as finished."""
+    """How many frames of a call were reconstructed (some of them not to be relied on, by status), failed, and were skipped as
+    finished."""
 
     reconstructed: int
     not_converged: int
+    unexplained: int
+    hidden: int
     failed: int
     skipped: int
 
@@ -71,7 +74,7 @@ def reconstruct_files(
         >>> sensor = replace(sensor, markers=replace(sensor.markers, rest_image=None))  # quicker, less accurate
         >>> reconstructor, images = Reconstructor(sensor), find_inputs(["examples/rest.png"])
         >>> reconstruct_files(reconstructor, images, tempfile.mkdtemp(), Settings.of(reconstructor, "npz"))
-        FrameCounts(reconstructed=1, not_converged=0, failed=0, skipped=0)
+        FrameCounts(reconstructed=1, not_converged=0, unexplained=0, hidden=0, failed=0, skipped=0)
     """
     out, report = Path(out), report or _write_line
     mesh = Mesh.of(reconstructor, settings)
@@ -95,7 +98,8 @@ def reconstruct_files(
     finally:
         folder.close()
     good = sum(done[status] for status in FINISHED)
-    return FrameCounts(good, done[Status.NOT_CONVERGED], done.total() - good, progress.initial)
+    doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN]
+    return FrameCounts(good, *doubts, done.total() - good, progress.initial)
 
 
 class _ResultFolder:

@@ -49,6 +49,7 @@ class MarkerObserver(nn.Module):
     rest_pixels: Tensor
     measured_rest: Tensor
     rest_covariance: Tensor
+    seen_at_rest: Tensor
 
     def __init__(
         self, markers: PlacedMarkers, rim_pixels: np.ndarray, name: str, dtype: torch.dtype, rest_image: np.ndarray | None
@@ -59,12 +60,16 @@ class MarkerObserver(nn.Module):
         self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
         self.register_buffer("measured_rest", torch.from_numpy(markers.model_pixels))
         self.register_buffer("rest_covariance", isotropic(self.rest_pixels[:, 0], NOISE))
+        self.register_buffer("seen_at_rest", torch.ones_like(self.rest_pixels[:, 0], dtype=torch.bool))
         self.to(dtype)
         if rest_image is not None:
-            self.measured_rest, self.rest_covariance = self._in_rest_image(torch.from_numpy(rest_image).to(dtype), name)
+            self.measured_rest, self.rest_covariance, self.seen_at_rest = self._in_rest_image(
+                torch.from_numpy(rest_image).to(dtype), name
+            )
 
-    def _in_rest_image(self, image: Tensor, name: str) -> tuple[Tensor, Tensor]:
-        """The markers in the rest image, and their covariance: subtracted from every frame's, rest offsets are nulled (5.2)."""
+    def _in_rest_image(self, image: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor]:
+        """The markers in the rest image, their covariance, which are found: subtracted from every frame's, rest offsets are
+        nulled (5.2)."""
         with torch.no_grad():
             pixels, confidence, covariance = self.locator(image[None, None])
         found = confidence > FOUND
@@ -73,7 +78,7 @@ class MarkerObserver(nn.Module):
                 f"sensor {name!r}: only {int(found.sum())} of {found.shape[1]} markers are found in the rest image; "
                 "expected most: check the marker file, the polarity and the camera against the image"
             )
-        return torch.where(found[0, :, None], pixels[0], self.measured_rest), covariance[0]
+        return torch.where(found[0, :, None], pixels[0], self.measured_rest), covariance[0], found[0]
 
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels `[B, D, 2]` of the markers in grey images `[B, 1, height, width]`, and which of them are found `[B, D]`."""

@@ -193,9 +193,8 @@ class MongeMinimumEnergy(nn.Module):
         """
         psi, pressure, step = self.heights(origins, directions)
         x = self.material(psi, self._cells(psi, origins, directions), origins, directions)
-        return Equilibrium(
-            x, pressure, self.membrane.volume(self.surface(psi)), torch.zeros_like(x), step, torch.zeros_like(x[..., 0])
-        )
+        volume, none = self.membrane.volume(self.surface(psi)), torch.zeros_like(x)
+        return Equilibrium(x, pressure, volume, none, step, none[..., 0], none[..., 0, 0])
 
     def heights(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """`psi` at the free points, the pressure, and the last step over the surface's size (eqs. 22, 27 with `v.psi = 0`)."""

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ...solve.elimination import solve_positive
 from ..spacing import spacing
 from .ellipse import SOFTNESS, half_axes, metric_of, rms_half_axes
 from .pyramid import LEVELS
@@ -14,23 +15,6 @@ RING = 2.5  # widest ring of background around a dot in the fit, pixels of its l
 FINEST = 2.0  # a dot's short half axis on its level of the pyramid is at least this, where it can be
 MISFIT = 0.02  # of the residual's variance, what differs from image to image besides noise: most of it is the model's, in all
 RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, its slope over the dot, depth, shift, growth
-
-
-def solve_positive(system: Tensor) -> Tensor:
-    """`x [n, k, ...]` with `matrix x = loads` from `system = [matrix, loads] [n, n + k, ...]`: Gauss-Jordan without pivoting.
-
-    The matrix must be positive definite; the batch comes last, so that each row is one long vector.
-
-    Example:
-        >>> solve_positive(torch.tensor([[2.0, 0.0, 6.0], [0.0, 4.0, 2.0]])).tolist()
-        [[3.0], [0.5]]
-    """
-    n = system.shape[0]
-    unit = torch.eye(n, dtype=system.dtype, device=system.device).reshape(n, n, *(1,) * (system.ndim - 2))
-    for i in range(n):
-        column, rest = system.split([1, system.shape[1] - 1], 1)
-        system = rest - (column - unit[:, i : i + 1]) * (rest[i : i + 1] / column[i : i + 1])
-    return system
 
 
 class Outline(NamedTuple):

@@ -1,0 +1,185 @@
+"""What contacts tell: wrench, force, normal, area, slip and curvatures of patches, the rim; what of a membrane is seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import rotate
+
+from torchmembrane import Reconstructor, Status
+from torchmembrane.estimators.contact_patches import ContactPatches, contact_points
+from torchmembrane.io.results import ADDED, Reconstruction, completed
+from torchmembrane.markers.coverage import Coverage
+from torchmembrane.presets import preset
+from torchmembrane.simulate import Simulator, Sphere, Stroke
+from torchmembrane.simulate.appearance import Appearance
+from torchmembrane.surface.shapes import spherical_cap
+
+DOME = spherical_cap(12, 9, 3, (33, 33))
+PATCHES = ContactPatches(DOME)
+
+
+def pressed_by(x, centres, radius=3.0, size=0.02, shear=0.0):
+    """Traction of even pushes on discs about the rest vertices nearest to `centres`, with shear along x; and the discs."""
+    normals = DOME.normals(x)
+    along = torch.tensor([1.0, 0, 0], dtype=x.dtype) - normals[..., :1] * normals
+    along = along / along.norm(dim=-1, keepdim=True)
+    discs = [(DOME.rest - torch.tensor(c, dtype=x.dtype)).norm(dim=-1) < radius for c in centres]
+    disc = torch.stack(discs).any(0)[None, :, None] & ~DOME.fixed[:, None]
+    return size * disc * (shear * along - normals), normals, discs
+
+
+def told(x, traction, normals):
+    indicator = ((traction * normals).sum(-1) < 0).to(x.dtype)
+    inward = -(traction * normals).sum(-1) * DOME.rest_area
+    points, mine = contact_points(x, DOME.rest, inward, DOME.size, 4)
+    return PATCHES(x, normals, traction, indicator, points, mine)
+
+
+@pytest.mark.parametrize("shear", [0.0, 0.5])
+def test_patches_of_known_pushes(shear):
+    """Two discs: forces add up to the whole, areas are the discs', slip is the shear over the push."""
+    x = DOME.rest[None]
+    traction, normals, discs = pressed_by(x, [(6.0, 0.0, 11.0), (-6.0, 0.0, 11.0)], shear=shear)
+    found = told(x, traction, normals)
+    load = traction * DOME.rest_area[:, None]
+    torch.testing.assert_close(found.force[0, :2].sum(0), load.sum((0, 1)))
+    assert found.points[0, 2:].isnan().all() and found.force[0, 2:].isnan().all() and found.at_rim[0, 2:].isnan().all()
+    for k in range(2):
+        mine = discs[0] if found.points[0, k, 0] > 0 else discs[1]
+        torch.testing.assert_close(found.force[0, k], load[0, mine].sum(0))
+        torch.testing.assert_close(found.area[0, k], DOME.vertex_area(x)[0, mine].sum())
+        centre = (found.points[0, k] - torch.tensor([0.0, 0, DOME.rest[:, 2].max() - 12.5])) / 12.5  # the cap's own sphere
+        torch.testing.assert_close(found.normal[0, k], centre / centre.norm(), atol=0.03, rtol=0)
+        assert found.slip[0, k] == pytest.approx(shear, abs=0.02)
+    assert (found.at_rim[0, :2] == 0).all()
+
+
+@pytest.mark.parametrize("form", ["dent", "saddle"])
+def test_curvatures_are_those_of_the_surface(form):
+    """A dent in the shape of a sphere, and a saddle, on a plane: principal curvatures hollow seen from outside are positive."""
+    u, v = DOME.rest[:, 0] - 2.0, DOME.rest[:, 1] + 1.0
+    height = (u * u + v * v) / 10 if form == "dent" else (u * u - v * v) / 10
+    x = torch.stack([u, v, height], -1)[None]
+    traction, normals, _ = pressed_by(x, [(2.0, -1.0, 11.5)], radius=2.0)
+    found = told(x, traction, normals)
+    expected = torch.tensor([0.2, 0.2 if form == "dent" else -0.2])
+    torch.testing.assert_close(found.curvature[0, 0].float(), expected, atol=0.02, rtol=0)
+
+
+def test_curvatures_do_not_depend_on_the_frame():
+    """The surface turned in space has the same curvatures, also where its tangent plane is steep."""
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
+    turn = turn * torch.det(turn)
+    u, v = DOME.rest[:, 0], DOME.rest[:, 1]
+    x = torch.stack([u, v, u * u / 8 - v * v / 20 + 0.02 * u * v], -1)[None]
+    traction, normals, _ = pressed_by(x, [(0.0, 0.0, 12.0)], radius=2.5)
+    once, turned = told(x, traction, normals), told(x @ turn.mT, traction @ turn.mT, normals @ turn.mT)
+    torch.testing.assert_close(once.curvature, turned.curvature, atol=1e-4, rtol=1e-4, equal_nan=True)
+    torch.testing.assert_close(once.slip, turned.slip, equal_nan=True)
+    torch.testing.assert_close(once.normal @ turn.mT, turned.normal, equal_nan=True)
+
+
+def test_a_patch_of_fewer_than_two_grid_steps_has_no_curvature():
+    x = DOME.rest[None]
+    traction, normals, _ = pressed_by(x, [(0.0, 0.0, 12.0)], radius=0.5)
+    found = told(x, traction, normals)
+    assert found.curvature[0, 0].isnan().all() and found.area[0, 0] > 0
+
+
+def test_a_patch_at_the_rim_says_so_and_one_clear_of_it_does_not():
+    x = DOME.rest[None]
+    rim = DOME.rest[DOME.fixed].double()
+    for centre in DOME.rest[::37]:
+        if (centre - rim).norm(dim=-1).min() < 1.0:
+            continue
+        traction, normals, (disc,) = pressed_by(x, [centre.tolist()], radius=2.0)
+        found = told(x, traction, normals)
+        away = torch.cdist(DOME.rest[disc & ~DOME.fixed], rim).min() / DOME.size
+        if away < 0.02:
+            assert found.at_rim[0, 0] == 1
+        if away > 0.08:
+            assert found.at_rim[0, 0] == 0
+
+
+def test_coverage_is_the_share_of_area_near_found_markers():
+    """Half of the markers lost: half of the area; a lone lost one among found ones hides nothing; those unseen do not count."""
+    u, v = torch.meshgrid(torch.linspace(-9, 9, 12), torch.linspace(-9, 9, 12), indexing="ij")
+    positions = torch.stack([u, v, 0 * u], -1).reshape(-1, 3).double()
+    flat = spherical_cap(12, 0.5, 3, (33, 33))
+    positions[:, 2] = 3
+    seen = torch.ones(len(positions), dtype=torch.bool)
+    coverage = Coverage(flat, positions, seen)
+    found = torch.ones(3, len(positions), dtype=torch.float64)
+    found[1, positions[:, 0] > 0] = 0
+    found[2, 66] = 0
+    everything, half, lone = coverage(found).tolist()
+    assert everything == pytest.approx(1) and lone == pytest.approx(1) and half == pytest.approx(0.57, abs=0.04)
+    assert Coverage(flat, positions, positions[:, 0] < 0)(found)[1] == pytest.approx(1)
+
+
+@pytest.fixture(scope="module")
+def fingertip():
+    sensor = preset("fingertip")
+    sensor = replace(sensor, membrane=sensor.surface.membrane((17, 17)))
+    return Simulator(sensor, grid=(31, 31), appearance=Appearance(noise=35.0)), Reconstructor(sensor)
+
+
+@pytest.fixture(scope="module")
+def pressed(fingertip):
+    """A ball with friction pressed into the side: the state, its image, the truth and what is found."""
+    simulator, reconstructor = fingertip
+    way = np.array([0.5, 0.2, -1.0]) / np.linalg.norm([0.5, 0.2, -1.0])
+    stroke = Stroke(Sphere(5.0).touching(simulator.membrane, way), way, 2.0)
+    (state,) = simulator.presses(stroke, ("push",))
+    frame = simulator.frame(state, stroke, np.random.default_rng(0))
+    with torch.no_grad():
+        return state, frame, reconstructor(frame.image)
+
+
+def test_wrench_and_patch_against_the_simulator(fingertip, pressed):
+    simulator, (state, _, got) = fingertip[0], pressed
+    load = state.traction * simulator.membrane.rest_area[:, None]
+    force, moment = load.sum(0), torch.linalg.cross(state.vertices, load).sum(0)
+    assert (got.wrench[0, :3] - force).norm() < 0.1 * force.norm()
+    assert (got.wrench[0, 3:] - moment).norm() < 0.5 * force.norm()  # mm
+    assert got.contact_points[0, 1:].isnan().all() and (got.contact_force[0, 0] - force).norm() < 0.1 * force.norm()
+    assert got.contact_slip[0, 0] < 0.1 and got.contact_at_rim[0, 0] == 0
+    touched = state.contact
+    normal = torch.nn.functional.normalize(simulator.membrane.normals(state.vertices)[touched].mean(0), dim=0)
+    assert (got.contact_normal[0, 0] * normal).sum() > 0.995
+    area = float(simulator.membrane.vertex_area(state.vertices)[touched].sum())
+    assert 0.55 * area < got.contact_area[0, 0] < 1.8 * area  # whole vertices of a coarse grid
+    assert float(got.contact_curvature[0, 0].mean()) == pytest.approx(1 / 5.0, rel=0.25)
+
+
+def test_traction_splits_into_push_and_shear(pressed):
+    got = pressed[2]
+    push, shear = got.split_traction()
+    torch.testing.assert_close(shear - push[..., None] * got.normals, got.traction)
+    assert (shear * got.normals).sum(-1).abs().max() < 1e-5 * got.traction.abs().max()
+
+
+def test_a_moved_camera_and_a_hidden_part_are_said(fingertip, pressed):
+    """Clean, rotated by 3 degrees, a part covered with grey: an answer each, but the first with a doubt."""
+    reconstructor, image = fingertip[1], pressed[1].image
+    covered = image.copy()
+    covered[:, : image.shape[1] * 2 // 5] = np.median(image)
+    images = [image, rotate(image, 3.0, reshape=False, order=1, mode="nearest"), covered]
+    with torch.no_grad():
+        got = reconstructor(np.stack(images))
+    assert got.status.tolist() == [Status.OK, Status.UNEXPLAINED, Status.HIDDEN]
+    assert got.vertices.isfinite().all() and got.coverage[0] > 0.99 and 0.4 < got.coverage[2] < 0.85
+
+
+def test_frames_of_before_are_read_with_what_they_lack_as_nan(pressed):
+    frame = pressed[2].frame(0)
+    old = {key: value for key, value in frame.items() if key not in ADDED}
+    again = completed(old)
+    assert list(again) == list(Reconstruction._fields)
+    for key, value in frame.items():
+        assert again[key].shape == value.shape and again[key].dtype == value.dtype
+        assert np.isnan(again[key]).all() if key in ADDED else np.array_equal(again[key], value, equal_nan=True)
+    with pytest.raises(KeyError):
+        completed({key: value for key, value in frame.items() if key != "force"})

@@ -1,0 +1,41 @@
+"""How much of a membrane the markers that are found still see."""
+
+import torch
+from torch import Tensor, nn
+
+from ..surface.membrane import Membrane
+
+NEAREST = 4
+"""Markers that a vertex is asked of."""
+REACH = 1.5
+"""How far a marker sees, over the markers' spacing."""
+
+
+class Coverage(nn.Module):
+    """The share of a membrane's area near markers that are found, of what is near those seen at rest.
+
+    Args:
+        membrane: the rest surface on the solver's grid.
+        positions: of the markers, `[D, 3]`.
+        seen: `[D]` bool, which of them are seen at rest.
+    """
+
+    nearest: Tensor
+    near: Tensor
+    share: Tensor
+
+    def __init__(self, membrane: Membrane, positions: Tensor, seen: Tensor):
+        super().__init__()
+        reach = REACH * membrane.size / len(positions) ** 0.5
+        distance = torch.where(seen, torch.cdist(membrane.rest, positions.to(membrane.rest)), torch.inf)
+        distance, nearest = distance.topk(min(NEAREST, len(positions)), largest=False)
+        area = membrane.rest_area * (distance[:, 0] < reach)
+        self.register_buffer("nearest", nearest)
+        self.register_buffer("near", (distance < reach).double())
+        self.register_buffer("share", area / area.sum())
+
+    def forward(self, confidence: Tensor) -> Tensor:
+        """The share `[B]`, of markers with `confidence [B, D]`, 0 where one is lost."""
+        found = (confidence > 0).to(self.near.dtype)
+        seen: Tensor = (found[:, self.nearest] * self.near).amax(-1) @ self.share
+        return seen
