@@ -55,10 +55,11 @@ class Reconstructor(nn.Module):
         dtype: torch.float32 or torch.float64.
         locator: how markers are found in images: "fit", by least squares, or "soft", by soft-argmax of responses; default:
             "soft" for "paper", else "fit".
+        check_rest: whether a rest image that disagrees with the model by more than calibration could explain is refused.
 
     Raises:
         MembraneError: an unknown estimator or locator, settings of another one, a sensor that cannot see its membrane or
-            its markers.
+            its markers, or whose rest image disagrees with it.
 
     Example:
         >>> reconstructor = Reconstructor.from_file("examples/sensor.toml")
@@ -82,6 +83,7 @@ class Reconstructor(nn.Module):
         channels: Channels = "rgb",
         dtype: torch.dtype = torch.float32,
         locator: str | None = None,
+        check_rest: bool = True,
     ):
         super().__init__()
         if estimator not in ESTIMATORS:
@@ -95,14 +97,16 @@ class Reconstructor(nn.Module):
         self.image_size, self.model = sensor.camera.image_size, model or sensor.material.model
         self.camera, membrane = copy.deepcopy(sensor.camera), copy.deepcopy(sensor.membrane)
         vertex_pixels = self.camera.point_to_pixel(membrane.rest)
-        if not torch.isfinite(vertex_pixels).all():
+        imaged, whole = torch.isfinite(vertex_pixels).all(-1), estimator != "force-balance" or sensor.markers.positions is None
+        if not (imaged.all() if whole else imaged.any()):
             raise MembraneError(
-                f"sensor {sensor.name!r}: parts of the rest surface cannot be imaged by its camera; check the poses"
+                f"sensor {sensor.name!r}: parts of the rest surface cannot be imaged by its camera; check the poses (force "
+                "balance of listed dots can do with a part)"
             )
         markers, cavity = place_markers(sensor, vertex_pixels, locator), cavity_filling(sensor, membrane, warn=True)
         positions, model_pixels = torch.from_numpy(markers.positions), torch.from_numpy(markers.model_pixels)
-        rim_pixels, rest_image = vertex_pixels[membrane.fixed].numpy(), sensor.markers.rest_image
-        self.observer = MarkerObserver(markers, rim_pixels, sensor.name, dtype, rest_image)
+        rim_pixels, rest_image = vertex_pixels[membrane.fixed & imaged].numpy(), sensor.markers.rest_image
+        self.observer = MarkerObserver(markers, rim_pixels, sensor.name, dtype, rest_image, self.image_size, check_rest)
         problem = Problem(
             camera=self.camera,
             membrane=membrane,

@@ -67,14 +67,7 @@ class Tracker:
         images = self._latest if frame is None else self._one(frame)
         if images is None:
             raise MembraneError("Tracker.rezero: no frame yet; pass one without contact")
-        observer = self.reconstructor.observer
-        flow = observer(images)
-        status = Status(int(observer.judge(*flow).status[0]))
-        if status is not Status.OK:
-            raise MembraneError(f"Tracker.rezero: {status.text}; expected a frame without contact that shows the markers")
-        pixels, found = observer.locate(images)
-        self._rest_pixels = torch.where(found[0, :, None], pixels[0], observer.measured_rest)
-        self._before = None
+        self._rest_pixels, self._before = self.reconstructor.observer.rest_of(images), None
 
     def _one(self, frame: Tensor | np.ndarray) -> Tensor:
         images = self.reconstructor.grey(frame)

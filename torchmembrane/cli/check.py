@@ -33,7 +33,8 @@ def run(arguments: Namespace) -> int:
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     reconstructor, problem = None, None
     try:
-        reconstructor = Reconstructor(sensor)
+        reconstructor = Reconstructor(sensor, check_rest=False)
+        reconstructor.observer.check_rest(sensor.name)
     except MembraneError as error:
         problem = error
     frame = None if reconstructor is None else rest_frame(reconstructor)

@@ -36,6 +36,8 @@ def add_parser(commands: Any) -> None:
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: %(default)s)")
     add("--batch", metavar="N", type=count, default=16, help="frames computed at once (default: %(default)s)")
     add("--video", action="store_true", help="treat every input as a video (mp4, mov, avi, mkv, webm always are)")
+    own = "images of this recording without contact, or first:N, its first N frames: their mean is rest (default: the sensor's)"
+    add("--rest", metavar="IMAGES", nargs="+", default=[], help=own)
     one = "one .npz per frame, or one dataset (default: %(default)s)"
     add("--format", choices=RESULT_FORMATS, default=RESULT_FORMATS[0], help=one)
     add("--figures", action="store_true", help="also NAME.png: flow, side view and displacement of every frame")
@@ -49,6 +51,7 @@ def run(arguments: Namespace) -> int:
     from ..io.store import Settings, check_folder
     from ..jobs.inputs import find_inputs
     from ..jobs.local import reconstruct_files
+    from ..jobs.rest import recording_rest
     from ..presets import sensor_file
     from ..sensor.sensor import Sensor
     from .build import build_reconstructor
@@ -58,9 +61,10 @@ def run(arguments: Namespace) -> int:
     inputs = find_inputs(arguments.images, arguments.video)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     reconstructor = build_reconstructor(sensor, arguments).to(arguments.device)
-    settings = Settings.of(reconstructor, arguments.format)
+    settings = Settings.of(reconstructor, arguments.format, " ".join(arguments.rest))
     check_folder(arguments.out, sensor.fingerprint, settings)
-    options = {"batch": arguments.batch, "figures": arguments.figures}
+    rest = recording_rest(reconstructor, arguments.rest, inputs) if arguments.rest else None
+    options = {"batch": arguments.batch, "figures": arguments.figures, "rest_pixels": rest}
     counts = reconstruct_files(reconstructor, inputs, arguments.out, settings, **options)
     doubts = ("not converged", counts.not_converged), ("unexplained", counts.unexplained), ("partly hidden", counts.hidden)
     said = ", ".join(f"{count} {doubt}" for doubt, count in doubts if count)

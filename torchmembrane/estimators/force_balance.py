@@ -252,7 +252,8 @@ class ForceBalance(nn.Module):
     def is_explained(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the markers are off their rays by no more than their noise and the model's error."""
         coarse = max(1.0, (RESOLVED - 1) / (min(self.membrane.grid) - 1))
-        return ~(found.misfit > self.settings.largest_misfit * coarse**2)
+        explained: Tensor = ~(found.misfit > self.settings.largest_misfit * coarse**2)
+        return explained
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes."""

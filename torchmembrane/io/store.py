@@ -18,6 +18,7 @@ FINISHED = tuple(status for status in Status if status.has_surface)
 """Status of frames that are not tried again."""
 FORMATS = ("npz", "parquet")
 MESH = "mesh.npz"
+OWN = "of the sensor"
 
 
 class Settings(NamedTuple):
@@ -31,10 +32,11 @@ class Settings(NamedTuple):
     flow: str = "smooth"
     smoothing: float = 0.0
     locator: str = "fit"
+    rest: str = ""
 
     @classmethod
-    def of(cls, reconstructor: "Reconstructor", format: str) -> "Settings":
-        """Those of results that a reconstructor makes."""
+    def of(cls, reconstructor: "Reconstructor", format: str, rest: str = "") -> "Settings":
+        """Those of results that a reconstructor makes; `rest`: what was taken for rest in place of the sensor's rest image."""
         estimator = reconstructor.estimator
         return cls(
             estimator=reconstructor.estimator_name,
@@ -45,6 +47,7 @@ class Settings(NamedTuple):
             flow=estimator.flow_kind,
             smoothing=estimator.smoothing_weight,
             locator=reconstructor.locator_name,
+            rest=rest,
         )
 
 
@@ -61,7 +64,7 @@ class Mesh(NamedTuple):
     image_size      [2]     int64, width and height, px
     length_unit, force_unit, name    of the sensor
     sensor          fingerprint of its file
-    estimator, energy, element, format, volume, flow, smoothing, locator    the `Settings`
+    estimator, energy, element, format, volume, flow, smoothing, locator, rest    the `Settings`
     """
 
     rest_vertices: np.ndarray
@@ -84,6 +87,7 @@ class Mesh(NamedTuple):
     flow: str = "smooth"
     smoothing: float = 0.0
     locator: str = "fit"
+    rest: str = ""
 
     @classmethod
     def of(cls, reconstructor: "Reconstructor", settings: Settings) -> "Mesh":
@@ -149,9 +153,10 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
         )
     for option, before, now in zip(Settings._fields, mesh.settings, settings, strict=True):
         if before != now:
+            remedy = f"pass --{option} {before}" if before else f"leave --{option} out"
             raise MembraneError(
-                f"--out {folder}: was made with {option} {before}, this call asks for {now}; "
-                f"choose another folder, or pass --{option} {before}"
+                f"--out {folder}: was made with {option} {before or OWN}, this call asks for {now or OWN}; choose another "
+                f"folder, or {remedy}"
             )
 
 

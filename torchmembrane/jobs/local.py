@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from ..errors import MembraneError
 from ..io.frames import Frame, open_folder
@@ -43,6 +44,7 @@ def reconstruct_files(
     *,
     batch: int = 16,
     figures: bool = False,
+    rest_pixels: Tensor | None = None,
     report: Callable[[str], None] | None = None,
 ) -> FrameCounts:
     """Reconstruct all frames of `inputs` that have no finished result in the folder `out` yet.
@@ -57,6 +59,7 @@ def reconstruct_files(
         settings: what the reconstructor was made with, and the format of the results.
         batch: frames computed at once; at most three batches of images are in memory.
         figures: also NAME.png for every frame; a finished frame that lacks its figure is done again.
+        rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
         report: called with one line per failed frame (default: the line is written to stderr, above the progress bar).
 
     Returns:
@@ -88,7 +91,7 @@ def reconstruct_files(
     try:
         with torch.no_grad(), _progress(inputs, folder.finished) as progress:
             for group in read_ahead(waiting, batch):
-                for frame, result, seconds in _reconstructed(reconstructor, group):
+                for frame, result, seconds in _reconstructed(reconstructor, group, rest_pixels):
                     status = folder.keep(frame, result, seconds)
                     done[status] += 1
                     if status not in FINISHED:
@@ -145,14 +148,15 @@ class _ResultFolder:
 
 
 def _reconstructed(
-    reconstructor: "Reconstructor", group: list[DecodedFrame]
+    reconstructor: "Reconstructor", group: list[DecodedFrame], rest_pixels: Tensor | None
 ) -> Iterator[tuple[DecodedFrame, Frame | None, float]]:
     """Every frame of a batch with its result, None for an unreadable one, and the seconds that it took."""
     start = time.perf_counter()
     images = [frame.image for frame in group if frame.image is not None]
     results: Iterator[Frame] = iter(())
     if images:
-        computed = Reconstruction(*(field.cpu() for field in reconstructor(torch.cat(images))))
+        options = {} if rest_pixels is None else {"rest_pixels": rest_pixels}
+        computed = Reconstruction(*(field.cpu() for field in reconstructor(torch.cat(images), **options)))
         results = iter([computed.frame(i) for i in range(len(images))])
     seconds = (time.perf_counter() - start) / max(len(images), 1)
     for frame in group:

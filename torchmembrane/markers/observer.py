@@ -18,6 +18,7 @@ NOISE = 0.05
 FOUND = 0.5
 """Confidence above which a marker counts as found."""
 FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5  # of the markers: fewer found are too few, or an image unlike the rest image
+LARGEST_OFFSET = 0.005  # of the image's diagonal: rms, by which markers at rest may lie off the model's
 LEAST_CONTRAST, SATURATED_SHARE = 0.02, 0.98
 SPARSE = 4  # px: every so many rows and columns are asked whether they are saturated
 
@@ -41,9 +42,11 @@ class MarkerObserver(nn.Module):
         name: the sensor's, for messages.
         dtype: precision of the pixels.
         rest_image: `[height, width]` grey, or None: displacements are then from where the model sees the markers.
+        image_size: width and height; what the model has outside is not seen, not lost.
+        check_rest: whether a rest image that disagrees with the model is refused.
 
     Raises:
-        MembraneError: most markers are not found in the rest image.
+        MembraneError: most markers in view are not found in the rest image, or they lie far from where the model has them.
     """
 
     rest_pixels: Tensor
@@ -52,7 +55,14 @@ class MarkerObserver(nn.Module):
     seen_at_rest: Tensor
 
     def __init__(
-        self, markers: PlacedMarkers, rim_pixels: np.ndarray, name: str, dtype: torch.dtype, rest_image: np.ndarray | None
+        self,
+        markers: PlacedMarkers,
+        rim_pixels: np.ndarray,
+        name: str,
+        dtype: torch.dtype,
+        rest_image: np.ndarray | None,
+        image_size: tuple[int, int],
+        check_rest: bool = True,
     ):
         super().__init__()
         self.locator: Locator = markers.locator
@@ -60,12 +70,21 @@ class MarkerObserver(nn.Module):
         self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
         self.register_buffer("measured_rest", torch.from_numpy(markers.model_pixels))
         self.register_buffer("rest_covariance", isotropic(self.rest_pixels[:, 0], NOISE))
-        self.register_buffer("seen_at_rest", torch.ones_like(self.rest_pixels[:, 0], dtype=torch.bool))
+        in_view = ((self.rest_pixels >= 0) & (self.rest_pixels <= torch.tensor(image_size) - 1)).all(-1)
+        if in_view.sum() < FEWEST_MARKERS:
+            raise MembraneError(
+                f"sensor {name!r}: {int(in_view.sum())} of {len(in_view)} markers are in the camera's view; expected at least "
+                f"{FEWEST_MARKERS}: check the camera's pose and focal length"
+            )
+        self.register_buffer("seen_at_rest", in_view)
         self.to(dtype)
         if rest_image is not None:
             self.measured_rest, self.rest_covariance, self.seen_at_rest = self._in_rest_image(
                 torch.from_numpy(rest_image).to(dtype), name
             )
+        self.largest_offset = LARGEST_OFFSET * float(np.hypot(*image_size))
+        if check_rest:
+            self.check_rest(name)
 
     def _in_rest_image(self, image: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor]:
         """The markers in the rest image, their covariance, which are found: subtracted from every frame's, rest offsets are
@@ -73,12 +92,44 @@ class MarkerObserver(nn.Module):
         with torch.no_grad():
             pixels, confidence, covariance = self.locator(image[None, None])
         found = confidence > FOUND
-        if found.sum() < max(FEWEST_MARKERS, ALIKE_SHARE * found.shape[1]):
+        in_view = int(self.seen_at_rest.sum())
+        if found.sum() < max(FEWEST_MARKERS, ALIKE_SHARE * in_view):
             raise MembraneError(
-                f"sensor {name!r}: only {int(found.sum())} of {found.shape[1]} markers are found in the rest image; "
+                f"sensor {name!r}: only {int(found.sum())} of {in_view} markers in view are found in the rest image; "
                 "expected most: check the marker file, the polarity and the camera against the image"
             )
         return torch.where(found[0, :, None], pixels[0], self.measured_rest), covariance[0], found[0]
+
+    def rest_offset(self) -> float:
+        """Rms distance of the markers in the rest image from where the model has them, px."""
+        off2 = (self.measured_rest - self.rest_pixels).square().sum(-1)
+        return float(off2[self.seen_at_rest].mean().sqrt())
+
+    def check_rest(self, name: str) -> None:
+        """Refuse a rest image that disagrees with the model by more than calibration could explain."""
+        largest = self.largest_offset
+        if (offset := self.rest_offset()) > largest:
+            raise MembraneError(
+                f"sensor {name!r}: in the rest image the markers lie {offset:.1f} px (rms) from where the model has them; "
+                f"expected at most {largest:.1f}: check that camera, surface and rest image are of one sensor, and that the "
+                "camera has not moved; `torchmembrane calibrate rest` fits the rest surface to the image"
+            )
+
+    def rest_of(self, images: Tensor) -> Tensor:
+        """The markers without contact, `[D, 2]` px, in grey images `[B, 1, height, width]` at rest, averaged; those that are
+        found in none keep their places in the sensor's rest image.
+
+        Raises:
+            MembraneError: an image that does not show the markers.
+        """
+        status = self.judge(*self(images)).status
+        if (status != Status.OK.value).any():
+            bad = int(status.ne(Status.OK.value).nonzero()[0])
+            raise MembraneError(f"rest image {bad}: {Status(int(status[bad])).text}; expected a frame without contact")
+        pixels, found = self.locate(images)
+        weight = found[..., None].to(pixels.dtype)
+        mean = (weight * pixels).sum(0) / weight.sum(0).clamp_min(1)
+        return torch.where(found.any(0)[:, None], mean, self.measured_rest)
 
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels `[B, D, 2]` of the markers in grey images `[B, 1, height, width]`, and which of them are found `[B, D]`."""
@@ -150,9 +201,9 @@ class MarkerObserver(nn.Module):
     def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
         """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""
         found = confidence > FOUND
-        count, D = found.sum(-1), found.shape[-1]
+        count, D = found.sum(-1), self.seen_at_rest.sum()
         unlike = torch.where(count < ALIKE_SHARE * D, Status.UNLIKE_REST.value, Status.OK.value)
-        few = torch.where(count < max(FEWEST_MARKERS, FEWEST_SHARE * D), Status.TOO_FEW_MARKERS.value, unlike)
+        few = torch.where(count < (FEWEST_SHARE * D).clamp_min(FEWEST_MARKERS), Status.TOO_FEW_MARKERS.value, unlike)
         status = torch.where(status == Status.OK.value, few, status)
         usable = (status == Status.OK.value)[:, None, None]
         return MarkerFlow(displacement * usable, torch.where(found, confidence, 0.0), covariance, status)

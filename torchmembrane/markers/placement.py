@@ -62,6 +62,7 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS
     if markers.kind == "dots" and markers.positions is not None:
         positions = np.asarray(markers.positions, dtype=float)
         pattern = _listed_pattern(sensor, positions)
+        anchors = anchors[np.isfinite(anchors).all(1)]
         built = of_dots(pattern, (width, height), markers.polarity, anchors)
     else:
         image, mask = markers.rest_image, rim_mask(sensor, vertex_pixels)
@@ -90,7 +91,10 @@ def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]
 
 
 def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
-    return sensor.camera.point_to_pixel(torch.from_numpy(positions)).numpy()
+    """Where the camera sees `positions [D, 3]`; what it cannot image lies far outside, each point elsewhere."""
+    pixels = sensor.camera.point_to_pixel(torch.from_numpy(positions)).numpy()
+    outside = -float(max(sensor.camera.image_size)) * (2 + np.arange(len(pixels)))
+    return np.where(np.isfinite(pixels).all(1, keepdims=True), pixels, outside[:, None])
 
 
 def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -114,6 +118,9 @@ def _listed_pattern(sensor: Sensor, positions: np.ndarray) -> DotPattern:
     markers, pixels = sensor.markers, _model_pixels(sensor, positions)
     sizes = np.array([int(size == "large") for size in markers.sizes or ()], dtype=int)
     shapes = _unit_dot_shapes(sensor, positions)
+    in_view = np.logical_and(pixels >= 0, pixels <= np.array(sensor.camera.image_size) - 1).all(1)
+    if in_view.any():  # what is outside, some of it behind the camera, tells nothing of how dots look
+        shapes = np.where(in_view[:, None, None], shapes, np.median(shapes[in_view], 0))
     if markers.rest_image is None:
         pitch = (float(sensor.membrane.rest_area.sum()) / len(sizes)) ** 0.5
         return DotPattern(pixels, shapes * np.array(DOT_RADIUS)[sizes][:, None, None] * pitch, sizes)

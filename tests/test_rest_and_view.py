@@ -1,0 +1,122 @@
+"""Where rest is: a rest image that disagrees, a recording's own; and cameras that see a part of the membrane."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import torchmembrane as tm
+from torchmembrane.camera.model import Camera
+from torchmembrane.cli.main import main
+from torchmembrane.presets import preset
+from torchmembrane.simulate import Simulator, Sphere, Stroke
+from torchmembrane.simulate.appearance import Appearance
+
+WAY = np.array([0.1, 0.2, -1.0]) / np.linalg.norm([0.1, 0.2, -1.0])
+
+
+def seen_by(scale=1.0, shift=0.0):
+    """The fingertip on 17 x 17 vertices, its camera's focal length times `scale`, its centre moved by `shift` px; simulator."""
+    sensor = preset("fingertip")
+    camera = sensor.camera
+    centre = (float(camera.centre[0]) + shift, float(camera.centre[1]))
+    camera = Camera(camera.model, camera.image_size, tuple((scale * camera.focal).tolist()), centre, camera.distortion.tolist())
+    markers = replace(sensor.markers, rest_image=None)
+    sensor = replace(sensor, camera=camera, membrane=sensor.surface.membrane((17, 17)), markers=markers)
+    simulator = Simulator(sensor, grid=(31, 31), appearance=Appearance(noise=35.0))
+    return replace(sensor, markers=replace(markers, rest_image=simulator.rest_image())), simulator
+
+
+def pressed(simulator, seed=0):
+    stroke = Stroke(Sphere(3.0).touching(simulator.membrane, WAY), WAY, 1.6)
+    (state,) = simulator.presses(stroke, ("push",))
+    return simulator.frame(state, stroke, np.random.default_rng(seed))
+
+
+@pytest.fixture(scope="module")
+def fingertip():
+    return seen_by()
+
+
+@pytest.mark.parametrize(("shift", "said"), [(0, None), (2, None), (6, "6.0 px"), (40, "px")])
+def test_a_rest_image_that_disagrees_is_refused_by_how_much(fingertip, shift, said):
+    sensor, _ = fingertip
+    moved = replace(sensor, markers=replace(sensor.markers, rest_image=np.roll(sensor.markers.rest_image, shift, 1)))
+    if said is None:
+        assert tm.Reconstructor(moved).observer.rest_offset() == pytest.approx(shift, abs=0.1)
+        return
+    with pytest.raises(tm.MembraneError, match=said):
+        tm.Reconstructor(moved)
+
+
+def test_check_opens_a_sensor_that_disagrees_and_says_so(fingertip, tmp_path, capsys):
+    sensor, _ = fingertip
+    moved = replace(sensor, markers=replace(sensor.markers, rest_image=np.roll(sensor.markers.rest_image, 9, 1)))
+    moved.to_file(tmp_path / "sensor.toml")
+    assert main(["check", str(tmp_path / "sensor.toml"), "--out", str(tmp_path / "drawn.png")]) == 2
+    told = capsys.readouterr()
+    assert "found in the rest image" in told.out and "9.0" in told.out and (tmp_path / "drawn.png").exists()
+    assert "calibrate rest" in told.err
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1.5, 120.0), (2.2, 0.0)])
+def test_a_part_of_the_membrane_is_seen_and_the_press_in_it_found(scale, shift):
+    """Dots outside the image are unseen, not lost: the surface is known at those in view, and they alone count."""
+    sensor, simulator = seen_by(scale, shift)
+    reconstructor = tm.Reconstructor(sensor)
+    seen = reconstructor.observer.seen_at_rest
+    assert 0.5 * len(seen) < seen.sum() < 0.95 * len(seen)
+    frame = pressed(simulator)
+    with torch.no_grad():
+        result = reconstructor(frame.image)
+    X, Y = frame.truth["dots_nominal"], frame.truth["dots_deformed"]
+    assert result.status.tolist() == [0] and result.coverage[0] > 0.95
+    assert np.linalg.norm(result.markers[0].numpy() - Y) < 0.15 * np.linalg.norm(Y - X)
+    assert np.linalg.norm(result.force[0].numpy() - frame.truth["force"]) < 0.25 * np.linalg.norm(frame.truth["force"])
+
+
+def test_what_the_lens_cannot_image_is_no_error(fingertip):
+    """A pinhole camera inside the membrane: what lies beside or behind it has no pixel."""
+    sensor, _ = fingertip
+    rest = sensor.membrane.rest.reshape(17, 17, 3).numpy() - np.array([0, 0, 6.0])
+    surface = replace(sensor.surface, values=sensor.surface.values | {"base_z": sensor.surface.values["base_z"] - 6.0})
+    camera = Camera("pinhole", (640, 480), (250, 250), (320, 240))
+    positions = sensor.markers.positions - np.array([0, 0, 6.0])
+    assert (rest[..., 2] < 0).any()
+    lowered = replace(
+        sensor,
+        camera=camera,
+        surface=surface,
+        membrane=surface.membrane((17, 17)),
+        markers=replace(sensor.markers, positions=positions, rest_image=None),
+    )
+    reconstructor = tm.Reconstructor(lowered)
+    assert not reconstructor.vertex_pixels.isfinite().all()
+    result = reconstructor.from_pixels(reconstructor.rest_pixels, reconstructor.observer.seen_at_rest.float())
+    assert result.status.tolist() == [0] and result.force.norm() < 1e-3
+    with pytest.raises(tm.MembraneError, match="cannot be imaged"):
+        tm.Reconstructor(lowered, "minimum-energy")
+
+
+def test_a_recording_brings_its_own_rest(fingertip, tmp_path, capsys):
+    """All images shifted by 3 px: against the sensor's rest a false press, against their own the press."""
+    sensor, simulator = fingertip
+    sensor.to_file(tmp_path / "sensor.toml")
+    frame = pressed(simulator)
+    images = [simulator.image(simulator.membrane.rest, np.random.default_rng(k)) for k in range(3)] + [frame.image]
+    for k, image in enumerate(images):
+        Image.fromarray(np.roll(image, 3, 1)).save(tmp_path / f"i{k}.png")
+    files = [str(tmp_path / f"i{k}.png") for k in range(4)]
+    truth = frame.truth["force"]
+    errors = {}
+    for name, options in {"own": [], "first": ["--rest", "first:3"], "files": ["--rest", *files[:3]]}.items():
+        out = tmp_path / name
+        assert main(["reconstruct", str(tmp_path / "sensor.toml"), *files, "--out", str(out), *options]) == 0
+        force = tm.read_results(out)["i3"]["force"]
+        errors[name] = np.linalg.norm(force - truth) / np.linalg.norm(truth)
+    assert errors["own"] > 0.3 and errors["first"] < 0.12 and errors["files"] == pytest.approx(errors["first"], abs=1e-6)
+    again = ["reconstruct", str(tmp_path / "sensor.toml"), *files, "--out", str(tmp_path / "first")]
+    assert main(again) == 2 and "--rest first:3" in capsys.readouterr().err
+    assert main([*again, "--rest", "first:none"]) == 2
