@@ -97,12 +97,7 @@ class Reconstructor(nn.Module):
         self.image_size, self.model = sensor.camera.image_size, model or sensor.material.model
         self.camera, membrane = copy.deepcopy(sensor.camera), copy.deepcopy(sensor.membrane)
         vertex_pixels = self.camera.point_to_pixel(membrane.rest)
-        imaged, whole = torch.isfinite(vertex_pixels).all(-1), estimator != "force-balance" or sensor.markers.positions is None
-        if not (imaged.all() if whole else imaged.any()):
-            raise MembraneError(
-                f"sensor {sensor.name!r}: parts of the rest surface cannot be imaged by its camera; check the poses (force "
-                "balance of listed dots can do with a part)"
-            )
+        imaged = _imaged(sensor, estimator, vertex_pixels)
         markers, cavity = place_markers(sensor, vertex_pixels, locator), cavity_filling(sensor, membrane, warn=True)
         positions, model_pixels = torch.from_numpy(markers.positions), torch.from_numpy(markers.model_pixels)
         rim_pixels, rest_image = vertex_pixels[membrane.fixed & imaged].numpy(), sensor.markers.rest_image
@@ -338,6 +333,18 @@ class Reconstructor(nn.Module):
                     "sensor's; it is of another one, or from before a calibration: leave previous out to start from rest"
                 )
         return previous
+
+
+def _imaged(sensor: Sensor, estimator: str, vertex_pixels: Tensor) -> Tensor:
+    """Which vertices the camera can image, `[V]` bool; refused where some cannot be imaged that must."""
+    imaged = torch.isfinite(vertex_pixels).all(-1)
+    whole = estimator != "force-balance" or sensor.markers.positions is None
+    if not (imaged.all() if whole else imaged.any()):
+        raise MembraneError(
+            f"sensor {sensor.name!r}: parts of the rest surface cannot be imaged by its camera; check the poses (force "
+            "balance of listed dots can do with a part)"
+        )
+    return imaged
 
 
 def _estimator(problem: Problem, name: str, settings: Settings | None) -> AnyEstimator:

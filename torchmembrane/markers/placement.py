@@ -118,7 +118,7 @@ def _listed_pattern(sensor: Sensor, positions: np.ndarray) -> DotPattern:
     markers, pixels = sensor.markers, _model_pixels(sensor, positions)
     sizes = np.array([int(size == "large") for size in markers.sizes or ()], dtype=int)
     shapes = _unit_dot_shapes(sensor, positions)
-    in_view = np.logical_and(pixels >= 0, pixels <= np.array(sensor.camera.image_size) - 1).all(1)
+    in_view = np.all(np.logical_and(pixels >= 0, pixels <= np.array(sensor.camera.image_size) - 1), axis=1)
     if in_view.any():  # what is outside, some of it behind the camera, tells nothing of how dots look
         shapes = np.where(in_view[:, None, None], shapes, np.median(shapes[in_view], 0))
     if markers.rest_image is None:
