@@ -33,7 +33,7 @@ CONTRACT = {
     "confidence": (7,), "traction": (25, 3), "contact": (25,), "contact_points": (4, 3), "force": (3,), "pressure": (),
     "pressure_change": (), "volume_error": (), "residual": (), "status": (), "wrench": (6,), "contact_force": (4, 3),
     "contact_normal": (4, 3), "contact_area": (4,), "contact_slip": (4,), "contact_curvature": (4, 2), "contact_at_rim": (4,),
-    "coverage": (),
+    "coverage": (), "camera_motion": (4,),
 }  # fmt: skip
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import rotate
 
 from torchmembrane import Reconstructor, Status
 from torchmembrane.estimators.contact_patches import ContactPatches, contact_points
@@ -161,16 +160,14 @@ def test_traction_splits_into_push_and_shear(pressed):
     assert (shear * got.normals).sum(-1).abs().max() < 1e-5 * got.traction.abs().max()
 
 
-def test_a_moved_camera_and_a_hidden_part_are_said(fingertip, pressed):
-    """Clean, rotated by 3 degrees, a part covered with grey: an answer each, but the first with a doubt."""
+def test_a_hidden_part_is_said(fingertip, pressed):
     reconstructor, image = fingertip[1], pressed[1].image
     covered = image.copy()
     covered[:, : image.shape[1] * 2 // 5] = np.median(image)
-    images = [image, rotate(image, 3.0, reshape=False, order=1, mode="nearest"), covered]
     with torch.no_grad():
-        got = reconstructor(np.stack(images))
-    assert got.status.tolist() == [Status.OK, Status.UNEXPLAINED, Status.HIDDEN]
-    assert got.vertices.isfinite().all() and got.coverage[0] > 0.99 and 0.4 < got.coverage[2] < 0.85
+        got = reconstructor(np.stack([image, covered]))
+    assert got.status.tolist() == [Status.OK, Status.HIDDEN]
+    assert got.vertices.isfinite().all() and got.coverage[0] > 0.99 and 0.4 < got.coverage[1] < 0.85
 
 
 def test_frames_of_before_are_read_with_what_they_lack_as_nan(pressed):

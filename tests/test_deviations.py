@@ -76,11 +76,11 @@ def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(na
     pixels = exact + NOISE * torch.randn(DRAWS, *exact.shape, generator=generator, dtype=torch.float64)
     with torch.no_grad():
         clean = estimate(estimator, camera, exact[None])
-        start = clean.vertices.repeat(DRAWS, 1, 1), clean.pressure.repeat(DRAWS)
+        start = clean.vertices.repeat(DRAWS, 1, 1), clean.pressure.repeat(DRAWS), clean.moved.repeat(DRAWS, 1)
         result = estimate(estimator, camera, pixels, start)
         noise = turns(estimator, camera, pixels, result.vertices)
         observation = estimator.prepare(camera, pixels, torch.ones_like(pixels[..., 0]))
-        deviations = estimator.standard_deviations(result.vertices, result.pressure, observation, noise)
+        deviations = estimator.standard_deviations(result.vertices, result.pressure, result.moved, observation, noise)
     free = estimator.membrane.free_vertices
     for values, spread in (
         (result.vertices[:, free], deviations.vertices[:, free]),
@@ -93,7 +93,7 @@ def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(na
 def test_deviations_grow_with_the_noise_and_leave_the_rim_alone():
     estimator, camera, exact = observed("cap", 9, truth_grid=15, steps=6)
     result = estimate(estimator, camera, exact[None])
-    rays, weight, found = camera.pixel_to_ray(exact[None]), torch.ones_like(exact[None, :, 0]), result[:2]
+    rays, weight, found = camera.pixel_to_ray(exact[None]), torch.ones_like(exact[None, :, 0]), (*result[:2], result.moved)
     all_found = Observation(*rays, weight)
     once, twice = (estimator.standard_deviations(*found, all_found, k * NOISE / 168) for k in (1, 2))
     for a, b in zip(once, twice, strict=True):

@@ -11,6 +11,7 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.bearings import Bearings
 from torchmembrane.estimators.contact_patches import contact_indicator, contact_points
+from torchmembrane.estimators.descent import State
 from torchmembrane.estimators.force_balance import ForceBalance
 from torchmembrane.estimators.robust import Cauchy
 from torchmembrane.estimators.settings import ForceBalanceSettings
@@ -133,12 +134,14 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     )
     x, p = bent(dome), torch.tensor([0.3], dtype=torch.float64)
     directions = torch.nn.functional.normalize(positions + 0.3, dim=-1)[None]
+    motion = torch.rand(1, 2, 4, directions.shape[1], generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     measured = Bearings(
-        0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, directions.shape[1]).double(), ONE
+        0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, directions.shape[1]).double(), ONE, motion
     )
+    moved = torch.tensor([[0.3, -0.2, 0.1, 0.5]], dtype=torch.float64)
     equations = estimator.equations
     at = equations.forces.linearised(x, p)
-    angle, jacobian = equations.bearings.angles(x, measured)
+    angle, jacobian = equations.bearings.angles(x, measured, moved)
     generator = torch.Generator().manual_seed(3)
     weight = torch.rand(1, len(positions), generator=generator, dtype=torch.float64)
     root = torch.rand(1, at.force.shape[-1], 3, 3, generator=generator, dtype=torch.float64)
@@ -150,7 +153,7 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     moving = equations.forces.inner_free.repeat(3) > 0
     unknowns = torch.nonzero(moving).ravel()
     A = jacobian_at_inner_vertices(lambda y: inner(equations.forces(y, p), dome.grid).mT, x, estimator)
-    J = jacobian_at_inner_vertices(lambda y: equations.bearings.angles(y, measured)[0], x, estimator)
+    J = jacobian_at_inner_vertices(lambda y: equations.bearings.angles(y, measured, moved)[0], x, estimator)
     A, J = (by_component(rows)[:, unknowns] for rows in (A, J))
     W = torch.diag_embed(W[0]).movedim(2, 1).flatten(2).flatten(0, 1)
     w = torch.diag(weight[0].repeat(2))
@@ -164,23 +167,30 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     solved = equations.system.substitute(equations.system.factor(matrix), loads)[0].T
     torch.testing.assert_close(solved[unknowns], torch.linalg.solve(M, loads[0].T[unknowns]))
     assert (solved.count_nonzero(0) == len(unknowns)).all()
-    moved = torch.zeros_like(loads)
-    moved[..., unknowns] = torch.rand(3, len(unknowns), generator=generator, dtype=torch.float64)
-    product = equations.product(normal, moved)[0].T
-    torch.testing.assert_close(product[unknowns], (A.T @ W @ A + J.T @ w @ J) @ moved[0].T[unknowns])
+    steps = torch.zeros_like(loads)
+    steps[..., unknowns] = torch.rand(3, len(unknowns), generator=generator, dtype=torch.float64)
+    product = equations.product(normal, steps)[0].T
+    torch.testing.assert_close(product[unknowns], (A.T @ W @ A + J.T @ w @ J) @ steps[0].T[unknowns])
     assert (product.count_nonzero(0) == len(unknowns)).all()
+    of_camera = equations.motion(normal, measured, angle)
+    K = motion[0].movedim(1, -1).flatten(0, 1)
+    torch.testing.assert_close(of_camera.coupling[0, :, unknowns], K.T @ w @ J)
+    torch.testing.assert_close(of_camera.own[0], K.T @ w @ K)
+    torch.testing.assert_close(of_camera.slope[0], K.T @ w @ angle.flatten())
 
 
 def test_the_bearing_jacobian_is_the_derivative_of_the_angles():
     estimator = make(7)
     bearings = estimator.equations.bearings
     directions = torch.nn.functional.normalize(bearings.positions + 0.3, dim=-1)[None]
+    motion = torch.rand(1, 2, 4, directions.shape[1], generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     measured = Bearings(
-        0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, directions.shape[1]).double(), ONE
+        0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, directions.shape[1]).double(), ONE, motion
     )
+    moved = torch.tensor([[0.3, -0.2, 0.1, 0.5]], dtype=torch.float64)
     x = bent(estimator.membrane)
-    _, jacobian = bearings.angles(x, measured)
-    exact = torch.autograd.functional.jacobian(lambda y: bearings.angles(y, measured)[0], x)[0, :, :, 0]
+    _, jacobian = bearings.angles(x, measured, moved)
+    exact = torch.autograd.functional.jacobian(lambda y: bearings.angles(y, measured, moved)[0], x)[0, :, :, 0]
     expected = torch.einsum("acd,dn->adnc", jacobian[0], bearings.vertex_shares)
     torch.testing.assert_close(inner(exact, estimator.membrane.grid), expected)
 
@@ -190,7 +200,7 @@ def test_angles_vanish_on_the_rays_and_grow_with_the_distance_across():
     bearings, y = estimator.equations.bearings, estimator.equations.bearings.positions
     directions = torch.nn.functional.normalize(y, dim=-1)[None]
     measured = bearings.measured(seen(torch.zeros_like(directions), directions))
-    angle, _ = bearings.angles(estimator.membrane.rest[None], measured)
+    angle, _ = bearings.angles(estimator.membrane.rest[None], measured, torch.zeros(1, 4).double())
     assert angle.abs().max() < 1e-12
     basis = measured.across.movedim(-1, 1) * bearings.noise
     identity = basis @ basis.mT
@@ -327,7 +337,7 @@ def test_a_fine_grid_begins_with_the_coarse_ones_solution(pressed):
     fine = make(33)
     assert fine.coarse.membrane.grid == (17, 17) and fine.coarse.coarse.membrane.grid == (9, 9)
     assert fine.coarse.coarse.coarse is None and make(16).coarse is None
-    surface = bent(fine.coarse.membrane), torch.ones(1)
+    surface = State(bent(fine.coarse.membrane), torch.ones(1), torch.ones(1, 4))
     torch.testing.assert_close(fine.coarsened(*fine.refined(*surface)), surface)
     result = fine(seen(origins, directions))
     assert relative(fine, result, positions, moved) < 0.1
@@ -344,7 +354,7 @@ def test_four_steps_from_the_frame_before_follow_a_press(pressed, n):
     before = torch.nn.functional.normalize(0.1 * rest + 0.9 * directions, dim=-1)
     cold = estimator(seen(origins, directions))
     previous = estimator(seen(origins, before))
-    warm = estimator(seen(origins, directions), (previous.vertices, previous.pressure))
+    warm = estimator(seen(origins, directions), (previous.vertices, previous.pressure, previous.moved))
 
     def rms(u):
         return u.square().sum(-1).mean().sqrt()
@@ -360,7 +370,7 @@ def test_elimination_by_products_rounds_a_contacts_system_as_cholesky_does(press
     measured = equations.bearings.measured(seen(origins, directions))
     found = estimator(seen(origins, directions))
     scales = SETTINGS.tau[1], SETTINGS.outlier
-    _, normal, loads, _ = equations.linearised(found.vertices, found.pressure, measured, *scales)
+    _, normal, loads, *_ = equations.linearised(found.vertices, found.pressure, found.moved, measured, *scales)
     *blocks, scale = equations.matrix(normal)
     b = equations.system.in_blocks(scale * loads)
 
@@ -454,7 +464,7 @@ def test_the_objective_is_the_misfit_of_the_markers_and_the_loss_of_the_traction
     found = estimator(observation)
     none = found._replace(traction=torch.zeros_like(found.traction))
     bearings = estimator.equations.bearings
-    misfit = bearings.angles(found.vertices, bearings.measured(observation))[0].square().sum(1)
+    misfit = bearings.angles(found.vertices, bearings.measured(observation), found.moved)[0].square().sum(1)
     expected = Cauchy(SETTINGS.outlier).loss(misfit).sum(1)
     torch.testing.assert_close(estimator.objective(none, observation), expected)
     assert (estimator.objective(found, observation) > expected).all()
@@ -462,7 +472,7 @@ def test_the_objective_is_the_misfit_of_the_markers_and_the_loss_of_the_traction
 
 
 def equilibrium_at_rest(estimator):
-    x, pressure = estimator.at_rest(torch.ones(1, 1))
+    x, pressure, moved = estimator.at_rest(torch.ones(1, 1))
     rays = estimator.equations.bearings.positions
     measured = estimator.equations.bearings.measured(seen(torch.zeros_like(rays), torch.nn.functional.normalize(rays, dim=-1)))
-    return estimator.equilibrium(x, pressure, x, measured)
+    return estimator.equilibrium(x, pressure, moved, x, measured)

@@ -85,10 +85,10 @@ def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
     turn[range(D), :, range(D)] = bearings.noise * unit
     rays = torch.nn.functional.normalize(true + small * turn.flatten(0, 1), dim=-1)
     measured = bearings.measured(seen(torch.zeros_like(rays), rays))
-    x, pressure = estimator.at_rest(torch.ones(2 * D, 1, dtype=torch.float64))
+    state = estimator.at_rest(torch.ones(2 * D, 1, dtype=torch.float64))
     infinite = torch.tensor(torch.inf, dtype=torch.float64)
-    x, pressure, _ = estimator.descent.step(x, pressure, measured, infinite, infinite)
-    traction = estimator.equilibrium(x, pressure, x, measured).traction
+    (x, pressure, moved), _ = estimator.descent.step(state, measured, infinite, infinite)
+    traction = estimator.equilibrium(x, pressure, moved, x, measured).traction
     _, normal = at_rest(estimator)
     push = (inner(traction, estimator.membrane.grid) * normal).sum(-1) / estimator.reference / small
     expected = (push.square().sum(0) @ loss.surroundings).sqrt()

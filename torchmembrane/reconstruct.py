@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from .errors import MembraneError
 from .estimators.base import Equilibrium, Observation, Problem
+from .estimators.camera_motion import in_pixels, in_words, shift_of
 from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
 from .estimators.minimum_energy import MinimumEnergy
@@ -212,15 +213,17 @@ class Reconstructor(nn.Module):
 
     def _solve(self, flow: MarkerFlow, previous: Reconstruction | None) -> Reconstruction:
         usable, confidence, covariance, status = self.observer.judge(*flow)
-        start = None if previous is None else self.start(previous.vertices, previous.pressure)
+        start = None if previous is None else self.start(previous.vertices, previous.pressure, previous.camera_motion)
         found = self.estimator(self.observation(usable, confidence, covariance), start)
         return self.result(found, flow.displacement, confidence, status)
 
     @piece
-    def start(self, vertices: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
-        """Vertices `[B, V, 3]` and pressure `[B]` of the frames before, those of rest where there are none (NaN)."""
+    def start(self, vertices: Tensor, pressure: Tensor, camera_motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Vertices `[B, V, 3]`, pressure `[B]` and the camera's motion `[B, 4]` of the frames before, those of rest where there
+        are none (NaN)."""
         vertices = torch.where(vertices.isfinite(), vertices, self.estimator.membrane.rest)
-        return vertices, torch.where(pressure.isfinite(), pressure, self.estimator.rest_pressure)
+        pressure = torch.where(pressure.isfinite(), pressure, self.estimator.rest_pressure)
+        return vertices, pressure, in_pixels(camera_motion, self.image_size).nan_to_num()
 
     @piece
     def observation(self, displacement: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
@@ -241,7 +244,8 @@ class Reconstructor(nn.Module):
         corner_u = u[:, self.marker_vertices.ravel()].unflatten(1, (-1, 3))
         markers = self.rest_markers + (self.marker_weights[..., None] * corner_u).sum(-2)
         pixels = self.rest_pixels + displacement
-        miss2 = torch.where(lost, 0.0, ((self.camera.point_to_pixel(markers) - pixels) ** 2).sum(-1))
+        modelled = self.camera.point_to_pixel(markers) + shift_of(found.moved, pixels, self.image_size)
+        miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))
         ok, broken = status == Status.OK.value, ~x.flatten(1).isfinite().all(1)
         coverage = self.coverage(confidence)
         for of_this, value in (
@@ -283,6 +287,7 @@ class Reconstructor(nn.Module):
             contact_curvature=kept(contacts.curvature),
             contact_at_rim=kept(contacts.at_rim),
             coverage=kept(coverage),
+            camera_motion=kept(in_words(found.moved, self.image_size)),
         )
 
     def standard_deviations(self, result: Reconstruction) -> StandardDeviations:
@@ -303,7 +308,8 @@ class Reconstructor(nn.Module):
         turn = (after.origin - before.origin) / distance + after.direction - before.direction
         noise = torch.linalg.cholesky(2 * self.observer.rest_covariance).mT @ turn
         observation = self.observation(pixels - self.rest_pixels, result.confidence)
-        return self.estimator.standard_deviations(result.vertices, result.pressure, observation, noise)
+        state = result.vertices, result.pressure, result.camera_motion
+        return self.estimator.standard_deviations(*self.start(*state), observation, noise)
 
     def _check_precision(self) -> None:
         if self.rest_pixels.dtype not in PRECISIONS:

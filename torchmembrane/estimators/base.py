@@ -47,19 +47,22 @@ class Observation(NamedTuple):
     confidence           `[B, N]`, 0 for a lost one, else up to 1
     across               `[B, N, 2, 3]`, two vectors across each ray: a small turn of the ray, along them, in standard
                          deviations of its marker; None: all are as sure, in all directions
+    motion               `[B, N, 2, 4]`, by how much of these a camera that moves turns the ray, as `bearings.marker_rays` says;
+                         None: it has not moved
     """
 
     origins: Tensor
     directions: Tensor
     confidence: Tensor
     across: Tensor | None = None
+    motion: Tensor | None = None
 
 
 class Equilibrium(NamedTuple):
     """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`
     (zero for minimum energy), `relative_step [...]`: the last step over the surface's size, `reference [..., V]`: the traction
-    against which pushes are measured (zero where no tractions are found), and `misfit [...]`: rms of the markers' angles off
-    their rays, in standard deviations (zero where the surface is on every ray)."""
+    against which pushes are measured (zero where no tractions are found), `misfit [...]`: rms of the markers' angles off their
+    rays, in standard deviations (zero where the surface is on every ray), and `moved [..., 4]`: the camera, against the rim."""
 
     vertices: Tensor
     pressure: Tensor
@@ -68,6 +71,7 @@ class Equilibrium(NamedTuple):
     relative_step: Tensor
     reference: Tensor
     misfit: Tensor
+    moved: Tensor
 
 
 class Contacts(NamedTuple):

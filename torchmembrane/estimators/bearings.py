@@ -14,6 +14,7 @@ from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner
 from ..surface.tangent import tangent_frame
 from .base import Observation
+from .camera_motion import centred
 
 
 class Bearings(NamedTuple):
@@ -23,12 +24,14 @@ class Bearings(NamedTuple):
     across       `[B, 2, 3, D]`, two vectors across each ray, along which its turns are measured in standard deviations
     weight       `[B, D]`, the markers' confidence
     noise_level  `[B]`, the markers' standard deviations over those at rest
+    motion       `[B, 2, 4, D]`, derivatives of the angles in the camera's motion: du, dv, rotation, growth (px)
     """
 
     origins: Tensor
     across: Tensor
     weight: Tensor
     noise_level: Tensor
+    motion: Tensor
 
 
 def marker_rays(camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
@@ -42,7 +45,9 @@ def marker_rays(camera: Camera, pixels: Tensor, confidence: Tensor, covariance: 
 
     Returns:
         The rays; along `across` a turn has the covariance 1: with the derivative `J [3, 2]` of a ray in its pixel and the
-        covariance `C = L L^T` these are the rows of `L^-1 (J^T J)^-1 J^T`.
+        covariance `C = L L^T` these are the rows of `L^-1 (J^T J)^-1 J^T`. `motion`: what the image's motion against the rim,
+        `p -> p + (du, dv) + (rotation x (p - c) + growth (p - c)) / R` about the image's centre `c`, makes of them; all four in
+        px, those of rotation and growth at half the image's diagonal, `R`.
     """
     half = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
     steps = torch.cat([torch.zeros_like(half[:1]), half, -half])[:, None]
@@ -57,7 +62,11 @@ def marker_rays(camera: Camera, pixels: Tensor, confidence: Tensor, covariance: 
     across = torch.stack([first, second], 2)
     direction = directions[:, 0, :, None]
     across = across - (across * direction).sum(-1, keepdim=True) * direction
-    return Observation(origins[:, 0], directions[:, 0], confidence, across)
+    away = centred(pixels, camera.image_size)
+    one, none = torch.ones_like(pixels[..., 0]), torch.zeros_like(pixels[..., 0])
+    of_u, of_v = torch.stack([one, none, -away[..., 1], away[..., 0]], -1), torch.stack([none, one, *away.unbind(-1)], -1)
+    motion = torch.stack([of_u * a.rsqrt(), (of_v - b / a * of_u) * (c - b * b / a).rsqrt()], 2)
+    return Observation(origins[:, 0], directions[:, 0], confidence, across, motion)
 
 
 def seen_from_origin(positions: Tensor) -> Observation:
@@ -104,29 +113,34 @@ class MarkerBearings(nn.Module):
     @piece
     def measured(self, observation: Observation) -> Bearings:
         """The markers' rays as `angles` takes them."""
-        origins, directions, confidence, across = observation
+        origins, directions, confidence, across, motion = observation
         if across is None:
             across = tangent_frame(directions) / self.noise
+        if motion is None:
+            motion = torch.zeros_like(across[..., :1]).expand(-1, -1, -1, 4)
         found = (confidence > 0).to(confidence.dtype)
         spread = (torch.where(found > 0, _spread(across), 0.0)).sum(-1) / found.sum(-1).clamp_min(1)
-        return Bearings(origins.mT, across.movedim(1, -1), confidence, (spread / self.rest_spread).sqrt())
+        noise_level = (spread / self.rest_spread).sqrt()
+        return Bearings(origins.mT, across.movedim(1, -1), confidence, noise_level, motion.movedim(1, -1))
 
     def markers(self, x: Tensor) -> Tensor:
         """The markers' positions on the surface `x [B, V, 3]`, `[B, D, 3]`."""
         return self.positions + self.vertex_shares @ (inner(x, self.grid) - self.inner_rest)
 
-    def angles(self, x: Tensor, measured: Bearings) -> tuple[Tensor, Tensor]:
+    def angles(self, x: Tensor, measured: Bearings, moved: Tensor) -> tuple[Tensor, Tensor]:
         """Angles across the measured rays `[B, 2, D]`, and the bearing Jacobian: their derivatives in the markers' positions,
-        `[B, 2, 3, D]`."""
+        `[B, 2, 3, D]`; `moved [B, 4]`: of the camera."""
         to_marker = self.markers(x).mT - measured.origins
         distance = torch.linalg.vector_norm(to_marker, dim=1, keepdim=True)
         along = (to_marker / distance)[:, None]
         angle = (measured.across * along).sum(2, keepdim=True)
-        return angle.squeeze(2), (measured.across - angle * along) / distance[:, None]
+        jacobian = (measured.across - angle * along) / distance[:, None]
+        angle = angle.squeeze(2)
+        return angle + (measured.motion * moved[:, None, :, None]).sum(2), jacobian
 
-    def misfit(self, x: Tensor, measured: Bearings, outlier: float) -> Tensor:
+    def misfit(self, x: Tensor, measured: Bearings, moved: Tensor, outlier: float) -> Tensor:
         """Rms of the markers' angles off their rays `[B]`, in standard deviations, each counted as `outlier` at most."""
-        angles2 = self.angles(x, measured)[0].square().mean(1).clamp_max(outlier**2)
+        angles2 = self.angles(x, measured, moved)[0].square().mean(1).clamp_max(outlier**2)
         return ((measured.weight * angles2).sum(-1) / measured.weight.sum(-1).clamp_min(1)).sqrt()
 
 

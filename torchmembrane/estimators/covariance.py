@@ -6,8 +6,9 @@ At the solution a small change `e` of the measured angles moves surface and pres
     [m' c  C] [dp    ] = [   0   ],    M = A^T W A + J^T w J,
     [n' C  0] [lambda]   [   0   ]
 
-with `W` the curvature of a push's loss (flat where it bends down; shear by its parabola), so that noise of covariance S gives
-the sandwich `H^-1 J^T w S w J H^-1`. One load per marker and direction of its noise, all solved with one factor.
+and the camera's motion (`camera_motion`) as the step has it; with `W` the curvature of a push's loss (flat where it bends down;
+shear by its parabola), so that noise of covariance S gives the sandwich `H^-1 J^T w S w J H^-1`. One load per marker and
+direction of its noise, all solved with one factor.
 """
 
 from collections.abc import Callable
@@ -19,7 +20,9 @@ from torch import Tensor
 from ..mechanics.cavity import CavityLaw
 from .base import Observation
 from .bearings import Bearings
+from .camera_motion import CameraMotion
 from .contact_force import Linearised
+from .descent import State
 from .normal_equations import BalanceEquations, NormalEquations
 
 
@@ -39,6 +42,7 @@ class LinearisedSolution(NamedTuple):
     corner       `c` and the compliance `C`, `[B]` each; None where the pressure is fixed (an open cavity)
     force        `[B, 3, 3 N]`, the total force's derivative in the inner vertices
     of_pressure  `[B, 3]`, minus its derivative in the pressure
+    motion       the camera's
     """
 
     solve: Callable[[Tensor], Tensor]
@@ -46,59 +50,77 @@ class LinearisedSolution(NamedTuple):
     corner: tuple[Tensor, Tensor] | None
     force: Tensor
     of_pressure: Tensor
+    motion: CameraMotion
 
 
 def linearise(
     equations: BalanceEquations,
     cavity: CavityLaw,
-    x: Tensor,
-    pressure: Tensor,
+    state: State,
     measured: Bearings,
     scales: tuple[float, float],
+    play: float,
     curvature: bool = False,
 ) -> tuple[Linearised, NormalEquations, LinearisedSolution]:
-    """The equations about a surface `x [B, V, 3]`, and what solves them for small loads.
+    """The equations about a state, and what solves them for small loads.
 
     Args:
         equations: of the force balance.
         cavity: its law.
-        x: the surface.
-        pressure: `[B]`.
+        state: the solution.
         measured: the markers' rays.
         scales: of the losses of tractions and of markers.
+        play: of the camera, px, as for `CameraMotion.held`.
         curvature: as for `TractionLoss.weights`.
     """
-    at, normal, loads, (_, vWv) = equations.linearised(x, pressure, measured, *scales, curvature=curvature)
+    at, normal, loads, (_, vWv), motion = equations.linearised(*state, measured, *scales, curvature=curvature)
     factor, membrane = equations.system.factor(equations.matrix(normal)), equations.forces.membrane
-    compliance = cavity.condition(membrane.volume(x) - membrane.rest_volume, pressure)[1]
+    compliance = cavity.condition(membrane.volume(state.x) - membrane.rest_volume, state.pressure)[1]
+    motion = motion.held(state.moved, play)
+    of_motion = equations.system.substitute(factor, motion.coupling)
     corner = None if cavity.filling == "open" else (vWv, compliance.expand_as(vWv))
-    one = torch.eye(3).to(x)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
+    one = torch.eye(3).to(state.x)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
     of_force = equations.forces.change(at.stiffness, one).flatten(2)
     solution = LinearisedSolution(
-        lambda loads: equations.system.substitute(factor, loads), loads[:, [2, 0]], corner, of_force, at.volume.sum(-1)
+        lambda loads: motion.eased(equations.system.substitute(factor, loads), of_motion),
+        loads[:, [2, 0]],
+        corner,
+        of_force,
+        at.volume.sum(-1),
+        motion,
     )
     return at, normal, solution
 
 
 @torch.no_grad()
-def push_noise(equations: BalanceEquations, cavity: CavityLaw, rest: Observation) -> Tensor:
+def push_noise(equations: BalanceEquations, cavity: CavityLaw, rest: Observation, play: float) -> Tensor:
     """The push `S [N]` that the markers' noise makes at rest, one standard deviation, while all losses are quadratic.
 
     Args:
         equations: of the force balance.
         cavity: its law.
         rest: the markers' rays at rest.
+        play: of the camera, px, as for `CameraMotion.held`.
     """
     membrane, loss = equations.forces.membrane, equations.loss
     measured = equations.bearings.measured(rest)
-    at, normal, solution = linearise(
-        equations, cavity, membrane.rest[None], cavity.rest_pressure[None], measured, (torch.inf, torch.inf)
-    )
-    noise_loads = torch.einsum("bacd,dn->bdacn", normal.weighted_jacobian, equations.bearings.vertex_shares)
-    dx, dp = changes(solution, noise_loads.flatten(3).flatten(1, 2))
+    state = State(membrane.rest[None], cavity.rest_pressure[None], torch.zeros_like(membrane.rest[:1, :1]).expand(1, 4))
+    at, normal, solution = linearise(equations, cavity, state, measured, (torch.inf, torch.inf), play)
+    alone = torch.eye(2).to(measured.weight).expand(1, measured.weight.shape[1], 2, 2)
+    dx, dp = changes(solution, noise_loads(equations, normal, measured, solution.motion, alone))
     dq = equations.forces.change(at.stiffness, dx.unflatten(-1, (3, -1))) - dp[..., None, None] * at.volume[:, None]
     push = (dq * at.normal[:, None]).sum(2) / (loss.area * loss.reference)
     return (push.square().sum(1) @ loss.surroundings).sqrt()[0]
+
+
+def noise_loads(
+    equations: BalanceEquations, normal: NormalEquations, measured: Bearings, motion: CameraMotion, turned: Tensor
+) -> Tensor:
+    """What noise adds to the equations, the camera's motion eliminated: `[B, 2 D, 3 N]`, of independent noises that turn each
+    marker's angles by `turned [B, D, 2, 2]` (noise, angle): `J^T w e - B' T^-1 K^T w e`."""
+    loads = torch.einsum("bdra,bacd,dn->bdrcn", turned, normal.weighted_jacobian, equations.bearings.vertex_shares)
+    slopes = torch.einsum("bdra,bakd,bd->bdrk", turned, measured.motion, normal.marker_weights)
+    return motion.without(loads.flatten(3).flatten(1, 2), slopes.flatten(1, 2))
 
 
 def changes(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,5 +1,7 @@
 """Gauss-Newton steps of force balance: surface and pressure, the volume linearised."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 
@@ -13,6 +15,14 @@ from .normal_equations import BalanceEquations
 from .settings import ForceBalanceSettings
 
 Factor = tuple[Tensor, ...]
+
+
+class State(NamedTuple):
+    """What the steps change: the surface `x [B, V, 3]`, the `pressure [B]`, and by how much the camera has `moved [B, 4]`."""
+
+    x: Tensor
+    pressure: Tensor
+    moved: Tensor
 
 
 class Descent(nn.Module):
@@ -30,58 +40,66 @@ class Descent(nn.Module):
         self.membrane = equations.forces.membrane
 
     def forward(
-        self, x: Tensor, pressure: Tensor, measured: Bearings, schedule: list[tuple[float, float]], one_factor: bool = False
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Surface `[B, V, 3]` and pressure `[B]` after the steps of a schedule, and the surface before the last; `one_factor`:
-        all with the factor of the first step."""
-        before, factor = x, None
+        self, state: State, measured: Bearings, schedule: list[tuple[float, float]], one_factor: bool = False
+    ) -> tuple[State, Tensor]:
+        """The state after the steps of a schedule, and the surface before the last; `one_factor`: all with the factor of the
+        first step."""
+        before, factor = state.x, None
         if one_factor:
-            x, pressure, before, factor = self._first(x, pressure, measured, *schedule[0])
-            schedule = schedule[1:]
-        x, pressure, before = repeated(self._next, schedule, (x, pressure, before), measured, factor)
-        return x, pressure, before
+            x, pressure, moved, before, factor = self._first(*state, measured, *schedule[0])
+            state, schedule = State(x, pressure, moved), schedule[1:]
+        x, pressure, moved, before = repeated(self._next, schedule, (*state, before), measured, factor)
+        return State(x, pressure, moved), before
 
     @piece
     def _first(
-        self, x: Tensor, pressure: Tensor, measured: Bearings, tau: float, outlier: float
-    ) -> tuple[Tensor, Tensor, Tensor, Factor | None]:
-        """Surface, pressure and the surface before; the factor of the step's matrix."""
-        after, pressure, factor = self._traced_once(x, pressure, measured, tau, outlier, None)
-        return after, pressure, x, factor
+        self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings, tau: float, outlier: float
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Factor | None]:
+        """The state, the surface before; the factor of the step's matrix."""
+        state, factor = self._traced_once(State(x, pressure, moved), measured, tau, outlier, None)
+        return *state, x, factor
 
     @piece
     def _next(
-        self, x: Tensor, pressure: Tensor, before: Tensor, measured: Bearings, factor: Factor | None, tau: float, outlier: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Surface, pressure and the surface before."""
-        after, pressure, _ = self._traced_once(x, pressure, measured, tau, outlier, factor)
-        return after, pressure, x
+        self,
+        x: Tensor,
+        pressure: Tensor,
+        moved: Tensor,
+        before: Tensor,
+        measured: Bearings,
+        factor: Factor | None,
+        tau: float,
+        outlier: float,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The state, and the surface before."""
+        state, _ = self._traced_once(State(x, pressure, moved), measured, tau, outlier, factor)
+        return *state, x
 
     def _traced_once(
-        self, x: Tensor, pressure: Tensor, measured: Bearings, tau: float, outlier: float, factor: Factor | None
-    ) -> tuple[Tensor, Tensor, Factor | None]:
+        self, state: State, measured: Bearings, tau: float, outlier: float, factor: Factor | None
+    ) -> tuple[State, Factor | None]:
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself."""
-        scales = [torch.as_tensor(scale, dtype=x.dtype, device=x.device) for scale in (tau, outlier)]
+        scales = [torch.as_tensor(scale, dtype=state.x.dtype, device=state.x.device) for scale in (tau, outlier)]
         step = self.step if torch.compiler.is_exporting() else self._compiled_once
-        taken: tuple[Tensor, Tensor, Factor | None] = step(x, pressure, measured, scales[0], scales[1], factor)
+        taken: tuple[State, Factor | None] = step(state, measured, scales[0], scales[1], factor)
         return taken
 
     @torch.compiler.nested_compile_region
     def _compiled_once(
-        self, x: Tensor, pressure: Tensor, measured: Bearings, tau: Tensor, outlier: Tensor, factor: Factor | None
-    ) -> tuple[Tensor, Tensor, Factor | None]:
-        return self.step(x, pressure, measured, tau, outlier, factor)
+        self, state: State, measured: Bearings, tau: Tensor, outlier: Tensor, factor: Factor | None
+    ) -> tuple[State, Factor | None]:
+        return self.step(state, measured, tau, outlier, factor)
 
     def step(
-        self, x: Tensor, pressure: Tensor, measured: Bearings, tau: Tensor, outlier: Tensor, factor: Factor | None = None
-    ) -> tuple[Tensor, Tensor, Factor | None]:
-        """One reweighted Gauss-Newton step in surface and pressure, the volume linearised, the longest vertex step capped.
+        self, state: State, measured: Bearings, tau: Tensor, outlier: Tensor, factor: Factor | None = None
+    ) -> tuple[State, Factor | None]:
+        """One reweighted Gauss-Newton step, the volume linearised, the longest vertex step capped.
 
         Also returns the factor of its matrix if it made one: with the `factor` of a step near this one it makes none.
         """
-        equations = self.equations
-        _, normal, loads, corner = equations.linearised(x, pressure, measured, tau, outlier)
-        made = None
+        equations, (x, pressure, moved) = self.equations, state
+        _, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier)
+        loads, made = torch.cat([loads, motion.coupling], 1), None
         if factor is None:
             made = equations.system.factor(equations.matrix(normal))
             solved = equations.system.substitute(made, loads)
@@ -93,12 +111,17 @@ class Descent(nn.Module):
                 loads,
                 self.settings.conjugate_steps,
             )
+        first, last = self.settings.tau
+        motion = motion.held(moved, self.settings.camera_motion * (tau.clamp_max(first) / last) ** 2)
+        loads, solved = motion.eliminated(loads[:, :3], solved[:, :3], solved[:, 3:])
         move, rise = self._bordered_step(x, pressure, loads, solved, corner)
+        turn = motion.following(move)
         move = move.unflatten(-1, (3, -1)).mT
         longest = torch.linalg.vector_norm(move, dim=-1).amax(-1)
         cap = self.settings.longest_step * self.membrane.size
         share = (cap / longest.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1.0)
-        return x + pad_border(share[:, None, None] * move, self.membrane.grid), pressure + share * rise, made
+        x = x + pad_border(share[:, None, None] * move, self.membrane.grid)
+        return State(x, pressure + share * rise, moved + share[:, None] * turn), made
 
     def _bordered_step(
         self, x: Tensor, pressure: Tensor, loads: Tensor, solved: Tensor, corner: tuple[Tensor, Tensor]

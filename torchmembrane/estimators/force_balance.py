@@ -38,8 +38,8 @@ from .base import Contacts, Equilibrium, Observation, Problem
 from .bearings import Bearings, MarkerBearings, marker_rays, seen_from_origin
 from .contact_force import ContactForce
 from .contact_patches import ContactPatches
-from .covariance import StandardDeviations, linearise, push_noise, spread
-from .descent import Descent
+from .covariance import StandardDeviations, linearise, noise_loads, push_noise, spread
+from .descent import Descent, State
 from .normal_equations import BalanceEquations
 from .robust import Cauchy
 from .settings import ForceBalanceSettings
@@ -112,7 +112,7 @@ class ForceBalance(nn.Module):
             self.steps = settings.fine_steps if self.coarse.coarse is None else settings.finer_steps
         self.passes_on_starts = self.coarse is not None and min(self.coarse.membrane.grid) >= settings.coarsest_warm
         rest = seen_from_origin(bearings.positions) if rest is None else rest
-        loss.push_noise = push_noise(self.equations, self.cavity, rest)
+        loss.push_noise = push_noise(self.equations, self.cavity, rest, settings.camera_motion)
 
     @classmethod
     def of(cls, problem: Problem, settings: ForceBalanceSettings | None = None) -> "ForceBalance":
@@ -170,10 +170,11 @@ class ForceBalance(nn.Module):
             return Observation(*camera.pixel_to_ray(pixels), confidence)
         return marker_rays(camera, pixels, confidence, covariance)
 
-    def forward(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:
-        """The surface that the markers' rays show; `start`: vertices and pressure near it, such as the previous frame's."""
+    def forward(self, observation: Observation, start: tuple[Tensor, Tensor, Tensor] | None = None) -> Equilibrium:
+        """The surface that the markers' rays show; `start`: vertices, pressure and the camera's motion near it, such as the
+        previous frame's."""
         measured = self.equations.bearings.measured(observation)
-        found = self._solved(measured, start)
+        found = self._solved(measured, None if start is None else State(*start))
         again = mended(self.is_converged(found), found, self._patiently, measured, self.chosen)
         return Equilibrium(*again)
 
@@ -187,14 +188,14 @@ class ForceBalance(nn.Module):
         rows = [done.reshape(-1, *(1,) * (value.ndim - 1)) for value in values]
         return Equilibrium(*(torch.where(*each) for each in zip(rows, values, others, strict=True)))
 
-    def _solved(self, measured: Bearings, start: tuple[Tensor, Tensor] | None, patient: bool = False) -> Equilibrium:
-        if start is not None and not self.passes_on_starts:
-            return self._descend(*start, measured, self.schedule(warm=True), one_factor=True)
-        schedule = self.schedule(patient=patient)
-        if self.coarse is None:
-            return self._descend(*self.at_rest(measured.weight), measured, schedule)
-        coarse = self.coarse._solved(measured, None if start is None else self.coarsened(*start), patient)
-        return self._descend(*self.refined(coarse.vertices, coarse.pressure), measured, schedule)
+    def _solved(self, measured: Bearings, start: State | None, patient: bool = False) -> Equilibrium:
+        warm = start is not None and not self.passes_on_starts
+        if self.coarse is not None and not warm:
+            coarse = self.coarse._solved(measured, None if start is None else self.coarsened(*start), patient)
+            start = self.refined(coarse.vertices, coarse.pressure, coarse.moved)
+        state = self.at_rest(measured.weight) if start is None else start
+        state, before = self.descent(state, measured, self.schedule(warm, patient), one_factor=warm)
+        return self.equilibrium(state.x, state.pressure, state.moved, before, measured)
 
     def schedule(self, warm: bool = False, patient: bool = False) -> list[tuple[float, float]]:
         """`tau` and `R` of every step on this grid; `warm`: with a start; `patient`: a second time, from rest."""
@@ -206,41 +207,35 @@ class ForceBalance(nn.Module):
         return settings.gnc_schedule(steps, settings.tau if self.coarse is None else finer)
 
     @piece
-    def at_rest(self, confidence: Tensor) -> tuple[Tensor, Tensor]:
-        """The rest surface and pressure, for every row of `confidence [B, D]`."""
-        return self.membrane.rest.repeat(confidence.shape[0], 1, 1), self.rest_pressure.repeat(confidence.shape[0])
+    def at_rest(self, confidence: Tensor) -> State:
+        """The rest surface and pressure and a camera that has not moved, for every row of `confidence [B, D]`."""
+        pressure = self.rest_pressure.repeat(confidence.shape[0])
+        return State(self.membrane.rest.repeat(len(pressure), 1, 1), pressure, torch.zeros_like(pressure)[:, None].repeat(1, 4))
 
     @piece
-    def coarsened(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
-        """Vertices `[B, V, 3]` and pressure `[B]` on the grid of `coarse`: every second line's."""
-        return x.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure
+    def coarsened(self, x: Tensor, pressure: Tensor, moved: Tensor) -> State:
+        """Vertices `[B, V, 3]` on the grid of `coarse`: every second line's; pressure `[B]` and camera `[B, 4]` as they are."""
+        return State(x.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure, moved)
 
     @piece
-    def refined(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
-        """Surface and pressure of `coarse` on this grid: the displacement is bilinear between its lines."""
+    def refined(self, x: Tensor, pressure: Tensor, moved: Tensor) -> State:
+        """What `coarse` found on this grid: the displacement is bilinear between its lines."""
         assert self.coarse is not None  # only called with what it has found
         u = (x - self.coarse.membrane.rest).unflatten(1, self.coarse.membrane.grid).permute(0, 3, 1, 2)
         u = F.interpolate(u, self.membrane.grid, mode="bilinear", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
-        return self.membrane.rest + u * self.equations.forces.free, pressure
-
-    def _descend(
-        self, x: Tensor, pressure: Tensor, measured: Bearings, schedule: list[tuple[float, float]], one_factor: bool = False
-    ) -> Equilibrium:
-        """The steps of a schedule; `one_factor`: all with that of the first."""
-        x, pressure, before = self.descent(x, pressure, measured, schedule, one_factor)
-        return self.equilibrium(x, pressure, before, measured)
+        return State(self.membrane.rest + u * self.equations.forces.free, pressure, moved)
 
     @piece
-    def equilibrium(self, x: Tensor, pressure: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
-        """What this surface and pressure amount to; `before`: the surface a step earlier."""
+    def equilibrium(self, x: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
+        """What this state amounts to; `before`: the surface a step earlier."""
         membrane, loss = self.membrane, self.equations.loss
         step = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
         traction = self.equations.forces(x, pressure) / membrane.rest_area[:, None]
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
         scale = loss.contact_scale(*within, measured.noise_level)
         reference = self.reference * (1 + pad_border(scale[..., None] - 1, membrane.grid)[..., 0])
-        misfit = self.equations.bearings.misfit(x, measured, self.settings.outlier)
-        return Equilibrium(x, pressure, membrane.volume(x), traction, step, reference, misfit)
+        misfit = self.equations.bearings.misfit(x, measured, moved, self.settings.outlier)
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, reference, misfit, moved)
 
     @piece
     def is_converged(self, found: Equilibrium) -> Tensor:
@@ -264,20 +259,21 @@ class ForceBalance(nn.Module):
         equations, grid = self.equations, self.membrane.grid
         measured = equations.bearings.measured(observation)
         traction, normal = inner(found.traction, grid).mT, inner(self.membrane.normals(found.vertices), grid).mT
-        misfit = measured.weight * equations.bearings.angles(found.vertices, measured)[0].square().sum(1)
+        misfit = measured.weight * equations.bearings.angles(found.vertices, measured, found.moved)[0].square().sum(1)
         objective: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1) + equations.loss(
             traction, normal, measured.noise_level
         )
         return objective
 
     def standard_deviations(
-        self, x: Tensor, pressure: Tensor, observation: Observation, marker_noise: float | Tensor
+        self, x: Tensor, pressure: Tensor, moved: Tensor, observation: Observation, marker_noise: float | Tensor
     ) -> StandardDeviations:
         """Of the surface, total force and pressure found from these rays, as the noise of the markers spreads to first order.
 
         Args:
             x: vertices `[B, V, 3]` of the solution.
             pressure: `[B]`, its pressure.
+            moved: `[B, 4]`, of the camera.
             observation: the rays it was found from.
             marker_noise: standard deviation of every marker's angles, radians; or `[B, D, 2, 3]`, how noise in each of two
                 independent directions turns the rays.
@@ -291,8 +287,8 @@ class ForceBalance(nn.Module):
         plain = tangent_frame(observation.directions)
         noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * plain
         scales = self.settings.tau[1], self.settings.outlier
-        _, normal, solution = linearise(equations, self.cavity, x, pressure, measured, scales, curvature=True)
-        turned = torch.einsum("bdrj,bajd,bacd->bdrc", noise, measured.across, normal.weighted_jacobian)
-        noise_loads = torch.einsum("bdrc,dn->bdrcn", turned, equations.bearings.vertex_shares).flatten(3).flatten(1, 2)
-        dx, dF, dp = spread(solution, noise_loads)
+        state, play = State(x, pressure, moved), self.settings.camera_motion
+        _, normal, solution = linearise(equations, self.cavity, state, measured, scales, play, curvature=True)
+        turned = torch.einsum("bdrj,bajd->bdra", noise, measured.across)
+        dx, dF, dp = spread(solution, noise_loads(equations, normal, measured, solution.motion, turned))
         return StandardDeviations(pad_border(dx.unflatten(-1, (3, -1)).mT, self.membrane.grid), dF, dp)

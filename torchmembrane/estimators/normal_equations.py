@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ..solve.stencil_system import NEAR, StencilSystem
 from .bearings import Bearings, MarkerBearings
+from .camera_motion import CameraMotion
 from .contact_force import ContactForce, Linearised
 from .robust import Cauchy
 from .traction_loss import TractionLoss
@@ -17,12 +18,13 @@ from .traction_loss import TractionLoss
 
 class NormalEquations(NamedTuple):
     """`M = A^T W A + J^T w J`: the forces' tangent stiffness `A [B, 3, 3, 7, N]` and weights `W [B, 3, 3, N]`; the weighted
-    bearing Jacobian `w J [B, 2, 3, D]` and the markers' blocks `J^T w J [B, 3, 3, D]`, in the markers' positions."""
+    bearing Jacobian `w J [B, 2, 3, D]` and the markers' blocks `J^T w J [B, 3, 3, D]`, in the markers' positions; `w [B, D]`"""
 
     stiffness: Tensor
     weights: Tensor
     weighted_jacobian: Tensor
     marker_blocks: Tensor
+    marker_weights: Tensor
 
 
 class BalanceEquations(nn.Module):
@@ -43,23 +45,25 @@ class BalanceEquations(nn.Module):
         self,
         x: Tensor,
         pressure: Tensor,
+        moved: Tensor,
         measured: Bearings,
         tau: Tensor | float,
         outlier: Tensor | float,
         curvature: bool = False,
-    ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor]]:
-        """The forces, the normal equations and their loads at a surface; `curvature` as for `TractionLoss.weights`."""
+    ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor], CameraMotion]:
+        """The forces, the normal equations, their loads and the camera's motion at a surface; `curvature` as for
+        `TractionLoss.weights`."""
         at = self.forces.linearised(x, pressure)
         W = self.loss.weights(at.normal, at.force, measured.noise_level, tau, curvature)
-        angle, jacobian = self.bearings.angles(x, measured)
+        angle, jacobian = self.bearings.angles(x, measured, moved)
         weight = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
         normal = self.normal_equations(at, W, jacobian, weight)
-        return at, normal, *self.loads(normal, at, angle)
+        return at, normal, *self.loads(normal, at, angle), self.motion(normal, measured, angle)
 
     def normal_equations(self, at: Linearised, W: Tensor, jacobian: Tensor, weight: Tensor) -> NormalEquations:
         """Of forces weighted by `W [B, 3, 3, N]` and angles by `weight [B, D]`, with the bearing Jacobian of the angles."""
         weighted = weight[:, None, None] * jacobian
-        return NormalEquations(at.stiffness, W, weighted, (jacobian[:, :, :, None] * weighted[:, :, None]).sum(1))
+        return NormalEquations(at.stiffness, W, weighted, (jacobian[:, :, :, None] * weighted[:, :, None]).sum(1), weight)
 
     def loads(self, normal: NormalEquations, at: Linearised, angle: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """`v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, 3, 3 N]`; `f^T W v` and `v^T W v`, `[B]`."""
@@ -69,6 +73,14 @@ class BalanceEquations(nn.Module):
         of_markers = (normal.weighted_jacobian * angle[:, :, None]).sum(1) @ self.bearings.vertex_shares
         loads = torch.cat([v[:, None], of_forces + of_markers[:, None], of_fluid], 1).flatten(2)
         return loads, ((weighted[:, 0] * v).sum((1, 2)), (-weighted[:, 1] * v).sum((1, 2)))
+
+    def motion(self, normal: NormalEquations, measured: Bearings, angle: Tensor) -> CameraMotion:
+        """The camera's motion in the equations, with the angles `r [B, 2, D]`."""
+        K, w = measured.motion, normal.marker_weights
+        coupling = (K[:, :, :, None] * normal.weighted_jacobian[:, :, None]).sum(1) @ self.bearings.vertex_shares
+        weighted = (K * w[:, None, None]).movedim(2, 1).flatten(2)
+        own, slope = weighted @ K.movedim(2, 1).flatten(2).mT, (weighted @ angle.flatten(1)[..., None])[..., 0]
+        return CameraMotion(coupling.flatten(2), own, slope)
 
     def matrix(self, normal: NormalEquations) -> tuple[Tensor, Tensor, Tensor]:
         """`M` as `system.factor` takes it."""

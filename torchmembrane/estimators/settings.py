@@ -25,6 +25,7 @@ class ForceBalanceSettings:
         warm_tau: the same, from the solution of the frame before.
         patience: so many times the steps, from rest, where these do not converge.
         patient_tau: as `fine_tau`, then.
+        camera_motion: of the camera against the rim, px: what is less is nothing, what is more costs hardly more; as tau ends.
         decline: share of the steps over which tau declines.
         sparsity: twice the loss of the compressive traction p0 on the whole surface, while it is quadratic.
         scale_reach: radius of the wider surroundings whose largest push says what a vertex's tractions are measured against.
@@ -65,6 +66,7 @@ class ForceBalanceSettings:
     warm_tau: tuple[float, float] = (0.8, 0.4)
     patience: int = 3
     patient_tau: tuple[float, float] = (2.0, 0.4)
+    camera_motion: float = 0.005
     decline: float = 0.6
     sparsity: float = 6400.0
     scale_reach: float = 0.08

@@ -40,6 +40,8 @@ class Reconstruction(NamedTuple):
                                  the object bulges into the membrane; NaN where the patch is too narrow to tell
     contact_at_rim    [B, 4]     1 where the patch reaches the fixed rim, its force is then a lower bound; else 0
     coverage          [B]        share of the membrane's area that found markers see, of what they see at rest
+    camera_motion     [B, 4]     of the image against the rim, estimated and taken out: du, dv (px), rotation (degrees, u to v),
+                                 scale, about the image's centre; `pixels` stay as measured
 
     A frame without a surface has NaN in every floating array but `pixels` and `confidence`, which keep what was found.
     """
@@ -67,12 +69,13 @@ class Reconstruction(NamedTuple):
     contact_curvature: Tensor
     contact_at_rim: Tensor
     coverage: Tensor
+    camera_motion: Tensor
 
     def frame(self, index: int) -> dict[str, np.ndarray]:
         """One frame as numpy arrays, float32 (status int32), by the names above.
 
         Example:
-            >>> batch = Reconstruction(*torch.zeros(23, 2, 3))  # two frames; arrays of other shapes in a real one
+            >>> batch = Reconstruction(*torch.zeros(24, 2, 3))  # two frames; arrays of other shapes in a real one
             >>> frame = batch.frame(1)
             >>> frame["force"].tolist(), str(frame["status"].dtype)
             ([0.0, 0.0, 0.0], 'int32')
@@ -108,6 +111,7 @@ ADDED: dict[str, tuple[int, ...]] = {
     "contact_curvature": (0, 2),
     "contact_at_rim": (0,),
     "coverage": (),
+    "camera_motion": (4,),
 }
 """Arrays that results did not always hold, with their shapes: 0 stands for as many as there are `contact_points`."""
 
@@ -121,7 +125,7 @@ def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
 
     Example:
         >>> from tempfile import TemporaryDirectory
-        >>> frame = Reconstruction(*torch.ones(23, 1, 3)).frame(0)
+        >>> frame = Reconstruction(*torch.ones(24, 1, 3)).frame(0)
         >>> with TemporaryDirectory() as folder:
         ...     save_frame(f"{folder}/press.npz", frame)
         ...     load_frame(f"{folder}/press.npz")["force"].tolist()
@@ -178,7 +182,7 @@ def stack_frames(frames: list[dict[str, np.ndarray]]) -> Reconstruction:
         The batch, in their order, on the CPU.
 
     Example:
-        >>> first, second = (Reconstruction(*torch.full((23, 1, 3), value)).frame(0) for value in (1.0, 2.0))
+        >>> first, second = (Reconstruction(*torch.full((24, 1, 3), value)).frame(0) for value in (1.0, 2.0))
         >>> stack_frames([first, second]).force.tolist()
         [[1.0, 1.0, 1.0], [2.0, 2.0, 2.0]]
     """

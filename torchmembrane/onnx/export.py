@@ -149,7 +149,8 @@ def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = F
 
     Returns:
         The model. Input `image [batch, 1, height, width]`, grey in 0..1; with `tracking` also `previous_vertices
-        [batch, V, 3]`, `previous_pressure [batch]` and, of dots, `previous_pixels [batch, D, 2]`, NaN to start from rest.
+        [batch, V, 3]`, `previous_pressure [batch]`, `previous_camera_motion [batch, 4]` and, of dots, `previous_pixels
+        [batch, D, 2]`, NaN to start from rest.
         Outputs as `Reconstruction`.
 
     Raises:
@@ -172,6 +173,7 @@ def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = F
         rest = {
             "vertices": membrane.rest.repeat(EXAMPLES, 1, 1),
             "pressure": reconstructor.estimator.rest_pressure.repeat(EXAMPLES),
+            "camera_motion": image.new_tensor([0.0, 0.0, 0.0, 1.0]).repeat(EXAMPLES, 1),
             "pixels": reconstructor.rest_pixels.repeat(EXAMPLES, 1, 1),
         }
         inputs += [tracer.given(name, rest[name.removeprefix("previous_")]) for name in previous_of(reconstructor)]
@@ -187,8 +189,8 @@ def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = F
 
 def previous_of(reconstructor: Reconstructor) -> tuple[str, ...]:
     """A tracking model's further inputs: `previous_` and the field of `Reconstruction` that they continue."""
-    names = ("previous_vertices", "previous_pressure", "previous_pixels")
-    return names[: 3 if reconstructor.observer.locator.follows else 2]
+    names = ("previous_vertices", "previous_pressure", "previous_camera_motion", "previous_pixels")
+    return names[: 4 if reconstructor.observer.locator.follows else 2]
 
 
 def _finished(tracer: Tracer, inputs: list[Known], result: Any, reconstructor: Reconstructor) -> onnx.ModelProto:

@@ -1,0 +1,96 @@
+"""The camera's motion against the rim as four more unknowns: du, dv, rotation and growth of the image, px.
+
+A camera that was bumped sees every marker moved, the rim's as well, which no press does: the motion is found together with the
+surface. With the angles' derivatives `K` in it, a step solves
+
+    [M  B'] [d ]     [g]         B = K^T w J,  T = K^T w K + stiffness,  k = K^T w r + stiffness x motion
+    [B  T ] [dm] = - [k],
+
+`dm` eliminated: `(M - B' T^-1 B) d = -(g - B' T^-1 k)`, by the factor of `M` (Woodbury), `dm = -T^-1 (k + B d)`.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..solve.elimination import solve_positive
+
+RARE = 40.0
+"""How much less likely a camera moves than that it stays, a power: a tenfold motion has a likelihood `10^-RARE` times."""
+
+
+class CameraMotion(NamedTuple):
+    """Of a step: `coupling` `B [B, 4, 3 N]` to the vertices, `own` `T [B, 4, 4]` and `slope` `k [B, 4]`."""
+
+    coupling: Tensor
+    own: Tensor
+    slope: Tensor
+
+    def held(self, moved: Tensor, play: float | Tensor) -> "CameraMotion":
+        """With the loss `RARE / 2 log(play^2 + |moved|^2)` of what has `moved [B, 4]`: a camera rarely moves, and then by any
+        amount."""
+        stiffness = RARE / (play**2 + moved.square().sum(-1))
+        one = torch.eye(4, dtype=moved.dtype, device=moved.device)
+        own, slope = self.own + stiffness[:, None, None] * one, self.slope + stiffness[:, None] * moved
+        return CameraMotion(self.coupling, own, slope)
+
+    def eased(self, solved: Tensor, of_motion: Tensor) -> Tensor:
+        """`(M - B' T^-1 B)^-1` of loads whose `M^-1` is `solved [B, L, 3 N]`; `of_motion [B, 4, 3 N]`: that of the coupling."""
+        share = _solve(self.own - self.coupling @ of_motion.mT, self.coupling @ solved.mT)
+        eased: Tensor = solved + share.mT @ of_motion
+        return eased
+
+    def eliminated(self, loads: Tensor, solved: Tensor, of_motion: Tensor) -> tuple[Tensor, Tensor]:
+        """Loads and solutions `[B, 3, 3 N]` of the surface alone, of which the second load is `g`."""
+        alone = _solve(self.own, self.slope[..., None])[..., 0]
+        of_second = torch.stack([torch.zeros_like(alone), alone, torch.zeros_like(alone)], 1)
+        return loads - of_second @ self.coupling, self.eased(solved - of_second @ of_motion, of_motion)
+
+    def without(self, loads: Tensor, slopes: Tensor) -> Tensor:
+        """Loads `[B, L, 3 N]` on the surface alone, of those that pull the camera by `slopes [B, L, 4]` as well."""
+        kept: Tensor = loads - _solve(self.own, slopes.mT).mT @ self.coupling
+        return kept
+
+    def following(self, move: Tensor) -> Tensor:
+        """By how much the camera moves, `[B, 4]`, when the vertices move by `move [B, 3 N]`."""
+        moved: Tensor = -_solve(self.own, (self.slope[..., None] + self.coupling @ move[..., None]))[..., 0]
+        return moved
+
+
+def centred(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """`pixels [..., 2]` from the image's centre, over half its diagonal."""
+    size = pixels.new_tensor(image_size) - 1
+    away: Tensor = (2 * pixels - size) / torch.linalg.vector_norm(size)
+    return away
+
+
+def shift_of(moved: Tensor, pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """What the motion `[B, 4]` does to `pixels [B, D, 2]`, px."""
+    u, v = centred(pixels, image_size).unbind(-1)
+    du, dv, rotation, growth = moved[..., None, :].unbind(-1)
+    return torch.stack([du - rotation * v + growth * u, dv + rotation * u + growth * v], -1)
+
+
+def in_words(moved: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """The motion `[B, 4]` as du, dv (px), rotation (degrees) and scale."""
+    du, dv, rotation, growth = moved.unbind(-1)
+    half = _half_diagonal(image_size)
+    return torch.stack([du, dv, torch.rad2deg(rotation / half), 1 + growth / half], -1)
+
+
+def in_pixels(motion: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """What `in_words` gave as a motion in px again."""
+    du, dv, rotation, scale = motion.unbind(-1)
+    half = _half_diagonal(image_size)
+    return torch.stack([du, dv, torch.deg2rad(rotation) * half, (scale - 1) * half], -1)
+
+
+def _half_diagonal(image_size: tuple[int, int]) -> float:
+    return math.hypot(image_size[0] - 1, image_size[1] - 1) / 2
+
+
+def _solve(matrix: Tensor, loads: Tensor) -> Tensor:
+    """`matrix^-1 loads [B, n, k]` of positive matrices `[B, n, n]`."""
+    return solve_positive(torch.cat([matrix, loads], -1).movedim(0, -1)).movedim(-1, 0)
