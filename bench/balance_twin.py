@@ -42,10 +42,11 @@ class BalanceTwin:
         e, single = self.estimator, Observation(*(part[None] for part in observation))
         measured = e.equations.bearings.measured(single)
         if self.coarse is None:
-            x, pressure = e.at_rest(single.confidence)
+            x, pressure, _ = e.at_rest(single.confidence)
         else:
             surface, pressure = self.coarse(observation)
-            x, pressure = e.refined(torch.from_numpy(surface)[None], torch.tensor([pressure]).double())
+            still = torch.zeros(1, 4).double()
+            x, pressure, _ = e.refined(torch.from_numpy(surface)[None], torch.tensor([pressure]).double(), still)
         for tau, outlier in e.schedule():
             x, pressure = self.step(x, pressure, measured, tau, outlier)
         return x[0].numpy(), float(pressure)
@@ -59,7 +60,7 @@ class BalanceTwin:
         )
         weights = pad_border(inner_weights.flatten(1, 2).mT, e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
         blocks = e.elasticity.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)
-        angle, jacobian = bearings.angles(x, measured)
+        angle, jacobian = bearings.angles(x, measured, torch.zeros(1, 4).double())
         jacobian = jacobian.movedim(-1, 1).numpy()[..., None, :] * self.marker_weights[:, None, :, None]
         certainty = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
         certainty = np.repeat(certainty[0].numpy(), 2)

@@ -11,11 +11,9 @@ from torch import Tensor, nn
 from .errors import MembraneError
 from .estimators.base import Equilibrium, Observation, Problem
 from .estimators.camera_motion import in_pixels, in_words, shift_of
+from .estimators.choice import ESTIMATORS, Settings, estimator_of
 from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
-from .estimators.minimum_energy import MinimumEnergy
-from .estimators.paper import PaperEstimator
-from .estimators.settings import ForceBalanceSettings, MinimumEnergySettings, PaperSettings
 from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
@@ -27,13 +25,6 @@ from .pieces import piece
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
 
-AnyEstimator = ForceBalance | MinimumEnergy | PaperEstimator
-Settings = ForceBalanceSettings | MinimumEnergySettings | PaperSettings
-ESTIMATORS: dict[str, type[ForceBalance] | type[MinimumEnergy] | type[PaperEstimator]] = {
-    "force-balance": ForceBalance,
-    "minimum-energy": MinimumEnergy,
-    "paper": PaperEstimator,
-}
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
 LEAST_ERROR = 0.02  # px
 LEAST_COVERAGE = 0.88  # less of what the markers see at rest is a part hidden
@@ -115,7 +106,7 @@ class Reconstructor(nn.Module):
             vertex_pixels=vertex_pixels,
             rest_covariance=2 * self.observer.rest_covariance.double() + LEAST_ERROR**2 * torch.eye(2),
         )
-        self.estimator = _estimator(problem, estimator, settings)
+        self.estimator = estimator_of(problem, estimator, settings)
         self.coverage = Coverage(membrane, positions, self.observer.seen_at_rest)
         self.register_buffer("vertex_pixels", vertex_pixels)
         self.register_buffer("rest_markers", positions)
@@ -246,8 +237,7 @@ class Reconstructor(nn.Module):
         pixels = self.rest_pixels + displacement
         modelled = self.camera.point_to_pixel(markers) + shift_of(found.moved, pixels, self.image_size)
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))
-        ok, broken = status == Status.OK.value, ~x.flatten(1).isfinite().all(1)
-        coverage = self.coverage(confidence)
+        ok, broken, coverage = status == Status.OK.value, ~x.flatten(1).isfinite().all(1), self.coverage(confidence)
         for of_this, value in (
             (~self.estimator.is_converged(found), Status.NOT_CONVERGED.value),
             (coverage < LEAST_COVERAGE, Status.HIDDEN.value),
@@ -255,10 +245,10 @@ class Reconstructor(nn.Module):
             (broken, Status.NO_SOLUTION.value),
         ):
             status = torch.where(ok & of_this, value, status)
-        gone = ~(ok & ~broken)
+        gone = ~ok | broken
         normals = membrane.normals(x)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
-        force, moment = load.sum(1), torch.linalg.cross(x, load).sum(1)
+        wrench = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1)
 
         def kept(values: Tensor) -> Tensor:
             return torch.where(gone.reshape(-1, *(1,) * (values.ndim - 1)), torch.nan, values)
@@ -273,13 +263,13 @@ class Reconstructor(nn.Module):
             traction=kept(found.traction),
             contact=kept(contacts.indicator),
             contact_points=kept(contacts.points),
-            force=kept(force),
+            force=kept(wrench[:, :3]),
             pressure=kept(found.pressure),
             pressure_change=kept(found.pressure - self.estimator.rest_pressure),
             volume_error=kept(self.estimator.cavity.volume_error(found.volume, found.pressure)),
             residual=kept((miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()),
             status=status.to(torch.int32),
-            wrench=kept(torch.cat([force, moment], -1)),
+            wrench=kept(wrench),
             contact_force=kept(contacts.force),
             contact_normal=kept(contacts.normal),
             contact_area=kept(contacts.area),
@@ -351,13 +341,3 @@ def _imaged(sensor: Sensor, estimator: str, vertex_pixels: Tensor) -> Tensor:
             "balance of listed dots can do with a part)"
         )
     return imaged
-
-
-def _estimator(problem: Problem, name: str, settings: Settings | None) -> AnyEstimator:
-    kind: Any = ESTIMATORS[name]
-    if settings is not None and not isinstance(settings, kind.Settings):
-        raise MembraneError(
-            f"Reconstructor: settings are {type(settings).__name__}; expected {kind.Settings.__name__} for {name}"
-        )
-    built: AnyEstimator = kind.of(problem, settings)
-    return built

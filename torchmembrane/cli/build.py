@@ -4,7 +4,8 @@ from argparse import Namespace
 from typing import Any
 
 from ..errors import MembraneError
-from ..reconstruct import ESTIMATORS, Reconstructor
+from ..estimators.choice import ESTIMATORS
+from ..reconstruct import Reconstructor
 from ..sensor.sensor import Sensor
 
 OPTIONS = ("element", "volume", "flow", "smoothing")
