@@ -209,8 +209,9 @@ class ForceBalance(nn.Module):
     @piece
     def at_rest(self, confidence: Tensor) -> State:
         """The rest surface and pressure and a camera that has not moved, for every row of `confidence [B, D]`."""
-        pressure = self.rest_pressure.repeat(confidence.shape[0])
-        return State(self.membrane.rest.repeat(len(pressure), 1, 1), pressure, torch.zeros_like(pressure)[:, None].repeat(1, 4))
+        frames, pressure = confidence.shape[0], self.rest_pressure
+        still = torch.zeros_like(pressure).expand(4)
+        return State(self.membrane.rest.repeat(frames, 1, 1), pressure.repeat(frames), still.repeat(frames, 1))
 
     @piece
     def coarsened(self, x: Tensor, pressure: Tensor, moved: Tensor) -> State:
