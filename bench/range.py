@@ -5,8 +5,9 @@ python bench/range.py DATA [--first 0] [--sensors 10000] [--only press,light,res
 DATA from random_sensors.py. A press is right where the markers' surface is within a quarter of their displacement and the force
 within a quarter of the true one, or said to be a lower bound, by `contact_at_rim`. Printed: shares right and wrong with status
 ok, and the rest by status, of presses whose contact is no narrower than the dots' spacing, by filling, prestretch, dots, view
-and depth, and of the narrower ones; how often `contact_at_rim` is said of contacts clear of the rim; then what light strokes
-give, by the share of their largest force; then images at rest.
+and depth, and of the narrower ones; how often `contact_at_rim` is said of contacts clear of the rim; errors of moment (length
+unit), patch force, slip ratio and curvature, median / 90 %; then what light strokes give, by the share of their largest force;
+then images at rest.
 """
 
 import argparse
@@ -40,6 +41,23 @@ def quantities(result: tm.Reconstruction, truth: dict) -> dict:
     centre = truth["contact_centroid_each"][0]
     row |= dict(points=len(points), at_rim=bool((got["contact_at_rim"] == 1).any()), coverage=float(got["coverage"]))
     row["place"] = float(np.linalg.norm(points - centre, axis=1).mean()) if len(points) else np.inf
+    return row
+
+
+def patch_quantities(result: tm.Reconstruction, truth: dict, membrane: tm.Membrane) -> dict:
+    """Errors of the moment over the force (length unit) and, of one contact, of force, slip ratio and a sphere's curvature."""
+    x, traction = (torch.from_numpy(truth[key]).double() for key in ("vertices_deformed", "traction"))
+    load, normals = traction * membrane.rest_area[:, None], membrane.normals(x)
+    inward = -(load * normals).sum(-1)
+    force, shear = load.sum(0), (load + inward[:, None] * normals).sum(0)
+    moment = torch.linalg.cross(x, load).sum(0)
+    row = dict(moment=float((result.wrench[0, 3:] - moment).norm() / force.norm()))
+    if torch.isfinite(result.contact_points[0, :, 0]).sum() == 1:
+        row["patch_force"] = float((result.contact_force[0, 0] - force).norm() / force.norm())
+        row["slip"] = float((result.contact_slip[0, 0] - shear.norm() / inward.sum()).abs())
+        stroke = json.loads(str(truth["stroke"]))
+        if stroke["indenter"] == "sphere":
+            row["curvature"] = float((result.contact_curvature[0, 0] * stroke["radius"] - 1).mean().abs())
     return row
 
 
@@ -120,7 +138,9 @@ def reconstructed(r: tm.Reconstructor, path: Path) -> list[dict]:
     rim = r.sensor.membrane.rest.numpy()[r.sensor.membrane.fixed.numpy()]
     clear = np.linalg.norm(X[touched][:, None] - rim, axis=-1).min() / size if touched.any() else np.nan
     about |= dict(width=contact_width(truth, spacing), spacing=spacing, size=size, clear=float(clear))
-    return [about | quantities(result, truth)]
+    row = about | quantities(result, truth)
+    n = round(len(X) ** 0.5)
+    return [row | patch_quantities(result, truth, sensor.surface.membrane((n, n))) if n * n == len(X) else row]
 
 
 def verdict(row: dict) -> str:
@@ -163,6 +183,13 @@ def report(rows: list[dict]) -> None:
                     line(f"{key} {low} to {high}", chosen)
         off_rim = [row["at_rim"] for row in wide if row["clear"] > max(0.1, row["spacing"] / row["size"])]
         print(f"contact_at_rim of {len(off_rim)} contacts 0.1 of the size and a spacing clear of it: {np.mean(off_rim):.3f}")
+        settled = [row for row in wide if row["status"] == 0 and row["clear"] > 0.1]
+        for key in ("moment", "patch_force", "slip", "curvature"):
+            values = np.array([row[key] for row in settled if key in row])
+            told = values[np.isfinite(values)]
+            if len(told):
+                middle, most = np.percentile(told, (50, 90))
+                print(f"{key}, clear of the rim: {middle:.3f} / {most:.3f} of {len(told)}, {len(values) - len(told)} not told")
     narrow = [row for row in presses if row["width"] < 1]
     if narrow:
         line("narrower than the spacing", narrow)
