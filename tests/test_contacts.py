@@ -80,6 +80,16 @@ def test_curvatures_do_not_depend_on_the_frame():
     torch.testing.assert_close(once.normal @ turn.mT, turned.normal, equal_nan=True)
 
 
+def test_curvatures_are_a_sphere_s_from_a_plane_that_is_not_its_tangent():
+    """The height over a plane tilted by 0.4: its slopes and its mixed derivative count."""
+    u, v = (0.15 * DOME.rest[:, k] for k in (0, 1))
+    x = torch.stack([u, v, 10 - (100 - u * u - v * v).sqrt()], -1)[None]
+    tilted = torch.nn.functional.normalize(torch.tensor([[[0.3, 0.25, 1.0]]], dtype=torch.float64), dim=-1)
+    share = torch.full((1, 1, len(DOME.rest)), 1 / len(DOME.rest), dtype=torch.float64)
+    curvature, _ = PATCHES._curvature(x, tilted, share, share)
+    torch.testing.assert_close(curvature, torch.full((1, 1, 2), 0.1, dtype=torch.float64), rtol=0.03, atol=0)
+
+
 def test_a_patch_of_fewer_than_two_grid_steps_has_no_curvature():
     x = DOME.rest[None]
     traction, normals, _ = pressed_by(x, [(0.0, 0.0, 12.0)], radius=0.5)
