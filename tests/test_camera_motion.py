@@ -109,7 +109,7 @@ def test_a_bumped_camera_is_found_and_taken_out(fingertip, name):
     with torch.no_grad():
         clean, got = reconstructor(frame.image), reconstructor(seen(frame.image, **options))
     du, dv, degrees, scale = got.camera_motion[0].tolist()
-    assert abs(du - expected[0]) < 0.1 and abs(dv - expected[1]) < 0.1
+    assert abs(du - expected[0]) < 0.2 and abs(dv - expected[1]) < 0.2
     assert abs(degrees - expected[2]) < 0.03 and abs(scale - expected[3]) < 1e-3
     assert got.status.tolist() == [0] and got.residual[0] < 0.1
     truth, size = frame.truth["force"], np.linalg.norm(frame.truth["force"])

@@ -229,7 +229,8 @@ def test_edge_follows_a_video(model_files, reconstructor, images, monkeypatch):
                 continue
             if state is None:
                 rest = reconstructor(reconstructor.read(images[k]))
-                state = rest._replace(vertices=rest.vertices * torch.nan, pressure=rest.pressure * torch.nan)
+                nothing = {key: getattr(rest, key) * torch.nan for key in ("vertices", "pressure", "camera_motion")}
+                state = rest._replace(**nothing)
                 for _ in range(SETTLING - 1):
                     state = reconstructor(reconstructor.read(images[k]), state)
             state = reconstructor(reconstructor.read(images[k]), state)

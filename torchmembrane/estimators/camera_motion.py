@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..solve.elimination import solve_positive
 
-RARE = 40.0
+RARE = 100.0
 """How much less likely a camera moves than that it stays, a power: a tenfold motion has a likelihood `10^-RARE` times."""
 
 

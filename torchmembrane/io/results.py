@@ -166,10 +166,10 @@ def completed(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     Raises:
         KeyError: it lacks one that there always was.
     """
-    count = frame["contact_points"].shape[0]
-    shapes = {name: tuple(count if n == 0 else n for n in shape) for name, shape in ADDED.items()}
+    lacking = {name: shape for name, shape in ADDED.items() if name not in frame}
+    shapes = {name: [n or len(frame["contact_points"]) for n in shape] for name, shape in lacking.items()}
     added = {name: np.full(shape, np.nan, np.float32) for name, shape in shapes.items()}
-    return {key: frame[key] if key in frame or key not in added else added[key] for key in Reconstruction._fields}
+    return {key: added[key] if key in added else frame[key] for key in Reconstruction._fields}
 
 
 def stack_frames(frames: list[dict[str, np.ndarray]]) -> Reconstruction:

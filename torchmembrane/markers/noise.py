@@ -18,6 +18,7 @@ def pixel_noise(images: Tensor) -> Tensor:
         Noise that is not white, as JPEG leaves it, or texture finer than some pixels, is taken for more or less than it is.
 
     Example:
+        >>> import torch
         >>> noise = torch.randn(1, 1, 200, 200, generator=torch.Generator().manual_seed(0))
         >>> round(pixel_noise(0.5 + 0.02 * noise).item(), 3)
         0.02
