@@ -14,7 +14,7 @@ from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner
 from ..surface.tangent import tangent_frame
 from .base import Observation
-from .camera_motion import centred
+from .camera_motion import motion_of_pixels
 
 
 class Bearings(NamedTuple):
@@ -62,9 +62,7 @@ def marker_rays(camera: Camera, pixels: Tensor, confidence: Tensor, covariance: 
     across = torch.stack([first, second], 2)
     direction = directions[:, 0, :, None]
     across = across - (across * direction).sum(-1, keepdim=True) * direction
-    away = centred(pixels, camera.image_size)
-    one, none = torch.ones_like(pixels[..., 0]), torch.zeros_like(pixels[..., 0])
-    of_u, of_v = torch.stack([one, none, -away[..., 1], away[..., 0]], -1), torch.stack([none, one, *away.unbind(-1)], -1)
+    of_u, of_v = motion_of_pixels(pixels, camera.image_size).unbind(-2)
     motion = torch.stack([of_u * a.rsqrt(), (of_v - b / a * of_u) * (c - b * b / a).rsqrt()], 2)
     return Observation(origins[:, 0], directions[:, 0], confidence, across, motion)
 

@@ -59,18 +59,19 @@ class CameraMotion(NamedTuple):
         return moved
 
 
-def centred(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
-    """`pixels [..., 2]` from the image's centre, over half its diagonal."""
+def motion_of_pixels(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """Derivatives `[..., 2, 4]` of `pixels [..., 2]` in du, dv, rotation and growth, the latter two in px at half the image's
+    diagonal from its centre."""
     size = pixels.new_tensor(image_size) - 1
-    away: Tensor = (2 * pixels - size) / torch.linalg.vector_norm(size)
-    return away
+    u, v = ((2 * pixels - size) / torch.linalg.vector_norm(size)).unbind(-1)
+    one, none = torch.ones_like(u), torch.zeros_like(u)
+    return torch.stack([torch.stack([one, none, -v, u], -1), torch.stack([none, one, u, v], -1)], -2)
 
 
 def shift_of(moved: Tensor, pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
     """What the motion `[B, 4]` does to `pixels [B, D, 2]`, px."""
-    u, v = centred(pixels, image_size).unbind(-1)
-    du, dv, rotation, growth = moved[..., None, :].unbind(-1)
-    return torch.stack([du - rotation * v + growth * u, dv + rotation * u + growth * v], -1)
+    shift: Tensor = (motion_of_pixels(pixels, image_size) * moved[:, None, None]).sum(-1)
+    return shift
 
 
 def in_words(moved: Tensor, image_size: tuple[int, int]) -> Tensor:

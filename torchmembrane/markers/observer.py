@@ -122,14 +122,13 @@ class MarkerObserver(nn.Module):
         Raises:
             MembraneError: an image that does not show the markers.
         """
-        status = self.judge(*self(images)).status
+        with torch.no_grad():
+            displacement, confidence, _, status = self.judge(*self(images))
         if (status != Status.OK.value).any():
             bad = int(status.ne(Status.OK.value).nonzero()[0])
             raise MembraneError(f"rest image {bad}: {Status(int(status[bad])).text}; expected a frame without contact")
-        pixels, found = self.locate(images)
-        weight = found[..., None].to(pixels.dtype)
-        mean = (weight * pixels).sum(0) / weight.sum(0).clamp_min(1)
-        return torch.where(found.any(0)[:, None], mean, self.measured_rest)
+        weight = (confidence > 0).to(displacement.dtype)[..., None]
+        return self.measured_rest + (weight * displacement).sum(0) / weight.sum(0).clamp_min(1)
 
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels `[B, D, 2]` of the markers in grey images `[B, 1, height, width]`, and which of them are found `[B, D]`."""
