@@ -8,7 +8,22 @@ import torch
 
 from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
-from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.base import Contacts, Observation
+from torchmembrane.estimators.covariance import changes, linearise, noise_loads
+from torchmembrane.estimators.deviations import (
+    AT_RIM,
+    DEPTH,
+    DIP,
+    DIP_AT_RIM,
+    DIP_SHARE,
+    DIP_UNSEEN,
+    FORCE,
+    FORCE_SHARE,
+    UNSEEN,
+    depths,
+    of_presses,
+    spreads,
+)
 from torchmembrane.estimators.force_balance import ForceBalance
 from torchmembrane.estimators.settings import ForceBalanceSettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
@@ -17,6 +32,7 @@ from torchmembrane.simulate import Simulator, Stroke
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
+from torchmembrane.surface.stencil import inner
 from torchmembrane.surface.tangent import tangent_frame
 
 NOISE, DRAWS = 0.05, 192  # px
@@ -161,3 +177,54 @@ def test_deviations_are_of_the_weights_of_the_solve():
         deviations = reconstructor.standard_deviations(result)
     scatter, said = result.force.std(0).norm(), deviations.force.square().mean(0).sum().sqrt()
     assert 0.6 < said / scatter < 1.5
+
+
+@pytest.mark.parametrize("filling", ["liquid", "gas", "open"])
+def test_spreads_by_the_transposed_equations_are_those_of_every_noise_by_itself(filling):
+    """Force and depth: one solve for each against one for every marker and direction, a camera that may move included."""
+    gas = (10.0, 900.0) if filling == "gas" else None
+    estimator, camera, exact = observed("fingertip", 17, truth_grid=31, filling=filling, gas=gas)
+    confidence = (torch.arange(len(exact)) % 7 > 0).double()[None]
+    covariance = torch.tensor([[2e-3, 1e-3], [1e-3, 4e-3]]).double().expand(1, len(exact), 2, 2)
+    observation = estimator.prepare(camera, exact[None], confidence, covariance)
+    found = estimator(observation)
+    net, state = estimator.coarse, estimator.coarsened(found.vertices, found.pressure, found.moved)
+    settings, equations = estimator.settings, net.equations
+    of_force, of_depth = spreads(equations, net.cavity, settings, state, observation)
+    measured = equations.bearings.measured(observation)
+    scales = settings.tau[1], settings.outlier
+    _, normal, solution = linearise(equations, net.cavity, state, measured, scales, settings.camera_motion, curvature=True)
+    each = torch.eye(2).double().expand(1, len(exact), 2, 2)
+    dx, dp = changes(solution, noise_loads(equations, normal, measured, solution.motion, each))
+    dF = dx @ solution.force.mT - dp[..., None] * solution.of_pressure[:, None]
+    torch.testing.assert_close(of_force, dF.square().sum(1).sqrt())
+    inner_normals = inner(net.membrane.rest_normals, net.membrane.grid)
+    depth = inner(depths(net.membrane, state.x)[..., None], net.membrane.grid)[0, :, 0]
+    deepest = int(depth.argmax())
+    of_deepest = dx.unflatten(-1, (3, -1))[0, :, :, deepest] @ inner_normals[deepest]
+    torch.testing.assert_close(of_depth[0], of_deepest.square().sum().sqrt())
+
+
+def test_deviations_of_an_answer_are_its_spreads_and_what_the_model_leaves_out():
+    """Each part by itself, and turned with the force."""
+    spread, size, spacing = (torch.tensor([[3.0, 4.0, 0.0]]), torch.tensor([2.0])), 10.0, 2.0
+
+    def of(spread, force=(0.0, 0.0, 0.0), depth=0.0, at_rim=torch.nan, unseen=0.0):
+        rows = {name: torch.full((1, 4), torch.nan) for name in Contacts._fields}
+        contacts = Contacts(**rows | {"points": torch.full((1, 4, 3), torch.nan)})
+        if at_rim == at_rim:
+            contacts.points[0, 0], contacts.at_rim[0, 0] = 0.0, at_rim
+        force, depth = torch.tensor([force]), torch.tensor([depth])
+        return of_presses(spread, force, depth, contacts, size, spacing, torch.tensor(unseen))
+
+    nothing = tuple(torch.zeros_like(s) for s in spread)
+    close = torch.testing.assert_close
+    close(of(spread, at_rim=0).force, FORCE * spread[0])
+    close(of(spread, at_rim=0).depth, torch.tensor([((DEPTH * 2) ** 2 + (DIP * 0.4) ** 2) ** 0.5]))
+    close(of(nothing, (0.0, -5.0, 0.0), at_rim=0).force, torch.tensor([[0.0, 5 * FORCE_SHARE, 0.0]]))
+    rim = of(nothing, (3.0, 0.0, 4.0), 2.0, at_rim=1)
+    own = FORCE_SHARE * torch.tensor([[3.0, 0.0, 4.0]])
+    close(rim.force, (own**2 + (5 * AT_RIM) ** 2).sqrt())
+    close(rim.depth, torch.tensor([((DIP * 0.4) ** 2 + (DIP_SHARE * 0.4) ** 2 + (DIP_AT_RIM * 2) ** 2) ** 0.5]))
+    close(of(nothing, unseen=7.0).force, torch.full((1, 3), 7 * UNSEEN))
+    close(of(nothing).depth, torch.tensor([DIP_UNSEEN * 0.4]))

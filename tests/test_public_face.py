@@ -190,7 +190,7 @@ def test_a_foreign_or_stale_previous_is_refused_in_words(sensor, reconstructor, 
 def test_a_result_moves_and_keeps_its_meaning(result):
     double = result.to(torch.float64)
     assert double.vertices.dtype == torch.float64 and double.status.dtype == torch.int32
-    assert isinstance(double, tm.Reconstruction) and len(result) == 24 and result[0] is result.vertices
+    assert isinstance(double, tm.Reconstruction) and len(result) == 26 and result[0] is result.vertices
     arrays = result.cpu().numpy()
     assert all(isinstance(array, np.ndarray) for array in arrays) and arrays.status.dtype == np.int32
     frame = result.frame(1)

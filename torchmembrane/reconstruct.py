@@ -205,8 +205,9 @@ class Reconstructor(nn.Module):
     def _solve(self, flow: MarkerFlow, previous: Reconstruction | None) -> Reconstruction:
         usable, confidence, covariance, status = self.observer.judge(*flow)
         start = None if previous is None else self.start(previous.vertices, previous.pressure, previous.camera_motion)
-        found = self.estimator(self.observation(usable, confidence, covariance), start)
-        return self.result(found, flow.displacement, confidence, status)
+        observation = self.observation(usable, confidence, covariance)
+        found = self.estimator(observation, start)
+        return self.result(found, observation, flow.displacement, confidence, status)
 
     @piece
     def start(self, vertices: Tensor, pressure: Tensor, camera_motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -228,7 +229,9 @@ class Reconstructor(nn.Module):
         return self.estimator.prepare(self.camera, self.rest_pixels + displacement, confidence, covariance + error)
 
     @piece
-    def result(self, found: Equilibrium, displacement: Tensor, confidence: Tensor, status: Tensor) -> Reconstruction:
+    def result(
+        self, found: Equilibrium, observation: Observation, displacement: Tensor, confidence: Tensor, status: Tensor
+    ) -> Reconstruction:
         """The frames' results, NaN where there is no surface."""
         membrane, lost, x = self.estimator.membrane, confidence <= FOUND, found.vertices
         u = x - membrane.rest
@@ -248,6 +251,7 @@ class Reconstructor(nn.Module):
         gone = ~ok | broken
         normals = membrane.normals(x)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
+        deviations = self.estimator.deviations(found, observation, contacts)
         wrench = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1)
 
         def kept(values: Tensor) -> Tensor:
@@ -278,6 +282,8 @@ class Reconstructor(nn.Module):
             contact_at_rim=kept(contacts.at_rim),
             coverage=kept(coverage),
             camera_motion=kept(in_words(found.moved, self.image_size)),
+            force_deviation=kept(deviations.force),
+            depth_deviation=kept(deviations.depth),
         )
 
     def standard_deviations(self, result: Reconstruction) -> StandardDeviations:

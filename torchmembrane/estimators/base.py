@@ -2,6 +2,7 @@
 
 from typing import ClassVar, NamedTuple, Protocol
 
+import torch
 from torch import Tensor
 
 from ..camera.model import Camera
@@ -97,6 +98,19 @@ class Contacts(NamedTuple):
     at_rim: Tensor
 
 
+class Deviations(NamedTuple):
+    """Standard deviations: `force [B, 3]`, and `depth [B]` of the deepest displacement along the rest normal."""
+
+    force: Tensor
+    depth: Tensor
+
+    @classmethod
+    def unknown(cls, found: Equilibrium) -> "Deviations":
+        """NaN for every frame."""
+        force = torch.full_like(found.vertices[:, 0], torch.nan)
+        return cls(force, force[:, 0])
+
+
 class Estimator(Protocol):
     """From what the markers show to the surface: an `nn.Module` of one sensor, batched and differentiable.
 
@@ -128,4 +142,8 @@ class Estimator(Protocol):
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something touches; `normals [B, V, 3]` of the surface found."""
+        ...
+
+    def deviations(self, found: Equilibrium, observation: Observation, contacts: Contacts) -> Deviations:
+        """How far off force and depth may be."""
         ...

@@ -53,6 +53,11 @@ class CameraMotion(NamedTuple):
         kept: Tensor = loads - _solve(self.own, slopes.mT).mT @ self.coupling
         return kept
 
+    def turning(self, y: Tensor) -> Tensor:
+        """`T^-1 B y`, `[B, L, 4]`, of fields `y [B, L, 3 N]`."""
+        turned: Tensor = _solve(self.own, self.coupling @ y.mT).mT
+        return turned
+
     def following(self, move: Tensor) -> Tensor:
         """By how much the camera moves, `[B, 4]`, when the vertices move by `move [B, 3 N]`."""
         moved: Tensor = -_solve(self.own, (self.slope[..., None] + self.coupling @ move[..., None]))[..., 0]

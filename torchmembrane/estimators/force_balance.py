@@ -34,12 +34,13 @@ from ..surface.membrane import Membrane
 from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner, pad_border
 from ..surface.tangent import tangent_frame
-from .base import Contacts, Equilibrium, Observation, Problem
+from .base import Contacts, Deviations, Equilibrium, Observation, Problem
 from .bearings import Bearings, MarkerBearings, marker_rays, seen_from_origin
 from .contact_force import ContactForce
 from .contact_patches import ContactPatches
 from .covariance import StandardDeviations, linearise, noise_loads, push_noise, spread
 from .descent import Descent, State
+from .deviations import depths, of_presses, spreads
 from .normal_equations import BalanceEquations
 from .robust import Cauchy
 from .settings import ForceBalanceSettings
@@ -254,6 +255,18 @@ class ForceBalance(nn.Module):
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes."""
         return self.patches.pushes(found.vertices, normals, found.traction, found.reference)
+
+    def deviations(self, found: Equilibrium, observation: Observation, contacts: Contacts) -> Deviations:
+        """How far off force and depth may be; spread on the grid of `coarse`, which costs little and knows as much."""
+        net, state = self, State(found.vertices, found.pressure, found.moved)
+        if self.coarse is not None:
+            net, state = self.coarse, self.coarsened(*state)
+        with torch.no_grad():
+            spread = spreads(net.equations, net.cavity, self.settings, state, observation)
+        force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, found.vertices)
+        spacing = self.size / len(self.equations.bearings.positions) ** 0.5
+        unseen = self.equations.loss.push_noise.mean() * self.reference * self.size**2
+        return of_presses(spread, force, depth.amax(-1), contacts, self.size, spacing, unseen)
 
     def objective(self, found: Equilibrium, observation: Observation) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and the loss of the tractions."""

@@ -10,7 +10,7 @@ from ..mechanics.affine_quadrilateral import AffineQuadrilaterals
 from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..surface.membrane import Membrane
-from .base import Contacts, Equilibrium, Observation, Problem
+from .base import Contacts, Deviations, Equilibrium, Observation, Problem
 from .flow import VertexFlow
 from .segmentation import Segmentation
 
@@ -91,3 +91,7 @@ class VertexRays(nn.Module):
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where the membrane bulges in along its `normals [B, V, 3]` (section 5.1)."""
         return self.segmentation.contacts(found.vertices, normals)
+
+    def deviations(self, found: Equilibrium, observation: Observation, contacts: Contacts) -> Deviations:
+        """NaN: without tractions nothing is known of them."""
+        return Deviations.unknown(found)

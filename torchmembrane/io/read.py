@@ -36,7 +36,7 @@ def read_results(folder: str | Path) -> "Results":
         >>> folder = Path(tempfile.mkdtemp())
         >>> Mesh(*[np.zeros(0)] * 8, "mm", "N", "finger", "", "force-balance", "neo_hookean", "", "npz").save(folder / MESH)
         >>> for name in ("rest", "press"):
-        ...     save_frame(folder / f"{name}.npz", Reconstruction(*torch.zeros(24, 1)).frame(0))
+        ...     save_frame(folder / f"{name}.npz", Reconstruction(*torch.zeros(26, 1)).frame(0))
         >>> results = read_results(folder)
         >>> results.names, results.mesh.length_unit, int(results["press"]["status"])
         (['press', 'rest'], 'mm', 0)

@@ -42,6 +42,8 @@ class Reconstruction(NamedTuple):
     coverage          [B]        share of the membrane's area that found markers see, of what they see at rest
     camera_motion     [B, 4]     of the image against the rim, estimated and taken out: du, dv (px), rotation (degrees, u to v),
                                  scale, about the image's centre; `pixels` stay as measured
+    force_deviation   [B, 3]     standard deviation of `force`, with the model's error in it; NaN where no tractions are found
+    depth_deviation   [B]        the same of the deepest displacement along the inward rest normals
 
     A frame without a surface has NaN in every floating array but `pixels` and `confidence`, which keep what was found.
     """
@@ -70,12 +72,14 @@ class Reconstruction(NamedTuple):
     contact_at_rim: Tensor
     coverage: Tensor
     camera_motion: Tensor
+    force_deviation: Tensor
+    depth_deviation: Tensor
 
     def frame(self, index: int) -> dict[str, np.ndarray]:
         """One frame as numpy arrays, float32 (status int32), by the names above.
 
         Example:
-            >>> batch = Reconstruction(*torch.zeros(24, 2, 3))  # two frames; arrays of other shapes in a real one
+            >>> batch = Reconstruction(*torch.zeros(26, 2, 3))  # two frames; arrays of other shapes in a real one
             >>> frame = batch.frame(1)
             >>> frame["force"].tolist(), str(frame["status"].dtype)
             ([0.0, 0.0, 0.0], 'int32')
@@ -112,6 +116,8 @@ ADDED: dict[str, tuple[int, ...]] = {
     "contact_at_rim": (0,),
     "coverage": (),
     "camera_motion": (4,),
+    "force_deviation": (3,),
+    "depth_deviation": (),
 }
 """Arrays that results did not always hold, with their shapes: 0 stands for as many as there are `contact_points`."""
 
@@ -125,7 +131,7 @@ def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
 
     Example:
         >>> from tempfile import TemporaryDirectory
-        >>> frame = Reconstruction(*torch.ones(24, 1, 3)).frame(0)
+        >>> frame = Reconstruction(*torch.ones(26, 1, 3)).frame(0)
         >>> with TemporaryDirectory() as folder:
         ...     save_frame(f"{folder}/press.npz", frame)
         ...     load_frame(f"{folder}/press.npz")["force"].tolist()
@@ -182,7 +188,7 @@ def stack_frames(frames: list[dict[str, np.ndarray]]) -> Reconstruction:
         The batch, in their order, on the CPU.
 
     Example:
-        >>> first, second = (Reconstruction(*torch.full((24, 1, 3), value)).frame(0) for value in (1.0, 2.0))
+        >>> first, second = (Reconstruction(*torch.full((26, 1, 3), value)).frame(0) for value in (1.0, 2.0))
         >>> stack_frames([first, second]).force.tolist()
         [[1.0, 1.0, 1.0], [2.0, 2.0, 2.0]]
     """

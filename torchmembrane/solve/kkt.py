@@ -41,7 +41,7 @@ def constrained_minimum(
 
 
 class BorderedStep(NamedTuple):
-    """`step [B, N]` and what the second border's unknown rises by, `rise [B]`."""
+    """`step [..., N]` and what the second border's unknown rises by, `rise [...]`."""
 
     step: Tensor
     rise: Tensor
@@ -57,21 +57,21 @@ def solve_bordered(
         [n' 0  C] [lambda]   [ t]
 
     Args:
-        loads: `[B, 3, N]`: `n`, `g`, `m`.
-        solved: `[B, 3, N]`: `M^-1` of them.
-        corner: `c [B]`.
-        load: `b [B]`.
-        compliance: `C`, `[B]` or `[]`.
-        target: `t [B]`.
+        loads: `[..., 3, N]`: `n`, `g`, `m`.
+        solved: `[..., 3, N]`: `M^-1` of them.
+        corner: `c [...]`.
+        load: `b [...]`.
+        compliance: `C`, `[...]` or `[]`.
+        target: `t [...]`.
     """
-    products = (loads @ solved.mT).flatten(1).unbind(-1)
+    products = (loads @ solved.mT).flatten(-2).unbind(-1)
     nMn, nMg, nMm, mMg, mMm = *products[:3], *products[7:]
     a11, a12, a22 = corner - mMm, compliance - nMm, -nMn
     b1, b2 = load + mMg, target + nMg
     det = a11 * a22 - a12 * a12
     rise, multiplier = (b1 * a22 - a12 * b2) / det, (a11 * b2 - a12 * b1) / det
-    of_border, of_load, of_second = solved.unbind(1)
-    return BorderedStep(-(multiplier[:, None] * of_border + of_load + rise[:, None] * of_second), rise)
+    of_border, of_load, of_second = solved.unbind(-2)
+    return BorderedStep(-(multiplier[..., None] * of_border + of_load + rise[..., None] * of_second), rise)
 
 
 def _dot(p: Tensor, q: Tensor) -> Tensor:

@@ -1,0 +1,111 @@
+"""How often intervals of one standard deviation hold the truth, and how wide they are.
+
+python bench/intervals.py DATA [--first 0] [--sensors 10000] [--grid N] [--json FILE]
+
+DATA from random_sensors.py, its light strokes and presses. Of frames with status ok, by the true force over the sensor's
+largest, and apart where a contact reaches the rim: how many intervals of `force_deviation` (each component) and
+`depth_deviation` hold the truth (68 % would of normal errors), the deviations' median over the rms error, both over the force
+or depth itself, and the rank correlation of deviations and errors.
+"""
+
+import argparse
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from bands import BANDS
+from record import write
+
+import torchmembrane as tm
+
+FEWEST = 5
+
+
+def row_of(r: tm.Reconstructor, path: Path) -> dict:
+    """Errors and deviations of one frame."""
+    truth = dict(np.load(path))
+    with torch.no_grad():
+        got = r(truth["image"]).frame(0)
+    n = round(len(truth["vertices_nominal"]) ** 0.5)
+    normals = r.sensor.surface.membrane((n, n)).rest_normals.numpy()
+    rest = r.sensor.membrane
+    found = -(got["displacement"] * rest.rest_normals.numpy()).sum(-1).min(initial=0, where=~rest.fixed.numpy())
+    deepest = -((truth["vertices_deformed"] - truth["vertices_nominal"]) * normals).sum(-1).min()
+    F = truth["force"].astype(float)
+    return dict(
+        sensor=path.parent.name,
+        file=path.stem,
+        status=int(got["status"]),
+        force=np.linalg.norm(F),
+        depth=deepest,
+        force_error=(got["force"] - F).tolist(),
+        depth_error=[found - deepest],
+        force_deviation=got["force_deviation"].tolist(),
+        depth_deviation=[float(got["depth_deviation"])],
+        at_rim=bool((got["contact_at_rim"] == 1).any()),
+    )
+
+
+def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.corrcoef(a.argsort().argsort(), b.argsort().argsort())[0, 1])
+
+
+def line(name: str, rows: list[dict], of: str) -> None:
+    error, deviation = (np.array([row[f"{of}_{what}"] for row in rows]) for what in ("error", "deviation"))
+    held = (abs(error) < deviation).mean()
+    size = np.array([row[of] for row in rows])
+    error, deviation = (np.linalg.norm(a, axis=1) for a in (error, deviation))
+    wide = np.median(deviation / size) / np.sqrt(np.mean((error / size) ** 2))
+    print(f"{name:28s} {len(rows):4d}: held {held:.2f}, wide {wide:.2f}, ranks {rank_correlation(error, deviation):.2f}")
+
+
+def report(rows: list[dict]) -> None:
+    largest: dict[str, float] = {}
+    for row in rows:
+        largest[row["sensor"]] = max(largest.get(row["sensor"], 0.0), row["force"])
+    told = [row for row in rows if row["status"] == 0 and row["force"] > 0 and row["depth"] > 0]
+    for of in ("force", "depth"):
+        line(of, told, of)
+        for low, high in zip(BANDS[:-1], BANDS[1:], strict=True):
+            within = [row for row in told if low < row["force"] / largest[row["sensor"]] <= high]
+            for name, chosen in (
+                ("", within),
+                (", at the rim", [row for row in within if row["at_rim"]]),
+                (", clear", [row for row in within if not row["at_rim"]]),
+            ):
+                if len(chosen) >= FEWEST:
+                    line(f"{of}, {low} to {high}{name}", chosen, of)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--sensors", type=int, default=10000)
+    parser.add_argument("--grid", type=int)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    rows = []
+    for folder in sorted(args.data.glob("s[0-9]*")):
+        if not args.first <= int(folder.name[1:]) < args.first + args.sensors:
+            continue
+        files = [path for kind in ("press", "light") for path in sorted(folder.glob(f"{kind}_*.npz"))]
+        try:
+            sensor = tm.Sensor.from_file(folder / "sensor.toml")
+            if args.grid:
+                sensor = replace(sensor, membrane=sensor.surface.membrane((args.grid, args.grid)))
+            r = tm.Reconstructor(sensor)
+        except tm.MembraneError as error:
+            print(f"{folder.name}: {error}")
+            continue
+        rows += [row_of(r, path) for path in files]
+    report(rows)
+    write(args.json, json.loads(json.dumps(dict(rows=rows), default=float)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""How far off a result's force and depth may be: the markers' noise spread by the equations, and the model's own error.
+
+A small change of the markers changes the force and the depth by their sensitivities, which the transposed equations give: one
+solve for each wanted number, not for each marker,
+
+    K y = g,    spread^2 = sum_d |w_d (J_d y - K_d T^-1 B y)|^2
+
+with `g` the wanted number's derivative in surface and pressure and the symmetric `K` of `covariance`. On the estimator's second
+finest grid, which costs little and knows as much. Every marker's noise is what the solve took it for, with a share of the
+displacements in it for the grid and the material; but these err together over many markers, so the spread is too small. What is
+missing was fitted to presses of random sensors (`bench/intervals.py`), as standard deviations that add up:
+
+    of the force    FORCE x spread,  FORCE_SHARE of the force along itself,  AT_RIM of it where a contact reaches the rim,
+                    where no contact is found UNSEEN of what a patch as pushed as the noise pushes would bear
+    of the depth    DEPTH x spread,  DIP spacing^2 / size, or DIP_UNSEEN where no contact is found,  DIP_SHARE depth spacing /
+                    size,  DIP_AT_RIM depth where a contact reaches the rim
+"""
+
+import torch
+from torch import Tensor
+
+from ..mechanics.cavity import CavityLaw
+from ..solve.kkt import solve_bordered
+from ..surface.membrane import Membrane
+from ..surface.stencil import inner
+from .base import Contacts, Deviations, Observation
+from .bearings import Bearings
+from .covariance import LinearisedSolution, linearise
+from .descent import State
+from .normal_equations import BalanceEquations, NormalEquations
+from .settings import ForceBalanceSettings
+
+FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 1.7, 0.023, 0.4, 0.004
+DEPTH, DIP, DIP_UNSEEN, DIP_SHARE, DIP_AT_RIM = 2.5, 0.04, 0.24, 0.6, 0.075
+
+
+def of_presses(
+    noise: tuple[Tensor, Tensor],
+    force: Tensor,
+    depth: Tensor,
+    contacts: Contacts,
+    size: float,
+    spacing: float,
+    unseen: Tensor,
+) -> Deviations:
+    """With the model's error.
+
+    Args:
+        noise: of force and depth, as `spreads` gives it.
+        force: `[B, 3]`, as found.
+        depth: `[B]`, as found.
+        contacts: as found.
+        size: of the surface.
+        spacing: of the markers.
+        unseen: the force `[]` that noise alone makes, over the whole surface.
+    """
+    of_force, of_depth = (spread.square() for spread in noise)
+    none = (~contacts.points[..., 0].isfinite().any(1)).to(depth.dtype)
+    at_rim = (contacts.at_rim == 1).any(1).to(depth.dtype)
+    around = (AT_RIM * at_rim).square() * force.square().sum(-1) + (UNSEEN * unseen * none).square()
+    dip = (DIP + none * (DIP_UNSEEN - DIP)) * spacing**2 / size
+    share = (DIP_SHARE * spacing / size) ** 2 + (DIP_AT_RIM * at_rim).square()
+    return Deviations(
+        (FORCE**2 * of_force + FORCE_SHARE**2 * force.square() + around[:, None]).sqrt(),
+        (DEPTH**2 * of_depth + dip.square() + share * depth.square()).sqrt(),
+    )
+
+
+def depths(membrane: Membrane, x: Tensor) -> Tensor:
+    """Displacements along the inward rest normals `[B, V]`, of a surface `x [B, V, 3]`."""
+    depth: Tensor = ((membrane.rest - x) * membrane.rest_normals).sum(-1)
+    return depth
+
+
+def spreads(
+    equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, state: State, observation: Observation
+) -> tuple[Tensor, Tensor]:
+    """Of the force `[B, 3]` and the depth `[B]` at a solution, by the noise that the solve takes the markers to have."""
+    membrane, measured = equations.forces.membrane, equations.bearings.measured(observation)
+    scales, play = (settings.tau[1], settings.outlier), settings.camera_motion
+    _, normal, solution = linearise(equations, cavity, state, measured, scales, play, curvature=True)
+    depth = inner(depths(membrane, state.x)[..., None], membrane.grid)[..., 0]
+    deepest = (depth == depth.amax(-1, keepdim=True)).to(depth.dtype)
+    inwards = -inner(membrane.rest_normals, membrane.grid).mT
+    of_depth = (deepest / deepest.sum(-1, keepdim=True))[:, None] * inwards
+    frames = len(depth)
+    wanted = torch.cat([solution.force.expand(frames, -1, -1), of_depth.flatten(1)[:, None]], 1)
+    by_pressure = torch.cat([-solution.of_pressure, torch.zeros_like(state.pressure)[:, None]], 1)
+    both = spreads_of(equations, normal, solution, measured, wanted, by_pressure)
+    return both[:, :3], both[:, 3]
+
+
+def spreads_of(
+    equations: BalanceEquations,
+    normal: NormalEquations,
+    solution: LinearisedSolution,
+    measured: Bearings,
+    wanted: Tensor,
+    by_pressure: Tensor,
+) -> Tensor:
+    """Standard deviations `[B, L]` of numbers whose derivatives in the inner vertices are `wanted [B, L, 3 N]` and in the
+    pressure `by_pressure [B, L]`, where all angles `across` have a standard deviation of 1."""
+    solved = solution.solve(torch.cat([wanted, solution.borders], 1))
+    y = solved[:, :-2]
+    if solution.corner is not None:
+        (c, compliance), (m, n) = solution.corner, solution.borders.unbind(1)
+        of_m, of_n = solved[:, -2:].unbind(1)
+        loads, solutions = (
+            torch.stack([b[:, None].expand_as(a), -a, d[:, None].expand_as(a)], 2)
+            for a, b, d in ((wanted, n, m), (y, of_n, of_m))
+        )
+        zero = torch.zeros_like(by_pressure)
+        y = solve_bordered(loads, solutions, c[:, None], by_pressure, compliance[:, None], zero).step
+    at_markers = y.unflatten(-1, (3, -1)) @ equations.bearings.vertex_shares.mT
+    of_angles = (normal.weighted_jacobian[:, None] * at_markers[:, :, None]).sum(3)
+    of_camera = solution.motion.turning(y)[..., None, :, None] * normal.marker_weights[:, None, None, None]
+    spread: Tensor = (of_angles - (measured.motion[:, None] * of_camera).sum(3)).square().sum((2, 3)).sqrt()
+    return spread
