@@ -30,8 +30,10 @@ from .descent import State
 from .normal_equations import BalanceEquations, NormalEquations
 from .settings import ForceBalanceSettings
 
-FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 1.7, 0.023, 0.4, 0.004
-DEPTH, DIP, DIP_UNSEEN, DIP_SHARE, DIP_AT_RIM = 2.5, 0.04, 0.24, 0.6, 0.075
+FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 1.4, 0.03, 0.4, 0.004
+DEPTH, DIP, DIP_UNSEEN, DIP_SHARE, DIP_AT_RIM = 2.4, 0.04, 0.24, 0.7, 0.075
+FINE = 25
+"""Lines of the grids that it was fitted on, at least; on coarser ones the spreads count for more, as the square of the step."""
 
 
 def of_presses(
