@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 
+from ..camera.mode import Mode
 from ..camera.model import Camera
 from ..io.frames import Frame
 from ..io.status import Status
@@ -48,15 +49,24 @@ def _camera(camera: Camera, unit: str) -> list[str]:
     per = "px" if camera.model == "pinhole" else "px/rad"
     bent = camera.distortion.tolist()
     distortion = f"distortion {_listed(bent)}" if any(bent) else "no distortion"
+    mode = [] if camera.mode is None else [_mode(camera.mode)]
     lines = [
         f"{camera.model}, {width} x {height} px, focal {_listed(camera.focal.tolist())} {per}, "
         f"centre {_listed(camera.centre.tolist())} px, {distortion}",
+        *mode,
         f"field of view {_opening(camera, 0):.0f} x {_opening(camera, 1):.0f} degrees",
     ]
     for port in camera.ports:
         lines.append(f"port at {port.distance:g} {unit}, {port.thickness:g} {unit} thick, index {port.index:g}")
     lines.append(f"medium of index {float(camera.medium_index):g} behind" if camera.ports else "no ports")
     return lines
+
+
+def _mode(mode: Mode) -> str:
+    left, top, width, height = mode.crop
+    blocks = "not binned" if mode.binning == (1, 1) else "binned {} x {}".format(*mode.binning)
+    whole = "calibrated at {} x {} px".format(*mode.image_size)
+    return f"{whole}; its images are the {width} x {height} px from column {left} and row {top} on, {blocks}"
 
 
 def _opening(camera: Camera, axis: int) -> float:

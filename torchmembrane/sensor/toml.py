@@ -76,6 +76,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     tables, surface, markers = tables_of(parts), parts.surface, parts.markers
+    tables["camera"] |= _calibrated(parts.camera)
     if surface.shape in SHAPES_BY_ARRAYS:
         tables["membrane"]["file"] = f"{path.stem}_{surface.shape}.npz"
         np.savez_compressed(path.with_name(tables["membrane"]["file"]), **surface.values)
@@ -95,7 +96,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
 
 
 def tables_of(parts: SensorParts) -> dict[str, dict[str, Any]]:
-    """A sensor's numbers and words, without arrays, as the tables and keys of its file."""
+    """A sensor's numbers and words, without arrays, as the tables and keys of its file; a camera in a mode is that mode's."""
     camera, material, cavity, markers = parts.camera, parts.material, parts.cavity, parts.markers
     return {
         "": {"format": FORMAT, "name": parts.name, "length_unit": parts.length_unit},
@@ -111,6 +112,14 @@ def tables_of(parts: SensorParts) -> dict[str, dict[str, Any]]:
         "cavity": asdict(cavity),
         "markers": {"kind": markers.kind, "polarity": markers.polarity},
     }
+
+
+def _calibrated(camera: Camera) -> dict[str, list[float]]:
+    """The calibration and the mode of a camera in one, as keys of its file; none where its values are no longer the mode's."""
+    mode, found = camera.mode, (camera.focal.tolist(), camera.centre.tolist())
+    if mode is None or found != (list(mode.binned_focal), list(mode.binned_centre)):
+        return {}
+    return {key: list(value) for key, value in mode._asdict().items()}
 
 
 def default_grid(markers: Markers) -> tuple[int, int]:
@@ -135,15 +144,17 @@ def default_grid(markers: Markers) -> tuple[int, int]:
 
 
 def _read_camera(table: Table) -> Camera:
-    table.allow(("model", "image_size", "focal", "centre", "distortion", "ports", "medium"))
+    table.allow(("model", "image_size", "focal", "centre", "distortion", "crop", "binning", "ports", "medium"))
     ports = table.tables("ports")
     medium = table.table("medium") if ports or "medium" in table else None
     for part in ports:
         part.allow(Port._fields)
     if medium:
         medium.allow(("index",))
+    crop = table.whole_numbers("crop", 4) if "crop" in table else None
+    binning = table.whole_pair("binning") if "binning" in table else [1, 1]
     with table.naming():
-        return Camera(
+        calibrated = Camera(
             model=table.text("model", ("pinhole", "fisheye")),
             image_size=table.whole_numbers("image_size", 2),
             focal=table.numbers("focal", 2),
@@ -152,6 +163,7 @@ def _read_camera(table: Table) -> Camera:
             ports=[Port(*(port.number(key) for key in Port._fields)) for port in ports],
             medium_index=medium.number("index") if medium else 1.0,
         )
+        return calibrated.in_mode(crop, binning) if "crop" in table or "binning" in table else calibrated
 
 
 def _read_material(table: Table) -> Material:
