@@ -245,7 +245,7 @@ def test_fingerprint_changes_with_any_array(tmp_path):
     assert len(seen) == 4
 
 
-def test_a_file_without_a_mode_has_the_fingerprint_that_it_always_had():
+def test_a_file_without_a_mode_or_a_tool_has_the_fingerprint_that_it_always_had():
     """Folders of results go by it: they are continued."""
     examples = Path(__file__).parents[1] / "examples"
     known = "7fc64d13020689469967f9341c9783157a378e7cfa03c05f47c038220186e831"

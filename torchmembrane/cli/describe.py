@@ -40,6 +40,7 @@ def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame:
         "material": _material(sensor, reconstructor),
         "cavity": _cavity(sensor),
         "markers": _markers(sensor, reconstructor, frame),
+        "tool": _tool(sensor),
     }
     return [f"{key if i == 0 else '':<10}{line}" for key, block in lines.items() for i, line in enumerate(block)]
 
@@ -139,6 +140,14 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
         rms = np.sqrt((off**2).mean())
         lines.append(f"they lie {rms:.2f} px (rms; at most {off.max():.2f} px) from where the model has them")
     return [*lines, f"the rest image reconstructed: {Status(int(frame['status'])).text}"]
+
+
+def _tool(sensor: Sensor) -> list[str]:
+    if sensor.tool is None:
+        return []
+    right, _, ahead = (sensor.tool.rotation.T.round(9) + 0.0).tolist()  # no -0
+    at = f"the camera is at {_listed(sensor.tool.translation)} {sensor.length_unit} in the tool's frame"
+    return [f"{at}, looks along {_listed(ahead)}, its image's right is along {_listed(right)}"]
 
 
 def _listed(values: Iterable[float]) -> str:

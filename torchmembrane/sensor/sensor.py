@@ -12,6 +12,7 @@ import torch
 
 from ..camera.model import Camera
 from ..errors import MembraneError, expect
+from ..pose import Pose
 from ..surface.membrane import Membrane
 from .parts import METRE, Cavity, Markers, Material, SensorParts, Surface, refuse_off_surface
 from .toml import read_sensor, tables_of, write_sensor
@@ -30,6 +31,7 @@ class Sensor:
         cavity: what fills it.
         markers: what the camera follows on it.
         surface: how the file describes the rest surface (default: by the membrane's grid).
+        tool: the camera's pose in the frame of the tool (a robot's flange, a fingertip), where it is known.
 
     A rest image of the calibrated size is cropped and binned where the camera is `in_mode`.
 
@@ -50,6 +52,7 @@ class Sensor:
     cavity: Cavity
     markers: Markers
     surface: Surface = None  # type: ignore[assignment]  # set below where it is left out
+    tool: Pose | None = None
 
     def __post_init__(self) -> None:
         expect(self.length_unit in METRE, "length_unit", self.length_unit, "'mm', 'cm' or 'm'")

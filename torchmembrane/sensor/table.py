@@ -124,6 +124,15 @@ class Table:
         value = self._get(key, right, "a whole number, or a list of 2")
         return value if isinstance(value, list) else [value, value]
 
+    def rotation(self, key: str) -> list[Any]:
+        """The numbers of a rotation: three rows of three, or three of a rotation vector."""
+
+        def right(value: object) -> bool:
+            return _is_list(value, 3, _finite) or _is_list(value, 3, lambda row: _is_list(row, 3, _finite))
+
+        value: list[Any] = self._get(key, right, "three rows of three finite numbers, or a rotation vector of three, degrees")
+        return value
+
     def file(self, key: str) -> Path:
         """The path of the file that `key` names, relative to this file's folder."""
         path = self.path.parent / self.text(key)

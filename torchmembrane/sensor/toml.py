@@ -13,6 +13,7 @@ from ..camera.model import Camera
 from ..camera.ports import Port
 from ..errors import MembraneError
 from ..io.images import mean_image, write_image
+from ..pose import Pose
 from ..surface.membrane import Membrane
 from .parts import (
     METRE,
@@ -50,7 +51,7 @@ def read_sensor(path: Path) -> SensorParts:
         ('neo_hookean', (33, 33))
     """
     file = Table.from_file(path)
-    file.allow(("format", "name", "length_unit", "camera", "membrane", "material", "cavity", "markers"))
+    file.allow(("format", "name", "length_unit", "camera", "membrane", "material", "cavity", "markers", "tool"))
     if file.number("format") != FORMAT:
         raise file.refuse("format", f"{FORMAT}, the one this version reads: update torchmembrane or the file")
     name, length_unit = file.text("name"), file.text("length_unit", METRE)
@@ -61,7 +62,8 @@ def read_sensor(path: Path) -> SensorParts:
     surface, membrane = _read_membrane(file.table("membrane"), markers)
     if markers.positions is not None:
         refuse_off_surface(membrane, markers.positions, [f"{line}: the dot" for line in lines])
-    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface)
+    tool = _read_tool(file.table("tool")) if "tool" in file else None
+    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool)
 
 
 def write_sensor(parts: SensorParts, path: Path) -> Path:
@@ -98,7 +100,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
 def tables_of(parts: SensorParts) -> dict[str, dict[str, Any]]:
     """A sensor's numbers and words, without arrays, as the tables and keys of its file; a camera in a mode is that mode's."""
     camera, material, cavity, markers = parts.camera, parts.material, parts.cavity, parts.markers
-    return {
+    tables: dict[str, dict[str, Any]] = {
         "": {"format": FORMAT, "name": parts.name, "length_unit": parts.length_unit},
         "camera": {
             "model": camera.model,
@@ -112,6 +114,8 @@ def tables_of(parts: SensorParts) -> dict[str, dict[str, Any]]:
         "cavity": asdict(cavity),
         "markers": {"kind": markers.kind, "polarity": markers.polarity},
     }
+    tool = parts.tool
+    return tables if tool is None else tables | {"tool": {key: value.tolist() for key, value in vars(tool).items()}}
 
 
 def _calibrated(camera: Camera) -> dict[str, list[float]]:
@@ -164,6 +168,13 @@ def _read_camera(table: Table) -> Camera:
             medium_index=medium.number("index") if medium else 1.0,
         )
         return calibrated.in_mode(crop, binning) if "crop" in table or "binning" in table else calibrated
+
+
+def _read_tool(table: Table) -> Pose:
+    table.allow(("rotation", "translation"))
+    rotation, translation = table.rotation("rotation"), table.numbers("translation", 3)
+    with table.naming():
+        return Pose(np.array(rotation, float), np.array(translation))
 
 
 def _read_material(table: Table) -> Material:
