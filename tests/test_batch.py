@@ -43,7 +43,8 @@ class Denting:
     def __init__(self, fingerprint="a" * 64):
         membrane = spherical_cap(12.0, 9.0, 3.0, grid=(5, 5))
         camera = SimpleNamespace(image_size=(WIDTH, HEIGHT))
-        self.sensor = SimpleNamespace(name="cap", length_unit="mm", force_unit="N", fingerprint=fingerprint, camera=camera)
+        known = dict(name="cap", length_unit="mm", force_unit="N", fingerprint=fingerprint, camera=camera, tool=None)
+        self.sensor = SimpleNamespace(**known)
         self.estimator = SimpleNamespace(membrane=membrane)
         self.vertex_pixels = membrane.rest[:, :2] + 8
         self.rest_pixels = torch.linspace(2, 10, 14).reshape(7, 2)

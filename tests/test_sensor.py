@@ -4,6 +4,7 @@ import dataclasses
 import math
 import shutil
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -242,6 +243,13 @@ def test_fingerprint_changes_with_any_array(tmp_path):
     Image.fromarray(image).save(tmp_path / "rest.png")
     seen.add(Sensor.from_file(path).fingerprint)
     assert len(seen) == 4
+
+
+def test_a_file_without_a_mode_or_a_tool_has_the_fingerprint_that_it_always_had():
+    """Folders of results go by it: they are continued."""
+    examples = Path(__file__).parents[1] / "examples"
+    known = "7fc64d13020689469967f9341c9783157a378e7cfa03c05f47c038220186e831"
+    assert Sensor.from_file(examples / "sensor.toml").fingerprint == known
 
 
 @pytest.mark.parametrize("last", ["0.0,3.0,13.7,large", "0.0,3.0,13.71,small"])

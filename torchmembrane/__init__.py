@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from .io.status import Status
     from .mechanics.hyperelastic import ElasticEnergy
     from .onnx.export import export
+    from .pose import Pose
     from .presets import preset
     from .reconstruct import Reconstructor
     from .sensor.parts import Cavity, Markers, Material, Surface
@@ -55,6 +56,7 @@ _HOMES = {
     "PaperEstimator": "estimators.paper",
     "PaperSettings": "estimators.settings",
     "Port": "camera.ports",
+    "Pose": "pose",
     "Reconstruction": "io.results",
     "Reconstructor": "reconstruct",
     "Sensor": "sensor.sensor",
@@ -84,6 +86,7 @@ __all__ = [
     "PaperEstimator",
     "PaperSettings",
     "Port",
+    "Pose",
     "Reconstruction",
     "Reconstructor",
     "Sensor",

@@ -83,6 +83,17 @@ class Session:
             previous = self.run(np.asarray(image)[None], previous)
             yield previous
 
+    def wrench_in_tool(self, results: dict[str, np.ndarray]) -> np.ndarray:
+        """The wrench of results `[B, 6]` in the frame of the sensor's tool: force, and moment about that frame's origin."""
+        pose = self.mesh.get("camera_in_tool", ())
+        if not len(pose):
+            raise EdgeError(
+                f"the model of {self.name!r} knows no tool; expected one of a sensor file with [tool]: export it again"
+            )
+        rotation, translation = pose[:, :3], pose[:, 3]
+        force, moment = results["wrench"][:, :3] @ rotation.T, results["wrench"][:, 3:] @ rotation.T
+        return np.concatenate([force, moment + np.cross(translation, force)], -1)
+
     def _rest(self, batch: int) -> dict[str, np.ndarray]:
         shapes = {given.name: given.shape[1:] for given in self._session.get_inputs()}
         return {key: np.full((batch, *shapes[f"previous_{key}"]), np.nan, np.float32) for key in self._state}

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ..errors import expect
 from .distortion import fisheye_direction, fisheye_image, pinhole_direction, pinhole_image
+from .mode import Mode
 from .ports import Layers, Port, apparent_points, check_ports, layers_of, refract
 
 COEFFICIENTS = {"pinhole": 5, "fisheye": 4}  # k1 k2 p1 p2 k3 | k1 k2 k3 k4
@@ -58,6 +59,7 @@ class Camera(nn.Module):
         port_thickness: `[P]`.
         port_index: `[P]`.
         medium_index: `[]`.
+        mode: the `Mode` that made this camera of the calibrated one, else None; `in_mode` sets it.
 
     Raises:
         MembraneError: a value is not finite, of the wrong count or sign, or ports overlap.
@@ -104,6 +106,7 @@ class Camera(nn.Module):
         self._parameter("port_thickness", [port[1] for port in ports])
         self._parameter("port_index", [port[2] for port in ports])
         self._parameter("medium_index", medium_index)
+        self.mode: Mode | None = None
 
     def _parameter(self, name: str, value: float | list[float]) -> None:
         self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
@@ -113,6 +116,32 @@ class Camera(nn.Module):
         """The flat layers in order from the camera, as numbers."""
         rows = torch.stack([self.port_distance, self.port_thickness, self.port_index], -1)
         return [Port(*row) for row in rows.tolist()]
+
+    def in_mode(self, crop: Sequence[int] | None = None, binning: int | Sequence[int] = 1) -> "Camera":
+        """The camera whose images are cropped, then binned: the same rays at the mode's pixels.
+
+        Args:
+            crop: left, top, width, height of the part that is kept, px of this camera; None: the whole image.
+            binning: pixels of a block, whose mean becomes one pixel, along u and v; one number for both.
+
+        Returns:
+            A camera with image size, focal lengths and centre of the mode, which is its `mode`.
+
+        Raises:
+            MembraneError: a crop beyond the image, or blocks that do not fill it.
+
+        Example:
+            >>> camera = Camera("pinhole", (640, 480), (400, 400), (320, 240)).in_mode((80, 0, 480, 480), 2)
+            >>> camera.image_size, camera.focal.tolist(), camera.centre.tolist()
+            ((240, 240), [200.0, 200.0], [119.75, 119.75])
+        """
+        part = (0, 0, *self.image_size) if crop is None else crop
+        blocks = (binning, binning) if isinstance(binning, int) else binning
+        mode = Mode.of(self.image_size, self.focal.tolist(), self.centre.tolist(), part, blocks)
+        lens = mode.size, mode.binned_focal, mode.binned_centre, self.distortion.tolist()
+        made = Camera(self.model, *lens, ports=self.ports, medium_index=self.medium_index.item())
+        made.mode = mode
+        return made
 
     def pixel_to_ray(self, pixels: Tensor) -> Rays:
         """The ray on which a pixel's light travels in the medium (section 2, eq. 2; section 5.2 through ports).

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 
+from ..camera.mode import Mode
 from ..camera.model import Camera
 from ..io.frames import Frame
 from ..io.status import Status
@@ -39,6 +40,7 @@ def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame:
         "material": _material(sensor, reconstructor),
         "cavity": _cavity(sensor),
         "markers": _markers(sensor, reconstructor, frame),
+        "tool": _tool(sensor),
     }
     return [f"{key if i == 0 else '':<10}{line}" for key, block in lines.items() for i, line in enumerate(block)]
 
@@ -48,15 +50,24 @@ def _camera(camera: Camera, unit: str) -> list[str]:
     per = "px" if camera.model == "pinhole" else "px/rad"
     bent = camera.distortion.tolist()
     distortion = f"distortion {_listed(bent)}" if any(bent) else "no distortion"
+    mode = [] if camera.mode is None else [_mode(camera.mode)]
     lines = [
         f"{camera.model}, {width} x {height} px, focal {_listed(camera.focal.tolist())} {per}, "
         f"centre {_listed(camera.centre.tolist())} px, {distortion}",
+        *mode,
         f"field of view {_opening(camera, 0):.0f} x {_opening(camera, 1):.0f} degrees",
     ]
     for port in camera.ports:
         lines.append(f"port at {port.distance:g} {unit}, {port.thickness:g} {unit} thick, index {port.index:g}")
     lines.append(f"medium of index {float(camera.medium_index):g} behind" if camera.ports else "no ports")
     return lines
+
+
+def _mode(mode: Mode) -> str:
+    left, top, width, height = mode.crop
+    blocks = "not binned" if mode.binning == (1, 1) else "binned {} x {}".format(*mode.binning)
+    whole = "calibrated at {} x {} px".format(*mode.image_size)
+    return f"{whole}; its images are the {width} x {height} px from column {left} and row {top} on, {blocks}"
 
 
 def _opening(camera: Camera, axis: int) -> float:
@@ -129,6 +140,14 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
         rms = np.sqrt((off**2).mean())
         lines.append(f"they lie {rms:.2f} px (rms; at most {off.max():.2f} px) from where the model has them")
     return [*lines, f"the rest image reconstructed: {Status(int(frame['status'])).text}"]
+
+
+def _tool(sensor: Sensor) -> list[str]:
+    if sensor.tool is None:
+        return []
+    right, _, ahead = (sensor.tool.rotation.T.round(9) + 0.0).tolist()  # no -0
+    at = f"the camera is at {_listed(sensor.tool.translation)} {sensor.length_unit} in the tool's frame"
+    return [f"{at}, looks along {_listed(ahead)}, its image's right is along {_listed(right)}"]
 
 
 def _listed(values: Iterable[float]) -> str:

@@ -79,4 +79,4 @@ def _refusal(shape: tuple[int, ...], size: tuple[int, int]) -> str:
     given = shape[-3:-1] if shape[-1] in (1, 3) else shape[-2:]
     if len(given) == 2:
         said = f"the image is {given[1]} x {given[0]} px, expected {width} x {height} ({said})"
-    return f"{said}: use images of this sensor's camera at its calibrated resolution"
+    return f"{said}: use images of this sensor's camera; where its mode crops or bins them, say so in the file's [camera]"

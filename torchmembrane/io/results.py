@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import MembraneError
+from ..errors import MembraneError, expect
+from ..pose import Pose
 from .atomic import whole_file
 
 
@@ -91,6 +92,26 @@ class Reconstruction(NamedTuple):
         """The push `[B, V]`, compressive normal traction, and the shear `[B, V, 3]`: `traction = shear - push normals`."""
         push = -(self.traction * self.normals).sum(-1)
         return push, self.traction + push[..., None] * self.normals
+
+    def wrench_in(self, pose: Pose) -> Tensor:
+        """The wrench `[B, 6]` in a tool's frame: total contact force, and its moment about that frame's origin.
+
+        Args:
+            pose: the camera's in that frame: `sensor.tool`, or `results.mesh.tool` of stored results.
+
+        Raises:
+            MembraneError: it is none, as of a sensor file without `[tool]`.
+
+        Example:
+            >>> nothing = Reconstruction(*torch.zeros(len(Reconstruction._fields), 1))
+            >>> pressed = nothing._replace(wrench=torch.tensor([[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]]))
+            >>> beside = Pose([0, 0, 0], [5, 0, 0])  # the camera is 5 along the tool's x
+            >>> pressed.wrench_in(beside).tolist()
+            [[0.0, 0.0, -1.0, 0.0, 5.0, 0.0]]
+        """
+        expected = "a Pose: `sensor.tool`, or `results.mesh.tool`, of a sensor file with [tool]"
+        expect(isinstance(pose, Pose), "Reconstruction.wrench_in: pose", pose, expected)
+        return pose.wrench(self.wrench)
 
     def to(self, *args: Any, **kwargs: Any) -> "Reconstruction":
         """All arrays as `torch.Tensor.to` gives them: another device or precision; the status stays an integer."""

@@ -8,6 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..pose import Pose
 from .results import save_frame
 from .status import Status
 
@@ -65,6 +66,8 @@ class Mesh(NamedTuple):
     length_unit, force_unit, name    of the sensor
     sensor          fingerprint of its file
     estimator, energy, element, format, volume, flow, smoothing, locator, rest    the `Settings`
+    camera_in_tool  [3, 4]  rotation and translation from the camera's frame to the tool's, `p_tool = R p + t`; [0, 4] where the
+                            sensor file has no `[tool]`; `tool` gives it as a `Pose`
     """
 
     rest_vertices: np.ndarray
@@ -88,6 +91,7 @@ class Mesh(NamedTuple):
     smoothing: float = 0.0
     locator: str = "fit"
     rest: str = ""
+    camera_in_tool: np.ndarray = np.zeros((0, 4), np.float32)
 
     @classmethod
     def of(cls, reconstructor: "Reconstructor", settings: Settings) -> "Mesh":
@@ -107,6 +111,7 @@ class Mesh(NamedTuple):
             name=sensor.name,
             sensor=sensor.fingerprint,
             **settings._asdict(),
+            camera_in_tool=_rows(sensor.tool),
         )
 
     @classmethod
@@ -129,6 +134,12 @@ class Mesh(NamedTuple):
     def settings(self) -> Settings:
         """The choices that made the results."""
         return Settings(*(getattr(self, name) for name in Settings._fields))
+
+    @property
+    def tool(self) -> Pose | None:
+        """The camera's pose in the tool's frame, as `Reconstruction.wrench_in` takes it; None where it is not known."""
+        known = len(self.camera_in_tool) > 0
+        return Pose(self.camera_in_tool[:, :3], self.camera_in_tool[:, 3]) if known else None
 
     def normal_displacement(self, frame: dict[str, np.ndarray]) -> np.ndarray:
         """Displacement along the rest normals, `[V]`, length unit: negative where the membrane is pressed in."""
@@ -158,6 +169,12 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
                 f"--out {folder}: was made with {option} {before or OWN}, this call asks for {now or OWN}; choose another "
                 f"folder, or {remedy}"
             )
+
+
+def _rows(pose: Pose | None) -> np.ndarray:
+    """Rotation and translation side by side, `[3, 4]`; `[0, 4]` of no pose."""
+    rows = np.zeros((0, 4)) if pose is None else np.column_stack([pose.rotation, pose.translation])
+    return rows.astype(np.float32)
 
 
 def _single(values: Tensor) -> np.ndarray:

@@ -204,9 +204,13 @@ def _finished(tracer: Tracer, inputs: list[Known], result: Any, reconstructor: R
         tracer.assembly.named(value.name, name)
         outputs.append(of_batch(name, value, TensorProto.INT32 if name == "status" else TensorProto.FLOAT))
     given = [of_batch(value.name, value, TensorProto.FLOAT) for value in inputs]
+    return tracer.assembly.model(given, outputs, metadata_of(reconstructor))
+
+
+def metadata_of(reconstructor: Reconstructor) -> dict[str, str]:
+    """What a model says of its sensor, texts by key."""
     mesh = Mesh.of(reconstructor, Settings.of(reconstructor, FORMATS[0]))._asdict()
     plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in mesh.items()}
     texts = {str(status.value): status.text for status in Status}
     metadata = {"format": str(FORMAT), "name": mesh["name"], "length_unit": mesh["length_unit"]}
-    metadata |= {"force_unit": mesh["force_unit"], "status_texts": json.dumps(texts), "mesh": json.dumps(plain)}
-    return tracer.assembly.model(given, outputs, metadata)
+    return metadata | {"force_unit": mesh["force_unit"], "status_texts": json.dumps(texts), "mesh": json.dumps(plain)}

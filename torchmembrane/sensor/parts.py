@@ -14,6 +14,7 @@ import numpy as np
 from ..camera.model import Camera
 from ..errors import MembraneError, expect
 from ..io.images import read_image, to_grey
+from ..pose import Pose
 from ..surface import shapes
 from ..surface.membrane import Membrane
 
@@ -216,6 +217,7 @@ class SensorParts(NamedTuple):
         cavity: the `Cavity`.
         markers: the `Markers`.
         surface: the rest surface as the file describes it.
+        tool: the camera's pose in the tool's frame, where it is known.
     """
 
     name: str
@@ -226,6 +228,7 @@ class SensorParts(NamedTuple):
     cavity: Cavity
     markers: Markers
     surface: Surface
+    tool: Pose | None = None
 
 
 def refuse_off_surface(membrane: Membrane, positions: np.ndarray, names: Sequence[str]) -> None:

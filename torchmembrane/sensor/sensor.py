@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import torch
 
 from ..camera.model import Camera
 from ..errors import MembraneError, expect
+from ..pose import Pose
 from ..surface.membrane import Membrane
 from .parts import METRE, Cavity, Markers, Material, SensorParts, Surface, refuse_off_surface
 from .toml import read_sensor, tables_of, write_sensor
@@ -30,6 +31,9 @@ class Sensor:
         cavity: what fills it.
         markers: what the camera follows on it.
         surface: how the file describes the rest surface (default: by the membrane's grid).
+        tool: the camera's pose in the frame of the tool (a robot's flange, a fingertip), where it is known.
+
+    A rest image of the calibrated size is cropped and binned where the camera is `in_mode`.
 
     Raises:
         MembraneError: a dot lies off the rest surface, or the rest image has another size than the camera's.
@@ -48,18 +52,14 @@ class Sensor:
     cavity: Cavity
     markers: Markers
     surface: Surface = None  # type: ignore[assignment]  # set below where it is left out
+    tool: Pose | None = None
 
     def __post_init__(self) -> None:
         expect(self.length_unit in METRE, "length_unit", self.length_unit, "'mm', 'cm' or 'm'")
         if self.surface is None or not _same_surface(self.surface.membrane(self.membrane.grid), self.membrane):
             object.__setattr__(self, "surface", Surface.of(self.membrane))
         if self.markers.rest_image is not None:
-            size = self.markers.rest_image.shape[::-1]
-            if size != self.camera.image_size:
-                raise MembraneError(
-                    f"Sensor: rest_image is {size[0]} x {size[1]} px and image_size {list(self.camera.image_size)}; expected "
-                    "the same: calibrate the camera at the images' resolution"
-                )
+            object.__setattr__(self, "markers", _in_mode(self.markers, self.markers.rest_image, self.camera))
         if self.markers.positions is not None:
             names = [f"Sensor: markers.positions[{i}]" for i in range(len(self.markers.positions))]
             refuse_off_surface(self.membrane, self.markers.positions, names)
@@ -136,6 +136,20 @@ class Sensor:
         """
         path = Path(path)
         return write_sensor(self.parts, path if path.suffix == ".toml" else path / "sensor.toml")
+
+
+def _in_mode(markers: Markers, rest_image: np.ndarray, camera: Camera) -> Markers:
+    """The markers with a rest image of the camera's size, cropped and binned if it is of the calibrated one."""
+    size, mode = rest_image.shape[::-1], camera.mode
+    if size == camera.image_size:
+        return markers
+    if mode is not None and size == mode.image_size:
+        return replace(markers, rest_image=mode.image(rest_image))
+    came = f"Sensor: rest_image is {size[0]} x {size[1]} px and image_size {list(camera.image_size)}"
+    if mode is None:
+        raise MembraneError(f"{came}; expected the same: where the camera's mode crops or bins, give crop and binning")
+    how = f"of crop {list(mode.crop)} and binning {list(mode.binning)}"
+    raise MembraneError(f"{came} {how}; expected the same, or the calibrated {list(mode.image_size)}")
 
 
 def _same_surface(one: Membrane, other: Membrane) -> bool:

@@ -115,6 +115,24 @@ class Table:
         """A list of `count` whole numbers."""
         return self._list(key, count, _whole, "whole")
 
+    def whole_pair(self, key: str) -> list[int]:
+        """Two whole numbers; one stands for both."""
+
+        def right(value: object) -> bool:
+            return _whole(value) or _is_list(value, 2, _whole)
+
+        value = self._get(key, right, "a whole number, or a list of 2")
+        return value if isinstance(value, list) else [value, value]
+
+    def rotation(self, key: str) -> list[Any]:
+        """The numbers of a rotation: three rows of three, or three of a rotation vector."""
+
+        def right(value: object) -> bool:
+            return _is_list(value, 3, _finite) or _is_list(value, 3, lambda row: _is_list(row, 3, _finite))
+
+        value: list[Any] = self._get(key, right, "three rows of three finite numbers, or a rotation vector of three, degrees")
+        return value
+
     def file(self, key: str) -> Path:
         """The path of the file that `key` names, relative to this file's folder."""
         path = self.path.parent / self.text(key)
@@ -136,10 +154,8 @@ class Table:
         return paths
 
     def _list(self, key: str, count: int | None, right: Callable[[object], bool], kind: str) -> list[Any]:
-        def right_list(values: object) -> bool:
-            return isinstance(values, list) and len(values) == (count or len(values)) and all(map(right, values))
-
-        values: list[Any] = self._get(key, right_list, f"a list of {'' if count is None else f'{count} '}{kind} numbers")
+        expected = f"a list of {'' if count is None else f'{count} '}{kind} numbers"
+        values: list[Any] = self._get(key, lambda values: _is_list(values, count, right), expected)
         return values
 
     def _get(self, key: str, right: Callable[[object], bool], expected: str) -> Any:
@@ -181,6 +197,10 @@ def _finite(value: object) -> bool:
 
 def _whole(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _is_list(values: object, count: int | None, right: Callable[[object], bool]) -> bool:
+    return isinstance(values, list) and len(values) == (count or len(values)) and all(map(right, values))
 
 
 def _is_names(value: object) -> bool:

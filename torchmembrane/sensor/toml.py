@@ -13,6 +13,7 @@ from ..camera.model import Camera
 from ..camera.ports import Port
 from ..errors import MembraneError
 from ..io.images import mean_image, write_image
+from ..pose import Pose
 from ..surface.membrane import Membrane
 from .parts import (
     METRE,
@@ -50,7 +51,7 @@ def read_sensor(path: Path) -> SensorParts:
         ('neo_hookean', (33, 33))
     """
     file = Table.from_file(path)
-    file.allow(("format", "name", "length_unit", "camera", "membrane", "material", "cavity", "markers"))
+    file.allow(("format", "name", "length_unit", "camera", "membrane", "material", "cavity", "markers", "tool"))
     if file.number("format") != FORMAT:
         raise file.refuse("format", f"{FORMAT}, the one this version reads: update torchmembrane or the file")
     name, length_unit = file.text("name"), file.text("length_unit", METRE)
@@ -61,7 +62,8 @@ def read_sensor(path: Path) -> SensorParts:
     surface, membrane = _read_membrane(file.table("membrane"), markers)
     if markers.positions is not None:
         refuse_off_surface(membrane, markers.positions, [f"{line}: the dot" for line in lines])
-    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface)
+    tool = _read_tool(file.table("tool")) if "tool" in file else None
+    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool)
 
 
 def write_sensor(parts: SensorParts, path: Path) -> Path:
@@ -76,6 +78,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     tables, surface, markers = tables_of(parts), parts.surface, parts.markers
+    tables["camera"] |= _calibrated(parts.camera)
     if surface.shape in SHAPES_BY_ARRAYS:
         tables["membrane"]["file"] = f"{path.stem}_{surface.shape}.npz"
         np.savez_compressed(path.with_name(tables["membrane"]["file"]), **surface.values)
@@ -95,9 +98,9 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
 
 
 def tables_of(parts: SensorParts) -> dict[str, dict[str, Any]]:
-    """A sensor's numbers and words, without arrays, as the tables and keys of its file."""
+    """A sensor's numbers and words, without arrays, as the tables and keys of its file; a camera in a mode is that mode's."""
     camera, material, cavity, markers = parts.camera, parts.material, parts.cavity, parts.markers
-    return {
+    tables: dict[str, dict[str, Any]] = {
         "": {"format": FORMAT, "name": parts.name, "length_unit": parts.length_unit},
         "camera": {
             "model": camera.model,
@@ -111,6 +114,16 @@ def tables_of(parts: SensorParts) -> dict[str, dict[str, Any]]:
         "cavity": asdict(cavity),
         "markers": {"kind": markers.kind, "polarity": markers.polarity},
     }
+    tool = parts.tool
+    return tables if tool is None else tables | {"tool": {key: value.tolist() for key, value in vars(tool).items()}}
+
+
+def _calibrated(camera: Camera) -> dict[str, list[float]]:
+    """The calibration and the mode of a camera in one, as keys of its file; none where its values are no longer the mode's."""
+    mode, found = camera.mode, (camera.focal.tolist(), camera.centre.tolist())
+    if mode is None or found != (list(mode.binned_focal), list(mode.binned_centre)):
+        return {}
+    return {key: list(value) for key, value in mode._asdict().items()}
 
 
 def default_grid(markers: Markers) -> tuple[int, int]:
@@ -135,15 +148,17 @@ def default_grid(markers: Markers) -> tuple[int, int]:
 
 
 def _read_camera(table: Table) -> Camera:
-    table.allow(("model", "image_size", "focal", "centre", "distortion", "ports", "medium"))
+    table.allow(("model", "image_size", "focal", "centre", "distortion", "crop", "binning", "ports", "medium"))
     ports = table.tables("ports")
     medium = table.table("medium") if ports or "medium" in table else None
     for part in ports:
         part.allow(Port._fields)
     if medium:
         medium.allow(("index",))
+    crop = table.whole_numbers("crop", 4) if "crop" in table else None
+    binning = table.whole_pair("binning") if "binning" in table else [1, 1]
     with table.naming():
-        return Camera(
+        calibrated = Camera(
             model=table.text("model", ("pinhole", "fisheye")),
             image_size=table.whole_numbers("image_size", 2),
             focal=table.numbers("focal", 2),
@@ -152,6 +167,14 @@ def _read_camera(table: Table) -> Camera:
             ports=[Port(*(port.number(key) for key in Port._fields)) for port in ports],
             medium_index=medium.number("index") if medium else 1.0,
         )
+        return calibrated.in_mode(crop, binning) if "crop" in table or "binning" in table else calibrated
+
+
+def _read_tool(table: Table) -> Pose:
+    table.allow(("rotation", "translation"))
+    rotation, translation = table.rotation("rotation"), table.numbers("translation", 3)
+    with table.naming():
+        return Pose(np.array(rotation, float), np.array(translation))
 
 
 def _read_material(table: Table) -> Material:
