@@ -34,6 +34,7 @@ CONTRACT = {
     "pressure_change": (), "volume_error": (), "residual": (), "status": (), "wrench": (6,), "contact_force": (4, 3),
     "contact_normal": (4, 3), "contact_area": (4,), "contact_slip": (4,), "contact_curvature": (4, 2), "contact_at_rim": (4,),
     "coverage": (), "camera_motion": (4,),
+    "force_deviation": (3,), "depth_deviation": (),
 }  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """Standard deviations against the scatter of estimates from noisy markers; gradients against finite differences."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -207,19 +208,22 @@ def test_spreads_by_the_transposed_equations_are_those_of_every_noise_by_itself(
 
 def test_deviations_of_an_answer_are_its_spreads_and_what_the_model_leaves_out():
     """Each part by itself, and turned with the force."""
-    spread, size, spacing = (torch.tensor([[3.0, 4.0, 0.0]]), torch.tensor([2.0])), 10.0, 2.0
+    spread, spacing = (torch.tensor([[3.0, 4.0, 0.0]]), torch.tensor([2.0])), 2.0
 
-    def of(spread, force=(0.0, 0.0, 0.0), depth=0.0, at_rim=torch.nan, unseen=0.0):
+    def of(spread, force=(0.0, 0.0, 0.0), depth=0.0, at_rim=torch.nan, unseen=0.0, lines=25):
         rows = {name: torch.full((1, 4), torch.nan) for name in Contacts._fields}
         contacts = Contacts(**rows | {"points": torch.full((1, 4, 3), torch.nan)})
         if at_rim == at_rim:
             contacts.points[0, 0], contacts.at_rim[0, 0] = 0.0, at_rim
         force, depth = torch.tensor([force]), torch.tensor([depth])
-        return of_presses(spread, force, depth, contacts, size, spacing, torch.tensor(unseen))
+        membrane = SimpleNamespace(size=10.0, grid=(33, lines))
+        return of_presses(spread, force, depth, contacts, membrane, spacing, torch.tensor(unseen))
 
     nothing = tuple(torch.zeros_like(s) for s in spread)
     close = torch.testing.assert_close
     close(of(spread, at_rim=0).force, FORCE * spread[0])
+    close(of(spread, at_rim=0, lines=33).force, FORCE * spread[0])
+    close(of(spread, at_rim=0, lines=13).force, 4 * FORCE * spread[0])
     close(of(spread, at_rim=0).depth, torch.tensor([((DEPTH * 2) ** 2 + (DIP * 0.4) ** 2) ** 0.5]))
     close(of(nothing, (0.0, -5.0, 0.0), at_rim=0).force, torch.tensor([[0.0, 5 * FORCE_SHARE, 0.0]]))
     rim = of(nothing, (3.0, 0.0, 4.0), 2.0, at_rim=1)

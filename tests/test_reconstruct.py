@@ -68,12 +68,14 @@ def test_shapes_and_status_follow_the_contract(result):
         traction=(B, V, 3), contact=(B, V), contact_points=(B, 4, 3), force=(B, 3), pressure=(B,), pressure_change=(B,),
         volume_error=(B,), residual=(B,), status=(B,), wrench=(B, 6), contact_force=(B, 4, 3), contact_normal=(B, 4, 3),
         contact_area=(B, 4), contact_slip=(B, 4), contact_curvature=(B, 4, 2), contact_at_rim=(B, 4), coverage=(B,),
-        camera_motion=(B, 4),
+        camera_motion=(B, 4), force_deviation=(B, 3), depth_deviation=(B,),
     )  # fmt: skip
     assert {k: tuple(v.shape) for k, v in result._asdict().items()} == shapes
     assert result.status.dtype == torch.int32 and (result.status == Status.OK).all()
+    of_tractions = {"force_deviation", "depth_deviation"}  # which minimum energy does not find
     for key in {key for key in shapes if not key.startswith("contact_")}:
-        assert result._asdict()[key].isfinite().all(), key
+        values = result._asdict()[key]
+        assert (values.isnan() if key in of_tractions else values.isfinite()).all(), key
 
 
 @pytest.mark.parametrize("index", range(3))

@@ -41,7 +41,7 @@ def of_presses(
     force: Tensor,
     depth: Tensor,
     contacts: Contacts,
-    size: float,
+    membrane: Membrane,
     spacing: float,
     unseen: Tensor,
 ) -> Deviations:
@@ -52,11 +52,12 @@ def of_presses(
         force: `[B, 3]`, as found.
         depth: `[B]`, as found.
         contacts: as found.
-        size: of the surface.
+        membrane: the rest surface on the solver's grid.
         spacing: of the markers.
         unseen: the force `[]` that noise alone makes, over the whole surface.
     """
-    of_force, of_depth = (spread.square() for spread in noise)
+    size, coarse = membrane.size, max(1.0, (FINE - 1) / (min(membrane.grid) - 1)) ** 2
+    of_force, of_depth = ((coarse * spread).square() for spread in noise)
     none = (~contacts.points[..., 0].isfinite().any(1)).to(depth.dtype)
     at_rim = (contacts.at_rim == 1).any(1).to(depth.dtype)
     around = (AT_RIM * at_rim).square() * force.square().sum(-1) + (UNSEEN * unseen * none).square()

@@ -266,7 +266,7 @@ class ForceBalance(nn.Module):
         force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, found.vertices)
         spacing = self.size / len(self.equations.bearings.positions) ** 0.5
         unseen = self.equations.loss.push_noise.mean() * self.reference * self.size**2
-        return of_presses(spread, force, depth.amax(-1), contacts, self.size, spacing, unseen)
+        return of_presses(spread, force, depth.amax(-1), contacts, self.membrane, spacing, unseen)
 
     def objective(self, found: Equilibrium, observation: Observation) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and the loss of the tractions."""
