@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from .errors import MembraneError
-from .estimators.base import Equilibrium, Observation, Problem
+from .estimators.base import Contacts, Equilibrium, Observation, Problem
 from .estimators.camera_motion import in_pixels, in_words, shift_of
 from .estimators.choice import ESTIMATORS, Settings, estimator_of
 from .estimators.covariance import StandardDeviations
@@ -240,7 +240,40 @@ class Reconstructor(nn.Module):
         pixels = self.rest_pixels + displacement
         modelled = self.camera.point_to_pixel(markers) + shift_of(found.moved, pixels, self.image_size)
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))
-        ok, broken, coverage = status == Status.OK.value, ~x.flatten(1).isfinite().all(1), self.coverage(confidence)
+        coverage, broken = self.coverage(confidence), ~x.flatten(1).isfinite().all(1)
+        gone, status = (status != Status.OK.value) | broken, self._judged(status, found, coverage, broken)
+        normals = membrane.normals(x)
+        contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
+        deviations = self.estimator.deviations(found, observation, contacts)
+        wrench = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1)
+        values = dict(
+            vertices=x,
+            displacement=u,
+            normals=normals,
+            markers=markers,
+            traction=found.traction,
+            contact=contacts.indicator,
+            force=wrench[:, :3],
+            pressure=found.pressure,
+            pressure_change=found.pressure - self.estimator.rest_pressure,
+            volume_error=self.estimator.cavity.volume_error(found.volume, found.pressure),
+            residual=(miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt(),
+            wrench=wrench,
+            coverage=coverage,
+            camera_motion=in_words(found.moved, self.image_size),
+            force_deviation=deviations.force,
+            depth_deviation=deviations.depth,
+            **{f"contact_{name}": getattr(contacts, name) for name in Contacts._fields[1:]},
+        )
+        kept = {
+            name: torch.where(gone.reshape(-1, *(1,) * (value.ndim - 1)), torch.nan, value) for name, value in values.items()
+        }
+        measured = torch.where(lost[..., None], torch.nan, pixels)
+        return Reconstruction(pixels=measured, confidence=confidence, status=status.to(torch.int32), **kept)
+
+    def _judged(self, status: Tensor, found: Equilibrium, coverage: Tensor, broken: Tensor) -> Tensor:
+        """Statuses `[B]`, of frames that had none before the solve too: of several that hold the last."""
+        ok = status == Status.OK.value
         for of_this, value in (
             (~self.estimator.is_converged(found), Status.NOT_CONVERGED.value),
             (coverage < LEAST_COVERAGE, Status.HIDDEN.value),
@@ -248,43 +281,7 @@ class Reconstructor(nn.Module):
             (broken, Status.NO_SOLUTION.value),
         ):
             status = torch.where(ok & of_this, value, status)
-        gone = ~ok | broken
-        normals = membrane.normals(x)
-        contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
-        deviations = self.estimator.deviations(found, observation, contacts)
-        wrench = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1)
-
-        def kept(values: Tensor) -> Tensor:
-            return torch.where(gone.reshape(-1, *(1,) * (values.ndim - 1)), torch.nan, values)
-
-        return Reconstruction(
-            vertices=kept(x),
-            displacement=kept(u),
-            normals=kept(normals),
-            markers=kept(markers),
-            pixels=torch.where(lost[..., None], torch.nan, pixels),
-            confidence=confidence,
-            traction=kept(found.traction),
-            contact=kept(contacts.indicator),
-            contact_points=kept(contacts.points),
-            force=kept(wrench[:, :3]),
-            pressure=kept(found.pressure),
-            pressure_change=kept(found.pressure - self.estimator.rest_pressure),
-            volume_error=kept(self.estimator.cavity.volume_error(found.volume, found.pressure)),
-            residual=kept((miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()),
-            status=status.to(torch.int32),
-            wrench=kept(wrench),
-            contact_force=kept(contacts.force),
-            contact_normal=kept(contacts.normal),
-            contact_area=kept(contacts.area),
-            contact_slip=kept(contacts.slip),
-            contact_curvature=kept(contacts.curvature),
-            contact_at_rim=kept(contacts.at_rim),
-            coverage=kept(coverage),
-            camera_motion=kept(in_words(found.moved, self.image_size)),
-            force_deviation=kept(deviations.force),
-            depth_deviation=kept(deviations.depth),
-        )
+        return status
 
     def standard_deviations(self, result: Reconstruction) -> StandardDeviations:
         """Of vertices, total force and pressure of `result`, caused by the locator's noise; NaN where there is no surface.
