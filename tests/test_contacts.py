@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from torchmembrane import Reconstructor, Status
-from torchmembrane.estimators.contact_patches import ContactPatches, contact_points
+from torchmembrane.estimators.contact_patches import ContactPatches
+from torchmembrane.estimators.settings import ForceBalanceSettings
+from torchmembrane.estimators.traction_loss import TractionLoss
 from torchmembrane.io.results import ADDED, Reconstruction, completed
 from torchmembrane.markers.coverage import Coverage
 from torchmembrane.presets import preset
@@ -17,6 +19,7 @@ from torchmembrane.surface.shapes import spherical_cap
 
 DOME = spherical_cap(12, 9, 3, (33, 33))
 PATCHES = ContactPatches(DOME)
+SURROUNDINGS = TractionLoss(DOME, 1.0, 0.0, ForceBalanceSettings()).surroundings
 
 
 def pressed_by(x, centres, radius=3.0, size=0.02, shear=0.0):
@@ -30,10 +33,8 @@ def pressed_by(x, centres, radius=3.0, size=0.02, shear=0.0):
 
 
 def told(x, traction, normals):
-    indicator = ((traction * normals).sum(-1) < 0).to(x.dtype)
-    inward = -(traction * normals).sum(-1) * DOME.rest_area
-    points, mine = contact_points(x, DOME.rest, inward, DOME.size, 4)
-    return PATCHES(x, normals, traction, indicator, points, mine)
+    reference = torch.full_like(x[..., 0], 1e-6)
+    return PATCHES.pushes(x, normals, traction, reference, SURROUNDINGS)
 
 
 @pytest.mark.parametrize("shear", [0.0, 0.5])
@@ -53,6 +54,36 @@ def test_patches_of_known_pushes(shear):
         torch.testing.assert_close(found.normal[0, k], centre / centre.norm(), atol=0.03, rtol=0)
         assert found.slip[0, k] == pytest.approx(shear, abs=0.02)
     assert (found.at_rim[0, :2] == 0).all()
+
+
+def test_a_touch_beside_one_tenfold_as_strong_is_told_and_of_five_the_strongest_four():
+    """Forces of the patches are those of the discs, strongest first; what is of the fifth adds to the nearest."""
+    x = DOME.rest[None]
+    strong, normals, (first,) = pressed_by(x, [(5.0, 0.0, 11.0)], radius=3.0)
+    weak, _, (second,) = pressed_by(x, [(-6.0, 0.0, 11.0)], radius=1.5, size=0.006)
+    found = told(x, strong + weak, normals)
+    load = (strong + weak) * DOME.rest_area[:, None]
+    forces = torch.stack([load[0, disc].sum(0) for disc in (first, second)])
+    assert forces[0].norm() > 9 * forces[1].norm() and found.points[0, 2:].isnan().all()
+    torch.testing.assert_close(found.force[0, :2], forces)
+    places = [(7.0, 0.0, 10.0), (-7.0, 0.0, 10.0), (0.0, 7.0, 10.0), (0.0, -7.0, 10.0), (0.0, 0.0, 12.0)]
+    tractions = [pressed_by(x, [place], radius=1.6, size=0.01 * (k + 1))[0] for k, place in enumerate(places)]
+    found, load = told(x, sum(tractions), normals), sum(tractions) * DOME.rest_area[:, None]
+    torch.testing.assert_close(found.force[0].sum(0), load[0].sum(0))
+    strength = found.force[0].norm(dim=-1)
+    assert (strength[:-1] >= strength[1:]).all() and found.points[0].isfinite().all()
+    assert (found.points[0] - torch.tensor(places[0]).double()).norm(dim=-1).min() > 3
+
+
+@pytest.mark.parametrize("edge", [1.0, 3.0])
+def test_a_flat_plate_is_one_contact(edge):
+    """A wide disc, also where its edge bears more than its middle, as a plate's does."""
+    x = DOME.rest[None]
+    traction, normals, (disc,) = pressed_by(x, [(0.0, 0.0, 12.0)], radius=6.0)
+    rim = disc & ((DOME.rest - torch.tensor([0.0, 0.0, 12.0]).double()).norm(dim=-1) > 5)
+    found = told(x, torch.where(rim[:, None], edge * traction, traction), normals)
+    assert found.points[0, 1:].isnan().all()
+    assert (found.points[0, 0, :2]).norm() < 0.5
 
 
 @pytest.mark.parametrize("form", ["dent", "saddle"])

@@ -243,8 +243,7 @@ def test_a_press_simulated_on_another_grid_is_recovered_with_its_force_and_place
     )
     torch.testing.assert_close(result.volume, estimator.membrane.rest_volume[None], rtol=1e-5, atol=0)
     normals = estimator.membrane.normals(result.vertices)
-    inward = (-(result.traction * normals).sum(-1)).clamp_min(0) * estimator.membrane.rest_area
-    point = contact_points(result.vertices, estimator.membrane.rest, inward, estimator.size, 4)[0][0, 0]
+    point = estimator.contacts(result, normals).points[0, 0]
     assert (point - truth.contact_points[0]).norm() < 1.0
 
 
@@ -408,13 +407,14 @@ def test_float32_agrees_with_float64(pressed):
 
 def test_indicator_and_points_of_known_loads():
     dome = spherical_cap(12, 9, 3, (21, 21))
-    size = float(dome.rest_area.sum()) ** 0.5
     load = torch.zeros(2, len(dome.rest), dtype=torch.float64)
     first, second = 10 * 21 + 4, 10 * 21 + 16
-    load[0, first], load[0, second] = 3.0, 2.0
-    points, _ = contact_points(dome.rest.expand(2, -1, -1), dome.rest, load, size, 4)
-    torch.testing.assert_close(points[0, 0], dome.rest[first], rtol=0, atol=1e-3)
-    torch.testing.assert_close(points[0, 1], dome.rest[second], rtol=0, atol=1e-3)
+    load[0, first], load[0, second] = 2.0, 3.0
+    peaks = torch.tensor([[first, second, -1, -1], [-1, -1, -1, -1]])
+    points, mine = contact_points(dome.rest.expand(2, -1, -1), dome.rest, load, peaks)
+    assert mine[0, 0, second] == mine[0, 1, first] == 1 and mine[0].sum() == len(dome.rest) and mine[1].sum() == 0
+    torch.testing.assert_close(points[0, 0], dome.rest[second], rtol=0, atol=1e-3)
+    torch.testing.assert_close(points[0, 1], dome.rest[first], rtol=0, atol=1e-3)
     assert points[0, 2:].isnan().all() and points[1].isnan().all()
     traction = -0.25 * dome.rest_normals[None]
     torch.testing.assert_close(

@@ -1,6 +1,7 @@
 """Contact patches from tractions: where something pushes, the patches' centroids, and what each tells of what touches.
 
-Every vertex belongs to the patch that is nearest to it on the rest surface, with all of its traction: the patches' forces add
+A patch is what lies around a peak of the smoothed push that stands for itself, however weak it is beside the others. Every
+vertex belongs to the patch whose peak is nearest to it on the rest surface, with all of its traction: the patches' forces add
 up to the total force, also where the estimate smears a push over the contact's edge.
 """
 
@@ -9,13 +10,15 @@ from torch import Tensor, nn
 
 from ..solve.elimination import solve_positive
 from ..surface.membrane import Membrane
+from ..surface.stencil import inner, pad_border
 from ..surface.tangent import tangent_frame
 from .base import CONTACT_POINTS, Contacts
+from .regions import persistent_peaks
 
-PATCH = 0.1
-"""Radius of a patch over the surface's size; what lies within it counts as one contact."""
-LEAST = 0.15
-"""Smallest patch that is reported, as a share of the strongest one's force."""
+LEAST = 0.03
+"""Smallest peak of the smoothed push that is a patch of its own, over the highest."""
+APART = 0.3
+"""By how much of itself a peak stands above the pass to a higher one, if it is a patch of its own."""
 PUSHED = 0.5
 """Indicator above which a vertex is in contact."""
 RIM = 0.08
@@ -49,40 +52,32 @@ def contact_indicator(traction: Tensor, normals: Tensor, reference: float | Tens
     return inward / (inward + reference / 2)
 
 
-def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, size: float, count: int) -> tuple[Tensor, Tensor]:
+def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, peaks: Tensor) -> tuple[Tensor, Tensor]:
     """Force-weighted centroids of the contact patches, and whose every vertex is.
 
-    A patch is what lies within `PATCH` x size of the strongest concentration of force; it is taken away before the next is
-    looked for.
+    A vertex belongs to the patch whose peak is nearest at rest.
 
     Args:
         vertices: deformed, `[B, V, 3]`.
         rest: `[V, 3]`.
         inward_force: `[B, V]`.
-        size: of the surface.
-        count: how many are looked for.
+        peaks: the vertex at which each patch is pushed most, `[B, P]` int64, -1 where there is none.
 
     Returns:
-        `[B, count, 3]`, strongest first, NaN where there is none; and `[B, count, V]`, 1 where of all patches this is the
-        nearest at rest, else 0.
+        `[B, P, 3]`, strongest first, NaN where there is none; and `[B, P, V]`, 1 where of all patches this is the nearest at
+        rest, else 0.
     """
-    distance2 = ((rest[:, None] - rest) ** 2).sum(-1)
-    near = torch.exp(-distance2 / (2 * (PATCH * size) ** 2))
-    load, found, forces, away = inward_force, [], [], []
-    for _ in range(count):
-        peak = (load @ near).argmax(-1)
-        patch = near[peak]
-        weight = load * patch
-        force = weight.sum(-1, keepdim=True)
-        found.append((weight[..., None] * vertices).sum(1) / force.clamp_min(torch.finfo(load.dtype).tiny))
-        forces.append(force)
-        away.append(distance2[peak])
-        load = load * (1 - patch.sqrt().sqrt())  # a Gaussian twice as wide
-    points, strengths = torch.stack(found, 1), torch.stack(forces, 1)
-    present = (strengths > LEAST * strengths[:, :1]) & (strengths > 0)
-    nearest = torch.where(present, torch.stack(away, 1), torch.inf).argmin(1, keepdim=True)
-    mine = (nearest == torch.arange(count, device=nearest.device)[:, None]) & present
-    return torch.where(present, points, torch.nan), mine.to(load.dtype)
+    present = peaks >= 0
+    distance2 = (rest[peaks.clamp_min(0)][:, :, None] - rest).square().sum(-1)
+    nearest = torch.where(present[..., None], distance2, torch.inf).argmin(1, keepdim=True)
+    number = torch.arange(peaks.shape[1], device=peaks.device)
+    mine = ((nearest == number[:, None]) & present[..., None]).to(inward_force.dtype)
+    load = mine * inward_force[:, None]
+    order = torch.where(present, load.sum(-1), -1.0).argsort(-1, descending=True)
+    present = present.gather(1, order)
+    load, mine = (value.take_along_dim(order[..., None], 1) for value in (load, mine))
+    points = (load @ vertices) / load.sum(-1, keepdim=True).clamp_min(torch.finfo(load.dtype).tiny)
+    return torch.where(present[..., None], points, torch.nan), mine
 
 
 class ContactPatches(nn.Module):
@@ -103,11 +98,20 @@ class ContactPatches(nn.Module):
         from_rim = torch.cdist(membrane.rest, membrane.rest[membrane.fixed]).amin(1)
         self.register_buffer("at_rim", (from_rim < max(RIM * membrane.size, spacing)).double())
 
-    def pushes(self, x: Tensor, normals: Tensor, traction: Tensor, reference: Tensor) -> Contacts:
-        """Where tractions push, and what that tells; `reference [B, V]` is what they are large beside, the others as below."""
+    def pushes(self, x: Tensor, normals: Tensor, traction: Tensor, reference: Tensor, surroundings: Tensor) -> Contacts:
+        """Where tractions push, and what that tells: a patch around every peak of the push that stands for itself.
+
+        `reference [B, V]` is what tractions are large beside, `surroundings [N, N]` has a mean over those around every inner
+        vertex in each column, by which the push is smoothed, twice; the others as below.
+        """
+        membrane, grid = self.membrane, self.membrane.grid
         indicator = contact_indicator(traction, normals, reference)
-        inward = (indicator > PUSHED) * (-(traction * normals).sum(-1)).clamp_min(0) * self.membrane.rest_area
-        points, mine = contact_points(x, self.membrane.rest, inward, self.membrane.size, CONTACT_POINTS)
+        push = (indicator > PUSHED) * (-(traction * normals).sum(-1)).clamp_min(0)
+        smooth = inner(push[..., None], grid)[..., 0] @ surroundings @ surroundings
+        height = pad_border(smooth[..., None], grid).unflatten(1, grid)[..., 0]
+        top, peaks = persistent_peaks(height, CONTACT_POINTS, LEAST, APART)
+        peaks = torch.where(top > 0, peaks, -1)
+        points, mine = contact_points(x, membrane.rest, push * membrane.rest_area, peaks)
         contacts: Contacts = self(x, normals, traction, indicator, points, mine)
         return contacts
 

@@ -254,7 +254,7 @@ class ForceBalance(nn.Module):
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes."""
-        return self.patches.pushes(found.vertices, normals, found.traction, found.reference)
+        return self.patches.pushes(found.vertices, normals, found.traction, found.reference, self.equations.loss.surroundings)
 
     def deviations(self, found: Equilibrium, observation: Observation, contacts: Contacts) -> Deviations:
         """How far off force and depth may be; spread on the grid of `coarse`, which costs little and knows as much."""

@@ -31,15 +31,11 @@ def persistent_regions(height: Tensor, count: int, least: float) -> Tensor:
         [[[0, 0, 1, 1, 0, 2, 2, 2, 0]]]
     """
     n, flat = height.shape[2], height.flatten(1)
-    vertex, summit = torch.arange(flat.shape[1], device=height.device), _summits(height)
-    is_peak = (summit == vertex) & (flat >= least)
-    top, place = torch.where(is_peak, flat, -torch.inf).topk(min(CANDIDATES, len(vertex)))
-    numbers = torch.arange(top.shape[1], device=height.device)
-    basin = torch.full_like(summit, len(numbers)).scatter(1, place, numbers.expand_as(place)).gather(1, summit)
-    between = _passes(basin, height, len(numbers))
-    top, chosen = _standing_apart(top, between, count)
+    vertex = torch.arange(flat.shape[1], device=height.device)
+    top, place, basin, between = _peaks(height, flat >= least)
+    top, chosen = _standing_apart(top, between, count, PERSISTENCE * top.amax(1, keepdim=True))
     place, top = place.gather(1, chosen)[..., None], top[..., None]
-    passes = F.pad(between, (0, 1), value=-torch.inf).gather(1, chosen[..., None].expand(-1, -1, len(numbers) + 1))
+    passes = F.pad(between, (0, 1), value=-torch.inf).gather(1, chosen[..., None].expand(-1, -1, between.shape[2] + 1))
     passes = torch.minimum(passes.gather(2, basin[:, None].expand(-1, count, -1)), flat[:, None])
     passes = torch.where(top > -torch.inf, passes, -torch.inf)
     distance = (vertex // n - place // n).square() + (vertex % n - place % n).square()
@@ -47,6 +43,39 @@ def persistent_regions(height: Tensor, count: int, least: float) -> Tensor:
     peak, connected = top.squeeze(2).gather(1, nearest.squeeze(1)), passes.gather(1, nearest).squeeze(1)
     region = torch.where(connected > SHARE * peak, nearest.squeeze(1) + 1, 0)
     return region.reshape(height.shape)
+
+
+def persistent_peaks(height: Tensor, count: int, least: float, apart: float) -> tuple[Tensor, Tensor]:
+    """Peaks, each judged by itself: at least `least` of the highest, and by `apart` of itself above the passes to higher ones.
+
+    Args:
+        height: `[B, m, n]`.
+        count: how many at most.
+        least: smallest peak, over the highest.
+        apart: how much of itself a peak stands above the pass to a higher one.
+
+    Returns:
+        Heights `[B, count]`, highest first, `-inf` where there are no more, and vertices `[B, count]`, row by row.
+
+    Example:
+        >>> heights, vertices = persistent_peaks(torch.tensor([[[0.0, 10, 3, 4, 3.9, 1, 2, 0]]]), 3, 0.1, 0.3)
+        >>> heights.tolist(), vertices[0, :2].tolist()
+        ([[10.0, 2.0, -inf]], [1, 6])
+    """
+    top, place, _, between = _peaks(height, height.flatten(1) > 0)
+    top = torch.where(top >= least * top.amax(1, keepdim=True), top, -torch.inf)
+    top, chosen = _standing_apart(top, between, count, apart * top)
+    return top, place.gather(1, chosen)
+
+
+def _peaks(height: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of the highest peaks where it is `high [B, m n]`: heights and vertices `[B, K]`, highest first, heights of `-inf` where
+    there are no more; whose basin every vertex is in, `[B, m n]`; the passes between them, `[B, K, K]`."""
+    vertex, summit = torch.arange(high.shape[1], device=height.device), _summits(height)
+    top, place = torch.where((summit == vertex) & high, height.flatten(1), -torch.inf).topk(min(CANDIDATES, len(vertex)))
+    numbers = torch.arange(top.shape[1], device=height.device)
+    basin = torch.full_like(summit, len(numbers)).scatter(1, place, numbers.expand_as(place)).gather(1, summit)
+    return top, place, basin, _passes(basin, height, len(numbers))
 
 
 def _summits(height: Tensor) -> Tensor:
@@ -74,10 +103,10 @@ def _passes(basin: Tensor, height: Tensor, count: int) -> Tensor:
     return passes
 
 
-def _standing_apart(top: Tensor, between: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Heights and indices `[B, count]` of the persistent ones, highest first, of peaks `top [B, K]` with passes `between
-    [B, K, K]` them; heights of `-inf` where there are no more."""
-    margin, standing, heights, chosen = PERSISTENCE * top.amax(1, keepdim=True), top, [], []
+def _standing_apart(top: Tensor, between: Tensor, count: int, margin: Tensor) -> tuple[Tensor, Tensor]:
+    """Heights and indices `[B, count]`, highest first, of peaks `top [B, K]` that stand above the passes `between [B, K, K]`
+    to higher ones by `margin [B, K]` or `[B, 1]`; heights of `-inf` where there are no more."""
+    standing, heights, chosen = top, [], []
     for _ in range(count):
         highest, k = standing.max(1, keepdim=True)
         heights.append(highest)
