@@ -2,7 +2,7 @@
 
 python bench/calibration.py [PART ...] [--seeds 3] [--json FILE] [--figures docs/calibration]
 
-Parts: lens ports rest effect views depth layout material.
+Parts: lens ports rest effect views depth layout material gauge.
 Sensors of this package are seen by the simulator with noise 40 dB below white; the first guess is off. Printed: error, reported
 standard deviation, and the largest error over its deviation; for `effect` the error of the surface at the dots before and after
 the pose was calibrated.
@@ -24,6 +24,7 @@ from torchmembrane import Camera, Markers, MembraneError, Reconstructor, Surface
 from torchmembrane.calibrate import (
     Checkerboard,
     DotBoard,
+    KnownPressures,
     Views,
     find_target,
     layout_for_pixels,
@@ -176,6 +177,42 @@ def material(seeds, figures):
                 yield record
 
 
+def gauge(seeds, figures):
+    """Modulus from readings good to 0.5 % of the rest pressure: of one press or three, since rest, or with rest and offset."""
+    both = itertools.product(("fingertip", "half_cylinder"), (1.15, 1.3, 1.6))
+    for name, prestretch in (*both, ("bubble", 1.15)):
+        design = preset(name)
+        truth = replace(design, material=replace(design.material, prestretch=prestretch, shear_modulus=0.3, thickness=0.4))
+        simulator = Simulator(truth, appearance=Appearance(noise=NOISE))
+        unknown = replace(design.material, shear_modulus=None, thickness=None)
+        sensor = replace(design, material=unknown, markers=replace(design.markers, rest_image=simulator.rest_image()))
+        size, aim = simulator.membrane.size, simulator.membrane.rest[simulator.membrane.fixed].mean(0).numpy()
+        presses = ((0.14, (0, 0, -1), 0.12), (0.19, (-0.5, 0, -0.87), 0.1), (0.14, (0.3, -0.5, -0.7), 0.1))
+        strokes = [stroke_to(simulator, Sphere(r * size), aim, travel, depth * size) for r, travel, depth in presses]
+        states = [next(simulator.presses(stroke, ("push",))) for stroke in strokes]
+        shapes = [simulator.membrane.rest, *(state.vertices for state in states)]
+        p0 = float(states[0].rest_pressure)
+        pressures = np.array([p0, *(float(state.pressure) for state in states)])
+        for seed in range(seeds):
+            rng = np.random.default_rng(seed)
+            images = torch.from_numpy(np.stack([simulator.image(shape, rng) for shape in shapes]) / 255)[:, None]
+            read = pressures + 0.005 * p0 * rng.normal(size=4)
+            for said, chosen in (
+                ("one", [1]),
+                ("three", [1, 2, 3]),
+                ("rest and one", [0, 1]),
+                ("rest and three", [0, 1, 2, 3]),
+            ):
+                since_rest = "rest" not in said
+                known = KnownPressures(read[chosen] - (p0 if since_rest else -0.3 * p0), since_rest)
+                found = material_from_images(sensor, images[chosen], pressures=known)
+                record = dict(sensor=name, prestretch=prestretch, seed=seed, known=said, values=found.values.tolist())
+                record |= dict(deviations=found.deviations.tolist(), rises=(pressures / p0 - 1).tolist())
+                record["worst"] = worst(found.values - [prestretch, 0.12], found.deviations)
+                print("gauge", record, flush=True)
+                yield record
+
+
 def views(seeds, figures):
     for name, travel in (("fingertip", 1.5), ("half_cylinder", 3.0)):
         design = preset(name)
@@ -323,7 +360,7 @@ def draw(folder: Path | None, name: str, report: Report) -> None:
         save(fit_figure(report, (640, 480)), folder / f"{name}.png")
 
 
-PARTS = {part.__name__: part for part in (lens, ports, rest, effect, views, depth, layout, material)}
+PARTS = {part.__name__: part for part in (lens, ports, rest, effect, views, depth, layout, material, gauge)}
 
 
 def main():

@@ -1,4 +1,4 @@
-"""The whole reconstruction, from rest and from the frame before, compiles to one graph and gives what it gives eagerly."""
+"""The whole reconstruction, from rest, from a start and with a gauge, compiles to one graph and gives what it gives eagerly."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +23,8 @@ def test_the_compiled_reconstruction_is_one_graph_and_agrees(estimator):
         pairs = [(compiled(images), expected)]
         if reconstructor.finds_tractions:
             pairs.append((compiled(images, expected), reconstructor(images, expected)))
+            reading = {"pressure": 1.1 * expected.pressure}
+            pairs.append((compiled(images, **reading), reconstructor(images, **reading)))
     for got, want in pairs:
         for key, value in want._asdict().items():
             torch.testing.assert_close(got._asdict()[key], value, rtol=1e-4, atol=1e-4, equal_nan=True)

@@ -180,14 +180,16 @@ def test_deviations_are_of_the_weights_of_the_solve():
     assert 0.6 < said / scatter < 1.5
 
 
-@pytest.mark.parametrize("filling", ["liquid", "gas", "open"])
-def test_spreads_by_the_transposed_equations_are_those_of_every_noise_by_itself(filling):
+@pytest.mark.parametrize(("filling", "gauge"), [("liquid", False), ("liquid", True), ("gas", False), ("open", False)])
+def test_spreads_by_the_transposed_equations_are_those_of_every_noise_by_itself(filling, gauge):
     """Force and depth: one solve for each against one for every marker and direction, a camera that may move included."""
     gas = (10.0, 900.0) if filling == "gas" else None
     estimator, camera, exact = observed("fingertip", 17, truth_grid=31, filling=filling, gas=gas)
     confidence = (torch.arange(len(exact)) % 7 > 0).double()[None]
     covariance = torch.tensor([[2e-3, 1e-3], [1e-3, 4e-3]]).double().expand(1, len(exact), 2, 2)
     observation = estimator.prepare(camera, exact[None], confidence, covariance)
+    if gauge:
+        observation = estimator.gauged(observation, 1.1 * estimator.rest_pressure)
     found = estimator(observation)
     net, state = estimator.coarse, estimator.coarsened(found.vertices, found.pressure, found.moved)
     settings, equations = estimator.settings, net.equations

@@ -117,7 +117,7 @@ def mended(
         done: `[B]` bool.
         values: what there is, each `[B, ...]`.
         again: gives values of the same number and shapes.
-        given: what it needs, each `[B, ...]`.
+        given: what it needs, each `[B, ...]` or None.
         chosen: a piece, `chosen(done, values, others)`: `values` where `done` holds, else `others`.
     """
     if _graph(values) is not None:
@@ -125,7 +125,7 @@ def mended(
     if torch.compiler.is_compiling() or bool(done.all()):
         return values
     rows = (~done).nonzero().ravel()
-    others = again(*(one[rows] for one in given))
+    others = again(*(None if one is None else one[rows] for one in given))
     return [value.index_copy(0, rows, other) for value, other in zip(values, others, strict=True)]
 
 

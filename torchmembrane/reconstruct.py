@@ -14,13 +14,14 @@ from .estimators.camera_motion import in_pixels, in_words, shift_of
 from .estimators.choice import ESTIMATORS, Settings, estimator_of
 from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
+from .estimators.start import checked_previous
 from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
 from .io.status import Status
 from .markers.coverage import Coverage
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
-from .markers.placement import place_markers
+from .markers.placement import imaged_vertices, place_markers
 from .pieces import piece
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
@@ -28,7 +29,6 @@ from .sensor.sensor import Sensor
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
 LEAST_ERROR = 0.02  # px
 LEAST_COVERAGE = 0.88  # less of what the markers see at rest is a part hidden
-OFF_RIM = 1e-3  # largest distance of a previous result's rim from this sensor's, over the surface's size
 PRECISIONS = (torch.float32, torch.float64)
 
 
@@ -89,7 +89,7 @@ class Reconstructor(nn.Module):
         self.image_size, self.model = sensor.camera.image_size, model or sensor.material.model
         self.camera, membrane = copy.deepcopy(sensor.camera), copy.deepcopy(sensor.membrane)
         vertex_pixels = self.camera.point_to_pixel(membrane.rest)
-        imaged = _imaged(sensor, estimator, vertex_pixels)
+        imaged = imaged_vertices(sensor, vertex_pixels, whole=estimator != "force-balance")
         markers, cavity = place_markers(sensor, vertex_pixels, locator), cavity_filling(sensor, membrane, warn=True)
         positions, model_pixels = torch.from_numpy(markers.positions), torch.from_numpy(markers.model_pixels)
         rim_pixels, rest_image = vertex_pixels[membrane.fixed & imaged].numpy(), sensor.markers.rest_image
@@ -125,6 +125,11 @@ class Reconstructor(nn.Module):
         return self.observer.rest_pixels
 
     @property
+    def rest_pressure(self) -> Tensor:
+        """Pressure difference across the membrane at rest, `[]`, force / length^2."""
+        return self.estimator.rest_pressure
+
+    @property
     def finds_tractions(self) -> bool:
         """Whether tractions and standard deviations are found."""
         return self.estimator.finds_tractions
@@ -144,6 +149,7 @@ class Reconstructor(nn.Module):
         images: Tensor | np.ndarray,
         previous: Reconstruction | None = None,
         rest_pixels: Tensor | None = None,
+        pressure: Tensor | float | None = None,
     ) -> Reconstruction:
         """Reconstruct a batch of images.
 
@@ -152,30 +158,37 @@ class Reconstructor(nn.Module):
                 `[B, H, W, 1 | 3]`. Grey is 0.299 R + 0.587 G + 0.114 B.
             previous: results of the frames before, to start from (force balance): a few steps then do.
             rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: in the sensor's rest image.
+            pressure: `[B]` or a number, difference across the membrane that a gauge reads, unit as of the result's, NaN where
+                none is (force balance; `pressure_noise` in its settings). Of a change since rest, add `rest_pressure`.
 
         Returns:
             A `Reconstruction`. A frame that cannot be reconstructed gets a status and NaN, the others are not touched.
 
         Raises:
-            MembraneError: another size, shape or type; a previous result of another batch or sensor.
+            MembraneError: another size, shape or type; a previous result of another batch or sensor; a pressure of an open
+                cavity, or for another estimator.
         """
         self._check_precision()
         with torch.autocast(self.rest_pixels.device.type, enabled=False):
             grey = self.grey(images)
             if previous is not None:
                 previous = self._checked(previous, len(grey))
-            return self.reconstruct_grey(grey, previous, rest_pixels)
+            return self.reconstruct_grey(grey, previous, rest_pixels, pressure)
 
     def grey(self, images: Tensor | np.ndarray) -> Tensor:
         """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
         return grey_batch(images, self.image_size, self.channels, self.rest_pixels)
 
     def reconstruct_grey(
-        self, grey: Tensor, previous: Reconstruction | None = None, rest_pixels: Tensor | None = None
+        self,
+        grey: Tensor,
+        previous: Reconstruction | None = None,
+        rest_pixels: Tensor | None = None,
+        pressure: Tensor | float | None = None,
     ) -> Reconstruction:
         """As `forward`, from grey images `[B, 1, height, width]` in 0..1 of this module's precision; nothing is checked."""
         flow = self.observer(grey, None if previous is None else previous.pixels, rest_pixels)
-        return self._solve(flow, previous)
+        return self._solve(flow, previous, pressure)
 
     def from_pixels(
         self,
@@ -183,6 +196,7 @@ class Reconstructor(nn.Module):
         confidence: Tensor | None = None,
         rest_pixels: Tensor | None = None,
         previous: Reconstruction | None = None,
+        pressure: Tensor | float | None = None,
     ) -> Reconstruction:
         """Reconstruct from marker centres located elsewhere; those that belong with no neighbour get confidence 0.
 
@@ -190,7 +204,7 @@ class Reconstructor(nn.Module):
             pixels: `[B, D, 2]` or `[D, 2]` in the sensor file's order, NaN where lost.
             confidence: `[B, D]` or `[D]` in 0..1; default: 1 where finite.
             rest_pixels: `[D, 2]`, the same markers located in the rest image; default: the model's rest pixels.
-            previous: as for images.
+            previous, pressure: as for images.
 
         Raises:
             MembraneError: another shape, or a confidence outside 0..1.
@@ -200,12 +214,12 @@ class Reconstructor(nn.Module):
             flow = self.observer.from_pixels(pixels, confidence, rest_pixels)
             if previous is not None:
                 previous = self._checked(previous, len(flow.status))
-            return self._solve(flow, previous)
+            return self._solve(flow, previous, pressure)
 
-    def _solve(self, flow: MarkerFlow, previous: Reconstruction | None) -> Reconstruction:
+    def _solve(self, flow: MarkerFlow, previous: Reconstruction | None, pressure: Tensor | float | None) -> Reconstruction:
         usable, confidence, covariance, status = self.observer.judge(*flow)
         start = None if previous is None else self.start(previous.vertices, previous.pressure, previous.camera_motion)
-        observation = self.observation(usable, confidence, covariance)
+        observation = self._gauged(self.observation(usable, confidence, covariance), pressure)
         found = self.estimator(observation, start)
         return self.result(found, observation, flow.displacement, confidence, status)
 
@@ -283,8 +297,24 @@ class Reconstructor(nn.Module):
             status = torch.where(ok & of_this, value, status)
         return status
 
-    def standard_deviations(self, result: Reconstruction) -> StandardDeviations:
-        """Of vertices, total force and pressure of `result`, caused by the locator's noise; NaN where there is no surface.
+    def _gauged(self, observation: Observation, pressure: Tensor | float | None) -> Observation:
+        """The observation with what a gauge reads, if one does."""
+        return observation if pressure is None else self.check_gauge().gauged(observation, pressure)
+
+    def check_gauge(self) -> ForceBalance:
+        """The estimator, refused where a measured pressure tells it nothing.
+
+        Raises:
+            MembraneError: it is not force balance, or the cavity is open.
+        """
+        if not isinstance(self.estimator, ForceBalance):
+            raise MembraneError(f"Reconstructor: pressure for {self.estimator_name}; expected estimator = 'force-balance'")
+        self.estimator.check_gauge()
+        return self.estimator
+
+    def standard_deviations(self, result: Reconstruction, pressure: Tensor | float | None = None) -> StandardDeviations:
+        """Of vertices, total force and pressure of `result`, caused by the locator's noise, and by that of a gauge where its
+        `pressure` was given; NaN where there is no surface.
 
         Raises:
             MembraneError: the estimator finds no contacts.
@@ -300,7 +330,7 @@ class Reconstructor(nn.Module):
         after, before = (self.camera.pixel_to_ray(pixels[..., None, :] + step) for step in (half, -half))
         turn = (after.origin - before.origin) / distance + after.direction - before.direction
         noise = torch.linalg.cholesky(2 * self.observer.rest_covariance).mT @ turn
-        observation = self.observation(pixels - self.rest_pixels, result.confidence)
+        observation = self._gauged(self.observation(pixels - self.rest_pixels, result.confidence), pressure)
         state = result.vertices, result.pressure, result.camera_motion
         return self.estimator.standard_deviations(*self.start(*state), observation, noise)
 
@@ -315,32 +345,4 @@ class Reconstructor(nn.Module):
         """A previous result, refused where it cannot be one of these frames'."""
         if not self.estimator.takes_start:
             raise MembraneError(f"Reconstructor: {self.estimator_name} starts from rest always; leave previous out")
-        membrane = self.estimator.membrane
-        expected = ((frames, *membrane.rest.shape), (frames, *self.rest_pixels.shape))
-        given = (tuple(previous.vertices.shape), tuple(previous.pixels.shape))
-        if given != expected:
-            raise MembraneError(
-                f"Reconstructor: previous has vertices {list(given[0])} and pixels {list(given[1])}, expected "
-                f"{list(expected[0])} and {list(expected[1])}: one earlier result of this sensor and grid for each image"
-            )
-        previous = previous.to(self.rest_pixels)
-        if not torch.compiler.is_compiling():
-            off = (previous.vertices - membrane.rest)[:, membrane.fixed].abs().nan_to_num()
-            if off.numel() and off.max() > OFF_RIM * membrane.size:
-                raise MembraneError(
-                    f"Reconstructor: the rim of previous is {float(off.max()):.3g} {self.sensor.length_unit} off this "
-                    "sensor's; it is of another one, or from before a calibration: leave previous out to start from rest"
-                )
-        return previous
-
-
-def _imaged(sensor: Sensor, estimator: str, vertex_pixels: Tensor) -> Tensor:
-    """Which vertices the camera can image, `[V]` bool; refused where some cannot be imaged that must."""
-    imaged = torch.isfinite(vertex_pixels).all(-1)
-    whole = estimator != "force-balance" or sensor.markers.positions is None
-    if not (imaged.all() if whole else imaged.any()):
-        raise MembraneError(
-            f"sensor {sensor.name!r}: parts of the rest surface cannot be imaged by its camera; check the poses (force "
-            "balance of listed dots can do with a part)"
-        )
-    return imaged
+        return checked_previous(previous, frames, self.estimator.membrane, self.rest_pixels, self.sensor.length_unit)

@@ -35,18 +35,19 @@ class Tracker:
         self._latest: Tensor | None = None
         self._rest_pixels: Tensor | None = None
 
-    def __call__(self, frame: Tensor | np.ndarray) -> Reconstruction:
+    def __call__(self, frame: Tensor | np.ndarray, pressure: float | None = None) -> Reconstruction:
         """The frame's result, a batch of one.
 
         Args:
             frame: `[H, W]`, `[H, W, 3]`, or a batch of one as for `Reconstructor`.
+            pressure: that a gauge reads, as for `Reconstructor`.
 
         Raises:
             MembraneError: more than one frame, another size, shape or type.
         """
         images = self._one(frame)
         with torch.no_grad():
-            result: Reconstruction = self.reconstructor(images, self._before, self._rest_pixels)
+            result: Reconstruction = self.reconstructor(images, self._before, self._rest_pixels, pressure)
         self._latest = images
         follows = self.reconstructor.estimator.takes_start and Status(int(result.status[0])).has_surface
         self._before = result if follows else None

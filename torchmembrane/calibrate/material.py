@@ -1,6 +1,7 @@
 """The membrane's prestretch from images of presses, and its stiffness from presses of known force."""
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +17,10 @@ from ..reconstruct import Reconstructor
 from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor
 from ..surface.projection import SurfacePoints
+from .gauge import FoundPressures, GaugeModulus, modulus_from_pressures
 
 GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
+PRESSURE_GRID = (33, 33)  # on coarser ones pressure changes are off by up to a tenth
 STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it
 BETWEEN = 5  # prestretches tried on either side of the lowest
 PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the loss's, alike in all images
@@ -49,6 +52,7 @@ class MaterialFit(NamedTuple):
         profile: the losses on which the prestretch rests.
         each: `[B, 2]` prestretch and standard deviation from each image alone.
         forces: `[B, 2]` magnitudes found and measured, N, NaN where not known.
+        pressures: `[B, 2]` changes since rest found and measured, N per length unit squared, NaN where not known.
     """
 
     sensor: Sensor
@@ -57,6 +61,7 @@ class MaterialFit(NamedTuple):
     profile: LossProfile
     each: np.ndarray
     forces: np.ndarray
+    pressures: np.ndarray
 
     @property
     def deviations(self) -> np.ndarray:
@@ -64,19 +69,34 @@ class MaterialFit(NamedTuple):
         return np.sqrt(np.diag(self.covariance))
 
 
-def material_from_images(sensor: Sensor, images: Tensor, forces: np.ndarray | None = None) -> MaterialFit:
-    """Prestretch from images of presses, and the modulus where their forces are known; see `material_from_pixels`.
+class KnownPressures(NamedTuple):
+    """What a gauge read.
+
+    Attributes:
+        readings: `[B]` of the images, N per length unit squared, NaN where not known.
+        since_rest: whether these are changes since rest; else what the gauge reads at rest is found as well.
+    """
+
+    readings: np.ndarray
+    since_rest: bool = False
+
+
+def material_from_images(
+    sensor: Sensor, images: Tensor, forces: np.ndarray | None = None, pressures: KnownPressures | None = None
+) -> MaterialFit:
+    """Prestretch from images of presses, and the modulus where forces or pressures are known; see `material_from_pixels`.
 
     Args:
         sensor: the sensor, calibrated but for its material.
         images: `[B, 1, H, W]` grey in 0..1.
         forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
+        pressures: in place of forces, what a gauge read.
 
     Returns:
         The sensor with the material found.
 
     Raises:
-        MembraneError: an image shows too few markers, or the sensor's material is harmonic.
+        MembraneError: an image shows too few markers, or as of `material_from_pixels`.
     """
     reconstructor = _reconstructor(sensor)
     with torch.no_grad():
@@ -84,11 +104,13 @@ def material_from_images(sensor: Sensor, images: Tensor, forces: np.ndarray | No
     displacement, confidence, _, status = flow
     for i in np.flatnonzero(status != Status.OK):
         raise MembraneError(f"calibrate material: image {i + 1}: {Status(int(status[i])).text}; leave it out")
-    return _material(sensor, reconstructor, displacement, confidence, forces)
+    return _material(sensor, reconstructor, displacement, confidence, forces, pressures)
 
 
-def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | None = None) -> MaterialFit:
-    """Prestretch from presses, and the modulus where their forces are known.
+def material_from_pixels(
+    sensor: Sensor, pixels: Tensor, forces: np.ndarray | None = None, pressures: KnownPressures | None = None
+) -> MaterialFit:
+    """Prestretch from presses, and the modulus where their forces, or the pressures in the cavity, are known.
 
     Force balance is solved at many prestretches l. What it minimises, in standard deviations of the markers and of tractions in
     units of the rest pressure, is taken for the negative logarithm of a probability:
@@ -98,18 +120,20 @@ def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | No
     with e = `WRONG`, for an image that is explained wrongly altogether. Mean and deviation are reported, the latter enlarged
     where the images contradict one another, and by an error that all images share. A membrane with the wrong l needs forces
     where nothing touches it. Forces are proportional to the modulus, so that each press gives the modulus as force measured /
-    force found at modulus 1; their mean is reported.
+    force found at modulus 1; their mean is reported. Pressures likewise (`gauge.modulus_from_pressures`).
 
     Args:
         sensor: the sensor, calibrated but for its material.
         pixels: `[B, D, 2]` of the markers in B images of presses (NaN where lost), less what rest images show beside the model.
         forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
+        pressures: in place of forces, what a gauge read.
 
     Returns:
         The sensor with the material found.
 
     Raises:
-        MembraneError: the sensor's material is harmonic: its shape does not depend on the prestretch.
+        MembraneError: the sensor's material is harmonic: its shape does not depend on the prestretch; both forces and
+            pressures; an open cavity, or pressures that tell no modulus.
 
     Limitations:
         Shallow presses, or presses that the markers miss, identify little (the deviation is large then). The membrane must be
@@ -120,12 +144,21 @@ def material_from_pixels(sensor: Sensor, pixels: Tensor, forces: np.ndarray | No
     pixels = torch.as_tensor(pixels).to(reconstructor.rest_pixels)
     lost = ~pixels.isfinite().all(-1)
     displacement = torch.where(lost[..., None], 0.0, pixels - reconstructor.rest_pixels)
-    return _material(sensor, reconstructor, displacement, (~lost).to(pixels), forces)
+    return _material(sensor, reconstructor, displacement, (~lost).to(pixels), forces, pressures)
 
 
 def _material(
-    sensor: Sensor, reconstructor: Reconstructor, displacement: Tensor, confidence: Tensor, forces: np.ndarray | None
+    sensor: Sensor,
+    reconstructor: Reconstructor,
+    displacement: Tensor,
+    confidence: Tensor,
+    forces: np.ndarray | None,
+    pressures: KnownPressures | None,
 ) -> MaterialFit:
+    if forces is not None and pressures is not None:
+        raise MembraneError("calibrate material: forces and pressures; expected one of them, either gives the modulus")
+    if pressures is not None:
+        reconstructor.check_gauge()
     presses = Presses(reconstructor, displacement, confidence)
     profile = presses.profile()
     each = np.array([_log_stretch(profile.stretches, losses[:, None]) for losses in profile.losses.T])
@@ -135,15 +168,23 @@ def _material(
     deviation = np.hypot(deviation * np.sqrt(max(1.0, contradiction)), PRESTRETCH_ERROR)
     prestretch = float(np.exp(log_stretch))
     values, effects = [prestretch], [[prestretch * deviation, 0.0]]
-    material, magnitudes = replace(sensor.material, prestretch=prestretch), np.full((len(each), 2), np.nan)
+    material = replace(sensor.material, prestretch=prestretch)
+    magnitudes, gauged = np.full((2, len(each), 2), np.nan)
     if forces is not None:
         modulus, scatter, change, magnitudes = presses.modulus(log_stretch, deviation, np.asarray(forces, float))
+    elif pressures is not None:
+        modulus, scatter, change, gauged = presses.gauge_modulus(log_stretch, deviation, pressures)
+    if forces is not None or pressures is not None:
         values, effects = [prestretch, modulus], [*effects, [change, scatter]]
         thickness = material.thickness or 1.0
         material = replace(material, shear_modulus=modulus / thickness, thickness=thickness)
     alone = np.exp(each[:, :1]) * np.stack([np.ones(len(each)), np.sqrt(variances)], -1)
     covariance = np.array(effects) @ np.array(effects).T
-    return MaterialFit(replace(sensor, material=material), np.array(values), covariance, profile, alone, magnitudes)
+    made = replace(sensor, material=material)
+    if pressures is not None and sensor.cavity.filling == "gas" and sensor.force_unit == "relative":
+        # without a modulus the gas acted as a liquid
+        return _material(made, _reconstructor(made), displacement, confidence, None, pressures)
+    return MaterialFit(made, np.array(values), covariance, profile, alone, magnitudes, gauged)
 
 
 def _reconstructor(sensor: Sensor) -> Reconstructor:
@@ -178,13 +219,16 @@ class Presses:
         self.reconstructor = reconstructor
         self.observation = reconstructor.observation(displacement, confidence)
 
-    def explained(self, stretch: float, modulus: float) -> tuple[ForceBalance, Equilibrium]:
-        """The estimator with this material, and what it finds."""
+    def explained(
+        self, stretch: float, modulus: float, grid: tuple[int, int] | None = None
+    ) -> tuple[ForceBalance, Equilibrium]:
+        """The estimator with this material, on this grid, default the reconstructor's, and what it finds."""
         r, known = self.reconstructor, self.reconstructor.estimator
         assert isinstance(known, ForceBalance)  # as `_reconstructor` chooses
-        cavity, membrane = known.cavity, known.membrane
+        cavity, membrane = known.cavity, known.membrane if grid is None else r.sensor.surface.membrane(grid)
         elasticity = elastic_energy(r.sensor, membrane, prestretch=stretch, modulus=modulus)
         points = SurfacePoints(r.marker_vertices.numpy(), r.marker_weights.numpy(), np.zeros(len(r.rest_markers)))
+        points = points if grid is None else membrane.closest_points(r.rest_markers.numpy())
         gas = tuple(cavity.gas.tolist())
         estimator = ForceBalance(
             membrane, elasticity, points, r.rest_markers, known.equations.bearings.noise, cavity.filling, gas
@@ -205,6 +249,29 @@ class Presses:
     def _losses(self, stretch: float) -> np.ndarray:
         estimator, found = self.explained(stretch, self.reconstructor.sensor.material.modulus)
         return estimator.objective(found, self.observation).numpy()
+
+    def gauge_modulus(
+        self, log_stretch: float, deviation: float, pressures: KnownPressures
+    ) -> tuple[float, float, float, np.ndarray]:
+        """The modulus from pressures; arguments and what is returned as of `modulus`, with pressure changes for forces."""
+        gas, modulus = self.reconstructor.estimator.cavity.filling == "gas", self.reconstructor.sensor.material.modulus
+        readings = np.asarray(pressures.readings, float)
+
+        def found(stretch: float, modulus: float) -> FoundPressures:
+            estimator, it = self.explained(stretch, modulus, PRESSURE_GRID)
+            noise = estimator.equations.bearings.noise
+            with torch.no_grad():
+                spread = estimator.standard_deviations(it.vertices, it.pressure, it.moved, self.observation, noise)
+            rest = float(estimator.rest_pressure)
+            return FoundPressures((it.pressure - rest).numpy(), spread.pressure.numpy(), rest)
+
+        def fit(stretch: float, begin: float) -> GaugeModulus:
+            return modulus_from_pressures(partial(found, stretch), readings, pressures.since_rest, begin, gas)
+
+        fitted = fit(np.exp(log_stretch), modulus)
+        low, high = (fit(np.exp(log_stretch + s * deviation), fitted.modulus).modulus - fitted.modulus for s in (-1, 1))
+        change = float(np.sign(high - low) * max(abs(low), abs(high)))
+        return fitted.modulus, fitted.deviation, change, fitted.pressures
 
     def modulus(self, log_stretch: float, deviation: float, forces: np.ndarray) -> tuple[float, float, float, np.ndarray]:
         """The modulus from presses of known force.

@@ -8,22 +8,24 @@ from ..estimators.choice import ESTIMATORS
 from ..reconstruct import Reconstructor
 from ..sensor.sensor import Sensor
 
-OPTIONS = ("element", "volume", "flow", "smoothing")
+OPTIONS = ("element", "volume", "flow", "smoothing", "pressure_noise")
 
 
 def build_reconstructor(sensor: Sensor, arguments: Namespace) -> Reconstructor:
-    """The reconstructor of `--estimator`, `--energy`, `--element`, `--volume`, `--flow`, `--smoothing` and `--locator`.
+    """The reconstructor of `--estimator`, `--energy`, `--element`, `--volume`, `--flow`, `--smoothing`, `--pressure-noise` and
+    `--locator`.
 
     Raises:
         MembraneError: an option that the estimator does not have.
     """
     kind: Any = ESTIMATORS[arguments.estimator].Settings
-    given = {name: getattr(arguments, name) for name in OPTIONS if getattr(arguments, name) is not None}
+    given = {name: getattr(arguments, name) for name in OPTIONS if getattr(arguments, name, None) is not None}
     foreign = [name for name in given if name not in kind.__dataclass_fields__]
     if foreign:
+        fitting = next(name for name, other in ESTIMATORS.items() if foreign[0] in other.Settings.__dataclass_fields__)
         raise MembraneError(
-            f"--{foreign[0]} {given[foreign[0]]}: {arguments.estimator} has no such choice; leave it out, or pass "
-            "--estimator minimum-energy"
+            f"--{foreign[0].replace('_', '-')} {given[foreign[0]]}: {arguments.estimator} has no such choice; leave it out, or "
+            f"pass --estimator {fitting}"
         )
     options: Any = {"settings": kind(**given), "model": arguments.energy, "locator": arguments.locator}
     return Reconstructor(sensor, arguments.estimator, **options)

@@ -4,7 +4,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from .arguments import add_command, add_estimator, add_sensor, count
+from .arguments import add_command, add_estimator, add_sensor, count, positive
 from .choices import RESULT_FORMATS
 
 PURPOSE = "reconstruct surfaces from images or a video of one sensor"
@@ -13,6 +13,7 @@ examples:
   torchmembrane reconstruct sensor.toml press.png --out results --figures
   torchmembrane reconstruct sensor.toml 'day1/*.jpg' day2/ --out results --batch 32
   torchmembrane reconstruct sensor.toml press.mp4 --out results --format parquet
+  torchmembrane reconstruct sensor.toml day1/ --out results --pressure gauge.csv
 
 DIR then holds
   NAME.npz       the result for the image NAME.png (parquet: the dataset frames/part-*.parquet)
@@ -38,6 +39,10 @@ def add_parser(commands: Any) -> None:
     add("--video", action="store_true", help="treat every input as a video (mp4, mov, avi, mkv, webm always are)")
     own = "images of this recording without contact, or first:N, its first N frames: their mean is rest (default: the sensor's)"
     add("--rest", metavar="IMAGES", nargs="+", default=[], help=own)
+    gauge = "CSV name,pressure (across the membrane) or name,pressure_change (since rest), hPa: a gauge's readings of frames"
+    add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
+    noise = "standard deviation of these, over the rest pressure (default: 0.01)"
+    add("--pressure-noise", metavar="SHARE", type=positive, help=noise)
     one = "one .npz per frame, or one dataset (default: %(default)s)"
     add("--format", choices=RESULT_FORMATS, default=RESULT_FORMATS[0], help=one)
     add("--figures", action="store_true", help="also NAME.png: flow, side view and displacement of every frame")
@@ -51,6 +56,7 @@ def run(arguments: Namespace) -> int:
     from ..io.store import Settings, check_folder
     from ..jobs.inputs import find_inputs
     from ..jobs.local import reconstruct_files
+    from ..jobs.pressure import recording_pressures
     from ..jobs.rest import recording_rest
     from ..presets import sensor_file
     from ..sensor.sensor import Sensor
@@ -61,10 +67,11 @@ def run(arguments: Namespace) -> int:
     inputs = find_inputs(arguments.images, arguments.video)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     reconstructor = build_reconstructor(sensor, arguments).to(arguments.device)
-    settings = Settings.of(reconstructor, arguments.format, " ".join(arguments.rest))
+    pressure = recording_pressures(reconstructor, arguments.pressure, inputs) if arguments.pressure else None
+    settings = Settings.of(reconstructor, arguments.format, " ".join(arguments.rest), str(arguments.pressure or ""))
     check_folder(arguments.out, sensor.fingerprint, settings)
     rest = recording_rest(reconstructor, arguments.rest, inputs) if arguments.rest else None
-    options = {"batch": arguments.batch, "figures": arguments.figures, "rest_pixels": rest}
+    options = {"batch": arguments.batch, "figures": arguments.figures, "rest_pixels": rest, "pressure": pressure}
     counts = reconstruct_files(reconstructor, inputs, arguments.out, settings, **options)
     doubts = ("not converged", counts.not_converged), ("unexplained", counts.unexplained), ("partly hidden", counts.hidden)
     said = ", ".join(f"{count} {doubt}" for doubt, count in doubts if count)

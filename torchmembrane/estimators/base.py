@@ -50,6 +50,7 @@ class Observation(NamedTuple):
                          deviations of its marker; None: all are as sure, in all directions
     motion               `[B, N, 2, 4]`, by how much of these a camera that moves turns the ray, as `bearings.marker_rays` says;
                          None: it has not moved
+    gauge                `[B, 2]`, what a gauge in the cavity reads, as of `pressure_gauge.gauge_reading`; None: there is none
     """
 
     origins: Tensor
@@ -57,6 +58,7 @@ class Observation(NamedTuple):
     confidence: Tensor
     across: Tensor | None = None
     motion: Tensor | None = None
+    gauge: Tensor | None = None
 
 
 class Equilibrium(NamedTuple):

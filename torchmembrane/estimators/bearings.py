@@ -18,13 +18,14 @@ from .camera_motion import motion_of_pixels
 
 
 class Bearings(NamedTuple):
-    """Measured marker rays.
+    """Measured marker rays, and what a gauge reads.
 
     origins      `[B, 3, D]`
     across       `[B, 2, 3, D]`, two vectors across each ray, along which its turns are measured in standard deviations
     weight       `[B, D]`, the markers' confidence
     noise_level  `[B]`, the markers' standard deviations over those at rest
     motion       `[B, 2, 4, D]`, derivatives of the angles in the camera's motion: du, dv, rotation, growth (px)
+    gauge        `[B, 2]`, as of `Observation`, or None
     """
 
     origins: Tensor
@@ -32,6 +33,7 @@ class Bearings(NamedTuple):
     weight: Tensor
     noise_level: Tensor
     motion: Tensor
+    gauge: Tensor | None = None
 
 
 def marker_rays(camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
@@ -111,7 +113,7 @@ class MarkerBearings(nn.Module):
     @piece
     def measured(self, observation: Observation) -> Bearings:
         """The markers' rays as `angles` takes them."""
-        origins, directions, confidence, across, motion = observation
+        origins, directions, confidence, across, motion, gauge = observation
         if across is None:
             across = tangent_frame(directions) / self.noise
         if motion is None:
@@ -119,7 +121,7 @@ class MarkerBearings(nn.Module):
         found = (confidence > 0).to(confidence.dtype)
         spread = (torch.where(found > 0, _spread(across), 0.0)).sum(-1) / found.sum(-1).clamp_min(1)
         noise_level = (spread / self.rest_spread).sqrt()
-        return Bearings(origins.mT, across.movedim(1, -1), confidence, noise_level, motion.movedim(1, -1))
+        return Bearings(origins.mT, across.movedim(1, -1), confidence, noise_level, motion.movedim(1, -1), gauge)
 
     def markers(self, x: Tensor) -> Tensor:
         """The markers' positions on the surface `x [B, V, 3]`, `[B, D, 3]`."""

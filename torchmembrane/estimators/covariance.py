@@ -6,15 +6,17 @@ At the solution a small change `e` of the measured angles moves surface and pres
     [m' c  C] [dp    ] = [   0   ],    M = A^T W A + J^T w J,
     [n' C  0] [lambda]   [   0   ]
 
-and the camera's motion (`camera_motion`) as the step has it; with `W` the curvature of a push's loss (flat where it bends down;
-shear by its parabola), so that noise of covariance S gives the sandwich `H^-1 J^T w S w J H^-1`. One load per marker and
-direction of its noise, all solved with one factor.
+with `c + 1 / sigma^2` in place of `c` where a gauge reads the pressure, whose own noise of one sigma adds `1 / sigma` to the
+second row; and the camera's motion (`camera_motion`) as the step has it; with `W` the curvature of a push's loss (flat where it
+bends down; shear by its parabola), so that noise of covariance S gives the sandwich `H^-1 J^T w S w J H^-1`. One load per
+marker and direction of its noise, all solved with one factor.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..mechanics.cavity import CavityLaw
@@ -24,6 +26,7 @@ from .camera_motion import CameraMotion
 from .contact_force import Linearised
 from .descent import State
 from .normal_equations import BalanceEquations, NormalEquations
+from .pressure_gauge import pulled
 
 
 class StandardDeviations(NamedTuple):
@@ -43,6 +46,7 @@ class LinearisedSolution(NamedTuple):
     force        `[B, 3, 3 N]`, the total force's derivative in the inner vertices
     of_pressure  `[B, 3]`, minus its derivative in the pressure
     motion       the camera's
+    gauge        `1 / sigma` of a gauge's reading, `[B]`, in `c` already; None where there is no gauge
     """
 
     solve: Callable[[Tensor], Tensor]
@@ -51,6 +55,7 @@ class LinearisedSolution(NamedTuple):
     force: Tensor
     of_pressure: Tensor
     motion: CameraMotion
+    gauge: Tensor | None = None
 
 
 def linearise(
@@ -73,21 +78,23 @@ def linearise(
         play: of the camera, px, as for `CameraMotion.held`.
         curvature: as for `TractionLoss.weights`.
     """
-    at, normal, loads, (_, vWv), motion = equations.linearised(*state, measured, *scales, curvature=curvature)
+    at, normal, loads, corner, motion = equations.linearised(*state, measured, *scales, curvature=curvature)
+    vWv = pulled(corner, measured.gauge, state.pressure - cavity.rest_pressure)[1]
     factor, membrane = equations.system.factor(equations.matrix(normal)), equations.forces.membrane
     compliance = cavity.condition(membrane.volume(state.x) - membrane.rest_volume, state.pressure)[1]
     motion = motion.held(state.moved, play)
     of_motion = equations.system.substitute(factor, motion.coupling)
-    corner = None if cavity.filling == "open" else (vWv, compliance.expand_as(vWv))
+    closed = cavity.filling != "open"
     one = torch.eye(3).to(state.x)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
     of_force = equations.forces.change(at.stiffness, one).flatten(2)
     solution = LinearisedSolution(
         lambda loads: motion.eased(equations.system.substitute(factor, loads), of_motion),
         loads[:, [2, 0]],
-        corner,
+        (vWv, compliance.expand_as(vWv)) if closed else None,
         of_force,
         at.volume.sum(-1),
         motion,
+        measured.gauge[:, 1].sqrt() if closed and measured.gauge is not None else None,
     )
     return at, normal, solution
 
@@ -124,19 +131,24 @@ def noise_loads(
 
 
 def changes(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor]:
-    """What each load does to the inner vertices, `[B, L, 3 N]`, and to the pressure, `[B, L]`.
+    """What each load does to the inner vertices, `[B, L, 3 N]`, and to the pressure, `[B, L]`; with a gauge, its noise last.
 
     Args:
         solution: the linearised solution.
         noise_loads: `[B, L, 3 N]`, what one standard deviation of each independent noise adds to the equations, `J^T w e`.
     """
+    if solution.gauge is not None:
+        noise_loads = F.pad(noise_loads, (0, 0, 0, 1))
     y = solution.solve(torch.cat([noise_loads, solution.borders], 1))
     dx, dp = y[:, :-2], torch.zeros_like(noise_loads[..., 0])
     if solution.corner is not None:
         border = y[:, -2:]
         c, C = solution.corner
         corner = torch.stack([c, C, C, torch.zeros_like(C)], -1).unflatten(-1, (2, 2)) - solution.borders @ border.mT
-        rise = torch.linalg.solve(corner, -solution.borders @ dx.mT)
+        rows = -solution.borders @ dx.mT
+        if solution.gauge is not None:
+            rows = rows + F.pad(solution.gauge[:, None, None], (rows.shape[-1] - 1, 0, 0, 1))
+        rise = torch.linalg.solve(corner, rows)
         dx, dp = dx - rise.mT @ border, rise[:, 0]
     return dx, dp
 

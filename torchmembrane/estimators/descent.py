@@ -12,6 +12,7 @@ from ..solve.kkt import BorderedStep, solve_bordered
 from ..surface.stencil import pad_border
 from .bearings import Bearings
 from .normal_equations import BalanceEquations
+from .pressure_gauge import pulled
 from .settings import ForceBalanceSettings
 
 Factor = tuple[Tensor, ...]
@@ -114,6 +115,7 @@ class Descent(nn.Module):
         first, last = self.settings.tau
         motion = motion.held(moved, self.settings.camera_motion * (tau.clamp_max(first) / last) ** 2)
         loads, solved = motion.eliminated(loads[:, :3], solved[:, :3], solved[:, 3:])
+        corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
         move, rise = self._bordered_step(x, pressure, loads, solved, corner)
         turn = motion.following(move)
         move = move.unflatten(-1, (3, -1)).mT

@@ -102,9 +102,9 @@ def spreads_of(
     by_pressure: Tensor,
 ) -> Tensor:
     """Standard deviations `[B, L]` of numbers whose derivatives in the inner vertices are `wanted [B, L, 3 N]` and in the
-    pressure `by_pressure [B, L]`, where all angles `across` have a standard deviation of 1."""
+    pressure `by_pressure [B, L]`, where all angles `across` have a standard deviation of 1, and a gauge its own."""
     solved = solution.solve(torch.cat([wanted, solution.borders], 1))
-    y = solved[:, :-2]
+    y, of_gauge = solved[:, :-2], torch.zeros_like(by_pressure)
     if solution.corner is not None:
         (c, compliance), (m, n) = solution.corner, solution.borders.unbind(1)
         of_m, of_n = solved[:, -2:].unbind(1)
@@ -113,9 +113,11 @@ def spreads_of(
             for a, b, d in ((wanted, n, m), (y, of_n, of_m))
         )
         zero = torch.zeros_like(by_pressure)
-        y = solve_bordered(loads, solutions, c[:, None], by_pressure, compliance[:, None], zero).step
+        y, rise = solve_bordered(loads, solutions, c[:, None], by_pressure, compliance[:, None], zero)
+        of_gauge = of_gauge if solution.gauge is None else rise * solution.gauge[:, None]
     at_markers = y.unflatten(-1, (3, -1)) @ equations.bearings.vertex_shares.mT
     of_angles = (normal.weighted_jacobian[:, None] * at_markers[:, :, None]).sum(3)
     of_camera = solution.motion.turning(y)[..., None, :, None] * normal.marker_weights[:, None, None, None]
-    spread: Tensor = (of_angles - (measured.motion[:, None] * of_camera).sum(3)).square().sum((2, 3)).sqrt()
+    of_markers = (of_angles - (measured.motion[:, None] * of_camera).sum(3)).square().sum((2, 3))
+    spread: Tensor = (of_markers + of_gauge.square()).sqrt()
     return spread

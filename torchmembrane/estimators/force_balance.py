@@ -20,13 +20,14 @@ its lines, that one from one coarser still: it takes few vertices to find the ba
 first step's factor does for all: with it, two conjugate-gradient steps solve the others' equations well enough.
 """
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..camera.model import Camera
+from ..errors import MembraneError
 from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..pieces import mended, piece
@@ -42,6 +43,7 @@ from .covariance import StandardDeviations, linearise, noise_loads, push_noise, 
 from .descent import Descent, State
 from .deviations import depths, of_presses, spreads
 from .normal_equations import BalanceEquations
+from .pressure_gauge import gauge_loss, gauge_reading
 from .robust import Cauchy
 from .settings import ForceBalanceSettings
 from .traction_loss import TractionLoss
@@ -171,6 +173,24 @@ class ForceBalance(nn.Module):
             return Observation(*camera.pixel_to_ray(pixels), confidence)
         return marker_rays(camera, pixels, confidence, covariance)
 
+    def check_gauge(self) -> None:
+        """Refuse a gauge where it tells nothing."""
+        if self.cavity.filling == "open":
+            raise MembraneError(
+                "pressure: the cavity is open, its pressure is known to stay at rest: a gauge tells nothing; leave it out, or "
+                "describe the cavity as a liquid or a gas"
+            )
+
+    def gauged(self, observation: Observation, pressure: Tensor | float) -> Observation:
+        """The observation with the pressure `[B]` or `[]` that a gauge reads, NaN where there is no reading.
+
+        Raises:
+            MembraneError: the cavity is open, or the pressure of another shape.
+        """
+        self.check_gauge()
+        deviation = self.settings.pressure_noise * self.reference
+        return observation._replace(gauge=gauge_reading(pressure, self.rest_pressure, deviation, observation.confidence))
+
     def forward(self, observation: Observation, start: tuple[Tensor, Tensor, Tensor] | None = None) -> Equilibrium:
         """The surface that the markers' rays show; `start`: vertices, pressure and the camera's motion near it, such as the
         previous frame's."""
@@ -179,7 +199,7 @@ class ForceBalance(nn.Module):
         again = mended(self.is_converged(found), found, self._patiently, measured, self.chosen)
         return Equilibrium(*again)
 
-    def _patiently(self, *measured: Tensor) -> Equilibrium:
+    def _patiently(self, *measured: Any) -> Equilibrium:
         """From rest, in many small steps: deep presses need them."""
         return self._solved(Bearings(*measured), None, patient=True)
 
@@ -269,7 +289,7 @@ class ForceBalance(nn.Module):
         return of_presses(spread, force, depth.amax(-1), contacts, self.membrane, spacing, unseen)
 
     def objective(self, found: Equilibrium, observation: Observation) -> Tensor:
-        """What the last steps minimise, `[B]`: the misfit of the markers and the loss of the tractions."""
+        """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
         equations, grid = self.equations, self.membrane.grid
         measured = equations.bearings.measured(observation)
         traction, normal = inner(found.traction, grid).mT, inner(self.membrane.normals(found.vertices), grid).mT
@@ -277,7 +297,7 @@ class ForceBalance(nn.Module):
         objective: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1) + equations.loss(
             traction, normal, measured.noise_level
         )
-        return objective
+        return objective + gauge_loss(measured.gauge, found.pressure - self.rest_pressure)
 
     def standard_deviations(
         self, x: Tensor, pressure: Tensor, moved: Tensor, observation: Observation, marker_noise: float | Tensor

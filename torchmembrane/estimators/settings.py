@@ -42,6 +42,8 @@ class ForceBalanceSettings:
         reach: radius of the surroundings that are asked whether a vertex is pushed.
         floor: least weight of a compressive traction; without it a vertex under a contact has no place of its own.
         outlier: scale of the markers' loss, over their noise.
+        pressure_noise: standard deviation of a measured pressure, over the reference traction (mostly the rest pressure); a
+            better gauge is best told to be as good as this.
         longest_step: largest step of a vertex.
         coarsest: fewest lines of a coarser grid.
         coarsest_warm: fewest lines of a coarser grid that is given the solution of the frame before.
@@ -83,6 +85,7 @@ class ForceBalanceSettings:
     reach: float = 0.04
     floor: float = 1e-3
     outlier: float = 5.0
+    pressure_noise: float = 0.01
     longest_step: float = 0.04
     coarsest: int = 9
     coarsest_warm: int = 13
@@ -94,6 +97,8 @@ class ForceBalanceSettings:
         for name in ("steps", "coarse_steps", "fine_steps", "finer_steps", "warm_steps"):
             if getattr(self, name) < 2:
                 raise MembraneError(f"ForceBalanceSettings: {name} = {getattr(self, name)}; expected at least 2")
+        if not self.pressure_noise > 0:
+            raise MembraneError(f"ForceBalanceSettings: pressure_noise = {self.pressure_noise}; expected more than 0")
 
     def gnc_schedule(self, steps: int, tau: tuple[float, float]) -> list[tuple[float, float]]:
         """Scales of the losses in every step, graduated non-convexity: of compressive tractions (tau), of markers."""

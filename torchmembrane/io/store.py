@@ -19,7 +19,7 @@ FINISHED = tuple(status for status in Status if status.has_surface)
 """Status of frames that are not tried again."""
 FORMATS = ("npz", "parquet")
 MESH = "mesh.npz"
-OWN = "of the sensor"
+OWN, NONE = "of the sensor", "not measured"
 
 
 class Settings(NamedTuple):
@@ -34,10 +34,13 @@ class Settings(NamedTuple):
     smoothing: float = 0.0
     locator: str = "fit"
     rest: str = ""
+    pressure: str = ""
+    pressure_noise: float = 0.0
 
     @classmethod
-    def of(cls, reconstructor: "Reconstructor", format: str, rest: str = "") -> "Settings":
-        """Those of results that a reconstructor makes; `rest`: what was taken for rest in place of the sensor's rest image."""
+    def of(cls, reconstructor: "Reconstructor", format: str, rest: str = "", pressure: str = "") -> "Settings":
+        """Those of results that a reconstructor makes; `rest`: what was taken for rest in place of the sensor's rest image,
+        `pressure`: the file of a gauge's readings."""
         estimator = reconstructor.estimator
         return cls(
             estimator=reconstructor.estimator_name,
@@ -49,6 +52,8 @@ class Settings(NamedTuple):
             smoothing=estimator.smoothing_weight,
             locator=reconstructor.locator_name,
             rest=rest,
+            pressure=pressure,
+            pressure_noise=getattr(estimator.settings, "pressure_noise", 0.0) if pressure else 0.0,
         )
 
 
@@ -65,7 +70,7 @@ class Mesh(NamedTuple):
     image_size      [2]     int64, width and height, px
     length_unit, force_unit, name    of the sensor
     sensor          fingerprint of its file
-    estimator, energy, element, format, volume, flow, smoothing, locator, rest    the `Settings`
+    estimator, energy, element, format, volume, flow, smoothing, locator, rest, pressure, pressure_noise    the `Settings`
     camera_in_tool  [3, 4]  rotation and translation from the camera's frame to the tool's, `p_tool = R p + t`; [0, 4] where the
                             sensor file has no `[tool]`; `tool` gives it as a `Pose`
     """
@@ -91,6 +96,8 @@ class Mesh(NamedTuple):
     smoothing: float = 0.0
     locator: str = "fit"
     rest: str = ""
+    pressure: str = ""
+    pressure_noise: float = 0.0
     camera_in_tool: np.ndarray = np.zeros((0, 4), np.float32)
 
     @classmethod
@@ -164,9 +171,10 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
         )
     for option, before, now in zip(Settings._fields, mesh.settings, settings, strict=True):
         if before != now:
-            remedy = f"pass --{option} {before}" if before else f"leave --{option} out"
+            name, none = option.replace("_", "-"), NONE if option == "pressure" else OWN
+            remedy = f"pass --{name} {before}" if before else f"leave --{name} out"
             raise MembraneError(
-                f"--out {folder}: was made with {option} {before or OWN}, this call asks for {now or OWN}; choose another "
+                f"--out {folder}: was made with {name} {before or none}, this call asks for {now or none}; choose another "
                 f"folder, or {remedy}"
             )
 

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -45,6 +45,7 @@ def reconstruct_files(
     batch: int = 16,
     figures: bool = False,
     rest_pixels: Tensor | None = None,
+    pressure: Mapping[str, float] | None = None,
     report: Callable[[str], None] | None = None,
 ) -> FrameCounts:
     """Reconstruct all frames of `inputs` that have no finished result in the folder `out` yet.
@@ -60,6 +61,7 @@ def reconstruct_files(
         batch: frames computed at once; at most three batches of images are in memory.
         figures: also NAME.png for every frame; a finished frame that lacks its figure is done again.
         rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
+        pressure: that a gauge reads, by the names of the frames, as `Reconstructor` takes it.
         report: called with one line per failed frame (default: the line is written to stderr, above the progress bar).
 
     Returns:
@@ -91,7 +93,7 @@ def reconstruct_files(
     try:
         with torch.no_grad(), _progress(inputs, folder.finished) as progress:
             for group in read_ahead(waiting, batch):
-                for frame, result, seconds in _reconstructed(reconstructor, group, rest_pixels):
+                for frame, result, seconds in _reconstructed(reconstructor, group, rest_pixels, pressure):
                     status = folder.keep(frame, result, seconds)
                     done[status] += 1
                     if status not in FINISHED:
@@ -148,14 +150,20 @@ class _ResultFolder:
 
 
 def _reconstructed(
-    reconstructor: "Reconstructor", group: list[DecodedFrame], rest_pixels: Tensor | None
+    reconstructor: "Reconstructor",
+    group: list[DecodedFrame],
+    rest_pixels: Tensor | None,
+    pressure: Mapping[str, float] | None,
 ) -> Iterator[tuple[DecodedFrame, Frame | None, float]]:
     """Every frame of a batch with its result, None for an unreadable one, and the seconds that it took."""
     start = time.perf_counter()
-    images = [frame.image for frame in group if frame.image is not None]
+    readable = [(frame.name, frame.image) for frame in group if frame.image is not None]
+    names, images = [name for name, _ in readable], [image for _, image in readable]
     results: Iterator[Frame] = iter(())
     if images:
         options = {} if rest_pixels is None else {"rest_pixels": rest_pixels}
+        if pressure is not None:
+            options["pressure"] = torch.tensor([pressure.get(name, torch.nan) for name in names], dtype=torch.float64)
         computed = Reconstruction(*(field.cpu() for field in reconstructor(torch.cat(images), **options)))
         results = iter([computed.frame(i) for i in range(len(images))])
     seconds = (time.perf_counter() - start) / max(len(images), 1)

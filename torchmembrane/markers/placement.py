@@ -44,6 +44,26 @@ class PlacedMarkers:
     locator: Locator
 
 
+def imaged_vertices(sensor: Sensor, vertex_pixels: Tensor, whole: bool) -> Tensor:
+    """Which vertices the camera can image, `[V]` bool; refused where some cannot be imaged that must.
+
+    Args:
+        sensor: with a list of dots or a rest image.
+        vertex_pixels: rest pixels `[V, 2]` of the grid's vertices.
+        whole: whether the estimator needs all of them.
+
+    Raises:
+        MembraneError: a vertex that is needed cannot be imaged.
+    """
+    imaged = torch.isfinite(vertex_pixels).all(-1)
+    if not (imaged.all() if whole or sensor.markers.positions is None else imaged.any()):
+        raise MembraneError(
+            f"sensor {sensor.name!r}: parts of the rest surface cannot be imaged by its camera; check the poses (force "
+            "balance of listed dots can do with a part)"
+        )
+    return imaged
+
+
 def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS[0]) -> PlacedMarkers:
     """Place the sensor's markers: listed dots, dots found in the rest image, or texture patches chosen there.
 

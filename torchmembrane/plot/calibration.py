@@ -105,11 +105,12 @@ def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarr
 
 
 def material_figure(report: Report, found: Any, names: list[str]) -> Figure:
-    """Losses over the prestretch with the estimate, and forces found over forces measured where there are any.
+    """Losses over the prestretch with the estimate, and forces, or pressures, found over those measured where there are any.
 
     Args:
         report: the calibration's numbers, the prestretch first.
-        found: a material's fit: its `profile` (prestretches `[S]`, losses `[S, B]` of B images) and `forces [B, 2]`.
+        found: a material's fit: its `profile` (prestretches `[S]`, losses `[S, B]` of B images), `forces [B, 2]`
+            and `pressures [B, 2]`.
         names: of the B images.
 
     Example:
@@ -117,11 +118,13 @@ def material_figure(report: Report, found: Any, names: list[str]) -> Figure:
         >>> none, stretches = np.zeros((0, 2)), np.array([1.1, 1.3, 1.5])
         >>> losses = np.array([[4.0], [0.0], [1.0]])
         >>> report = Report("material", ["prestretch"], [""], *np.ones((3, 1)), np.eye(1), none, none, 0.0, [])
-        >>> found = SimpleNamespace(profile=(stretches, losses), forces=np.array([[1.0, 1.1]]))
+        >>> found = SimpleNamespace(profile=(stretches, losses), forces=np.array([[1.0, 1.1]]), pressures=none)
         >>> [axes.get_xlabel() for axes in material_figure(report, found, ["press.png"]).axes]
         ['prestretch', 'force found, N']
     """
-    known = np.isfinite(found.forces).all(1)
+    of_forces = bool(np.isfinite(found.forces).all(1).any())
+    pairs, kind = (found.forces, "force {}, N") if of_forces else (found.pressures, "pressure change {}, N per area")
+    known = np.isfinite(pairs).all(1)
     panels = 2 if known.any() else 1
     drawing = Figure(figsize=(1 + 6 * panels, 4.6), layout="constrained")
     drawing.suptitle(report.title)
@@ -139,13 +142,13 @@ def material_figure(report: Report, found: Any, names: list[str]) -> Figure:
     handles, labels = axes[0].get_legend_handles_labels()
     axes[0].legend(handles[-3:], labels[-3:])
     if known.any():
-        axes[1].plot(*found.forces[known].T, "o", color=BLUE)
-        for name, force in zip(names, found.forces, strict=True):
-            if np.isfinite(force).all():
-                axes[1].annotate(name, force, fontsize=8)
-        top = 1.1 * found.forces[known].max()
+        axes[1].plot(*pairs[known].T, "o", color=BLUE)
+        for name, pair in zip(names, pairs, strict=True):
+            if np.isfinite(pair).all():
+                axes[1].annotate(name, pair, fontsize=8)
+        top = 1.1 * pairs[known].max()
         axes[1].plot([0, top], [0, top], color=GREY, lw=1)
-        axes[1].set(xlabel="force found, N", ylabel="force measured, N", aspect="equal")
+        axes[1].set(xlabel=kind.format("found"), ylabel=kind.format("measured"), aspect="equal")
     return drawing
 
 

@@ -53,8 +53,8 @@ def solve_bordered(
     """Solve for `d`, `r` and a multiplier `lambda`
 
         [M  m  n] [d     ]   [-g]
-        [m' c  0] [r     ] = [ b]
-        [n' 0  C] [lambda]   [ t]
+        [m' c  C] [r     ] = [ b]
+        [n' C  0] [lambda]   [ t]
 
     Args:
         loads: `[..., 3, N]`: `n`, `g`, `m`.

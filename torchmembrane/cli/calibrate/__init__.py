@@ -26,7 +26,7 @@ A sensor is calibrated in this order, each step starting from the sensor file of
   rest       where the rest surface stands, and its dots, from the rest image, when the dots are listed
   views      the same from several views, when they are not
   depth      the same from a depth image
-  material   prestretch from images of presses; stiffness, where the forces of some are known
+  material   prestretch from images of presses; stiffness, where forces, or pressures in the cavity, of some are known
 and the other way round:
   layout     from the dots wanted in the image to positions on the rest surface, to fabricate them"""
 
@@ -93,6 +93,10 @@ def _material_options(add: Add) -> None:
     add("images", metavar="IMAGES", nargs="+", help="of presses, deep ones: files, globs, folders")
     vectors, lengths = "CSV image,fx,fy,fz (on the membrane, in the camera's frame)", "image,force (magnitude)"
     add("--forces", metavar="FILE.csv", type=Path, help=f"{vectors} or {lengths}, N: total force in some images")
+    gauge = (
+        "CSV name,pressure (images at rest and pressed) or name,pressure_change (since rest), hPa: a gauge's readings of some"
+    )
+    add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
 
 
 def _layout_options(add: Add) -> None:

@@ -5,19 +5,23 @@ from argparse import Namespace
 import numpy as np
 import torch
 
-from ...calibrate.material import STRETCHES, material_from_images
+from ...calibrate.material import STRETCHES, KnownPressures, material_from_images
 from ...io.report import Report
-from ...jobs.inputs import find_inputs
+from ...jobs.inputs import Inputs, find_inputs
+from ...jobs.pressure import read_pressures
 from ...plot.calibration import material_figure
+from ...sensor.sensor import Sensor
 from .files import read_forces, read_sensor, read_sensor_image, write_calibrated
 
 
 def material(arguments: Namespace) -> int:
     """`torchmembrane calibrate material`"""
-    sensor, paths = read_sensor(arguments), find_inputs(arguments.images).images
+    sensor, inputs = read_sensor(arguments), find_inputs(arguments.images)
+    paths = inputs.images
     forces = read_forces(arguments.forces, paths) if arguments.forces else None
+    pressures = _pressures(arguments, inputs, sensor) if arguments.pressure else None
     images = torch.from_numpy(np.stack([read_sensor_image(path, sensor) for path in paths]))[:, None]
-    found = material_from_images(sensor, images, forces)
+    found = material_from_images(sensor, images, forces, pressures)
     unit, n = sensor.length_unit, len(found.values)
     each = zip(paths, found.each, strict=True)
     notes = [f"{path.name} alone: prestretch {one:.3f} ± {sd:.2g}" for path, (one, sd) in each]
@@ -34,3 +38,8 @@ def material(arguments: Namespace) -> int:
         correlations=found.covariance / np.outer(found.deviations, found.deviations),
     )
     return write_calibrated(arguments, found.sensor, report, material_figure(report, found, [path.name for path in paths]))
+
+
+def _pressures(arguments: Namespace, inputs: Inputs, sensor: Sensor) -> KnownPressures:
+    values, since_rest = read_pressures(arguments.pressure, inputs, sensor)
+    return KnownPressures(np.array([values.get(path.stem, np.nan) for path in inputs.images]), since_rest)
