@@ -86,8 +86,7 @@ def spreads(
     deepest = (depth == depth.amax(-1, keepdim=True)).to(depth.dtype)
     inwards = -inner(membrane.rest_normals, membrane.grid).mT
     of_depth = (deepest / deepest.sum(-1, keepdim=True))[:, None] * inwards
-    frames = len(depth)
-    wanted = torch.cat([solution.force.expand(frames, -1, -1), of_depth.flatten(1)[:, None]], 1)
+    wanted = torch.cat([solution.force.expand(of_depth.shape[0], -1, -1), of_depth.flatten(1)[:, None]], 1)
     by_pressure = torch.cat([-solution.of_pressure, torch.zeros_like(state.pressure)[:, None]], 1)
     both = spreads_of(equations, normal, solution, measured, wanted, by_pressure)
     return both[:, :3], both[:, 3]
