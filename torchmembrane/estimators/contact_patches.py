@@ -75,7 +75,7 @@ def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, peaks: 
     load = mine * inward_force[:, None]
     order = torch.where(present, load.sum(-1), -1.0).argsort(-1, descending=True)
     present = present.gather(1, order)
-    load, mine = (value.take_along_dim(order[..., None], 1) for value in (load, mine))
+    load, mine = (value.gather(1, order[..., None].expand_as(value)) for value in (load, mine))
     points = (load @ vertices) / load.sum(-1, keepdim=True).clamp_min(torch.finfo(load.dtype).tiny)
     return torch.where(present[..., None], points, torch.nan), mine
 
