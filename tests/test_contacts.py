@@ -75,13 +75,15 @@ def test_a_touch_beside_one_tenfold_as_strong_is_told_and_of_five_the_strongest_
     assert (found.points[0] - torch.tensor(places[0]).double()).norm(dim=-1).min() > 3
 
 
-@pytest.mark.parametrize("edge", [1.0, 3.0])
-def test_a_flat_plate_is_one_contact(edge):
-    """A wide disc, also where its edge bears more than its middle, as a plate's does."""
+@pytest.mark.parametrize(("edge", "rough"), [(1.0, 0.0), (3.0, 0.0), (1.0, 0.8)])
+def test_a_flat_plate_is_one_contact(edge, rough):
+    """A wide disc, also where its edge bears more than its middle, as a plate's does, and where pushes vary from vertex to
+    vertex."""
     x = DOME.rest[None]
     traction, normals, (disc,) = pressed_by(x, [(0.0, 0.0, 12.0)], radius=6.0)
     rim = disc & ((DOME.rest - torch.tensor([0.0, 0.0, 12.0]).double()).norm(dim=-1) > 5)
-    found = told(x, torch.where(rim[:, None], edge * traction, traction), normals)
+    vary = 1 + rough * (2 * torch.rand(len(disc), 1, generator=torch.Generator().manual_seed(0)) - 1)
+    found = told(x, vary * torch.where(rim[:, None], edge * traction, traction), normals)
     assert found.points[0, 1:].isnan().all()
     assert (found.points[0, 0, :2]).norm() < 0.5
 
