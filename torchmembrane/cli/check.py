@@ -1,16 +1,27 @@
-"""`torchmembrane check`: what a sensor file means, in words and drawn."""
+"""`torchmembrane check`: what a sensor file means, in words and drawn, and what to expect of the sensor."""
 
+import os
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .arguments import add_command, add_sensor
+from ..errors import MembraneError
+from .arguments import add_command, add_sensor, count, positive, seed
 
-PURPOSE = "say in words, and draw, what a sensor file means"
+if TYPE_CHECKING:
+    from ..io.spec_sheet import SpecSheet
+    from ..sensor.sensor import Sensor
+
+PURPOSE = "say in words, and draw, what a sensor file means and what to expect of the sensor"
 EXAMPLES = """\
 examples:
   torchmembrane check sensor.toml
   torchmembrane check sensor.toml --out sensor.png
+  torchmembrane check preset:bubble --accuracy --out bubble.png
+
+--accuracy presses the sensor in the simulator, some 150 images, and reconstructs them: noise at rest, the lightest touch found,
+errors of force, depth and place, how near two touches are told apart, how deep a press may be. Some minutes of processor time,
+more for larger images. SENSOR.toml may be preset:NAME.
 
 exit code: 0 the sensor can be used, 2 it cannot: the message says why"""
 
@@ -19,12 +30,19 @@ def add_parser(commands: Any) -> None:
     """Add the command's parser."""
     add = add_command(commands, "check", run, PURPOSE, EXAMPLES)
     add_sensor(add)
-    add("--out", metavar="FIGURE.png", type=Path, help="draw it: side view with rays, rest surface, rest image")
+    add("--out", metavar="FIGURE.png", type=Path, help="draw it: side view with rays, rest surface, rest image, accuracy")
+    add("--accuracy", action="store_true", help="also what to expect of it, from simulated presses")
+    add("--seed", type=seed, help="of presses and noise of --accuracy (default: 0)")
+    noise = "of images of --accuracy, white over the noise's standard deviation (default: as in the rest image, else 40)"
+    add("--noise", metavar="DB", type=positive, help=noise)
+    add("--jobs", metavar="J", type=count, help="processes of --accuracy (default: all cores)")
 
 
 def run(arguments: Namespace) -> int:
     """Describe and draw the sensor; returns the exit code."""
-    from ..errors import MembraneError
+    for name in ("seed", "noise", "jobs"):
+        if getattr(arguments, name) is not None and not arguments.accuracy:
+            raise MembraneError(f"--{name} goes with --accuracy only: add it")
     from ..presets import sensor_file
     from ..reconstruct import Reconstructor
     from ..sensor.sensor import Sensor
@@ -38,13 +56,25 @@ def run(arguments: Namespace) -> int:
     except MembraneError as error:
         problem = error
     frame = None if reconstructor is None else rest_frame(reconstructor)
-    print("\n".join(described(sensor, reconstructor, frame)))
+    print("\n".join(described(sensor, reconstructor, frame)), flush=True)
+    sheet = _sheet(sensor, arguments) if arguments.accuracy and not problem else None
     if arguments.out:
         from ..plot.drawing import save
         from ..plot.sensor import sensor_figure
 
-        save(sensor_figure(sensor, reconstructor, frame), arguments.out)
+        save(sensor_figure(sensor, reconstructor, frame, sheet), arguments.out)
         print(f"drawn in {arguments.out}")
     if problem:
         raise problem
     return 0
+
+
+def _sheet(sensor: "Sensor", arguments: Namespace) -> "SpecSheet":
+    """The sensor's spec sheet, printed."""
+    from ..accuracy.measure import spec_sheet
+    from .sheet import sheet_lines
+
+    jobs = arguments.jobs or os.cpu_count() or 1
+    sheet = spec_sheet(sensor, arguments.seed or 0, noise=arguments.noise, jobs=jobs)
+    print("\n".join(sheet_lines(sheet)))
+    return sheet

@@ -17,6 +17,7 @@ from ..surface.topology import rim_loop
 BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # distinct with any colour vision
 Grid = tuple[int, int] | np.ndarray
 
+ROW = 6.0  # inches, of a row of panels
 LINES = 16  # of a grid that are drawn each way, at most about
 
 
@@ -50,11 +51,13 @@ def show(drawing: Figure) -> None:
     pyplot.show()
 
 
-def panels(count: int) -> tuple[Figure, GridSpec]:
-    """A figure with places for `count` panels in a row."""
-    drawing = Figure(figsize=(16 * count / 3, 6), dpi=100)
+def panels(count: int, below: float = 0.0) -> tuple[Figure, GridSpec]:
+    """A figure with places for `count` panels in a row, and `below` them as many inches more."""
+    height = ROW + below
+    drawing = Figure(figsize=(16 * count / 3, height), dpi=100)
+    top, bottom = 1 - 0.13 * ROW / height, (below + 0.19 * ROW) / height
     return drawing, drawing.add_gridspec(
-        1, count, left=0.135 / count, right=1 - 0.045 / count, top=0.87, bottom=0.19, wspace=0.2
+        1, count, left=0.135 / count, right=1 - 0.045 / count, top=top, bottom=bottom, wspace=0.2
     )
 
 

@@ -1,4 +1,7 @@
-"""A sensor as it was understood: its rays from the side, its rest surface in space, its markers in the rest image."""
+"""A sensor as it was understood: its rays from the side, its rest surface in space, its markers in the rest image.
+
+Below them, where it was tried, what to expect of it.
+"""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +12,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from ..camera.model import Camera
+from ..io.spec_sheet import SpecSheet
 from ..sensor.sensor import Sensor
+from .accuracy import BELOW, draw_sheet
 from .drawing import (
     BLUE,
     GREY,
@@ -29,30 +34,36 @@ if TYPE_CHECKING:
 
 
 def sensor_figure(
-    sensor: Sensor, reconstructor: "Reconstructor | None" = None, frame: dict[str, np.ndarray] | None = None
+    sensor: Sensor,
+    reconstructor: "Reconstructor | None" = None,
+    frame: dict[str, np.ndarray] | None = None,
+    sheet: SpecSheet | None = None,
 ) -> Figure:
-    """Side view with rays, rest surface in space, and what is projected into the rest image.
+    """Side view with rays, rest surface in space, and what is projected into the rest image; below them its spec sheet.
 
     Args:
         sensor: the sensor.
         reconstructor: its `Reconstructor`, if there is one: its markers are drawn.
         frame: the result of its rest image, if there is one: the markers found are drawn.
+        sheet: what to expect of it, if that was tried.
 
     Returns:
-        A figure of three panels.
+        A figure of three panels, with a sheet four more.
 
     Example:
         >>> from torchmembrane.presets import preset
         >>> [axes.get_title() for axes in sensor_figure(preset("bubble")).axes]
         ['From the side', 'Rest surface', 'Rest image']
     """
-    drawing, places = panels(3)
+    drawing, places = panels(3, 0.0 if sheet is None else BELOW)
     drawing.suptitle(f"Sensor {sensor.name!r}", fontsize=14)
     X, grid = sensor.membrane.rest.numpy(), sensor.membrane.grid
     markers = sensor.markers.positions if reconstructor is None else reconstructor.rest_markers.cpu().numpy()
     _draw_rays(drawing.add_subplot(places[0]), sensor, X)
     _draw_space(drawing.add_subplot(places[1], projection="3d"), X, grid, markers, sensor.length_unit)
     _draw_projection(drawing.add_subplot(places[2]), sensor, reconstructor, frame)
+    if sheet is not None:
+        draw_sheet(drawing, sheet)
     return drawing
 
 

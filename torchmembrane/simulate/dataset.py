@@ -1,6 +1,7 @@
 """Random presses of one sensor: the same for the same seed and number, on all cores, continued where they were interrupted."""
 
 import multiprocessing
+import pickle
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -77,12 +78,27 @@ def random_frame(simulator: Simulator, plan: Plan, number: int) -> SimulatedFram
     raise MembraneError(f"none of {ATTEMPTS} random strokes could be followed; the last one: {reason}")
 
 
-def random_stroke(simulator: Simulator, plan: Plan, rng: np.random.Generator) -> Stroke:
-    """A stroke towards a point of the surface off its rim, even in area, and tilted against the normal there."""
+def random_stroke(simulator: Simulator, plan: Plan, rng: np.random.Generator, seen: np.ndarray | None = None) -> Stroke:
+    """A stroke towards a point of the surface off its rim, even in area, and tilted against the normal there.
+
+    Args:
+        simulator: whose membrane is pressed.
+        plan: kinds of bodies, friction.
+        rng: that draws it.
+        seen: `[V]` bool, the vertices that may be aimed at; default: all.
+
+    Raises:
+        MembraneError: no such point is off the rim, or the body does not meet the surface.
+    """
     membrane, size = simulator.membrane, simulator.membrane.size
     X, normals, fixed = (a.numpy() for a in (membrane.rest, membrane.rest_normals, membrane.fixed))
     off_rim = np.linalg.norm(X[:, None] - X[fixed], axis=-1).min(1) > OFF_RIM * size
-    weight = np.where(off_rim, membrane.rest_area.numpy(), 0.0)
+    weight = np.where(off_rim if seen is None else off_rim & seen, membrane.rest_area.numpy(), 0.0)
+    if not weight.any():
+        raise MembraneError(
+            f"sensor {simulator.sensor.name!r}: no part of the membrane that may be pressed lies {OFF_RIM * size:.3g} off its "
+            "rim; expected one, in view of the camera: check the camera and the rest surface"
+        )
     target = rng.choice(len(X), p=weight / weight.sum())
     kind = plan.kinds[int(rng.integers(len(plan.kinds)))]
     body, turn, depth = _random_body(kind, size, rng), rng.uniform(0, 2 * np.pi), size * rng.uniform(*DEPTH)
@@ -193,7 +209,8 @@ def _in_processes(
         yield from ((number, _frame_or_reason(simulator, plan, number)) for number in numbers)
         return
     context = multiprocessing.get_context("spawn")
-    with context.Pool(jobs, _begin, (simulator, plan)) as pool:
+    shared = pickle.dumps((simulator, plan))  # as bytes: torch would move tensors whose memory the sensor's arrays look at
+    with context.Pool(jobs, _begin, (shared,)) as pool:
         yield from pool.imap(_work, numbers)
 
 
@@ -201,12 +218,12 @@ _simulator: Simulator
 _plan: Plan
 
 
-def _begin(simulator: Simulator, plan: Plan) -> None:
+def _begin(shared: bytes) -> None:
     """Start a worker process: what `_work` needs, once."""
     global _simulator, _plan
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     torch.set_num_threads(1)
-    _simulator, _plan = simulator, plan
+    _simulator, _plan = pickle.loads(shared)
 
 
 def _work(number: int) -> tuple[int, SimulatedFrame | str]:

@@ -1,0 +1,158 @@
+"""Which presses are tried on a sensor: strokes from the first touch on, pairs of balls ever nearer each other."""
+
+from collections.abc import Sequence
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ..errors import MembraneError
+from ..simulate.dataset import OFF_RIM, Plan, random_stroke, stroke_to
+from ..simulate.indenters import Sphere
+from ..simulate.quasi_static import Press, presses
+from ..simulate.simulator import Simulator
+
+BODIES = ("sphere", "sphere", "box")
+FRICTIONS = (0.0, 0.4)
+DEEPEST = 0.3  # travel of a stroke, over the surface's size
+INCREMENT = 0.03  # longest step, over the size
+BALL, PUSHED = 0.06, 0.05  # radius of the balls of a pair, and how deep they press
+WIDEST, NEARER = 0.55, 0.8  # distance of the first pair, and of each next one over that before
+LINES = 8  # drawn for a direction, of which that with room for most pairs is taken
+MIDDLE = 0.6  # how far a pair's middle is from the rim at least, over the largest distance from it
+IN_VIEW = 0.02  # of the image's sides, how far from its border a place has to be seen
+STEPS = 100  # of Newton's method at one pose, after which a stroke is not followed further
+FAR_FROM_A_RIM = "expected a membrane of which the camera sees a part off the rim: check the camera and the rest surface"
+
+
+class PairPress(NamedTuple):
+    """Two balls at once, in equilibrium; `distance` is between the true contacts' centres."""
+
+    state: Press
+    distance: float
+
+
+def in_view(simulator: Simulator) -> np.ndarray:
+    """Which vertices of the simulator's grid its camera sees well at rest, `[V]` bool."""
+    camera = simulator.sensor.camera
+    pixels, size = camera.point_to_pixel(simulator.membrane.rest).numpy(), np.array(camera.image_size)
+    with np.errstate(invalid="ignore"):
+        inside = (pixels > IN_VIEW * size) & (pixels < (1 - IN_VIEW) * size)
+    return np.asarray(inside.all(1))
+
+
+def shares(frames: int, offset: float) -> list[float]:
+    """Depths of a stroke's frames over its last one's: `((k + offset) / (frames + offset))^2`, k from 1 on.
+
+    Strokes with other offsets in 0..1 have other light touches between them.
+
+    Example:
+        >>> shares(2, 0.0), [round(share, 2) for share in shares(2, 0.5)]
+        ([0.25, 1.0], [0.36, 1.0])
+    """
+    return [((k + offset) / (frames + offset)) ** 2 for k in range(1, frames + 1)]
+
+
+def stroke_states(simulator: Simulator, number: int, frames: int, offset: float, seed: int) -> list[Press]:
+    """Equilibria along one stroke from the first touch on, their depth growing quadratically.
+
+    Args:
+        simulator: the sensor's.
+        number: of the stroke, which says what presses, where and with what friction.
+        frames: how many, at the `shares` of `DEEPEST`.
+        offset: of the shares, 0..1.
+        seed: of all strokes.
+
+    Returns:
+        As many as the membrane can follow, without those before the first vertex is touched.
+
+    Raises:
+        MembraneError: nothing can be pressed, or none of these can be followed.
+    """
+    rng = np.random.default_rng([seed, 1, number])
+    plan = Plan((BODIES[number % len(BODIES)],), FRICTIONS[number % len(FRICTIONS)], seed)
+    stroke = random_stroke(simulator, plan, rng, in_view(simulator))
+    depth = DEEPEST * simulator.membrane.size
+    path = [stroke.indenter.moved(share * depth * stroke.travel) for share in (0.0, *shares(frames, offset))]
+    states, reason = _followed(simulator, [path], stroke.friction)
+    touching = [state for state in states if state.contact.any()]
+    if not touching:
+        raise MembraneError(f"stroke {number + 1}: {reason or 'it never touches the membrane'}")
+    return touching
+
+
+def pair_states(simulator: Simulator, number: int, count: int, seed: int) -> list[PairPress]:
+    """Two balls side by side, ever nearer each other.
+
+    Args:
+        simulator: the sensor's.
+        number: of the direction, in which they lie from each other.
+        count: how many distances are tried, from `WIDEST` x size on, each `NEARER` of the one before.
+        seed: of all directions.
+
+    Returns:
+        Those that have room off the rim and in view, and that the membrane can follow.
+
+    Raises:
+        MembraneError: nothing can be pressed, or there are none of these.
+    """
+    membrane, rng = simulator.membrane, np.random.default_rng([seed, 2, number])
+    size, clear, seen = membrane.size, _clear_of_rim(simulator), in_view(simulator)
+    free = np.where(seen, clear, 0.0)
+    if free.max() < OFF_RIM * size:
+        raise MembraneError(f"pairs: no place for two balls; {FAR_FROM_A_RIM}")
+    middles = np.flatnonzero(free >= max(MIDDLE * free.max(), OFF_RIM * size))
+    X, normals = membrane.rest.numpy(), membrane.rest_normals.numpy()
+    away = WIDEST * size * NEARER ** np.arange(count)[:, None, None] / 2 * np.array([[-1.0], [1.0]])  # [count, 2, 1]
+    lines = []
+    for _ in range(LINES):
+        middle = int(rng.choice(middles))
+        along = np.cross(normals[middle], rng.normal(size=3))
+        points = membrane.closest_points((X[middle] + away * along / np.linalg.norm(along)).reshape(-1, 3))
+        places, ways = ((points.weights[..., None] * a[points.vertices]).sum(1) for a in (X, -normals))
+        room = (seen & (clear > OFF_RIM * size))[points.vertices].reshape(-1, 6).all(1)
+        lines.append((places.reshape(-1, 2, 3)[room], ways.reshape(-1, 2, 3)[room]))
+    places, ways = max(lines, key=lambda line: len(line[0]))
+    found = [pair for place, way in zip(places, ways, strict=True) for pair in _pair(simulator, place, way)]
+    if not found:
+        raise MembraneError(f"pairs, direction {number + 1}: no pair has room, or can be followed; {FAR_FROM_A_RIM}")
+    return found
+
+
+def _pair(simulator: Simulator, places: np.ndarray, ways: np.ndarray) -> list[PairPress]:
+    """Two balls pressed in at `places [2, 3]` along `ways [2, 3]`; none where they cannot be."""
+    size = simulator.membrane.size
+    try:
+        strokes = [
+            stroke_to(simulator, Sphere(BALL * size), place, way, PUSHED * size)
+            for place, way in zip(places, ways, strict=True)
+        ]
+    except MembraneError:
+        return []
+    paths = [[stroke.indenter, stroke.indenter.moved(stroke.depth * stroke.travel)] for stroke in strokes]
+    states, _ = _followed(simulator, paths, 0.0)
+    apart = [float((state.contact_points[0] - state.contact_points[1]).norm()) for state in states]
+    return [PairPress(state, distance) for state, distance in zip(states, apart, strict=True) if np.isfinite(distance)]
+
+
+def _followed(simulator: Simulator, paths: Sequence[Sequence], friction: float) -> tuple[list[Press], str]:
+    """Equilibria at the poses after the first, as far as the membrane follows, and why no farther."""
+    states: list[Press] = []
+    options = dict(friction=friction, increment=INCREMENT * simulator.membrane.size, **simulator.cavity)
+    try:
+        for state in islice(presses(simulator.membrane, simulator.elasticity, paths, **options), 1, None):
+            if bool((state.vertices[:, 2] <= 0).any()):
+                return states, "the press takes the membrane behind the camera"
+            states.append(state)
+            if state.iterations > STEPS:
+                return states, "no equilibrium in reasonable time"
+    except MembraneError as error:
+        return states, str(error)
+    return states, ""
+
+
+def _clear_of_rim(simulator: Simulator) -> np.ndarray:
+    """Distance of every vertex from the rim, `[V]`."""
+    X = simulator.membrane.rest
+    return torch.cdist(X, X[simulator.membrane.fixed]).amin(1).numpy()

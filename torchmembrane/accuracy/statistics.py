@@ -1,0 +1,123 @@
+"""From trials to the figures of a spec sheet."""
+
+from collections import Counter
+from collections.abc import Sequence
+from itertools import takewhile
+
+import numpy as np
+
+from ..io.spec_sheet import Band, ClosestPair, DeepestPress, LightestTouch, PairTrial, PressTrial, RestFloor, RestTrial, Spread
+from ..io.status import Status
+
+EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
+"""Of the bands, over the hardest press."""
+UNBROKEN = "the deepest press tried"
+UNFOUND = "never found"
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Median and 90 % quantile of those of the values that are finite.
+
+    Example:
+        >>> spread([3.0, 1.0, 2.0, float("inf")])
+        Spread(median=2.0, most=2.8)
+        >>> spread([])
+        Spread(median=nan, most=nan)
+    """
+    finite = [value for value in values if np.isfinite(value)]
+    return Spread(*(round(float(q), 12) for q in np.percentile(finite, (50, 90)))) if finite else Spread(np.nan, np.nan)
+
+
+def rest_floor(trials: Sequence[RestTrial]) -> RestFloor:
+    """What frames at rest give."""
+    good = [trial for trial in trials if trial.status == Status.OK]
+    return RestFloor(
+        frames=len(trials),
+        not_ok=len(trials) - len(good),
+        touched=sum(trial.contacts > 0 for trial in good),
+        surface=spread([trial.surface for trial in good]),
+        force=spread([trial.force for trial in good]),
+        pressure=spread([trial.pressure for trial in good]),
+    )
+
+
+def bands(trials: Sequence[PressTrial], near: float) -> list[Band]:
+    """Errors by force, in bands that end at `EDGES` of the hardest press; those without a press are left out.
+
+    Args:
+        trials: the presses.
+        near: distance within which a contact is found, length unit.
+    """
+    hardest = max((trial.force for trial in trials), default=0.0)
+    table = []
+    for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
+        low, high = low * hardest, high * hardest
+        chosen = [trial for trial in trials if low < trial.force <= high]
+        trusted = [trial for trial in chosen if trial.relied_on]
+        if not chosen:
+            continue
+        table.append(
+            Band(
+                low=low,
+                high=high,
+                presses=len(chosen),
+                relied_on=len(trusted) / len(chosen),
+                found=float(np.mean([trial.is_found(near) for trial in trusted])) if trusted else np.nan,
+                force=spread([trial.force_error for trial in trusted]),
+                depth=spread([trial.depth_error for trial in trusted]),
+                place=spread([trial.place_error for trial in trusted]),
+            )
+        )
+    return table
+
+
+def lightest_touch(trials: Sequence[PressTrial], near: float) -> LightestTouch:
+    """The first frame of every stroke in which the contact is found, and in the next one too, so that chance is no find.
+
+    Args:
+        trials: the presses, those of a stroke as they follow each other.
+        near: distance within which a contact is found, length unit.
+    """
+    each = _strokes(trials)
+    first = [stroke[k] for stroke in each if (k := _first_found(stroke, near)) is not None]
+    force, depth = spread([trial.force for trial in first]), spread([trial.depth for trial in first])
+    return LightestTouch(len(each), len(first), force, depth)
+
+
+def deepest_press(trials: Sequence[PressTrial], near: float) -> DeepestPress:
+    """How deep every stroke is followed without a failure, from the first frame found on; 0 where none is.
+
+    Args:
+        trials: the presses, those of a stroke as they follow each other.
+        near: distance within which a contact is found, length unit.
+    """
+    depths, forces, ends = [], [], []
+    for stroke in _strokes(trials):
+        first = _first_found(stroke, near)
+        followed = [] if first is None else list(takewhile(lambda trial: not trial.failure, stroke[first:]))
+        depths.append(followed[-1].depth if followed else 0.0)
+        forces.append(followed[-1].force if followed else 0.0)
+        end = UNFOUND if first is None else next((trial.failure for trial in stroke[first:] if trial.failure), UNBROKEN)
+        ends.append(end)
+    return DeepestPress(depths, forces, dict(Counter(ends).most_common()))
+
+
+def closest_pair(trials: Sequence[PairTrial]) -> ClosestPair:
+    """The smallest distance of every direction at which a pair, and every wider one, is told apart."""
+    smallest = []
+    directions = sorted({trial.direction for trial in trials})
+    for direction in directions:
+        apart = sorted((t for t in trials if t.direction == direction), key=lambda trial: -trial.distance)
+        told = list(takewhile(lambda trial: trial.told, apart))
+        smallest += [told[-1].distance] if told else []
+    distances = [trial.distance for trial in trials] or [np.nan]
+    return ClosestPair(len(directions), len(smallest), spread(smallest), min(distances), max(distances))
+
+
+def _strokes(trials: Sequence[PressTrial]) -> list[list[PressTrial]]:
+    return [[trial for trial in trials if trial.stroke == number] for number in sorted({trial.stroke for trial in trials})]
+
+
+def _first_found(stroke: Sequence[PressTrial], near: float) -> int | None:
+    found = [trial.is_found(near) for trial in stroke]
+    return next((k for k, here in enumerate(found) if here and all(found[k : k + 2])), None)
