@@ -1,10 +1,11 @@
 """The paper's figures from this project's own simulated sensors: the paper's estimator, minimum energy, force balance.
 
-python docs/figures.py [--out docs/figures] [--only 6,19,chain]
+python docs/figures.py [--out docs/figures] [--only 6,19,chain,slip]
 
 Presses are simulated on a finer grid, rendered with 30 dB noise, and reconstructed from the images alone. "The paper" is
 `--estimator paper` with the soft locator, "minimum energy" that of the sensor's material. Under each reconstruction stands its
-rms error at the dots over the rms displacement, in the sensor's unit. `chain` makes the pictures of docs/paper_chain.md.
+rms error at the dots over the rms displacement, in the sensor's unit. `chain` makes the pictures of docs/paper_chain.md, `slip`
+that of docs/slip.md.
 """
 
 import argparse
@@ -40,6 +41,7 @@ from pressed import (
     relative_words,
     segmented,
 )
+from slip import slip_figure
 
 from torchmembrane import Reconstruction
 from torchmembrane.estimators.segmentation import PolarAngle
@@ -234,7 +236,7 @@ def write(drawing: Figure, path: Path) -> None:
 def main():
     parser = argparse.ArgumentParser(description=textwrap.dedent(__doc__), formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "figures")
-    parser.add_argument("--only", type=lambda text: text.split(","), default=[*FIGURES, "chain"])
+    parser.add_argument("--only", type=lambda text: text.split(","), default=[*FIGURES, "chain", "slip"])
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(2)
@@ -243,6 +245,8 @@ def main():
         if name == "chain":
             for part, drawing in chain_figures():
                 write(drawing, args.out / f"chain_{part}.png")
+        elif name == "slip":
+            write(slip_figure(), args.out / "slip.png")
         else:
             write(FIGURES[name](), args.out / f"figure_{int(name):02d}.png")
 

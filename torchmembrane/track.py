@@ -1,13 +1,23 @@
-"""One stream of images: every frame starts from the one before."""
+"""One stream of images: every frame starts from the one before, and a rest state that has aged is noticed."""
+
+import warnings
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .errors import MembraneError
+from .estimators.camera_motion import in_pixels, shift_of
 from .io.results import Reconstruction
 from .io.status import Status
+from .markers.drift import ENOUGH, DriftWatch
+from .markers.observer import FOUND
 from .reconstruct import Reconstructor
+
+STEADY = 100
+"""Frames in which a contact holds still from the beginning before it is said that it may be a drift."""
+LARGEST_STEADY = 0.3
+"""px, rms: how far such a contact moves the markers at most."""
 
 
 class Tracker:
@@ -16,8 +26,18 @@ class Tracker:
     A frame starts from the solution of the frame before, which takes a few steps only; after a frame without a surface the next
     one starts from rest. Estimators that start from rest always are given nothing.
 
+    Frames without contact tell whether the markers still rest where the rest image has them. When they do not, beyond chance,
+    for temperature, creep, swelling, another pressure or a moved camera, the tracker warns once, with the remedy, `rezero`. A
+    slow drift may itself be taken for a contact: frames whose markers hardly leave where they lay without one count as well. So
+    may one from before the stream: a contact from its beginning that is light, moves the markers as a drift does and holds
+    still for `STEADY` frames is said too, as what it may be.
+
     Args:
         reconstructor: the sensor's.
+
+    Limitations:
+        A sudden change amid a stream that is taken for a contact is not noticed (see docs/drift.md). A touch too light to be
+        found, or held still from the beginning, may be said to be a drift.
 
     Example:
         >>> import torchmembrane as tm
@@ -27,6 +47,10 @@ class Tracker:
         >>> [int(tracker(frame).status[0]) for frame in (press, press)]
         [0, 0]
         >>> tracker.rezero(rest)
+        >>> for _ in range(10):
+        ...     result = tracker(rest)
+        >>> tracker.drift
+        0.0
     """
 
     def __init__(self, reconstructor: Reconstructor):
@@ -34,6 +58,7 @@ class Tracker:
         self._before: Reconstruction | None = None
         self._latest: Tensor | None = None
         self._rest_pixels: Tensor | None = None
+        self._watch_from(reconstructor.observer.rest_covariance)
 
     def __call__(self, frame: Tensor | np.ndarray, pressure: float | None = None) -> Reconstruction:
         """The frame's result, a batch of one.
@@ -51,11 +76,21 @@ class Tracker:
         self._latest = images
         follows = self.reconstructor.estimator.takes_start and Status(int(result.status[0])).has_surface
         self._before = result if follows else None
+        if int(result.status[0]) in (Status.OK, Status.UNEXPLAINED):  # a camera that moved may leave it unexplained
+            self._look_for_drift(result)
         return result
 
+    @property
+    def drift(self) -> float:
+        """How far the markers lie off their rest, px, rms over the markers of their mean displacement in the latest frames
+        without contact as a smooth field, beyond what noise explains; NaN before there are some. A moved camera's motion is
+        in it, as `pixels` have it. Where a contact that holds still is said to be a drift, that one's."""
+        return (self._steady if self._is_steady() else self._watch).drift().size
+
     def reset(self) -> None:
-        """Forget the frames before, and what `rezero` took for rest."""
+        """Forget the frames before, what `rezero` took for rest, and the drift."""
         self._before = self._latest = self._rest_pixels = None
+        self._watch_from(self.reconstructor.observer.rest_covariance)
 
     def rezero(self, frame: Tensor | np.ndarray | None = None) -> None:
         """Take a frame without contact, default the latest, for the rest state: what drifted since the rest image is nulled.
@@ -68,10 +103,65 @@ class Tracker:
         images = self._latest if frame is None else self._one(frame)
         if images is None:
             raise MembraneError("Tracker.rezero: no frame yet; pass one without contact")
-        self._rest_pixels, self._before = self.reconstructor.observer.rest_of(images), None
+        observer = self.reconstructor.observer
+        self._rest_pixels, self._before = observer.rest_of(images), None
+        with torch.no_grad():
+            _, confidence, covariance, _ = observer(images)
+        found = confidence[0, :, None, None] > FOUND
+        self._watch_from(torch.where(found, covariance[0] - observer.rest_covariance, observer.rest_covariance))
+
+    def _watch_from(self, rest_covariance: Tensor) -> None:
+        """Begin to look for a drift from a rest state with this noise, `[D, 2, 2]` px^2."""
+        r = self.reconstructor
+        rest = r.rest_pixels, rest_covariance, r.observer.seen_at_rest, r.image_size
+        self._watch, self._steady, self._said = DriftWatch(*rest), DriftWatch(*rest), False
+
+    def _look_for_drift(self, result: Reconstruction) -> None:
+        moved = result.pixels[0] - self.reconstructor.rest_pixels, result.confidence[0]
+        touched = bool(result.contact_points.isfinite().any())
+        if not touched or self._watch.is_near(*moved):
+            self._watch.add(*moved)
+            self._steady.forget()
+        else:
+            if self._steady.frames >= ENOUGH and not self._steady.is_near(*moved):
+                self._steady.forget()
+            self._steady.add(*moved)
+        if not self._said and (self._is_steady() or self._watch.drift().is_certain):
+            self._said = True
+            warnings.warn(drift_in_words(self.drift, self._camera_motion(result), self._is_steady()), stacklevel=3)
+
+    def _is_steady(self) -> bool:
+        """Whether a contact that was there from the beginning has held still, and moves the markers as a drift does."""
+        found, was_free = self._steady.drift(), self._watch.frames >= ENOUGH
+        return not was_free and self._steady.frames >= STEADY and found.is_certain and found.size < LARGEST_STEADY
+
+    def _camera_motion(self, result: Reconstruction) -> Tensor | None:
+        """The camera's motion `[4]` in a frame, if that is most of the drift."""
+        r, motion = self.reconstructor, result.camera_motion
+        shift = shift_of(in_pixels(motion, r.image_size), r.rest_pixels, r.image_size)[0, r.observer.seen_at_rest]
+        return motion[0] if float(shift.square().sum(-1).mean().sqrt()) > self.drift / 2 else None
 
     def _one(self, frame: Tensor | np.ndarray) -> Tensor:
         images = self.reconstructor.grey(frame)
         if len(images) != 1:
             raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
         return images
+
+
+def drift_in_words(size: float, camera_motion: Tensor | None = None, is_steady: bool = False) -> str:
+    """A drift and its remedy.
+
+    Args:
+        size: px.
+        camera_motion: du, dv (px), rotation (degrees) and scale, `[4]`, where it is that.
+        is_steady: whether it was found in frames with a contact.
+    """
+    camera = ""
+    if camera_motion is not None:
+        camera = "; it is a moved camera's: {:.1f}, {:.1f} px, {:.2f} degrees, scale {:.4f}".format(*camera_motion.tolist())
+    where = f"in a contact that has held still from the beginning, for {STEADY} frames," if is_steady else "without contact"
+    aged = "if nothing touches, it" if is_steady else "it"
+    return (
+        f"Tracker: {where} the markers lie {size:.2f} px (rms) off the rest image, more than noise explains: {aged} has aged "
+        f"(temperature, creep, swelling, pressure, a moved camera){camera}. Call Tracker.rezero() in a frame without contact"
+    )

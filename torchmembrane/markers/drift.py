@@ -1,0 +1,147 @@
+"""Whether the markers still rest where they are taken to: their running mean over frames in which nothing touches.
+
+What ages a rest image, temperature, creep, swelling, pressure, a moved camera, moves all markers a little, as a smooth field.
+The mean displacement of frames without contact, whitened by the noise that is frozen in the rest image, is projected on
+polynomials of the image: `S` is the square of these `k` coefficients, `U` that of what is left. By noise alone `S / v` is
+chi-squared of k, where `v = 1 + share x scatter` adds the noise that the frames' mean has kept; with a drift of `LEAST_DRIFT`,
+which does not matter, it is noncentral, by `lambda`. So
+
+    z = (S / v - k - lambda) / sqrt(2 k + 4 lambda)
+
+counts standard deviations beyond both. A touch too light to be found moves the markers near it: it leaves a large `U`.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+ORDER = 4
+"""Of the polynomials; lower where there are fewer than `PER_TERM` markers for each of their terms."""
+PER_TERM = 3
+MEMORY = 15
+"""Frames over which the mean runs."""
+ENOUGH = 10
+"""Frames before anything is said."""
+LEAST_DRIFT = 0.02
+"""px, rms: a drift that does not matter; some sensors take three times as much for a contact."""
+NEAR = 0.05
+"""px, rms: a contact that moves the markers by less from where they lay without one is one that the drift makes."""
+CERTAIN = 6.0
+"""Standard deviations of a drift that is said."""
+LARGEST_ROUGHNESS = 0.04
+"""Share of the mean displacement, squared and beyond its noise, that a smooth field leaves of a drift; a touch leaves more."""
+
+
+class Drift(NamedTuple):
+    """What a stream's frames without contact show.
+
+    Attributes:
+        size: px, rms over the markers of the smooth field, beyond what noise explains; NaN before there are `ENOUGH` frames.
+        certainty: z, standard deviations beyond the noise and a drift that does not matter.
+        roughness: share of the squared mean displacement that no smooth field explains, noise subtracted.
+    """
+
+    size: float
+    certainty: float
+    roughness: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is one, beyond chance."""
+        return self.certainty > CERTAIN and self.roughness < LARGEST_ROUGHNESS
+
+
+class DriftWatch:
+    """The markers' mean displacement over the latest frames in which nothing touches.
+
+    Args:
+        rest_pixels: `[D, 2]`, the markers at rest.
+        rest_covariance: `[D, 2, 2]` px^2, of the noise frozen in what is taken for rest.
+        seen: `[D]` bool, which markers were seen there.
+        image_size: width and height.
+
+    Limitations:
+        A touch that is too light or too wide for `LARGEST_ROUGHNESS` to tell, held for tens of frames, looks like a drift.
+
+    Example:
+        >>> u, v = torch.meshgrid(torch.arange(0.0, 100, 10), torch.arange(0.0, 100, 10), indexing="ij")
+        >>> pixels, everywhere = torch.stack([u, v], -1).reshape(-1, 2), torch.ones(100)
+        >>> watch = DriftWatch(pixels, 0.05**2 * torch.eye(2).expand(100, 2, 2), everywhere > 0, (100, 100))
+        >>> for _ in range(10):
+        ...     watch.add(torch.full((100, 2), 0.1), everywhere)
+        >>> round(watch.drift().size, 2), watch.drift().is_certain
+        (0.14, True)
+    """
+
+    def __init__(self, rest_pixels: Tensor, rest_covariance: Tensor, seen: Tensor, image_size: tuple[int, int]):
+        self.seen = seen.cpu()
+        root = torch.linalg.cholesky(rest_covariance.cpu().double()[self.seen])
+        terms = _polynomials(rest_pixels.cpu().double()[self.seen], image_size)
+        self.whitening = torch.linalg.inv(root)
+        whitened = (self.whitening[..., None] * terms[:, None, None]).flatten(-2).flatten(0, 1)
+        self.smooth: Tensor = torch.linalg.qr(whitened).Q  # [2 D, k]
+        self.fields = root @ self.smooth.unflatten(0, (len(root), 2))  # [D, 2, k], px
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self.frames, self.share, self.square = 0, 0.0, 0.0
+        self.mean = torch.zeros(len(self.fields), 2, dtype=torch.float64)
+        self.weight = torch.zeros_like(self.mean[:, :1])
+
+    def add(self, displacement: Tensor, confidence: Tensor) -> None:
+        """One more frame: the markers' displacement from rest `[D, 2]` px, NaN where lost, and their confidence `[D]`."""
+        moved, found = self._moved(displacement, confidence), (confidence > 0).cpu()[self.seen, None].double()
+        self.frames += 1
+        gain = 1 / min(self.frames, MEMORY)
+        self.weight = self.weight + gain * (found - self.weight)
+        self.mean = self.mean + gain / self.weight.clamp_min(gain) * (moved - self.mean)
+        self.square += gain * (float(self._coefficients(moved).square().sum()) - self.square)
+        self.share = (1 - gain) ** 2 * self.share + gain**2
+
+    def is_near(self, displacement: Tensor, confidence: Tensor) -> bool:
+        """Whether one more frame's markers lie where they have lain so far, as the arguments of `add`."""
+        if self.frames < ENOUGH:
+            return False
+        return self._size(self._coefficients(self._moved(displacement, confidence) - self.mean)) < NEAR
+
+    def drift(self) -> Drift:
+        """What the frames so far show."""
+        if self.frames < ENOUGH:
+            return Drift(float("nan"), 0.0, 0.0)
+        coefficients, (D, _, k) = self._coefficients(self.mean), self.fields.shape
+        S = float(coefficients.square().sum())
+        U = float(self._whitened(self.mean).square().sum()) - S
+        scatter = max(0.0, self.square - S) / k
+        v = 1 + self.share * scatter
+        least = LEAST_DRIFT**2 * float(self.whitening.square().sum()) / 2
+        certainty = (S / v - k - least) / (2 * k + 4 * least) ** 0.5
+        rough, smooth = max(0.0, U - v * (2 * D - k)), max(0.0, S - v * k)
+        roughness = rough / (rough + smooth) if rough > 0 else 0.0
+        noise = v * float(self.fields.square().sum()) / D
+        return Drift(max(0.0, self._size(coefficients) ** 2 - noise) ** 0.5, certainty, roughness)
+
+    def _moved(self, displacement: Tensor, confidence: Tensor) -> Tensor:
+        """The displacement of the markers that were seen at rest; lost ones are where they were."""
+        found = (confidence > 0).cpu()[self.seen, None]
+        return torch.where(found, displacement.detach().cpu().double()[self.seen], self.mean)
+
+    def _size(self, coefficients: Tensor) -> float:
+        """Rms of a smooth field, px."""
+        return float((self.fields @ coefficients).square().sum(-1).mean().sqrt())
+
+    def _whitened(self, displacement: Tensor) -> Tensor:
+        """`[D, 2]` px to `[2 D]`, in which the frozen noise has the covariance 1."""
+        return (self.whitening @ displacement[..., None]).flatten()
+
+    def _coefficients(self, displacement: Tensor) -> Tensor:
+        return self._whitened(displacement) @ self.smooth
+
+
+def _polynomials(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """Monomials of `pixels [D, 2]` about the image's centre, over half its longer side, `[D, T]`."""
+    order = max(n for n in range(ORDER + 1) if n == 0 or PER_TERM * (n + 1) * (n + 2) / 2 <= len(pixels))
+    size = torch.tensor(image_size, dtype=pixels.dtype)
+    u, v = ((2 * pixels - size) / size.max()).unbind(-1)
+    return torch.stack([u**i * v**j for i in range(order + 1) for j in range(order + 1 - i)], -1)
