@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import MembraneError
 
 
@@ -178,7 +180,7 @@ def toml_lines(name: str, values: Mapping[str, object], repeated: bool = False) 
         The lines, the table's head first.
 
     Example:
-        >>> toml_lines("cavity", {"filling": "gas", "pressure": 1013.0, "volume": None})
+        >>> toml_lines("cavity", {"filling": "gas", "pressure": np.float64(1013.0), "volume": None})
         ['[cavity]', 'filling = "gas"', 'pressure = 1013.0']
     """
     head = [f"[[{name}]]" if repeated else f"[{name}]"] if name else []
@@ -188,7 +190,9 @@ def toml_lines(name: str, values: Mapping[str, object], repeated: bool = False) 
 def _shown(value: object) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
-    return repr(list(value) if isinstance(value, tuple) else value)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_shown, value))}]"
+    return repr(value.item() if isinstance(value, np.generic) else value)
 
 
 def _finite(value: object) -> bool:
