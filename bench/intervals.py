@@ -9,7 +9,6 @@ or depth itself, and the rank correlation of deviations and errors.
 """
 
 import argparse
-import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 import torch
 from bands import BANDS
 from record import write
+from scipy.stats import spearmanr
 
 import torchmembrane as tm
 
@@ -39,18 +39,14 @@ def row_of(r: tm.Reconstructor, path: Path) -> dict:
         sensor=path.parent.name,
         file=path.stem,
         status=int(got["status"]),
-        force=np.linalg.norm(F),
-        depth=deepest,
+        force=float(np.linalg.norm(F)),
+        depth=float(deepest),
         force_error=(got["force"] - F).tolist(),
-        depth_error=[found - deepest],
+        depth_error=[float(found - deepest)],
         force_deviation=got["force_deviation"].tolist(),
         depth_deviation=[float(got["depth_deviation"])],
         at_rim=bool((got["contact_at_rim"] == 1).any()),
     )
-
-
-def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.corrcoef(a.argsort().argsort(), b.argsort().argsort())[0, 1])
 
 
 def line(name: str, rows: list[dict], of: str) -> None:
@@ -59,7 +55,7 @@ def line(name: str, rows: list[dict], of: str) -> None:
     size = np.array([row[of] for row in rows])
     error, deviation = (np.linalg.norm(a, axis=1) for a in (error, deviation))
     wide = np.median(deviation / size) / np.sqrt(np.mean((error / size) ** 2))
-    print(f"{name:28s} {len(rows):4d}: held {held:.2f}, wide {wide:.2f}, ranks {rank_correlation(error, deviation):.2f}")
+    print(f"{name:28s} {len(rows):4d}: held {held:.2f}, wide {wide:.2f}, ranks {spearmanr(error, deviation).statistic:.2f}")
 
 
 def report(rows: list[dict]) -> None:
@@ -104,7 +100,7 @@ def main():
             continue
         rows += [row_of(r, path) for path in files]
     report(rows)
-    write(args.json, json.loads(json.dumps(dict(rows=rows), default=float)))
+    write(args.json, dict(rows=rows))
 
 
 if __name__ == "__main__":

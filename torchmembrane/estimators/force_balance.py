@@ -108,7 +108,8 @@ class ForceBalance(nn.Module):
         loss = TractionLoss(membrane, self.reference, cone, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
         self.descent = Descent(self.equations, self.cavity, settings)
-        self.patches = ContactPatches(membrane, self.size / len(bearings.positions) ** 0.5)
+        self.spacing = self.size / len(bearings.positions) ** 0.5
+        self.patches = ContactPatches(membrane, self.spacing)
         if self.coarse is None:
             self.steps = settings.coarse_steps if is_coarse else settings.steps
         else:
@@ -284,9 +285,8 @@ class ForceBalance(nn.Module):
         with torch.no_grad():
             spread = spreads(net.equations, net.cavity, self.settings, state, observation)
         force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, found.vertices)
-        spacing = self.size / len(self.equations.bearings.positions) ** 0.5
         unseen = self.equations.loss.push_noise.mean() * self.reference * self.size**2
-        return of_presses(spread, force, depth.amax(-1), contacts, self.membrane, spacing, unseen)
+        return of_presses(spread, force, depth.amax(-1), contacts, self.membrane, self.spacing, unseen)
 
     def objective(self, found: Equilibrium, observation: Observation) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
