@@ -11,7 +11,6 @@ from .estimators.camera_motion import in_pixels, shift_of
 from .io.results import Reconstruction
 from .io.status import Status
 from .markers.drift import ENOUGH, DriftWatch
-from .markers.observer import FOUND
 from .reconstruct import Reconstructor
 
 STEADY = 100
@@ -103,12 +102,9 @@ class Tracker:
         images = self._latest if frame is None else self._one(frame)
         if images is None:
             raise MembraneError("Tracker.rezero: no frame yet; pass one without contact")
-        observer = self.reconstructor.observer
-        self._rest_pixels, self._before = observer.rest_of(images), None
-        with torch.no_grad():
-            _, confidence, covariance, _ = observer(images)
-        found = confidence[0, :, None, None] > FOUND
-        self._watch_from(torch.where(found, covariance[0] - observer.rest_covariance, observer.rest_covariance))
+        rest = self.reconstructor.observer.rest_of(images)
+        self._rest_pixels, self._before = rest.pixels, None
+        self._watch_from(rest.covariance)
 
     def _watch_from(self, rest_covariance: Tensor) -> None:
         """Begin to look for a drift from a rest state with this noise, `[D, 2, 2]` px^2."""

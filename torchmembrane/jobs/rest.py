@@ -38,6 +38,6 @@ def recording_rest(reconstructor: "Reconstructor", arguments: list[str], inputs:
         chosen = sources(find_inputs(arguments), reconstructor)
     images = [source.load() for source in chosen]
     try:
-        return reconstructor.observer.rest_of(torch.cat(images))
+        return reconstructor.observer.rest_of(torch.cat(images)).pixels
     except MembraneError as error:
         raise MembraneError(f"--rest {' '.join(arguments)}: {error}") from error

@@ -33,6 +33,13 @@ class MarkerFlow(NamedTuple):
     status: Tensor
 
 
+class RestState(NamedTuple):
+    """The markers without contact: `pixels [D, 2]`, and their own noise, `covariance [D, 2, 2]` px^2."""
+
+    pixels: Tensor
+    covariance: Tensor
+
+
 class MarkerObserver(nn.Module):
     """Images of one sensor to what its markers show.
 
@@ -115,20 +122,25 @@ class MarkerObserver(nn.Module):
                 "camera has not moved; `torchmembrane calibrate rest` fits the rest surface to the image"
             )
 
-    def rest_of(self, images: Tensor) -> Tensor:
-        """The markers without contact, `[D, 2]` px, in grey images `[B, 1, height, width]` at rest, averaged; those that are
-        found in none keep their places in the sensor's rest image.
+    def rest_of(self, images: Tensor) -> RestState:
+        """The markers in grey images `[B, 1, height, width]` without contact, averaged; those that are found in none keep their
+        places, and their noise, in the sensor's rest image.
 
         Raises:
             MembraneError: an image that does not show the markers.
         """
         with torch.no_grad():
-            displacement, confidence, _, status = self.judge(*self(images))
+            displacement, confidence, covariance, status = self.judge(*self(images))
         if (status != Status.OK.value).any():
             bad = int(status.ne(Status.OK.value).nonzero()[0])
             raise MembraneError(f"rest image {bad}: {Status(int(status[bad])).text}; expected a frame without contact")
-        weight = (confidence > 0).to(displacement.dtype)[..., None]
-        return self.measured_rest + (weight * displacement).sum(0) / weight.sum(0).clamp_min(1)
+        found = (confidence > 0).to(displacement.dtype)[..., None]
+        count = found.sum(0).clamp_min(1)
+        own = (found[..., None] * (covariance - self.rest_covariance)).sum(0) / count[..., None] ** 2
+        seen = found.any(0)[..., None]
+        return RestState(
+            self.measured_rest + (found * displacement).sum(0) / count, torch.where(seen, own, self.rest_covariance)
+        )
 
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels `[B, D, 2]` of the markers in grey images `[B, 1, height, width]`, and which of them are found `[B, D]`."""
