@@ -20,7 +20,9 @@ from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.quasi_static import carried, press
-from torchmembrane.solve import block_tridiagonal, matrix_products
+from torchmembrane.solve import block_pentadiagonal
+from torchmembrane.solve.block_pentadiagonal import BlockPentadiagonal
+from torchmembrane.solve.inverse_root import by_cholesky, by_products
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import spherical_cap
 from torchmembrane.surface.stencil import inner
@@ -77,16 +79,16 @@ def bent(membrane, batch=1, size=0.05):
 
 
 def dense(system, matrix):
-    """The dense matrix `[3 N, 3 N]` of one frame's scaled blocks on and beside the diagonal."""
-    diagonal, beside, scale = (a[0] for a in matrix)
-    blocks, s = diagonal.shape[:2]
+    """The dense matrix `[3 N, 3 N]` of one frame's scaled blocks."""
+    (diagonal, following, second, across), scale = (matrix[0], matrix[1][0])
+    blocks, s = system.rows, across.shape[-1]
     full = diagonal.new_zeros(blocks, s, blocks, s)
-    for k, block in zip(block_tridiagonal.inwards(blocks), diagonal, strict=True):
-        full[k, :, k] = block
-    for (k, further_in), block in zip(block_tridiagonal.coupled(blocks), beside, strict=True):
-        full[k, :, further_in], full[further_in, :, k] = block, block.mT
+    values = [*diagonal[0].flatten(0, 1), *following[0].flatten(0, 1), *second[0].flatten(0, 1), across[0]]
+    for (i, j), block in zip(block_pentadiagonal.places(blocks), values, strict=True):
+        if i >= 0:
+            full[i, :, j], full[j, :, i] = block, block.mT
     columns = (
-        system.in_blocks(torch.eye(scale.shape[1], dtype=scale.dtype)[None])[0][system.block_of_row].movedim(0, 1).flatten(1)
+        system.in_blocks(torch.eye(scale.shape[1], dtype=scale.dtype)[None])[0][system.place_of_row].movedim(0, 1).flatten(1)
     )
     return columns @ full.flatten(2).flatten(0, 1) @ columns.T / (scale * scale.T)
 
@@ -361,7 +363,7 @@ def test_four_steps_from_the_frame_before_follow_a_press(pressed, n):
     assert rms(warm.vertices - cold.vertices) < 0.02 * rms(cold.vertices - estimator.membrane.rest)
 
 
-def test_elimination_by_products_rounds_a_contacts_system_as_cholesky_does(pressed):
+def test_elimination_by_products_rounds_a_contacts_system_as_cholesky_does(monkeypatch, pressed):
     """Weights of forces a thousandfold apart, in float32."""
     (origins, directions), *_ = pressed
     estimator = make(33)
@@ -370,19 +372,20 @@ def test_elimination_by_products_rounds_a_contacts_system_as_cholesky_does(press
     found = estimator(seen(origins, directions))
     scales = SETTINGS.tau[1], SETTINGS.outlier
     _, normal, loads, *_ = equations.linearised(found.vertices, found.pressure, found.moved, measured, *scales)
-    *blocks, scale = equations.matrix(normal)
+    blocks, scale = equations.matrix(normal)
     b = equations.system.in_blocks(scale * loads)
 
-    def solved(kind, diagonal, coupling, b):
-        return kind.substitute(kind.factor(diagonal, coupling), b)
+    def solved(root, blocks, b):
+        monkeypatch.setattr(block_pentadiagonal, "inverse_root", root)
+        return block_pentadiagonal.substitute(block_pentadiagonal.factor(blocks), b)
 
-    exact = solved(block_tridiagonal, *blocks, b)
+    exact = solved(by_cholesky, blocks, b)
 
     def error(x):
         return (x - exact).norm(dim=(1, 3)) / exact.norm(dim=(1, 3))
 
-    single = [a.float() for a in (*blocks, b)]
-    assert (error(solved(matrix_products, *single)) < 10 * error(solved(block_tridiagonal, *single))).all()
+    single = BlockPentadiagonal(*(part.float() for part in blocks)), b.float()
+    assert (error(solved(by_products, *single)) < 10 * error(solved(by_cholesky, *single))).all()
 
 
 def test_batch_equals_singles_and_lost_markers_have_zero_weight(pressed):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from torchmembrane.solve import block_tridiagonal, matrix_products
+from torchmembrane.solve import block_tridiagonal
 from torchmembrane.solve.anderson import DEPTH, accelerated, first
 from torchmembrane.solve.conjugate_gradient import conjugate_gradient
+from torchmembrane.solve.inverse_root import by_cholesky, by_products
 from torchmembrane.solve.kkt import constrained_minimum
 
 
@@ -51,12 +52,12 @@ def test_two_solves_equal_the_dense_kkt_system(compliance):
     torch.testing.assert_close(got.multiplier, want[:, 9])
 
 
-def _grid_system(blocks, size, dtype, seed=0):
+def _grid_system(blocks, size, dtype, equations=None, ridge=1e-2):
     """A positive definite block-tridiagonal matrix with a diagonal of about 1, in the order of elimination, and loads."""
-    generator = torch.Generator().manual_seed(seed)
-    rows = torch.randn(2, blocks, 2 * size, 2 * size, dtype=torch.float64, generator=generator) / (2 * size) ** 0.5
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(2, blocks, equations or 2 * size, 2 * size, dtype=torch.float64, generator=generator) / (2 * size) ** 0.5
     gram = rows.mT @ rows
-    diagonal = gram[..., :size, :size].clone() + 1e-2 * torch.eye(size, dtype=torch.float64)
+    diagonal = gram[..., :size, :size].clone() + ridge * torch.eye(size, dtype=torch.float64)
     diagonal[:, 1:] += gram[:, :-1, size:, size:]
     b = torch.randn(2, blocks, 3, size, dtype=torch.float64, generator=generator)
     upper = gram[:, :-1, :size, size:]
@@ -82,20 +83,33 @@ def test_elimination_from_both_ends_solves_the_dense_system(blocks):
 
 @pytest.mark.parametrize("dtype, bound", [(torch.float64, 1e-9), (torch.float32, 2e-4)])
 @pytest.mark.parametrize("blocks, size", [(1, 9), (2, 9), (3, 9), (4, 42), (7, 90)])
-def test_elimination_by_products_agrees_with_cholesky(blocks, size, dtype, bound):
+def test_elimination_by_products_agrees_with_cholesky(monkeypatch, blocks, size, dtype, bound):
     *matrix, b = _grid_system(blocks, size, dtype)
-    ours = matrix_products.substitute(matrix_products.factor(*matrix), b)
-    theirs = block_tridiagonal.substitute(block_tridiagonal.factor(*(blocks.double() for blocks in matrix)), b.double())
+    exact = (part.double() for part in matrix)
+    theirs = block_tridiagonal.substitute(block_tridiagonal.factor(*exact), b.double())
+    monkeypatch.setattr(block_tridiagonal, "inverse_root", by_products)
+    ours = block_tridiagonal.substitute(block_tridiagonal.factor(*matrix), b)
     assert (ours - theirs).norm() / theirs.norm() < bound
 
 
+@pytest.mark.parametrize("root", [by_cholesky, by_products])
 @pytest.mark.parametrize("size", [3, 47, 96])
-def test_inverse_by_products(size):
+def test_the_square_of_an_inverse_root_is_the_inverse(root, size):
     generator = torch.Generator().manual_seed(size)
     q, _ = torch.linalg.qr(torch.randn(2, size, size, dtype=torch.float64, generator=generator))
-    matrix = q @ torch.diag(torch.logspace(-3, 0, size, dtype=torch.float64)) @ q.mT
+    matrix = q @ torch.diag(torch.logspace(-5, 0, size, dtype=torch.float64)) @ q.mT
     one = torch.eye(size, dtype=torch.float64)
-    assert (matrix_products.inverse(matrix) @ matrix - one).abs().max() < 1e-9
+    assert (root(matrix).mT @ root(matrix) @ matrix - one).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("root", [by_cholesky, by_products])
+def test_what_is_left_of_an_ill_conditioned_system_stays_positive_in_float32(monkeypatch, root):
+    """Of fewer equations than unknowns and a ridge of 3e-5: through inverses instead of their roots it would not."""
+    monkeypatch.setattr(block_tridiagonal, "inverse_root", root)
+    *matrix, b = _grid_system(6, 42, torch.float64, equations=38, ridge=3e-5)
+    exact = block_tridiagonal.substitute(block_tridiagonal.factor(*matrix), b)
+    single = block_tridiagonal.substitute(block_tridiagonal.factor(*(part.float() for part in matrix)), b.float())
+    assert (single - exact).norm() < 0.1 * exact.norm()
 
 
 def test_anderson_solves_a_linear_fixed_point_in_two_unknowns_at_the_third_evaluation():

@@ -242,10 +242,10 @@ class ForceBalance(nn.Module):
 
     @piece
     def refined(self, x: Tensor, pressure: Tensor, moved: Tensor) -> State:
-        """What `coarse` found on this grid: the displacement is bilinear between its lines."""
+        """What `coarse` found on this grid: the displacement is bicubic between its lines, so that it has no folds there."""
         assert self.coarse is not None  # only called with what it has found
         u = (x - self.coarse.membrane.rest).unflatten(1, self.coarse.membrane.grid).permute(0, 3, 1, 2)
-        u = F.interpolate(u, self.membrane.grid, mode="bilinear", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
+        u = F.interpolate(u, self.membrane.grid, mode="bicubic", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
         return State(self.membrane.rest + u * self.equations.forces.free, pressure, moved)
 
     @piece

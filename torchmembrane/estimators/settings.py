@@ -59,8 +59,8 @@ class ForceBalanceSettings:
 
     steps: int = 8
     coarse_steps: int = 4
-    fine_steps: int = 5
-    finer_steps: int = 4
+    fine_steps: int = 4
+    finer_steps: int = 3
     warm_steps: int = 4
     conjugate_steps: int = 2
     tau: tuple[float, float] = (4.0, 0.4)

@@ -1,14 +1,18 @@
 """Symmetric positive definite block-tridiagonal systems, batched: elimination from both ends inwards, two blocks at a time.
 
 Blocks come in the order of their elimination: the first, the last, the second, the last but one, and so on. They are eliminated
-in pairs, then the one or two in the middle, one after the other. Here by Cholesky factors.
+in pairs, then the one or two in the middle, one after the other. Kept are inverse roots of the pivots: solving takes products
+alone.
 """
 
 import torch
 from torch import Tensor
 
+from .inverse_root import inverse_root
+
 Factor = tuple[list[Tensor], list[Tensor]]
-"""Of the pivots and of what couples them to the next ones, blocks `[..., 1 or 2, s, s]` in the order of their elimination."""
+"""The pivots' inverse roots, and these times what couples them to the next ones: blocks `[..., 1 or 2, s, s]` in the order of
+their elimination."""
 
 
 def inwards(n: int) -> list[int]:
@@ -30,37 +34,33 @@ def parts(n: int) -> list[int]:
 def factor(diagonal: Tensor, coupling: Tensor) -> Factor:
     """What `substitute` needs to solve `M x = b`.
 
-    Arguments: of `M` the blocks `[..., n, s, s]` on the diagonal and those of the pairs `coupled`, `[..., n-1, s, s]`, in the
-    order of elimination.
+    Args:
+        diagonal: of `M` the blocks `[..., n, s, s]` on the diagonal, in the order of elimination, best with a diagonal of 1.
+        coupling: those of the pairs `coupled`, `[..., n-1, s, s]`.
     """
     sizes = parts(diagonal.shape[-3])
-    pivots, couplings = list(diagonal.split(sizes, -3)), list(coupling.split(sizes[:-1], -3))
+    roots, couplings = list(diagonal.split(sizes, -3)), list(coupling.split(sizes[:-1], -3))
     for k in range(len(sizes)):
-        pivots[k] = torch.linalg.cholesky_ex(pivots[k]).L
+        roots[k] = inverse_root(roots[k])
         if k < len(couplings):
-            couplings[k] = torch.linalg.solve_triangular(pivots[k], couplings[k], upper=False)
-            subtract_further_in(pivots, k, couplings[k].mT @ couplings[k])
-    return pivots, couplings
+            couplings[k] = roots[k] @ couplings[k]
+            subtract_further_in(roots, k, couplings[k].mT @ couplings[k])
+    return roots, couplings
 
 
 def substitute(factor: Factor, b: Tensor) -> Tensor:
     """Solutions for the rows of `b [..., n, C, s]`, blocks in the order of elimination."""
-    pivots, couplings = factor
+    roots, couplings = factor
     x = list(b.split(parts(b.shape[-3]), -3))
-    for k, L in enumerate(pivots):
-        x[k] = torch.linalg.solve_triangular(_transposed(L), x[k], upper=True, left=False)
+    for k, root in enumerate(roots):
+        x[k] = x[k] @ root.transpose(-2, -1)  # mT of an input would be a second, aliased one
         if k < len(couplings):
             subtract_further_in(x, k, x[k] @ couplings[k])
-    for k in reversed(range(len(pivots))):
+    for k in reversed(range(len(roots))):
         if k < len(couplings):
-            x[k] = x[k] - further_in(x, k) @ _transposed(couplings[k])
-        x[k] = torch.linalg.solve_triangular(pivots[k], x[k], upper=False, left=False)
+            x[k] = x[k] - further_in(x, k) @ couplings[k].transpose(-2, -1)
+        x[k] = x[k] @ roots[k]
     return torch.cat(x, -3)
-
-
-def _transposed(block: Tensor) -> Tensor:
-    """`mT` of the input of a compiled region would be a second, aliased one."""
-    return block.transpose(-2, -1)
 
 
 def subtract_further_in(blocks: list[Tensor], k: int, change: Tensor) -> None:

@@ -1,13 +1,11 @@
 """Symmetric systems of one unknown per inner vertex of a grid, from 5 x 5 stencils, by elimination over pairs of grid rows."""
 
-from types import ModuleType
-
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from . import block_tridiagonal, matrix_products
+from . import block_tridiagonal
 
 UPPER = ((0, 0), (0, 1), (0, 2), *((i, j) for i in (1, 2) for j in range(-2, 3)))
 """Offsets from a vertex to itself and to those further on that a stencil joins it with; the others follow by symmetry."""
@@ -59,22 +57,18 @@ class GridSystem(nn.Module):
         rows, columns = (by_block.index_select(1, index) for index in (self.block_rows, self.block_columns))
         matrix = rows[..., None] * matrix * columns[..., None, :]
         diagonal, beside = matrix.split([self.blocks, self.blocks - 1], 1)
-        pivots, couplings = _elimination().factor(diagonal, beside)
-        return *pivots, *couplings, scale
+        roots, couplings = block_tridiagonal.factor(diagonal, beside)
+        return *roots, *couplings, scale
 
     def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
         """Solutions `[B, C, N]` for `loads` of that shape."""
         *blocks, scale = factor
-        pivots = len(blocks) // 2 + 1  # and a coupling between two
+        roots = len(blocks) // 2 + 1  # and a coupling between two
         scale = (scale * self.free)[:, None]
         padded = F.pad(scale * loads, (0, self.blocks * self.block_size - self.count))
         in_blocks = padded.unflatten(-1, (self.blocks, self.block_size)).transpose(1, 2).index_select(1, self.order)
-        x = _elimination().substitute((blocks[:pivots], blocks[pivots:]), in_blocks)
+        x = block_tridiagonal.substitute((blocks[:roots], blocks[roots:]), in_blocks)
         return scale * x.index_select(1, self.block_of_row).transpose(1, 2).flatten(-2)[..., : self.count]
-
-
-def _elimination() -> ModuleType:
-    return matrix_products if torch.compiler.is_exporting() else block_tridiagonal
 
 
 def _scatter_index(size: tuple[int, int], free: np.ndarray, pairs: np.ndarray) -> np.ndarray:

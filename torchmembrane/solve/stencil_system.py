@@ -1,9 +1,8 @@
-"""Symmetric systems on a grid from products of seven-point stencils, solved by elimination over pairs of grid rows."""
+"""Symmetric systems on a grid from products of seven-point stencils, solved by elimination over grid rows."""
 
 from itertools import groupby
 from math import prod
 from operator import itemgetter
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -12,13 +11,16 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..surface.stencil import STENCIL
-from . import block_tridiagonal, matrix_products
+from . import block_pentadiagonal
+from .block_pentadiagonal import BlockPentadiagonal
+from .block_tridiagonal import inwards
 
 NEAR = ((0, 0), (0, 1), (1, 0), (1, 1))  # from a vertex to itself and to its neighbours further on
+REACH = 2  # lines, between two vertices of a stencil
 
 
 class StencilSystem(nn.Module):
-    """Three unknowns per inner vertex of an `m x n` grid, one block per two grid rows; the matrix is block tridiagonal.
+    """Three unknowns per inner vertex of an `m x n` grid, one block per grid row; the matrix is block pentadiagonal.
 
     Vectors are fields `[3, N]` over the inner vertices, flattened. Sums are gathered, not scattered, three numbers at a time:
     where they come from is known beforehand.
@@ -29,9 +31,9 @@ class StencilSystem(nn.Module):
     """
 
     order: Tensor
-    block_of_row: Tensor
+    place_of_row: Tensor
     product_sources: Tensor
-    scatter_index: Tensor
+    band_sources: Tensor
     ends: Tensor
     one: Tensor
     fixed: Tensor
@@ -39,25 +41,26 @@ class StencilSystem(nn.Module):
     def __init__(self, grid: tuple[int, int], free: Tensor):
         super().__init__()
         m, n = grid
-        self.count, self.blocks, self.block_size = (m - 2) * (n - 2), (m - 1) // 2, 6 * (n - 2)
+        self.count, self.inner_grid = (m - 2) * (n - 2), (m - 2, n - 2)
+        self.rows = max(3, m - 2 + (m + 1) % 2)  # an odd number
+        self.columns = max(n - 2, 2 * REACH + 1)  # no fewer than a row of the matrix reaches
         groups = _offsets()
         offsets = [offset for group in groups for offset, _ in group]
         sources = [np.stack([_product_sources(grid, *joined) for joined in group], 1) for group in groups]
         self.sizes = [source.shape for source in sources]
         for name, index in (
-            ("order", np.array(block_tridiagonal.inwards(self.blocks))),
-            ("block_of_row", np.argsort(block_tridiagonal.inwards(self.blocks))),
+            ("order", np.array(inwards(self.rows))),
+            ("place_of_row", np.argsort(inwards(self.rows))),
             ("product_sources", np.concatenate([source.ravel() for source in sources])),
-            ("scatter_index", _scatter_index(grid, offsets, free.cpu().numpy(), self.blocks).ravel()),
+            ("band_sources", _band_sources(grid, offsets, free.cpu().numpy(), self.rows, self.columns).ravel()),
             ("ends", np.concatenate([_Inner.of(grid).beside(offset) for offset in offsets])),
         ):
             self.register_buffer(name, torch.from_numpy(index.astype(np.int32)))
         self.register_buffer("one", torch.eye(3, dtype=torch.float64))
         self.register_buffer("fixed", (~free).double()[:, None])
 
-    def matrix(self, products: Tensor, near: Tensor, damping: float = 1e-6) -> tuple[Tensor, Tensor, Tensor]:
-        """Blocks on the diagonal `[B, blocks, s, s]` and beside it `[B, blocks - 1, s, s]`, as `block_tridiagonal.factor` takes
-        them, scaled from both sides to a diagonal of 1; by what, `[B, 1, 3 N]`.
+    def matrix(self, products: Tensor, near: Tensor, damping: float = 1e-6) -> tuple[BlockPentadiagonal, Tensor]:
+        """The matrix, scaled from both sides to a diagonal of 1; by what, `[B, 1, 3 N]`.
 
         Arguments: `products [B, N, 21, 21]` of every stencil row's columns with each other; `near [B, 4, 3, N, 3]`, further
         blocks between the vertices and those at `NEAR` from them; `damping`, a share of the diagonal.
@@ -69,39 +72,48 @@ class StencilSystem(nn.Module):
         scale = (own.diagonal(dim1=2, dim2=4).squeeze(1) + self.fixed).rsqrt()
         there = scale.index_select(1, self.ends).unflatten(1, (-1, 1, self.count))
         blocks = torch.cat([own, beside + near[:, 1:], *further], 1) * scale.mT[:, None, :, :, None] * there
-        one = self.one.to(blocks).expand(blocks.shape[0], 3, 3)
-        entries = torch.cat([blocks.flatten(1, 3), blocks.transpose(2, 4).flatten(1, 3), one], 1)
-        s = self.block_size
-        matrix = entries.index_select(1, self.scatter_index).flatten(1).unflatten(1, (-1, s, s))
-        return *matrix.split([self.blocks, self.blocks - 1], 1), scale.mT.flatten(1)[:, None]
+        rows = blocks.transpose(2, 3)
+        constants = torch.stack([torch.zeros_like(self.one), self.one]).to(rows).flatten(1).expand(rows.shape[0], -1, -1)
+        entries = torch.cat([rows.flatten(3).flatten(1, 2), rows.mT.flatten(3).flatten(1, 2), constants], 1)
+        matrix = self._from_band(entries.index_select(1, self.band_sources))
+        return block_pentadiagonal.split(matrix), scale.mT.flatten(1)[:, None]
 
-    def factor(self, matrix: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, ...]:
+    def _from_band(self, band: Tensor) -> Tensor:
+        """Blocks `[B, ..., s, s]` from those of 3 x 3, `[B, ..., 9]`, between every vertex and those at most `REACH` columns
+        from it.
+
+        Behind as many zeros as make a row of the matrix, and three more a vertex, each lies where it belongs, but for a shift.
+        """
+        width, columns = 2 * REACH + 1, self.columns
+        band = band.unflatten(2, (3, 3)).unflatten(1, (-1, width)).transpose(2, 3).flatten(3)
+        rows = F.pad(band, (0, 3 * (columns - width))).flatten(2).unflatten(1, (-1, columns))
+        skewed = F.pad(rows, (0, 3)).flatten(2)
+        return skewed[..., 3 * REACH : 3 * (REACH - columns)].unflatten(2, (-1, 3 * columns))
+
+    def factor(self, matrix: tuple[BlockPentadiagonal, Tensor]) -> tuple[Tensor, ...]:
         """What `substitute` needs, from what `matrix` gives."""
-        diagonal, coupling, scale = matrix
-        pivots, couplings = _elimination().factor(diagonal, coupling)
-        return *pivots, *couplings, scale
+        blocks, scale = matrix
+        roots, couplings = block_pentadiagonal.factor(blocks)
+        return *roots, *couplings, scale
 
     def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
         """Solutions `[B, C, 3 N]` for `loads` of that shape."""
         *blocks, scale = factor
-        pivots = len(blocks) // 2 + 1  # and a coupling between two
-        x = _elimination().substitute((blocks[:pivots], blocks[pivots:]), self.in_blocks(scale * loads))
+        roots = len(blocks) // 2 + 1  # and a coupling between two
+        x = block_pentadiagonal.substitute((blocks[:roots], blocks[roots:]), self.in_blocks(scale * loads))
         return scale * self.from_blocks(x)
 
     def in_blocks(self, vector: Tensor) -> Tensor:
-        """Vectors `[B, C, 3 N]` as blocks `[B, blocks, C, s]` in the order of their elimination."""
-        unknowns = vector.unflatten(-1, (3, -1)).mT.flatten(-2)
-        padded = F.pad(unknowns, (0, self.blocks * self.block_size - 3 * self.count))
-        return padded.unflatten(-1, (self.blocks, self.block_size)).transpose(1, 2).index_select(1, self.order)
+        """Vectors `[B, C, 3 N]` as blocks `[B, rows, C, s]` in the order of their elimination."""
+        m, n = self.inner_grid
+        field = F.pad(vector.unflatten(-1, (3, m, n)), (0, self.columns - n, 0, self.rows - m))
+        return field.permute(0, 3, 1, 4, 2).flatten(3).index_select(1, self.order)
 
     def from_blocks(self, blocks: Tensor) -> Tensor:
         """`in_blocks` undone."""
-        unknowns = blocks.index_select(1, self.block_of_row).transpose(1, 2).flatten(-2)[..., : 3 * self.count]
-        return unknowns.unflatten(-1, (-1, 3)).mT.flatten(-2)
-
-
-def _elimination() -> ModuleType:
-    return matrix_products if torch.compiler.is_exporting() else block_tridiagonal
+        m, n = self.inner_grid
+        field = blocks.index_select(1, self.place_of_row).unflatten(-1, (-1, 3)).permute(0, 2, 4, 1, 3)
+        return field[..., :m, :n].flatten(-3)
 
 
 class _Inner(NamedTuple):
@@ -156,23 +168,21 @@ def _product_sources(grid: tuple[int, int], offset: tuple[int, int], pairs: list
     return np.stack(sources)
 
 
-def _scatter_index(grid: tuple[int, int], offsets: list[tuple[int, int]], free: np.ndarray, blocks: int) -> np.ndarray:
-    """Where three neighbouring entries of the blocks on the diagonal, then of those beside it, are, `[2 blocks - 1, s, s / 3]`:
-    in the blocks' rows `[offsets, 3, N]`, their columns `[offsets, 3, N]`, a one's rows, one after another."""
-    inner, N, s = _Inner.of(grid), len(free), 6 * (grid[1] - 2)
-    number = np.full((5, 5), -1)
+def _band_sources(
+    grid: tuple[int, int], offsets: list[tuple[int, int]], free: np.ndarray, rows: int, columns: int
+) -> np.ndarray:
+    """Where the blocks between a vertex and those at most `REACH` columns from it are, `[places, columns, 5]`, in a matrix'
+    places: among the vertices' blocks at the `offsets`, the transposed ones, a zero and a one."""
+    inner, N, K = _Inner.of(grid), len(free), len(offsets)
+    number = np.full((2 * REACH + 1,) * 2, -1)
     for k, offset in enumerate(offsets):
         number[offset] = k  # negative indices wrap: the opposite offset has its own place
-    unknown = np.arange(blocks * s).reshape(blocks, s)
-    rows, columns = np.array([(k, k) for k in block_tridiagonal.inwards(blocks)] + block_tridiagonal.coupled(blocks)).T
-    p, c = np.divmod(unknown[rows][:, :, None], 3)
-    q = unknown[columns][:, None, ::3] // 3
-    used = [(vertex < N) & free[vertex.clip(max=N - 1)] for vertex in (p, q)]
-    i, j = (index[q.clip(max=N - 1)] - index[p.clip(max=N - 1)] for index in (inner.row, inner.column))
-    close = used[0] & used[1] & (abs(i) <= 2) & (abs(j) <= 2)
-    i, j = np.where(close, i, 0), np.where(close, j, 0)
-    upper, lower = number[i, j], number[-i, -j]
-    entry = np.where(upper >= 0, (3 * upper + c) * N + p, (3 * (len(offsets) + lower) + c) * N + q)
-    zero, one = (3 * offsets.index((2, 2)) + 1) * N - 1, 6 * len(offsets) * N + c
-    entry = np.where(close & ((upper >= 0) | (lower >= 0)), entry, zero)
-    return np.where((p == q) & ~used[0], one, entry)
+    i, other = np.array(block_pentadiagonal.places(rows)).T[:, :, None, None]
+    j, di, dj = np.arange(columns)[:, None], other - i, np.arange(-REACH, REACH + 1)
+    p, q = inner.at(i, j), inner.at(i + di, j + dj)
+    used, itself = (p >= 0) & free[p], (i >= 0) & (di == 0) & (dj == 0)
+    close = used & (q >= 0) & free[q] & (abs(di) <= REACH)
+    di, dj = np.where(close, di, 0), np.where(close, dj, 0)
+    upper, lower = number[di, dj], number[-di, -dj]
+    entry = np.where(upper >= 0, upper * N + p, (K + lower) * N + q)
+    return np.where(close & ((upper >= 0) | (lower >= 0)), entry, 2 * K * N + (itself & ~used))

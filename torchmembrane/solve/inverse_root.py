@@ -1,0 +1,76 @@
+"""Inverse roots of symmetric positive definite matrices, many at once: `R` with `R^T R = A^-1`.
+
+What is left of a system after an elimination, `C - B^T A^-1 B = C - (R B)^T R B`, then stays positive where `A^-1` itself would
+lose it to rounding: in float32 from conditions of some 1e5 on, as a contact on a nearly unstretched sheet has.
+
+By Cholesky factors, or where a runtime has none (ONNX) by matrix products alone: a root is split into 2 x 2 blocks down to
+`LEAF` rows, and there iterated, `T = (3 I - Z Y) / 2, Y <- Y T, Z <- T Z` from `Y = A, Z = I` to `Z = A^-1/2` (Higham 2008,
+Functions of matrices, eq. 6.35), with `Z Y` scaled in between so that its eigenvalues, which go to 1, do so evenly.
+"""
+
+import torch
+from torch import Tensor
+
+LEAF = 48
+LARGEST_CONDITION = 1e6  # of a leaf
+LARGEST_SCALE = 2.8  # of eigenvalues up to 1; near 3 an iteration would make all of them small
+
+
+def inverse_root(matrix: Tensor) -> Tensor:
+    """`R` of symmetric positive definite `[..., n, n]`.
+
+    Example:
+        >>> R = inverse_root(torch.tensor([[2.0, 1.0], [1.0, 1.0]]))
+        >>> (R.mT @ R).round(decimals=4)
+        tensor([[ 1., -1.],
+                [-1.,  2.]])
+    """
+    return by_products(matrix) if torch.compiler.is_exporting() else by_cholesky(matrix)
+
+
+def by_cholesky(matrix: Tensor) -> Tensor:
+    """The inverse of the Cholesky factor."""
+    factor = torch.linalg.cholesky_ex(matrix).L
+    one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    return torch.linalg.solve_triangular(factor, one.expand_as(matrix), upper=False)
+
+
+def by_products(matrix: Tensor) -> Tensor:
+    """Too small in the directions of a leaf's smallest eigenvalues where its condition exceeds `LARGEST_CONDITION`."""
+    n = matrix.shape[-1]
+    one = torch.eye(n, dtype=matrix.dtype, device=matrix.device)
+    if n > LEAF:
+        A, B, C = matrix[..., : n // 2, : n // 2], matrix[..., : n // 2, n // 2 :], matrix[..., n // 2 :, n // 2 :]
+        root = by_products(A)
+        coupling = root @ B
+        further = by_products(C - coupling.mT @ coupling)
+        first = torch.cat([root, torch.zeros_like(B)], -1)
+        return torch.cat([first, torch.cat([-(further @ coupling.mT) @ root, further], -1)], -2)
+    largest = matrix.abs().sum(-1).amax(-1)[..., None, None]
+    Y, Z = matrix / largest, one / largest.sqrt()
+    for scale in iteration_scales(LARGEST_CONDITION, torch.finfo(matrix.dtype).eps):
+        T = scale**0.5 / 2 * (3 * one - scale * largest.sqrt() * (Z @ Y))
+        Y, Z = Y @ T, T @ Z
+    return Z
+
+
+def iteration_scales(condition: float, rounding: float) -> list[float]:
+    """By what to scale eigenvalues before every iteration, from between `1 / condition` and 1 at first."""
+    low, scales = 1 / condition, [1.0]
+    while 1 - low > rounding:
+        scales.append(_evening(low))
+        low = _iterated(scales[-1] * low)
+    return [*scales[1:], 1.0]
+
+
+def _evening(low: float) -> float:
+    """The scale that sends the smallest and the largest eigenvalue to the same: iterated, both are least."""
+    scale, beyond = 1.0, 3.0
+    for _ in range(60):
+        middle = (scale + beyond) / 2
+        scale, beyond = (middle, beyond) if _iterated(middle) > _iterated(middle * low) else (scale, middle)
+    return min(scale, LARGEST_SCALE)
+
+
+def _iterated(eigenvalue: float) -> float:
+    return eigenvalue * (3 - eigenvalue) ** 2 / 4
