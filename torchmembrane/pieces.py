@@ -91,7 +91,8 @@ def repeated(
 
 
 def unless(done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[Any]]) -> Sequence[Any]:
-    """Take what `otherwise` gives, which is `values` where `done` holds: a graph works it out only if somewhere it does not.
+    """Take what `otherwise` gives, which is `values` where `done` holds: worked out only if somewhere it does not, but for a
+    compiled graph, and for a device that would have to be waited for.
 
     Args:
         done: `[B]` bool.
@@ -100,7 +101,7 @@ def unless(done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[An
     """
     graph = _graph(values)
     if graph is None:
-        return otherwise()
+        return values if at_hand(done) and bool(done.all()) else otherwise()
     written: Sequence[Any] = graph.unless(done, values, otherwise)
     return written
 
@@ -110,8 +111,8 @@ def mended(
 ) -> Sequence[Any]:
     """Take `values` in the rows where `done` holds, else what `again(*given)` gives.
 
-    Tensors: nothing is worked out where all is done, and only the rows that are not where some are; a compiled graph, which has
-    no such branch, takes `values`. A graph works all rows out if one is not done.
+    Tensors: nothing is worked out where all is done, and only the rows that are not where some are; a compiled graph, and a
+    device that would have to be waited for, take `values`. A graph works all rows out if one is not done.
 
     Args:
         done: `[B]` bool.
@@ -122,11 +123,16 @@ def mended(
     """
     if _graph(values) is not None:
         return unless(done, values, lambda: chosen(done, values, again(*given)))
-    if torch.compiler.is_compiling() or bool(done.all()):
+    if not at_hand(done) or bool(done.all()):
         return values
     rows = (~done).nonzero().ravel()
     others = again(*(None if one is None else one[rows] for one in given))
     return [value.index_copy(0, rows, other) for value, other in zip(values, others, strict=True)]
+
+
+def at_hand(done: torch.Tensor) -> bool:
+    """Whether its values can be looked at now."""
+    return done.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
 def _graph(values: Sequence[Any]) -> Graph | None:

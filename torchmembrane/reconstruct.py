@@ -14,6 +14,7 @@ from .estimators.camera_motion import in_pixels, in_words, shift_of
 from .estimators.choice import ESTIMATORS, Settings, estimator_of
 from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
+from .estimators.precision import PRECISIONS, check_precision, full_precision
 from .estimators.start import checked_previous
 from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
@@ -29,7 +30,6 @@ from .sensor.sensor import Sensor
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
 LEAST_ERROR = 0.02  # px
 LEAST_COVERAGE = 0.88  # less of what the markers see at rest is a part hidden
-PRECISIONS = (torch.float32, torch.float64)
 
 
 class Reconstructor(nn.Module):
@@ -168,8 +168,8 @@ class Reconstructor(nn.Module):
             MembraneError: another size, shape or type; a previous result of another batch or sensor; a pressure of an open
                 cavity, or for another estimator.
         """
-        self._check_precision()
-        with torch.autocast(self.rest_pixels.device.type, enabled=False):
+        check_precision(self.rest_pixels.dtype)
+        with full_precision(self.rest_pixels.device.type):
             grey = self.grey(images)
             if previous is not None:
                 previous = self._checked(previous, len(grey))
@@ -209,8 +209,8 @@ class Reconstructor(nn.Module):
         Raises:
             MembraneError: another shape, or a confidence outside 0..1.
         """
-        self._check_precision()
-        with torch.autocast(self.rest_pixels.device.type, enabled=False):
+        check_precision(self.rest_pixels.dtype)
+        with full_precision(self.rest_pixels.device.type):
             flow = self.observer.from_pixels(pixels, confidence, rest_pixels)
             if previous is not None:
                 previous = self._checked(previous, len(flow.status))
@@ -333,13 +333,6 @@ class Reconstructor(nn.Module):
         observation = self._gauged(self.observation(pixels - self.rest_pixels, result.confidence), pressure)
         state = result.vertices, result.pressure, result.camera_motion
         return self.estimator.standard_deviations(*self.start(*state), observation, noise)
-
-    def _check_precision(self) -> None:
-        if self.rest_pixels.dtype not in PRECISIONS:
-            raise MembraneError(
-                f"Reconstructor: in {self.rest_pixels.dtype} the solve loses the answer; "
-                "expected torch.float32 or torch.float64: call .float() (images may be of half precision)"
-            )
 
     def _checked(self, previous: Reconstruction, frames: int) -> Reconstruction:
         """A previous result, refused where it cannot be one of these frames'."""

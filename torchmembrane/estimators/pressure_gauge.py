@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..pieces import at_hand
 
 
 def gauge_reading(pressure: Tensor | float, rest_pressure: Tensor, deviation: float, confidence: Tensor) -> Tensor:
@@ -27,7 +28,7 @@ def gauge_reading(pressure: Tensor | float, rest_pressure: Tensor, deviation: fl
     read, frames = torch.as_tensor(pressure).to(confidence), len(confidence)
     if read.shape not in ((), (frames,)):
         raise MembraneError(f"pressure {list(read.shape)}; expected [{frames}], one reading for each frame, NaN where none is")
-    if not torch.compiler.is_compiling() and bool(read.isinf().any()):
+    if at_hand(read) and bool(read.isinf().any()):
         raise MembraneError("pressure: inf; expected force / length^2 across the membrane, NaN where there is no reading")
     known = read.isfinite().expand(frames)
     change = torch.where(known, read - rest_pressure, 0.0)

@@ -1,10 +1,10 @@
 """What a solve can start from: results of the frames before, refused where they cannot be that."""
 
-import torch
 from torch import Tensor
 
 from ..errors import MembraneError
 from ..io.results import Reconstruction
+from ..pieces import at_hand
 from ..surface.membrane import Membrane
 
 OFF_RIM = 1e-3  # largest distance of a previous result's rim from this sensor's, over the surface's size
@@ -33,7 +33,7 @@ def checked_previous(
             f"{list(expected[0])} and {list(expected[1])}: one earlier result of this sensor and grid for each image"
         )
     previous = previous.to(rest_pixels)
-    if not torch.compiler.is_compiling():
+    if at_hand(previous.vertices):
         off = (previous.vertices - membrane.rest)[:, membrane.fixed].abs().nan_to_num()
         if off.numel() and off.max() > OFF_RIM * membrane.size:
             raise MembraneError(

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..io.status import Status
-from ..pieces import piece
+from ..pieces import at_hand, piece
 from .locator import Locator, isotropic
 from .placement import FEWEST_MARKERS, PlacedMarkers
 from .screening import MismatchScreen
@@ -226,6 +226,6 @@ def _checked_confidence(confidence: Tensor | None, pixels: Tensor) -> Tensor:
     confidence, shape = torch.as_tensor(confidence).to(pixels), pixels.shape[:2]
     if confidence.shape not in (shape, shape[1:]):
         raise MembraneError(f"from_pixels: confidence {list(confidence.shape)}; expected {list(shape)}, one for each marker")
-    if not torch.compiler.is_compiling() and not ((confidence >= 0) & (confidence <= 1)).all():
+    if at_hand(confidence) and not ((confidence >= 0) & (confidence <= 1)).all():
         raise MembraneError("from_pixels: confidence outside 0..1; expected 0 for a lost marker, up to 1 for a sure one")
     return confidence.expand(shape)

@@ -1,0 +1,54 @@
+"""The pipeline on a device that refuses what lies on another, and cannot be waited for: the meta device.
+
+A tensor left on the CPU, a value read by Python, a branch on one: each is an error there. (Fake CUDA tensors cannot be indexed
+where torch was built without CUDA.)
+"""
+
+import dataclasses
+
+import pytest
+import torch
+
+import torchmembrane as tm
+
+CASES = [
+    ("force-balance", {}),
+    ("force-balance", dict(locator="soft")),
+    ("minimum-energy", {}),
+    ("minimum-energy", dict(settings=tm.MinimumEnergySettings(element="quadrilateral", volume="linear"), model="harmonic")),
+    ("paper", {}),
+]
+
+
+@pytest.fixture(scope="module")
+def sensor():
+    whole = tm.Sensor.from_file("examples/sensor.toml")
+    return dataclasses.replace(whole, membrane=whole.membrane.resampled((17, 17)))
+
+
+@pytest.mark.parametrize(("estimator", "options"), CASES)
+def test_images_go_through_every_estimator(sensor, estimator, options):
+    reconstructor = tm.Reconstructor(sensor, estimator, **options).to("meta")
+    images = torch.empty(2, 480, 640, 3, dtype=torch.uint8, device="meta")
+    result = reconstructor(images)
+    assert {values.device.type for values in result} == {"meta"}
+    assert result.vertices.shape == (2, 289, 3)
+
+
+def test_frames_are_tracked_gauged_and_taken_from_markers(sensor):
+    reconstructor = tm.Reconstructor(sensor).to("meta")
+    images = torch.empty(2, 1, 480, 640, device="meta")
+    first = reconstructor(images)
+    followed = reconstructor(images, first, pressure=torch.empty(2, device="meta"))
+    located = reconstructor.from_pixels(first.pixels, first.confidence, previous=first)
+    assert followed.force.shape == located.force.shape == (2, 3)
+
+
+def test_a_tensor_left_on_the_cpu_is_refused(sensor):
+    """What the tests above are worth."""
+    reconstructor = tm.Reconstructor(sensor).to("meta")
+    reconstructor.observer.rest_pixels = reconstructor.observer.rest_pixels.new_zeros(
+        reconstructor.observer.rest_pixels.shape, device="cpu"
+    )
+    with pytest.raises((RuntimeError, NotImplementedError)):
+        reconstructor(torch.empty(2, 1, 480, 640, device="meta"))
