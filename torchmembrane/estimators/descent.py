@@ -102,7 +102,7 @@ class Descent(nn.Module):
         _, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier)
         loads, made = torch.cat([loads, motion.coupling], 1), None
         if factor is None:
-            made = equations.system.factor(equations.matrix(normal))
+            made = equations.system.factor(equations.matrix(normal, self.settings.damping * (tau / self.settings.tau[1]) ** 2))
             solved = equations.system.substitute(made, loads)
         else:
             known = factor

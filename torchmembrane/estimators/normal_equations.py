@@ -83,11 +83,11 @@ class BalanceEquations(nn.Module):
         own, slope = weighted @ K.movedim(2, 1).flatten(2).mT, (weighted @ angle.flatten(1)[..., None])[..., 0]
         return CameraMotion(coupling.flatten(2), own, slope)
 
-    def matrix(self, normal: NormalEquations) -> tuple[BlockPentadiagonal, Tensor]:
-        """`M` as `system.factor` takes it."""
+    def matrix(self, normal: NormalEquations, damping: float | Tensor = 1e-6) -> tuple[BlockPentadiagonal, Tensor]:
+        """`M` as `system.factor` takes it, with a share of its diagonal added."""
         A = normal.stiffness.transpose(2, 3).flatten(2, 3).movedim(-1, 1).contiguous()  # products of strided ones take a loop
         near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1)).permute(0, 3, 1, 4, 2)
-        return self.system.matrix(A.mT @ (normal.weights.movedim(-1, 1).contiguous() @ A), near)
+        return self.system.matrix(A.mT @ (normal.weights.movedim(-1, 1).contiguous() @ A), near, damping)
 
     def product(self, normal: NormalEquations, u: Tensor) -> Tensor:
         """`M u` for `u [B, C, 3 N]`, without the matrix."""

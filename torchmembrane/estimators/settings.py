@@ -45,6 +45,7 @@ class ForceBalanceSettings:
         pressure_noise: standard deviation of a measured pressure, over the reference traction (mostly the rest pressure); a
             better gauge is best told to be as good as this.
         longest_step: largest step of a vertex.
+        damping: share of a step's matrix' diagonal that is added to it as tau ends; it falls with tau's square.
         coarsest: fewest lines of a coarser grid.
         coarsest_warm: fewest lines of a coarser grid that is given the solution of the frame before.
         largest_relative_step: rms of the last step of a converged solution.
@@ -87,6 +88,7 @@ class ForceBalanceSettings:
     outlier: float = 5.0
     pressure_noise: float = 0.01
     longest_step: float = 0.04
+    damping: float = 3e-7
     coarsest: int = 9
     coarsest_warm: int = 13
     largest_relative_step: float = 2e-3

@@ -11,8 +11,11 @@ Functions of matrices, eq. 6.35), with `Z Y` scaled in between so that its eigen
 import torch
 from torch import Tensor
 
+from ..pieces import at_hand
+
 LEAF = 48
 LARGEST_CONDITION = 1e6  # of a leaf
+RIDGE = 1e-5  # of a matrix' largest eigenvalue, where it has no Cholesky factor
 LARGEST_SCALE = 2.8  # of eigenvalues up to 1; near 3 an iteration would make all of them small
 
 
@@ -29,9 +32,12 @@ def inverse_root(matrix: Tensor) -> Tensor:
 
 
 def by_cholesky(matrix: Tensor) -> Tensor:
-    """The inverse of the Cholesky factor."""
-    factor = torch.linalg.cholesky_ex(matrix).L
+    """The inverse of the Cholesky factor; where rounding has left a matrix without one, of that with a `RIDGE`."""
+    factor, info = torch.linalg.cholesky_ex(matrix)
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    if at_hand(info) and bool(info.any()):
+        ridge = torch.where(info > 0, RIDGE * matrix.abs().sum(-1).amax(-1), 0.0)
+        factor = torch.linalg.cholesky_ex(matrix + ridge[..., None, None] * one).L
     return torch.linalg.solve_triangular(factor, one.expand_as(matrix), upper=False)
 
 

@@ -59,7 +59,7 @@ class StencilSystem(nn.Module):
         self.register_buffer("one", torch.eye(3, dtype=torch.float64))
         self.register_buffer("fixed", (~free).double()[:, None])
 
-    def matrix(self, products: Tensor, near: Tensor, damping: float = 1e-6) -> tuple[BlockPentadiagonal, Tensor]:
+    def matrix(self, products: Tensor, near: Tensor, damping: float | Tensor) -> tuple[BlockPentadiagonal, Tensor]:
         """The matrix, scaled from both sides to a diagonal of 1; by what, `[B, 1, 3 N]`.
 
         Arguments: `products [B, N, 21, 21]` of every stencil row's columns with each other; `near [B, 4, 3, N, 3]`, further
