@@ -292,8 +292,9 @@ def test_threshold_and_components_follow_a_small_flow(thresholded_dots, field):
 
 
 @pytest.mark.parametrize("arrangement, two_sizes", PATTERNS)
-def test_dots_followed_from_the_frame_before_are_those_searched_for(arrangement, two_sizes):
-    """Whether they moved little, or so far that they can no longer be followed; dots that were lost are found again."""
+def test_dots_followed_from_the_frame_before_are_those_searched_for(monkeypatch, arrangement, two_sizes):
+    """Whether they moved little, or so far that they can no longer be followed; dots that were lost are found again. Where all
+    frames can be followed nothing is searched for."""
     s = scene(arrangement, two_sizes)
     locate = DotLocator(measured(s), SIZE, "dark", s.rim)
     before, _, _ = locate(batch(render(*deform(s, slide, 0.2), seed=1)))
@@ -309,6 +310,8 @@ def test_dots_followed_from_the_frame_before_are_those_searched_for(arrangement,
     _, blobs, log_radius, valid = locate.begin(images)[-4:]
     *_, kept = locate.match.follow(blobs, log_radius, valid, before.expand(len(frames), -1, -1))
     assert kept[:2].all() and not kept[-1]
+    monkeypatch.setattr(locate.match, "search", None)
+    assert torch.equal(locate(images[:2], before.expand(2, -1, -1)).pixels, pixels[:2])
 
 
 def test_dots_are_searched_for_where_the_frame_before_says_nothing_or_is_another(two):

@@ -7,7 +7,7 @@ import torch
 from torchmembrane.solve import block_tridiagonal
 from torchmembrane.solve.anderson import DEPTH, accelerated, first
 from torchmembrane.solve.conjugate_gradient import conjugate_gradient
-from torchmembrane.solve.inverse_root import by_cholesky, by_products
+from torchmembrane.solve.inverse_root import RIDGE, by_cholesky, by_products
 from torchmembrane.solve.kkt import constrained_minimum
 
 
@@ -110,6 +110,14 @@ def test_what_is_left_of_an_ill_conditioned_system_stays_positive_in_float32(mon
     exact = block_tridiagonal.substitute(block_tridiagonal.factor(*matrix), b)
     single = block_tridiagonal.substitute(block_tridiagonal.factor(*(part.float() for part in matrix)), b.float())
     assert (single - exact).norm() < 0.1 * exact.norm()
+
+
+def test_what_rounding_has_left_without_a_factor_gets_a_ridge_and_nothing_else_does():
+    one = torch.eye(3, dtype=torch.float64)
+    barely_indefinite = torch.diag(torch.tensor([2.0, 1.0, -1e-6], dtype=torch.float64))
+    roots = by_cholesky(torch.stack([one, barely_indefinite]))
+    assert (roots[0] == one).all()
+    torch.testing.assert_close(roots[1].mT @ roots[1] @ (barely_indefinite + 2 * RIDGE * one), one)
 
 
 def test_anderson_solves_a_linear_fixed_point_in_two_unknowns_at_the_third_evaluation():
