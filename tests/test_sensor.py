@@ -267,7 +267,9 @@ def test_fingerprint_of_a_sensor_made_in_python_is_that_of_its_file(tmp_path):
 
 @pytest.mark.parametrize("count, n", [(3, 25), (81, 25), (100, 29), (121, 33), (2000, 33)])
 def test_solver_grid_follows_the_number_of_dots(tmp_path, count, n):
-    dots = [DOTS[0], *["0.0,0.0,14.0,small"] * count]
+    radius, angle = 11 * np.sqrt((np.arange(count) + 0.5) / count), 2.4 * np.arange(count)  # a spiral on the cap
+    z = -1 + np.sqrt(15**2 - radius**2)
+    dots = [DOTS[0], *(f"{x},{y},{z},small" for x, y, z in zip(radius * np.cos(angle), radius * np.sin(angle), z, strict=True))]
     assert Sensor.from_file(write(tmp_path, dots=dots)).membrane.grid == (n, n)
 
 

@@ -138,10 +138,7 @@ class Reconstructor(nn.Module):
         """Image files as a batch `[B, 1, height, width]` in 0..1, in this module's precision and on its device."""
         grey = []
         for path in paths:
-            try:
-                grey.append(grey_batch(read_image(path), self.image_size, "rgb", self.rest_pixels))
-            except MembraneError as error:
-                raise MembraneError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+            grey.append(grey_batch(read_image(path, self.image_size), self.image_size, "rgb", self.rest_pixels))
         return torch.cat(grey)
 
     def forward(
