@@ -117,7 +117,11 @@ class Reconstructor(nn.Module):
     @classmethod
     def from_file(cls, path: str | Path, estimator: str = "force-balance", **options: Any) -> "Reconstructor":
         """The reconstructor of a sensor file; options as for the class."""
-        return cls(Sensor.from_file(path), estimator, **options)
+        sensor = Sensor.from_file(path)
+        try:
+            return cls(sensor, estimator, **options)
+        except MembraneError as error:
+            raise MembraneError(f"{path}: {error}") from error
 
     @property
     def rest_pixels(self) -> Tensor:

@@ -54,7 +54,7 @@ def run(arguments: Namespace) -> int:
         reconstructor = Reconstructor(sensor, check_rest=False)
         reconstructor.observer.check_rest(sensor.name)
     except MembraneError as error:
-        problem = error
+        problem = MembraneError(f"{arguments.sensor}: {error}")
     frame = None if reconstructor is None else rest_frame(reconstructor)
     print("\n".join(described(sensor, reconstructor, frame)), flush=True)
     sheet = _sheet(sensor, arguments) if arguments.accuracy and not problem else None

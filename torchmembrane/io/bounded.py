@@ -60,6 +60,8 @@ def read_bytes(path: Path, most: int, expected: str) -> bytes:
                 content = file.read(most + 1)
             if len(content) <= most:
                 return content
+    except MembraneError:
+        raise
     except FileNotFoundError:
         raise MembraneError(f"{path}: no such file; expected {expected}, check the path") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path

@@ -80,10 +80,12 @@ class Table:
 
     @contextmanager
     def naming(self, key: str = "") -> Iterator[None]:
-        """Put file, table and key before the message of whatever is refused inside."""
+        """Put file, table and key before the message of whatever is refused inside, unless it begins with the file."""
         try:
             yield
         except MembraneError as error:
+            if str(error).startswith(f"{self.path}:"):
+                raise
             shown = f" = {_said(self.values[key])}" if key in self else ""
             raise MembraneError(f"{self.where(key)}{shown}: {error}") from error
 
