@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
+from ..io.bounded import read_text
 from ..markers.placement import rim_mask
 from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
@@ -21,6 +22,7 @@ from .surface import dot_outlines, fine_surface, surface_projection
 RADIUS = {"small": 0.16, "large": 0.27}  # of dots, over their spacing
 MARGIN = 0.6  # of a pitch, that a lattice keeps from the rim's outline
 NEWTON_STEPS, AIMS = 3, 2
+MOST_BYTES = 2**20  # of a file of wanted pixels
 
 
 class FabricationLayout(NamedTuple):
@@ -150,13 +152,14 @@ def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
         >>> pixels.tolist(), sizes
         ([[320.0, 240.0], [360.0, 240.0]], ['large', 'small'])
     """
+    text = read_text(path, MOST_BYTES, "CSV with the header u,v,size")
     try:
-        rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row]
+        rows = [row for row in csv.reader(text.splitlines()) if row]
         header, *body = rows
         right = [cell.strip() for cell in header] == ["u", "v", "size"]
         pixels = np.array([[float(u), float(v)] for u, v, _ in body])
         sizes = [size.strip() for _, _, size in body]
-    except (ValueError, OSError, UnicodeDecodeError) as error:
+    except (ValueError, csv.Error) as error:
         raise MembraneError(
             f"{path}: not readable ({error}); expected CSV with the header u,v,size and one line per dot"
         ) from error

@@ -173,8 +173,17 @@ def in_one_line(text: object) -> str:
         >>> in_one_line("unexpected\\n  end\\a")
         'unexpected end?'
     """
-    line = re.sub(r"\s+", " ", str(text)) or type(text).__name__
-    return shortened("".join(c if c.isprintable() else "?" for c in line), 200)
+    return shortened(printable(re.sub(r"\s+", " ", str(text))) or type(text).__name__, 200)
+
+
+def printable(text: object) -> str:
+    """Text with `?` for what cannot be printed in a line.
+
+    Example:
+        >>> printable("rest\\n.png")
+        'rest?.png'
+    """
+    return "".join(c if c.isprintable() else "?" for c in str(text))
 
 
 def _kind(mode: int) -> str:

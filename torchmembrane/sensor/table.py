@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import MembraneError
-from ..io.bounded import lies_within, read_text, shortened
+from ..io.bounded import lies_within, printable, read_text, shortened
 
 MOST_BYTES, LONGEST_LINE = 2**15, 2000
 """Of a sensor file: the time that TOML takes grows as the square of a line's length."""
@@ -167,7 +167,9 @@ class Table:
                 raise self.refuse(key, "a path relative to the sensor file, of a file in its folder or below: copy it there")
             found = sorted(map(Path, glob.glob(f"{glob.escape(str(folder))}/{name}"))) if "*" in name else [folder / name]
             if not found or not all(map(_is_file, found)):
-                raise self.refuse(key, f"a file; there is none at {folder / name}: paths are relative to the sensor file")
+                raise self.refuse(
+                    key, f"a file; there is none at {printable(folder / name)}: paths are relative to the sensor file"
+                )
             paths += found
         if len(paths) > MOST_FILES:
             raise self.refuse(key, f"at most {MOST_FILES} files; these are {len(paths)}")
