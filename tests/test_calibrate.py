@@ -4,6 +4,7 @@ import csv
 import json
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -24,7 +25,7 @@ from torchmembrane.calibrate.rest import rest_from_image
 from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
-from torchmembrane.io.images import to_grey
+from torchmembrane.io.images import read_image, to_grey
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
@@ -281,6 +282,17 @@ def test_a_calibrated_sensor_reconstructs_its_rest(design, truth, image):
     assert off["before"] > 0.25 and off["after"] < 0.03
 
 
+@pytest.mark.parametrize(
+    "name, pressed", [("rest", False), ("press_on_axis", True), ("flat_plate", True), ("two_contacts", True)]
+)
+def test_a_pressed_image_is_noticed_to_be_no_rest(name, pressed):
+    sensor = Sensor.from_file("examples/sensor.toml")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        rest_from_image(sensor, read_image(f"examples/{name}.png"))
+    assert [("something presses the membrane" in str(one.message)) for one in said] == [True] * pressed
+
+
 def test_misplaced_dots_are_nulled(design):
     shift, wrong = np.array([0.12, -0.08]), [3, 20]
     dots = design.markers.positions.copy()
@@ -288,7 +300,9 @@ def test_misplaced_dots_are_nulled(design):
     dots[wrong, :2] += shift
     dots[wrong, 2] = centre + np.sqrt(radius**2 - (dots[wrong, :2] ** 2).sum(1))
     made = replace(design, markers=replace(design.markers, positions=dots))
-    found = rest_from_image(design, simulator_of(made).rest_image())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # they are no press
+        found = rest_from_image(design, simulator_of(made).rest_image())
     assert np.linalg.norm(found.sensor.markers.positions - dots, axis=1).max() < 0.03
     assert (np.linalg.norm(found.shifts, axis=1) > 0.1).nonzero()[0].tolist() == wrong
 

@@ -39,7 +39,7 @@ def write_calibrated(arguments: Namespace, sensor: Sensor, report: Report, drawi
     return 0
 
 
-def read_sensor_image(path: Path, sensor: Sensor) -> np.ndarray:
+def read_sensor_image(path: str | Path, sensor: Sensor) -> np.ndarray:
     """An image `[H, W]` that must be as large as the sensor's."""
     return read_image(path, sensor.camera.image_size)
 
