@@ -14,7 +14,7 @@ from .estimators.camera_motion import in_pixels, in_words, shift_of
 from .estimators.choice import ESTIMATORS, Settings, estimator_of
 from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
-from .estimators.start import checked_previous
+from .estimators.start import checked_previous, solved_from
 from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
@@ -172,9 +172,8 @@ class Reconstructor(nn.Module):
         self._check_precision()
         with torch.autocast(self.rest_pixels.device.type, enabled=False):
             grey = self.grey(images)
-            if previous is not None:
-                previous = self._checked(previous, len(grey))
-            return self.reconstruct_grey(grey, previous, rest_pixels, pressure)
+            before = self._checked(previous, len(grey))
+            return solved_from(before, lambda p, g, q: self.reconstruct_grey(g, p, rest_pixels, q), grey, pressure)
 
     def grey(self, images: Tensor | np.ndarray) -> Tensor:
         """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
@@ -213,9 +212,8 @@ class Reconstructor(nn.Module):
         self._check_precision()
         with torch.autocast(self.rest_pixels.device.type, enabled=False):
             flow = self.observer.from_pixels(pixels, confidence, rest_pixels)
-            if previous is not None:
-                previous = self._checked(previous, len(flow.status))
-            return self._solve(flow, previous, pressure)
+            before = self._checked(previous, len(flow.status))
+            return solved_from(before, lambda p, q, *rows: self._solve(MarkerFlow(*rows), p, q), pressure, *flow)
 
     def _solve(self, flow: MarkerFlow, previous: Reconstruction | None, pressure: Tensor | float | None) -> Reconstruction:
         usable, confidence, covariance, status = self.observer.judge(*flow)
@@ -333,7 +331,8 @@ class Reconstructor(nn.Module):
         noise = torch.linalg.cholesky(2 * self.observer.rest_covariance).mT @ turn
         observation = self._gauged(self.observation(pixels - self.rest_pixels, result.confidence), pressure)
         state = result.vertices, result.pressure, result.camera_motion
-        return self.estimator.standard_deviations(*self.start(*state), observation, noise)
+        found = self.estimator.standard_deviations(*self.start(*state), observation, noise)
+        return found.known(result.vertices.flatten(1).isfinite().all(1))
 
     def _check_precision(self) -> None:
         if self.rest_pixels.dtype not in PRECISIONS:
@@ -342,8 +341,10 @@ class Reconstructor(nn.Module):
                 "expected torch.float32 or torch.float64: call .float() (images may be of half precision)"
             )
 
-    def _checked(self, previous: Reconstruction, frames: int) -> Reconstruction:
+    def _checked(self, previous: Reconstruction | None, frames: int) -> Reconstruction | None:
         """A previous result, refused where it cannot be one of these frames'."""
+        if previous is None:
+            return None
         if not self.estimator.takes_start:
             raise MembraneError(f"Reconstructor: {self.estimator_name} starts from rest always; leave previous out")
         return checked_previous(previous, frames, self.estimator.membrane, self.rest_pixels, self.sensor.length_unit)

@@ -57,15 +57,15 @@ def read_bytes(path: Path, most: int, expected: str) -> bytes:
             raise MembraneError(f"{path}: not readable (it is a {_kind(found.st_mode)}); expected {expected}, a regular file")
         if found.st_size <= most:
             with open(path, "rb") as file:
-                content = file.read(most + 1)
+                content = file.read(found.st_size + 1)
             if len(content) <= most:
                 return content
     except MembraneError:
         raise
     except FileNotFoundError:
         raise MembraneError(f"{path}: no such file; expected {expected}, check the path") from None
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        cause = getattr(error, "strerror", None) or error
+    except (OSError, ValueError, MemoryError) as error:  # ValueError: a NUL in the path
+        cause = getattr(error, "strerror", None) or in_one_line(error)
         raise MembraneError(f"{path}: not readable ({cause}); expected {expected}") from error
     raise MembraneError(f"{path}: holds {found.st_size} bytes; expected {expected}, at most {most} bytes")
 
