@@ -55,16 +55,13 @@ class Table:
         if (longest := max(map(len, text.split("\n")))) > LONGEST_LINE:
             raise MembraneError(f"{path}: a line of {longest} characters; expected {EXPECTED}, lines of at most {LONGEST_LINE}")
         try:
-            return cls(path, "", _plain(path, tomllib.loads(text)))
-        except tomllib.TOMLDecodeError as error:
+            values = tomllib.loads(text)
+        except ValueError as error:
             cause = str(error).replace("at end of document", f"at line {len(text.splitlines())}, the last")
             raise MembraneError(f"{path}: not valid TOML: {cause}; correct that line") from error
         except RecursionError as error:
             raise MembraneError(_too_deep(path)) from error
-        except MembraneError:
-            raise
-        except ValueError as error:
-            raise MembraneError(f"{path}: a number is too long ({error}); expected {EXPECTED}") from error
+        return cls(path, "", _plain(path, values))
 
     def __contains__(self, key: str) -> bool:
         return key in self.values
