@@ -363,6 +363,7 @@ def test_every_mistake_in_the_file_is_named(tmp_path, text, words):
         ([*DOTS, "", "0,0,14"], "line 6: 3 values, 0,0,14; expected four"),
         ([*DOTS, "0,0,fourteen,small"], "line 5: z = 'fourteen'; expected a number"),
         ([*DOTS, "0,nan,14,small"], "line 5: y = nan; expected a finite number"),
+        ([*DOTS, "0,1e308,14,small"], "line 5: y = 1e308; expected a coordinate up to 1e+06"),
         ([*DOTS, "0,0,14,medium"], "line 5: size = 'medium'; expected small or large"),
         ([*DOTS, "", "0,0,14,small", "0,0,4,small"], "line 7: the dot at [0.0, 0.0, 4.0] is 9.985 off the rest surface"),
     ],

@@ -16,6 +16,7 @@ from ..errors import MembraneError, expect
 from ..io.images import read_image, to_grey
 from ..pose import Pose
 from ..surface import shapes
+from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
 
 OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, in the surface's size
@@ -144,8 +145,10 @@ class Markers:
             expect(self.sizes is None, "sizes", self.sizes, "none without positions")
             return
         positions = np.asarray(self.positions, dtype=np.float64)
-        right = positions.ndim == 2 and positions.shape[1] == 3 and len(positions) > 0 and bool(np.isfinite(positions).all())
-        expect(right, "positions", f"an array {list(positions.shape)}", "[D, 3], finite, D at least 1")
+        right = positions.ndim == 2 and positions.shape[1] == 3 and len(positions) > 0
+        right = right and bool((np.abs(positions) <= FARTHEST).all())
+        expected = f"[D, 3], finite, up to {FARTHEST:g}, D at least 1"
+        expect(right, "positions", f"an array {list(positions.shape)}", expected)
         sizes = ["small"] * len(positions) if self.sizes is None else list(self.sizes)
         right = len(sizes) == len(positions) and set(sizes) <= {"small", "large"}
         expect(right, "sizes", sizes, f"{len(positions)} times 'small' or 'large'")

@@ -15,6 +15,7 @@ from ..errors import MembraneError
 from ..io.bounded import in_one_line, read_arrays, read_text, shortened
 from ..io.images import image_size, mean_image, write_image
 from ..pose import Pose
+from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
 from .parts import (
     METRE,
@@ -252,6 +253,10 @@ def _dot(line: str, row: list[str]) -> tuple[list[float], str]:
             raise MembraneError(f"{line}: {key} = {shortened(cell)!r}; expected a number with a decimal point") from None
         if not math.isfinite(position[-1]):
             raise MembraneError(f"{line}: {key} = {cell}; expected a finite number: leave unknown dots out")
+        if abs(position[-1]) > FARTHEST:
+            raise MembraneError(
+                f"{line}: {key} = {shortened(cell)}; expected a coordinate up to {FARTHEST:g}, in the length unit"
+            )
     if row[3] not in ("small", "large"):
         raise MembraneError(f"{line}: size = {shortened(row[3])!r}; expected small or large")
     return position, row[3]
