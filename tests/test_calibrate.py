@@ -6,6 +6,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -423,3 +424,38 @@ def test_command_layout_writes_for_machine_and_eye(design, tmp_path, capsys):
     assert code == 2 and "small or large" in errors
     code, _, errors = run(capsys, "pattern", path, "--out", tmp_path / "no")  # the step's former name
     assert code == 2 and "--pixels" in errors
+
+
+@pytest.mark.parametrize(
+    "step, options, words",
+    [
+        (
+            "layout",
+            ("--pitch", "1e300"),
+            "pitch = 1e+300; expected 4 px or more, so that dots are distinguishable, at most 1120",
+        ),
+        ("layout", ("--pitch", "4"), "dots; expected at most 2000, as a sensor file lists"),
+        ("layout", ("--pixels", "far.csv"), "the ray of pixel [1e+300, 240.0] (dot 0) misses the rest surface"),
+        ("layout", ("--pixels", "/dev/zero"), "/dev/zero: not readable (it is a device); expected CSV"),
+        (
+            "views",
+            ("rest.png", "rest.png", "--motions", "far.motions"),
+            "largest 1e+300; expected six finite numbers up to 10000",
+        ),
+        ("depth", ("far.npy", "--image", "rest.png"), "far.npy: depths up to 1e+300; expected at most 1e+06: check --unit 1"),
+        ("depth", ("text.npy", "--image", "rest.png"), "text.npy: not readable"),
+        ("rest", ("small.png",), "small.png: the image is 16 x 12 px, expected 640 x 480"),
+    ],
+)
+def test_values_that_calibrate_nothing_are_refused_in_one_line(tmp_path, capsys, monkeypatch, step, options, words):
+    example = Path("examples").resolve()
+    monkeypatch.chdir(tmp_path)
+    Path("rest.png").symlink_to(example / "rest.png")
+    Path("far.csv").write_text("u,v,size\n1e300,240,large\n360,240,small\n")
+    Path("far.motions").write_text("x,y,z,turn_x,turn_y,turn_z\n0,0,0,0,0,0\n1e300,0,0,0,0,0\n")
+    Path("text.npy").write_text("no array")
+    np.save("far.npy", np.full((480, 640), 1e300))
+    Image.new("L", (16, 12)).save("small.png")
+    assert cli.main(["calibrate", step, str(example / "sensor.toml"), *options, "--out", "out"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line and not Path("out").exists()

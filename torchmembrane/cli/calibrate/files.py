@@ -17,12 +17,14 @@ from ...jobs.inputs import find_inputs
 from ...plot.drawing import save
 from ...presets import sensor_file
 from ...sensor.sensor import Sensor
+from ...surface.checks import FARTHEST
 from ...targets import Checkerboard, DotBoard
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_TABLE_BYTES = 2**20
+LARGEST_MOTION = 1e4  # length unit, and degrees
 
 
 def read_sensor(arguments: Namespace) -> Sensor:
@@ -66,8 +68,9 @@ def read_motions(path: Path) -> np.ndarray:
         rows = np.loadtxt(text.splitlines(), delimiter=",", skiprows=1, ndmin=2)
     except ValueError as error:
         raise MembraneError(f"{path}: not readable ({error}); expected {expected}") from error
-    if rows.shape[1] != 6 or not np.isfinite(rows).all():
-        raise MembraneError(f"{path}: {rows.shape[1]} columns; expected six finite numbers, x,y,z,turn_x,turn_y,turn_z")
+    if rows.shape[1] != 6 or not (np.abs(rows) <= LARGEST_MOTION).all():
+        limit = f"six finite numbers up to {LARGEST_MOTION:g}, x,y,z,turn_x,turn_y,turn_z"
+        raise MembraneError(f"{path}: {rows.shape[1]} columns, largest {np.abs(rows).max(initial=0):g}; expected {limit}")
     return rows
 
 
@@ -93,6 +96,8 @@ def read_forces(path: Path, images: Sequence[Path]) -> np.ndarray:
 
 def read_depth(path: Path, unit: float) -> np.ndarray:
     """A depth image `[H, W]` in the sensor's length unit; `unit`: of one step of the file's values."""
-    if path.suffix != ".npy":
-        return read_image(path).astype(float) * 65535 * unit
-    return unit * read_array(path).astype(float)
+    values = read_array(path) if path.suffix == ".npy" else read_image(path).astype(float) * 65535
+    depth: np.ndarray = values.astype(float) * unit
+    if (np.abs(depth) > FARTHEST).any():
+        raise MembraneError(f"{path}: depths up to {np.nanmax(depth):g}; expected at most {FARTHEST:g}: check --unit {unit:g}")
+    return depth
