@@ -485,6 +485,10 @@ HOSTILE = [
     (replaced("c2_ratio = 0.1", "c2_ratio = 1e9"), "c2_ratio is 1000000000.0; expected C2 / C1, from 0 to 1000"),
     (replaced("pressure = 1013.0", "pressure = 1e9"), "pressure is 1000000000.0; expected a finite positive number, from"),
     (replaced("focal = [20.0, 20.0]", "focal = [20.0, 1e200]"), "focal is [20.0, 1e+200]; expected positive", "to 1e+06 px"),
+    (
+        replaced("focal = [20.0, 20.0]", "focal = [20.0, 500.0]"),
+        "focal is [20.0, 500.0]; expected two values, the larger at most 20",
+    ),
     (replaced("centre = [15.5, 11.5]", "centre = [1e200, 11.5]"), "centre is [1e+200, 11.5]; expected values up to 1e+06"),
     (replaced("[-0.1]", "[1e200]"), "distortion is [1e+200]; expected values up to 1e+06"),
     (replaced("image_size = [32, 24]", "image_size = [10000, 10000]"), "image_size is [10000, 10000]; expected", "33554432 px"),

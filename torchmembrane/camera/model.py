@@ -20,8 +20,10 @@ from .ports import MOST_INDEX, Layers, Port, apparent_points, check_ports, layer
 COEFFICIENTS = {"pinhole": 5, "fisheye": 4}  # k1 k2 p1 p2 k3 | k1 k2 k3 k4
 LONGEST_SIDE = 16384
 """Of an image, px."""
-FOCAL = (1e-2, 1e6)
+FOCAL = (1.0, 1e6)
 """Least and greatest, px."""
+MOST_ASPECT = 20.0
+"""Of the two focal lengths to one another."""
 FARTHEST_CENTRE, MOST_DISTORTION = 1e6, 1e6
 
 
@@ -247,5 +249,7 @@ def _check_lens(
     least, most_focal = FOCAL
     expected = f"positive values (without eq. 1's sign), from {least:g} to {most_focal:g} px"
     expect(min(focal) >= least and max(focal) <= most_focal, "Camera: focal", list(focal), expected)
+    alike = max(focal) <= MOST_ASPECT * min(focal)
+    expect(alike, "Camera: focal", list(focal), f"two values, the larger at most {MOST_ASPECT:g} times the smaller")
     for name, values, limit in (("centre", centre, FARTHEST_CENTRE), ("distortion", distortion, MOST_DISTORTION)):
         expect(max(map(abs, values), default=0) <= limit, f"Camera: {name}", list(values), f"values up to {limit:g}")
