@@ -1,6 +1,8 @@
-# make demo | make test | make lint (style, types, layers) | make bench | make figures: each sets itself up on a machine with Python 3.11+ only.
+# make demo | make test | make lint (style, types, layers) | make bench | make soak SOAK=HOURS | make figures: each sets itself up on a machine with Python 3.11+ only.
 # make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
 PYTHON ?= python3
+SOAK ?= 1
+SEED ?= $(shell date +%s)
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -11,7 +13,7 @@ PACKAGES := $(WEB)/node_modules/.package-lock.json
 SENSOR := examples/sensor.toml examples/rest_grid.npz examples/dots.csv examples/rest.png
 IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
 
-.PHONY: demo test lint style types layers bench figures web test-web clean
+.PHONY: demo test lint style types layers bench soak figures web test-web clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -42,6 +44,9 @@ layers: $(READY)
 
 bench: $(READY)
 	$(BIN)/python bench/speed.py --json out/bench/speed.json
+
+soak: $(READY)
+	$(BIN)/python bench/fuzz.py --hours $(SOAK) --seed $(SEED) --json out/bench/fuzz.json
 
 figures: $(READY)
 	$(BIN)/python docs/figures.py

@@ -4,7 +4,9 @@ import csv
 import json
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -24,7 +26,7 @@ from torchmembrane.calibrate.rest import rest_from_image
 from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
-from torchmembrane.io.images import to_grey
+from torchmembrane.io.images import read_image, to_grey
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
@@ -281,6 +283,17 @@ def test_a_calibrated_sensor_reconstructs_its_rest(design, truth, image):
     assert off["before"] > 0.25 and off["after"] < 0.03
 
 
+@pytest.mark.parametrize(
+    "name, pressed", [("rest", False), ("press_on_axis", True), ("flat_plate", True), ("two_contacts", True)]
+)
+def test_a_pressed_image_is_noticed_to_be_no_rest(name, pressed):
+    sensor = Sensor.from_file("examples/sensor.toml")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        rest_from_image(sensor, read_image(f"examples/{name}.png"))
+    assert [("something presses the membrane" in str(one.message)) for one in said] == [True] * pressed
+
+
 def test_misplaced_dots_are_nulled(design):
     shift, wrong = np.array([0.12, -0.08]), [3, 20]
     dots = design.markers.positions.copy()
@@ -288,7 +301,9 @@ def test_misplaced_dots_are_nulled(design):
     dots[wrong, :2] += shift
     dots[wrong, 2] = centre + np.sqrt(radius**2 - (dots[wrong, :2] ** 2).sum(1))
     made = replace(design, markers=replace(design.markers, positions=dots))
-    found = rest_from_image(design, simulator_of(made).rest_image())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # they are no press
+        found = rest_from_image(design, simulator_of(made).rest_image())
     assert np.linalg.norm(found.sensor.markers.positions - dots, axis=1).max() < 0.03
     assert (np.linalg.norm(found.shifts, axis=1) > 0.1).nonzero()[0].tolist() == wrong
 
@@ -409,3 +424,38 @@ def test_command_layout_writes_for_machine_and_eye(design, tmp_path, capsys):
     assert code == 2 and "small or large" in errors
     code, _, errors = run(capsys, "pattern", path, "--out", tmp_path / "no")  # the step's former name
     assert code == 2 and "--pixels" in errors
+
+
+@pytest.mark.parametrize(
+    "step, options, words",
+    [
+        (
+            "layout",
+            ("--pitch", "1e300"),
+            "pitch = 1e+300; expected 4 px or more, so that dots are distinguishable, at most 1120",
+        ),
+        ("layout", ("--pitch", "4"), "dots; expected at most 2000, as a sensor file lists"),
+        ("layout", ("--pixels", "far.csv"), "the ray of pixel [1e+300, 240.0] (dot 0) misses the rest surface"),
+        ("layout", ("--pixels", "/dev/zero"), "/dev/zero: not readable (it is a device); expected CSV"),
+        (
+            "views",
+            ("rest.png", "rest.png", "--motions", "far.motions"),
+            "largest 1e+300; expected six finite numbers up to 10000",
+        ),
+        ("depth", ("far.npy", "--image", "rest.png"), "far.npy: depths up to 1e+300; expected at most 1e+06: check --unit 1"),
+        ("depth", ("text.npy", "--image", "rest.png"), "text.npy: not readable"),
+        ("rest", ("small.png",), "small.png: the image is 16 x 12 px, expected 640 x 480"),
+    ],
+)
+def test_values_that_calibrate_nothing_are_refused_in_one_line(tmp_path, capsys, monkeypatch, step, options, words):
+    example = Path("examples").resolve()
+    monkeypatch.chdir(tmp_path)
+    Path("rest.png").symlink_to(example / "rest.png")
+    Path("far.csv").write_text("u,v,size\n1e300,240,large\n360,240,small\n")
+    Path("far.motions").write_text("x,y,z,turn_x,turn_y,turn_z\n0,0,0,0,0,0\n1e300,0,0,0,0,0\n")
+    Path("text.npy").write_text("no array")
+    np.save("far.npy", np.full((480, 640), 1e300))
+    Image.new("L", (16, 12)).save("small.png")
+    assert cli.main(["calibrate", step, str(example / "sensor.toml"), *options, "--out", "out"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line and not Path("out").exists()

@@ -234,6 +234,7 @@ def test_the_options_choices_are_what_the_package_has():
     assert choices.PRESETS == presets.NAMES and choices.INDENTERS == dataset.KINDS and choices.LEGS == simulator.LEGS
     assert choices.SIMULATION_FORMATS == frames.FORMATS and choices.PORTS == camera.PORTS
     assert (choices.HIGHLIGHT, choices.BLUR) == (appearance.Appearance.highlight, appearance.Appearance.blur)
+    assert (choices.MOST_BLUR, choices.MOST_DECIBEL) == (appearance.RANGES["blur"][1], appearance.RANGES["noise"][1])
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """One grey everywhere: 0.299 R + 0.587 G + 0.114 B in floating point, whatever the file or array."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -108,3 +110,62 @@ def test_arrays_that_are_no_image_are_refused(array, words):
     with pytest.raises(MembraneError) as caught:
         to_grey(array)
     assert words in str(caught.value) and "expected" in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def photograph():
+    return Image.open("examples/press_on_axis.png").convert("L")
+
+
+@pytest.mark.parametrize("mode, options", [("L", {}), ("RGB", dict(progressive=True)), ("RGB", dict(subsampling=0))])
+def test_what_the_decoder_remarks_of_a_jpeg_is_an_error(tmp_path, photograph, mode, options):
+    """Bytes lost amid the scan: Pillow fills in what is missing."""
+    path = tmp_path / "a.jpg"
+    photograph.convert(mode).save(path, quality=90, **options)
+    whole = path.read_bytes()
+    assert read_image(path).shape == (480, 640)
+    at = len(whole) // 2
+    path.write_bytes(whole[:at] + whole[at + 400 :])
+    with pytest.raises(MembraneError, match="not readable as an image .corrupt JPEG data.; expected a whole PNG, JPEG or TIFF"):
+        read_image(path)
+
+
+def test_every_format_is_read_and_its_first_half_is_not(tmp_path, photograph):
+    written = {"a.png": {}, "a.jpg": {}, "a.bmp": {}, "a.tiff": {}, "a.webp": dict(lossless=True)}
+    for name, options in {**written, "b.tiff": dict(compression="tiff_lzw")}.items():
+        path = tmp_path / name
+        photograph.save(path, **options)
+        assert np.abs(read_image(path) - np.asarray(photograph) / 255).max() < (0.1 if name == "a.jpg" else 1e-6), name
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        with pytest.raises(MembraneError, match=f"{name}: not readable as an image"):
+            read_image(path)
+
+
+def test_checksums_of_a_png_are_compared_to_its_end(tmp_path, photograph):
+    path = tmp_path / "a.png"
+    photograph.save(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-13] + bytes([whole[-13] ^ 1]) + whole[-12:])  # the last byte of the last block's checksum
+    with pytest.raises(MembraneError, match="not readable as an image"):
+        read_image(path)
+
+
+def test_a_large_image_is_refused_by_its_header(tmp_path):
+    """13000 x 13000 px would take 2 GB; these bytes end after the header."""
+    path = tmp_path / "large.png"
+    Image.new("1", (13000, 13000)).save(path)
+    tracemalloc.start()
+    for size, words in ((None, "13000 x 13000 px; at most 33554432 px are read"), ((640, 480), "13000 x 13000 px")):
+        with pytest.raises(MembraneError, match=words):
+            read_image(path, size)
+    with pytest.raises(MembraneError, match="the image is 640 x 480 px, expected 64 x 48: use images of this sensor's camera"):
+        read_image("examples/rest.png", (64, 48))
+    assert tracemalloc.get_traced_memory()[1] < 2e7
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("kind", ["EPS", "PDF", "GIF", "PPM", "ICO"])
+def test_formats_that_no_camera_writes_are_not_opened(tmp_path, photograph, kind):
+    photograph.save(tmp_path / "a.png", kind)
+    with pytest.raises(MembraneError, match="cannot identify image file"):
+        read_image(tmp_path / "a.png")

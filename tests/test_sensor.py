@@ -13,6 +13,7 @@ from PIL import Image
 
 from torchmembrane.errors import MembraneError
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
+from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.factories import cavity_filling, cavity_law, elastic_energy
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
@@ -267,7 +268,9 @@ def test_fingerprint_of_a_sensor_made_in_python_is_that_of_its_file(tmp_path):
 
 @pytest.mark.parametrize("count, n", [(3, 25), (81, 25), (100, 29), (121, 33), (2000, 33)])
 def test_solver_grid_follows_the_number_of_dots(tmp_path, count, n):
-    dots = [DOTS[0], *["0.0,0.0,14.0,small"] * count]
+    radius, angle = 11 * np.sqrt((np.arange(count) + 0.5) / count), 2.4 * np.arange(count)  # a spiral on the cap
+    z = -1 + np.sqrt(15**2 - radius**2)
+    dots = [DOTS[0], *(f"{x},{y},{z},small" for x, y, z in zip(radius * np.cos(angle), radius * np.sin(angle), z, strict=True))]
     assert Sensor.from_file(write(tmp_path, dots=dots)).membrane.grid == (n, n)
 
 
@@ -360,6 +363,7 @@ def test_every_mistake_in_the_file_is_named(tmp_path, text, words):
         ([*DOTS, "", "0,0,14"], "line 6: 3 values, 0,0,14; expected four"),
         ([*DOTS, "0,0,fourteen,small"], "line 5: z = 'fourteen'; expected a number"),
         ([*DOTS, "0,nan,14,small"], "line 5: y = nan; expected a finite number"),
+        ([*DOTS, "0,1e308,14,small"], "line 5: y = 1e308; expected a coordinate up to 1e+06"),
         ([*DOTS, "0,0,14,medium"], "line 5: size = 'medium'; expected small or large"),
         ([*DOTS, "", "0,0,14,small", "0,0,4,small"], "line 7: the dot at [0.0, 0.0, 4.0] is 9.985 off the rest surface"),
     ],
@@ -462,3 +466,119 @@ def test_a_relative_gas_is_a_liquid_and_says_so_where_it_is_asked(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert cavity_filling(sensor, sensor.membrane) == ("liquid", None)
+
+
+HOSTILE = [
+    (replaced("format = 1", "format = " + "9" * 4400), "a line of 4409 characters; expected"),
+    (replaced("format = 1", "format = 0x" + "f" * 1900), "more than 300 digits"),
+    (replaced("height = 6.0", "height = 1" + "0" * 400), "more than 300 digits"),
+    (replaced("[-0.1]", "[" * 1900), "more than 8 levels"),
+    (replaced("[-0.1]", "[" * 40 + "]" * 40), "more than 8 levels"),
+    (replaced("height = 6.0", "height = 6.0" + "." * 2000), "a line of 2012 characters; expected"),
+    (GOOD + "#\n" * 20000, "holds 40", "at most 32768 bytes"),
+    (replaced("shear_modulus = 0.3", "shear_modulus = 1e-300"), "shear_modulus is 1e-300; expected a finite positive", "1e-06"),
+    (replaced("thickness = 0.5", "thickness = 1e300"), "thickness is 1e+300; expected a finite positive number, from 1e-06"),
+    (
+        replaced("prestretch = 1.2", "prestretch = 1e9"),
+        "prestretch is 1000000000.0; expected 1 (unstretched) or more, at most 10",
+    ),
+    (replaced("c2_ratio = 0.1", "c2_ratio = 1e9"), "c2_ratio is 1000000000.0; expected C2 / C1, from 0 to 1000"),
+    (replaced("pressure = 1013.0", "pressure = 1e9"), "pressure is 1000000000.0; expected a finite positive number, from"),
+    (replaced("focal = [20.0, 20.0]", "focal = [20.0, 1e200]"), "focal is [20.0, 1e+200]; expected positive", "to 1e+06 px"),
+    (
+        replaced("focal = [20.0, 20.0]", "focal = [20.0, 500.0]"),
+        "focal is [20.0, 500.0]; expected two values, the larger at most 20",
+    ),
+    (replaced("centre = [15.5, 11.5]", "centre = [1e200, 11.5]"), "centre is [1e+200, 11.5]; expected values up to 1e+06"),
+    (replaced("[-0.1]", "[1e200]"), "distortion is [1e+200]; expected values up to 1e+06"),
+    (replaced("image_size = [32, 24]", "image_size = [10000, 10000]"), "image_size is [10000, 10000]; expected", "33554432 px"),
+    (replaced("index = 1.52", "index = 1e9"), "ports[1].index is 1000000000.0; expected 1 (air)"),
+    (replaced("height = 6.0", "height = 1e200"), "height = 1e+200; expected a finite positive number, from 1e-06 to 1e+06"),
+    (replaced("base_z = 8.0", "base_z = 1e200"), "expected coordinates up to 1e+06"),
+    (
+        replaced("base_z = 8.0", "base_z = 8.0\ngrid = [1000000, 1000000]"),
+        "[membrane] grid = [1000000, 1000000]; expected 5 x 5",
+    ),
+    (
+        replaced("base_z = 8.0", "base_z = 8.0\ngrid = [66, 65]"),
+        "[membrane] grid = [66, 65]; expected 5 x 5",
+        "at most 65 x 65",
+    ),
+    (GOOD + '"a\\nb" = 1\n', '[markers] "a\\nb" is unknown here'),
+    (replaced('"rest.png"', '"a\\nb.png"'), "a\\nb.png", "expected a file; there is none at"),
+    (replaced('"rest.png"', '"."'), "rest_image", "not readable (it is a folder)"),
+    (replaced('"dots.csv"', '"."'), "not readable (it is a folder)"),
+    (replaced('"dots.csv"', '"sensor.toml"'), "line 1: the header is", "expected x,y,z,size"),
+    *(
+        (
+            replaced(old, f'"{name}"'),
+            f'= "{name}"; expected a path relative to the sensor file, of a file in its folder or below',
+        )
+        for old in ('"dots.csv"', '"rest.png"')
+        for name in ("/etc/passwd", "../sensor.toml", "a/../../b", "/etc/*", "C:/dots.csv")
+    ),
+    (replaced(CAP, GRID.replace("grid.npz", "/etc/passwd")), '[membrane] file = "/etc/passwd"; expected a path relative'),
+]
+
+
+@pytest.mark.parametrize("text, words", [(text, words) for text, *words in HOSTILE])
+def test_what_no_sensor_file_says_is_refused_in_one_line(tmp_path, text, words):
+    message = refusal(write(tmp_path, text))
+    assert message.isprintable() and str(tmp_path) in message and len(message) < len(str(tmp_path)) * 3 + 500
+    for word in words:
+        assert word in message
+
+
+def test_a_byte_order_mark_is_passed_over(tmp_path):
+    path = write(tmp_path)
+    path.write_text(GOOD, encoding="utf-8-sig")
+    assert Sensor.from_file(path).name == "fingertip"
+    path.write_bytes(GOOD.encode() + b"#\0")
+    assert "holds NUL" in refusal(path)
+
+
+def test_a_listed_file_that_is_none_is_not_quoted(tmp_path):
+    path = write(tmp_path, dots=["root:x:0:0:root:/root:/bin/bash"])
+    assert "the header is 31 characters that name no columns" in refusal(path)
+
+
+def test_dots_that_lie_on_one_another_are_named_with_both_lines(tmp_path):
+    message = refusal(write(tmp_path, dots=[*DOTS, DOTS[2]]))
+    assert f"{tmp_path / 'dots.csv'}, line 5: the dot at [3.0, 0.0, 13.7] lies on that" in message and "line 3" in message
+    sensor = Sensor.from_file(write(tmp_path / "b"))
+    twice = dataclasses.replace(sensor.markers, positions=np.repeat(sensor.markers.positions, 2, 0), sizes=["small"] * 6)
+    with pytest.raises(MembraneError, match=r"markers.positions\[1\] .* lies on that .*remove one"):
+        dataclasses.replace(sensor, markers=twice)
+
+
+def test_more_dots_than_can_be_followed_are_refused_by_their_number(tmp_path):
+    assert "10000 dots; expected at most 2000" in refusal(write(tmp_path, dots=[DOTS[0], *[DOTS[1]] * 10000]))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_too_few_dots_are_refused_by_the_reconstructor_by_their_number(tmp_path, count):
+    path = write(tmp_path, replaced('rest_image = "rest.png"\n', ""), DOTS[: 1 + count])
+    with pytest.raises(MembraneError) as caught:
+        Reconstructor.from_file(path)
+    assert (
+        str(caught.value).startswith(f"{path}: ") and f"{count} dots" in str(caught.value) and "at least 8" in str(caught.value)
+    )
+
+
+def test_a_rest_image_of_another_size_is_refused_before_its_pixels_are_decoded(tmp_path):
+    path = write(tmp_path)
+    Image.new("1", (5000, 6000)).save(tmp_path / "rest.png")
+    whole = (tmp_path / "rest.png").read_bytes()
+    (tmp_path / "rest.png").write_bytes(whole[: len(whole) // 2])
+    assert "rest_image is 5000 x 6000 px and image_size [32, 24]" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    "shape, words", [((3, 9, 3), "3 x 9 lines; expected 4 or more"), ((600, 600, 3), "expected at most 262144")]
+)
+def test_grids_too_small_or_too_large_to_interpolate_are_refused(tmp_path, shape, words):
+    path = write(tmp_path, with_membrane("grid"))
+    x, y = np.meshgrid(*(np.linspace(-9, 9, count) for count in shape[:2]), indexing="ij")
+    fixed = np.pad(np.zeros([count - 2 for count in shape[:2]], bool), 1, constant_values=True)
+    np.savez_compressed(tmp_path / "grid.npz", vertices=np.stack([x, y, 14 + 0 * x], -1), fixed=fixed)
+    assert words in refusal(path) and str(tmp_path) in refusal(path)

@@ -19,6 +19,8 @@ from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate import dataset
 from torchmembrane.simulate.frames import SimulatedFrames, SimulatedFrameTable
 from torchmembrane.simulate.indenters import Sphere
+from torchmembrane.simulate.mesh_indenter import MeshIndenter
+from torchmembrane.simulate.pattern import Dots
 from torchmembrane.simulate.simulator import Simulator
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -212,6 +214,14 @@ def test_a_folder_of_another_look_or_sensor_is_refused(sensor_path, tmp_path, ca
         (("--random", "3", "--depth", "1"), "--depth"),
         (("--random", "3", "--indenter", "cone"), "cone"),
         (("--indenter", "sphere", "--radius", "3", "--depth", "30"), "press"),
+        ((*SPHERE, "--direction=0,0,-1"), "--direction 0,0,-1: it would push the membrane from within"),
+        ((*SPHERE, "--slide", "1e300,0,0"), "--slide 1e+300,0,0: no press of this membrane; expected lengths from"),
+        (("--indenter", "sphere", "--radius", "1e300", "--depth", "1"), "--radius 1e+300: no press"),
+        (("--indenter", "sphere", "--radius", "3", "--depth", "1e300"), "--depth 1e+300: no press"),
+        ((*SPHERE, "--increment", "1e-9"), "--increment 1e-09: no press"),
+        ((*SPHERE, "--dots", "5,9"), "--dots, radii of small and large dots: dots 0 and"),
+        ((*SPHERE, "--name", "sensor_rest"), "--name sensor_rest"),
+        (("--indenter", "/etc/passwd", "--depth", "1"), "/etc/passwd: no mesh by its name; expected a closed mesh"),
     ],
 )
 def test_wrong_calls_give_2_and_a_message_and_no_folder(sensor_path, tmp_path, capsys, options, expected):
@@ -274,3 +284,47 @@ def test_presets_are_what_their_design_makes():
     assert np.array_equal(made.markers.positions, kept.markers.positions)
     assert np.abs(made.markers.rest_image - kept.markers.rest_image).max() < 2 / 255
     assert torch.equal(made.membrane.rest, kept.membrane.rest) and made.material == kept.material
+
+
+@pytest.mark.parametrize(
+    "option, expected",
+    [
+        ("--name=../../evil", "a file's name"),
+        ("--name=/tmp/evil", "a file's name"),
+        ("--name=.hidden", "a file's name"),
+        ("--noise=nan", "a number from 0 to 200"),
+        ("--noise=-1", "a number from 0 to 200"),
+        ("--highlight=5", "a number from 0 to 1"),
+        ("--blur=1000", "a number from 0 to 20"),
+        ("--turn=nan", "a number from -360 to 360"),
+        ("--friction=1e9", "a number from 0 to 10"),
+        ("--grid=100000,100000", "each at most 129"),
+        ("--frames=9999999999999", "a whole number"),
+    ],
+)
+def test_values_that_make_no_sense_name_the_option_and_what_was_expected(sensor_path, tmp_path, capsys, option, expected):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["simulate", sensor_path, *SPHERE, "--out", str(tmp_path / "out"), option])
+    *_, last = capsys.readouterr().err.strip().splitlines()
+    assert ended.value.code == 2 and option.partition("=")[0] in last and expected in last
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"solid\n", b"x" * 84, bytes(80) + b"\xff" * 4, b"ply\nformat ascii 1.0\nelement vertex 9"]
+)
+@pytest.mark.parametrize("kind", ["stl", "obj", "ply"])
+def test_a_damaged_mesh_is_refused_in_one_line(tmp_path, kind, content):
+    path = tmp_path / f"part.{kind}"
+    path.write_bytes(content)
+    with pytest.raises(MembraneError) as caught:
+        MeshIndenter.read(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value) and "expected a closed mesh" in str(caught.value)
+
+
+def test_dots_may_be_as_large_as_do_not_overlap():
+    sensor = preset("fingertip")
+    nearest = np.sort(np.linalg.norm(sensor.markers.positions[:, None] - sensor.markers.positions, axis=-1), 1)[:, 1].min()
+    assert Dots.of(sensor, [0.49 * nearest, 0.49 * nearest]).radii.max() < nearest / 2
+    with pytest.raises(MembraneError, match="overlap"):
+        Dots.of(sensor, [0.51 * nearest, 0.51 * nearest])

@@ -9,7 +9,7 @@ class MembraneError(ValueError):
         >>> spherical_cap(rim_radius=12.0, height=-1.0, base_z=5.0)
         Traceback (most recent call last):
         ...
-        torchmembrane.errors.MembraneError: spherical_cap: height = -1.0; expected a finite positive number
+        torchmembrane.errors.MembraneError: spherical_cap: height = -1.0; expected a finite positive number, from 1e-06 to 1e+06
     """
 
 

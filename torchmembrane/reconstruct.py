@@ -15,7 +15,7 @@ from .estimators.choice import ESTIMATORS, Settings, estimator_of
 from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
 from .estimators.precision import PRECISIONS, check_precision, full_precision
-from .estimators.start import checked_previous
+from .estimators.start import checked_previous, solved_from
 from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
@@ -117,7 +117,11 @@ class Reconstructor(nn.Module):
     @classmethod
     def from_file(cls, path: str | Path, estimator: str = "force-balance", **options: Any) -> "Reconstructor":
         """The reconstructor of a sensor file; options as for the class."""
-        return cls(Sensor.from_file(path), estimator, **options)
+        sensor = Sensor.from_file(path)
+        try:
+            return cls(sensor, estimator, **options)
+        except MembraneError as error:
+            raise MembraneError(f"{path}: {error}") from error
 
     @property
     def rest_pixels(self) -> Tensor:
@@ -138,10 +142,7 @@ class Reconstructor(nn.Module):
         """Image files as a batch `[B, 1, height, width]` in 0..1, in this module's precision and on its device."""
         grey = []
         for path in paths:
-            try:
-                grey.append(grey_batch(read_image(path), self.image_size, "rgb", self.rest_pixels))
-            except MembraneError as error:
-                raise MembraneError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+            grey.append(grey_batch(read_image(path, self.image_size), self.image_size, "rgb", self.rest_pixels))
         return torch.cat(grey)
 
     def forward(
@@ -171,9 +172,8 @@ class Reconstructor(nn.Module):
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
             grey = self.grey(images)
-            if previous is not None:
-                previous = self._checked(previous, len(grey))
-            return self.reconstruct_grey(grey, previous, rest_pixels, pressure)
+            before = self._checked(previous, len(grey))
+            return solved_from(before, lambda p, g, q: self.reconstruct_grey(g, p, rest_pixels, q), grey, pressure)
 
     def grey(self, images: Tensor | np.ndarray) -> Tensor:
         """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
@@ -212,9 +212,8 @@ class Reconstructor(nn.Module):
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
             flow = self.observer.from_pixels(pixels, confidence, rest_pixels)
-            if previous is not None:
-                previous = self._checked(previous, len(flow.status))
-            return self._solve(flow, previous, pressure)
+            before = self._checked(previous, len(flow.status))
+            return solved_from(before, lambda p, q, *rows: self._solve(MarkerFlow(*rows), p, q), pressure, *flow)
 
     def _solve(self, flow: MarkerFlow, previous: Reconstruction | None, pressure: Tensor | float | None) -> Reconstruction:
         usable, confidence, covariance, status = self.observer.judge(*flow)
@@ -332,10 +331,13 @@ class Reconstructor(nn.Module):
         noise = torch.linalg.cholesky(2 * self.observer.rest_covariance).mT @ turn
         observation = self._gauged(self.observation(pixels - self.rest_pixels, result.confidence), pressure)
         state = result.vertices, result.pressure, result.camera_motion
-        return self.estimator.standard_deviations(*self.start(*state), observation, noise)
+        found = self.estimator.standard_deviations(*self.start(*state), observation, noise)
+        return found.known(result.vertices.flatten(1).isfinite().all(1))
 
-    def _checked(self, previous: Reconstruction, frames: int) -> Reconstruction:
+    def _checked(self, previous: Reconstruction | None, frames: int) -> Reconstruction | None:
         """A previous result, refused where it cannot be one of these frames'."""
+        if previous is None:
+            return None
         if not self.estimator.takes_start:
             raise MembraneError(f"Reconstructor: {self.estimator_name} starts from rest always; leave previous out")
         return checked_previous(previous, frames, self.estimator.membrane, self.rest_pixels, self.sensor.length_unit)

@@ -11,8 +11,10 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
+from ..io.bounded import read_text
 from ..markers.placement import rim_mask
 from ..sensor.sensor import Sensor
+from ..sensor.toml import MOST_DOTS
 from ..surface.membrane import Membrane
 from ..surface.topology import rim_loop
 from .fit import outline_centres
@@ -21,6 +23,7 @@ from .surface import dot_outlines, fine_surface, surface_projection
 RADIUS = {"small": 0.16, "large": 0.27}  # of dots, over their spacing
 MARGIN = 0.6  # of a pitch, that a lattice keeps from the rim's outline
 NEWTON_STEPS, AIMS = 3, 2
+MOST_BYTES = 2**20  # of a file of wanted pixels
 
 
 class FabricationLayout(NamedTuple):
@@ -59,9 +62,10 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
         >>> pixels.shape, sizes[:3]
         ((32, 2), ['large', 'small', 'large'])
     """
-    if not pitch >= 4:
-        raise MembraneError(f"calibrate layout: pitch = {pitch}; expected 4 px or more, so that dots are distinguishable")
     width, height = sensor.camera.image_size
+    if not 4 <= pitch <= width + height:
+        expected = f"4 px or more, so that dots are distinguishable, at most {width + height}"
+        raise MembraneError(f"calibrate layout: pitch = {pitch}; expected {expected}")
     centre = sensor.camera.centre.numpy()
     reach = int(max(width, height) / pitch)
     i, j = (a.ravel() for a in np.mgrid[-reach : reach + 1, -reach : reach + 1])
@@ -72,6 +76,8 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
     inside = np.all((around >= 0) & (around < [width, height]), axis=-1)
     u, v = np.where(inside[..., None], around, 0).transpose(2, 0, 1)
     kept = (inside & mask[v, u]).all(1)
+    if not kept.any():
+        raise MembraneError(f"calibrate layout: pitch = {pitch}; expected less, so that dots lie within the rim's outline")
     return pixels[kept], np.where((i + j) % 2 == 0, "large", "small")[kept].tolist()
 
 
@@ -89,7 +95,7 @@ def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> F
         The dots to be made.
 
     Raises:
-        MembraneError: the ray of a pixel misses the surface; the first such pixel is named.
+        MembraneError: the ray of a pixel misses the surface, the first such pixel is named; or more dots than a sensor lists.
 
     Example:
         >>> sensor = Sensor.from_file("examples/sensor.toml")
@@ -99,6 +105,8 @@ def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> F
                [360., 240.]])
     """
     wanted = aimed = np.asarray(pixels, float)
+    if not 1 <= len(wanted) <= MOST_DOTS:
+        raise MembraneError(f"calibrate layout: {len(wanted)} dots; expected at most {MOST_DOTS}, as a sensor file lists")
     surface = fine_surface(sensor)
     spacing = (float(surface.rest_area.sum()) / len(wanted)) ** 0.5
     radii = spacing * np.array([RADIUS[size] for size in sizes])
@@ -150,13 +158,14 @@ def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
         >>> pixels.tolist(), sizes
         ([[320.0, 240.0], [360.0, 240.0]], ['large', 'small'])
     """
+    text = read_text(path, MOST_BYTES, "CSV with the header u,v,size")
     try:
-        rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row]
+        rows = [row for row in csv.reader(text.splitlines()) if row]
         header, *body = rows
         right = [cell.strip() for cell in header] == ["u", "v", "size"]
         pixels = np.array([[float(u), float(v)] for u, v, _ in body])
         sizes = [size.strip() for _, _, size in body]
-    except (ValueError, OSError, UnicodeDecodeError) as error:
+    except (ValueError, csv.Error) as error:
         raise MembraneError(
             f"{path}: not readable ({error}); expected CSV with the header u,v,size and one line per dot"
         ) from error

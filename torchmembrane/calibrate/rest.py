@@ -1,5 +1,6 @@
 """Pose of the rest surface before the camera, and the dots on it, from one rest image (section 5.2)."""
 
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from torch.func import jacfwd, vmap
 
 from ..errors import MembraneError
 from ..markers.dots.pattern import measure_dots
+from ..markers.spacing import neighbours
 from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from .fit import Fit, fit, outliers, outline_centres, rotations, with_common_errors
@@ -17,6 +19,8 @@ from .surface import dot_outlines, fine_surface, frames_at, recalibrated, unit_s
 
 NAMES = ["tilt_x", "tilt_y", "tilt_z", "offset_x", "offset_y", "offset_z"]
 BIAS = 0.03  # px, outwards: of located dots on a shaded surface, the same for all of them (up to 0.026 px, docs/calibration.md)
+PRESSED = 4e-4  # of the image's diagonal: rms that neighbouring dots have in common of what no pose explains
+NEIGHBOURS = 6
 GUESS = 0.02  # radius of a dot before it is measured, over the surface's size
 
 
@@ -57,7 +61,8 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
         MembraneError: the sensor lists no dots, or fewer than 8 of them are found.
 
     Limitations:
-        The surface must have the designed shape; where it has another, use several views or a depth image.
+        The surface must have the designed shape; where it has another, or something presses it, a warning says so, unless
+        neighbouring dots move in common by less than `PRESSED` of the image's diagonal: use several views or a depth image.
 
     Example:
         >>> from dataclasses import replace
@@ -99,10 +104,39 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
         return (x - pivot.numpy()) @ rotation.T + pivot.numpy() + offset
 
     left = pixels - modelled(torch.from_numpy(found), torch.from_numpy(outlines)).numpy()
+    _warn_of_press(sensor, pixels[visible], left[visible])
     _, tangents = frames_at(surface, X)
     shifts = _nulling(sensor, move(outlines), rotation @ tangents, pixels, visible)
     moved = recalibrated(sensor, surface, move(surface.rest.numpy()), move(X) + shifts, sensor.markers.sizes, image)
     return RestFit(moved, NAMES, result.in_degrees(1), pixels, left, shifts)
+
+
+def common_residual(pixels: np.ndarray, residuals: np.ndarray) -> float:
+    """What neighbouring dots have in common of their residuals, rms, px: `sqrt(mean_d r_d . mean_n r_n)`, 0 where they differ.
+
+    Args:
+        pixels: `[D, 2]` px.
+        residuals: there, `[D, 2]` px.
+
+    Example:
+        >>> pixels = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), -1).reshape(-1, 2)
+        >>> common_residual(pixels, np.full((25, 2), 3.0)), common_residual(pixels, np.eye(25)[:, :2])
+        (4.242640687119285, 0.0)
+    """
+    around = residuals[neighbours(pixels, NEIGHBOURS)].mean(1)
+    return float(np.sqrt(max((residuals * around).sum(1).mean(), 0.0)))
+
+
+def _warn_of_press(sensor: Sensor, pixels: np.ndarray, residuals: np.ndarray) -> None:
+    """Say where residuals are a displacement of the surface, not errors of single dots."""
+    common, limit = common_residual(pixels, residuals), PRESSED * float(np.hypot(*sensor.camera.image_size))
+    if common > limit:
+        warnings.warn(
+            f"calibrate rest: neighbouring dots lie off the model together, {common:.2f} px rms; expected at most {limit:.2f}: "
+            "something presses the membrane in this image, or its shape is not the designed: give an image without contact, "
+            "or use views or depth",
+            stacklevel=3,
+        )
 
 
 def shading_bias(sensor: Sensor, pixels: np.ndarray) -> np.ndarray:

@@ -12,11 +12,19 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import expect
+from ..io.images import MOST_PIXELS
 from .distortion import fisheye_direction, fisheye_image, pinhole_direction, pinhole_image
 from .mode import Mode
-from .ports import Layers, Port, apparent_points, check_ports, layers_of, refract
+from .ports import MOST_INDEX, Layers, Port, apparent_points, check_ports, layers_of, refract
 
 COEFFICIENTS = {"pinhole": 5, "fisheye": 4}  # k1 k2 p1 p2 k3 | k1 k2 k3 k4
+LONGEST_SIDE = 16384
+"""Of an image, px."""
+FOCAL = (1.0, 1e6)
+"""Least and greatest, px."""
+MOST_ASPECT = 20.0
+"""Of the two focal lengths to one another."""
+FARTHEST_CENTRE, MOST_DISTORTION = 1e6, 1e6
 
 
 class Rays(NamedTuple):
@@ -94,7 +102,9 @@ class Camera(nn.Module):
     ) -> None:
         super().__init__()
         _check_lens(model, image_size, focal, centre, distortion)
-        expect(1 <= medium_index < math.inf, "Camera: medium_index", medium_index, "1 (air) or more; water has 1.33")
+        expect(
+            1 <= medium_index <= MOST_INDEX, "Camera: medium_index", medium_index, "1 (air) or more, at most 5; water has 1.33"
+        )
         check_ports("Camera", ports)
         self.model = model
         self.image_size = (int(image_size[0]), int(image_size[1]))
@@ -229,9 +239,17 @@ def _check_lens(
     expect(len(focal) == 2, "Camera: focal", list(focal), "two values, along u and v (repeat it for square pixels)")
     expect(len(centre) == 2, "Camera: centre", list(centre), "two values, u and v")
     whole = len(image_size) == 2 and all(int(side) == side >= 1 for side in image_size)
-    expect(whole, "Camera: image_size", list(image_size), "width and height, whole pixels, 1 or more")
+    small = whole and max(image_size) <= LONGEST_SIDE and image_size[0] * image_size[1] <= MOST_PIXELS
+    expected = f"width and height, whole pixels, 1 or more, each at most {LONGEST_SIDE}, together at most {MOST_PIXELS} px"
+    expect(small, "Camera: image_size", list(image_size), expected)
     most = "k1 k2 p1 p2 k3" if model == "pinhole" else "k1 k2 k3 k4"
     expect(len(distortion) <= COEFFICIENTS[model], "Camera: distortion", list(distortion), f"for a {model} at most {most}")
     for name, values in (("focal", focal), ("centre", centre), ("distortion", distortion)):
         expect(all(map(math.isfinite, values)), f"Camera: {name}", list(values), "finite numbers")
-    expect(min(focal) > 0, "Camera: focal", list(focal), "positive values (without eq. 1's sign)")
+    least, most_focal = FOCAL
+    expected = f"positive values (without eq. 1's sign), from {least:g} to {most_focal:g} px"
+    expect(min(focal) >= least and max(focal) <= most_focal, "Camera: focal", list(focal), expected)
+    alike = max(focal) <= MOST_ASPECT * min(focal)
+    expect(alike, "Camera: focal", list(focal), f"two values, the larger at most {MOST_ASPECT:g} times the smaller")
+    for name, values, limit in (("centre", centre, FARTHEST_CENTRE), ("distortion", distortion, MOST_DISTORTION)):
+        expect(max(map(abs, values), default=0) <= limit, f"Camera: {name}", list(values), f"values up to {limit:g}")

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..errors import expect
 
+MOST_INDEX, FARTHEST = 5.0, 1e6  # refractive index; length unit
 PORT_STEPS = 10  # Newton steps to the refracted ray of a point
 
 
@@ -144,8 +145,8 @@ def check_ports(owner: str, ports: Sequence[Sequence[float]]) -> None:
         finite = len(port) == 3 and all(map(math.isfinite, port))
         expect(finite, name, list(port), "distance, thickness, index, all finite")
         distance, thickness, index = port
-        expect(thickness > 0, f"{name}.thickness", thickness, "a positive length")
-        expect(index >= 1, f"{name}.index", index, "1 (air) or more; Plexiglas has 1.49")
+        expect(0 < thickness <= FARTHEST, f"{name}.thickness", thickness, f"a positive length, at most {FARTHEST:g}")
+        expect(1 <= index <= MOST_INDEX, f"{name}.index", index, "1 (air) or more; Plexiglas has 1.49")
         order = f"more than 0 and at least {face}, where the layer before it ends: list ports in order from the camera"
-        expect(distance > 0 and distance >= face * (1 - 1e-12), f"{name}.distance", distance, order)
+        expect(0 < distance <= FARTHEST and distance >= face * (1 - 1e-12), f"{name}.distance", distance, order)
         face = distance + thickness

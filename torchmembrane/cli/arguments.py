@@ -1,6 +1,7 @@
 """Arguments that several commands take, and types that turn an argument's text into a value or say what was expected."""
 
 import math
+import re
 from argparse import Action, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -76,10 +77,38 @@ def not_negative(text: str) -> float:
     return value
 
 
+def number_from(least: float, most: float, expected: str = "a number") -> Callable[[str], float]:
+    """The type of a number within bounds.
+
+    >>> number_from(0, 1)("0.5")
+    0.5
+    """
+    said = f"{expected} from {least:g} to {most:g}"
+
+    def within(text: str) -> float:
+        value: float = _values(text, float, 1, said)[0]
+        if not least <= value <= most:
+            raise ArgumentTypeError(f"{text!r}; expected {said}")
+        return value
+
+    return within
+
+
+def file_name(text: str) -> str:
+    """A name for files of an output folder: nothing that leads out of it or hides there.
+
+    >>> file_name("press 1")
+    'press 1'
+    """
+    if not re.fullmatch(r"(?!\.)[^/\\:*?\"<>|]{1,100}", text) or not text.isprintable():
+        raise ArgumentTypeError(f"{text!r}; expected a file's name of at most 100 characters, without folder")
+    return text
+
+
 def count(text: str) -> int:
     """A whole number, 1 or more."""
-    if not text.isdigit() or int(text) < 1:
-        raise ArgumentTypeError(f"{text!r}; expected a whole number, 1 or more")
+    if not re.fullmatch(r"[0-9]{1,12}", text) or int(text) < 1:
+        raise ArgumentTypeError(f"{text[:40]!r}; expected a whole number, 1 or more, of at most 12 digits")
     return int(text)
 
 
@@ -102,13 +131,20 @@ def positive_pair(expected: str) -> Callable[[str], list[float]]:
     return lambda text: _values(text, positive, 2, expected)
 
 
-def count_pair(expected: str) -> Callable[[str], list[int]]:
+def count_pair(expected: str, most: int = 1000) -> Callable[[str], list[int]]:
     """The type of two whole numbers, 1 or more; `expected` says which in an error.
 
     >>> count_pair("two counts, COLUMNS,ROWS")("11,8")
     [11, 8]
     """
-    return lambda text: _values(text, count, 2, expected)
+
+    def pair(text: str) -> list[int]:
+        values = _values(text, count, 2, expected)
+        if max(values) > most:
+            raise ArgumentTypeError(f"{text!r}; expected {expected}, each at most {most}")
+        return values
+
+    return pair
 
 
 def numbers(expected: str) -> Callable[[str], list[int]]:

@@ -28,4 +28,7 @@ def build_reconstructor(sensor: Sensor, arguments: Namespace) -> Reconstructor:
             f"pass --estimator {fitting}"
         )
     options: Any = {"settings": kind(**given), "model": arguments.energy, "locator": arguments.locator}
-    return Reconstructor(sensor, arguments.estimator, **options)
+    try:
+        return Reconstructor(sensor, arguments.estimator, **options)
+    except MembraneError as error:
+        raise MembraneError(f"{arguments.sensor}: {error}") from error

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import MembraneError
-from .arguments import add_command, add_sensor, count, positive, seed
+from .arguments import add_command, add_sensor, count, number_from, seed
+from .choices import MOST_DECIBEL
 
 if TYPE_CHECKING:
     from ..io.spec_sheet import SpecSheet
@@ -34,7 +35,7 @@ def add_parser(commands: Any) -> None:
     add("--accuracy", action="store_true", help="also what to expect of it, from simulated presses")
     add("--seed", type=seed, help="of presses and noise of --accuracy (default: 0)")
     noise = "of images of --accuracy, white over the noise's standard deviation (default: as in the rest image, else 40)"
-    add("--noise", metavar="DB", type=positive, help=noise)
+    add("--noise", metavar="DB", type=number_from(0, MOST_DECIBEL), help=noise)
     add("--jobs", metavar="J", type=count, help="processes of --accuracy (default: all cores)")
 
 
@@ -54,7 +55,7 @@ def run(arguments: Namespace) -> int:
         reconstructor = Reconstructor(sensor, check_rest=False)
         reconstructor.observer.check_rest(sensor.name)
     except MembraneError as error:
-        problem = error
+        problem = MembraneError(f"{arguments.sensor}: {error}")
     frame = None if reconstructor is None else rest_frame(reconstructor)
     print("\n".join(described(sensor, reconstructor, frame)), flush=True)
     sheet = _sheet(sensor, arguments) if arguments.accuracy and not problem else None

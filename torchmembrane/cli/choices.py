@@ -16,5 +16,7 @@ INDENTERS = ("sphere", "cylinder", "wedge", "box", "plane")
 LEGS = ("push", "slide", "release")
 SIMULATION_FORMATS = ("png", "parquet")
 HIGHLIGHT, BLUR = 0.0, 0.6
+MOST_BLUR, MOST_DECIBEL = 20.0, 200.0
+MOST_FRICTION, MOST_LINES = 10.0, 129
 
 PORTS = ("port_distance", "port_thickness", "port_index", "medium_index")

@@ -1,6 +1,8 @@
 """What `torchmembrane simulate` does: one press, the frames along a path, or a data set of random presses."""
 
+import math
 from argparse import Namespace
+from collections.abc import Iterable
 from contextlib import nullcontext
 from itertools import chain
 from pathlib import Path
@@ -18,6 +20,18 @@ from ..simulate.frames import Video, open_frames
 from ..simulate.indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge
 from ..simulate.mesh_indenter import MeshIndenter
 from ..simulate.simulator import Simulator, Stroke
+
+LENGTHS = {
+    "radius": (1e-3, 100.0),
+    "sides": (1e-3, 100.0),
+    "depth": (1e-6, 2.0),
+    "slide": (0.0, 2.0),
+    "aim": (0.0, 100.0),
+    "increment": (1e-4, 2.0),
+}
+"""Least and greatest over the surface's size."""
+OUTWARDS = 0.3
+"""Cosine between a press and the outward normal where it first touches, from which on it comes from within."""
 
 
 def simulate(arguments: Namespace) -> int:
@@ -42,6 +56,7 @@ def _random(arguments: Namespace, simulator: Simulator) -> int:
 
 
 def _single(arguments: Namespace, simulator: Simulator) -> int:
+    _refuse_lengths(arguments, simulator.membrane.size)
     stroke = _stroke(arguments, simulator)
     if arguments.path:
         return _film(arguments, simulator, stroke)
@@ -76,15 +91,36 @@ def _film(arguments: Namespace, simulator: Simulator, stroke: Stroke) -> int:
     return 0
 
 
+def _refuse_lengths(arguments: Namespace, size: float) -> None:
+    """Refuse lengths that no press of a surface of this size can have, by the option."""
+    for name, (least, most) in LENGTHS.items():
+        if (value := getattr(arguments, name)) is None:
+            continue
+        given = np.atleast_1d(np.asarray(value, float))
+        lengths = np.array([math.hypot(*given)]) if name in ("slide", "aim") else given
+        if not ((lengths >= least * size) & (lengths <= most * size)).all():
+            expected = f"{least * size:.3g} to {most * size:.3g}, as the surface's size is {size:.3g}"
+            raise MembraneError(f"--{name} {_listed(given)}: no press of this membrane; expected lengths from {expected}")
+
+
 def _stroke(arguments: Namespace, simulator: Simulator) -> Stroke:
     membrane = simulator.membrane
     aim = membrane.rest[membrane.fixed].mean(0).numpy() if arguments.aim is None else np.array(arguments.aim)
     direction = np.array(arguments.direction)
-    if not np.linalg.norm(direction) > 0:
-        raise MembraneError("--direction: has no length; expected X,Y,Z, the side from which the indenter comes")
+    if not 1e-6 < np.abs(direction).max() < 1e6:
+        raise MembraneError(
+            f"--direction {_listed(direction)}: expected X,Y,Z with a length, the side that the indenter comes from"
+        )
     slide = np.zeros(3) if arguments.slide is None else np.array(arguments.slide)
     turn, friction = np.deg2rad(arguments.turn), arguments.friction
-    return stroke_to(simulator, _body(arguments), aim, -direction, arguments.depth, turn, slide, friction)
+    stroke = stroke_to(simulator, _body(arguments), aim, -direction, arguments.depth, turn, slide, friction)
+    touched = int(stroke.indenter.distance(membrane.rest).argmin())
+    if float(membrane.rest_normals[touched] @ torch.from_numpy(stroke.travel)) > OUTWARDS:
+        raise MembraneError(
+            f"--direction {_listed(arguments.direction)}: it would push the membrane from within; "
+            "expected the side that the indenter comes from, outside, as 0,0,1"
+        )
+    return stroke
 
 
 def _body(arguments: Namespace) -> Indenter:
@@ -102,6 +138,10 @@ def _body(arguments: Namespace) -> Indenter:
     if not Path(kind).is_file():
         raise MembraneError(f"--indenter {kind!r}: neither a file nor one of {', '.join(KINDS)}")
     return MeshIndenter.read(kind)
+
+
+def _listed(values: Iterable[float]) -> str:
+    return ",".join(f"{value:g}" for value in values)
 
 
 def _needed(arguments: Namespace, name: str) -> Any:

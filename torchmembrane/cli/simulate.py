@@ -12,7 +12,8 @@ from .arguments import (
     add_sensor,
     count,
     count_pair,
-    not_negative,
+    file_name,
+    number_from,
     numbers,
     positive,
     positive_pair,
@@ -20,7 +21,18 @@ from .arguments import (
     some_of,
     vector,
 )
-from .choices import BLUR, HIGHLIGHT, INDENTERS, LEGS, PRESETS, SIMULATION_FORMATS
+from .choices import (
+    BLUR,
+    HIGHLIGHT,
+    INDENTERS,
+    LEGS,
+    MOST_BLUR,
+    MOST_DECIBEL,
+    MOST_FRICTION,
+    MOST_LINES,
+    PRESETS,
+    SIMULATION_FORMATS,
+)
 
 PURPOSE = "press a sensor's membrane and render its image, with the truth"
 EXAMPLES = f"""\
@@ -50,7 +62,7 @@ def add_parser(commands: Any) -> None:
     add = add_command(commands, "simulate", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     add("--out", metavar="DIR", type=Path, required=True, help="folder of frames: new, or of the same sensor and appearance")
-    add("--name", default="press", help="of a single press' files (default: %(default)s)")
+    add("--name", type=file_name, default="press", help="of a single press' files (default: %(default)s)")
     _add_press(add)
     _add_sequence(add)
     _add_appearance(add)
@@ -67,8 +79,11 @@ def _add_press(add: Add) -> None:
     direction = "the side that it comes from, seen from the point it aims at (default: %(default)s, straight at the camera)"
     add("--direction", metavar="X,Y,Z", type=vector, default="0,0,1", help=direction)
     add("--aim", metavar="X,Y,Z", type=vector, help="the point it moves to (default: the middle of the rim)")
-    add("--turn", metavar="DEGREES", type=float, default=0.0, help="about its direction (default: %(default)s)")
-    add("--friction", metavar="MU", type=not_negative, default=0.0, help="Coulomb's coefficient (default: %(default)s)")
+    add(
+        "--turn", metavar="DEGREES", type=number_from(-360, 360), default=0.0, help="about its direction (default: %(default)s)"
+    )
+    friction = number_from(0, MOST_FRICTION)
+    add("--friction", metavar="MU", type=friction, default=0.0, help="Coulomb's coefficient (default: %(default)s)")
 
 
 def _add_sequence(add: Add) -> None:
@@ -86,12 +101,17 @@ def _add_sequence(add: Add) -> None:
 
 
 def _add_appearance(add: Add) -> None:
-    add("--noise", metavar="DB", type=float, help="white over the noise's standard deviation (default: no noise)")
+    add(
+        "--noise",
+        metavar="DB",
+        type=number_from(0, MOST_DECIBEL),
+        help="white over the noise's standard deviation (default: no noise)",
+    )
     highlight = "specular over diffuse light (default: %(default)s)"
-    add("--highlight", metavar="SHARE", type=not_negative, default=HIGHLIGHT, help=highlight)
+    add("--highlight", metavar="SHARE", type=number_from(0, 1), default=HIGHLIGHT, help=highlight)
     blur = "defocus, standard deviation (default: %(default)s)"
-    add("--blur", metavar="PX", type=not_negative, default=BLUR, help=blur)
-    radii, grid = positive_pair("two radii, SMALL,LARGE"), count_pair("two counts of vertices, M,N")
+    add("--blur", metavar="PX", type=number_from(0, MOST_BLUR), default=BLUR, help=blur)
+    radii, grid = positive_pair("two radii, SMALL,LARGE"), count_pair("two counts of vertices, M,N", MOST_LINES)
     add("--dots", metavar="SMALL,LARGE", type=radii, help="their radii (default: 0.16 and 0.27 of their spacing)")
     missing = numbers("numbers of dots, as 0,17,18")
     add("--missing", metavar="I,J", type=missing, default=(), help="dots that are not painted, from 0")
@@ -112,6 +132,8 @@ def _check_options(arguments: Namespace) -> None:
     def given(*names: str) -> list[str]:
         return [name for name in names if getattr(arguments, name) is not None]
 
+    if arguments.name == "sensor_rest":
+        raise MembraneError("--name sensor_rest: so is the sensor's rest image called; expected another name")
     if arguments.random:
         if extra := given("depth", "slide", "path", "aim", "radius", "sides", "opening"):
             raise MembraneError(f"--{extra[0]} does not go with --random, whose presses are drawn")

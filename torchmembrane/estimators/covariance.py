@@ -36,6 +36,11 @@ class StandardDeviations(NamedTuple):
     force: Tensor
     pressure: Tensor
 
+    def known(self, frames: Tensor) -> "StandardDeviations":
+        """The same, NaN but in `frames [B]`, bool."""
+        rows = ((value, frames.reshape(-1, *(1,) * (value.ndim - 1))) for value in self)
+        return StandardDeviations(*(torch.where(row, value, torch.nan) for value, row in rows))
+
 
 class LinearisedSolution(NamedTuple):
     """A solution, linearised.

@@ -1,44 +1,108 @@
 """Images as grey values: 0.299 R + 0.587 G + 0.114 B in floating point, the same on every path."""
 
-from collections.abc import Sequence
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from ..errors import MembraneError
+from .bounded import DAMAGE, in_one_line, read_bytes
 
+FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
+MOST_PIXELS, MOST_IMAGE_BYTES = 2**25, 2**28
 GREY = (0.299, 0.587, 0.114)
 
 
-def read_image(path: str | Path) -> np.ndarray:
+def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
     """An image file's grey values, float32 `[height, width]` in 0..1.
 
     Grey of 8 and 16 bits and of float (TIFF), RGB, palette, CMYK; alpha is ignored, of several frames the first is taken.
-    EXIF orientation is not applied: pixels are the camera's own. Colour of 16 bits arrives as 8 bits (Pillow's limit).
+    EXIF orientation is not applied: pixels are the camera's own. Colour of 16 bits arrives as 8 bits (Pillow's limit). Whatever
+    the decoders remark is an error: checksums of PNG, corrupt or missing data in JPEG.
 
     Args:
-        path: the file.
+        path: a PNG, JPEG, BMP, TIFF or WebP file.
+        size: width and height that it must have, px; it is looked at before pixels are decoded.
 
     Returns:
         Grey values.
 
     Raises:
-        MembraneError: the file is missing, no image, truncated or damaged; names the file and the cause.
+        MembraneError: the file is missing, no image, too large, of another size, truncated or damaged; names the file and the
+            cause.
+
+    Limitations:
+        TIFF, BMP and WebP have no checksums, JPEG has none for what decodes without remark: damage that leaves the file well
+        formed is not seen here.
 
     Example:
         >>> image = read_image("examples/rest.png")
         >>> image.shape, str(image.dtype), float(image.max()) <= 1
         ((480, 640), 'float32', True)
     """
+    with _opened(path) as (image, content):
+        if size is not None and image.size != size:
+            raise MembraneError(
+                f"{path}: the image is {image.width} x {image.height} px, expected {size[0]} x {size[1]}: use images of this "
+                "sensor's camera; where its mode crops or bins them, say so in the file's [camera]"
+            )
+        image.load()
+        _refuse_damaged(image, content)
+        return to_grey(_array(image))
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """Width and height of an image file, px, without decoding its pixels.
+
+    Args:
+        path: as `read_image`.
+
+    Raises:
+        MembraneError: the file is missing, no image, or too large.
+
+    Example:
+        >>> image_size("examples/rest.png")
+        (640, 480)
+    """
+    with _opened(path) as (image, _):
+        return image.size
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[tuple[Image.Image, bytes]]:
+    """An image whose header is read, and its file's content; whatever fails inside is an error that names the file."""
+    path, expected = Path(path), "a whole PNG, JPEG or TIFF"
     try:
-        with Image.open(path) as image:
-            image.load()
-            return to_grey(_array(image))
-    except FileNotFoundError as error:
-        raise MembraneError(f"{path}: no such image; expected a readable image file, check the path") from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise MembraneError(f"{path}: not readable as an image ({error}); expected a whole PNG, JPEG or TIFF") from error
+        content = read_bytes(path, MOST_IMAGE_BYTES, "a readable image file")
+    except MembraneError as error:
+        raise MembraneError(str(error).replace("no such file", "no such image")) from error
+    try:
+        with Image.open(io.BytesIO(content), formats=FORMATS) as image:
+            if image.width * image.height > MOST_PIXELS:
+                raise ValueError(f"{image.width} x {image.height} px; at most {MOST_PIXELS} px are read")
+            yield image, content
+    except MembraneError as error:
+        raise MembraneError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    except (*DAMAGE, Image.DecompressionBombError) as error:
+        cause = "cannot identify image file" if isinstance(error, UnidentifiedImageError) else in_one_line(error)
+        raise MembraneError(f"{path}: not readable as an image ({cause}); expected {expected}") from error
+
+
+def _refuse_damaged(image: Image.Image, content: bytes) -> None:
+    """Refuse what decoding passes over: wrong checksums of a PNG, what libjpeg only remarks of a JPEG."""
+    if image.format == "PNG":
+        with Image.open(io.BytesIO(content), formats=FORMATS) as twin:
+            twin.verify()
+    if image.format in ("JPEG", "MPO") and image.mode in ("L", "RGB"):
+        from kornia_rs.io import ImageDecoder
+
+        try:
+            ImageDecoder().decode_gray8(content)
+        except Exception as error:  # it raises nothing narrower
+            raise ValueError("corrupt JPEG data") from error
 
 
 def mean_image(paths: Sequence[Path]) -> np.ndarray:
@@ -50,12 +114,15 @@ def mean_image(paths: Sequence[Path]) -> np.ndarray:
     Raises:
         MembraneError: as `read_image`; or the images differ in size.
     """
-    images = [read_image(path) for path in paths]
-    for path, image in zip(paths, images, strict=True):
-        if image.shape != images[0].shape:
-            sizes = ["{1} x {0}".format(*shape) for shape in (image.shape, images[0].shape)]
+    first = image_size(paths[0])
+    for path in paths[1:]:
+        if (size := image_size(path)) != first:
+            sizes = ["{} x {}".format(*each) for each in (size, first)]
             raise MembraneError(f"{path} is {sizes[0]} px; expected {sizes[1]} as {paths[0]}: give images of one camera mode")
-    return np.asarray(np.mean(images, 0, dtype=np.float64)).astype(np.float32)
+    total = np.zeros(first[::-1])
+    for path in paths:
+        total += read_image(path, first)
+    return (total / len(paths)).astype(np.float32)
 
 
 def to_grey(array: np.ndarray) -> np.ndarray:
@@ -87,8 +154,10 @@ def to_grey(array: np.ndarray) -> np.ndarray:
     else:
         raise MembraneError(f"to_grey: values of type {array.dtype}; expected uint8, uint16 or float in 0..1")
     if array.ndim == 3:
-        array = array.astype(np.float64)
-        array = GREY[0] * array[..., 0] + GREY[1] * array[..., 1] + GREY[2] * array[..., 2]
+        red, green, blue = (array[..., c] for c in range(3))
+        array = GREY[0] * red.astype(np.float64)
+        array += GREY[1] * green.astype(np.float64)
+        array += GREY[2] * blue.astype(np.float64)
     return (array.astype(np.float64) / white).astype(np.float32)
 
 

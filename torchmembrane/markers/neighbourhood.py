@@ -87,7 +87,9 @@ class Neighbourhood(nn.Module):
         """Squared residuals `[B, D, k]` of the neighbours, and the scale `[B, D, 1]` up to which they are credible."""
         linear = torch.einsum("bdij,dkj->bdki", fit[1], self.offset)
         squared = (u - fit[0][:, :, None] - linear).square().sum(-1)
-        median = weighted_median(squared[..., None], prior).sqrt()
+        median = (
+            weighted_median(squared[..., None], prior).clamp_min(1e-12).sqrt()
+        )  # all of a neighbourhood lost: no slope at 0
         return squared, tolerance + 1.5 * median.clamp(max=3 * tolerance)
 
 

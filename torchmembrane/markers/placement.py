@@ -81,6 +81,8 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS
     built: Locator
     if markers.kind == "dots" and markers.positions is not None:
         positions = np.asarray(markers.positions, dtype=float)
+        if len(positions) < FEWEST_MARKERS:
+            raise MembraneError(f"sensor {sensor.name!r}: {len(positions)} dots; expected at least {FEWEST_MARKERS}: list more")
         pattern = _listed_pattern(sensor, positions)
         anchors = anchors[np.isfinite(anchors).all(1)]
         built = of_dots(pattern, (width, height), markers.polarity, anchors)

@@ -3,23 +3,28 @@
 Lengths are in the sensor's unit, in the camera's frame. Pressures are in hPa, as in the file.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..camera.model import Camera
 from ..errors import MembraneError, expect
 from ..io.images import read_image, to_grey
 from ..pose import Pose
 from ..surface import shapes
+from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
 
 OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, in the surface's size
 METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}  # one metre in the length unit
+MOST_PRESTRETCH, MOST_C2_RATIO = 10.0, 1e3
+POSITIVE = {"shear_modulus": (1e-6, 1e12), "thickness": (1e-6, 1e4), "pressure": (1e-3, 1e6), "volume": (1e-12, 1e15)}
+"""What such a quantity of a membrane can be, in the file's units with any of the length units."""
+LEAST_APART = 1e-3  # of two dots, in the surface's size
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 SHAPES_BY_NUMBERS = {
     "spherical_cap": ("rim_radius", "height", "base_z"),
@@ -56,10 +61,12 @@ class Material:
 
     def __post_init__(self) -> None:
         expect(self.model in MODELS, "material model", self.model, f"one of {', '.join(MODELS)}")
-        expect(1 <= self.prestretch < math.inf, "prestretch", self.prestretch, "1 (unstretched) or more")
+        known = 1 <= self.prestretch <= MOST_PRESTRETCH
+        expect(known, "prestretch", self.prestretch, f"1 (unstretched) or more, at most {MOST_PRESTRETCH:g}")
         if self.model == "mooney_rivlin":
-            right = self.c2_ratio is not None and 0 <= self.c2_ratio < math.inf
-            expect(right, "c2_ratio", self.c2_ratio, "C2 / C1, 0 or more, as model is mooney_rivlin: add it")
+            right = self.c2_ratio is not None and 0 <= self.c2_ratio <= MOST_C2_RATIO
+            expected = f"C2 / C1, from 0 to {MOST_C2_RATIO:g}, as model is mooney_rivlin: add it"
+            expect(right, "c2_ratio", self.c2_ratio, expected)
         else:
             expect(self.c2_ratio is None, "c2_ratio", self.c2_ratio, f"none, as model is {self.model}: remove it")
         _expect_positive(shear_modulus=self.shear_modulus, thickness=self.thickness)
@@ -138,8 +145,10 @@ class Markers:
             expect(self.sizes is None, "sizes", self.sizes, "none without positions")
             return
         positions = np.asarray(self.positions, dtype=np.float64)
-        right = positions.ndim == 2 and positions.shape[1] == 3 and len(positions) > 0 and bool(np.isfinite(positions).all())
-        expect(right, "positions", f"an array {list(positions.shape)}", "[D, 3], finite, D at least 1")
+        right = positions.ndim == 2 and positions.shape[1] == 3 and len(positions) > 0
+        right = right and bool((np.abs(positions) <= FARTHEST).all())
+        expected = f"[D, 3], finite, up to {FARTHEST:g}, D at least 1"
+        expect(right, "positions", f"an array {list(positions.shape)}", expected)
         sizes = ["small"] * len(positions) if self.sizes is None else list(self.sizes)
         right = len(sizes) == len(positions) and set(sizes) <= {"small", "large"}
         expect(right, "sizes", sizes, f"{len(positions)} times 'small' or 'large'")
@@ -231,6 +240,26 @@ class SensorParts(NamedTuple):
     tool: Pose | None = None
 
 
+def refuse_other_size(size: tuple[int, int], camera: Camera) -> None:
+    """Refuse a rest image that is neither of the camera's size nor, where it is in a mode, of the calibrated one.
+
+    Args:
+        size: of the image, width and height, px.
+        camera: the sensor's.
+
+    Raises:
+        MembraneError: with both sizes, and the remedy.
+    """
+    mode = camera.mode
+    if size == camera.image_size or (mode is not None and size == mode.image_size):
+        return
+    came = f"Sensor: rest_image is {size[0]} x {size[1]} px and image_size {list(camera.image_size)}"
+    if mode is None:
+        raise MembraneError(f"{came}; expected the same: where the camera's mode crops or bins, give crop and binning")
+    how = f"of crop {list(mode.crop)} and binning {list(mode.binning)}"
+    raise MembraneError(f"{came} {how}; expected the same, or the calibrated {list(mode.image_size)}")
+
+
 def refuse_off_surface(membrane: Membrane, positions: np.ndarray, names: Sequence[str]) -> None:
     """Refuse the first dot that is not near the rest surface.
 
@@ -252,6 +281,29 @@ def refuse_off_surface(membrane: Membrane, positions: np.ndarray, names: Sequenc
         )
 
 
+def refuse_coincident(membrane: Membrane, positions: np.ndarray, names: Sequence[str]) -> None:
+    """Refuse the first dot that lies on another one.
+
+    Args:
+        membrane: the rest surface.
+        positions: `[D, 3]`.
+        names: of the D dots, as the message begins.
+
+    Raises:
+        MembraneError: with the names and positions of both, and what was expected.
+    """
+    limit = LEAST_APART * membrane.size
+    pairs = cKDTree(positions).query_pairs(limit, output_type="ndarray")
+    if len(pairs):
+        i, j = pairs[np.lexsort(pairs.T)[0]]
+        raise MembraneError(
+            f"{names[j]} at {positions[j].tolist()} lies on that at {positions[i].tolist()} ({names[i]}); expected dots more "
+            f"than {limit:.3g} apart: remove one"
+        )
+
+
 def _expect_positive(**values: float | None) -> None:
     for name, value in values.items():
-        expect(value is None or 0 < value < math.inf, name, value, "a finite positive number, or leave it out")
+        low, high = POSITIVE[name]
+        expected = f"a finite positive number, from {low:g} to {high:g}, or leave it out"
+        expect(value is None or low <= value <= high, name, value, expected)

@@ -14,7 +14,17 @@ from ..camera.model import Camera
 from ..errors import MembraneError, expect
 from ..pose import Pose
 from ..surface.membrane import Membrane
-from .parts import METRE, Cavity, Markers, Material, SensorParts, Surface, refuse_off_surface
+from .parts import (
+    METRE,
+    Cavity,
+    Markers,
+    Material,
+    SensorParts,
+    Surface,
+    refuse_coincident,
+    refuse_off_surface,
+    refuse_other_size,
+)
 from .toml import read_sensor, tables_of, write_sensor
 
 
@@ -36,7 +46,7 @@ class Sensor:
     A rest image of the calibrated size is cropped and binned where the camera is `in_mode`.
 
     Raises:
-        MembraneError: a dot lies off the rest surface, or the rest image has another size than the camera's.
+        MembraneError: a dot lies off the rest surface or on another one, or the rest image has another size than the camera's.
 
     Example:
         >>> sensor = Sensor.from_file("examples/sensor.toml")
@@ -63,6 +73,7 @@ class Sensor:
         if self.markers.positions is not None:
             names = [f"Sensor: markers.positions[{i}]" for i in range(len(self.markers.positions))]
             refuse_off_surface(self.membrane, self.markers.positions, names)
+            refuse_coincident(self.membrane, self.markers.positions, names)
 
     @property
     def force_unit(self) -> str:
@@ -140,16 +151,11 @@ class Sensor:
 
 def _in_mode(markers: Markers, rest_image: np.ndarray, camera: Camera) -> Markers:
     """The markers with a rest image of the camera's size, cropped and binned if it is of the calibrated one."""
-    size, mode = rest_image.shape[::-1], camera.mode
-    if size == camera.image_size:
+    size = (rest_image.shape[1], rest_image.shape[0])
+    refuse_other_size(size, camera)
+    if size == camera.image_size or camera.mode is None:
         return markers
-    if mode is not None and size == mode.image_size:
-        return replace(markers, rest_image=mode.image(rest_image))
-    came = f"Sensor: rest_image is {size[0]} x {size[1]} px and image_size {list(camera.image_size)}"
-    if mode is None:
-        raise MembraneError(f"{came}; expected the same: where the camera's mode crops or bins, give crop and binning")
-    how = f"of crop {list(mode.crop)} and binning {list(mode.binning)}"
-    raise MembraneError(f"{came} {how}; expected the same, or the calibrated {list(mode.image_size)}")
+    return replace(markers, rest_image=camera.mode.image(rest_image))
 
 
 def _same_surface(one: Membrane, other: Membrane) -> bool:

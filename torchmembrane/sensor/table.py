@@ -16,6 +16,17 @@ from typing import Any
 import numpy as np
 
 from ..errors import MembraneError
+from ..io.bounded import lies_within, printable, read_text, shortened
+
+MOST_BYTES, LONGEST_LINE = 2**15, 2000
+"""Of a sensor file: the time that TOML takes grows as the square of a line's length."""
+MOST_FILES = 1000
+"""That a key may name."""
+LARGEST = 1e300
+"""Whole number."""
+DEEPEST = 8
+"""Level of tables and lists within one another."""
+EXPECTED = "a sensor file in TOML"
 
 
 class Table:
@@ -40,37 +51,39 @@ class Table:
     @classmethod
     def from_file(cls, path: Path) -> "Table":
         """The table of a whole file."""
+        text = read_text(path, MOST_BYTES, EXPECTED)
+        if (longest := max(map(len, text.split("\n")))) > LONGEST_LINE:
+            raise MembraneError(f"{path}: a line of {longest} characters; expected {EXPECTED}, lines of at most {LONGEST_LINE}")
         try:
-            text = path.read_text(encoding="utf-8")
-            return cls(path, "", tomllib.loads(text))
-        except FileNotFoundError:
-            raise MembraneError(f"{path}: no such file; expected a sensor file, check the path") from None
-        except UnicodeDecodeError as error:
-            raise MembraneError(f"{path}: not UTF-8 text ({error}); expected a TOML file saved as UTF-8") from error
-        except OSError as error:
-            raise MembraneError(f"{path}: not readable ({error.strerror}); expected a sensor file") from error
-        except tomllib.TOMLDecodeError as error:
+            values = tomllib.loads(text)
+        except ValueError as error:
             cause = str(error).replace("at end of document", f"at line {len(text.splitlines())}, the last")
             raise MembraneError(f"{path}: not valid TOML: {cause}; correct that line") from error
+        except RecursionError as error:
+            raise MembraneError(_too_deep(path)) from error
+        return cls(path, "", _plain(path, values))
 
     def __contains__(self, key: str) -> bool:
         return key in self.values
 
     def where(self, key: str = "") -> str:
         """File, table and key, as messages begin."""
+        key = key if key.isidentifier() else _said(key) if key else ""
         return " ".join(part for part in (f"{self.path}:", f"[{self.name}]" if self.name else "", key) if part)
 
     def refuse(self, key: str, expected: str) -> MembraneError:
         """The error for a value that is not what was expected."""
-        return MembraneError(f"{self.where(key)} = {_shown(self.values[key])}; expected {expected}")
+        return MembraneError(f"{self.where(key)} = {_said(self.values[key])}; expected {expected}")
 
     @contextmanager
     def naming(self, key: str = "") -> Iterator[None]:
-        """Put file, table and key before the message of whatever is refused inside."""
+        """Put file, table and key before the message of whatever is refused inside, unless it begins with the file."""
         try:
             yield
         except MembraneError as error:
-            shown = f" = {_shown(self.values[key])}" if key in self else ""
+            if str(error).startswith(f"{self.path}:"):
+                raise
+            shown = f" = {_said(self.values[key])}" if key in self else ""
             raise MembraneError(f"{self.where(key)}{shown}: {error}") from error
 
     def allow(self, keys: Iterable[str], owner: str = "here") -> None:
@@ -136,23 +149,27 @@ class Table:
         return value
 
     def file(self, key: str) -> Path:
-        """The path of the file that `key` names, relative to this file's folder."""
-        path = self.path.parent / self.text(key)
-        if not path.is_file():
-            raise self.refuse(key, f"a file; there is none at {path}: paths are relative to the sensor file")
-        return path
+        """The path of the file that `key` names, in this file's folder or below."""
+        return self._named(key, [self.text(key)])[0]
 
     def files(self, key: str) -> list[Path]:
-        """The paths of the files that `key` names: one, a list, or patterns with `*`, relative to this file's folder."""
+        """The paths of the files that `key` names, in this file's folder or below: one, a list, or patterns with `*`."""
         names = self._get(key, _is_names, "a file, or a list of files, in quotes")
-        paths: list[Path] = []
-        for name in [names] if isinstance(names, str) else names:
-            pattern = name if Path(name).is_absolute() else f"{glob.escape(str(self.path.parent))}/{name}"
-            found = sorted(map(Path, glob.glob(pattern))) if "*" in name else [self.path.parent / name]
-            if not found or not all(path.is_file() for path in found):
-                where = self.path.parent / name
-                raise self.refuse(key, f"a file; there is none at {where}: paths are relative to the sensor file")
+        return self._named(key, [names] if isinstance(names, str) else names)
+
+    def _named(self, key: str, names: Iterable[str]) -> list[Path]:
+        folder, paths = self.path.parent, []
+        for name in names:
+            if not lies_within(name):
+                raise self.refuse(key, "a path relative to the sensor file, of a file in its folder or below: copy it there")
+            found = sorted(map(Path, glob.glob(f"{glob.escape(str(folder))}/{name}"))) if "*" in name else [folder / name]
+            if not found or not all(map(_is_file, found)):
+                raise self.refuse(
+                    key, f"a file; there is none at {printable(folder / name)}: paths are relative to the sensor file"
+                )
             paths += found
+        if len(paths) > MOST_FILES:
+            raise self.refuse(key, f"at most {MOST_FILES} files; these are {len(paths)}")
         return paths
 
     def _list(self, key: str, count: int | None, right: Callable[[object], bool], kind: str) -> list[Any]:
@@ -193,6 +210,36 @@ def _shown(value: object) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_shown, value))}]"
     return repr(value.item() if isinstance(value, np.generic) else value)
+
+
+def _plain(path: Path, values: dict[str, Any]) -> dict[str, Any]:
+    """What a file holds, refused where it is nested too deeply or a whole number is no number of this world."""
+    level: list[Any] = [values]
+    for _ in range(DEEPEST + 1):
+        if any(isinstance(value, int) and abs(value) > LARGEST for value in level):
+            raise MembraneError(f"{path}: a whole number of more than 300 digits; expected {EXPECTED}, of a real sensor")
+        nested = [value.values() if isinstance(value, dict) else value for value in level if isinstance(value, dict | list)]
+        level = [value for values in nested for value in values]
+    if level:
+        raise MembraneError(_too_deep(path))
+    return values
+
+
+def _too_deep(path: Path) -> str:
+    return f"{path}: tables or lists within one another on more than {DEEPEST} levels; expected {EXPECTED}, which needs four"
+
+
+def _said(value: object) -> str:
+    """A value as messages have it: on one line, and not too long."""
+    return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in shortened(_shown(value)))
+
+
+def _is_file(path: Path) -> bool:
+    """Whether there is one, or something else of that name, which reading it refuses."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
 
 
 def _finite(value: object) -> bool:

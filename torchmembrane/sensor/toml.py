@@ -2,7 +2,7 @@
 
 import csv
 import math
-import zipfile
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,10 @@ import numpy as np
 from ..camera.model import Camera
 from ..camera.ports import Port
 from ..errors import MembraneError
-from ..io.images import mean_image, write_image
+from ..io.bounded import in_one_line, read_arrays, read_text, shortened
+from ..io.images import image_size, mean_image, write_image
 from ..pose import Pose
+from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
 from .parts import (
     METRE,
@@ -24,12 +26,18 @@ from .parts import (
     Material,
     SensorParts,
     Surface,
+    refuse_coincident,
     refuse_off_surface,
+    refuse_other_size,
 )
 from .table import Table, toml_lines
 
 FORMAT = 1
 COARSEST, FINEST = 25, 33  # solver grids chosen where the file names none
+FEWEST_LINES, MOST_LINES = 5, 65  # of a solver grid: beyond, a frame takes more than 2 GB
+MOST_VERTICES = 2**18
+"""Of a rest surface in a file of arrays."""
+MOST_DOTS, MOST_DOTS_BYTES = 2000, 2**20
 DOTS_HEADER = ["x", "y", "z", "size"]
 
 
@@ -58,10 +66,12 @@ def read_sensor(path: Path) -> SensorParts:
     camera = _read_camera(file.table("camera"))
     material = _read_material(file.table("material"))
     cavity = _read_cavity(file.table("cavity"))
-    markers, lines = _read_markers(file.table("markers"))
+    markers, lines = _read_markers(file.table("markers"), camera)
     surface, membrane = _read_membrane(file.table("membrane"), markers)
     if markers.positions is not None:
-        refuse_off_surface(membrane, markers.positions, [f"{line}: the dot" for line in lines])
+        names = [f"{line}: the dot" for line in lines]
+        refuse_off_surface(membrane, markers.positions, names)
+        refuse_coincident(membrane, markers.positions, names)
     tool = _read_tool(file.table("tool")) if "tool" in file else None
     return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool)
 
@@ -193,7 +203,7 @@ def _read_cavity(table: Table) -> Cavity:
         return Cavity(filling, **numbers)
 
 
-def _read_markers(table: Table) -> tuple[Markers, list[str]]:
+def _read_markers(table: Table, camera: Camera) -> tuple[Markers, list[str]]:
     """The markers, and of each listed dot where it stands: file and line."""
     table.allow(("kind", "file", "rest_image", "polarity"))
     kind = table.text("kind", ("dots", "texture"))
@@ -203,38 +213,52 @@ def _read_markers(table: Table) -> tuple[Markers, list[str]]:
         raise table.refuse("file", "none for texture, whose patches are chosen in the rest image: remove it")
     positions, sizes, lines = _read_dots(dots) if dots else (None, None, [])
     with table.naming("rest_image"):
+        for path in images[:1]:  # the others are of the same size, or refused
+            refuse_other_size(image_size(path), camera)
         return Markers(kind, polarity, positions, sizes, mean_image(images) if images else None), lines
 
 
 def _read_dots(path: Path) -> tuple[np.ndarray, list[str], list[str]]:
     """Positions `[D, 3]`, sizes, and where each dot stands."""
+    text = read_text(path, MOST_DOTS_BYTES, "CSV with a line x,y,z,size for each dot")
     try:
-        rows = list(enumerate(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()), 1))
-    except (UnicodeDecodeError, csv.Error) as error:
+        rows = list(enumerate(csv.reader(text.splitlines()), 1))
+    except csv.Error as error:
         raise MembraneError(f"{path}: not readable as CSV ({error}); expected UTF-8 text with x,y,z,size") from error
     rows = [(i, [cell.strip() for cell in row]) for i, row in rows if row]
     if not rows or rows[0][1] != DOTS_HEADER:
-        found = ",".join(rows[0][1]) if rows else "nothing"
-        raise MembraneError(f"{path}, line 1: the header is {found!r}; expected x,y,z,size: correct it")
+        raise MembraneError(f"{path}, line 1: the header is {_header(rows)}; expected x,y,z,size: correct it")
+    if len(rows) - 1 > MOST_DOTS:
+        raise MembraneError(f"{path}: {len(rows) - 1} dots; expected at most {MOST_DOTS}, one line x,y,z,size for each")
     if len(rows) == 1:
         raise MembraneError(f"{path}: no dots after the header; expected a line x,y,z,size for each")
     dots = [_dot(f"{path}, line {i}", row) for i, row in rows[1:]]
     return np.array([dot[0] for dot in dots]), [dot[1] for dot in dots], [f"{path}, line {i}" for i, _ in rows[1:]]
 
 
+def _header(rows: list[tuple[int, list[str]]]) -> str:
+    """A list's first line for a message; of what is no list of columns only its length, as it may be anything."""
+    found = ",".join(rows[0][1]) if rows else "nothing"
+    return repr(found) if re.fullmatch(r"[\w.,+ -]{0,60}", found) else f"{len(found)} characters that name no columns"
+
+
 def _dot(line: str, row: list[str]) -> tuple[list[float], str]:
     if len(row) != 4:
-        raise MembraneError(f"{line}: {len(row)} values, {','.join(row)}; expected four, x,y,z,size")
+        raise MembraneError(f"{line}: {len(row)} values, {in_one_line(','.join(row))}; expected four, x,y,z,size")
     position = []
     for key, cell in zip("xyz", row, strict=False):
         try:
             position.append(float(cell))
         except ValueError:
-            raise MembraneError(f"{line}: {key} = {cell!r}; expected a number with a decimal point") from None
+            raise MembraneError(f"{line}: {key} = {shortened(cell)!r}; expected a number with a decimal point") from None
         if not math.isfinite(position[-1]):
             raise MembraneError(f"{line}: {key} = {cell}; expected a finite number: leave unknown dots out")
+        if abs(position[-1]) > FARTHEST:
+            raise MembraneError(
+                f"{line}: {key} = {shortened(cell)}; expected a coordinate up to {FARTHEST:g}, in the length unit"
+            )
     if row[3] not in ("small", "large"):
-        raise MembraneError(f"{line}: size = {row[3]!r}; expected small or large")
+        raise MembraneError(f"{line}: size = {shortened(row[3])!r}; expected small or large")
     return position, row[3]
 
 
@@ -249,11 +273,12 @@ def _read_membrane(table: Table, markers: Markers) -> tuple[Surface, Membrane]:
     table.allow(("shape", "grid", *(("file",) if arrays else numbers)), f"for shape {shape}")
     named = table.whole_numbers("grid", 2) if "grid" in table else None
     grid = (named[0], named[1]) if named else default_grid(markers)
-    if min(grid) < 5:
-        raise table.refuse("grid", "5 x 5 vertices or more; 17 x 17 serves about 150 dots")
+    if min(grid) < FEWEST_LINES or max(grid) > MOST_LINES:
+        expected = f"5 x 5 vertices or more, at most {MOST_LINES} x {MOST_LINES}; 17 x 17 serves about 150 dots"
+        raise table.refuse("grid", expected)
     if arrays:
         path = table.file("file")
-        surface = Surface(shape, _read_arrays(path, arrays))
+        surface = Surface(shape, _read_surface(path, arrays))
         with table.naming("file"):
             membrane = surface.membrane(grid)
             lines = surface.values["vertices" if shape == "grid" else "z"].shape[:2]
@@ -263,22 +288,16 @@ def _read_membrane(table: Table, markers: Markers) -> tuple[Surface, Membrane]:
         return surface, surface.membrane(grid)
 
 
-def _read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in names if name in file}
-            found = ", ".join(file) or "nothing"
-    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
-        raise MembraneError(f"{path}: not readable ({error}); expected an .npz as numpy.savez writes it") from error
-    for name in names:
-        if name not in arrays:
-            raise MembraneError(f"{path}: {name} is missing, the file holds {found}; expected {', '.join(names)}: add it")
-        array = arrays[name]
-        if name != "fixed":
-            if array.dtype.kind not in "fiu":
-                raise MembraneError(f"{path}: {name} is of type {array.dtype}; expected numbers")
-            arrays[name] = array.astype(np.float64)
-            if not np.isfinite(arrays[name]).all():
-                at = np.argwhere(~np.isfinite(arrays[name]))[0].tolist()
-                raise MembraneError(f"{path}: {name}{at} is not finite; expected finite numbers everywhere")
+def _read_surface(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    arrays = read_arrays(path, names)
+    for name in set(names) - {"fixed"}:
+        if not np.isfinite(arrays[name]).all():
+            at = np.argwhere(~np.isfinite(arrays[name]))[0].tolist()
+            raise MembraneError(f"{path}: {name}{at} is not finite; expected finite numbers everywhere")
+        arrays[name] = arrays[name].astype(np.float64)
+    lines = arrays["vertices" if "vertices" in arrays else "z"].shape[:2]
+    if math.prod(lines) > MOST_VERTICES:
+        raise MembraneError(
+            f"{path}: {' x '.join(map(str, lines))} vertices; expected at most {MOST_VERTICES}: take fewer lines"
+        )
     return arrays

@@ -18,11 +18,12 @@ BRIGHT = 0.95  # the quantile of the rest surface that is exposed as asked
 RANGES = {
     "exposure": (0, math.inf),
     "ambient": (0, 1),
-    "highlight": (0, math.inf),
+    "highlight": (0, 1),
     "shininess": (0, math.inf),
     "vignetting": (0, 1),
-    "blur": (0, math.inf),
+    "blur": (0, 20),
     "outside": (0, 1),
+    "noise": (0, 200),
 }
 
 
@@ -62,7 +63,7 @@ class Appearance:
     def __post_init__(self) -> None:
         for name, (low, high) in RANGES.items():
             value = getattr(self, name)
-            if not low <= value <= high:
+            if value is not None and not low <= value <= high:
                 raise MembraneError(f"Appearance: {name} = {value}; expected a number from {low} to {high}")
 
     def lights_for(self, membrane: Membrane) -> Tensor:

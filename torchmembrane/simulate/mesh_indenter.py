@@ -1,5 +1,6 @@
 """A rigid indenter given as a closed triangle mesh; through trimesh (extra `mesh`)."""
 
+import io
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -10,7 +11,12 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..io.bounded import DAMAGE, in_one_line, read_bytes
 from .indenters import Indenter, box_distance
+
+KINDS = ("stl", "obj", "ply")
+MOST_TRIANGLES, MOST_BYTES = 200_000, 2**25
+"""Of a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +69,21 @@ class MeshIndenter(Indenter):
             pose: `translation`, `rotation`.
 
         Raises:
-            MembraneError: the mesh is not closed, or trimesh is not installed.
+            MembraneError: the file is no such mesh, too large or damaged, the mesh is not closed, or trimesh is not installed.
         """
-        body = _trimesh().load_mesh(path)
-        return cls(body.vertices, body.faces, **pose)
+        path, expected = Path(path), f"a closed mesh as STL, OBJ or PLY, of at most {MOST_TRIANGLES} triangles"
+        kind, trimesh = path.suffix.lower().removeprefix("."), _trimesh()
+        if kind not in KINDS:
+            raise MembraneError(f"{path}: no mesh by its name; expected {expected}")
+        content = read_bytes(path, MOST_BYTES, expected)
+        try:
+            body = trimesh.load_mesh(io.BytesIO(content), file_type=kind)
+            vertices, faces = np.asarray(body.vertices, float), np.asarray(body.faces)
+        except DAMAGE as error:
+            raise MembraneError(f"{path}: not readable ({in_one_line(error)}); expected {expected}") from error
+        if not 0 < len(faces) <= MOST_TRIANGLES or not np.isfinite(vertices).all():
+            raise MembraneError(f"{path}: {len(faces)} triangles, or corners that are not finite; expected {expected}")
+        return cls(vertices, faces, **pose)
 
     def local_distance(self, points: Tensor) -> Tensor:
         low, high = torch.from_numpy(self._body.bounds.copy()).to(points)

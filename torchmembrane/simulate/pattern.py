@@ -80,7 +80,10 @@ class Dots:
         default = [share * spacing for share in DOT_RADIUS.values()]
         radius = dict(zip(DOT_RADIUS, radii or default, strict=True))
         tones = {"dark": (0.12, 1.0), "light": (1.0, 0.2)}[sensor.markers.polarity]
-        return cls(positions, np.array([radius[size] for size in sizes]), tuple(missing), *tones)
+        made = cls(positions, np.array([radius[size] for size in sizes]), tuple(missing), *tones)
+        if radii is not None:
+            _refuse_overlap(made)
+        return made
 
     def described(self) -> dict[str, Any]:
         """What a data set's settings keep of the pattern."""
@@ -89,6 +92,18 @@ class Dots:
     def albedo(self, canvas: Canvas) -> Tensor:
         """Reflectance `[V]` of the ground; discs are drawn sample by sample."""
         return torch.full_like(canvas.white, self.ground)
+
+
+def _refuse_overlap(dots: Dots) -> None:
+    if len(dots.positions) < 2:
+        return
+    distance, other = (np.asarray(found)[:, 1] for found in cKDTree(dots.positions).query(dots.positions, k=2))
+    if (over := dots.radii + dots.radii[other] >= distance).any():
+        i = int(over.argmax())
+        raise MembraneError(
+            f"--dots, radii of small and large dots: dots {i} and {other[i]} overlap, {distance[i]:.3g} apart with radii "
+            f"{dots.radii[i]:g} and {dots.radii[other[i]]:g}; expected smaller ones"
+        )
 
 
 @dataclass(frozen=True)

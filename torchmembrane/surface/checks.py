@@ -5,6 +5,8 @@ from numpy.typing import ArrayLike
 
 from ..errors import MembraneError
 
+FARTHEST = 1e6
+"""Coordinate, length unit."""
 SMALLEST_AREA = 1e-9  # of a triangle, over that of the largest
 
 
@@ -27,6 +29,11 @@ def checked_grid(vertices: ArrayLike, fixed: ArrayLike | None) -> tuple[np.ndarr
     if not np.isfinite(X).all():
         i, j = np.argwhere(~np.isfinite(X).all(-1))[0]
         raise MembraneError(f"Membrane: vertex ({i}, {j}) is not finite; expected finite coordinates")
+    if np.abs(X).max() > FARTHEST:
+        i, j = np.argwhere(np.abs(X).max(-1) > FARTHEST)[0]
+        raise MembraneError(
+            f"Membrane: vertex ({i}, {j}) at {X[i, j].tolist()}; expected coordinates up to {FARTHEST:g}, in the length unit"
+        )
     border = np.zeros(X.shape[:2], bool)
     border[[0, -1]] = border[:, [0, -1]] = True
     if fixed is None:

@@ -3,6 +3,9 @@
 import numpy as np
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
+from ..errors import MembraneError
+
+FEWEST = 4  # lines that bicubic interpolation needs
 FINE = 40  # samples between two lines, for arc lengths
 
 
@@ -19,7 +22,12 @@ def resampled_grid(X: np.ndarray, fixed: np.ndarray, grid: tuple[int, int]) -> t
 
     Returns:
         Vertices `[*grid, 3]`, and which are fixed, `[*grid]`: the border, and inside it as the nearest vertex.
+
+    Raises:
+        MembraneError: fewer than 4 lines.
     """
+    if min(X.shape[:2]) < FEWEST:
+        raise MembraneError(f"Membrane: {X.shape[0]} x {X.shape[1]} lines; expected {FEWEST} or more each way, to interpolate")
     lines = even_lines(X, grid[0]), even_lines(X.swapaxes(0, 1), grid[1])
     m, n = (np.arange(count) for count in X.shape[:2])
     vertices = np.stack([RectBivariateSpline(m, n, X[..., c])(*lines) for c in range(3)], -1)

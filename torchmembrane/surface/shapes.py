@@ -10,7 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import MembraneError
+from .checks import FARTHEST
 from .membrane import Membrane
+
+LEAST_LENGTH = 1e-6
 
 
 def disc_grid(m: int, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -149,5 +152,6 @@ def _dome(grid: tuple[int, int], semi_axes: tuple[float, float, float], opening:
 
 def _positive(function: str, **values: float) -> None:
     for name, value in values.items():
-        if not (np.isfinite(value) and value > 0):
-            raise MembraneError(f"{function}: {name} = {value}; expected a finite positive number")
+        if not LEAST_LENGTH <= value <= FARTHEST:
+            limits = f"from {LEAST_LENGTH:g} to {FARTHEST:g}"
+            raise MembraneError(f"{function}: {name} = {value}; expected a finite positive number, {limits}")

@@ -10,16 +10,21 @@ import numpy as np
 
 from ...calibrate.detection import find_target
 from ...errors import MembraneError
+from ...io.bounded import read_array, read_text
 from ...io.images import read_image
 from ...io.report import Report
 from ...jobs.inputs import find_inputs
 from ...plot.drawing import save
 from ...presets import sensor_file
 from ...sensor.sensor import Sensor
+from ...surface.checks import FARTHEST
 from ...targets import Checkerboard, DotBoard
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+MOST_TABLE_BYTES = 2**20
+LARGEST_MOTION = 1e4  # length unit, and degrees
 
 
 def read_sensor(arguments: Namespace) -> Sensor:
@@ -36,12 +41,9 @@ def write_calibrated(arguments: Namespace, sensor: Sensor, report: Report, drawi
     return 0
 
 
-def read_sensor_image(path: Path, sensor: Sensor) -> np.ndarray:
+def read_sensor_image(path: str | Path, sensor: Sensor) -> np.ndarray:
     """An image `[H, W]` that must be as large as the sensor's."""
-    image = read_image(path)
-    if image.shape[::-1] != sensor.camera.image_size:
-        raise MembraneError(f"{path}: {image.shape[1]} x {image.shape[0]} px; expected {list(sensor.camera.image_size)}")
-    return image
+    return read_image(path, sensor.camera.image_size)
 
 
 def read_targets(images: Sequence[str], sensor: Sensor, board: Checkerboard | DotBoard) -> np.ndarray:
@@ -60,24 +62,26 @@ def read_targets(images: Sequence[str], sensor: Sensor, board: Checkerboard | Do
 
 def read_motions(path: Path) -> np.ndarray:
     """Where the camera was, `[P, 6]`: position (length unit) and rotation vector (degrees) of each view."""
+    expected = "CSV with the header x,y,z,turn_x,turn_y,turn_z and one line per image"
+    text = read_text(path, MOST_TABLE_BYTES, expected)
     try:
-        rows = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise MembraneError(
-            f"{path}: not readable ({error}); expected CSV with the header x,y,z,turn_x,turn_y,turn_z and one line per image"
-        ) from error
-    if rows.shape[1] != 6 or not np.isfinite(rows).all():
-        raise MembraneError(f"{path}: {rows.shape[1]} columns; expected six finite numbers, x,y,z,turn_x,turn_y,turn_z")
+        rows = np.loadtxt(text.splitlines(), delimiter=",", skiprows=1, ndmin=2)
+    except ValueError as error:
+        raise MembraneError(f"{path}: not readable ({error}); expected {expected}") from error
+    if rows.shape[1] != 6 or not (np.abs(rows) <= LARGEST_MOTION).all():
+        limit = f"six finite numbers up to {LARGEST_MOTION:g}, x,y,z,turn_x,turn_y,turn_z"
+        raise MembraneError(f"{path}: {rows.shape[1]} columns, largest {np.abs(rows).max(initial=0):g}; expected {limit}")
     return rows
 
 
 def read_forces(path: Path, images: Sequence[Path]) -> np.ndarray:
     """Forces of the images `[B, 3]`, or magnitudes `[B, 1]`, N, NaN where the file has none."""
     expected = "CSV with the header image,fx,fy,fz or image,force and one line per image, N"
+    text = read_text(path, MOST_TABLE_BYTES, expected)
     try:
-        header, *rows = csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
+        header, *rows = csv.reader(text.splitlines())
         known = {name: [float(value) for value in values] for name, *values in rows}
-    except (OSError, ValueError) as error:
+    except (csv.Error, ValueError) as error:
         raise MembraneError(f"{path}: not readable ({error}); expected {expected}") from error
     if header not in (["image", "fx", "fy", "fz"], ["image", "force"]):
         raise MembraneError(f"{path}: the header is {','.join(header)!r}; expected {expected}")
@@ -92,9 +96,8 @@ def read_forces(path: Path, images: Sequence[Path]) -> np.ndarray:
 
 def read_depth(path: Path, unit: float) -> np.ndarray:
     """A depth image `[H, W]` in the sensor's length unit; `unit`: of one step of the file's values."""
-    if path.suffix != ".npy":
-        return read_image(path).astype(float) * 65535 * unit
-    try:
-        return unit * np.load(path, allow_pickle=False).astype(float)
-    except (OSError, ValueError) as error:
-        raise MembraneError(f"{path}: not readable ({error}); expected a depth image as numpy.save writes it") from error
+    values = read_array(path) if path.suffix == ".npy" else read_image(path).astype(float) * 65535
+    depth: np.ndarray = values.astype(float) * unit
+    if (np.abs(depth) > FARTHEST).any():
+        raise MembraneError(f"{path}: depths up to {np.nanmax(depth):g}; expected at most {FARTHEST:g}: check --unit {unit:g}")
+    return depth

@@ -10,11 +10,10 @@ from ...calibrate.depth import rest_from_depth
 from ...calibrate.rest import rest_from_image
 from ...calibrate.surface import Correction, fine_surface
 from ...calibrate.views import rest_from_views
-from ...io.images import read_image
 from ...io.report import Report
 from ...plot.calibration import fit_figure, surface_figure
 from ...sensor.sensor import Sensor
-from .files import read_depth, read_motions, read_sensor, write_calibrated
+from .files import read_depth, read_motions, read_sensor, read_sensor_image, write_calibrated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,7 +21,8 @@ if TYPE_CHECKING:
 
 def rest(arguments: Namespace) -> int:
     """`torchmembrane calibrate rest`"""
-    sensor, image = read_sensor(arguments), read_image(arguments.image)
+    sensor = read_sensor(arguments)
+    image = read_sensor_image(arguments.image, sensor)
     found = rest_from_image(sensor, image)
     units = ["degrees"] * 3 + [sensor.length_unit] * 3
     shifts = np.linalg.norm(found.shifts, axis=1)
@@ -38,7 +38,9 @@ def rest(arguments: Namespace) -> int:
 def views(arguments: Namespace) -> int:
     """`torchmembrane calibrate views`"""
     sensor, motions = read_sensor(arguments), read_motions(arguments.motions)
-    found = rest_from_views(sensor, [read_image(path) for path in arguments.images], motions, arguments.travel_error)
+    found = rest_from_views(
+        sensor, [read_sensor_image(path, sensor) for path in arguments.images], motions, arguments.travel_error
+    )
     unit, P = sensor.length_unit, len(motions)
     design = np.concatenate([motions[1:, 3:], motions[1:, :3]], 1).ravel()
     rms = np.sqrt((found.deviations**2).mean(0))
@@ -56,7 +58,7 @@ def views(arguments: Namespace) -> int:
 def depth(arguments: Namespace) -> int:
     """`torchmembrane calibrate depth`"""
     sensor = read_sensor(arguments)
-    found = rest_from_depth(sensor, read_depth(arguments.depth, arguments.unit), read_image(arguments.image))
+    found = rest_from_depth(sensor, read_depth(arguments.depth, arguments.unit), read_sensor_image(arguments.image, sensor))
     unit = sensor.length_unit
     notes = [
         f"{len(found.deviations)} squares of depths, each known to {np.median(found.deviations):.4f} {unit}",
