@@ -103,7 +103,8 @@ class Descent(nn.Module):
         loads, made = torch.cat([loads, motion.coupling], 1), None
         if factor is None:
             made = equations.system.factor(equations.matrix(normal, self.settings.damping * (tau / self.settings.tau[1]) ** 2))
-            solved = equations.system.substitute(made, loads)
+            solved = equations.system.substitute(made, loads)  # refined once: of rounding and damping little is left
+            solved = solved + equations.system.substitute(made, loads - equations.product(normal, solved))
         else:
             known = factor
             solved = conjugate_gradient(

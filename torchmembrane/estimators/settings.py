@@ -88,7 +88,7 @@ class ForceBalanceSettings:
     outlier: float = 5.0
     pressure_noise: float = 0.01
     longest_step: float = 0.04
-    damping: float = 3e-7
+    damping: float = 1e-6
     coarsest: int = 9
     coarsest_warm: int = 13
     largest_relative_step: float = 2e-3
