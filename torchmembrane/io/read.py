@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MembraneError
-from .frames import PART_ROWS, Frame, frames_of
+from .frame_table import PART_ROWS
+from .frames import frames_of
 from .optional import load_pandas
-from .results import Reconstruction, stack_frames
+from .results import Frame, Reconstruction, stack_frames
 from .store import MESH, Mesh
 
 
@@ -70,7 +71,7 @@ class Results:
         self.folder = folder
         self.mesh = Mesh.load(folder / MESH)
         self._frames = frames_of(folder, self.mesh)
-        self.names = sorted(self._frames.statuses())
+        self.names = sorted(self._frames.names())
         self._known = frozenset(self.names)
         if not self.names:
             raise MembraneError(f"{folder}: no frames; expected results of `torchmembrane reconstruct`")
