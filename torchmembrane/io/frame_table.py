@@ -70,7 +70,9 @@ class FrameTable:
                     part.replace(part.with_suffix(".damaged"))
                     continue
                 once = {name: stored for name, stored in rows.items() if name not in seen}
-                if len(once) < len(table):
+                if not once:
+                    part.unlink()
+                elif len(once) < len(table):
                     self._put(self._table_of(once), part)
                 elif tuple(table.column_names) != COLUMNS:
                     self._put(self._table_of(rows), part)
