@@ -3,11 +3,12 @@
     python bench/kills.py SENSOR.toml IMAGES_FOLDER [--kills 10] [--format npz|parquet] [--engine ray] [--workers N]
 
 Starts the command again and again, each time ended by SIGTERM or SIGKILL at a random moment, and last to the end. Prints for
-each time the frames kept, the seconds since the first frame, and the seconds of work lost: from the last frame that was kept to
+each time the frames kept, the seconds since the first frames, and the seconds of work lost: from the last frame that was kept to
 the kill, by the modification times of the files. Then compares the results with those of a job that was left alone.
 """
 
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -37,12 +38,18 @@ def kept(out: Path) -> int:
         return 0
 
 
+def has_begun(log: str) -> bool:
+    """Whether the progress bar has moved."""
+    counts = re.findall(r"(\d+)/\d+ \[", log)
+    return len(set(counts)) > 1
+
+
 def killed(command: list[str], out: Path, after: float, end: signal.Signals) -> str:
     """One job, ended so many seconds after its computation has begun; says what was kept and lost."""
     before, log = kept(out), out.with_suffix(".log")
     with open(log, "w") as said, subprocess.Popen(command, stdout=said, stderr=said) as process:
-        while "reconstruct:" not in log.read_text() and process.poll() is None:
-            time.sleep(0.05)
+        while not has_begun(log.read_text()) and process.poll() is None:
+            time.sleep(0.02)
         begun = time.time()
         time.sleep(after)
         alive = process.poll() is None

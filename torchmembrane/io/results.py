@@ -181,7 +181,7 @@ class Stored(NamedTuple):
     def arrays(self) -> Frame:
         """All arrays of a file, by name."""
         known = {key: np.asarray(value) for key, value in self.origin._asdict().items()}
-        return self.frame | known | {"seconds": np.asarray(self.seconds, np.float32)}
+        return self.frame | known | {"seconds": np.asarray(self.seconds, np.float64)}
 
 
 def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
