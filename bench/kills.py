@@ -3,8 +3,8 @@
     python bench/kills.py SENSOR.toml IMAGES_FOLDER [--kills 10] [--format npz|parquet] [--engine ray] [--workers N]
 
 Starts the command again and again, each time ended by SIGTERM or SIGKILL at a random moment, and last to the end. Prints for
-each time the frames kept, the seconds since the first frames, and the seconds of work lost: from the last frame that was kept to
-the kill, by the modification times of the files. Then compares the results with those of a job that was left alone.
+each time the frames kept, the seconds since the first frames, and the seconds of work lost: from the last frame that was kept
+to the kill, by the modification times of the files. Then compares the results with those of a job that was left alone.
 """
 
 import random

@@ -310,3 +310,22 @@ def test_frames_are_the_same_in_any_batch_within_the_stated_bound(small_sensor, 
         alone = reconstructor(images[k : k + 1])
         assert (alone.vertices[0] - together.vertices[k]).abs().max() < 1e-3
         assert (alone.force[0] - together.force[k]).norm() < 1e-3 * together.force[k].norm().clamp_min(0.1)
+
+
+@both
+def test_view_draws_a_frame_of_a_folder_or_a_part(small_sensor, small_images, tmp_path, monkeypatch, capsys, settings):
+    from torchmembrane.cli.main import main
+
+    monkeypatch.setattr("torchmembrane.cli.view._has_display", lambda: False)
+    out, given = tmp_path / "out", [str(small_sensor / "sensor.toml"), *map(str, small_images[:2])]
+    assert main(["reconstruct", *given, "--out", str(out), "--format", settings.format]) == 0
+    whole = [out] if settings is NPZ else [out, out / "frames" / "part-00000.parquet"]
+    for number, path in enumerate(whole):
+        drawn = tmp_path / f"{number}.png"
+        assert main(["view", str(path), "--frame", "press1", "--out", str(drawn)]) == 0 and drawn.exists()
+        assert main(["view", str(path)]) == 0 and (out / "press0_view.png").exists()
+        (out / "press0_view.png").unlink()
+        assert main(["view", str(path), "--frame", "press9"]) == 2
+        assert "no frame 'press9'" in capsys.readouterr().err
+    (tmp_path / "bad.parquet").write_bytes(b"PAR1")
+    assert main(["view", str(tmp_path / "bad.parquet")]) == 2 and "not a part" in capsys.readouterr().err

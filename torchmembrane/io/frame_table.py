@@ -63,7 +63,7 @@ class FrameTable:
             seen: set[str] = set()
             for part in self._parts():
                 try:
-                    table = self._table(part)
+                    table = _table(part)
                     rows = _stored_rows(table)
                 except DAMAGE:
                     self.damaged.append(part)
@@ -85,11 +85,9 @@ class FrameTable:
         for part, held in self._index().items():
             if not held.isdisjoint(names):
                 try:
-                    found |= {name: stored.frame for name, stored in _stored_rows(self._table(part)).items()}
+                    found |= read_part(part)
                 except FileNotFoundError:  # merged into another one meanwhile
                     return self.read(names)
-                except DAMAGE as error:
-                    raise _refusal(part, error) from error
         return [found[name] for name in names]
 
     def write(self, name: str, stored: Stored) -> None:
@@ -142,7 +140,7 @@ class FrameTable:
 
     def _join(self, parts: list[Path]) -> None:
         if len(parts) > 1:
-            self._put(self.arrow.concat_tables([self._table(part) for part in parts]), parts[0])
+            self._put(self.arrow.concat_tables([_table(part) for part in parts]), parts[0])
             for part in parts[1:]:
                 part.unlink()
 
@@ -154,7 +152,7 @@ class FrameTable:
             if held <= set(names):
                 part.unlink()
                 continue
-            table = self._table(part)
+            table = _table(part)
             self._put(table.filter(self.arrow.array([name not in names for name in table["name"].to_pylist()])), part)
 
     def _parts(self) -> list[Path]:
@@ -166,18 +164,10 @@ class FrameTable:
             versions = {part: (stat.st_ino, stat.st_mtime_ns) for part in self._parts() for stat in [part.stat()]}
             for part, version in versions.items():
                 if self._held.get(part, ((), ()))[0] != version:
-                    self._held[part] = version, frozenset(self._table(part, ["name"])["name"].to_pylist())
+                    self._held[part] = version, frozenset(_table(part, ["name"])["name"].to_pylist())
         except FileNotFoundError:  # merged into another one meanwhile
             return self._index()
         return {part: self._held[part][1] for part in versions}
-
-    def _table(self, part: Path, columns: list[str] | None = None) -> Any:
-        try:
-            return self.parquet.read_table(part, columns=columns, partitioning=None, page_checksum_verification=True)
-        except FileNotFoundError:
-            raise
-        except (OSError, ValueError, KeyError) as error:
-            raise _refusal(part, error) from error
 
     def _put(self, table: Any, part: Path) -> None:
         with whole_file(part) as partial:
@@ -198,6 +188,29 @@ class FrameTable:
         for size in reversed(values.shape[1:]):
             column = self.arrow.FixedSizeListArray.from_arrays(column, size)
         return column
+
+
+def read_part(part: Path) -> dict[str, Frame]:
+    """The frames of one part by name.
+
+    Raises:
+        MembraneError: it is not one, or damaged.
+    """
+    table = _table(part)
+    try:
+        return {name: stored.frame for name, stored in _stored_rows(table).items()}
+    except DAMAGE as error:
+        raise _refusal(part, error) from error
+
+
+def _table(part: Path, columns: list[str] | None = None) -> Any:
+    parquet = load_pyarrow()[1]
+    try:
+        return parquet.read_table(part, columns=columns, partitioning=None, page_checksum_verification=True)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, KeyError) as error:
+        raise _refusal(part, error) from error
 
 
 def _stored_rows(table: Any) -> dict[str, Stored]:

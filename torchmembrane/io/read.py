@@ -3,13 +3,13 @@
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from ..errors import MembraneError
-from .frame_table import PART_ROWS
+from ..errors import MembraneError, expect
+from .frame_table import PART_ROWS, read_part
 from .frames import frames_of
 from .optional import load_pandas
-from .results import Frame, Reconstruction, stack_frames
+from .results import Frame, Reconstruction, load_frame, stack_frames
 from .store import MESH, Mesh
 
 
@@ -45,6 +45,38 @@ def read_results(folder: str | Path) -> "Results":
         ([0.0, 0.0], tensor([0., 0.]))
     """
     return Results(Path(folder))
+
+
+class FoundFrame(NamedTuple):
+    """A frame that was asked for, and the folder in which its `mesh.npz` should be."""
+
+    name: str
+    frame: Frame
+    home: Path
+
+
+def read_frame(path: Path, name: str | None = None) -> FoundFrame:
+    """One frame of whatever holds results.
+
+    Args:
+        path: NAME.npz, a part of a Parquet dataset, or a folder of results.
+        name: of the frame in a part or a folder; default: the first.
+
+    Raises:
+        MembraneError: it holds no results, or none of this name.
+    """
+    if path.is_dir():
+        results = read_results(path)
+        chosen = results.names[0] if name is None else name
+        return FoundFrame(chosen, results[chosen], path)
+    if path.suffix != ".parquet":
+        expect(name in (None, path.stem), "--frame", name, f"a folder or a part to choose from; {path} is one frame")
+        return FoundFrame(path.stem, load_frame(path), path.parent)
+    frames = read_part(path)
+    chosen = next(iter(sorted(frames))) if name is None else name
+    if chosen not in frames:
+        raise MembraneError(f"{path}: no frame {chosen!r}; expected one of {len(frames)}, {min(frames)!r} the first")
+    return FoundFrame(chosen, frames[chosen], path.parent.parent if path.parent.name == "frames" else path.parent)
 
 
 class Results:
