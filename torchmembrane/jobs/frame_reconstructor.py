@@ -51,7 +51,6 @@ class FrameReconstructor:
         reconstructor: of the sensor.
         rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
         pressure: that a gauge reads, by the names of the frames, as `Reconstructor` takes it.
-        device: where to compute, "cpu" or "cuda"; default: where the reconstructor is.
 
     Example:
         >>> from dataclasses import replace
@@ -68,11 +67,13 @@ class FrameReconstructor:
         reconstructor: "Reconstructor",
         rest_pixels: Tensor | None = None,
         pressure: Mapping[str, float] | None = None,
-        device: str | None = None,
     ):
-        self.reconstructor = reconstructor if device is None else reconstructor.to(device)
-        self.rest_pixels = rest_pixels if device is None or rest_pixels is None else rest_pixels.to(device)
-        self.pressure = pressure
+        self.reconstructor, self.rest_pixels, self.pressure = reconstructor, rest_pixels, pressure
+
+    def on(self, device: str) -> "FrameReconstructor":
+        """The same on a device, "cpu" or "cuda"."""
+        rest_pixels = None if self.rest_pixels is None else self.rest_pixels.to(device)
+        return FrameReconstructor(self.reconstructor.to(device), rest_pixels, self.pressure)
 
     def __call__(self, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Reconstruct a batch of rows.
