@@ -171,7 +171,7 @@ class FrameTable:
 
     def _put(self, table: Any, part: Path) -> None:
         with whole_file(part) as partial:
-            self.parquet.write_table(table, partial, write_page_checksum=True)
+            self.parquet.write_table(table, partial, use_dictionary=False, compression="zstd", write_page_checksum=True)
 
     def _table_of(self, rows: dict[str, Stored]) -> Any:
         arrays = [stored.arrays() for stored in rows.values()]

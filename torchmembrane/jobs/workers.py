@@ -1,6 +1,7 @@
 """Frames computed in this process, decoded a batch ahead, or by worker processes with one thread each."""
 
 import os
+import pickle
 import signal
 from collections import deque
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from functools import partial
 from itertools import islice
 from multiprocessing import get_context, parent_process
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Thread
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -130,30 +132,36 @@ def _given(reason: str, image: object, reconstructor: "Reconstructor") -> Tensor
 
 @contextmanager
 def _pool(workers: int, work: Work) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes; when the block ends early, what they are doing is abandoned."""
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (work,))
-    try:
-        yield pool
-    except BaseException:
-        for process in list((pool._processes or {}).values()):
-            process.terminate()
-        pool.shutdown(wait=True, cancel_futures=True)
-        raise
-    pool.shutdown()
+    """Worker processes; when the block ends early, what they are doing is abandoned.
+
+    They read their work from a file: through a pipe, one would have to be up before the next one starts.
+    """
+    with TemporaryDirectory() as folder:
+        state = Path(folder) / "work"
+        state.write_bytes(pickle.dumps(work))
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (state,))
+        try:
+            yield pool
+        except BaseException:
+            for process in list((pool._processes or {}).values()):
+                process.terminate()
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+        pool.shutdown()
 
 
 _work: Work
 """Of this worker process."""
 
 
-def _start(work: Work) -> None:
+def _start(state: Path) -> None:
     """Make ready a worker process: one thread, interrupted and ended by its parent alone, and with it."""
     global _work
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     torch.set_num_threads(1)
     Thread(target=_end_with_parent, daemon=True).start()
-    _work = work
+    _work = pickle.loads(state.read_bytes())
 
 
 def _end_with_parent() -> None:
