@@ -285,6 +285,15 @@ def wait_for(condition, seconds=120):
         time.sleep(0.02)
 
 
+QUICKLY_SAVING = """
+import sys
+from torchmembrane.cli.main import main
+from torchmembrane.io import frame_table
+frame_table.SAVE_SECONDS = 0.2
+sys.exit(main(sys.argv[1:]))
+"""
+
+
 @pytest.mark.parametrize(
     "end, format, workers", [(signal.SIGTERM, "npz", "1"), (signal.SIGTERM, "parquet", "2"), (signal.SIGKILL, "parquet", "1")]
 )
@@ -296,8 +305,8 @@ def test_a_killed_command_keeps_what_is_done(small_sensor, small_images, tmp_pat
     options = ["--out", str(out), "--format", format, "--workers", workers, "--batch", "2"]
     command = [
         sys.executable,
-        "-m",
-        "torchmembrane",
+        "-c",
+        QUICKLY_SAVING,
         "reconstruct",
         str(small_sensor / "sensor.toml"),
         str(tmp_path / "images"),
