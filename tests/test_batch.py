@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.io import frames, results
+from torchmembrane.io import frame_table, frames, results
 from torchmembrane.io.images import read_image
 from torchmembrane.io.read import read_results
 from torchmembrane.io.status import Status
@@ -36,6 +36,7 @@ CONTRACT = {
     "coverage": (), "camera_motion": (4,),
     "force_deviation": (3,), "depth_deviation": (),
 }  # fmt: skip
+OF_FILE = ("path", "file_size", "file_modified", "content_hash", "seconds")
 
 
 class Denting:
@@ -102,8 +103,8 @@ def test_one_result_for_each_image_with_the_contract_s_keys(images, tmp_path):
     assert outcome == (5, 0, 0, 0, 0, 0) and lines == [] and made.calls == [2, 2, 1]
     for path in images:
         with np.load(tmp_path / "out" / f"{path.stem}.npz") as stored:
-            assert {key: stored[key].shape for key in stored} == CONTRACT
-            assert {stored[key].dtype.name for key in stored if key != "status"} == {"float32"}
+            assert {key: stored[key].shape for key in stored} == CONTRACT | dict.fromkeys(OF_FILE, ())
+            assert {stored[key].dtype.name for key in CONTRACT if key != "status"} == {"float32"}
             expected = made(made.read(path)).frame(0)
             assert all(np.array_equal(stored[key], expected[key]) for key in CONTRACT)
 
@@ -187,13 +188,13 @@ def test_summary_is_rebuilt_from_the_frames(images, tmp_path):
     reconstruct(images[1:], tmp_path / "out")
     after = summary_of(tmp_path / "out")
     assert list(after) == [path.stem for path in images]
-    assert [after[name]["file"] for name in ("i0", "i1")] == ["", str(images[1])]
+    assert [after[name]["file"] for name in ("i0", "i1")] == [str(images[0]), str(images[1])]
     assert all(after["i1"][key] == before["i1"][key] for key in before["i1"] if key != "seconds")
 
 
 @pytest.mark.parametrize("settings", [NPZ, PARQUET])
 def test_results_are_read_by_name_in_order_and_all_at_once(images, tmp_path, monkeypatch, settings):
-    monkeypatch.setattr(frames, "PART_ROWS", 2)
+    monkeypatch.setattr(frame_table, "PART_ROWS", 2)
     grey_image(images[1], 0)
     reconstruct(images, tmp_path / "out", settings)
     found = read_results(str(tmp_path / "out"))
@@ -361,14 +362,16 @@ def test_parquet_holds_the_same_as_npz(images, tmp_path):
 def test_parquet_can_be_read_by_others(images, tmp_path):
     reconstruct(images, tmp_path / "out", PARQUET)
     table = pq.read_table(tmp_path / "out" / "frames")
-    assert table.column_names == ["name", *CONTRACT]
+    assert table.column_names == ["name", "status_text", *OF_FILE, *CONTRACT]
     assert b'"vertices": [25, 3]' in table.schema.metadata[b"shapes"] and table.schema.metadata[b"length_unit"] == b"mm"
     vertices = np.array(table["vertices"].to_pylist()).reshape(-1, 25, 3)
+    assert np.shape(table["vertices"][0].as_py()) == (25, 3) and np.shape(table["contact_points"][0].as_py()) == (4, 3)
+    assert table["path"].to_pylist() == [str(path) for path in images] and set(table["status_text"].to_pylist()) == {"ok"}
     assert np.array_equal(vertices.astype(np.float32), read_results(tmp_path / "out").batch().vertices.numpy())
 
 
 def test_a_frame_tried_again_is_one_row_of_the_dataset(images, tmp_path, monkeypatch):
-    monkeypatch.setattr(frames, "PART_ROWS", 2)
+    monkeypatch.setattr(frame_table, "PART_ROWS", 2)
     grey_image(images[1], 0)
     reconstruct(images, tmp_path / "out", PARQUET)
     assert len(list((tmp_path / "out" / "frames").glob("part-*.parquet"))) == 3

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
@@ -225,3 +226,16 @@ def test_matplotlib_is_loaded_only_to_draw():
         "import sys, torchmembrane.cli.main; sys.exit(int('matplotlib' in sys.modules or 'torchmembrane.plot' in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@pytest.mark.parametrize("size", [(640, 480), (480, 480), (360, 640)])
+def test_colour_bars_are_whole_and_below_their_axes_whatever_the_image_s_shape(monkeypatch, size):
+    monkeypatch.setattr(sys.modules[__name__], "SIZE", size)
+    mesh = cap_mesh(Camera("fisheye", size, (180, 180), (size[0] / 2, size[1] / 2)))
+    frame = pressed(mesh)
+    frame["traction"] = -np.abs(frame["displacement"].sum(-1, keepdims=True)) * mesh.rest_normals
+    drawing = view.figure(frame, mesh)
+    FigureCanvasAgg(drawing).draw()
+    for axes in drawing.axes[2:4]:
+        (bar,) = axes.child_axes
+        assert bar.get_tightbbox().y0 >= 0 and bar.get_tightbbox().y1 < axes.xaxis.label.get_window_extent().y0

@@ -112,6 +112,23 @@ def count(text: str) -> int:
     return int(text)
 
 
+def count_or_auto(text: str) -> int | None:
+    """A whole number, 1 or more, or auto: None."""
+    return None if text == "auto" else count(text)
+
+
+def share(text: str) -> tuple[int, int]:
+    """The I-th of N parts, I/N.
+
+    >>> share("2/8")
+    (2, 8)
+    """
+    number, _, total = text.partition("/")
+    if not (number.isdigit() and total.isdigit() and 1 <= int(number) <= int(total)):
+        raise ArgumentTypeError(f"{text!r}; expected I/N, I from 1 to N, as 2/8")
+    return int(number), int(total)
+
+
 def seed(text: str) -> int:
     """A whole number, 0 or more."""
     return 0 if text == "0" else count(text)

@@ -9,6 +9,7 @@ ENERGIES = ("harmonic", "neo_hookean", "mooney_rivlin")
 ELEMENTS = ("triangle", "quadrilateral")
 VOLUMES = ("exact", "linear")
 FLOWS = ("smooth", "bilinear")
+ENGINES = ("local", "ray")
 RESULT_FORMATS = ("npz", "parquet")
 
 PRESETS = ("fingertip", "bubble", "half_cylinder")

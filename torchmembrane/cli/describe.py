@@ -7,7 +7,7 @@ import torch
 
 from ..camera.mode import Mode
 from ..camera.model import Camera
-from ..io.frames import Frame
+from ..io.results import Frame
 from ..io.status import Status
 from ..reconstruct import Reconstructor
 from ..sensor.parts import METRE

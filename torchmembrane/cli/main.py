@@ -3,9 +3,13 @@
 Each command has a module of its own, with its parser, which loads nothing heavy, and `run`, which loads what it needs.
 """
 
+import signal
 import sys
 import warnings
 from argparse import ArgumentParser
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import current_thread, main_thread
 
 from .. import __version__
 from ..errors import MembraneError
@@ -20,13 +24,27 @@ def main(argv: list[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(f"torchmembrane: warning: {message}", file=sys.stderr)
         try:
-            return int(arguments.run(arguments))
+            with _terminated_as_interrupted():
+                return int(arguments.run(arguments))
         except (MembraneError, OSError) as error:
             print(f"torchmembrane: error: {error}", file=sys.stderr)
             return 2
         except KeyboardInterrupt:
             print("torchmembrane: interrupted; what is done so far is kept", file=sys.stderr)
             return 130
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM, as schedulers send it, ends the command as Ctrl-C does."""
+    if current_thread() is not main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _parser() -> ArgumentParser:

@@ -4,8 +4,8 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from .arguments import add_command, add_estimator, add_sensor, count, positive
-from .choices import RESULT_FORMATS
+from .arguments import add_command, add_estimator, add_sensor, count, count_or_auto, positive, share
+from .choices import ENGINES, RESULT_FORMATS
 
 PURPOSE = "reconstruct surfaces from images or a video of one sensor"
 EXAMPLES = """\
@@ -14,6 +14,7 @@ examples:
   torchmembrane reconstruct sensor.toml 'day1/*.jpg' day2/ --out results --batch 32
   torchmembrane reconstruct sensor.toml press.mp4 --out results --format parquet
   torchmembrane reconstruct sensor.toml day1/ --out results --pressure gauge.csv
+  torchmembrane reconstruct sensor.toml day1/ --out results --shard 2/8    # on the second of eight machines
 
 DIR then holds
   NAME.npz       the result for the image NAME.png (parquet: the dataset frames/part-*.parquet)
@@ -21,7 +22,8 @@ DIR then holds
   summary.csv    one row per frame
   NAME.png       its figure (--figures)
 Frames of a video are called STEM_000000, STEM_000001 ... The same command again continues after an
-interruption: finished frames are skipped, failed ones tried again. In Python,
+interruption: finished frames are skipped, failed ones, those of damaged results and those whose image
+has changed are done again. In Python,
 torchmembrane.read_results(DIR) gives the frames one by one, by name, or as one batch.
 
 exit code: 0 all well, 1 some frames failed (see stderr and summary.csv), 2 wrong usage or sensor file"""
@@ -35,7 +37,13 @@ def add_parser(commands: Any) -> None:
     add("--out", metavar="DIR", type=Path, required=True, help="folder of the results: new, or of the same sensor")
     add_estimator(add, "triangle (default), or quadrilateral: the paper's, harmonic, with the tension of --energy")
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: %(default)s)")
-    add("--batch", metavar="N", type=count, default=16, help="frames computed at once (default: %(default)s)")
+    add("--batch", metavar="N", type=count_or_auto, help="frames computed at once (default: auto, by the memory there is)")
+    each = "processes of one thread each; 1: none but this one (default: one per core, if there are frames enough)"
+    add("--workers", metavar="N", type=count, help=each)
+    where = "this machine (default), or the Ray cluster of RAY_ADDRESS, which writes a Parquet dataset; see docs/clusters.md"
+    add("--engine", choices=ENGINES, default=ENGINES[0], help=where)
+    part = "do the I-th of N disjoint parts of the frames; others may do theirs in the same DIR at the same time"
+    add("--shard", metavar="I/N", type=share, default=(1, 1), help=part)
     add("--video", action="store_true", help="treat every input as a video (mp4, mov, avi, mkv, webm always are)")
     own = "images of this recording without contact, or first:N, its first N frames: their mean is rest (default: the sensor's)"
     add("--rest", metavar="IMAGES", nargs="+", default=[], help=own)
@@ -43,8 +51,8 @@ def add_parser(commands: Any) -> None:
     add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
     noise = "standard deviation of these, over the rest pressure (default: 0.01)"
     add("--pressure-noise", metavar="SHARE", type=positive, help=noise)
-    one = "one .npz per frame, or one dataset (default: %(default)s)"
-    add("--format", choices=RESULT_FORMATS, default=RESULT_FORMATS[0], help=one)
+    one = "one .npz per frame, or one dataset (default: npz; of --engine ray: parquet)"
+    add("--format", choices=RESULT_FORMATS, help=one)
     add("--figures", action="store_true", help="also NAME.png: flow, side view and displacement of every frame")
 
 
@@ -53,26 +61,43 @@ def run(arguments: Namespace) -> int:
     import torch
 
     from ..errors import MembraneError
+    from ..io.claim import Shard
     from ..io.store import Settings, check_folder
     from ..jobs.inputs import find_inputs
     from ..jobs.local import reconstruct_files
     from ..jobs.pressure import recording_pressures
+    from ..jobs.ray_engine import RayEngine
     from ..jobs.rest import recording_rest
     from ..presets import sensor_file
     from ..sensor.sensor import Sensor
     from .build import build_reconstructor
 
-    if arguments.device == "cuda" and not torch.cuda.is_available():
+    if arguments.device == "cuda" and arguments.engine == "local" and not torch.cuda.is_available():
         raise MembraneError("--device cuda: torch sees no CUDA device; pass --device cpu, or install torch with CUDA")
+    by_ray = arguments.engine == "ray"
+    if by_ray and arguments.format == "npz":
+        raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
     inputs = find_inputs(arguments.images, arguments.video)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
-    reconstructor = build_reconstructor(sensor, arguments).to(arguments.device)
+    reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = recording_pressures(reconstructor, arguments.pressure, inputs) if arguments.pressure else None
-    settings = Settings.of(reconstructor, arguments.format, " ".join(arguments.rest), str(arguments.pressure or ""))
+    format = arguments.format or ("parquet" if by_ray else "npz")
+    settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""))
     check_folder(arguments.out, sensor.fingerprint, settings)
     rest = recording_rest(reconstructor, arguments.rest, inputs) if arguments.rest else None
-    options = {"batch": arguments.batch, "figures": arguments.figures, "rest_pixels": rest, "pressure": pressure}
-    counts = reconstruct_files(reconstructor, inputs, arguments.out, settings, **options)
+    counts = reconstruct_files(
+        reconstructor,
+        inputs,
+        arguments.out,
+        settings,
+        batch=arguments.batch,
+        workers=arguments.workers,
+        engine=RayEngine(arguments.device, arguments.workers) if by_ray else None,
+        shard=Shard(*arguments.shard),
+        figures=arguments.figures,
+        rest_pixels=rest,
+        pressure=pressure,
+    )
     doubts = ("not converged", counts.not_converged), ("unexplained", counts.unexplained), ("partly hidden", counts.hidden)
     said = ", ".join(f"{count} {doubt}" for doubt, count in doubts if count)
     unsure = f" ({said})" if said else ""

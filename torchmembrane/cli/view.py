@@ -13,14 +13,17 @@ EXAMPLES = """\
 examples:
   torchmembrane view results/press.npz --out press.png
   torchmembrane view results/press.npz --image press.png
+  torchmembrane view results --frame press          # of a folder of either format; without --frame its first
+  torchmembrane view results/frames/part-00000.parquet
 
-Without --out a window is opened; without a display, RESULT_view.png is written."""
+Without --out a window is opened; without a display, NAME_view.png is written beside the results."""
 
 
 def add_parser(commands: Any) -> None:
     """Add the command's parser."""
     add = add_command(commands, "view", run, PURPOSE, EXAMPLES)
-    add("result", metavar="RESULT.npz", type=Path, help="a frame's result")
+    add("result", metavar="RESULT", type=Path, help="a frame's result NAME.npz, a part of a Parquet dataset, or a folder")
+    add("--frame", metavar="NAME", help="which frame of a folder or a part (default: the first)")
     add("--mesh", metavar="mesh.npz", type=Path, help="the mesh of its folder (default: mesh.npz beside it)")
     add("--image", metavar="IMAGE", type=Path, help="the frame's image, drawn behind the flow")
     add("--out", metavar="FILE.png", type=Path, help="where to draw it (default: in a window, if there is a display)")
@@ -30,25 +33,26 @@ def run(arguments: Namespace) -> int:
     """Draw the result; returns the exit code."""
     from ..errors import MembraneError
     from ..io.images import read_image
-    from ..io.results import load_frame
+    from ..io.read import read_frame
     from ..io.store import MESH, Mesh
     from ..plot.drawing import save, show
     from ..plot.frames import figure
 
-    frame, mesh = load_frame(arguments.result), Mesh.load(arguments.mesh or arguments.result.parent / MESH)
+    name, frame, home = read_frame(arguments.result, arguments.frame)
+    mesh = Mesh.load(arguments.mesh or home / MESH)
     vertices, expected = len(frame["vertices"]), len(mesh.rest_vertices)
     if vertices != expected:
         raise MembraneError(
             f"{arguments.result}: {vertices} vertices, the mesh has {expected}; pass the {MESH} of its folder as --mesh"
         )
     image = read_image(arguments.image) if arguments.image else None
-    drawing = figure(frame, mesh, image, arguments.result.stem)
+    drawing = figure(frame, mesh, image, name)
     if arguments.out is None and _has_display():
         show(drawing)
         return 0
-    out = arguments.out or arguments.result.with_name(f"{arguments.result.stem}_view.png")
+    out = arguments.out or home / f"{name}_view.png"
     save(drawing, out)
-    print(f"drawn in {out}")
+    print(f"{name} drawn in {out}")
     return 0
 
 

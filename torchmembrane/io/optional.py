@@ -42,6 +42,17 @@ def load_pandas() -> Any:
     return _load("pandas", "a DataFrame of results needs pandas", "pandas")
 
 
+def load_ray() -> Any:
+    """The module `ray`, with `ray.data`.
+
+    Raises:
+        MembraneError: Ray is not installed.
+    """
+    ray = _load("ray", "clusters need Ray", "ray")
+    import_module("ray.data")
+    return ray
+
+
 def _load(module: str, purpose: str, extra: str) -> Any:
     try:
         return import_module(module)

@@ -3,12 +3,13 @@
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from ..errors import MembraneError
-from .frames import PART_ROWS, Frame, frames_of
+from ..errors import MembraneError, expect
+from .frame_table import PART_ROWS, read_part
+from .frames import frames_of
 from .optional import load_pandas
-from .results import Reconstruction, stack_frames
+from .results import Frame, Reconstruction, load_frame, stack_frames
 from .store import MESH, Mesh
 
 
@@ -46,6 +47,38 @@ def read_results(folder: str | Path) -> "Results":
     return Results(Path(folder))
 
 
+class FoundFrame(NamedTuple):
+    """A frame that was asked for, and the folder in which its `mesh.npz` should be."""
+
+    name: str
+    frame: Frame
+    home: Path
+
+
+def read_frame(path: Path, name: str | None = None) -> FoundFrame:
+    """One frame of whatever holds results.
+
+    Args:
+        path: NAME.npz, a part of a Parquet dataset, or a folder of results.
+        name: of the frame in a part or a folder; default: the first.
+
+    Raises:
+        MembraneError: it holds no results, or none of this name.
+    """
+    if path.is_dir():
+        results = read_results(path)
+        chosen = results.names[0] if name is None else name
+        return FoundFrame(chosen, results[chosen], path)
+    if path.suffix != ".parquet":
+        expect(name in (None, path.stem), "--frame", name, f"a folder or a part to choose from; {path} is one frame")
+        return FoundFrame(path.stem, load_frame(path), path.parent)
+    frames = read_part(path)
+    chosen = next(iter(sorted(frames))) if name is None else name
+    if chosen not in frames:
+        raise MembraneError(f"{path}: no frame {chosen!r}; expected one of {len(frames)}, {min(frames)!r} the first")
+    return FoundFrame(chosen, frames[chosen], path.parent.parent if path.parent.name == "frames" else path.parent)
+
+
 class Results:
     """The frames of a folder of results: a sequence in name order, and a mapping by name.
 
@@ -70,7 +103,7 @@ class Results:
         self.folder = folder
         self.mesh = Mesh.load(folder / MESH)
         self._frames = frames_of(folder, self.mesh)
-        self.names = sorted(self._frames.statuses())
+        self.names = sorted(self._frames.names())
         self._known = frozenset(self.names)
         if not self.names:
             raise MembraneError(f"{folder}: no frames; expected results of `torchmembrane reconstruct`")

@@ -1,7 +1,9 @@
 """What one frame's reconstruction holds, and how it is stored."""
 
+import struct
+import zlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 from zipfile import BadZipFile
 
 import numpy as np
@@ -11,6 +13,15 @@ from torch import Tensor
 from ..errors import MembraneError, expect
 from ..pose import Pose
 from .atomic import whole_file
+from .origin import Origin
+
+Frame: TypeAlias = dict[str, np.ndarray]
+"""One frame's arrays, as `Reconstruction.frame` gives them."""
+DAMAGE = (
+    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError, ValueError),
+    *(BadZipFile, struct.error, zlib.error),
+)
+"""What reading a damaged file raises."""
 
 
 class Reconstruction(NamedTuple):
@@ -143,6 +154,36 @@ ADDED: dict[str, tuple[int, ...]] = {
 """Arrays that results did not always hold, with their shapes: 0 stands for as many as there are `contact_points`."""
 
 
+class Stored(NamedTuple):
+    """A frame as it is stored: its arrays, what they were found in, and the seconds that it took.
+
+    Attributes:
+        frame: as `Reconstruction.frame` gives it.
+        origin: the image file, or the video.
+        seconds: NaN where it is not known.
+    """
+
+    frame: Frame
+    origin: Origin = Origin()
+    seconds: float = float("nan")
+
+    @classmethod
+    def of(cls, arrays: dict[str, Any]) -> "Stored":
+        """From all arrays of a file; those that it lacks are as unknown.
+
+        Raises:
+            KeyError: it lacks one that there always was.
+        """
+        known = {key: arrays[key] for key in Origin._fields if key in arrays}
+        origin = Origin()._replace(**{key: value.item() if hasattr(value, "item") else value for key, value in known.items()})
+        return cls(completed(arrays), origin, float(arrays.get("seconds", np.nan)))
+
+    def arrays(self) -> Frame:
+        """All arrays of a file, by name."""
+        known = {key: np.asarray(value) for key, value in self.origin._asdict().items()}
+        return self.frame | known | {"seconds": np.asarray(self.seconds, np.float64)}
+
+
 def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
     """Write one frame, whole or not at all.
 
@@ -180,7 +221,7 @@ def load_frame(path: str | Path) -> dict[str, np.ndarray]:
             frame = completed({k: data[k] for k in data})
     except FileNotFoundError as error:
         raise MembraneError(f"{path}: no such file; expected a result NAME.npz") from error
-    except (KeyError, OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
+    except DAMAGE as error:
         raise MembraneError(
             f"{path}: not a result of torchmembrane ({error}); expected the arrays of Reconstruction"
         ) from error

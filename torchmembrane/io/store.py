@@ -1,6 +1,5 @@
 """A folder of results: the settings that all its frames share, and `mesh.npz`, which holds them beside the rest surface."""
 
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -9,7 +8,7 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..pose import Pose
-from .results import save_frame
+from .results import DAMAGE, save_frame
 from .status import Status
 
 if TYPE_CHECKING:
@@ -129,7 +128,7 @@ class Mesh(NamedTuple):
                 found = {key: data[key] for key in cls._fields if key in data or key not in cls._field_defaults}
         except FileNotFoundError as error:
             raise MembraneError(f"{path}: no such file; expected the {MESH} that is written beside results") from error
-        except (KeyError, OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
+        except DAMAGE as error:
             raise MembraneError(f"{path}: not a {MESH} of torchmembrane ({error})") from error
         return cls(**{key: array.item() if array.ndim == 0 else array for key, array in found.items()})
 

@@ -1,1 +1,5 @@
 """Files in, results out."""
+
+from .frame_reconstructor import FrameReconstructor
+
+__all__ = ["FrameReconstructor"]

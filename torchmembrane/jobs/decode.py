@@ -13,20 +13,27 @@ from torch import Tensor
 from ..errors import MembraneError
 from ..io.images import to_grey
 from ..io.optional import load_pyav
-from .inputs import Inputs
+from ..io.origin import Origin
+from .inputs import Inputs, frame_name
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
 
 DECODERS = 4
+LONGEST_NAME = 251
+"""Bytes of a frame's name, so that there can be a file NAME.npz."""
 
 
 class Source(NamedTuple):
-    """A frame still to be decoded: `load()` gives its image `[1, 1, height, width]` or raises `MembraneError`."""
+    """A frame still to be decoded: `load(reconstructor)` gives its image `[1, 1, height, width]` or raises `MembraneError`.
+
+    Those of image files can be sent to another process.
+    """
 
     name: str
     file: Path
-    load: Callable[[], Tensor]
+    load: Callable[["Reconstructor"], Tensor]
+    origin: Origin | None = None
 
 
 class DecodedFrame(NamedTuple):
@@ -36,21 +43,57 @@ class DecodedFrame(NamedTuple):
     file: Path
     image: Tensor | None
     reason: str = ""
+    origin: Origin = Origin()
+
+    def but(self, error: Exception) -> "DecodedFrame":
+        """The same without an image, because of an error."""
+        return self._replace(image=None, reason=str(error).removeprefix(f"{self.file}: "))
 
 
 def sources(inputs: Inputs, reconstructor: "Reconstructor") -> Iterator[Source]:
     """All frames of the inputs: the images, then the videos' pictures, which are called STEM_NUMBER."""
-    for path in inputs.images:
-        yield Source(path.stem, path, partial(reconstructor.read, path))
+    yield from map(source_of, inputs.images)
     for path in inputs.videos:
         yield from _video_frames(path, reconstructor)
 
 
-def read_ahead(sources: Iterator[Source], batch: int) -> Iterator[list[DecodedFrame]]:
+def source_of(path: Path) -> Source:
+    """The frame of an image file."""
+    return Source(frame_name(path), path, partial(_read, path))
+
+
+def decoded(source: Source, reconstructor: "Reconstructor") -> DecodedFrame:
+    """A frame's image, or the reason why there is none."""
+    frame = DecodedFrame(source.name, source.file, None)
+    try:
+        if len(source.name.encode()) > LONGEST_NAME:
+            raise MembraneError(f"its name has {len(source.name.encode())} bytes; expected {LONGEST_NAME} at most: rename it")
+        origin = source.origin or origin_of(source.file)
+        return frame._replace(image=source.load(reconstructor), origin=origin)
+    except MembraneError as error:
+        return frame.but(error)
+
+
+def origin_of(path: Path) -> Origin:
+    """The origin of a frame in this file.
+
+    Raises:
+        MembraneError: it is not a regular file (a pipe would be waited for), or cannot be read.
+    """
+    try:
+        if not path.is_file():
+            raise MembraneError(f"{path}: not a regular file; expected an image or a video")
+        return Origin.of(path)
+    except OSError as error:
+        raise MembraneError(f"{path}: not readable ({error})") from error
+
+
+def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch: int) -> Iterator[list[DecodedFrame]]:
     """Batches of decoded frames; while one is used, the next is decoded.
 
     Args:
         sources: frames to decode, in order.
+        reconstructor: of the sensor.
         batch: the number of frames in a batch.
 
     Yields:
@@ -59,7 +102,7 @@ def read_ahead(sources: Iterator[Source], batch: int) -> Iterator[list[DecodedFr
     with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(DECODERS) as decoders:
 
         def read() -> list[DecodedFrame]:
-            return list(decoders.map(_decoded, islice(sources, batch)))
+            return list(decoders.map(lambda source: decoded(source, reconstructor), islice(sources, batch)))
 
         following = reader.submit(read)
         while group := following.result():
@@ -70,6 +113,8 @@ def read_ahead(sources: Iterator[Source], batch: int) -> Iterator[list[DecodedFr
 def video_length(path: Path) -> int | None:
     """The number of frames that a video says it has; None where it does not say, or is no video."""
     av = load_pyav()
+    if not path.is_file():
+        return None
     try:
         with av.open(str(path)) as container:
             return container.streams.video[0].frames or None
@@ -77,11 +122,8 @@ def video_length(path: Path) -> int | None:
         return None
 
 
-def _decoded(source: Source) -> DecodedFrame:
-    try:
-        return DecodedFrame(source.name, source.file, source.load())
-    except MembraneError as error:
-        return DecodedFrame(source.name, source.file, None, str(error).removeprefix(f"{source.file}: "))
+def _read(path: Path, reconstructor: "Reconstructor") -> Tensor:
+    return reconstructor.read(path)
 
 
 def _video_frames(path: Path, reconstructor: "Reconstructor") -> Iterator[Source]:
@@ -89,17 +131,19 @@ def _video_frames(path: Path, reconstructor: "Reconstructor") -> Iterator[Source
     av, number = load_pyav(), -1
     width, height = reconstructor.sensor.camera.image_size
     try:
+        origin = origin_of(path)
         with av.open(str(path)) as container:
             for number, picture in enumerate(container.decode(video=0)):
                 if (picture.width, picture.height) != (width, height):
                     raise MembraneError(
                         f"the video is {picture.width} x {picture.height} px, the sensor's images {width} x {height}"
                     )
-                yield Source(f"{path.stem}_{number:06d}", path, partial(_video_image, picture, reconstructor))
+                yield Source(f"{frame_name(path)}_{number:06d}", path, partial(_video_image, picture), origin)
         if number < 0:
             raise MembraneError("holds no picture")
     except (av.FFmpegError, IndexError, MembraneError) as error:
-        yield Source(f"{path.stem}_{number + 1:06d}", path, partial(_refuse, f"video: {error}"))
+        refusal = partial(_refuse, str(error).removeprefix(f"{path}: "))
+        yield Source(f"{frame_name(path)}_{number + 1:06d}", path, refusal, Origin())
 
 
 def _video_image(picture: Any, reconstructor: "Reconstructor") -> Tensor:
@@ -107,5 +151,5 @@ def _video_image(picture: Any, reconstructor: "Reconstructor") -> Tensor:
     return torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels)
 
 
-def _refuse(reason: str) -> NoReturn:
-    raise MembraneError(reason)
+def _refuse(reason: str, reconstructor: "Reconstructor") -> NoReturn:
+    raise MembraneError(f"video: {reason}")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import MembraneError
+from ..io.origin import printable
 from ..io.store import MESH
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -32,7 +33,17 @@ class Inputs(NamedTuple):
             'press.mp4'
         """
         stem, _, number = name.rpartition("_")
-        return next((path for path in self.videos if path.stem == stem and number.isdigit()), None)
+        return next((path for path in self.videos if frame_name(path) == stem and number.isdigit()), None)
+
+
+def frame_name(path: Path) -> str:
+    r"""The name of an image's frame, or the first part of the names of a video's: the file's, without its ending, in UTF-8.
+
+    Example:
+        >>> frame_name(Path("day/caf\udce9.png"))
+        'caf\\xe9'
+    """
+    return printable(path.stem)
 
 
 def find_inputs(arguments: Iterable[str | Path], video: bool = False) -> Inputs:
@@ -55,13 +66,13 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False) -> Inputs:
     paths = [path for argument in arguments for path in _expanded(str(argument), VIDEOS if video else IMAGES)]
     is_video = {path: video or path.suffix.lower() in VIDEOS for path in paths}
     inputs = Inputs([path for path in paths if not is_video[path]], [path for path in paths if is_video[path]])
-    for name, count in Counter(path.stem for path in paths).items():
+    for name, count in Counter(map(frame_name, paths)).items():
         if count > 1:
-            twins = ", ".join(str(path) for path in paths if path.stem == name)
+            twins = ", ".join(printable(str(path)) for path in paths if frame_name(path) == name)
             raise MembraneError(f"two inputs of the name {name!r} ({twins}); results bear it: rename, or use two calls")
     for image in inputs.images:
-        if inputs.video_of(image.stem):
-            raise MembraneError(f"{image}: a frame of {inputs.video_of(image.stem)} has the same name; use two calls")
+        if of_video := inputs.video_of(frame_name(image)):
+            raise MembraneError(f"{image}: a frame of {of_video} has the same name; use two calls")
         if f"{image.stem}.npz" == MESH:
             raise MembraneError(f"{image}: its result would be {MESH}, which holds the mesh; rename the image")
     return inputs

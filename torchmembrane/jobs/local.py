@@ -1,27 +1,32 @@
 """Images on disk to results on disk: in batches, restartable, one bad file never stops the rest."""
 
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-import torch
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..io.frames import Frame, open_folder
+from ..io.claim import WHOLE, Shard
 from ..io.optional import load_pyav
-from ..io.results import Reconstruction
+from ..io.origin import printable
 from ..io.status import Status
 from ..io.store import FINISHED, Mesh, Settings
-from ..io.summary import UNREADABLE, Summary
-from .decode import DecodedFrame, read_ahead, sources, video_length
-from .inputs import Inputs
+from .decode import Source, sources, video_length
+from .frame_reconstructor import FrameReconstructor, Outcome
+from .inputs import Inputs, frame_name
+from .result_folder import ResultFolder
+from .workers import Work, batch_for, outcomes_by, outcomes_here, workers_for
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
+
+Engine: TypeAlias = Callable[[Work, Iterator[Source], int | None], Iterator[list[Outcome]]]
+"""Computes what becomes of all frames, in batches of a size, by default of its own."""
 
 
 class FrameCounts(NamedTuple):
@@ -42,7 +47,10 @@ def reconstruct_files(
     out: str | Path,
     settings: Settings,
     *,
-    batch: int = 16,
+    batch: int | None = None,
+    workers: int | None = 1,
+    shard: Shard = WHOLE,
+    engine: Engine | None = None,
     figures: bool = False,
     rest_pixels: Tensor | None = None,
     pressure: Mapping[str, float] | None = None,
@@ -51,14 +59,19 @@ def reconstruct_files(
     """Reconstruct all frames of `inputs` that have no finished result in the folder `out` yet.
 
     A file that cannot be read stands in summary.csv with status -1 and has no result. Interrupted at any point, `out`
-    holds what is done so far and the same call continues from there.
+    holds what is done so far and the same call continues from there: at most `SAVE_SECONDS` and a batch are lost. A frame whose
+    image has changed since is done again.
 
     Args:
         reconstructor: a `Reconstructor`.
         inputs: what `find_inputs` gives.
         out: folder of the results: new, or of the same sensor and settings.
         settings: what the reconstructor was made with, and the format of the results.
-        batch: frames computed at once; at most three batches of images are in memory.
+        batch: frames computed at once; default: by the memory that there is.
+        workers: processes that compute, each with one thread; 1: this process with all of torch's threads; default None: one
+            per core where there are frames enough. A script that asks for more than one needs `if __name__ == "__main__":`.
+        shard: which part of the frames to do; several shards may do theirs at once.
+        engine: what computes, in place of this machine's processes: from work, sources and batch, all outcomes.
         figures: also NAME.png for every frame; a finished frame that lacks its figure is done again.
         rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
         pressure: that a gauge reads, by the names of the frames, as `Reconstructor` takes it.
@@ -68,7 +81,7 @@ def reconstruct_files(
         The numbers of frames.
 
     Raises:
-        MembraneError: `out` is refused, or a package for videos or Parquet is missing.
+        MembraneError: `out` is refused, another job is writing there, or a package for videos or Parquet is missing.
 
     Example:
         >>> import tempfile
@@ -87,103 +100,72 @@ def reconstruct_files(
         raise MembraneError(f"--out {out}: figures would overwrite images there ({shadowed[0]}); choose another")
     if inputs.videos:
         load_pyav()
-    folder = _ResultFolder(out, mesh, inputs, figures)
-    waiting = (source for source in sources(inputs, reconstructor) if source.name not in folder.finished)
     done: Counter[int] = Counter()
-    try:
-        with torch.no_grad(), _progress(inputs, folder.finished) as progress:
-            for group in read_ahead(waiting, batch):
-                for frame, result, seconds in _reconstructed(reconstructor, group, rest_pixels, pressure):
-                    status = folder.keep(frame, result, seconds)
-                    done[status] += 1
-                    if status not in FINISHED:
-                        of_video = "" if frame.name == frame.file.stem else f", {frame.name}"
-                        report(f"{frame.file}{of_video}: {frame.reason or Status(status).text}")
-                progress.update(len(group))
-    finally:
-        folder.close()
+    work = Work(FrameReconstructor(reconstructor, rest_pixels, pressure), (out, mesh) if figures else None)
+    with ResultFolder(out, mesh, inputs, shard, figures, report) as folder:
+        mine = (source for source in sources(inputs, reconstructor) if shard.holds(source.name))
+        waiting = (source for source in mine if source.name not in folder.finished)
+        with _progress(inputs, shard, folder.finished) as progress:
+            for group in (engine or _local(reconstructor, workers, progress.left))(work, waiting, batch):
+                for outcome in group:
+                    done[_kept(folder, outcome, report)] += 1
+                folder.save()
+                progress.update(len(group), done)
     good = sum(done[status] for status in FINISHED)
     doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN]
     return FrameCounts(good, *doubts, done.total() - good, progress.initial)
 
 
-class _ResultFolder:
-    """The folder of a call's results: frames, figures and summary.csv, kept in step.
-
-    Args:
-        path: the folder.
-        mesh: what its frames share.
-        inputs: the files of this call, to name them in summary.csv.
-        figures: whether to draw every frame.
-
-    Attributes:
-        finished: the frames that need not be done again.
-    """
-
-    def __init__(self, path: Path, mesh: Mesh, inputs: Inputs, figures: bool):
-        self.path, self.mesh, self.figures = path, mesh, figures
-        self.frames = open_folder(path, mesh)
-        stored, files = self.frames.statuses(), {image.stem: image for image in inputs.images}
-        self.summary = Summary(path, self.frames, stored, mesh, lambda name: files.get(name) or inputs.video_of(name))
-        good = {name for name, status in stored.items() if status in FINISHED}
-        self.finished = {name for name in good if not figures or (path / f"{name}.png").exists()}
-
-    def keep(self, frame: DecodedFrame, result: Frame | None, seconds: float) -> int:
-        """Store a frame's result, or that it has none; returns its status."""
-        if frame.image is None or result is None:
-            self.frames.forget(frame.name)
-            self.summary.add_unreadable(frame.name, frame.file, frame.reason)
-            return UNREADABLE
-        if self.figures:
-            from ..plot.drawing import save
-            from ..plot.frames import figure
-
-            save(figure(result, self.mesh, frame.image[0, 0].cpu().numpy(), frame.name), self.path / f"{frame.name}.png")
-        self.frames.write(frame.name, result)
-        self.summary.add(frame.name, frame.file, result, seconds)
-        return int(result["status"])
-
-    def close(self) -> None:
-        """Write what is held back."""
-        self.frames.flush()
-        self.summary.write()
+def _kept(folder: ResultFolder, outcome: Outcome, report: Callable[[str], None]) -> int:
+    """Keep an outcome, and say why if it is no result; returns its status."""
+    status = folder.keep(outcome)
+    if status not in FINISHED:
+        of_video = "" if outcome.name == frame_name(outcome.file) else f", {outcome.name}"
+        report(f"{outcome.file}{of_video}: {outcome.status_text}")
+    return status
 
 
-def _reconstructed(
-    reconstructor: "Reconstructor",
-    group: list[DecodedFrame],
-    rest_pixels: Tensor | None,
-    pressure: Mapping[str, float] | None,
-) -> Iterator[tuple[DecodedFrame, Frame | None, float]]:
-    """Every frame of a batch with its result, None for an unreadable one, and the seconds that it took."""
-    start = time.perf_counter()
-    readable = [(frame.name, frame.image) for frame in group if frame.image is not None]
-    names, images = [name for name, _ in readable], [image for _, image in readable]
-    results: Iterator[Frame] = iter(())
-    if images:
-        options = {} if rest_pixels is None else {"rest_pixels": rest_pixels}
-        if pressure is not None:
-            options["pressure"] = torch.tensor([pressure.get(name, torch.nan) for name in names], dtype=torch.float64)
-        computed = Reconstruction(*(field.cpu() for field in reconstructor(torch.cat(images), **options)))
-        results = iter([computed.frame(i) for i in range(len(images))])
-    seconds = (time.perf_counter() - start) / max(len(images), 1)
-    for frame in group:
-        yield frame, None if frame.image is None else next(results), seconds
+def _local(reconstructor: "Reconstructor", workers: int | None, left: int) -> Engine:
+    """This process, or worker processes of this machine."""
+    device = reconstructor.rest_pixels.device.type
+    count = workers_for(left, device) if workers is None else workers
+    compute = outcomes_here if count == 1 else partial(outcomes_by, count)
+
+    def engine(work: Work, waiting: Iterator[Source], batch: int | None) -> Iterator[list[Outcome]]:
+        return compute(work, waiting, batch or batch_for(reconstructor.image_size, count, device))
+
+    return engine
 
 
-def _progress(inputs: Inputs, finished: set[str]) -> Any:
-    """A bar with rate over all frames of the call, as far as the videos say how many they hold."""
-    from tqdm import tqdm
+class _Progress:
+    """A bar with rate and counts over all frames of the call, as far as the videos say how many they hold."""
 
-    mine = sum(path.stem in finished for path in inputs.images)
-    mine += sum(inputs.video_of(name) is not None for name in finished) if inputs.videos else 0
-    lengths = [video_length(path) for path in inputs.videos]
-    known = [length for length in lengths if length is not None]
-    total = len(inputs.images) + sum(known) if len(known) == len(lengths) else None
-    return tqdm(total=total, initial=mine, unit="frame", desc="reconstruct")
+    def __init__(self, inputs: Inputs, shard: Shard, finished: set[str]):
+        from tqdm import tqdm
+
+        mine = [name for name in map(frame_name, inputs.images) if shard.holds(name)]
+        self.initial = sum(name in finished for name in mine)
+        self.initial += sum(inputs.video_of(name) is not None for name in finished) if inputs.videos else 0
+        lengths = [(length or 0) // shard.total for length in map(video_length, inputs.videos)]
+        total = len(mine) + sum(lengths)
+        self.left = total - self.initial
+        self.bar = tqdm(total=total if all(lengths) else None, initial=self.initial, unit="frame", desc="reconstruct")
+
+    def update(self, frames: int, done: Counter[int]) -> None:
+        """Some more frames; `done`: all of this call by status."""
+        failed = sum(count for status, count in done.items() if status not in FINISHED)
+        self.bar.set_postfix({"failed": failed, "not converged": done[Status.NOT_CONVERGED]}, refresh=False)
+        self.bar.update(frames)
+
+
+@contextmanager
+def _progress(inputs: Inputs, shard: Shard, finished: set[str]) -> Iterator[_Progress]:
+    progress = _Progress(inputs, shard, finished)
+    with progress.bar:
+        yield progress
 
 
 def _write_line(line: str) -> None:
     from tqdm import tqdm
 
-    tqdm.write(line, file=sys.stderr)
+    tqdm.write(printable(line), file=sys.stderr)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ..errors import MembraneError
 from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
-from .inputs import Inputs
+from .inputs import Inputs, frame_name
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
@@ -71,7 +71,8 @@ def read_pressures(path: Path, inputs: Inputs, sensor: Sensor) -> PressureReadin
         raise MembraneError(f"{path}: not readable ({error}); expected {EXPECTED}") from error
     if header not in HEADERS:
         raise MembraneError(f"{path}: the header is {','.join(header)!r}; expected {EXPECTED}")
-    stems = {image.name: image.stem for image in inputs.images} | {image.stem: image.stem for image in inputs.images}
+    names = [(image.name, frame_name(image)) for image in inputs.images]
+    stems = dict(names) | {name: name for _, name in names}
     readings: dict[str, float] = {}
     for line, row in enumerate(rows, 2):
         where = f"{path}, line {line}"
@@ -100,5 +101,5 @@ def _number(text: str, where: str) -> float:
 
 
 def _known(inputs: Inputs) -> str:
-    names = [image.stem for image in inputs.images[:1]] + [f"{video.stem}_000000" for video in inputs.videos[:1]]
+    names = [frame_name(image) for image in inputs.images[:1]] + [f"{frame_name(video)}_000000" for video in inputs.videos[:1]]
     return f"their names, as {' or '.join(names)}"

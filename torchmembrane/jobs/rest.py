@@ -36,7 +36,7 @@ def recording_rest(reconstructor: "Reconstructor", arguments: list[str], inputs:
         chosen = islice(sources(inputs, reconstructor), int(count))
     else:
         chosen = sources(find_inputs(arguments), reconstructor)
-    images = [source.load() for source in chosen]
+    images = [source.load(reconstructor) for source in chosen]
     try:
         return reconstructor.observer.rest_of(torch.cat(images)).pixels
     except MembraneError as error:

@@ -5,6 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 from matplotlib.tri import Triangulation, TriContourSet
 
 from ..io.status import Status
@@ -28,6 +29,7 @@ FORCE_ARROW = 0.2  # of the image's width: a force across the optical axis; shor
 MAGNIFICATIONS = (1, 2, 3, 5, 10, 20)
 LONGEST_ARROW, LEAST_SCALE = 0.07, 0.002  # of the image's width; of the surface's extent
 ARROWS_ACROSS = 22
+BAR_BELOW, BAR_HEIGHT = 0.58, 0.13  # inches: of a colour bar, below its axes, whatever the image's shape
 
 
 def figure(frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = None, name: str = "") -> Figure:
@@ -174,7 +176,10 @@ def draw_traction(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
 
 def _colour_bar(axes: Axes, shades: TriContourSet, ticks: np.ndarray | None = None) -> Colorbar:
     """A flat bar below the axes."""
-    bar = axes.figure.colorbar(shades, cax=axes.inset_axes((0.05, -0.24, 0.9, 0.04)), ticks=ticks, orientation="horizontal")
+    foot = ScaledTranslation(0, 0, axes.transAxes)  # type: ignore[arg-type]
+    inches_below = blended_transform_factory(axes.transAxes, axes.figure.dpi_scale_trans + foot)
+    place = axes.inset_axes((0.05, -BAR_BELOW - BAR_HEIGHT, 0.9, BAR_HEIGHT), transform=inches_below)
+    bar = axes.figure.colorbar(shades, cax=place, ticks=ticks, orientation="horizontal")
     bar.ax.tick_params(labelsize=8.5)
     return bar
 

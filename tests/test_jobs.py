@@ -1,0 +1,359 @@
+"""Jobs that are killed, doubled, divided, given bad names, new images and damaged results."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from PIL import Image
+from test_batch import NPZ, PARQUET, Denting, grey_image, reconstruct, summary_of
+
+from torchmembrane.errors import MembraneError
+from torchmembrane.io import frame_table
+from torchmembrane.io.claim import WHOLE, Claim, Shard
+from torchmembrane.io.origin import Origin
+from torchmembrane.io.read import read_results
+from torchmembrane.io.results import Reconstruction
+from torchmembrane.jobs import workers
+from torchmembrane.jobs.inputs import find_inputs
+
+both = pytest.mark.parametrize("settings", [NPZ, PARQUET], ids=["npz", "parquet"])
+
+
+@pytest.fixture
+def images(tmp_path) -> list[Path]:
+    (tmp_path / "images").mkdir()
+    return [grey_image(tmp_path / "images" / f"i{k}.png", 40 + 30 * k) for k in range(5)]
+
+
+def rows_in(out: Path) -> list[str]:
+    return sorted(name for part in (out / "frames").glob("*.parquet") for name in pq.read_table(part)["name"].to_pylist())
+
+
+def test_parquet_rows_are_on_the_disk_while_work_goes_on(images, tmp_path, monkeypatch):
+    monkeypatch.setattr(frame_table, "SAVE_SECONDS", 0.0)
+    seen = []
+
+    class Watching(Denting):
+        def __call__(self, batch):
+            seen.append(rows_in(tmp_path / "out"))
+            return super().__call__(batch)
+
+    reconstruct(images, tmp_path / "out", PARQUET, Watching())
+    assert [len(names) for names in seen] == [0, 2, 4]
+    assert rows_in(tmp_path / "out") == [path.stem for path in images]
+    assert len(list((tmp_path / "out" / "frames").iterdir())) == 1
+
+
+def test_small_parts_become_large_ones_as_they_gather(images, tmp_path, monkeypatch):
+    monkeypatch.setattr(frame_table, "SAVE_SECONDS", 0.0)
+    monkeypatch.setattr(frame_table, "PART_ROWS", 4)
+    paths = [grey_image(images[0].parent / f"m{k:02d}.png", 99) for k in range(19)]
+    parts = []
+
+    class Watching(Denting):
+        def __call__(self, batch):
+            parts.append(len(list((tmp_path / "out" / "frames").glob("*.parquet"))))
+            return super().__call__(batch)
+
+    reconstruct(paths, tmp_path / "out", PARQUET, Watching())
+    assert parts == [0, 1, 1, 2, 2, 3, 3, 4, 4, 5]
+    sizes = [pq.read_metadata(part).num_rows for part in sorted((tmp_path / "out" / "frames").glob("*.parquet"))]
+    assert sizes == [4, 4, 4, 4, 3] and rows_in(tmp_path / "out") == [path.stem for path in paths]
+
+
+def test_rows_that_an_interrupted_merge_left_twice_are_taken_out(images, tmp_path):
+    reconstruct(images, tmp_path / "out", PARQUET)
+    part = tmp_path / "out" / "frames" / "part-00000.parquet"
+    table = pq.read_table(part)
+    pq.write_table(table.slice(3), part.with_name("part-00001.parquet"))
+    assert len(read_results(tmp_path / "out").batch().status) == 5
+    assert reconstruct(images, tmp_path / "out", PARQUET)[0] == (0, 0, 0, 0, 0, 5)
+    assert rows_in(tmp_path / "out") == [path.stem for path in images]
+
+
+@both
+def test_a_new_image_under_an_old_name_is_done_again(images, tmp_path, settings):
+    reconstruct(images, tmp_path / "out", settings)
+    grey_image(images[1], 200)
+    os.utime(images[2], ns=(1, 1))
+    outcome, lines, _ = reconstruct(images, tmp_path / "out", settings)
+    assert outcome == (1, 0, 0, 0, 0, 4) and lines == [f"{images[1]}: changed, done again"]
+    assert float(read_results(tmp_path / "out")["i1"]["pressure"]) == pytest.approx(200 / 255, abs=1e-5)
+    assert summary_of(tmp_path / "out")["i1"]["content_hash"] == Origin.of(images[1]).content_hash
+    assert reconstruct(images, tmp_path / "out", settings)[0] == (0, 0, 0, 0, 0, 5)
+
+
+def test_results_without_hashes_are_kept_and_that_is_said_once(images, tmp_path):
+    made = reconstruct(images, tmp_path / "out")[2]
+    for path in images:
+        np.savez(tmp_path / "out" / f"{path.stem}.npz", **made(made.read(path)).frame(0))
+    outcome, lines, _ = reconstruct(images, tmp_path / "out")
+    assert outcome == (0, 0, 0, 0, 0, 5) and len(lines) == 1 and "5 results do not say" in lines[0]
+    assert summary_of(tmp_path / "out")["i2"]["file"] == str(images[2])
+
+
+def test_a_dataset_of_before_is_resumed_in_the_form_of_now(images, tmp_path):
+    made = reconstruct(images, tmp_path / "out", PARQUET)[2]
+    part = tmp_path / "out" / "frames" / "part-00000.parquet"
+    table = pq.read_table(part)
+    columns = {"name": table["name"]}
+    for key in Reconstruction._fields:
+        values = torch.cat([getattr(made(made.read(path)), key) for path in images]).numpy()
+        values = values.astype(np.int32 if key == "status" else np.float32)
+        flat = pa.array(values.ravel())
+        size = values[0].size
+        columns[key] = pa.FixedSizeListArray.from_arrays(flat, size) if values.ndim > 1 else flat
+    pq.write_table(pa.table(columns).replace_schema_metadata(table.schema.metadata), part)
+    before = read_results(tmp_path / "out").batch()
+    outcome, lines, _ = reconstruct([*images, grey_image(tmp_path / "new.png", 77)], tmp_path / "out", PARQUET)
+    assert outcome == (1, 0, 0, 0, 0, 5) and "5 results do not say" in lines[0]
+    assert pq.read_table(part.parent).column_names == table.column_names
+    after = read_results(tmp_path / "out").batch()
+    assert torch.equal(after.vertices[:5], before.vertices) and len(after.status) == 6
+
+
+@both
+def test_a_damaged_result_is_done_again_and_that_is_said_once(images, tmp_path, settings):
+    reconstruct(images, tmp_path / "out", settings)
+    damaged = tmp_path / "out" / ("i3.npz" if settings is NPZ else "frames/part-00000.parquet")
+    before, found = read_results(tmp_path / "out").batch(), 0
+    for share in np.linspace(0.02, 0.98, 25):
+        whole = damaged.read_bytes()
+        content = bytearray(whole)
+        content[int(share * len(content))] ^= 0x10
+        damaged.write_bytes(content)
+        outcome, lines, _ = reconstruct(images, tmp_path / "out", settings)
+        assert all(torch.equal(a, b) for a, b in zip(read_results(tmp_path / "out").batch(), before, strict=True)), share
+        assert lines in ([], [f"{damaged}: damaged, done again"]) and bool(lines) == bool(outcome.reconstructed)
+        found += bool(lines)
+        damaged.write_bytes(whole)
+    assert found > 12
+    assert reconstruct(images, tmp_path / "out", settings)[:2] == ((0, 0, 0, 0, 0, 5), [])
+
+
+def test_a_damaged_summary_is_made_anew_from_the_frames(images, tmp_path):
+    images[4].write_bytes(b"broken")
+    reconstruct(images, tmp_path / "out")
+    path = tmp_path / "out" / "summary.csv"
+    before, content = path.read_text(), bytearray(path.read_bytes())
+    for spoiled in (content[:90] + b"\xff\x00" + content[90:], content[:300], b""):
+        path.write_bytes(spoiled)
+        assert reconstruct(images, tmp_path / "out")[0] == (0, 0, 0, 0, 1, 4)
+        assert path.read_text() == before
+
+
+def test_the_summary_of_a_killed_job_keeps_its_seconds(images, tmp_path):
+    reconstruct(images, tmp_path / "out")
+    (tmp_path / "out" / "summary.csv").unlink()
+    reconstruct(images, tmp_path / "out")
+    assert all(float(row["seconds"]) > 0 for row in summary_of(tmp_path / "out").values())
+
+
+def test_summary_holds_force_vector_and_the_strongest_contact(images, tmp_path):
+    class Slanting(Denting):
+        def __call__(self, batch):
+            found = super().__call__(batch)
+            return found._replace(force=found.force * torch.tensor([1.0, -2.0, 3.0]))
+
+    made = reconstruct(images, tmp_path / "out", reconstructor=Slanting())[2]
+    row, frame = summary_of(tmp_path / "out")["i2"], made(made.read(images[2])).frame(0)
+    assert np.allclose([float(row[f"force_{axis}"]) for axis in "xyz"], frame["force"], atol=1e-5)
+    assert np.allclose([float(row[f"contact_{axis}"]) for axis in "xyz"], frame["contact_points"][0], atol=1e-5)
+    assert row["contacts"] == "4" and float(row["contact_force"]) > 0
+
+
+@both
+def test_bad_names_do_not_stop_the_run(images, tmp_path, settings):
+    folder = images[0].parent
+    long = grey_image(folder / f"{'n' * 251}.png", 90)
+    strange = folder / os.fsdecode(b"caf\xe9.png")
+    images[1].rename(strange)
+    too_long = folder / os.fsdecode(b"\xff" * 100 + b".png")
+    images[2].rename(too_long)
+    os.mkfifo(folder / "pipe.png")
+    paths = [images[0], long, strange, too_long, folder / "pipe.png"]
+    outcome, lines, _ = reconstruct(paths, tmp_path / "out", settings)
+    assert outcome == (3, 0, 0, 0, 2, 0)
+    assert "400 bytes" in lines[0] and "regular file" in lines[1]
+    assert read_results(tmp_path / "out").names == ["caf\\xe9", "i0", "n" * 251]
+    assert reconstruct(paths, tmp_path / "out", settings)[0] == (0, 0, 0, 0, 2, 3)
+
+
+def test_a_name_that_a_spreadsheet_takes_for_a_formula_is_quoted(images, tmp_path):
+    paths = [grey_image(images[0].parent / f"{name}.png", 99) for name in ("=1+1", "+a", "-b", "@c", "'=d")]
+    broken = images[0].parent / "=broken.png"
+    broken.write_bytes(b"broken")
+    for _ in range(2):
+        reconstruct([*paths, broken], tmp_path / "out")
+    with open(tmp_path / "out" / "summary.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert sorted(row["name"] for row in rows) == sorted(["'=1+1", "'+a", "'-b", "'@c", "''=d", "'=broken"])
+    assert all(float(row["deepest"]) < 0 for row in rows if row["status"] == "0")
+
+
+def test_a_claimed_folder_is_refused_until_the_other_job_ends(images, tmp_path):
+    with Claim(tmp_path / "out", WHOLE):
+        for shard in (WHOLE, Shard(2, 2)):
+            with pytest.raises(MembraneError, match="another job is writing there .all frames"):
+                reconstruct(images, tmp_path / "out", shard=shard)
+    with Claim(tmp_path / "out", Shard(1, 2)):
+        for shard in (WHOLE, Shard(1, 2), Shard(2, 3)):
+            with pytest.raises(MembraneError, match="shard 1/2"):
+                reconstruct(images, tmp_path / "out", shard=shard)
+        reconstruct(images, tmp_path / "out", shard=Shard(2, 2))
+    reconstruct(images, tmp_path / "out")
+    assert not [path for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
+
+
+def test_a_lock_ends_with_a_killed_process(tmp_path):
+    script = (
+        "import sys, time; from pathlib import Path; from torchmembrane.io.claim import Claim, WHOLE\n"
+        "with Claim(Path(sys.argv[1]), WHOLE): print('claimed', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", script, tmp_path / "out"], stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"claimed\n"
+        with pytest.raises(MembraneError), Claim(tmp_path / "out", WHOLE):
+            pass
+        process.kill()
+    with Claim(tmp_path / "out", WHOLE) as claim:
+        assert claim.alone
+
+
+@both
+def test_shards_are_disjoint_and_together_everything(images, tmp_path, settings, monkeypatch):
+    monkeypatch.setattr(frame_table, "SAVE_SECONDS", 0.0)
+    paths = [grey_image(images[0].parent / f"s{k:02d}.png", 40 + k) for k in range(20)]
+    paths[3].write_bytes(b"broken")
+    outcomes = []
+
+    class Dividing(Denting):
+        """The first shard's job, in the midst of which the others run."""
+
+        def __call__(self, batch):
+            if not outcomes:
+                for number in (2, 3):
+                    outcomes.append(reconstruct(paths, tmp_path / "out", settings, shard=Shard(number, 3))[0])
+            return super().__call__(batch)
+
+    outcomes.append(reconstruct(paths, tmp_path / "out", settings, Dividing(), shard=Shard(1, 3))[0])
+    assert sum(outcome.reconstructed for outcome in outcomes) == 19 and sum(outcome.failed for outcome in outcomes) == 1
+    good = [path.stem for path in paths if path != paths[3]]
+    assert read_results(tmp_path / "out").names == good
+    assert sorted(summary_of(tmp_path / "out")) == [path.stem for path in paths]
+    assert reconstruct(paths, tmp_path / "out", settings)[0] == (0, 0, 0, 0, 1, 19)
+    if settings is PARQUET:
+        assert rows_in(tmp_path / "out") == good
+
+
+@both
+def test_worker_processes_give_what_one_process_gives(small_sensor, small_images, tmp_path, monkeypatch, settings):
+    from torchmembrane import Reconstructor
+    from torchmembrane.io.store import Settings
+    from torchmembrane.jobs.local import reconstruct_files
+
+    monkeypatch.setattr(workers, "AHEAD", 1)
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"broken")
+    reconstructor = Reconstructor.from_file(small_sensor / "sensor.toml")
+    found, lines = [], []
+    for count in (1, 2):
+        out, made = tmp_path / f"out{count}", Settings.of(reconstructor, settings.format)
+        options = {"batch": 1, "workers": count, "report": lines.append, "figures": settings is NPZ}
+        counts = reconstruct_files(reconstructor, find_inputs([*small_images, broken]), out, made, **options)
+        assert (counts.reconstructed, counts.failed) == (3, 1)
+        found.append(read_results(out))
+    assert found[0].names == found[1].names and lines[0] == lines[1]
+    for a, b in zip(*found, strict=True):
+        assert all(np.array_equal(a[key], b[key], equal_nan=True) for key in a)
+    if settings is NPZ:
+        assert len(list((tmp_path / "out2").glob("press*.png"))) == 3
+
+
+def wait_for(condition, seconds=120):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+QUICKLY_SAVING = """
+import sys
+from torchmembrane.cli.main import main
+from torchmembrane.io import frame_table
+frame_table.SAVE_SECONDS = 0.2
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize(
+    "end, format, workers", [(signal.SIGTERM, "npz", "1"), (signal.SIGTERM, "parquet", "2"), (signal.SIGKILL, "parquet", "1")]
+)
+def test_a_killed_command_keeps_what_is_done(small_sensor, small_images, tmp_path, end, format, workers):
+    (tmp_path / "images").mkdir()
+    for k in range(120):
+        Image.open(small_images[k % 3]).save(tmp_path / "images" / f"k{k:03d}.png")
+    out = tmp_path / "out"
+    options = ["--out", str(out), "--format", format, "--workers", workers, "--batch", "2"]
+    command = [
+        sys.executable,
+        "-c",
+        QUICKLY_SAVING,
+        "reconstruct",
+        str(small_sensor / "sensor.toml"),
+        str(tmp_path / "images"),
+    ]
+
+    def done() -> int:
+        return len(rows_in(out)) if format == "parquet" else len(list(out.glob("k*.npz")))
+
+    with subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True) as process:
+        wait_for(lambda: done() > 0 or process.poll() is not None)
+        process.send_signal(end)
+        said = process.communicate()[1]
+    assert process.returncode == (130 if end == signal.SIGTERM else -signal.SIGKILL), said
+    kept = done()
+    assert 0 < kept < 120
+    finished = subprocess.run([*command, *options], capture_output=True, text=True)
+    assert f"{120 - kept} reconstructed, 0 failed, {kept} finished before" in finished.stdout
+    assert read_results(out).names == list(summary_of(out)) == [f"k{k:03d}" for k in range(120)]
+    assert not [path for path in out.rglob(".*")]
+
+
+def test_frames_are_the_same_in_any_batch_within_the_stated_bound(small_sensor, small_images):
+    from torchmembrane import Reconstructor
+
+    reconstructor = Reconstructor.from_file(small_sensor / "sensor.toml")
+    images = reconstructor.read(*small_images)
+    together = reconstructor(images.repeat(6, 1, 1, 1))
+    for k in range(3):
+        alone = reconstructor(images[k : k + 1])
+        assert (alone.vertices[0] - together.vertices[k]).abs().max() < 1e-3
+        assert (alone.force[0] - together.force[k]).norm() < 1e-3 * together.force[k].norm().clamp_min(0.1)
+
+
+@both
+def test_view_draws_a_frame_of_a_folder_or_a_part(small_sensor, small_images, tmp_path, monkeypatch, capsys, settings):
+    from torchmembrane.cli.main import main
+
+    monkeypatch.setattr("torchmembrane.cli.view._has_display", lambda: False)
+    out, given = tmp_path / "out", [str(small_sensor / "sensor.toml"), *map(str, small_images[:2])]
+    assert main(["reconstruct", *given, "--out", str(out), "--format", settings.format]) == 0
+    whole = [out] if settings is NPZ else [out, out / "frames" / "part-00000.parquet"]
+    for number, path in enumerate(whole):
+        drawn = tmp_path / f"{number}.png"
+        assert main(["view", str(path), "--frame", "press1", "--out", str(drawn)]) == 0 and drawn.exists()
+        assert main(["view", str(path)]) == 0 and (out / "press0_view.png").exists()
+        (out / "press0_view.png").unlink()
+        assert main(["view", str(path), "--frame", "press9"]) == 2
+        assert "no frame 'press9'" in capsys.readouterr().err
+    (tmp_path / "bad.parquet").write_bytes(b"PAR1")
+    assert main(["view", str(tmp_path / "bad.parquet")]) == 2 and "not a part" in capsys.readouterr().err

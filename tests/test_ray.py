@@ -1,0 +1,97 @@
+"""A job on a local Ray cluster of two workers, one of which is killed midway."""
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from torchmembrane import Reconstructor, read_results
+from torchmembrane.errors import MembraneError
+from torchmembrane.io.store import Settings
+from torchmembrane.jobs.frame_reconstructor import FrameReconstructor, outcomes_of
+from torchmembrane.jobs.inputs import find_inputs
+from torchmembrane.jobs.local import reconstruct_files
+
+
+def ray_workers() -> list[int]:
+    """Process ids of the actors that reconstruct."""
+    titles = {int(path.parent.name): path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.exists()}
+    return [number for number, title in titles.items() if title.startswith(b"ray::") and b"RayWorker" in title]
+
+
+@pytest.fixture(scope="module")
+def reconstructor(small_sensor):
+    return Reconstructor.from_file(small_sensor / "sensor.toml")
+
+
+def test_rows_hold_what_the_reconstructor_gives(reconstructor, small_images, tmp_path):
+    (tmp_path / "broken.png").write_bytes(b"broken")
+    paths = np.array([*map(str, small_images), str(tmp_path / "broken.png")])
+    rows = FrameReconstructor(reconstructor)({"path": paths})
+    expected = reconstructor(reconstructor.read(*small_images)).numpy()
+    assert rows["name"].tolist() == ["press0", "press1", "press2", "broken"] and rows["status"].tolist() == [0, 0, 0, -1]
+    assert "not readable" in rows["status_text"][3] and np.isnan(rows["vertices"][3]).all()
+    assert np.allclose(rows["vertices"][:3], expected.vertices, atol=1e-4)
+    outcomes = outcomes_of(rows)
+    assert [outcome.status for outcome in outcomes] == [0, 0, 0, -1] and outcomes[3].reason == rows["status_text"][3]
+    assert np.array_equal(outcomes[1].stored.frame["pixels"], rows["pixels"][1], equal_nan=True)
+
+
+def test_rows_of_decoded_and_of_encoded_images_are_those_of_files(reconstructor, small_images):
+    paths = np.array([str(path) for path in small_images])
+    engine = FrameReconstructor(reconstructor)
+    by_path = engine({"path": paths})
+    decoded = engine({"path": paths, "image": np.stack([np.asarray(Image.open(path)) for path in small_images])})
+    encoded = engine({"path": paths, "bytes": np.array([path.read_bytes() for path in small_images], object)})
+    for found in (decoded, encoded):
+        assert np.array_equal(by_path["vertices"], found["vertices"]) and by_path["name"].tolist() == found["name"].tolist()
+    assert by_path["content_hash"].tolist() == encoded["content_hash"].tolist()
+    small = engine({"path": paths[:1], "image": np.zeros((1, 10, 10), np.uint8)})
+    broken = engine({"path": paths[:1], "bytes": np.array([b"broken"], object)})
+    assert "10 x 10" in small["status_text"][0] and broken["status_text"][0].startswith("not readable")
+
+
+def test_a_killed_worker_is_replaced_and_each_frame_is_there_once(reconstructor, small_images, tmp_path):
+    ray = pytest.importorskip("ray")
+    from torchmembrane.jobs.ray_engine import RayEngine
+
+    class Killing(RayEngine):
+        def __call__(self, *arguments):
+            for number, group in enumerate(super().__call__(*arguments)):
+                if number == 0:
+                    os.kill(ray_workers()[0], signal.SIGKILL)
+                yield group
+
+    paths = [tmp_path / f"k{k:02d}.png" for k in range(40)]
+    for k, path in enumerate(paths):
+        Image.open(small_images[k % 3]).save(path)
+    (tmp_path / "broken.png").write_bytes(b"broken")
+    settings = Settings.of(reconstructor, "parquet")
+    inputs = find_inputs([*paths[:30], tmp_path / "broken.png"])
+    ray.init(num_cpus=2, log_to_driver=False, logging_level="error", include_dashboard=False)
+    try:
+        counts = reconstruct_files(reconstructor, inputs, tmp_path / "out", settings, batch=1, engine=Killing("cpu", 2))
+        assert (counts.reconstructed, counts.failed) == (30, 1)
+        engine = RayEngine("cpu", 2)
+        counts = reconstruct_files(reconstructor, find_inputs(paths), tmp_path / "out", settings, engine=engine)
+        assert (counts.reconstructed, counts.skipped) == (10, 30)
+    finally:
+        ray.shutdown()
+    reconstruct_files(reconstructor, find_inputs(paths), tmp_path / "alone", settings)
+    found, alone = read_results(tmp_path / "out"), read_results(tmp_path / "alone")
+    assert found.names == alone.names == [path.stem for path in paths]
+    assert np.allclose(found.batch().vertices, alone.batch().vertices, atol=1e-3)
+
+
+def test_what_ray_does_not_do_is_refused(reconstructor, small_images, tmp_path):
+    pytest.importorskip("ray")
+    from torchmembrane.jobs.ray_engine import RayEngine
+
+    settings = Settings.of(reconstructor, "parquet")
+    with pytest.raises(MembraneError, match="figures"):
+        reconstruct_files(
+            reconstructor, find_inputs(small_images), tmp_path / "out", settings, engine=RayEngine(), figures=True
+        )

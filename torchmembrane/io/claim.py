@@ -1,0 +1,108 @@
+"""The right to write into a folder: one job has it, or several shards of one job."""
+
+import zlib
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+from filelock import BaseFileLock, FileLock, Timeout
+
+from ..errors import MembraneError
+
+GATE = ".gate.lock"
+PATIENCE = 600.0
+"""Seconds to wait for another shard to leave the gate: it opens the folder, or writes what it holds back."""
+
+
+class Shard(NamedTuple):
+    """One of `total` disjoint parts of a job, told by the frames' names: the same on every machine, in any order.
+
+    Attributes:
+        number: 1 to `total`.
+        total: of all shards.
+
+    Example:
+        >>> shards = [Shard(1, 2), Shard(2, 2)]
+        >>> [[shard.holds(name) for shard in shards] for name in ("press", "rest")]
+        [[False, True], [True, False]]
+    """
+
+    number: int = 1
+    total: int = 1
+
+    def holds(self, name: str) -> bool:
+        """Whether a frame of this name is this shard's."""
+        return zlib.crc32(name.encode()) % self.total == self.number - 1
+
+
+WHOLE = Shard()
+"""Not divided."""
+
+
+class Claim:
+    """A folder claimed for writing: `with Claim(folder, shard) as claim`, and `with claim.gate` while its files are changed.
+
+    The locks are the operating system's: they end with the process, however that ends.
+
+    Args:
+        folder: made if need be.
+        shard: which part of a job writes there; the shards of one division may write at once.
+
+    Attributes:
+        gate: a lock that one shard holds at a time.
+        alone: whether no other shard was writing when the folder was claimed.
+
+    Raises:
+        MembraneError: on entering: another job, the same shard, or shards of another division are writing there.
+    """
+
+    def __init__(self, folder: Path, shard: Shard):
+        self.folder, self.shard = folder, shard
+        folder.mkdir(parents=True, exist_ok=True)
+        self.gate = FileLock(folder / GATE, timeout=PATIENCE)
+        self.alone = True
+        self._own = FileLock(folder / _lock_name(shard), timeout=0)
+
+    def __enter__(self) -> "Claim":
+        with self.gate:
+            held = [path.name for path in self.folder.glob(".shard-*.lock") if _is_held(path)]
+            self.alone = not held
+            division = f"-of-{self.shard.total}.lock"
+            if _lock_name(self.shard) in held or not all(name.endswith(division) for name in held):
+                raise MembraneError(
+                    f"--out {self.folder}: another job is writing there ({_said(held[0])}); wait until it ends, choose another "
+                    "folder, or divide the frames between jobs by --shard I/N"
+                )
+            self._own.acquire()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        with self.gate:
+            _remove(self._own)
+            self._own.release()
+            if not any(self.folder.glob(".shard-*.lock")):
+                _remove(self.gate)
+
+
+def _lock_name(shard: Shard) -> str:
+    return f".shard-{shard.number}-of-{shard.total}.lock"
+
+
+def _said(lock: str) -> str:
+    number, _, count = lock.removeprefix(".shard-").removesuffix(".lock").partition("-of-")
+    return "all frames" if count == "1" else f"shard {number}/{count}"
+
+
+def _remove(lock: BaseFileLock) -> None:
+    """Delete the file of a held lock: whoever waits for it sees that it is gone, and makes a new one."""
+    with suppress(OSError):  # Windows keeps open files
+        Path(lock.lock_file).unlink()
+
+
+def _is_held(path: Path) -> bool:
+    try:
+        with FileLock(path, timeout=0):
+            return False
+    except Timeout:
+        return True

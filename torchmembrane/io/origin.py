@@ -1,0 +1,66 @@
+"""Where a frame came from, so that a new image under an old name is noticed."""
+
+import hashlib
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+DIGEST = partial(hashlib.blake2b, digest_size=16)
+
+
+class Origin(NamedTuple):
+    """The file of a frame as it was when the frame was reconstructed.
+
+    Attributes:
+        path: as given.
+        file_size: bytes; -1 where it is not known.
+        file_modified: nanoseconds since 1970; -1 where it is not known.
+        content_hash: BLAKE2b of 16 bytes of what it held, hexadecimal; "" where it is not known.
+    """
+
+    path: str = ""
+    file_size: int = -1
+    file_modified: int = -1
+    content_hash: str = ""
+
+    @classmethod
+    def of(cls, file: Path) -> "Origin":
+        """That of a file as it is now.
+
+        Raises:
+            OSError: it cannot be read.
+
+        Example:
+            >>> Origin.of(Path("examples/rest.png")).content_hash == Origin.of(Path("examples/flat_plate.png")).content_hash
+            False
+        """
+        stat = file.stat()
+        with open(file, "rb") as content:
+            digest = hashlib.file_digest(content, DIGEST).hexdigest()
+        return cls(printable(str(file)), stat.st_size, stat.st_mtime_ns, digest)
+
+    @classmethod
+    def of_bytes(cls, file: Path, content: bytes) -> "Origin":
+        """That of a file of which only this content is known."""
+        return cls(printable(str(file)), len(content), content_hash=DIGEST(content).hexdigest())
+
+    def is_of(self, file: Path) -> bool:
+        """Whether a file holds what it held: by size and time, where these differ by its hash; True where that is not known,
+        or the file cannot be read."""
+        try:
+            stat = file.stat()
+            if not self.content_hash or (stat.st_size, stat.st_mtime_ns) == (self.file_size, self.file_modified):
+                return True
+            return stat.st_size == self.file_size and Origin.of(file).content_hash == self.content_hash
+        except OSError:
+            return True
+
+
+def printable(text: str) -> str:
+    r"""A path's text in UTF-8: bytes that are none are written out.
+
+    Example:
+        >>> printable("caf\udce9.png")
+        'caf\\xe9.png'
+    """
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")

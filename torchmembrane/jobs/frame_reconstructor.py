@@ -1,0 +1,165 @@
+"""Frames in, rows of results out: the state of one worker, whatever hands out the work."""
+
+import time
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import MembraneError
+from ..io.origin import Origin, printable
+from ..io.results import Frame, Reconstruction, Stored
+from ..io.status import Status
+from ..io.summary import UNREADABLE
+from .decode import DecodedFrame, Source, decoded, source_of
+from .inputs import frame_name
+
+if TYPE_CHECKING:
+    from ..reconstruct import Reconstructor
+
+
+class Outcome(NamedTuple):
+    """What became of a frame: its result, or the reason why it gave no image."""
+
+    name: str
+    file: Path
+    stored: Stored | None
+    reason: str = ""
+
+    @property
+    def status(self) -> int:
+        """Of the result, or `UNREADABLE`."""
+        return UNREADABLE if self.stored is None else int(self.stored.frame["status"])
+
+    @property
+    def status_text(self) -> str:
+        """The same in words."""
+        return self.reason if self.stored is None else Status(self.status).text
+
+
+class FrameReconstructor:
+    """A `Reconstructor` as clusters' engines take it: built once per worker, called with batches of rows.
+
+    It can be pickled, with all that it holds.
+
+    Args:
+        reconstructor: of the sensor.
+        rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
+        pressure: that a gauge reads, by the names of the frames, as `Reconstructor` takes it.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from torchmembrane import Reconstructor, Sensor
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> sensor = replace(sensor, markers=replace(sensor.markers, rest_image=None))  # quicker, less accurate
+        >>> rows = FrameReconstructor(Reconstructor(sensor))({"path": np.array(["examples/rest.png", "none.png"])})
+        >>> rows["name"].tolist(), rows["status"].tolist(), rows["vertices"].shape
+        (['rest', 'none'], [0, -1], (2, 1089, 3))
+    """
+
+    def __init__(
+        self,
+        reconstructor: "Reconstructor",
+        rest_pixels: Tensor | None = None,
+        pressure: Mapping[str, float] | None = None,
+    ):
+        self.reconstructor, self.rest_pixels, self.pressure = reconstructor, rest_pixels, pressure
+
+    def on(self, device: str) -> "FrameReconstructor":
+        """The same on a device, "cpu" or "cuda"."""
+        rest_pixels = None if self.rest_pixels is None else self.rest_pixels.to(device)
+        return FrameReconstructor(self.reconstructor.to(device), rest_pixels, self.pressure)
+
+    def __call__(self, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Reconstruct a batch of rows.
+
+        Args:
+            rows: `path [B]`, the image files, which also name the frames. They are read here, unless `image [B, ...]` holds
+                decoded images as `Reconstructor` takes them, or `bytes [B]` what is in the files.
+
+        Returns:
+            Columns of B rows: `name`, `path`, `status`, `status_text`, the arrays of `Reconstruction`, `content_hash`, size
+            and time of the file, `seconds`. A file that gave no image has status -1, the reason as text, and NaN.
+        """
+        columns = [rows.get(key, [None] * len(rows["path"])) for key in ("image", "bytes")]
+        outcomes = self.outcomes([self._frame(*row) for row in zip(rows["path"], *columns, strict=True)])
+        stored = [outcome.stored or Stored(self._blank, Origin(printable(str(outcome.file)))) for outcome in outcomes]
+        arrays = [each.arrays() for each in stored]
+        found = {key: np.stack([row[key] for row in arrays]) for key in arrays[0]}
+        words = {key: np.array([getattr(outcome, key) for outcome in outcomes]) for key in ("name", "status_text")}
+        return words | found
+
+    def outcomes(self, group: list[DecodedFrame]) -> list[Outcome]:
+        """What becomes of each frame of a batch."""
+        start = time.perf_counter()
+        readable = [(frame.name, frame.image) for frame in group if frame.image is not None]
+        frames = iter(self._reconstructed([name for name, _ in readable], [image for _, image in readable]))
+        seconds = (time.perf_counter() - start) / max(len(readable), 1)
+        return [
+            Outcome(frame.name, frame.file, None, frame.reason)
+            if frame.image is None
+            else Outcome(frame.name, frame.file, Stored(next(frames), frame.origin, seconds))
+            for frame in group
+        ]
+
+    def _frame(self, path: str, image: np.ndarray | None, content: bytes | None) -> DecodedFrame:
+        file = Path(str(path))
+        if image is None and content is None:
+            return self.decoded(source_of(file))
+        frame = DecodedFrame(frame_name(file), file, None)
+        try:
+            if content is None:
+                data, grey = np.ascontiguousarray(image).tobytes(), self.reconstructor.grey(np.asarray(image))
+            else:
+                data, grey = content, self._read(content)
+            return frame._replace(image=grey, origin=Origin.of_bytes(file, data))
+        except MembraneError as error:
+            return frame.but(error)
+
+    def _read(self, content: bytes) -> Tensor:
+        with NamedTemporaryFile() as file:
+            file.write(content)
+            file.flush()
+            try:
+                return self.reconstructor.read(file.name)
+            except MembraneError as error:
+                raise MembraneError(str(error).removeprefix(f"{file.name}: ")) from error
+
+    def decoded(self, source: Source) -> DecodedFrame:
+        """A frame's image, or the reason why there is none."""
+        return decoded(source, self.reconstructor)
+
+    @torch.no_grad()
+    def _reconstructed(self, names: list[str], images: list[Tensor]) -> list[Frame]:
+        if not images:
+            return []
+        options: dict[str, Any] = {} if self.rest_pixels is None else {"rest_pixels": self.rest_pixels}
+        if self.pressure is not None:
+            readings = [self.pressure.get(name, torch.nan) for name in names]
+            options["pressure"] = torch.tensor(readings, dtype=torch.float64)
+        computed = self.reconstructor(torch.cat(images), **options)
+        results = Reconstruction(*(field.cpu() for field in computed))
+        return [results.frame(i) for i in range(len(images))]
+
+    @cached_property
+    def _blank(self) -> Frame:
+        """What a file that gave no image has in place of a result."""
+        width, height = self.reconstructor.image_size
+        (frame,) = self._reconstructed([""], [torch.zeros(1, 1, height, width).to(self.reconstructor.rest_pixels)])
+        return frame | {"status": np.array(UNREADABLE, np.int32)}
+
+
+def outcomes_of(rows: dict[str, np.ndarray]) -> list[Outcome]:
+    """What `FrameReconstructor` gave as columns, frame by frame."""
+    frames = [dict(zip(rows, values, strict=True)) for values in zip(*rows.values(), strict=True)]
+    return [
+        Outcome(str(frame["name"]), Path(str(frame["path"])), None, str(frame["status_text"]))
+        if frame["status"] == UNREADABLE
+        else Outcome(str(frame["name"]), Path(str(frame["path"])), Stored.of(frame))
+        for frame in frames
+    ]

@@ -1,0 +1,128 @@
+"""The folder of a job's results: what is finished, and the one place where frames, figures and summary.csv are written."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import TracebackType
+
+from ..io.atomic import PARTIAL
+from ..io.claim import Claim, Shard
+from ..io.frames import open_folder
+from ..io.optional import load_pyarrow
+from ..io.origin import Origin, printable
+from ..io.store import FINISHED, Mesh, check_folder
+from ..io.summary import UNREADABLE, Summary
+from .frame_reconstructor import Outcome
+from .inputs import Inputs, frame_name
+
+
+class ResultFolder:
+    """A folder of results, claimed for writing: `with ResultFolder(...) as folder`.
+
+    Frames are on the disk `SAVE_SECONDS` after they are kept at most, summary.csv at the end; after a kill it is made anew from
+    the frames.
+
+    Args:
+        path: the folder.
+        mesh: what its frames share.
+        inputs: the files of this call.
+        shard: which frames of theirs are to be done here.
+        figures: whether every frame has a figure.
+        report: called with what is to be said.
+
+    Attributes:
+        finished: the frames that need not be done again.
+
+    Raises:
+        MembraneError: on entering: the folder is of another sensor or of other settings, or another job is writing there.
+    """
+
+    def __init__(self, path: Path, mesh: Mesh, inputs: Inputs, shard: Shard, figures: bool, report: Callable[[str], None]):
+        check_folder(path, mesh.sensor, mesh.settings)
+        if mesh.format == "parquet":
+            load_pyarrow()
+        self.path, self.mesh, self.figures, self.report = path, mesh, figures, report
+        self._files = {frame_name(image): image for image in inputs.images}
+        self._inputs, self._shard = inputs, shard
+        self.finished: set[str] = set()
+
+    def __enter__(self) -> "ResultFolder":
+        self._claim = Claim(self.path, self._shard)
+        self._claim.__enter__()
+        try:
+            self._open()
+        except BaseException:
+            self._claim.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        """Write what is held back."""
+        try:
+            self.frames.close()
+            self.summary.write()
+        finally:
+            self._claim.__exit__(kind, error, traceback)
+
+    def keep(self, outcome: Outcome) -> int:
+        """Store a frame's result, or that it has none; returns its status."""
+        if outcome.stored is None:
+            self.frames.forget(outcome.name)
+            self.summary.add_unreadable(outcome.name, outcome.file, outcome.reason)
+        else:
+            self.frames.write(outcome.name, outcome.stored)
+            self.summary.add(outcome.name, outcome.stored)
+        return outcome.status
+
+    def save(self) -> None:
+        """Write what has been held back for long."""
+        self.frames.save()
+
+    def _open(self) -> None:
+        """Read what is there: rows of summary.csv from the frames, and which of them are finished."""
+        if self._claim.alone:
+            for left in [*self.path.glob(PARTIAL), *self.path.glob(f"frames/{PARTIAL}")]:
+                left.unlink(missing_ok=True)
+        self.frames = open_folder(self.path, self.mesh, self._claim.gate)
+        self.summary = Summary(self.path, self.mesh, self._claim.gate)
+        origins: dict[str, Origin] = {}
+        for name, stored in self.frames.stored(self._shard.holds):
+            if not stored.origin.path and (file := self._file_of(name)):
+                stored = stored._replace(origin=stored.origin._replace(path=printable(str(file))))
+            self.summary.add(name, stored)
+            status = int(stored.frame["status"])
+            origins[name] = stored.origin
+            if status in FINISHED and (not self.figures or (self.path / f"{name}.png").exists()):
+                self.finished.add(name)
+        unreadable, holds = str(UNREADABLE), self._shard.holds
+        self.summary.write(lambda row: not holds(row["name"]) or (row["status"] == unreadable and row["name"] not in origins))
+        self._judge({name: origins[name] for name in self.finished})
+
+    def _judge(self, origins: dict[str, Origin]) -> None:
+        """Take frames whose images have changed from the finished ones, and say what was found."""
+
+        @cache
+        def is_of(origin: Origin, file: Path) -> bool:
+            return origin.is_of(file)
+
+        files = {name: file for name in sorted(origins) if (file := self._file_of(name))}
+        changed = [name for name, file in files.items() if not is_of(origins[name], file)]
+        self.finished.difference_update(changed)
+        damaged = [path for path in self.frames.damaged if path.parent != self.path or self._file_of(path.stem)]
+        unknown = [name for name in files if not origins[name].content_hash]
+        if changed:
+            self.report(f"{_listed([files[name] for name in changed])}: changed, done again")
+        if damaged:
+            self.report(f"{_listed(damaged)}: damaged, done again")
+        if unknown:
+            self.report(
+                f"{self.path}: {len(unknown)} results do not say what their images held (earlier version); kept, whether these "
+                "have changed or not"
+            )
+
+    def _file_of(self, name: str) -> Path | None:
+        return self._files.get(name) or self._inputs.video_of(name)
+
+
+def _listed(paths: list[Path]) -> str:
+    return f"{paths[0]}" + (f" and {len(paths) - 1} more" if paths[1:] else "")

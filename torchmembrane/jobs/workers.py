@@ -1,0 +1,175 @@
+"""Frames computed in this process, decoded a batch ahead, or by worker processes with one thread each."""
+
+import os
+import pickle
+import signal
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import partial
+from itertools import islice
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Thread
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import MembraneError
+from ..io.store import Mesh
+from .decode import DecodedFrame, Source, decoded, read_ahead
+from .frame_reconstructor import FrameReconstructor, Outcome
+
+if TYPE_CHECKING:
+    from ..reconstruct import Reconstructor
+
+FRAMES_EACH = 200
+"""Frames for which a worker process is worth its start."""
+AHEAD = 3
+"""Batches that a worker process has been given and not yet returned."""
+LARGEST_BATCH = 16
+"""A larger one is no faster on a processor."""
+LARGEST_GPU_BATCH = 256
+PIXEL_BYTES = 600
+"""Memory of a frame in computation, over the pixels of its image."""
+MEMORY_SHARE = 0.25
+"""Of the machine's memory, for all frames in computation."""
+
+
+class Work(NamedTuple):
+    """What is done with a batch of frames.
+
+    Attributes:
+        reconstructor: makes their results.
+        figures: the folder of a figure for every frame, and the mesh of the results; None: no figures.
+    """
+
+    reconstructor: FrameReconstructor
+    figures: tuple[Path, Mesh] | None = None
+
+    def outcomes(self, group: list[DecodedFrame]) -> list[Outcome]:
+        """What becomes of decoded frames."""
+        found = self.reconstructor.outcomes(group)
+        if self.figures:
+            from ..plot.drawing import save
+            from ..plot.frames import figure
+
+            folder, mesh = self.figures
+            for outcome, frame in zip(found, group, strict=True):
+                if outcome.stored is not None and frame.image is not None:
+                    image = frame.image[0, 0].cpu().numpy()
+                    save(figure(outcome.stored.frame, mesh, image, frame.name), folder / f"{frame.name}.png")
+        return found
+
+
+def outcomes_here(work: Work, sources: Iterator[Source], batch: int) -> Iterator[list[Outcome]]:
+    """What becomes of all frames, batch by batch, computed in this process while the next batch is decoded."""
+    for group in read_ahead(sources, work.reconstructor.reconstructor, batch):
+        yield work.outcomes(group)
+
+
+def outcomes_by(workers: int, work: Work, sources: Iterator[Source], batch: int) -> Iterator[list[Outcome]]:
+    """The same by worker processes, in the order of the sources; pictures of videos are decoded in this process.
+
+    Raises:
+        MembraneError: a worker process has ended.
+    """
+    reconstructor = work.reconstructor.reconstructor
+    with _pool(workers, work) as pool:
+        waiting: deque[Future[list[Outcome]]] = deque()
+        try:
+            while group := [_portable(source, reconstructor) for source in islice(sources, batch)]:
+                waiting.append(pool.submit(_outcomes, group))
+                if len(waiting) >= AHEAD * workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        except BrokenProcessPool as error:
+            raise MembraneError(
+                f"one of {workers} worker processes has ended (out of memory?); what is done is kept: pass fewer --workers, or "
+                "a smaller --batch"
+            ) from error
+
+
+def cores() -> int:
+    """The processor's cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def workers_for(frames: int, device: str) -> int:
+    """How many worker processes are worth their start; 1 is this process."""
+    return max(1, min(cores(), frames // FRAMES_EACH)) if device == "cpu" else 1
+
+
+def batch_for(image_size: tuple[int, int], workers: int, device: str) -> int:
+    """How many frames to compute at once, by the memory that there is."""
+    if device == "cuda":
+        memory, largest = torch.cuda.mem_get_info()[0], LARGEST_GPU_BATCH
+    else:
+        known = hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names
+        memory, largest = (os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if known else 2**32), LARGEST_BATCH
+    width, height = image_size
+    return max(1, min(largest, int(MEMORY_SHARE * memory / (workers * width * height * PIXEL_BYTES))))
+
+
+def _portable(source: Source, reconstructor: "Reconstructor") -> Source:
+    """A source that another process can load."""
+    if source.origin is None:
+        return source
+    frame = decoded(source, reconstructor)
+    return source._replace(load=partial(_given, frame.reason, None if frame.image is None else frame.image.numpy()))
+
+
+def _given(reason: str, image: object, reconstructor: "Reconstructor") -> Tensor:
+    if image is None:
+        raise MembraneError(reason)
+    return torch.as_tensor(image)
+
+
+@contextmanager
+def _pool(workers: int, work: Work) -> Iterator[ProcessPoolExecutor]:
+    """Worker processes; when the block ends early, what they are doing is abandoned.
+
+    They read their work from a file: through a pipe, one would have to be up before the next one starts.
+    """
+    with TemporaryDirectory() as folder:
+        state = Path(folder) / "work"
+        state.write_bytes(pickle.dumps(work))
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (state,))
+        try:
+            yield pool
+        except BaseException:
+            for process in list((pool._processes or {}).values()):
+                process.terminate()
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+        pool.shutdown()
+
+
+_work: Work
+"""Of this worker process."""
+
+
+def _start(state: Path) -> None:
+    """Make ready a worker process: one thread, interrupted and ended by its parent alone, and with it."""
+    global _work
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    torch.set_num_threads(1)
+    Thread(target=_end_with_parent, daemon=True).start()
+    _work = pickle.loads(state.read_bytes())
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _outcomes(group: list[Source]) -> list[Outcome]:
+    return _work.outcomes([_work.reconstructor.decoded(source) for source in group])
