@@ -9,9 +9,9 @@ from argparse import ArgumentParser
 
 from .. import __version__
 from ..errors import MembraneError
-from . import calibrate, check, export, reconstruct, simulate, view
+from . import calibrate, check, export, init, reconstruct, simulate, view
 
-COMMANDS = (reconstruct, simulate, calibrate, check, view, export)
+COMMANDS = (init, check, reconstruct, view, calibrate, simulate, export)
 
 
 def main(argv: list[str] | None = None) -> int:

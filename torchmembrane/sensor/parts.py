@@ -17,9 +17,11 @@ from ..io.images import read_image, to_grey
 from ..pose import Pose
 from ..surface import shapes
 from ..surface.membrane import Membrane
+from .synonyms import did_you_mean
 
 OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, in the surface's size
 METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}  # one metre in the length unit
+FILLINGS = ("liquid", "gas", "open")
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 SHAPES_BY_NUMBERS = {
     "spherical_cap": ("rim_radius", "height", "base_z"),
@@ -55,7 +57,8 @@ class Material:
     thickness: float | None = None
 
     def __post_init__(self) -> None:
-        expect(self.model in MODELS, "material model", self.model, f"one of {', '.join(MODELS)}")
+        meant = did_you_mean(self.model, MODELS)
+        expect(self.model in MODELS, "material model", self.model, f"one of {', '.join(MODELS)}" + (meant and f": {meant}"))
         expect(1 <= self.prestretch < math.inf, "prestretch", self.prestretch, "1 (unstretched) or more")
         if self.model == "mooney_rivlin":
             right = self.c2_ratio is not None and 0 <= self.c2_ratio < math.inf
@@ -92,7 +95,9 @@ class Cavity:
     volume: float | None = None
 
     def __post_init__(self) -> None:
-        expect(self.filling in ("liquid", "gas", "open"), "filling", self.filling, "'liquid', 'gas' or 'open'")
+        meant = did_you_mean(self.filling, FILLINGS)
+        expected = "'liquid', 'gas' or 'open'" + (meant and f": {meant}")
+        expect(self.filling in FILLINGS, "filling", self.filling, expected)
         known = self.filling != "gas" or self.pressure is not None
         expect(known, "pressure", None, "the gas' absolute pressure at rest in hPa, about 1013: add it")
         _expect_positive(pressure=self.pressure, volume=self.volume)
