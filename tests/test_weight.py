@@ -46,7 +46,8 @@ def told(monkeypatch):
     sensor = tm.preset("fingertip")
     nothing = tm.Reconstruction(*torch.zeros(len(tm.Reconstruction._fields), 3, 1))
     result = nothing._replace(force=torch.tensor([[0.0, 0.0, -2.0]] * 3), force_deviation=torch.full((3, 3), 0.06))
-    result = result._replace(contact_at_rim=torch.zeros(3, 4), status=torch.zeros(3, dtype=torch.int32))
+    patches = torch.tensor([[[0, 0, -1.9], [0, 0, -0.1]]] * 3)
+    result = result._replace(contact_at_rim=torch.zeros(3, 2), contact_force=patches, status=torch.zeros(3, dtype=torch.int32))
 
     class Made:
         def __init__(self, sensor):
@@ -77,7 +78,7 @@ def test_the_modulus_is_in_proportion_to_the_weight(told):
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ({"contact_at_rim": torch.tensor([[0.0], [1.0], [0.0]])}, "image 2: the press reaches the rim"),
+        ({"contact_at_rim": torch.tensor([[0, 0], [1.0, 0], [0, 0]])}, "image 2: the press reaches the rim"),
         ({"force_deviation": torch.full((3, 3), 1.0)}, "image 1 shows a force that is known to 50 % only"),
         ({"status": torch.tensor([0, 0, 3])}, "image 3: the solve has not converged"),
         ({"force": torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, -2.0], [0.0, 0.0, -4.0]])}, "image 3 shows"),
@@ -88,6 +89,12 @@ def test_what_tells_no_scale_is_refused(told, fields, said):
     change(**fields)
     with pytest.raises(tm.MembraneError, match=said):
         fit(2.0)
+
+
+def test_a_trace_of_force_at_the_rim_does_no_harm(told):
+    change, fit = told
+    change(contact_at_rim=torch.tensor([[0, 1.0]] * 3))
+    assert fit(2.0).sensor.material.shear_modulus == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("text", ["200", "g", "-2N", "2 pounds", ""])

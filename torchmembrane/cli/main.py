@@ -16,7 +16,7 @@ COMMANDS = (init, check, reconstruct, view, calibrate, simulate, export)
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command with these arguments (default: the process's); returns the exit code."""
-    arguments = _parser().parse_args(argv)
+    arguments = command_parser().parse_args(argv)
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(f"torchmembrane: warning: {message}", file=sys.stderr)
         try:
@@ -29,7 +29,8 @@ def main(argv: list[str] | None = None) -> int:
             return 130
 
 
-def _parser() -> ArgumentParser:
+def command_parser() -> ArgumentParser:
+    """The parser of the whole command."""
     parser = ArgumentParser(
         prog="torchmembrane", description="3-D shape of a deformable membrane from one image of its markings."
     )
