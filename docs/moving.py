@@ -15,7 +15,7 @@ import torchmembrane as tm
 from torchmembrane.plot.drawing import BLUE, VERMILION
 
 FRICTION, RADIUS, DEPTH, DRAG = 0.5, 4.0, 2.0, 2.5  # lengths in mm
-PUSHED, DRAGGED, MILLISECONDS, COLOURS = 9, 10, 130, 96
+PUSHED, DRAGGED, MILLISECONDS, COLOURS = 9, 10, 130, 64
 
 
 class Film(NamedTuple):
