@@ -101,7 +101,7 @@ def test_the_rim_s_circle_gives_the_distance_and_the_focal_length(model):
     assert circle.distance(200.0) == pytest.approx(15.0) and circle.focal(15.0) == pytest.approx(200.0)
 
 
-def test_a_rest_image_and_the_rim_s_circle_give_the_sensor(tmp_path):
+def test_a_rest_image_and_the_rim_s_circle_give_the_sensor_and_check_finds_all_of_its_dots(tmp_path, capsys):
     path = drafted(tmp_path, "dome")
     press = tmp_path / "press"
     arguments = ["--indenter", "sphere", "--radius", "3", "--depth", "1"]
@@ -114,7 +114,12 @@ def test_a_rest_image_and_the_rim_s_circle_give_the_sensor(tmp_path):
     assert main(["init", str(made), *arguments]) == 0
     found = Sensor.from_file(made)
     assert found.surface.values["base_z"] == pytest.approx(12.0, abs=1e-3)
-    assert found.camera.focal.tolist() == design.camera.focal.tolist() and main(["check", str(made)]) == 0
+    assert found.camera.focal.tolist() == design.camera.focal.tolist()
+    capsys.readouterr()
+    assert main(["check", str(made)]) == 0
+    dots = len(design.markers.positions)
+    said = capsys.readouterr().out
+    assert f"{dots} placed on the rest surface" in said and f"{dots} of {dots} found in the rest image" in said
 
 
 @pytest.mark.parametrize(
