@@ -176,3 +176,15 @@ def test_bad_dots_are_named_with_their_line(tmp_path):
         (tmp_path / "dots.csv").write_text(text)
         with pytest.raises(ValueError, match=said):
             read_drafted_dots(tmp_path / "dots.csv", surface, camera)
+
+
+def test_a_pattern_is_laid_out_for_a_design_without_dots_as_for_one_with_dots(tmp_path, capsys):
+    path = drafted(tmp_path, "cap")
+    bare = tmp_path / "bare.toml"
+    bare.write_text("\n".join(line for line in path.read_text().splitlines() if not line.startswith("file = ")))
+    for design in (path, bare):
+        call = ["calibrate", "pattern", str(design), "--pitch", "30", "--out", str(tmp_path / design.stem)]
+        assert main(call) == 0
+    listed, unlisted = ((tmp_path / name / "sensor_dots.csv").read_text() for name in ("sensor", "bare"))
+    assert listed == unlisted and len(listed.splitlines()) > 50
+    assert main(["check", str(bare)]) == 2 and "file and rest_image are missing" in capsys.readouterr().err
