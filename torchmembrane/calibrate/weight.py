@@ -100,7 +100,7 @@ def _told(sensor: Sensor, images: Tensor) -> tuple[np.ndarray, np.ndarray]:
         if at_rim.sum() > AT_THE_RIM * forces[i]:
             raise MembraneError(
                 f"calibrate material: image {i + 1}: the press reaches the rim, which bears a part of the weight; expected the "
-                "weight in the middle of the membrane"
+                "weight in the middle of the membrane, and the rest surface where the file has it (`calibrate rest`)"
             )
         if not deviations[i] < UNSURE:
             raise MembraneError(
