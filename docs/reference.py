@@ -51,11 +51,10 @@ def section(title: str, parser: argparse.ArgumentParser, called: str) -> str:
 
 def row(action: argparse.Action) -> str:
     """A line of the table: how it is written, what it says, which values it takes."""
-    value = action.metavar or ("|".join(map(str, action.choices)) if action.choices else None)
-    value = value or ("" if action.nargs == 0 else action.dest.upper())
-    names = ", ".join(f"{name} {value}".strip() for name in action.option_strings) or str(value)
+    value = "" if action.nargs == 0 else str(action.metavar or action.dest.upper())
+    names = ", ".join(f"{name} {value}".strip() for name in action.option_strings) or value
     help = (action.help or "") % {"default": action.default, "dest": action.dest}
-    words = [help] + ([f"one of {', '.join(map(str, action.choices))}"] if action.choices and action.metavar else [])
+    words = [help] + ([f"one of {', '.join(map(str, action.choices))}"] if action.choices else [])
     words += ["required"] if action.required and action.option_strings else []
     return f"| `{escaped(names)}` | {escaped('; '.join(words))} |"
 
