@@ -170,6 +170,10 @@ def test_on_a_terminal_what_is_missing_is_asked_for(tmp_path, monkeypatch):
     assert sensor.camera.focal[0].item() == pytest.approx(320 / math.tan(math.radians(50)), abs=1e-3)
 
 
+def test_the_lens_centre_need_not_be_whole(tmp_path):
+    assert Sensor.from_file(drafted(tmp_path, "dome", "--centre", "307.9,241.6")).camera.centre.tolist() == [307.9, 241.6]
+
+
 def test_bad_dots_are_named_with_their_line(tmp_path):
     surface, camera = drafted_surface("dome", {"radius": 12.0}, 20.0), Camera("pinhole", (640, 480), (400, 400), (320, 240))
     for text, said in (("x,y\n1,2\n30,0\n", "line 3"), ("a,b\n1,2\n", "header"), ("x,y\n1,a\n", "readable"), ("x,y\n", "none")):

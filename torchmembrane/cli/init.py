@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MembraneError
-from .arguments import Add, add_command, count_pair, numbers, positive, vector
+from .arguments import Add, add_command, count_pair, positive, positive_pair, vector
 from .choices import DRAFTS, FILLINGS, LENGTH_UNITS, LENSES, POLARITIES
 
 PURPOSE = "write a sensor file, with a word on every key, from a few numbers"
@@ -76,7 +76,8 @@ def _add_camera(add: Add) -> None:
     add("--image-size", metavar="WIDTH,HEIGHT", type=size, help="px (default: the rest image's)")
     add("--focal", metavar="PX", type=positive, help="focal length, px; fisheye: px / rad")
     add("--view", metavar="DEGREES", type=positive, help="in place of --focal: field of view across the image's width")
-    add("--centre", metavar="U,V", type=_pair, help="principal point, px (default: the rim's centre, else the image's)")
+    centre = positive_pair("two numbers, U,V")
+    add("--centre", metavar="U,V", type=centre, help="principal point, px (default: the rim's centre, else the image's)")
     add("--rim", metavar="U,V,RADIUS", type=vector, help="the rim's circle in the rest image, px, as an image viewer tells it")
 
 
@@ -93,13 +94,6 @@ def _add_markers(add: Add) -> None:
     add("--dots", metavar="FILE.csv", type=Path, help="list of dots, in one of the frames below")
     add("--pitch", metavar="LENGTH", type=positive, help="without either: of a pattern of dots along the membrane")
     add("--polarity", choices=POLARITIES, default=POLARITIES[0], help="of dots against their ground (default: %(default)s)")
-
-
-def _pair(text: str) -> list[float]:
-    values: list[int] = numbers("two whole numbers, U,V")(text)
-    if len(values) != 2:
-        raise ArgumentTypeError(f"{text!r}; expected two whole numbers, U,V")
-    return [float(value) for value in values]
 
 
 def _pressure(text: str) -> float:
