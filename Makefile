@@ -1,4 +1,5 @@
 # make demo | make test | make lint (style, types, layers) | make bench | make soak SOAK=HOURS | make figures: each sets itself up on a machine with Python 3.11+ only.
+# make docs: the site in out/site, links checked.
 # make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
 PYTHON ?= python3
 SOAK ?= 1
@@ -13,7 +14,7 @@ PACKAGES := $(WEB)/node_modules/.package-lock.json
 SENSOR := examples/sensor.toml examples/rest_grid.npz examples/dots.csv examples/rest.png
 IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
 
-.PHONY: demo test lint style types layers bench soak figures web test-web clean
+.PHONY: demo test lint style types layers bench soak figures docs web test-web clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -50,6 +51,13 @@ soak: $(READY)
 
 figures: $(READY)
 	$(BIN)/python docs/figures.py
+
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+$(VENV)/.docs: $(READY)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	touch $(VENV)/.docs
 
 web: $(PAGE)
 

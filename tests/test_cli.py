@@ -14,6 +14,7 @@ from PIL import Image
 
 from torchmembrane import __version__, presets, reconstruct
 from torchmembrane.calibrate import camera
+from torchmembrane.camera import model
 from torchmembrane.cli import arguments as types
 from torchmembrane.cli import choices
 from torchmembrane.cli import main as cli
@@ -22,7 +23,9 @@ from torchmembrane.estimators import settings
 from torchmembrane.io import store
 from torchmembrane.markers import placement
 from torchmembrane.mechanics import hyperelastic
+from torchmembrane.presets import draft
 from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.sensor import parts
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate import appearance, dataset, frames, simulator
 
@@ -203,7 +206,7 @@ def test_view_draws_a_stored_result(built_once, monkeypatch, tmp_path, capsys):
     assert code == 2 and "mesh.npz" in errors
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "check", "view", "export"])
+@pytest.mark.parametrize("command", ["init", "reconstruct", "check", "view", "export"])
 def test_help_shows_examples_and_exit_codes(command, capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main([command, "--help"])
@@ -215,7 +218,9 @@ def test_help_shows_examples_and_exit_codes(command, capsys):
 HEAVY = ("torch", "kornia", "scipy", "matplotlib", "tqdm", "numpy", "PIL")
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["simulate", "--help"], ["calibrate", "ports", "--help"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["--version"], ["init", "--help"], ["simulate", "--help"], ["calibrate", "ports", "--help"]]
+)
 def test_help_loads_nothing_heavy(arguments):
     code = (
         "import sys\nfrom torchmembrane.cli.main import main\n"
@@ -231,6 +236,8 @@ def test_the_options_choices_are_what_the_package_has():
     assert (choices.ELEMENTS, choices.VOLUMES, choices.FLOWS) == (settings.ELEMENTS, settings.VOLUMES, settings.FLOWS)
     assert choices.RESULT_FORMATS == store.FORMATS
     assert choices.LOCATORS == placement.LOCATORS
+    assert choices.DRAFTS == tuple(draft.SHAPES) and choices.LENGTH_UNITS == tuple(parts.METRE)
+    assert choices.LENSES == tuple(model.COEFFICIENTS) and choices.FILLINGS == parts.FILLINGS
     assert choices.PRESETS == presets.NAMES and choices.INDENTERS == dataset.KINDS and choices.LEGS == simulator.LEGS
     assert choices.SIMULATION_FORMATS == frames.FORMATS and choices.PORTS == camera.PORTS
     assert (choices.HIGHLIGHT, choices.BLUR) == (appearance.Appearance.highlight, appearance.Appearance.blur)

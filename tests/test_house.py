@@ -185,6 +185,7 @@ EXAMPLES_LEFT_OUT = {
     "export": "takes half a minute",
     "material_from_images": "some twenty force balances",
     "material_from_pixels": "some twenty force balances",
+    "material_from_weight": "some twenty force balances",
     "rest_from_views": "needs images taken from several places, which take seconds to render",
 }
 """Public names whose docstrings run no example, and why; records, whose docstrings list their fields, need none either."""

@@ -285,6 +285,13 @@ def test_solver_grid_without_listed_dots(tmp_path):
 TEXTURE = replaced('kind = "dots"\nfile = "dots.csv"', 'kind = "texture"')
 NO_FILE = replaced('file = "dots.csv"\n', "")
 BAD_TEXTS = [
+    (replaced('"spherical_cap"', '"half_sphere"'), "did you mean 'spherical_cap' (half a sphere has rim_radius = height)?"),
+    (replaced('"spherical_cap"', '"height_field"'), "did you mean 'heightfield'?"),
+    (replaced('"gas"', '"air"'), "filling is 'air'; expected 'liquid', 'gas' or 'open': did you mean 'gas'?"),
+    (replaced('"mooney_rivlin"', '"NeoHookean"'), "did you mean 'neo_hookean'?"),
+    (replaced('"dark"', '"black"'), "did you mean 'dark'?"),
+    (replaced("pressure", "overpressure"), "[cavity] overpressure is unknown", "did you mean 'pressure' (of a gas, absolute"),
+    (replaced("rim_radius", "radius"), "[membrane] radius is unknown", "did you mean 'rim_radius'?"),
     (replaced('name = "fingertip"', 'name = "fingertip'), "not valid TOML: ", "line 2"),
     (GOOD + "[markers", "not valid TOML: ", "at line 44, the last"),
     (replaced("format = 1", "format = 2"), "format = 2", "expected 1", "update"),

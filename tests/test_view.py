@@ -151,7 +151,7 @@ def test_an_answer_without_convergence_is_drawn_and_named(mesh):
 
 def test_relative_forces_are_called_relative():
     mesh = cap_mesh(Camera("fisheye", SIZE, (220, 220), (320, 240)), force_unit="relative")
-    assert "(relative)" in view.figure(pressed(mesh), mesh).get_suptitle()
+    assert "relative units" in view.figure(pressed(mesh), mesh).get_suptitle()
 
 
 def test_a_fourth_panel_shows_where_and_how_hard_something_pushes(mesh):

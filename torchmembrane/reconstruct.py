@@ -204,7 +204,8 @@ class Reconstructor(nn.Module):
             pixels: `[B, D, 2]` or `[D, 2]` in the sensor file's order, NaN where lost.
             confidence: `[B, D]` or `[D]` in 0..1; default: 1 where finite.
             rest_pixels: `[D, 2]`, the same markers located in the rest image; default: the model's rest pixels.
-            previous, pressure: as for images.
+            previous: as for images.
+            pressure: as for images.
 
         Raises:
             MembraneError: another shape, or a confidence outside 0..1.

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .material import KnownPressures, MaterialFit, material_from_images, material_from_pixels
     from .rest import RestFit, rest_from_image
     from .views import ViewsFit, rest_from_views
+    from .weight import WeightFit, material_from_weight
 
 _MODULES = {
     "..targets": ("Checkerboard", "DotBoard"),
@@ -35,6 +36,7 @@ _MODULES = {
     ".material": ("KnownPressures", "MaterialFit", "material_from_images", "material_from_pixels"),
     ".rest": ("RestFit", "rest_from_image"),
     ".views": ("ViewsFit", "rest_from_views"),
+    ".weight": ("WeightFit", "material_from_weight"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
@@ -50,11 +52,13 @@ __all__ = [
     "RestFit",
     "Views",
     "ViewsFit",
+    "WeightFit",
     "find_target",
     "layout_for_pixels",
     "lens_from_views",
     "material_from_images",
     "material_from_pixels",
+    "material_from_weight",
     "pixel_lattice",
     "ports_from_views",
     "rest_from_depth",

@@ -69,6 +69,21 @@ def positive(text: str) -> float:
     return value
 
 
+NEWTONS = {"N": 1.0, "mN": 1e-3, "kg": 9.80665, "g": 9.80665e-3}
+
+
+def weight(text: str) -> float:
+    """A force, N, from a weight with its unit.
+
+    >>> weight("2N"), round(weight("200 g"), 4)
+    (2.0, 1.9613)
+    """
+    unit = next((unit for unit in ("mN", "N", "kg", "g") if text.strip().endswith(unit)), None)
+    if unit is None:
+        raise ArgumentTypeError(f"{text!r}; expected a weight with its unit, {', '.join(NEWTONS)}, as 200g")
+    return positive(text.strip().removesuffix(unit).strip()) * NEWTONS[unit]
+
+
 def not_negative(text: str) -> float:
     """A number, 0 or more."""
     value: float = _values(text, float, 1, "a number, 0 or more")[0]

@@ -12,6 +12,12 @@ FLOWS = ("smooth", "bilinear")
 ENGINES = ("local", "ray")
 RESULT_FORMATS = ("npz", "parquet")
 
+DRAFTS = ("dome", "cap", "bubble", "fingertip", "half_cylinder")
+LENGTH_UNITS = ("mm", "cm", "m")
+LENSES = ("pinhole", "fisheye")
+FILLINGS = ("liquid", "gas", "open")
+POLARITIES = ("dark", "light")
+
 PRESETS = ("fingertip", "bubble", "half_cylinder")
 INDENTERS = ("sphere", "cylinder", "wedge", "box", "plane")
 LEGS = ("push", "slide", "release")

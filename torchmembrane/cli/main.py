@@ -13,14 +13,14 @@ from threading import current_thread, main_thread
 
 from .. import __version__
 from ..errors import MembraneError
-from . import calibrate, check, export, reconstruct, simulate, view
+from . import calibrate, check, export, init, reconstruct, simulate, view
 
-COMMANDS = (reconstruct, simulate, calibrate, check, view, export)
+COMMANDS = (init, check, reconstruct, view, calibrate, simulate, export)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command with these arguments (default: the process's); returns the exit code."""
-    arguments = _parser().parse_args(argv)
+    arguments = command_parser().parse_args(argv)
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(f"torchmembrane: warning: {message}", file=sys.stderr)
         try:
@@ -47,7 +47,8 @@ def _terminated_as_interrupted() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _parser() -> ArgumentParser:
+def command_parser() -> ArgumentParser:
+    """The parser of the whole command."""
     parser = ArgumentParser(
         prog="torchmembrane", description="3-D shape of a deformable membrane from one image of its markings."
     )

@@ -1,6 +1,7 @@
 """A frame's result in one row of panels: marker flow, surface from the side, map of displacements, map of traction."""
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
@@ -32,6 +33,7 @@ ARROWS_ACROSS = 22
 BAR_BELOW, BAR_HEIGHT = 0.58, 0.13  # inches: of a colour bar, below its axes, whatever the image's shape
 
 
+@rc_context({"font.size": 13, "axes.titlesize": 14.5})
 def figure(frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = None, name: str = "") -> Figure:
     """Flow over the image, side view, displacement along the rest normals and, where forces are known, traction.
 
@@ -57,8 +59,8 @@ def figure(frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = 
     """
     good = bool(np.isfinite(frame["vertices"]).all())
     forces = good and np.any(frame["traction"])
-    drawing, places = panels(4 if forces else 3)
-    drawing.suptitle(_title(frame, mesh, name), fontsize=14, color="k" if good else VERMILION)
+    drawing, places = panels(4 if forces else 3, below=0.15)
+    drawing.suptitle(_title(frame, mesh, name), fontsize=17, color="k" if good else VERMILION)
     draw_flow(drawing.add_subplot(places[0]), frame, mesh, image)
     if good:
         draw_side(drawing.add_subplot(places[1]), frame, mesh)
@@ -94,7 +96,7 @@ def draw_flow(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh, image: np.nd
             minlength=0.3,
             zorder=3,
         )
-        label = "moved to" if times == 1 else f"moved to, arrows {times} times as long"
+        label = "moved to" if times == 1 else f"moved, {times} times as long"
         axes.plot([], [], ls="", marker=r"$\rightarrow$", ms=14, color=VERMILION, label=label)
     if len(gone):
         axes.plot(*gone.T, "x", ms=6 if len(gone) < 200 else 3, mec="k", mew=1.3, label=f"lost ({len(gone)})")
@@ -116,6 +118,7 @@ def draw_side(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
     if pressed:
         axes.plot(*x[vertex, plane], "o", ms=8, mfc="none", mec="k", mew=1.5)
     side_axes(axes, "xy"[across], mesh.length_unit)
+    axes.set_ylabel(f"z [{mesh.length_unit}]")
     axes.set_title(f"Surface, seen along {'yx'[across]}")
     legend_below(axes)
 
@@ -133,7 +136,7 @@ def draw_displacement(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> N
     axes.tricontour(triangulation, depth, levels=lines, colors="0.4", linewidths=0.6, linestyles="-")
     axes.plot(*place[closed_rim(mesh.grid)].T, color="k", lw=1)
     bar = _colour_bar(axes, shades, marks)
-    bar.set_label(f"displacement along the normal [{unit}], negative: pressed in")
+    bar.set_label(f"displacement [{unit}], negative: pressed in")
     image_axes(axes, mesh.image_size, None)
     for point in frame["contact_points"][np.isfinite(frame["contact_points"]).all(1)]:
         nearest = np.linalg.norm(frame["vertices"] - point, axis=1).argmin()
@@ -159,8 +162,7 @@ def draw_traction(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
     bar = _colour_bar(axes, shades)
     bar.locator = MaxNLocator(5)
     bar.update_ticks()
-    relative = mesh.force_unit == "relative"
-    bar.set_label("compressive normal traction " + ("(relative)" if relative else f"[{mesh.force_unit}/{mesh.length_unit}²]"))
+    bar.set_label(f"compressive normal traction [{_pressure_unit(mesh)}]")
     image_axes(axes, mesh.image_size, None)
     points = frame["contact_points"][np.isfinite(frame["contact_points"]).all(1)]
     nearest = np.linalg.norm(frame["vertices"] - points[:, None], axis=2).argmin(1)
@@ -171,7 +173,12 @@ def draw_traction(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
         arrow = FORCE_ARROW * mesh.image_size[0] * force[:2] / size
         axes.annotate("", place[nearest[0]] + arrow, place[nearest[0]], arrowprops=dict(arrowstyle="-|>", color=BLUE, lw=2.5))
     components = ", ".join(f"{c:.3g}" for c in force)
-    axes.set_title(f"Force {size:.3g}" + ("" if relative else f" {mesh.force_unit}") + f" ({components})")
+    unit = "relative units\n" if mesh.force_unit == "relative" else f"{mesh.force_unit} "
+    axes.set_title(f"Force {size:.3g} {unit}({components})")
+
+
+def _pressure_unit(mesh: Mesh) -> str:
+    return "relative units" if mesh.force_unit == "relative" else f"{mesh.force_unit}/{mesh.length_unit}²"
 
 
 def _colour_bar(axes: Axes, shades: TriContourSet, ticks: np.ndarray | None = None) -> Colorbar:
@@ -180,7 +187,7 @@ def _colour_bar(axes: Axes, shades: TriContourSet, ticks: np.ndarray | None = No
     inches_below = blended_transform_factory(axes.transAxes, axes.figure.dpi_scale_trans + foot)
     place = axes.inset_axes((0.05, -BAR_BELOW - BAR_HEIGHT, 0.9, BAR_HEIGHT), transform=inches_below)
     bar = axes.figure.colorbar(shades, cax=place, ticks=ticks, orientation="horizontal")
-    bar.ax.tick_params(labelsize=8.5)
+    bar.ax.tick_params(labelsize=12)
     return bar
 
 
@@ -197,8 +204,10 @@ def _title(frame: dict[str, np.ndarray], mesh: Mesh, name: str) -> str:
     status = int(frame["status"])
     words = [name] * bool(name) + ["ok" if status == Status.OK else "NOT OK: " + Status(status).text.partition(":")[0]]
     if np.isfinite(frame["pressure_change"]):
-        unit = "(relative)" if mesh.force_unit == "relative" else f"{mesh.force_unit}/{mesh.length_unit}²"
-        words += [f"pressure change {frame['pressure_change']:+.3g} {unit}", f"residual {frame['residual']:.2f} px"]
+        words += [
+            f"pressure change {frame['pressure_change']:+.3g} {_pressure_unit(mesh)}",
+            f"residual {frame['residual']:.2f} px",
+        ]
     return "    ".join(words)
 
 
@@ -222,7 +231,7 @@ def _annotate(axes: Axes, text: str, place: np.ndarray, size: np.ndarray) -> Non
         textcoords="offset points",
         ha="left" if side > 0 else "right",
         va="center",
-        fontsize=12,
+        fontsize=16,
         fontweight="bold",
         arrowprops={"arrowstyle": "-", "lw": 1, "shrinkB": 5},
         bbox={"boxstyle": "round,pad=0.2", "fc": "w", "ec": "none", "alpha": 0.8},

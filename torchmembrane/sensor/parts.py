@@ -18,6 +18,7 @@ from ..pose import Pose
 from ..surface import shapes
 from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
+from .synonyms import did_you_mean
 
 OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, in the surface's size
 METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}  # one metre in the length unit
@@ -25,6 +26,7 @@ MOST_PRESTRETCH, MOST_C2_RATIO = 10.0, 1e3
 POSITIVE = {"shear_modulus": (1e-6, 1e12), "thickness": (1e-6, 1e4), "pressure": (1e-3, 1e6), "volume": (1e-12, 1e15)}
 """What such a quantity of a membrane can be, in the file's units with any of the length units."""
 LEAST_APART = 1e-3  # of two dots, in the surface's size
+FILLINGS = ("liquid", "gas", "open")
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 SHAPES_BY_NUMBERS = {
     "spherical_cap": ("rim_radius", "height", "base_z"),
@@ -60,7 +62,8 @@ class Material:
     thickness: float | None = None
 
     def __post_init__(self) -> None:
-        expect(self.model in MODELS, "material model", self.model, f"one of {', '.join(MODELS)}")
+        meant = did_you_mean(self.model, MODELS)
+        expect(self.model in MODELS, "material model", self.model, f"one of {', '.join(MODELS)}" + (meant and f": {meant}"))
         known = 1 <= self.prestretch <= MOST_PRESTRETCH
         expect(known, "prestretch", self.prestretch, f"1 (unstretched) or more, at most {MOST_PRESTRETCH:g}")
         if self.model == "mooney_rivlin":
@@ -99,7 +102,9 @@ class Cavity:
     volume: float | None = None
 
     def __post_init__(self) -> None:
-        expect(self.filling in ("liquid", "gas", "open"), "filling", self.filling, "'liquid', 'gas' or 'open'")
+        meant = did_you_mean(self.filling, FILLINGS)
+        expected = "'liquid', 'gas' or 'open'" + (meant and f": {meant}")
+        expect(self.filling in FILLINGS, "filling", self.filling, expected)
         known = self.filling != "gas" or self.pressure is not None
         expect(known, "pressure", None, "the gas' absolute pressure at rest in hPa, about 1013: add it")
         _expect_positive(pressure=self.pressure, volume=self.volume)

@@ -3,7 +3,6 @@
 Every message names the file, the table and key, the value that came and what was expected.
 """
 
-import difflib
 import glob
 import json
 import math
@@ -17,6 +16,7 @@ import numpy as np
 
 from ..errors import MembraneError
 from ..io.bounded import lies_within, printable, read_text, shortened
+from .synonyms import did_you_mean
 
 MOST_BYTES, LONGEST_LINE = 2**15, 2000
 """Of a sensor file: the time that TOML takes grows as the square of a line's length."""
@@ -91,8 +91,7 @@ class Table:
         keys = list(keys)
         for key in self.values:
             if key not in keys:
-                closest = difflib.get_close_matches(key, keys, 1)
-                remedy = f"did you mean {closest[0]!r}?" if closest else "remove it"
+                remedy = did_you_mean(key, keys, "remove it")
                 raise MembraneError(f"{self.where(key)} is unknown {owner}; expected {', '.join(keys)}; {remedy}")
 
     def table(self, key: str) -> "Table":
@@ -110,7 +109,8 @@ class Table:
     def text(self, key: str, choices: Iterable[str] = ()) -> str:
         """Text that is not empty; one of `choices` where they are given."""
         choices = tuple(choices)
-        expected = " or ".join(map(_shown, choices)) or "text in quotes"
+        meant = did_you_mean(self.values.get(key), choices)
+        expected = (" or ".join(map(_shown, choices)) or "text in quotes") + (meant and f": {meant}")
 
         def right(value: object) -> bool:
             return isinstance(value, str) and value != "" and (not choices or value in choices)

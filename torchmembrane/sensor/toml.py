@@ -3,7 +3,7 @@
 import csv
 import math
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +41,12 @@ MOST_DOTS, MOST_DOTS_BYTES = 2000, 2**20
 DOTS_HEADER = ["x", "y", "z", "size"]
 
 
-def read_sensor(path: Path) -> SensorParts:
+def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
     """The parts of the sensor that a `sensor.toml` describes; `Sensor.from_file` puts them together.
 
     Args:
         path: of the `.toml` file; the files named in it are relative to its folder.
+        undotted: whether it is a design that may have no dots yet; one in the middle then stands for those to come.
 
     Returns:
         `SensorParts`.
@@ -66,9 +67,13 @@ def read_sensor(path: Path) -> SensorParts:
     camera = _read_camera(file.table("camera"))
     material = _read_material(file.table("material"))
     cavity = _read_cavity(file.table("cavity"))
-    markers, lines = _read_markers(file.table("markers"), camera)
+    dotted = not undotted or "file" in file.table("markers") or "rest_image" in file.table("markers")
+    markers, lines = _read_markers(file.table("markers"), camera) if dotted else (_dots_to_come(file.table("markers")), [])
     surface, membrane = _read_membrane(file.table("membrane"), markers)
-    if markers.positions is not None:
+    if not dotted:
+        middle = len(membrane.rest) // 2
+        markers = replace(markers, positions=membrane.rest[middle : middle + 1].numpy())
+    elif markers.positions is not None:
         names = [f"{line}: the dot" for line in lines]
         refuse_off_surface(membrane, markers.positions, names)
         refuse_coincident(membrane, markers.positions, names)
@@ -216,6 +221,11 @@ def _read_markers(table: Table, camera: Camera) -> tuple[Markers, list[str]]:
         for path in images[:1]:  # the others are of the same size, or refused
             refuse_other_size(image_size(path), camera)
         return Markers(kind, polarity, positions, sizes, mean_image(images) if images else None), lines
+
+
+def _dots_to_come(table: Table) -> Markers:
+    table.allow(("kind", "polarity"))
+    return Markers(table.text("kind", ("dots",)), table.text("polarity", ("dark", "light")), np.zeros((1, 3)))
 
 
 def _read_dots(path: Path) -> tuple[np.ndarray, list[str], list[str]]:

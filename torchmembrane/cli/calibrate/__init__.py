@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..arguments import Add, add_command, count_pair, positive
+from ..arguments import Add, add_command, count_pair, positive, weight
 from ..choices import PORTS
 
 PURPOSE = "find lens, ports, rest surface and dots from images; make a layout of dots"
@@ -97,6 +97,7 @@ def _material_options(add: Add) -> None:
         "CSV name,pressure (images at rest and pressed) or name,pressure_change (since rest), hPa: a gauge's readings of some"
     )
     add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
+    add("--weight", metavar="WEIGHT", type=weight, help="that lies on the membrane in every image, alone, as 200g or 1.96N")
 
 
 def _layout_options(add: Add) -> None:

@@ -7,13 +7,15 @@ from ...calibrate.layout import layout_for_pixels, pixel_lattice, read_pixels, w
 from ...errors import MembraneError
 from ...plot.calibration import layout_figure
 from ...plot.drawing import save
+from ...presets import sensor_file
 from ...sensor.parts import Markers
-from .files import read_sensor
+from ...sensor.sensor import Sensor
+from ...sensor.toml import read_sensor
 
 
 def layout(arguments: Namespace) -> int:
     """`torchmembrane calibrate layout`"""
-    sensor = read_sensor(arguments)
+    sensor = Sensor(*read_sensor(sensor_file(arguments.sensor), undotted=True))
     if (arguments.pixels is None) == (arguments.pitch is None):
         raise MembraneError("calibrate layout: expected either --pixels FILE or --pitch PX")
     wanted = read_pixels(arguments.pixels) if arguments.pixels else pixel_lattice(sensor, arguments.pitch)

@@ -6,6 +6,8 @@ import numpy as np
 import torch
 
 from ...calibrate.material import STRETCHES, KnownPressures, material_from_images
+from ...calibrate.weight import WeightFit, material_from_weight
+from ...errors import MembraneError
 from ...io.report import Report
 from ...jobs.inputs import Inputs, find_inputs
 from ...jobs.pressure import read_pressures
@@ -21,7 +23,8 @@ def material(arguments: Namespace) -> int:
     forces = read_forces(arguments.forces, paths) if arguments.forces else None
     pressures = _pressures(arguments, inputs, sensor) if arguments.pressure else None
     images = torch.from_numpy(np.stack([read_sensor_image(path, sensor) for path in paths]))[:, None]
-    found = material_from_images(sensor, images, forces, pressures)
+    weighed = _weighed(arguments, sensor, images) if arguments.weight else None
+    found = material_from_images(sensor, images, forces, pressures) if weighed is None else weighed.material
     unit, n = sensor.length_unit, len(found.values)
     each = zip(paths, found.each, strict=True)
     notes = [f"{path.name} alone: prestretch {one:.3f} ± {sd:.2g}" for path, (one, sd) in each]
@@ -29,6 +32,12 @@ def material(arguments: Namespace) -> int:
         notes.append(f"the prestretch may be larger: {STRETCHES[-1]:g} is the largest that was tried")
     if n == 2:
         notes.append("modulus: shear modulus x thickness; the sensor file's thickness is kept, or 1 where it has none")
+    if weighed is not None:
+        forces_said = ", ".join(f"{force:.3g}" for force in weighed.forces)
+        notes.append(
+            f"the file's modulus is scaled to {weighed.sensor.material.modulus:.4g} N/{unit}, so that its reconstruction says "
+            f"the weight, {arguments.weight:.4g} N: {forces_said} N; forces are scaled to {100 * weighed.deviation:.0f} %"
+        )
     report = Report.without_parameters(f"material from {len(paths)} images of presses", notes)._replace(
         names=["prestretch", "modulus"][:n],
         units=["", f"N/{unit}"][:n],
@@ -37,7 +46,16 @@ def material(arguments: Namespace) -> int:
         deviations=found.deviations,
         correlations=found.covariance / np.outer(found.deviations, found.deviations),
     )
-    return write_calibrated(arguments, found.sensor, report, material_figure(report, found, [path.name for path in paths]))
+    made = found.sensor if weighed is None else weighed.sensor
+    return write_calibrated(arguments, made, report, material_figure(report, found, [path.name for path in paths]))
+
+
+def _weighed(arguments: Namespace, sensor: Sensor, images: torch.Tensor) -> WeightFit:
+    if arguments.forces or arguments.pressure:
+        raise MembraneError(
+            "calibrate material: --weight and --forces or --pressure; expected one of them, either gives newtons"
+        )
+    return material_from_weight(sensor, images, arguments.weight)
 
 
 def _pressures(arguments: Namespace, inputs: Inputs, sensor: Sensor) -> KnownPressures:

@@ -1,0 +1,194 @@
+"""Laws of drafted sensors: what `init` writes is read, checked and reconstructs; pressures as of a neo-Hookean sphere."""
+
+import csv
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchmembrane import Camera, Sensor
+from torchmembrane.cli.main import main
+from torchmembrane.presets.draft import RimCircle, balanced, drafted_dots, drafted_surface, overpressure, read_drafted_dots
+from torchmembrane.sensor.parts import METRE, Material
+
+FISHEYE = "--image-size 640,480 --lens fisheye --view 150".split()
+SHAPES = {
+    "dome": "--radius 12 --distance 12",
+    "cap": "--radius 12 --height 7 --distance 12",
+    "bubble": "--radius 30 --height 18 --distance 25 --shear-modulus 0.3 --thickness 0.3 --prestretch 1.3",
+    "fingertip": "--semi-axes 10,8,12 --distance 8",
+    "half_cylinder": "--radius 10 --length 30 --half-angle 75 --distance 20",
+}
+
+
+def drafted(tmp_path, shape, *more):
+    path = tmp_path / "sensor.toml"
+    assert main(["init", str(path), "--shape", shape, *SHAPES[shape].split(), *FISHEYE, *more]) == 0
+    return path
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_what_is_written_passes_check_and_reconstructs_a_press(tmp_path, shape):
+    path = drafted(tmp_path, shape)
+    assert main(["check", str(path)]) == 0
+    size = Sensor.from_file(path).membrane.size
+    pressed = ["--radius", str(size / 6), "--depth", str(size / 12), "--noise", "40"]
+    press, results = tmp_path / "press", tmp_path / "results"
+    assert main(["simulate", str(path), "--indenter", "sphere", *pressed, "--out", str(press)]) == 0
+    assert main(["reconstruct", str(press / "sensor.toml"), str(press / "press.png"), "--out", str(results)]) == 0
+    (row,) = csv.DictReader((results / "summary.csv").open())
+    assert row["status_text"] == "ok" and row["force_unit"] == ("N" if shape == "bubble" else "relative")
+    assert float(row["deepest"]) == pytest.approx(-size / 12, rel=0.25)
+
+
+def test_every_key_that_is_written_has_a_word(tmp_path):
+    for shape in SHAPES:
+        lines = drafted(tmp_path, shape, "--force").read_text().splitlines()
+        assert not [line for line in lines if " = " in line and not line.startswith("#") and "  # " not in line]
+
+
+@pytest.mark.parametrize("unit", METRE)
+def test_the_overpressure_is_that_of_a_neo_hookean_sphere(unit):
+    """`p = 2 mu H / R (1 / l - 1 / l^7)` with thickness H and radius R before it is blown up."""
+    stretch, mu, flat, before = 1.4, 0.3, 0.5, 10.0
+    membrane = drafted_surface("dome", {"radius": stretch * before}, 20.0).membrane((65, 65))
+    p = 2 * mu * flat / before * (1 / stretch - 1 / stretch**7) * METRE[unit] ** 2 / 100
+    blown_up = Material("neo_hookean", stretch, None, mu, flat / stretch**2)
+    assert overpressure(membrane, blown_up, unit) == pytest.approx(p, rel=5e-3)
+
+
+def test_of_overpressure_prestretch_and_modulus_any_two_give_the_third():
+    membrane = drafted_surface("cap", {"radius": 12.0, "height": 7.0}, 20.0).membrane((33, 33))
+    held = overpressure(membrane, Material("neo_hookean", 1.3, None, 0.4, 0.5), "mm")
+    stretched, said = balanced(membrane, "mm", held, shear_modulus=0.4, thickness=0.5)
+    assert stretched.prestretch == pytest.approx(1.3, rel=1e-5) and "from the overpressure" in said[0]
+    stiff, said = balanced(membrane, "mm", held, prestretch=1.3, thickness=0.5)
+    assert stiff.shear_modulus == pytest.approx(0.4, rel=1e-4) and "from the overpressure" in said[0]
+    _, said = balanced(membrane, "mm", held, 1.3, 0.4, 0.5)
+    assert not said
+    _, said = balanced(membrane, "mm", 1.2 * held, 1.3, 0.4, 0.5)
+    assert "disagree" in said[0]
+
+
+@pytest.mark.parametrize("shape", ["dome", "half_cylinder"])
+def test_dots_are_the_same_in_whatever_frame_they_are_given(tmp_path, shape):
+    lengths = {"radius": 12.0, "length": 30.0, "half_angle": 75.0}
+    surface, camera = drafted_surface(shape, lengths, 20.0), Camera("fisheye", (640, 480), (200, 200), (320, 240))
+    X, sizes = drafted_dots(surface)
+    x, y, h = (X - [0, 0, 20.0]).T
+    angle, azimuth = np.degrees(np.arctan2(np.hypot(x, y), h)), np.degrees(np.arctan2(y, x))
+    tables = {
+        "x,y,z": X,
+        "x,y,h": np.stack([x, y, h], -1),
+        "x,y": np.stack([x, y], -1),
+        "angle,azimuth": np.stack([angle, azimuth], -1),
+        "u,v": camera.point_to_pixel(torch.from_numpy(X)).numpy(),
+    }
+    for header, values in tables.items():
+        path = tmp_path / "dots.csv"
+        rows = [",".join(map(repr, row)) + f",{size}" for row, size in zip(values.tolist(), sizes, strict=True)]
+        path.write_text("\n".join([f"{header},size", *rows]) + "\n")
+        got, got_sizes = read_drafted_dots(path, surface, camera)
+        assert got_sizes == sizes and np.abs(got - X).max() < 0.02, header
+
+
+@pytest.mark.parametrize("model", ["pinhole", "fisheye"])
+def test_the_rim_s_circle_gives_the_distance_and_the_focal_length(model):
+    camera = Camera(model, (640, 480), (200, 200), (320, 240))
+    pixel = camera.point_to_pixel(torch.tensor([12.0, 0.0, 15.0], dtype=torch.float64))
+    circle = RimCircle(12.0, float(pixel[0]) - 320, model)
+    assert circle.distance(200.0) == pytest.approx(15.0) and circle.focal(15.0) == pytest.approx(200.0)
+
+
+def test_a_rest_image_and_the_rim_s_circle_give_the_sensor_and_check_finds_all_of_its_dots(tmp_path, capsys):
+    path = drafted(tmp_path, "dome")
+    press = tmp_path / "press"
+    arguments = ["--indenter", "sphere", "--radius", "3", "--depth", "1"]
+    assert main(["simulate", str(path), *arguments, "--out", str(press)]) == 0
+    design = Sensor.from_file(path)
+    rim = torch.tensor([12.0, 0.0, 12.0], dtype=torch.float64)
+    pixels = float(design.camera.point_to_pixel(rim)[0] - design.camera.centre[0])
+    made, shape = tmp_path / "photo" / "sensor.toml", "--shape dome --radius 12 --view 150 --lens fisheye".split()
+    arguments = [*shape, "--rest", str(press / "sensor_rest.png"), "--rim", f"319.5,239.5,{pixels}"]
+    assert main(["init", str(made), *arguments]) == 0
+    found = Sensor.from_file(made)
+    assert found.surface.values["base_z"] == pytest.approx(12.0, abs=1e-3)
+    assert found.camera.focal.tolist() == design.camera.focal.tolist()
+    capsys.readouterr()
+    assert main(["check", str(made)]) == 0
+    dots = len(design.markers.positions)
+    said = capsys.readouterr().out
+    assert f"{dots} placed on the rest surface" in said and f"{dots} of {dots} found in the rest image" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("", "--shape is missing"),
+        ("--shape dome", "--radius is missing"),
+        ("--shape dome --radius 12 --distance 12 --view 100", "--image-size is missing"),
+        ("--shape dome --radius 12 --image-size 640,480 --view 100", "--distance is missing"),
+        ("--shape dome --radius 12 --image-size 640,480 --distance 12", "--view is missing"),
+        (
+            "--shape dome --radius 12 --height 3 --image-size 640,480 --distance 12 --view 100",
+            "--height is no length of a dome",
+        ),
+        ("--shape dome --radius 12 --image-size 640,480 --distance 12 --view 200", "less than 180"),
+        ("--shape dome --radius 12 --image-size 640,480 --distance 12 --view 100 --focal 300", "one of them"),
+        ("--shape dome --radius 12 --image-size 640,480 --distance 12 --view 100 --overpressure 20hPa", "follows"),
+        ("--shape dome --radius 12 --image-size 640,480 --distance 12 --view 100 --rim 1,2,3", "--rest"),
+    ],
+)
+def test_what_is_missing_or_too_much_is_named(tmp_path, capsys, arguments, said):
+    assert main(["init", str(tmp_path / "sensor.toml"), *arguments.split()]) == 2
+    error = capsys.readouterr().err
+    assert said in error and len(error.splitlines()) == 1 and not (tmp_path / "sensor.toml").exists()
+
+
+@pytest.mark.parametrize("text", ["20", "20 furlongs", "hPa"])
+def test_a_pressure_without_a_known_unit_is_refused(tmp_path, capsys, text):
+    with pytest.raises(SystemExit):
+        main(["init", str(tmp_path / "sensor.toml"), "--overpressure", text])
+    assert "expected a number and its unit" in capsys.readouterr().err
+
+
+def test_a_file_is_not_written_over_unless_it_is_asked_for(tmp_path, capsys):
+    path = drafted(tmp_path, "dome")
+    assert main(["init", str(path), "--shape", "dome", *SHAPES["dome"].split(), *FISHEYE]) == 2
+    assert "--force" in capsys.readouterr().err
+
+
+def test_on_a_terminal_what_is_missing_is_asked_for(tmp_path, monkeypatch):
+    answers = iter(["cap", "12", "7", "640,480", "15", "100"])
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda question: next(answers))
+    path = tmp_path / "sensor.toml"
+    assert main(["init", str(path)]) == 0
+    sensor = Sensor.from_file(path)
+    assert sensor.surface.values == {"rim_radius": 12.0, "height": 7.0, "base_z": 15.0}
+    assert sensor.camera.focal[0].item() == pytest.approx(320 / math.tan(math.radians(50)), abs=1e-3)
+
+
+def test_the_lens_centre_need_not_be_whole(tmp_path):
+    assert Sensor.from_file(drafted(tmp_path, "dome", "--centre", "307.9,241.6")).camera.centre.tolist() == [307.9, 241.6]
+
+
+def test_bad_dots_are_named_with_their_line(tmp_path):
+    surface, camera = drafted_surface("dome", {"radius": 12.0}, 20.0), Camera("pinhole", (640, 480), (400, 400), (320, 240))
+    for text, said in (("x,y\n1,2\n30,0\n", "line 3"), ("a,b\n1,2\n", "header"), ("x,y\n1,a\n", "readable"), ("x,y\n", "none")):
+        (tmp_path / "dots.csv").write_text(text)
+        with pytest.raises(ValueError, match=said):
+            read_drafted_dots(tmp_path / "dots.csv", surface, camera)
+
+
+def test_a_pattern_is_laid_out_for_a_design_without_dots_as_for_one_with_dots(tmp_path, capsys):
+    path = drafted(tmp_path, "cap")
+    bare = tmp_path / "bare.toml"
+    bare.write_text("\n".join(line for line in path.read_text().splitlines() if not line.startswith("file = ")))
+    for design in (path, bare):
+        call = ["calibrate", "pattern", str(design), "--pitch", "30", "--out", str(tmp_path / design.stem)]
+        assert main(call) == 0
+    listed, unlisted = ((tmp_path / name / "sensor_dots.csv").read_text() for name in ("sensor", "bare"))
+    assert listed == unlisted and len(listed.splitlines()) > 50
+    assert main(["check", str(bare)]) == 2 and "file and rest_image are missing" in capsys.readouterr().err

@@ -1,0 +1,110 @@
+"""Laws of newtons from one known weight: other presses' forces are right then, and what tells nothing is refused."""
+
+import json
+import re
+from argparse import ArgumentTypeError
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import torchmembrane as tm
+from torchmembrane.calibrate import weight as weight_module
+from torchmembrane.cli import arguments
+from torchmembrane.cli.main import main
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+NAMES = ("press_on_axis", "two_contacts", "flat_plate")
+FORCES = {name: float(np.linalg.norm(np.load(EXAMPLES / f"{name}_truth.npz")["force"])) for name in NAMES}
+
+
+def test_one_known_weight_gives_the_forces_of_other_presses(tmp_path, capsys):
+    """Of a sensor whose file has no modulus and a wrong prestretch."""
+    text = (EXAMPLES / "sensor.toml").read_text().replace("shear_modulus = 1.0\nthickness = 1.0\n", "")
+    text = re.sub(
+        r'"(rest_grid.npz|dots.csv|rest.png)"', rf'"{EXAMPLES}/\1"', text.replace("prestretch = 1.3", "prestretch = 1.1")
+    )
+    (tmp_path / "sensor.toml").write_text(text)
+    weight = f"{FORCES['press_on_axis']}N"
+    call = ["calibrate", "material", str(tmp_path / "sensor.toml"), str(EXAMPLES / "press_on_axis.png"), "--weight", weight]
+    assert main([*call, "--out", str(tmp_path / "out")]) == 0
+    assert "forces are scaled to" in capsys.readouterr().out
+    reconstructor = tm.Reconstructor.from_file(tmp_path / "out" / "sensor.toml")
+    with torch.no_grad():
+        found = reconstructor(reconstructor.read(*(str(EXAMPLES / f"{name}.png") for name in NAMES)))
+    assert reconstructor.sensor.force_unit == "N"
+    assert found.force.norm(dim=1).numpy() == pytest.approx(list(FORCES.values()), rel=0.1)
+    assert found.force[0].norm().item() == pytest.approx(FORCES["press_on_axis"], rel=1e-3)
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["parameters"]["modulus"]["value"] > 0
+
+
+@pytest.fixture
+def told(monkeypatch):
+    """A reconstruction of three images that is made up, and the weight it is compared with."""
+    sensor = tm.preset("fingertip")
+    nothing = tm.Reconstruction(*torch.zeros(len(tm.Reconstruction._fields), 3, 1))
+    result = nothing._replace(force=torch.tensor([[0.0, 0.0, -2.0]] * 3), force_deviation=torch.full((3, 3), 0.06))
+    patches = torch.tensor([[[0, 0, -1.9], [0, 0, -0.1]]] * 3)
+    result = result._replace(contact_at_rim=torch.zeros(3, 2), contact_force=patches, status=torch.zeros(3, dtype=torch.int32))
+
+    class Made:
+        def __init__(self, sensor):
+            self.modulus = sensor.material.shear_modulus
+
+        def __call__(self, images):
+            return result._replace(force=result.force * self.modulus)
+
+    def change(**fields):
+        nonlocal result
+        result = result._replace(**fields)
+
+    made = replace(sensor, material=replace(sensor.material, shear_modulus=1.0))
+    monkeypatch.setattr(weight_module, "Reconstructor", Made)
+    monkeypatch.setattr(weight_module, "material_from_images", lambda *_: weight_module.MaterialFit(made, *[np.zeros(2)] * 6))
+    return change, lambda weight: weight_module.material_from_weight(sensor, torch.zeros(3, 1, 2, 2), weight)
+
+
+def test_the_modulus_is_in_proportion_to_the_weight(told):
+    _, fit = told
+    for weight in (1.0, 5.0):
+        found = fit(weight)
+        assert found.sensor.material.shear_modulus == pytest.approx(weight / 2)
+        assert found.forces == pytest.approx([weight] * 3)
+    assert fit(2.0).deviation == pytest.approx(0.03 / 3**0.5)  # each known to 0.06 / 2
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"contact_at_rim": torch.tensor([[0, 0], [1.0, 0], [0, 0]])}, "image 2: the press reaches the rim"),
+        ({"force_deviation": torch.full((3, 3), 1.0)}, "image 1 shows a force that is known to 50 % only"),
+        ({"status": torch.tensor([0, 0, 3])}, "image 3: the solve has not converged"),
+        ({"force": torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, -2.0], [0.0, 0.0, -4.0]])}, "image 3 shows"),
+    ],
+)
+def test_what_tells_no_scale_is_refused(told, fields, said):
+    change, fit = told
+    change(**fields)
+    with pytest.raises(tm.MembraneError, match=said):
+        fit(2.0)
+
+
+def test_a_trace_of_force_at_the_rim_does_no_harm(told):
+    change, fit = told
+    change(contact_at_rim=torch.tensor([[0, 1.0]] * 3))
+    assert fit(2.0).sensor.material.shear_modulus == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("text", ["200", "g", "-2N", "2 pounds", ""])
+def test_a_weight_needs_its_unit(text):
+    with pytest.raises(ArgumentTypeError, match="expected"):
+        arguments.weight(text)
+
+
+def test_a_weight_beside_forces_is_refused(tmp_path, capsys):
+    (tmp_path / "forces.csv").write_text("image,force\nflat_plate.png,1\n")
+    call = ["calibrate", "material", str(EXAMPLES / "sensor.toml"), str(EXAMPLES / "flat_plate.png"), "--weight", "2N"]
+    assert main([*call, "--forces", str(tmp_path / "forces.csv"), "--out", str(tmp_path / "out")]) == 2
+    assert "--weight and --forces" in capsys.readouterr().err

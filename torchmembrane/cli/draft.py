@@ -1,0 +1,120 @@
+"""What `torchmembrane init` does: from its options to a sensor, and its file with words."""
+
+from argparse import Namespace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..camera.model import Camera
+from ..errors import MembraneError
+from ..io.images import read_image
+from ..presets.annotate import annotate
+from ..presets.design import AIR
+from ..presets.draft import (
+    SHAPES,
+    RimCircle,
+    balanced,
+    drafted_dots,
+    drafted_surface,
+    focal_of_view,
+    overpressure,
+    read_drafted_dots,
+)
+from ..reconstruct import Reconstructor
+from ..sensor.parts import Cavity, Markers, Surface
+from ..sensor.sensor import Sensor
+from ..sensor.toml import default_grid
+
+LENGTHS = ("radius", "height", "semi_axes", "length", "half_angle")
+
+
+class Optics(NamedTuple):
+    """The camera, and its distance from the rim's plane."""
+
+    camera: Camera
+    distance: float
+
+
+def needed(arguments: Namespace) -> list[str]:
+    """The options that are still to be given."""
+    lens = arguments.focal or arguments.view
+    wanted = [*SHAPES[arguments.shape]]
+    if arguments.rest is None:
+        wanted.append("image_size")
+    if arguments.rim is None or not lens:
+        wanted.append("distance")
+    if arguments.rim is None and not lens:
+        wanted.append("view")
+    return [name for name in wanted if getattr(arguments, name) is None]
+
+
+def write_draft(arguments: Namespace) -> list[str]:
+    """Write the sensor that the arguments describe; returns what was made, assumed and derived, in lines."""
+    _refuse_foreign(arguments)
+    rest = None if arguments.rest is None else read_image(arguments.rest)
+    camera, distance = _optics(arguments, rest)
+    lengths = {name: value for name in LENGTHS if (value := getattr(arguments, name)) is not None}
+    surface = drafted_surface(arguments.shape, lengths, distance)
+    markers = _markers(arguments, rest, surface, camera)
+    membrane, unit = surface.membrane(default_grid(markers)), arguments.unit
+    stated = arguments.overpressure
+    material, said = balanced(membrane, unit, stated, arguments.prestretch, arguments.shear_modulus, arguments.thickness)
+    filling = arguments.filling or ("gas" if arguments.shape == "bubble" else "liquid")
+    known = stated is None and material.shear_modulus is not None and material.thickness is not None
+    inside = overpressure(membrane, material, unit) if known else stated or 0.0
+    cavity = Cavity(filling, round(AIR + inside, 2) if filling == "gas" else None)
+    sensor = Sensor(arguments.name or arguments.sensor.stem, unit, camera, membrane, material, cavity, markers, surface)
+    found = _dots_in_words(sensor)
+    path = sensor.to_file(arguments.sensor)
+    annotate(path, said, sensor.force_unit == "relative")
+    return [f"sensor file: {path}", *found, *said, f"next: torchmembrane check {path} --out {path.with_suffix('.png')}"]
+
+
+def _refuse_foreign(arguments: Namespace) -> None:
+    """Refuse lengths of other shapes, and two answers to one question."""
+    allowed = {*SHAPES[arguments.shape], *(["half_angle"] if arguments.shape == "half_cylinder" else [])}
+    for name in LENGTHS:
+        if getattr(arguments, name) is not None and name not in allowed:
+            expected = ", ".join(f"--{other.replace('_', '-')}" for other in SHAPES[arguments.shape])
+            raise MembraneError(f"init: --{name.replace('_', '-')} is no length of a {arguments.shape}; expected {expected}")
+    for one, other in (("focal", "view"), ("dots", "pitch"), ("rest", "pitch")):
+        if getattr(arguments, one) is not None and getattr(arguments, other) is not None:
+            raise MembraneError(f"init: --{one} and --{other}; expected one of them, either says the same")
+    if arguments.rim is not None and (arguments.rest is None or "radius" not in SHAPES[arguments.shape][:1]):
+        raise MembraneError("init: --rim; expected a round membrane (dome, cap, bubble) and the image it is read from, --rest")
+    if arguments.rim is not None and arguments.distance is not None and (arguments.focal or arguments.view):
+        raise MembraneError("init: --rim, --distance and a focal length; expected two of them, which give the third")
+
+
+def _optics(arguments: Namespace, rest: np.ndarray | None) -> Optics:
+    size = arguments.image_size or list(rest.shape[::-1] if rest is not None else ())
+    if rest is not None and list(rest.shape[::-1]) != size:
+        raise MembraneError(
+            f"init: --image-size {size[0]},{size[1]} and {arguments.rest} of {rest.shape[1]} x {rest.shape[0]} px"
+        )
+    focal = arguments.focal or (arguments.view and focal_of_view(arguments.lens, size[0], arguments.view))
+    distance, centre = arguments.distance, arguments.centre or [(side - 1) / 2 for side in size]
+    if arguments.rim is not None:
+        u, v, pixels = arguments.rim
+        circle, centre = RimCircle(arguments.radius, pixels, arguments.lens), arguments.centre or [u, v]
+        distance = distance or circle.distance(focal)
+        focal = focal or circle.focal(distance)
+    return Optics(Camera(arguments.lens, tuple(size), (round(focal, 3),) * 2, centre), round(distance, 5))
+
+
+def _markers(arguments: Namespace, rest: np.ndarray | None, surface: Surface, camera: Camera) -> Markers:
+    if arguments.dots is None and rest is not None:
+        return Markers("dots", arguments.polarity, rest_image=rest)
+    dots = (
+        drafted_dots(surface, arguments.pitch) if arguments.dots is None else read_drafted_dots(arguments.dots, surface, camera)
+    )
+    return Markers("dots", arguments.polarity, *dots, rest_image=rest)
+
+
+def _dots_in_words(sensor: Sensor) -> list[str]:
+    """How many dots there are, and how many of them the rest image shows."""
+    if sensor.markers.rest_image is None:
+        return [f"{len(sensor.markers.sizes or ())} dots, to be made on the membrane"]
+    observer = Reconstructor(sensor, check_rest=False).observer
+    found = int(observer.seen_at_rest.sum())
+    return [f"{found} of {len(observer.measured_rest)} dots found in the rest image"]

@@ -1,0 +1,135 @@
+"""`torchmembrane init`: a commented sensor file from a few numbers, given as options or asked for."""
+
+import sys
+from argparse import ArgumentTypeError, Namespace
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ..errors import MembraneError
+from .arguments import Add, add_command, count_pair, positive, positive_pair, vector
+from .choices import DRAFTS, FILLINGS, LENGTH_UNITS, LENSES, POLARITIES
+
+PURPOSE = "write a sensor file, with a word on every key, from a few numbers"
+EXAMPLES = """\
+examples:
+  torchmembrane init sensor.toml --shape dome --radius 12 --distance 15 --image-size 640,480 --view 120 --lens fisheye
+  torchmembrane init sensor.toml --shape bubble --radius 30 --height 18 --distance 60 --rest rest.png --focal 440 \\
+      --overpressure 71hPa --shear-modulus 0.3 --thickness 0.3
+  torchmembrane init sensor.toml --shape dome --radius 12 --rest rest.png --rim 322,239,210 --focal 385 --lens fisheye
+  torchmembrane init sensor.toml            # on a terminal: asks
+
+What is needed: the shape and its lengths, the image's size (--image-size, or --rest), a focal length (--focal or --view),
+and how far the rim is from the camera (--distance), which --rim, the rim's circle in the image, gives as well; or with
+--distance and --rim the focal length. What is missing is asked for on a terminal.
+The camera looks along the membrane's axis, in the file's frame: origin at the camera's centre of projection, +z towards
+the membrane. Dots are a list (--dots), those found in the rest image (--rest), or a pattern to make (--pitch).
+
+Dots are a CSV with one of the headers
+  x,y,z          in the camera's frame        x,y,h           h above the rim's plane
+  x,y            from above                   angle,azimuth   degrees from the pole, and about the axis from x to y
+  u,v            px in the image at rest
+each with a further column size, small or large, or without.
+
+Of overpressure, prestretch and shear modulus x thickness any two give the third; where all are given and disagree, it is
+said. SENSOR.toml's files are written beside it. Next: torchmembrane check SENSOR.toml --out sensor.png
+
+exit code: 0 written, 2 wrong usage"""
+QUESTIONS = {
+    "radius": ("radius of the dome, of the cap's rim, or of the cylinder", positive),
+    "height": ("height of the cap over its rim", positive),
+    "semi_axes": ("half axes A,B,C of the fingertip along x, y, z", vector),
+    "length": ("length of the half cylinder", positive),
+    "image_size": ("size of the camera's image, WIDTH,HEIGHT, px", count_pair("WIDTH,HEIGHT")),
+    "view": ("field of view across the image's width, degrees", positive),
+    "distance": ("distance from the camera's pinhole to the rim's plane", positive),
+}
+"""What is asked for on a terminal, and the type of the answer."""
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command's parser."""
+    add = add_command(commands, "init", run, PURPOSE, EXAMPLES)
+    add("sensor", metavar="SENSOR.toml", type=Path, help="the file to write")
+    add("--name", help="of the sensor (default: the file's)")
+    add("--unit", choices=LENGTH_UNITS, default=LENGTH_UNITS[0], help="of all lengths (default: %(default)s)")
+    add("--force", action="store_true", help="write over an existing file")
+    _add_membrane(add)
+    _add_camera(add)
+    _add_material(add)
+    _add_markers(add)
+
+
+def _add_membrane(add: Add) -> None:
+    add("--shape", choices=DRAFTS, help="half a sphere, a cap of one, such a cap of gas, half an ellipsoid, half a cylinder")
+    add("--radius", metavar="R", type=positive, help="of the dome, of the cap's or bubble's rim, or of the half cylinder")
+    add("--height", metavar="H", type=positive, help="of the cap or bubble, from its rim's plane to its pole")
+    add("--semi-axes", metavar="A,B,C", type=vector, help="of the fingertip along x, y, z")
+    add("--length", metavar="L", type=positive, help="of the half cylinder, along x")
+    add("--half-angle", metavar="DEGREES", type=positive, help="of the half cylinder to either side of its top (default: 90)")
+
+
+def _add_camera(add: Add) -> None:
+    add("--distance", metavar="Z", type=positive, help="from the camera's centre of projection to the rim's plane")
+    add("--lens", choices=LENSES, default=LENSES[0], help="(default: %(default)s)")
+    size = count_pair("two counts, WIDTH,HEIGHT")
+    add("--image-size", metavar="WIDTH,HEIGHT", type=size, help="px (default: the rest image's)")
+    add("--focal", metavar="PX", type=positive, help="focal length, px; fisheye: px / rad")
+    add("--view", metavar="DEGREES", type=positive, help="in place of --focal: field of view across the image's width")
+    centre = positive_pair("two numbers, U,V")
+    add("--centre", metavar="U,V", type=centre, help="principal point, px (default: the rim's centre, else the image's)")
+    add("--rim", metavar="U,V,RADIUS", type=vector, help="the rim's circle in the rest image, px, as an image viewer tells it")
+
+
+def _add_material(add: Add) -> None:
+    add("--filling", choices=FILLINGS, help="of the cavity (default: of a bubble gas, else liquid)")
+    add("--overpressure", metavar="P", type=_pressure, help="inside over outside, at rest, with its unit: 20hPa, 2kPa, 0.3psi")
+    add("--prestretch", metavar="L", type=positive, help="of the membrane at rest (default: from the overpressure, else 1.2)")
+    add("--shear-modulus", metavar="G", type=positive, help="N / length unit^2: a third of Young's modulus")
+    add("--thickness", metavar="T", type=positive, help="at rest: of the flat sheet over prestretch^2")
+
+
+def _add_markers(add: Add) -> None:
+    add("--rest", metavar="REST.png", help="image of the membrane at rest; without --dots, the dots are found in it")
+    add("--dots", metavar="FILE.csv", type=Path, help="list of dots, in one of the frames below")
+    add("--pitch", metavar="LENGTH", type=positive, help="without either: of a pattern of dots along the membrane")
+    add("--polarity", choices=POLARITIES, default=POLARITIES[0], help="of dots against their ground (default: %(default)s)")
+
+
+def _pressure(text: str) -> float:
+    from ..presets.draft import PRESSURE_UNITS, pressure_in_hectopascal
+
+    try:
+        return pressure_in_hectopascal(text)
+    except ValueError:
+        raise ArgumentTypeError(f"{text!r}; expected a number and its unit, of {', '.join(PRESSURE_UNITS)}, as 20hPa") from None
+
+
+def run(arguments: Namespace) -> int:
+    """Write the file; returns the exit code."""
+    path: Path = arguments.sensor
+    if path.suffix != ".toml":
+        raise MembraneError(f"init {path}: expected a file that ends with .toml, as sensor.toml")
+    if path.exists() and not arguments.force:
+        raise MembraneError(f"init {path}: is there already; choose another name, or pass --force to write over it")
+    if arguments.shape is None:
+        arguments.shape = _asked("shape", f"shape, {' | '.join(DRAFTS)}", str)
+    if arguments.shape not in DRAFTS:
+        raise MembraneError(f"init: shape {arguments.shape!r}; expected one of {', '.join(DRAFTS)}")
+    from .draft import needed, write_draft
+
+    for name in needed(arguments):
+        setattr(arguments, name, _asked(name, *QUESTIONS[name]))
+    print("\n".join(write_draft(arguments)))
+    return 0
+
+
+def _asked(name: str, question: str, kind: Callable[[str], Any]) -> Any:
+    """An answer from the terminal; without one, the option that is missing is named."""
+    option = f"--{name.replace('_', '-')}"
+    if not sys.stdin.isatty():
+        raise MembraneError(f"init: {option} is missing; expected the {question}")
+    try:
+        return kind(input(f"{question}: ").strip())
+    except (ArgumentTypeError, EOFError) as error:
+        raise MembraneError(f"init: {option} {error or 'without an answer'}") from None

@@ -1,0 +1,79 @@
+"""A sensor file with a word on every key: what `torchmembrane init` writes for people to go on from."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+WORDS = {
+    "": {"format": "of this file", "name": "any text", "length_unit": "mm | cm | m: of all lengths here and in results"},
+    "camera": {
+        "model": "pinhole (OpenCV's k1 k2 p1 p2 k3) | fisheye (k1 to k4)",
+        "image_size": "width, height, px",
+        "focal": "along u and v, px; fisheye: px / rad",
+        "centre": "principal point u, v, px; the top left pixel's centre is 0, 0",
+        "distortion": "OpenCV's coefficients; `calibrate camera` finds all of these from a checkerboard",
+    },
+    "membrane": {
+        "shape": "spherical_cap | ellipsoid_cap | half_cylinder | grid | heightfield",
+        "grid": "vertices of the solver; leave the line out for the default",
+        "rim_radius": "of the fixed circle",
+        "height": "of the pole over the rim's plane",
+        "base_z": "the rim's plane, from the camera's centre of projection along its axis",
+        "semi_axes": "along x, y, z",
+        "radius": "of the cylinder",
+        "length": "along x, the image's u",
+        "half_angle": "to either side of the top, degrees",
+    },
+    "material": {
+        "model": "neo_hookean | mooney_rivlin (with c2_ratio) | harmonic",
+        "prestretch": "at rest, over the unstretched membrane, 1 or more",
+        "shear_modulus": "N / length unit^2",
+        "thickness": "at rest, already stretched: of the flat sheet over prestretch^2",
+    },
+    "cavity": {
+        "filling": "liquid (volume kept) | gas (pressure x volume kept) | open (pressure kept)",
+        "pressure": "of a gas at rest, absolute, hPa: the atmosphere's, about 1013, and the overpressure",
+        "volume": "of a gas, tubes and all, length unit^3; leave the line out for the volume under the membrane",
+    },
+    "markers": {
+        "kind": "dots | texture",
+        "polarity": "dark | light, the marks against their ground",
+        "file": "x,y,z,size of every dot at rest, camera's frame, length unit",
+        "rest_image": "nothing touches; or a list of images, or a pattern with *, averaged",
+    },
+}
+"""By table and key, what stands behind a key's value."""
+RELATIVE = """\
+# shear_modulus = 0.3  # N / length unit^2; without it and thickness forces are relative. From one known weight:
+# thickness = 0.5      # torchmembrane calibrate material sensor.toml press.png --weight 200g --out material"""
+FURTHER = """\
+# [[camera.ports]]     # flat windows, in order from the camera; what is behind the last one is the medium
+# distance = 2.0       # from the centre of projection to the near face
+# thickness = 3.0
+# index = 1.49
+# [camera.medium]
+# index = 1.33
+
+# [tool]               # the camera's pose on a robot: p_tool = rotation p_camera + translation
+# rotation = [0, 0, 0] # rotation vector, degrees; or three rows of three
+# translation = [0.0, 0.0, 0.0]"""
+
+
+def annotate(path: Path, said: Sequence[str], relative: bool) -> None:
+    """Put words behind the keys of a sensor file, and what else may stand there at the end, commented out.
+
+    Args:
+        path: what `Sensor.to_file` wrote.
+        said: sentences for its top: what was assumed or derived.
+        relative: whether its forces are, so that it shows the keys that give newtons.
+    """
+    table, lines = "", [f"# {sentence}" for sentence in said]
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if head := re.fullmatch(r"\[+([\w.]+)\]+", line):
+            table = head[1]
+        key = line.partition(" = ")[0]
+        word = WORDS.get(table, {}).get(key)
+        lines.append(f"{line}  # {word}" if word else line)
+        if table == "material" and key == "prestretch" and relative:
+            lines.append(RELATIVE)
+    path.write_text("\n".join([*lines, "", FURTHER]) + "\n", encoding="utf-8")

@@ -1,0 +1,288 @@
+"""A sensor from a few numbers: rest surface, camera on its axis, material in balance with its pressure, dots in any frame."""
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.optimize import brentq
+
+from ..camera.model import Camera
+from ..errors import MembraneError
+from ..mechanics.cavity import rest_balance
+from ..mechanics.hyperelastic import ElasticEnergy
+from ..sensor.parts import METRE, Material, Surface
+from ..surface.membrane import Membrane
+from .design import cylinder_dots, dome_dots
+
+SHAPES: dict[str, tuple[str, ...]] = {
+    "dome": ("radius",),
+    "cap": ("radius", "height"),
+    "bubble": ("radius", "height"),
+    "fingertip": ("semi_axes",),
+    "half_cylinder": ("radius", "length"),
+}
+"""The shapes that are drafted, and the lengths that each needs."""
+ASSUMED_PRESTRETCH = 1.2
+DISAGREEMENT = 0.1  # between the overpressure stated and the one that the material holds, relative: above, it is said
+LARGEST_STRETCH = 4.0
+FINE = (97, 97)  # vertices of the surface on which dots are put
+PITCHES = 11  # of dots across the square root of the area, where nothing else is said
+RAYS = (["x", "y"], ["angle", "azimuth"], ["u", "v"])  # columns of dots that a ray puts on the surface
+POINTS = (["x", "y", "z"], ["x", "y", "h"])
+PRESSURE_UNITS = {"Pa": 0.01, "hPa": 1.0, "mbar": 1.0, "kPa": 10.0, "bar": 1000.0, "psi": 68.94757}  # in hPa
+
+
+def drafted_surface(shape: str, numbers: Mapping[str, float | list[float]], base_z: float) -> Surface:
+    """The rest surface of one of `SHAPES`.
+
+    Args:
+        shape: "dome" (half a sphere) | "cap" | "bubble" (a cap of gas) | "fingertip" (half an ellipsoid) | "half_cylinder".
+        numbers: lengths: `radius` of the sphere, of the cap's rim or of the cylinder; `height`; `semi_axes`; `length`;
+            `half_angle` (degrees, default 90).
+        base_z: the rim's distance from the camera.
+
+    Returns:
+        The `Surface`, as a sensor file describes it.
+
+    Example:
+        >>> drafted_surface("dome", {"radius": 12.0}, 15.0).values
+        {'rim_radius': 12.0, 'height': 12.0, 'base_z': 15.0}
+    """
+    if shape == "fingertip":
+        return Surface("ellipsoid_cap", {"semi_axes": numbers["semi_axes"], "base_z": base_z})
+    if shape == "half_cylinder":
+        keys = {key: numbers[key] for key in ("radius", "length")}
+        return Surface("half_cylinder", keys | {"half_angle": numbers.get("half_angle", 90.0), "base_z": base_z})
+    height = numbers["radius" if shape == "dome" else "height"]
+    return Surface("spherical_cap", {"rim_radius": numbers["radius"], "height": height, "base_z": base_z})
+
+
+@dataclass(frozen=True)
+class RimCircle:
+    """The rim as an image shows it, by a camera on the axis of a round membrane: its radius and distance, and a focal length.
+
+    Args:
+        radius: of the rim, length unit.
+        pixels: its radius in the image, px.
+        model: "pinhole" | "fisheye".
+
+    Example:
+        >>> RimCircle(12.0, 240.0, "pinhole").distance(400.0)
+        20.0
+    """
+
+    radius: float
+    pixels: float
+    model: str
+
+    def distance(self, focal: float) -> float:
+        """The rim's distance from the camera, by the focal length (px; fisheye: px / rad)."""
+        angle = self.pixels / focal
+        return self.radius / (angle if self.model == "pinhole" else math.tan(angle))
+
+    def focal(self, distance: float) -> float:
+        """The focal length, by the rim's distance."""
+        return self.pixels / (self.radius / distance if self.model == "pinhole" else math.atan2(self.radius, distance))
+
+
+def focal_of_view(model: str, width: int, degrees: float) -> float:
+    """The focal length, px, of a lens that sees so many degrees across the image's width.
+
+    Example:
+        >>> focal_of_view("pinhole", 640, 90.0).__round__(6), focal_of_view("fisheye", 628, 180.0).__round__(2)
+        (320.0, 199.9)
+    """
+    half = math.radians(degrees) / 2
+    if model == "pinhole" and not degrees < 180:
+        raise MembraneError(f"field of view {degrees:g} degrees; expected less than 180 of a pinhole lens: a fisheye sees more")
+    return width / 2 / (math.tan(half) if model == "pinhole" else half)
+
+
+def overpressure(membrane: Membrane, material: Material, unit: str) -> float:
+    """The pressure over its surroundings that holds a membrane at rest, hPa: of a sphere of radius r, `2 T / r`, T its tension.
+
+    Args:
+        membrane: the rest surface.
+        material: its prestretch, shear modulus and thickness at rest.
+        unit: of length.
+
+    Example:
+        >>> from torchmembrane.surface.shapes import spherical_cap
+        >>> rubber = Material("neo_hookean", prestretch=1.3, shear_modulus=0.3, thickness=0.3)
+        >>> round(overpressure(spherical_cap(30.0, 18.0, 60.0, (33, 33)), rubber, "mm"))
+        71
+    """
+    energy = ElasticEnergy(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
+    return float(rest_balance(membrane, energy)[0]) * METRE[unit] ** 2 / 100
+
+
+def balanced(
+    membrane: Membrane,
+    unit: str,
+    stated: float | None = None,
+    prestretch: float | None = None,
+    shear_modulus: float | None = None,
+    thickness: float | None = None,
+) -> tuple[Material, list[str]]:
+    """A neo-Hookean material in balance with the overpressure: prestretch or modulus from it, where one of them is left out.
+
+    Args:
+        membrane: the rest surface.
+        unit: of length.
+        stated: the overpressure measured, hPa.
+        prestretch: of the membrane at rest.
+        shear_modulus: N per length unit squared.
+        thickness: at rest, already stretched, length unit.
+
+    Returns:
+        The `Material`, and what was derived, assumed or contradicts, in sentences.
+
+    Raises:
+        MembraneError: an overpressure from which nothing follows, or that no prestretch up to `LARGEST_STRETCH` holds.
+
+    Example:
+        >>> from torchmembrane.surface.shapes import spherical_cap
+        >>> material, said = balanced(spherical_cap(30.0, 18.0, 60.0), "mm", 71.0, shear_modulus=0.3, thickness=0.3)
+        >>> round(material.prestretch, 2), said
+        (1.3, ['prestretch 1.3 from the overpressure, 71 hPa'])
+    """
+    known = shear_modulus is not None and thickness is not None
+    if stated is not None and not known and (prestretch is None or thickness is None):
+        raise MembraneError(
+            f"init: an overpressure of {stated:g} hPa alone; expected --shear-modulus and --thickness, from which the "
+            "prestretch follows, or --prestretch and --thickness, from which the shear modulus follows"
+        )
+
+    def held(stretch: float, modulus: float | None = shear_modulus) -> float:
+        return overpressure(membrane, Material("neo_hookean", stretch, None, modulus, thickness), unit)
+
+    if stated is None:
+        said = [] if prestretch else [f"prestretch {ASSUMED_PRESTRETCH:g} is assumed: `calibrate material` finds it"]
+        return Material("neo_hookean", prestretch or ASSUMED_PRESTRETCH, None, shear_modulus, thickness), said
+    if prestretch is None:
+        most = held(LARGEST_STRETCH)
+        if not 0 < stated < most:
+            raise MembraneError(
+                f"init: overpressure {stated:g} hPa; expected more than 0 and less than {most:.4g}, what this membrane holds "
+                f"at a prestretch of {LARGEST_STRETCH:g}: check unit, shear modulus and thickness"
+            )
+        prestretch = float(brentq(lambda stretch: held(stretch) - stated, 1.0, LARGEST_STRETCH))
+        return Material("neo_hookean", round(prestretch, 6), None, shear_modulus, thickness), [
+            f"prestretch {prestretch:.4g} from the overpressure, {stated:g} hPa"
+        ]
+    if shear_modulus is None:
+        if prestretch == 1:
+            raise MembraneError("init: a prestretch of 1 holds no overpressure; expected more than 1, or no --overpressure")
+        shear_modulus = float(f"{stated / held(prestretch, 1.0):.6g}")
+        said = [f"shear modulus {shear_modulus:.4g} N/{unit}^2 from the overpressure, {stated:g} hPa"]
+    else:
+        holds = held(prestretch)
+        off = abs(holds - stated) > DISAGREEMENT * max(holds, stated)
+        said = [
+            f"the numbers disagree: prestretch, modulus and thickness hold {holds:.4g} hPa at rest, the overpressure stated is "
+            f"{stated:.4g} hPa; leave out --prestretch or --shear-modulus, whichever is known worse: it then follows"
+        ] * off
+    return Material("neo_hookean", prestretch, None, shear_modulus, thickness), said
+
+
+def pressure_in_hectopascal(text: str) -> float:
+    """A pressure with its unit, such as 20hPa, 2 kPa, 0.3psi.
+
+    Raises:
+        ValueError: no number, or no unit that is known.
+
+    Example:
+        >>> pressure_in_hectopascal("2kPa")
+        20.0
+    """
+    number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyzPB").strip()
+    unit = text.strip()[len(number) :].strip()
+    if unit not in PRESSURE_UNITS:
+        raise ValueError(text)
+    return float(number) * PRESSURE_UNITS[unit]
+
+
+def drafted_dots(surface: Surface, pitch: float | None = None) -> tuple[np.ndarray, list[str]]:
+    """A square pattern of large and small dots in turns, to be made on the membrane.
+
+    Args:
+        surface: one that `drafted_surface` gives.
+        pitch: their distance along the membrane, length unit; None: `PITCHES` across the square root of its area.
+
+    Returns:
+        Positions `[D, 3]` in the camera's frame, and sizes.
+
+    Example:
+        >>> positions, sizes = drafted_dots(drafted_surface("dome", {"radius": 12.0}, 15.0), 2.4)
+        >>> len(positions), sizes[:2]
+        (177, ['small', 'large'])
+    """
+    pitch = pitch or round(float(surface.membrane((33, 33)).rest_area.sum()) ** 0.5 / PITCHES, 3)
+    v = surface.values
+    if surface.shape == "half_cylinder":
+        return cylinder_dots(v["radius"], v["length"], math.radians(v["half_angle"]), v["base_z"], pitch)
+    if surface.shape == "ellipsoid_cap":
+        return dome_dots(v["semi_axes"], math.pi / 2, v["base_z"], pitch)
+    radius = (v["rim_radius"] ** 2 + v["height"] ** 2) / (2 * v["height"])
+    return dome_dots((radius,) * 3, math.atan2(v["rim_radius"], radius - v["height"]), v["base_z"], pitch)
+
+
+def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.ndarray, list[str]]:
+    """Dots from a table whose header says in which frame they are.
+
+    `x,y,z` camera frame; `x,y,h` h above the rim's plane; `x,y` from above, the height is the membrane's; `angle,azimuth`
+    degrees from the pole and about the axis (from x to y), seen from the rim's centre; `u,v` px in the image at rest. A further
+    column `size`: small or large (default: small).
+
+    Args:
+        path: of the CSV file.
+        surface: the rest surface.
+        camera: for `u,v`.
+
+    Returns:
+        Positions `[D, 3]` in the camera's frame, and sizes.
+
+    Raises:
+        MembraneError: the file cannot be read, has another header, or a dot whose ray misses the membrane: the line is named.
+    """
+    forms = [",".join(form) for form in (*POINTS, *RAYS)]
+    expected = f"CSV with the header {', '.join(forms)}, each with ,size or without"
+    try:
+        header, *rows = [[cell.strip() for cell in row] for row in csv.reader(path.read_text("utf-8-sig").splitlines()) if row]
+        sizes = [row[-1] for row in rows] if header[-1:] == ["size"] else ["small"] * len(rows)
+        form = header[: len(header) - (header[-1:] == ["size"])]
+        values = np.array([[float(cell) for cell in row[: len(form)]] for row in rows])
+    except (OSError, ValueError) as error:
+        raise MembraneError(f"{path}: not readable ({error}); expected {expected}") from error
+    if form not in (*POINTS, *RAYS):
+        raise MembraneError(f"{path}: the header is {','.join(header)!r}; expected {expected}")
+    if values.shape != (len(rows), len(form)) or not len(rows) or not np.isfinite(values).all():
+        raise MembraneError(f"{path}: lines of different length, none, or not finite; expected {expected}")
+    base_z = surface.values["base_z"]
+    if form == ["x", "y", "z"]:
+        return values, sizes
+    if form == ["x", "y", "h"]:
+        return values + [0.0, 0.0, base_z], sizes
+    origin, direction = _rays(form, values, base_z, camera)
+    distance = surface.membrane(FINE).ray_points(origin, direction).distance
+    for line in np.flatnonzero(~np.isfinite(distance)):
+        raise MembraneError(f"{path}, line {line + 2}: {','.join(rows[line])} misses the membrane; expected dots in its rim")
+    return (origin + distance[:, None] * direction).round(5), sizes
+
+
+def _rays(form: list[str], values: np.ndarray, base_z: float, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Rays on which dots lie, origins and directions `[D, 3]`."""
+    a, b = values.T
+    if form == ["u", "v"]:
+        rays = camera.pixel_to_ray(torch.from_numpy(values))
+        return rays.origin.numpy(), rays.direction.numpy()
+    nothing = np.zeros_like(a)
+    if form == ["x", "y"]:
+        return np.stack([a, b, nothing + base_z], -1), np.stack([nothing, nothing, nothing + 1], -1)
+    angle, azimuth = np.radians(a), np.radians(b)
+    direction = np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], -1)
+    return np.stack([nothing, nothing, nothing + base_z], -1), direction

@@ -1,0 +1,55 @@
+"""What people write for the words of a sensor file, and the word that is meant."""
+
+import difflib
+from collections.abc import Iterable
+
+MEANT = {
+    "spherical_cap": ("half_sphere", "hemisphere", "sphere", "dome", "bubble", "cap", "spherical"),
+    "ellipsoid_cap": ("half_ellipsoid", "ellipsoid", "fingertip", "finger"),
+    "half_cylinder": ("cylinder", "cylindrical", "semi_cylinder", "tube"),
+    "heightfield": ("height_field", "heightmap", "height_map", "heights", "plane", "flat", "pad"),
+    "grid": ("mesh", "stl", "points", "vertices"),
+    "neo_hookean": ("neohookean", "neo_hooke", "rubber", "silicone", "hyperelastic"),
+    "mooney_rivlin": ("mooney", "rivlin"),
+    "harmonic": ("linear", "soap_film"),
+    "liquid": ("water", "oil", "gel", "fluid", "silicone_oil", "closed"),
+    "gas": ("air", "pneumatic", "nitrogen"),
+    "open": ("vented", "none", "empty", "pressure"),
+    "dots": ("dot", "markers", "points", "pins", "blobs"),
+    "texture": ("speckle", "paint", "pattern", "random"),
+    "dark": ("black", "dark_on_light"),
+    "light": ("white", "bright", "light_on_dark"),
+    "pinhole": ("perspective", "opencv", "rectilinear"),
+    "fisheye": ("kannala_brandt", "equidistant", "omnidirectional", "wide"),
+    "rim_radius": ("radius", "rim", "base_radius"),
+    "base_z": ("distance", "z", "rim_z", "offset"),
+    "semi_axes": ("axes", "radii", "half_axes"),
+    "pressure": ("overpressure", "gauge_pressure", "absolute_pressure"),
+    "shear_modulus": ("modulus", "mu", "youngs_modulus", "stiffness"),
+    "prestretch": ("stretch", "pretension", "prestrain"),
+    "image_size": ("resolution", "size", "width", "height"),
+    "focal": ("focal_length", "fx", "fy", "f"),
+    "centre": ("center", "principal_point", "cx", "cy"),
+}
+"""What is written, by the word that is meant."""
+HINTS = {
+    "spherical_cap": "half a sphere has rim_radius = height",
+    "pressure": "of a gas, absolute: the atmosphere's, about 1013 hPa, and the overpressure",
+    "shear_modulus": "a third of Young's modulus",
+}
+
+
+def did_you_mean(word: object, choices: Iterable[str], otherwise: str = "") -> str:
+    """The question whether a wrong word stands for one of the choices, with a hint; `otherwise` where none is near.
+
+    Example:
+        >>> did_you_mean("half_sphere", ["grid", "spherical_cap"]), did_you_mean("neo-Hookean", ["neo_hookean"])
+        ("did you mean 'spherical_cap' (half a sphere has rim_radius = height)?", "did you mean 'neo_hookean'?")
+    """
+    plain, choices = str(word).strip().lower().replace("-", "_").replace(" ", "_"), list(choices)
+    known = [choice for choice in choices if plain == choice or plain in MEANT.get(choice, ())]
+    found = known or difflib.get_close_matches(plain, choices, 1)
+    if not found:
+        return otherwise
+    hint = f" ({HINTS[found[0]]})" if found[0] in HINTS else ""
+    return f"did you mean {found[0]!r}{hint}?"
