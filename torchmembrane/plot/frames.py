@@ -30,7 +30,7 @@ FORCE_ARROW = 0.2  # of the image's width: a force across the optical axis; shor
 MAGNIFICATIONS = (1, 2, 3, 5, 10, 20)
 LONGEST_ARROW, LEAST_SCALE = 0.07, 0.002  # of the image's width; of the surface's extent
 ARROWS_ACROSS = 22
-BAR_BELOW, BAR_HEIGHT = 0.58, 0.13  # inches: of a colour bar, below its axes, whatever the image's shape
+BAR_BELOW, BAR_HEIGHT = 0.52, 0.11  # inches: of a colour bar, below its axes, whatever the image's shape
 
 
 @rc_context({"font.size": 13, "axes.titlesize": 14.5})
@@ -59,7 +59,7 @@ def figure(frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = 
     """
     good = bool(np.isfinite(frame["vertices"]).all())
     forces = good and np.any(frame["traction"])
-    drawing, places = panels(4 if forces else 3, below=0.15)
+    drawing, places = panels(4 if forces else 3)
     drawing.suptitle(_title(frame, mesh, name), fontsize=17, color="k" if good else VERMILION)
     draw_flow(drawing.add_subplot(places[0]), frame, mesh, image)
     if good:
