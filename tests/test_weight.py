@@ -1,7 +1,7 @@
 """Laws of newtons from one known weight: other presses' forces are right then, and what tells nothing is refused."""
 
 import json
-import re
+import shutil
 from argparse import ArgumentTypeError
 from dataclasses import replace
 from pathlib import Path
@@ -23,10 +23,9 @@ FORCES = {name: float(np.linalg.norm(np.load(EXAMPLES / f"{name}_truth.npz")["fo
 def test_one_known_weight_gives_the_forces_of_other_presses(tmp_path, capsys):
     """Of a sensor whose file has no modulus and a wrong prestretch."""
     text = (EXAMPLES / "sensor.toml").read_text().replace("shear_modulus = 1.0\nthickness = 1.0\n", "")
-    text = re.sub(
-        r'"(rest_grid.npz|dots.csv|rest.png)"', rf'"{EXAMPLES}/\1"', text.replace("prestretch = 1.3", "prestretch = 1.1")
-    )
-    (tmp_path / "sensor.toml").write_text(text)
+    (tmp_path / "sensor.toml").write_text(text.replace("prestretch = 1.3", "prestretch = 1.1"))
+    for name in ("rest_grid.npz", "dots.csv", "rest.png"):
+        shutil.copy(EXAMPLES / name, tmp_path)
     weight = f"{FORCES['press_on_axis']}N"
     call = ["calibrate", "material", str(tmp_path / "sensor.toml"), str(EXAMPLES / "press_on_axis.png"), "--weight", weight]
     assert main([*call, "--out", str(tmp_path / "out")]) == 0

@@ -101,8 +101,10 @@ class Descent(nn.Module):
         equations, (x, pressure, moved) = self.equations, state
         _, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier)
         loads, made = torch.cat([loads, motion.coupling], 1), None
+        first, last = self.settings.tau
+        blunt = (tau.clamp_max(first) / last) ** 2  # 1 as tau ends
         if factor is None:
-            made = equations.system.factor(equations.matrix(normal, self.settings.damping * (tau / self.settings.tau[1]) ** 2))
+            made = equations.system.factor(equations.matrix(normal, self.settings.damping * blunt))
             solved = equations.system.substitute(made, loads)  # refined once: of rounding and damping little is left
             solved = solved + equations.system.substitute(made, loads - equations.product(normal, solved))
         else:
@@ -113,8 +115,7 @@ class Descent(nn.Module):
                 loads,
                 self.settings.conjugate_steps,
             )
-        first, last = self.settings.tau
-        motion = motion.held(moved, self.settings.camera_motion * (tau.clamp_max(first) / last) ** 2)
+        motion = motion.held(moved, self.settings.camera_motion * blunt)
         loads, solved = motion.eliminated(loads[:, :3], solved[:, :3], solved[:, 3:])
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
         move, rise = self._bordered_step(x, pressure, loads, solved, corner)

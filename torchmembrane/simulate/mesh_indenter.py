@@ -79,7 +79,7 @@ class MeshIndenter(Indenter):
         try:
             body = trimesh.load_mesh(io.BytesIO(content), file_type=kind)
             vertices, faces = np.asarray(body.vertices, float), np.asarray(body.faces)
-        except DAMAGE as error:
+        except (*DAMAGE, ImportError) as error:  # of text that is no UTF-8 trimesh asks another package
             raise MembraneError(f"{path}: not readable ({in_one_line(error)}); expected {expected}") from error
         if not 0 < len(faces) <= MOST_TRIANGLES or not np.isfinite(vertices).all():
             raise MembraneError(f"{path}: {len(faces)} triangles, or corners that are not finite; expected {expected}")
