@@ -70,7 +70,7 @@ class ForceBalanceSettings:
     patience: int = 3
     patient_tau: tuple[float, float] = (2.0, 0.4)
     camera_motion: float = 0.005
-    decline: float = 0.6
+    decline: float = 0.4
     sparsity: float = 6400.0
     scale_reach: float = 0.08
     scale_share: float = 0.3
