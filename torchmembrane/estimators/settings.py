@@ -61,7 +61,7 @@ class ForceBalanceSettings:
     steps: int = 8
     coarse_steps: int = 4
     fine_steps: int = 4
-    finer_steps: int = 3
+    finer_steps: int = 4
     warm_steps: int = 4
     conjugate_steps: int = 2
     tau: tuple[float, float] = (4.0, 0.4)
@@ -70,7 +70,7 @@ class ForceBalanceSettings:
     patience: int = 3
     patient_tau: tuple[float, float] = (2.0, 0.4)
     camera_motion: float = 0.005
-    decline: float = 0.4
+    decline: float = 0.6
     sparsity: float = 6400.0
     scale_reach: float = 0.08
     scale_share: float = 0.3
