@@ -4,7 +4,9 @@ A method that is a `piece`, `repeated` and `unless` do on tensors what they say.
 graph that is being written, they are added to its `graph` instead. Between pieces values are only handed on.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import wraps
 from typing import Any, ParamSpec, Protocol, TypeVar
 
@@ -12,6 +14,10 @@ import torch
 
 Inputs = ParamSpec("Inputs")
 Output = TypeVar("Output")
+
+NAMED = "torchmembrane"
+FUNCTIONS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {}
+_writing = ContextVar("writing", default=False)
 
 
 class Graph(Protocol):
@@ -64,6 +70,32 @@ def piece(method: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
         return written
 
     return called
+
+
+def named(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Make a function, to a tensor of the shape and type of its argument, one that a piece being traced holds as one node of
+    the domain `NAMED`, its type the function's name: its own nodes are traced once for every shape."""
+
+    @wraps(function)
+    def called(value: torch.Tensor) -> torch.Tensor:
+        if not _writing.get():
+            return function(value)
+        sizes = {"sizes": list(value.shape[1:])}
+        kept: torch.Tensor = torch.onnx.ops.symbolic(
+            f"{NAMED}::{function.__name__}", (value,), sizes, dtype=value.dtype, shape=value.shape
+        )
+        return kept
+
+    FUNCTIONS[function.__name__] = function
+    return called
+
+
+@contextmanager
+def writing() -> Iterator[None]:
+    """Within, functions that are `named` are nodes."""
+    token = _writing.set(True)
+    yield
+    _writing.reset(token)
 
 
 def repeated(

@@ -22,10 +22,10 @@ from ..io.atomic import whole_file
 from ..io.results import Reconstruction
 from ..io.status import Status
 from ..io.store import FORMATS, Mesh, Settings
-from ..pieces import Value
+from ..pieces import FUNCTIONS, Value
 from ..reconstruct import Reconstructor
 from .check import checked
-from .graph import Assembly, described, traced
+from .graph import Assembly, described, inlined, traced
 
 FORMAT = 1
 EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
@@ -118,12 +118,26 @@ class Tracer:
         if key not in self.traced:
             outputs = [f"output {k}" for k, _ in enumerate(value for value in tree_leaves(found) if value is not None)]
             try:
-                self.traced[key] = traced(Piece(owner, function, arranged), examples, outputs)
+                self.traced[key] = self._whole(traced(Piece(owner, function, arranged), examples, outputs))
             except Exception as error:  # of torch's exporter and of what it calls, which raise what they like
                 reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
                 name = getattr(function, "__qualname__", str(function))
                 raise MembraneError(f"export: {name} cannot be written as ONNX: {reason.strip()}") from error
         return self.traced[key], names, found
+
+    def _whole(self, model: onnx.ModelProto) -> onnx.ModelProto:
+        """The model with the nodes of the `named` functions that it holds."""
+        return inlined(model, self._function)
+
+    def _function(self, node: onnx.NodeProto) -> onnx.ModelProto:
+        """The model of a `named` function for the sizes that a node has, but for the batch."""
+        name, sizes = node.op_type, tuple(node.attribute[0].ints)
+        if (name, sizes) not in self.traced:
+            of_one: Callable[..., Any] = lambda _, value: FUNCTIONS[name](value)  # noqa: E731
+            self.traced[name, sizes] = self._whole(
+                traced(Piece(None, of_one), {"value": torch.zeros(EXAMPLES, *sizes)}, ["result"])
+            )
+        return self.traced[name, sizes]
 
     def _known(self, found: Any, names: dict[str, str]) -> Any:
         """The values of such names, arranged as the examples `found` are."""

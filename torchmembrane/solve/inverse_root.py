@@ -8,10 +8,13 @@ By Cholesky factors, or where a runtime has none (ONNX) by matrix products alone
 Functions of matrices, eq. 6.35), with `Z Y` scaled in between so that its eigenvalues, which go to 1, do so evenly.
 """
 
+import math
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from ..pieces import at_hand
+from ..pieces import at_hand, named
 
 LEAF = 48
 LARGEST_CONDITION = 1e6  # of a leaf
@@ -41,6 +44,7 @@ def by_cholesky(matrix: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(factor, one.expand_as(matrix), upper=False)
 
 
+@named
 def by_products(matrix: Tensor) -> Tensor:
     """Too small in the directions of a leaf's smallest eigenvalues where its condition exceeds `LARGEST_CONDITION`."""
     n = matrix.shape[-1]
@@ -53,11 +57,35 @@ def by_products(matrix: Tensor) -> Tensor:
         first = torch.cat([root, torch.zeros_like(B)], -1)
         return torch.cat([first, torch.cat([-(further @ coupling.mT) @ root, further], -1)], -2)
     largest = matrix.abs().sum(-1).amax(-1)[..., None, None]
-    Y, Z = matrix / largest, one / largest.sqrt()
-    for scale in iteration_scales(LARGEST_CONDITION, torch.finfo(matrix.dtype).eps):
-        T = scale**0.5 / 2 * (3 * one - scale * largest.sqrt() * (Z @ Y))
-        Y, Z = Y @ T, T @ Z
-    return Z
+    iteration = Iteration.to(LARGEST_CONDITION, torch.finfo(matrix.dtype).eps)
+    Y = (iteration.first / largest) * matrix
+    T = Z = iteration.shifts[0] * one - Y
+    for shift in iteration.shifts[1:]:
+        Y = Y @ T
+        T = shift * one - Z @ Y
+        Z = T @ Z
+    return (iteration.last * largest.rsqrt()) * Z
+
+
+class Iteration(NamedTuple):
+    """Scaled steps `T = (3 I - s Z Y) sqrt(s) / 2` without a product by a number: `T = shift I - Z Y`, the rest in `Y` and `Z`.
+
+    With `z` in `Z` and `y` in `Y`, and `c` in `T` of a step, `z y = c s^(3/2) / 2` and those of the next step are `c z` and `c y`.
+    """
+
+    shifts: list[float]
+    first: float
+    last: float
+
+    @classmethod
+    def to(cls, condition: float, rounding: float) -> "Iteration":
+        """For matrices of a condition up to this, until eigenvalues are 1 but for rounding."""
+        scales = iteration_scales(condition, rounding)
+        c = [1.0]
+        for scale, following in zip(reversed(scales[:-1]), reversed(scales[1:]), strict=True):
+            c.insert(0, (c[0] * (following / scale) ** 1.5) ** (1 / 3))
+        shifts = [1.5 * each * scale**0.5 for each, scale in zip(c, scales, strict=True)]
+        return cls(shifts, c[0] * scales[0] ** 1.5 / 2, 1 / math.prod(c))
 
 
 def iteration_scales(condition: float, rounding: float) -> list[float]:
