@@ -85,24 +85,42 @@ def test_nan_beside_a_surface_is_no_agreement(sensor, monkeypatch):
             return [onnx.helper.make_tensor_value_info("image", onnx.TensorProto.FLOAT, None)]
 
         def run(self, names, feed):
-            vertices = made.estimator.membrane.rest.numpy() * np.array([1, np.nan])[:, None, None]
-            return vertices, np.zeros(2, np.int32)
+            frames = len(feed["image"])
+            vertices = made.estimator.membrane.rest.numpy() * np.array([1, np.nan])[:frames, None, None]
+            return vertices, np.zeros(frames, np.int32)
 
     made = Reconstructor(sensor, "minimum-energy")
     monkeypatch.setattr(check.onnxruntime, "InferenceSession", Session)
     rest = made.grey(check.Simulator(sensor).rest_image())
     found = check.compare(b"", made, rest.expand(2, -1, -1, -1))
-    assert found.status == found.expected == [0, 0] and np.isnan(found.distance)
+    assert found.status == found.expected == [0, 0, 0] and np.isnan(found.distance)
 
 
-class Doubled(torch.nn.Module):
+class Lengths(torch.nn.Module):
+    """The batch's length in shapes, of which one Reshape cannot have it free, and in whatever else it is given."""
+
+    def __init__(self, further=lambda x, batch: x):
+        super().__init__()
+        self.further = further
+
     def forward(self, *x):
-        return torch.ones(len(x[0]), 3) * x[0]
+        batch = len(x[0])
+        pairs = torch.cat([x[0], torch.zeros(batch, 3).expand(batch, 3)]).reshape(2, batch, 3)
+        return self.further(pairs.mT.reshape(-1, batch * 3), batch)
 
 
-def test_what_holds_for_one_batch_only_is_refused():
-    with pytest.raises(ValueError, match="this batch alone"):
-        traced(Doubled(), {"x": torch.rand(2, 3)}, ["y"])
+@pytest.mark.parametrize("frames", [1, 2, 5])
+@pytest.mark.parametrize("further", [lambda x, batch: x, lambda x, batch: x / batch])
+def test_lengths_of_the_batch_stay_free(frames, further):
+    model = traced(Lengths(further), {"x": torch.rand(2, 3)}, ["y"])
+    x = torch.rand(frames, 3)
+    found = onnxruntime.InferenceSession(model.SerializeToString()).run(None, {"x": x.numpy()})[0]
+    np.testing.assert_array_equal(found, Lengths(further)(x))
+
+
+def test_a_number_that_depends_on_the_batch_is_refused():
+    with pytest.raises(ValueError, match="depends on the batch's length, as a number"):
+        traced(Lengths(lambda x, batch: x + float(2 * batch)), {"x": torch.rand(2, 3)}, ["y"])
 
 
 def test_a_model_is_checked_on_the_sensor_at_rest_and_pressed(sensor):

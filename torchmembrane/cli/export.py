@@ -2,6 +2,7 @@
 
 from argparse import Namespace
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from .arguments import add_command, add_estimator, add_sensor
@@ -31,6 +32,8 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: Namespace) -> int:
     """Write the model; returns the exit code."""
+    from tqdm import tqdm
+
     from ..errors import MembraneError
     from ..presets import sensor_file
     from ..sensor.sensor import Sensor
@@ -43,6 +46,13 @@ def run(arguments: Namespace) -> int:
             f'export needs {error.name}, which is not installed: pip install "torchmembrane[export]"'
         ) from error
     reconstructor = build_reconstructor(Sensor.from_file(sensor_file(arguments.sensor)), arguments)
-    export(reconstructor, arguments.out, tracking=arguments.tracking)
-    print(f"written: {arguments.out}, {arguments.out.stat().st_size / 1e6:.1f} MB")
+    start = monotonic()
+    with tqdm(desc="export", unit=" pieces", bar_format="{desc}: {n}{unit} {elapsed}{postfix}", disable=None) as bar:
+
+        def said(piece: str) -> None:
+            bar.set_postfix_str(piece, refresh=False)
+            bar.update()
+
+        export(reconstructor, arguments.out, tracking=arguments.tracking, progress=said)
+    print(f"written: {arguments.out}, {arguments.out.stat().st_size / 1e6:.1f} MB, {monotonic() - start:.0f} s")
     return 0

@@ -27,6 +27,7 @@ from .settings import ForceBalanceSettings
 
 POWER = 4  # of squared pushes, in the mean that stands for the largest around
 BEYOND = 1e6  # over p0: no push comes near it
+NEGLIGIBLE = 1e-6  # weight of a vertex far away, over that of the one in the middle
 TINY = 1e-12  # keeps roots and quotients of what vanishes finite
 
 
@@ -138,5 +139,5 @@ class TractionLoss(nn.Module):
 def _gaussian_mean(membrane: Membrane, reach: float) -> Tensor:
     """Weights `[V, V]` of a Gaussian mean over the rest surface; column k is that around vertex k."""
     weight = torch.exp(-(torch.cdist(membrane.rest, membrane.rest) ** 2) / (2 * reach**2))
-    weight = membrane.rest_area[:, None] * weight
+    weight = membrane.rest_area[:, None] * torch.where(weight < NEGLIGIBLE, 0.0, weight)
     return weight / weight.sum(0)

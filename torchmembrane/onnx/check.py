@@ -20,7 +20,7 @@ class Agreement(NamedTuple):
 
     Attributes:
         distance: the largest between their vertices, length unit.
-        status: of the model's frames.
+        status: of the model's frames, the first one twice.
         expected: torch's.
     """
 
@@ -57,7 +57,8 @@ def check_images(reconstructor: Reconstructor) -> Tensor:
 
 
 def compare(model: bytes, reconstructor: Reconstructor, images: Tensor) -> Agreement:
-    """Run a model and torch on `images [B, 1, H, W]`: a tracking one from rest, and again from what torch found."""
+    """Run a model, on the batch and on its first frame alone, and torch on `images [B, 1, H, W]`: a tracking one from rest, and
+    again from what torch found."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # its warnings are of its own optimiser
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
@@ -72,10 +73,11 @@ def compare(model: bytes, reconstructor: Reconstructor, images: Tensor) -> Agree
     for _ in range(2 if fields else 1):
         with torch.no_grad():
             expected = reconstructor.reconstruct_grey(images, previous)
-        feed = {f"previous_{name}": getattr(previous, name).numpy() for name in fields}
-        vertices, statuses = session.run(["vertices", "status"], {"image": images.numpy(), **feed})
-        apart = np.linalg.norm(vertices - expected.vertices.numpy(), axis=-1)
-        distances += [float(apart[k].max()) for k, value in enumerate(statuses) if value == 0 == expected.status[k]]
-        status, expected_status = status + statuses.tolist(), expected_status + expected.status.tolist()
+        feed = {"image": images.numpy(), **{f"previous_{name}": getattr(previous, name).numpy() for name in fields}}
+        for frames in (len(images), 1):
+            vertices, statuses = session.run(["vertices", "status"], {name: value[:frames] for name, value in feed.items()})
+            apart = np.linalg.norm(vertices - expected.vertices[:frames].numpy(), axis=-1).max(-1)
+            distances += [float(apart[k]) for k, value in enumerate(statuses) if value == 0 == expected.status[k]]
+            status, expected_status = status + statuses.tolist(), expected_status + expected.status[:frames].tolist()
         previous = expected
     return Agreement(float(np.max(distances)), status, expected_status)

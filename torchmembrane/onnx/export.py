@@ -62,8 +62,8 @@ class Tracer:
     Nodes are named after the part of the package that they come from.
     """
 
-    def __init__(self) -> None:
-        self.assembly = Assembly()
+    def __init__(self, progress: Callable[[str], object] = lambda _: None) -> None:
+        self.assembly, self.progress = Assembly(), progress
         self.traced: dict[tuple[Any, ...], onnx.ModelProto] = {}
 
     def given(self, name: str, example: Tensor) -> Known:
@@ -116,6 +116,7 @@ class Tracer:
             self.assembly.part = type(owner).__module__.removeprefix("torchmembrane.").partition(".")[0]
         key = (owner, function, str(structure), *fixed.items(), *(value.shape for value in examples.values()))
         if key not in self.traced:
+            self.progress(getattr(function, "__qualname__", ""))
             outputs = [f"output {k}" for k, _ in enumerate(value for value in tree_leaves(found) if value is not None)]
             try:
                 self.traced[key] = self._whole(traced(Piece(owner, function, arranged), examples, outputs))
@@ -149,7 +150,13 @@ def _everywhere(_: None, done: Tensor) -> Tensor:
     return done.all()
 
 
-def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = False) -> onnx.ModelProto:
+def export(
+    reconstructor: Reconstructor,
+    path: str | Path,
+    *,
+    tracking: bool = False,
+    progress: Callable[[str], object] = lambda _: None,
+) -> onnx.ModelProto:
     """Write the whole reconstruction, image to result, as one ONNX model, if it agrees with torch.
 
     Standard operators only, float32, batch free. Run on the sensor at rest and pressed, both simulated, it must give torch's
@@ -160,6 +167,7 @@ def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = F
         reconstructor: the sensor's.
         path: the model's file.
         tracking: start from the results of the frames before (force balance).
+        progress: is told what comes next: the pieces' names, some thirty, and at last the check.
 
     Returns:
         The model. Input `image [batch, 1, height, width]`, grey in 0..1; with `tracking` also `previous_vertices
@@ -179,7 +187,7 @@ def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = F
         raise MembraneError(f"export: the reconstructor is {reconstructor.rest_pixels.dtype}; expected torch.float32")
     width, height = reconstructor.image_size
     image = torch.rand(EXAMPLES, 1, height, width, generator=torch.Generator().manual_seed(0)).to(reconstructor.rest_pixels)
-    tracer = Tracer()
+    tracer = Tracer(progress)
     before: dict[str, Any] = dict.fromkeys(Reconstruction._fields)
     inputs = [tracer.given("image", image)]
     if tracking:
@@ -195,6 +203,7 @@ def export(reconstructor: Reconstructor, path: str | Path, *, tracking: bool = F
     grey: Any = inputs[0]  # stands for a tensor
     result: Any = reconstructor.reconstruct_grey(grey, Reconstruction(**before) if tracking else None)
     model = _finished(tracer, inputs, result, reconstructor)
+    progress("check against torch")
     checked(model.SerializeToString(), reconstructor)
     with whole_file(path) as partial:
         onnx.save(model, partial)

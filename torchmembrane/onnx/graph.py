@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
+from itertools import chain
 from typing import Any
 from unittest.mock import patch
 
@@ -17,6 +18,7 @@ from onnx_ir import passes
 from onnx_ir.passes import common
 from onnxscript.optimizer import fold_constants_ir
 from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.onnx._internal.exporter._registration import ONNXRegistry
 from torch.onnx._internal.fx.passes.type_promotion import _TypePromotionInterpreter, get_type_promotion_rule
 
@@ -24,6 +26,15 @@ from ..pieces import NAMED, writing
 
 OPSET, IR_VERSION = 18, 8
 """onnxruntime reads them from 1.14 on."""
+MANY = 1_000_003
+"""A prime: the length of the batch that is traced. Nothing of that size is made."""
+HUGE = (1 << 31) - 1
+"""What lies beyond, the end of an axis, is no length."""
+LENGTHS = 8
+"""Numbers that are lengths, at most, in a tensor."""
+SPARSE_SIZE, SPARSE_SHARE = 4096, 0.45
+"""A constant of more numbers, of which less are not zero, is stored by these and their places."""
+NUMBERS = (ir.AttributeType.INT, ir.AttributeType.INTS, ir.AttributeType.FLOAT, ir.AttributeType.FLOATS)
 
 TIDY = passes.Sequential(
     common.RemoveUnusedNodesPass(),
@@ -53,52 +64,101 @@ def _promoted(interpreter: _TypePromotionInterpreter, node: torch.fx.Node) -> An
 def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> onnx.ModelProto:
     """A module as ONNX, its inputs and outputs named in order; the first axis of every input is the batch (of scalars none).
 
+    Traced is a batch of `MANY` frames, which nothing else has the length of, and what the graph then holds of it made free: in a
+    third of the time that torch takes with a length that is a symbol.
+
     Raises:
-        ValueError: what is traced depends on the batch's length; torch's exporter then keeps that of the example, in silence.
+        ValueError: a number, not a length, depends on the batch's length.
     """
-    batch = torch.export.Dim("batch")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    shapes = tuple({0: batch} if value.ndim else None for value in inputs.values())
     registered_once = patch.object(ONNXRegistry, "from_torchlib", _registry)
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        examples = tuple(
+            torch.empty(MANY, *value.shape[1:], dtype=value.dtype) if value.ndim else torch.empty_like(value)
+            for value in inputs.values()
+        )
     with warnings.catch_warnings(), registered_once, patch.object(_TypePromotionInterpreter, "run_node", _promoted), writing():
         warnings.simplefilter("ignore")  # of the exporter about itself
         program = torch.onnx.export(
             module.eval(),
-            tuple(inputs.values()),
+            examples,
             input_names=list(inputs),
             output_names=outputs,
             opset_version=OPSET,
-            dynamic_shapes=(shapes,),
             dynamo=True,
             external_data=False,
             verbose=False,
             optimize=False,
         )
     assert program is not None  # it is None only of the exporter before dynamo
-    if any(value.shape and isinstance(value.shape[0], int) for value in program.model.graph.inputs):
-        raise ValueError("the traced program holds for this batch alone")
     common.InlinePass()(program.model)
-    fold_constants_ir(program.model)
-    _plain_reshapes(program.model.graph)
+    fold_constants_ir(program.model, should_fold=_is_constant)
+    _free(program.model.graph)
     TIDY(program.model)
     for value, name in zip(program.model.graph.inputs, inputs, strict=True):  # one that is an output too has lost its name
         value.name = name
     return program.model_proto
 
 
-def _plain_reshapes(graph: ir.Graph) -> None:
-    """Shapes of which one length depends on the batch, put together at every run, become constants with -1 for it."""
+def _is_constant(node: ir.Node) -> bool | None:
+    """False of what is as long as the batch; None leaves it to the pass."""
+    lengths = (None if value is None else ir.convenience.get_const_tensor(value) for value in node.inputs)
+    made = any(each is not None and each.size <= LENGTHS and _depends(each.numpy()) for each in lengths)
+    return False if made else None
+
+
+def _free(graph: ir.Graph) -> None:
+    """Lengths that are the batch's, or multiples of it, as constants of the graph, become what the batch has.
+
+    Raises:
+        ValueError: a number that is no length is a multiple.
+    """
+    length: ir.Value | None = None
     for node in list(graph):
-        lengths_of = node.inputs[1] if node.op_type == "Reshape" else None
-        shape = None if lengths_of is None else lengths_of.producer()
-        if shape is None or shape.op_type != "Concat":
-            continue
-        lengths = [None if part is None else ir.convenience.get_const_tensor(part) for part in shape.inputs]
-        if sum(length is None for length in lengths) == 1:
-            known = np.concatenate([[-1] if length is None else length.numpy() for length in lengths])
-            constant = ir.node("Constant", [], {"value": ir.tensor(known)})
-            graph.insert_before(node, constant)
-            node.replace_input_with(1, constant.outputs[0])
+        given = [] if node.op_type == "Constant" else node.attributes.values()
+        if any(_depends(np.asarray(each.value)) for each in given if each.type in NUMBERS):
+            raise ValueError(f"the batch's length is an attribute of {node.op_type}")
+        for k, value in enumerate(node.inputs):
+            constant = None if value is None else ir.convenience.get_const_tensor(value)
+            if constant is None or constant.size > LENGTHS or not _depends(constant.numpy()):
+                continue
+            numbers = constant.numpy()
+            if numbers.dtype != np.int64:
+                raise ValueError(f"{node.op_type} depends on the batch's length, as a number")
+            of_batch = numbers % MANY == 0
+            if node.op_type == "Reshape" and of_batch.sum() == 1 and (numbers > 0).all():
+                free = [ir.node("Constant", [], {"value": ir.tensor(np.where(of_batch, -1, numbers))})]
+            else:
+                if length is None:
+                    source = next(value for value in graph.inputs if value.shape is not None and len(value.shape))
+                    first = ir.node("Shape", [source], {"start": 0, "end": 1})
+                    graph.insert_before(graph[0], first)
+                    length = first.outputs[0]
+                free = _lengths(numbers, of_batch & (numbers != 0), length)
+            graph.insert_before(node, free)
+            node.replace_input_with(k, free[-1].outputs[0])
+    for value in [*graph.inputs, *(value for node in graph for value in node.outputs)]:
+        if value.shape is not None:
+            lengths = [length if isinstance(length, int) else None for length in value.shape]
+            value.shape = ir.Shape([None if length and length % MANY == 0 else length for length in lengths])
+
+
+def _depends(numbers: np.ndarray) -> bool:
+    """Whether one of them is a multiple of the length of the batch that is traced."""
+    wide = numbers.dtype.kind in "if" and numbers.dtype.itemsize > 2
+    return bool(wide and (numbers[(numbers >= MANY) & (numbers < HUGE)] % MANY == 0).any())
+
+
+def _lengths(numbers: np.ndarray, of_batch: np.ndarray, length: ir.Value) -> list[ir.Node]:
+    """Nodes whose last one gives the numbers, of which some are multiples of the batch's `length [1]`."""
+    times, plus = np.where(of_batch, numbers // MANY, 0), np.where(of_batch, 0, numbers)
+    constants = [ir.node("Constant", [], {"value": ir.tensor(each.reshape(-1))}) for each in (times, plus)]
+    product = ir.node("Mul", [length, constants[0].outputs[0]])
+    both = ir.node("Add", [product.outputs[0], constants[1].outputs[0]])
+    if numbers.ndim == 1:
+        return [*constants, product, both]
+    shape = ir.node("Constant", [], {"value": ir.tensor(np.array(numbers.shape, np.int64))})
+    return [*constants, product, both, shape, ir.node("Reshape", [both.outputs[0], shape.outputs[0]])]
 
 
 def inlined(model: onnx.ModelProto, function: Callable[[onnx.NodeProto], onnx.ModelProto]) -> onnx.ModelProto:
@@ -145,6 +205,7 @@ class Assembly:
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[tuple[Any, ...], TensorProto] = {}
+        self.scattered: dict[str, list[onnx.NodeProto]] = {}
         self.pieces, self.part = 0, ""
 
     def append(self, piece: onnx.ModelProto, names: dict[str, str]) -> dict[str, str]:
@@ -155,12 +216,35 @@ class Assembly:
 
     def constant(self, array: np.ndarray) -> str:
         """The name of a constant."""
+        nonzero = np.flatnonzero(array) if array.size > SPARSE_SIZE and array.dtype == np.float32 else None
+        if nonzero is not None and len(nonzero) < SPARSE_SHARE * array.size:
+            return self._scattered(array, nonzero)
         tensor = numpy_helper.from_array(array)
         key = (tensor.data_type, tuple(tensor.dims), tensor.raw_data)
         if key not in self.constants:
             tensor.name = f"constant{len(self.constants)}"
             self.constants[key] = tensor
         return self.constants[key].name
+
+    def _scattered(self, array: np.ndarray, nonzero: np.ndarray) -> str:
+        """The name of a constant that is mostly zero, put together when the model is loaded."""
+        parts = {
+            "values": array.ravel()[nonzero],
+            "places": nonzero[:, None].astype(np.int32),
+            "length": np.array([array.size]),
+            "shape": np.array(array.shape),
+        }
+        names = {name: self.constant(part) for name, part in parts.items()}
+        dense = f"{names['values']}/{names['places']}/{names['shape']}"
+        if dense not in self.scattered:
+            made = [f"{dense}/{step}" for step in ("places", "zero", "flat")]
+            self.scattered[dense] = [
+                helper.make_node("Cast", [names["places"]], [made[0]], to=TensorProto.INT64),
+                helper.make_node("ConstantOfShape", [names["length"]], [made[1]]),
+                helper.make_node("ScatterND", [made[1], made[0], names["values"]], [made[2]]),
+                helper.make_node("Reshape", [made[2], names["shape"]], [dense]),
+            ]
+        return dense
 
     def named(self, name: str, output: str) -> None:
         """Give a value the name of an output."""
@@ -214,7 +298,8 @@ class Assembly:
         self, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto], metadata: dict[str, str]
     ) -> onnx.ModelProto:
         """The whole as a checked model of such inputs and outputs, with metadata."""
-        graph = helper.make_graph(self.nodes, "torchmembrane", inputs, outputs, list(self.constants.values()))
+        nodes = [*chain.from_iterable(self.scattered.values()), *self.nodes]
+        graph = helper.make_graph(nodes, "torchmembrane", inputs, outputs, list(self.constants.values()))
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="torchmembrane")
         model.ir_version = IR_VERSION
         helper.set_model_props(model, metadata)
