@@ -237,7 +237,8 @@ def test_the_options_choices_are_what_the_package_has():
     assert choices.RESULT_FORMATS == store.FORMATS
     assert choices.LOCATORS == placement.LOCATORS
     assert choices.DRAFTS == tuple(draft.SHAPES) and choices.LENGTH_UNITS == tuple(parts.METRE)
-    assert choices.LENSES == tuple(model.COEFFICIENTS) and choices.FILLINGS == parts.FILLINGS
+    assert choices.LENSES == tuple(model.COEFFICIENTS) and choices.LONGEST_SIDE == model.LONGEST_SIDE
+    assert choices.FILLINGS == parts.FILLINGS
     assert choices.PRESETS == presets.NAMES and choices.INDENTERS == dataset.KINDS and choices.LEGS == simulator.LEGS
     assert choices.SIMULATION_FORMATS == frames.FORMATS and choices.PORTS == camera.PORTS
     assert (choices.HIGHLIGHT, choices.BLUR) == (appearance.Appearance.highlight, appearance.Appearance.blur)

@@ -21,7 +21,8 @@ from torchmembrane.io.status import Status
 from torchmembrane.io.store import Mesh
 from torchmembrane.onnx import export
 from torchmembrane.onnx.export import Piece
-from torchmembrane.onnx.graph import Assembly, traced
+from torchmembrane.onnx.graph import Assembly
+from torchmembrane.onnx.trace import traced
 from torchmembrane.pieces import piece, unless
 from torchmembrane.reconstruct import Reconstructor
 

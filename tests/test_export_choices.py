@@ -14,7 +14,7 @@ from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.settings import ELEMENTS, FLOWS, VOLUMES
 from torchmembrane.onnx import check, export
 from torchmembrane.onnx.check import Agreement, check_images, checked
-from torchmembrane.onnx.graph import traced
+from torchmembrane.onnx.trace import traced
 from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
 from torchmembrane.sensor.sensor import Sensor
 

@@ -28,6 +28,13 @@ def drafted(tmp_path, shape, *more):
     return path
 
 
+def test_an_image_may_be_wider_than_a_thousand_pixels(tmp_path):
+    path = tmp_path / "sensor.toml"
+    numbers = "--shape dome --radius 20 --distance 30 --image-size 1280,720 --focal 420"
+    assert main(["init", str(path), *numbers.split()]) == 0
+    assert Sensor.from_file(path).camera.image_size == (1280, 720)
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_what_is_written_passes_check_and_reconstructs_a_press(tmp_path, shape):
     path = drafted(tmp_path, shape)

@@ -80,9 +80,8 @@ def named(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[torch.T
     def called(value: torch.Tensor) -> torch.Tensor:
         if not _writing.get():
             return function(value)
-        sizes = {"sizes": list(value.shape[1:])}
         kept: torch.Tensor = torch.onnx.ops.symbolic(
-            f"{NAMED}::{function.__name__}", (value,), sizes, dtype=value.dtype, shape=value.shape
+            f"{NAMED}::{function.__name__}", (value,), {"sizes": [*value.shape[1:]]}, dtype=value.dtype, shape=value.shape
         )
         return kept
 

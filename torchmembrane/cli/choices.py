@@ -15,6 +15,7 @@ RESULT_FORMATS = ("npz", "parquet")
 DRAFTS = ("dome", "cap", "bubble", "fingertip", "half_cylinder")
 LENGTH_UNITS = ("mm", "cm", "m")
 LENSES = ("pinhole", "fisheye")
+LONGEST_SIDE = 16384
 FILLINGS = ("liquid", "gas", "open")
 POLARITIES = ("dark", "light")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..errors import MembraneError
 from .arguments import Add, add_command, count_pair, positive, positive_pair, vector
-from .choices import DRAFTS, FILLINGS, LENGTH_UNITS, LENSES, POLARITIES
+from .choices import DRAFTS, FILLINGS, LENGTH_UNITS, LENSES, LONGEST_SIDE, POLARITIES
 
 PURPOSE = "write a sensor file, with a word on every key, from a few numbers"
 EXAMPLES = """\
@@ -40,7 +40,7 @@ QUESTIONS = {
     "height": ("height of the cap over its rim", positive),
     "semi_axes": ("half axes A,B,C of the fingertip along x, y, z", vector),
     "length": ("length of the half cylinder", positive),
-    "image_size": ("size of the camera's image, WIDTH,HEIGHT, px", count_pair("WIDTH,HEIGHT")),
+    "image_size": ("size of the camera's image, WIDTH,HEIGHT, px", count_pair("WIDTH,HEIGHT", LONGEST_SIDE)),
     "view": ("field of view across the image's width, degrees", positive),
     "distance": ("distance from the camera's pinhole to the rim's plane", positive),
 }
@@ -72,7 +72,7 @@ def _add_membrane(add: Add) -> None:
 def _add_camera(add: Add) -> None:
     add("--distance", metavar="Z", type=positive, help="from the camera's centre of projection to the rim's plane")
     add("--lens", choices=LENSES, default=LENSES[0], help="(default: %(default)s)")
-    size = count_pair("two counts, WIDTH,HEIGHT")
+    size = count_pair("two counts, WIDTH,HEIGHT", LONGEST_SIDE)
     add("--image-size", metavar="WIDTH,HEIGHT", type=size, help="px (default: the rest image's)")
     add("--focal", metavar="PX", type=positive, help="focal length, px; fisheye: px / rad")
     add("--view", metavar="DEGREES", type=positive, help="in place of --focal: field of view across the image's width")

@@ -25,7 +25,8 @@ from ..io.store import FORMATS, Mesh, Settings
 from ..pieces import FUNCTIONS, Value
 from ..reconstruct import Reconstructor
 from .check import checked
-from .graph import Assembly, described, inlined, traced
+from .graph import Assembly, described, inlined
+from .trace import traced
 
 FORMAT = 1
 EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
@@ -134,10 +135,9 @@ class Tracer:
         """The model of a `named` function for the sizes that a node has, but for the batch."""
         name, sizes = node.op_type, tuple(node.attribute[0].ints)
         if (name, sizes) not in self.traced:
-            of_one: Callable[..., Any] = lambda _, value: FUNCTIONS[name](value)  # noqa: E731
-            self.traced[name, sizes] = self._whole(
-                traced(Piece(None, of_one), {"value": torch.zeros(EXAMPLES, *sizes)}, ["result"])
-            )
+            example = {"value": torch.zeros(EXAMPLES, *sizes)}
+            piece = Piece(None, lambda _, value: FUNCTIONS[name](value))
+            self.traced[name, sizes] = self._whole(traced(piece, example, ["result"]))
         return self.traced[name, sizes]
 
     def _known(self, found: Any, names: dict[str, str]) -> Any:

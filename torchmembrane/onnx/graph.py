@@ -1,164 +1,21 @@
 """One ONNX graph from pieces, each traced once: a step that is repeated is neither traced nor stored again."""
 
-import logging
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from itertools import chain
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import onnx
-import onnx_ir as ir
-import torch
 from onnx import TensorProto, helper, numpy_helper
-from onnx_ir import passes
-from onnx_ir.passes import common
-from onnxscript.optimizer import fold_constants_ir
-from torch import Tensor, nn
-from torch._subclasses.fake_tensor import FakeTensorMode
-from torch.onnx._internal.exporter._registration import ONNXRegistry
-from torch.onnx._internal.fx.passes.type_promotion import _TypePromotionInterpreter, get_type_promotion_rule
 
-from ..pieces import NAMED, writing
+from ..pieces import NAMED
+from .trace import OPSET
 
-OPSET, IR_VERSION = 18, 8
-"""onnxruntime reads them from 1.14 on."""
-MANY = 1_000_003
-"""A prime: the length of the batch that is traced. Nothing of that size is made."""
-HUGE = (1 << 31) - 1
-"""What lies beyond, the end of an axis, is no length."""
-LENGTHS = 8
-"""Numbers that are lengths, at most, in a tensor."""
+IR_VERSION = 8
+"""onnxruntime reads it, and the operators' set, from 1.14 on."""
 SPARSE_SIZE, SPARSE_SHARE = 4096, 0.45
 """A constant of more numbers, of which less are not zero, is stored by these and their places."""
-NUMBERS = (ir.AttributeType.INT, ir.AttributeType.INTS, ir.AttributeType.FLOAT, ir.AttributeType.FLOATS)
-
-TIDY = passes.Sequential(
-    common.RemoveUnusedNodesPass(),
-    common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
-    common.DeduplicateInitializersPass(),
-    common.CommonSubexpressionEliminationPass(),
-    common.OutputFixPass(),
-    common.NameFixPass(),
-)
-"""What torch's exporter does too, but for its patterns, which take most of its time and change next to nothing here."""
-_registry = staticmethod(cache(ONNXRegistry.from_torchlib))
-"""Torch's exporter reads its operators anew for every model, a second each; nothing here changes them."""
-
-
-def _promoted(interpreter: _TypePromotionInterpreter, node: torch.fx.Node) -> Any:
-    """The exporter's pass that makes operands of several types one, without working out anew what it leaves as it is: a fifth of
-    the time of tracing."""
-    if node.op != "call_function":
-        return torch.fx.Interpreter.run_node(interpreter, node)
-    with interpreter._set_current_node(node):
-        rule = get_type_promotion_rule(node, interpreter.type_promotion_table)
-        if rule is not None:
-            interpreter._maybe_promote_node(node, rule)
-    return node.meta.get("val")
-
-
-def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> onnx.ModelProto:
-    """A module as ONNX, its inputs and outputs named in order; the first axis of every input is the batch (of scalars none).
-
-    Traced is a batch of `MANY` frames, which nothing else has the length of, and what the graph then holds of it made free: in a
-    third of the time that torch takes with a length that is a symbol.
-
-    Raises:
-        ValueError: a number, not a length, depends on the batch's length.
-    """
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    registered_once = patch.object(ONNXRegistry, "from_torchlib", _registry)
-    with FakeTensorMode(allow_non_fake_inputs=True):
-        examples = tuple(
-            torch.empty(MANY, *value.shape[1:], dtype=value.dtype) if value.ndim else torch.empty_like(value)
-            for value in inputs.values()
-        )
-    with warnings.catch_warnings(), registered_once, patch.object(_TypePromotionInterpreter, "run_node", _promoted), writing():
-        warnings.simplefilter("ignore")  # of the exporter about itself
-        program = torch.onnx.export(
-            module.eval(),
-            examples,
-            input_names=list(inputs),
-            output_names=outputs,
-            opset_version=OPSET,
-            dynamo=True,
-            external_data=False,
-            verbose=False,
-            optimize=False,
-        )
-    assert program is not None  # it is None only of the exporter before dynamo
-    common.InlinePass()(program.model)
-    fold_constants_ir(program.model, should_fold=_is_constant)
-    _free(program.model.graph)
-    TIDY(program.model)
-    for value, name in zip(program.model.graph.inputs, inputs, strict=True):  # one that is an output too has lost its name
-        value.name = name
-    return program.model_proto
-
-
-def _is_constant(node: ir.Node) -> bool | None:
-    """False of what is as long as the batch; None leaves it to the pass."""
-    lengths = (None if value is None else ir.convenience.get_const_tensor(value) for value in node.inputs)
-    made = any(each is not None and each.size <= LENGTHS and _depends(each.numpy()) for each in lengths)
-    return False if made else None
-
-
-def _free(graph: ir.Graph) -> None:
-    """Lengths that are the batch's, or multiples of it, as constants of the graph, become what the batch has.
-
-    Raises:
-        ValueError: a number that is no length is a multiple.
-    """
-    length: ir.Value | None = None
-    for node in list(graph):
-        given = [] if node.op_type == "Constant" else node.attributes.values()
-        if any(_depends(np.asarray(each.value)) for each in given if each.type in NUMBERS):
-            raise ValueError(f"the batch's length is an attribute of {node.op_type}")
-        for k, value in enumerate(node.inputs):
-            constant = None if value is None else ir.convenience.get_const_tensor(value)
-            if constant is None or constant.size > LENGTHS or not _depends(constant.numpy()):
-                continue
-            numbers = constant.numpy()
-            if numbers.dtype != np.int64:
-                raise ValueError(f"{node.op_type} depends on the batch's length, as a number")
-            of_batch = numbers % MANY == 0
-            if node.op_type == "Reshape" and of_batch.sum() == 1 and (numbers > 0).all():
-                free = [ir.node("Constant", [], {"value": ir.tensor(np.where(of_batch, -1, numbers))})]
-            else:
-                if length is None:
-                    source = next(value for value in graph.inputs if value.shape is not None and len(value.shape))
-                    first = ir.node("Shape", [source], {"start": 0, "end": 1})
-                    graph.insert_before(graph[0], first)
-                    length = first.outputs[0]
-                free = _lengths(numbers, of_batch & (numbers != 0), length)
-            graph.insert_before(node, free)
-            node.replace_input_with(k, free[-1].outputs[0])
-    for value in [*graph.inputs, *(value for node in graph for value in node.outputs)]:
-        if value.shape is not None:
-            lengths = [length if isinstance(length, int) else None for length in value.shape]
-            value.shape = ir.Shape([None if length and length % MANY == 0 else length for length in lengths])
-
-
-def _depends(numbers: np.ndarray) -> bool:
-    """Whether one of them is a multiple of the length of the batch that is traced."""
-    wide = numbers.dtype.kind in "if" and numbers.dtype.itemsize > 2
-    return bool(wide and (numbers[(numbers >= MANY) & (numbers < HUGE)] % MANY == 0).any())
-
-
-def _lengths(numbers: np.ndarray, of_batch: np.ndarray, length: ir.Value) -> list[ir.Node]:
-    """Nodes whose last one gives the numbers, of which some are multiples of the batch's `length [1]`."""
-    times, plus = np.where(of_batch, numbers // MANY, 0), np.where(of_batch, 0, numbers)
-    constants = [ir.node("Constant", [], {"value": ir.tensor(each.reshape(-1))}) for each in (times, plus)]
-    product = ir.node("Mul", [length, constants[0].outputs[0]])
-    both = ir.node("Add", [product.outputs[0], constants[1].outputs[0]])
-    if numbers.ndim == 1:
-        return [*constants, product, both]
-    shape = ir.node("Constant", [], {"value": ir.tensor(np.array(numbers.shape, np.int64))})
-    return [*constants, product, both, shape, ir.node("Reshape", [both.outputs[0], shape.outputs[0]])]
 
 
 def inlined(model: onnx.ModelProto, function: Callable[[onnx.NodeProto], onnx.ModelProto]) -> onnx.ModelProto:

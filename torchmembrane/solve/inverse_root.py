@@ -70,7 +70,7 @@ def by_products(matrix: Tensor) -> Tensor:
 class Iteration(NamedTuple):
     """Scaled steps `T = (3 I - s Z Y) sqrt(s) / 2` without a product by a number: `T = shift I - Z Y`, the rest in `Y` and `Z`.
 
-    With `z` in `Z` and `y` in `Y`, and `c` in `T` of a step, `z y = c s^(3/2) / 2` and those of the next step are `c z` and `c y`.
+    With `z` in `Z`, `y` in `Y` and `c` in `T` of a step, `z y = c s^(3/2) / 2` and those of the next step are `c z` and `c y`.
     """
 
     shifts: list[float]
