@@ -1,5 +1,6 @@
 """A model against the reconstructor that it was made of, on images of the sensor at rest and pressed."""
 
+from copy import deepcopy
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from ..simulate.dataset import Plan, random_frame
 from ..simulate.simulator import Simulator
 
 LARGEST = 3e-5  # distance between the vertices of both, over the surface's size
+ROUNDING = 4.0  # or over that which float32 makes in torch
 
 
 class Agreement(NamedTuple):
@@ -33,15 +35,27 @@ def checked(model: bytes, reconstructor: Reconstructor) -> Agreement:
     """Run a model and torch on the sensor at rest and pressed by its simulator.
 
     Raises:
-        MembraneError: they disagree.
+        MembraneError: they disagree, by more than float32 makes of it.
     """
-    found, largest = compare(model, reconstructor, check_images(reconstructor)), LARGEST * reconstructor.estimator.membrane.size
+    images = check_images(reconstructor)
+    found, largest = compare(model, reconstructor, images), LARGEST * reconstructor.estimator.membrane.size
+    if found.distance > largest:
+        largest = max(largest, ROUNDING * rounding(reconstructor, images))
     if found.status != found.expected or not found.distance <= largest:
         raise MembraneError(
             f"export: on images of the sensor at rest and pressed the model's vertices are {found.distance:.1e} from torch's, "
             f"its statuses {found.status}, torch's {found.expected}; expected at most {largest:.1e} and the same statuses"
         )
     return found
+
+
+def rounding(reconstructor: Reconstructor, images: Tensor) -> float:
+    """How far torch's vertices in float32 are from those in float64, on images `[B, 1, H, W]`: of a nearly unstretched sheet in
+    a contact between markers, where little holds it, up to some per cent of the displacement."""
+    with torch.no_grad():
+        found = reconstructor.reconstruct_grey(images).vertices
+        exact = deepcopy(reconstructor).double().reconstruct_grey(images.double()).vertices
+    return float((found - exact).norm(dim=-1).nan_to_num().max())
 
 
 def check_images(reconstructor: Reconstructor) -> Tensor:
