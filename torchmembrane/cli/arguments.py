@@ -109,6 +109,15 @@ def number_from(least: float, most: float, expected: str = "a number") -> Callab
     return within
 
 
+def camera(text: str) -> int | str:
+    """A camera's number, or the path or address of its stream.
+
+    >>> camera("0"), camera("/dev/video0")
+    (0, '/dev/video0')
+    """
+    return int(text) if text.isdecimal() else text
+
+
 def file_name(text: str) -> str:
     """A name for files of an output folder: nothing that leads out of it or hides there.
 
