@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Event, Thread, current_thread, main_thread
 from typing import TYPE_CHECKING, Any
 
-from .arguments import add_command, add_estimator, add_sensor, camera, count, positive
+from .arguments import add_command, add_estimator, add_rerun, add_sensor, camera, count, positive, wants_rerun
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,6 +54,7 @@ def add_parser(commands: Any) -> None:
     add("--threads", metavar="N", type=count, default=1, help="that compute (default: %(default)s)")
     kept = "keep images, results and times in a new folder; what the disk is too slow for is dropped and counted"
     add("--record", metavar="DIR", type=Path, help=kept)
+    add_rerun(add)
 
 
 def run(arguments: Namespace) -> int:
@@ -127,6 +128,7 @@ def _watchers(
     arguments: Namespace, stream: "Stream", stack: ExitStack
 ) -> "tuple[list[Callable[[Seen, Tally], None]], list[Callable[[], str]]]":
     """What else is given the frames, and what is to be said of it in the end."""
+    from ..integrations.rerun import RerunLog
     from ..live.background import Background
     from ..live.recording import Recording
 
@@ -137,6 +139,12 @@ def _watchers(
         later = stack.enter_context(Background(recording.keep))
         watchers.append(lambda seen, _: later(seen))
         said.append(lambda: f"recorded in {arguments.record}; {later.dropped} frames left out, for want of time")
+    if wants_rerun(arguments):
+        log = stack.enter_context(RerunLog(stream.mesh, arguments.save))
+        logged: Background[Seen] = Background(lambda seen: log.add(seen.number, seen.frame, seen.image, seen.time))
+        stack.enter_context(logged)
+        watchers.append(lambda seen, _: logged(seen))
+        said.append(lambda: f"shown in Rerun; {logged.dropped} frames left out, for want of time")
     return watchers, said
 
 

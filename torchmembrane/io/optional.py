@@ -70,6 +70,15 @@ def load_ray() -> Any:
     return ray
 
 
+def load_rerun() -> Any:
+    """The module `rerun`.
+
+    Raises:
+        MembraneError: Rerun is not installed.
+    """
+    return _load("rerun", "its viewer needs rerun-sdk", "rerun")
+
+
 def _load(module: str, purpose: str, extra: str) -> Any:
     try:
         return import_module(module)

@@ -48,7 +48,8 @@ class Line:
 def described(seen: Seen, tally: Tally, mesh: Mesh) -> str:
     """Rate, latency, dropped pictures, status, wrench and change of pressure in one line."""
     milliseconds = [1000 * tally.latency(percent, RECENT) for percent in (50, 95)]
-    pace = "{:.1f} Hz, {:.0f} ms (95 %: {:.0f}), {} dropped".format(tally.rate(RECENT), *milliseconds, tally.dropped)
+    rate = f"{tally.rate(RECENT):.1f} Hz, " if tally.followed > 1 else ""
+    pace = rate + "{:.0f} ms (95 %: {:.0f}), {} dropped".format(*milliseconds, tally.dropped)
     status = Status(int(seen.frame["status"]))
     if not status.has_surface:
         return f"{pace} | {status.text}"
