@@ -10,7 +10,7 @@ from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.cli.main import main
-from torchmembrane.integrations.rerun import LONGEST_FORCE, RerunLog
+from torchmembrane.integrations.rerun import LONGER, LONGEST_FORCE, RerunLog
 from torchmembrane.io.images import read_image
 from torchmembrane.live.loop import Seen
 from torchmembrane.live.recording import Recording
@@ -130,7 +130,8 @@ def test_rerun_gets_what_the_results_hold(recording, tmp_path):
     extent = np.ptp(results.mesh.rest_vertices, 0).max()
     assert np.linalg.norm(arrows, axis=1).max() == pytest.approx(LONGEST_FORCE * extent, rel=1e-3)
     flow = values(rows["/camera/image/flow"][2], "vectors")
-    np.testing.assert_allclose(flow, (good[2]["pixels"] - results.mesh.rest_pixels)[good[2]["confidence"] > 0], atol=1e-4)
+    moved = (good[2]["pixels"] - results.mesh.rest_pixels)[good[2]["confidence"] > 0]
+    np.testing.assert_allclose(flow, LONGER * moved, atol=1e-4)
 
 
 def test_rerun_that_is_missing_is_said(stream, monkeypatch):

@@ -18,6 +18,8 @@ LONGEST_TRACTION, LONGEST_FORCE = 0.15, 0.35
 """Of the surface's extent: the arrows of the largest traction and of the largest force so far."""
 LEAST_TRACTION = 0.1
 """Of the largest traction so far: smaller ones get no arrow."""
+LONGER = 5.0
+"""As long as the markers' motion: its arrows."""
 QUALITY = 90
 """Of the images' JPEG."""
 
@@ -25,9 +27,10 @@ QUALITY = 90
 class RerunLog:
     """A Rerun recording of one sensor's frames: `with RerunLog(mesh, "press.rrd") as log`, then `log.add(...)`.
 
-    Entities: `camera/image`, with `rest`, `flow` and `lost` markers; `surface/now`, coloured by compressive normal traction,
-    with `traction`, `contacts` and `forces`, beside `surface/rest`; the curves `force`, `moment` and `pressure`; `status`, when
-    it changes. Timelines: `frame`, and `time` where it is known. Colours and arrows run to the largest value so far.
+    Entities: `camera/image`, with `rest`, `flow` (`LONGER` times as long) and `lost` markers; `surface/now`, coloured by
+    compressive normal traction, with `traction`, `contacts` and `forces`, beside `surface/rest`; the curves `force`, `moment`
+    and `pressure`; `status`, when it changes. Timelines: `frame`, and `time` where it is known. Colours and arrows run to the
+    largest value so far.
 
     Args:
         mesh: what the frames share.
@@ -103,7 +106,7 @@ class RerunLog:
     def _add_markers(self, frame: Frame) -> None:
         rest, now = self._mesh.rest_pixels, frame["pixels"]
         found = np.isfinite(now).all(1)
-        arrows = self._rr.Arrows2D(origins=rest[found], vectors=(now - rest)[found], colors=VERMILION)
+        arrows = self._rr.Arrows2D(origins=rest[found], vectors=LONGER * (now - rest)[found], radii=1.0, colors=VERMILION)
         self._log("camera/image/flow", arrows)
         self._log("camera/image/lost", self._rr.Points2D(rest[~found], radii=4.0, colors=DARK))
 
