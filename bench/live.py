@@ -5,13 +5,15 @@ python bench/live.py [--seconds 20] [--only "17 x 17,default grid"] [--model vid
 The preset fingertip is pressed by a ball and dragged, 40 frames of 640 x 480 px with 35 dB noise, played back and forth from
 memory at 30 Hz through what the command runs: capturing thread, mailbox, loop, one thread that computes. Printed for
 each way of computing: frames captured, followed and dropped; rate; latency from the capture to the wrench, median and 95 %; its
-median in the first and the last quarter of the time, which would differ if a lag built up. `--model` adds the exported tracking
-model on 17 x 17, and is written there if it does not exist yet (minutes). A second is played before each run and not counted.
+median in the first and the last quarter of the time, which would differ if a lag built up; processor time of the whole program
+for each frame that was followed; the machine's load, other programs' included. `--model` adds the exported tracking model on
+17 x 17, which is written there if it does not exist yet (minutes). A second is played before each run and not counted.
 """
 
 import argparse
 import os
 import tempfile
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -54,7 +56,7 @@ def to_and_fro(images: list[np.ndarray]) -> Iterator[np.ndarray]:
 
 def measured(stream: Stream, images: list[np.ndarray], seconds: float, record: bool) -> dict:
     """One run."""
-    tally, dropped = Tally(), 0
+    tally, dropped, began = Tally(), 0, time.process_time()
     with ExitStack() as stack:
         watchers = []
         if record:
@@ -78,6 +80,7 @@ def measured(stream: Stream, images: list[np.ndarray], seconds: float, record: b
         percent_95=float(np.percentile(milliseconds, 95)),
         first_quarter=float(np.median(first)),
         last_quarter=float(np.median(last)),
+        processor=1000 * (time.process_time() - began) / tally.followed,
         load=os.getloadavg()[0],
     )
 
@@ -115,7 +118,7 @@ def main():
         print(
             "{name}: {captured} captured, {followed} followed, {dropped} dropped, {failed} failed{left_out}; {rate:.1f} Hz; "
             "latency {median:.0f} ms, 95 %: {percent_95:.0f}; first quarter {first_quarter:.0f}, last {last_quarter:.0f}; "
-            "load {load:.1f}".format(name=name, left_out=left_out, **row),
+            "processor time {processor:.0f} ms a frame followed; load {load:.1f}".format(name=name, left_out=left_out, **row),
             flush=True,
         )
     write(args.json, dict(frames_per_second=RATE, seconds=args.seconds, cases=rows))

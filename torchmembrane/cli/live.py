@@ -171,7 +171,7 @@ def _rezero_by_key() -> Event:
     rezero = Event()
 
     def read() -> None:
-        for text in sys.stdin:
+        for text in sys.stdin or ():
             if text.strip() == "z":
                 rezero.set()
 
