@@ -90,13 +90,13 @@ def test_a_file_of_rerun_is_refused_without_rerun(recording, capsys):
 
 
 def read_back(path: Path) -> dict[str, list[dict]]:
-    """The rows of each entity of a file of Rerun, in the order of its frames."""
+    """The rows of each entity of a file of Rerun, in the order of its frames, those of none first."""
     from rerun.chunk import RrdReader
 
     rows: dict[str, list[dict]] = {}
     for chunk in RrdReader(path).stream().to_chunks():
         rows.setdefault(chunk.entity_path, []).extend(chunk.to_record_batch().to_pylist())
-    return {entity: sorted(each, key=lambda row: row.get("frame") or 0) for entity, each in rows.items()}
+    return {entity: sorted(each, key=lambda row: row.get("frame", -1)) for entity, each in rows.items()}
 
 
 def values(row: dict, name: str) -> np.ndarray:
