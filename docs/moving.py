@@ -6,16 +6,16 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from matplotlib import colormaps
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.plot.drawing import BLUE, VERMILION
+from torchmembrane.plot.film import picture_of
+from torchmembrane.plot.film import write_film as write_pictures
 
 FRICTION, RADIUS, DEPTH, DRAG = 0.5, 4.0, 2.0, 2.5  # lengths in mm
-PUSHED, DRAGGED, MILLISECONDS, COLOURS = 9, 10, 130, 64
+PUSHED, DRAGGED, SECONDS = 9, 10, 0.13
 
 
 class Film(NamedTuple):
@@ -83,12 +83,7 @@ def drawn(film: Film, k: int) -> Figure:
 
 def write_film(path: Path) -> None:
     """The animated GIF."""
-    shown, pictures = film(), []
-    for k in range(len(shown.images)):
-        canvas = FigureCanvasAgg(drawn(shown, k))
-        canvas.draw()
-        picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
-        pictures.append(picture.quantize(COLOURS, dither=Image.Dither.NONE))
-    times = [MILLISECONDS] * (len(pictures) - 1) + [10 * MILLISECONDS]
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=times, loop=0, optimize=True)
+    shown = film()
+    pictures = (picture_of(drawn(shown, k)) for k in range(len(shown.images)))
+    write_pictures(path, pictures, 1 / SECONDS, last=9 * SECONDS)
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB", flush=True)

@@ -19,6 +19,7 @@ from torchmembrane.io.images import to_grey
 from torchmembrane.io.results import Reconstruction, load_frame
 from torchmembrane.io.status import Status
 from torchmembrane.io.store import Mesh
+from torchmembrane.live.streams import ModelStream
 from torchmembrane.onnx import export
 from torchmembrane.onnx.export import Piece
 from torchmembrane.onnx.graph import Assembly
@@ -238,6 +239,25 @@ def test_edge_follows_a_video(model_files, reconstructor, images, monkeypatch):
             assert np.abs(frame["vertices"] - state.vertices.numpy()).max() < 1e-3
     with pytest.raises(EdgeError, match="does not track"):
         next(Session(model_files[False]).track(frames))
+
+
+def test_a_stream_by_a_model_gives_what_the_model_gives(model_files, reconstructor, images, monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(ROOT / "export")
+    from torchmembrane_edge import Session
+
+    frames, sensor = reconstructor.read(*images)[:, 0].numpy(), reconstructor.sensor.fingerprint
+    expected = Session(model_files[True]).track(frames)
+    stream = ModelStream(model_files[True], sensor)
+    for image, each in zip(frames, expected, strict=True):
+        frame = stream(image, 0.0)
+        assert frame.keys() == each.keys() and all(np.array_equal(frame[key], each[key][0], equal_nan=True) for key in each)
+    np.testing.assert_array_equal(stream.mesh.rest_vertices, reconstructor.estimator.membrane.rest.numpy())
+    with pytest.raises(MembraneError, match="rest state baked in"):
+        stream.rezero()
+    with pytest.raises(MembraneError, match="of another sensor, 'cap'"):
+        ModelStream(model_files[True], 64 * "0")
+    with pytest.raises(MembraneError, match="--model .*no such file"):
+        ModelStream(tmp_path / "none.onnx", sensor)
 
 
 def test_edge_says_what_is_wrong(model_file, images, bare_python, tmp_path):

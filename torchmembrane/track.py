@@ -34,6 +34,9 @@ class Tracker:
     Args:
         reconstructor: the sensor's.
 
+    Attributes:
+        time: of the latest frame, as it was given; None where it was not.
+
     Limitations:
         A sudden change amid a stream that is taken for a contact is not noticed (see docs/drift.md). A touch too light to be
         found, or held still from the beginning, may be said to be a drift.
@@ -54,22 +57,30 @@ class Tracker:
 
     def __init__(self, reconstructor: Reconstructor):
         self.reconstructor = reconstructor
+        self.time: float | None = None
         self._before: Reconstruction | None = None
         self._latest: Tensor | None = None
         self._rest_pixels: Tensor | None = None
         self._watch_from(reconstructor.observer.rest_covariance)
 
-    def __call__(self, frame: Tensor | np.ndarray, pressure: float | None = None) -> Reconstruction:
+    def __call__(self, frame: Tensor | np.ndarray, pressure: float | None = None, time: float | None = None) -> Reconstruction:
         """The frame's result, a batch of one.
 
         Args:
             frame: `[H, W]`, `[H, W, 3]`, or a batch of one as for `Reconstructor`.
             pressure: that a gauge reads, as for `Reconstructor`.
+            time: when the frame was taken, seconds of any clock; kept in `time`, later than that of the frame before.
 
         Raises:
-            MembraneError: more than one frame, another size, shape or type.
+            MembraneError: more than one frame, another size, shape or type; a time not after that of the frame before.
         """
         images = self._one(frame)
+        if time is not None and self.time is not None and not time > self.time:
+            raise MembraneError(
+                f"Tracker: a frame of time {time} after one of {self.time}; expected frames in order: call reset() where "
+                "another recording begins"
+            )
+        self.time = time
         with torch.no_grad():
             result: Reconstruction = self.reconstructor(images, self._before, self._rest_pixels, pressure)
         self._latest = images
@@ -87,8 +98,8 @@ class Tracker:
         return (self._steady if self._is_steady() else self._watch).drift().size
 
     def reset(self) -> None:
-        """Forget the frames before, what `rezero` took for rest, and the drift."""
-        self._before = self._latest = self._rest_pixels = None
+        """Forget the frames before, what `rezero` took for rest, the drift and the time."""
+        self._before = self._latest = self._rest_pixels = self.time = None
         self._watch_from(self.reconstructor.observer.rest_covariance)
 
     def rezero(self, frame: Tensor | np.ndarray | None = None) -> None:

@@ -2,10 +2,12 @@
 
 import math
 import re
-from argparse import Action, ArgumentTypeError, RawDescriptionHelpFormatter
+from argparse import Action, ArgumentTypeError, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeAlias
 
+from ..errors import MembraneError
 from .choices import ELEMENTS, ENERGIES, ESTIMATORS, FLOWS, LOCATORS, VOLUMES
 
 Add: TypeAlias = Callable[..., Action]
@@ -55,6 +57,24 @@ def add_estimator(add: Add, element: str) -> None:
     add("--smoothing", metavar="S", type=not_negative, help=weight)
     how = "how markers are found: least-squares fit, or soft-argmax (default: soft for paper, else fit)"
     add("--locator", choices=LOCATORS, help=how)
+
+
+def add_rerun(add: Add) -> None:
+    """Whether frames are shown in the viewer Rerun."""
+    add("--rerun", action="store_true", help='show image, surface, contacts, wrench and pressure in Rerun (extra "rerun")')
+    add("--save", metavar="FILE.rrd", type=Path, help="with --rerun: write this file and open no viewer")
+
+
+def wants_rerun(arguments: Namespace) -> bool:
+    """Whether `--rerun` was given.
+
+    Raises:
+        MembraneError: `--save` was, without it.
+    """
+    if arguments.save is not None and not arguments.rerun:
+        raise MembraneError(f"--save {arguments.save}: a file of Rerun; expected --rerun with it")
+    given: bool = arguments.rerun
+    return given
 
 
 def positive(text: str) -> float:
@@ -107,6 +127,15 @@ def number_from(least: float, most: float, expected: str = "a number") -> Callab
         return value
 
     return within
+
+
+def camera(text: str) -> int | str:
+    """A camera's number, or the path or address of its stream.
+
+    >>> camera("0"), camera("/dev/video0")
+    (0, '/dev/video0')
+    """
+    return int(text) if text.isdecimal() else text
 
 
 def file_name(text: str) -> str:

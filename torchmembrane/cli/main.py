@@ -13,9 +13,9 @@ from threading import current_thread, main_thread
 
 from .. import __version__
 from ..errors import MembraneError
-from . import calibrate, check, export, init, reconstruct, simulate, view
+from . import calibrate, check, export, init, live, reconstruct, simulate, view
 
-COMMANDS = (init, check, reconstruct, view, calibrate, simulate, export)
+COMMANDS = (init, check, reconstruct, live, view, calibrate, simulate, export)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,22 +1,30 @@
-"""`torchmembrane view`: a stored result drawn."""
+"""`torchmembrane view`: stored results drawn, one as a figure, all of a folder as a film or in Rerun."""
 
 import os
 import sys
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .arguments import add_command
+from .arguments import add_command, add_rerun, positive, wants_rerun
 
-PURPOSE = "draw a stored result"
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..io.read import Results
+
+PURPOSE = "draw stored results"
 EXAMPLES = """\
 examples:
   torchmembrane view results/press.npz --out press.png
   torchmembrane view results/press.npz --image press.png
   torchmembrane view results --frame press          # of a folder of either format; without --frame its first
   torchmembrane view results/frames/part-00000.parquet
+  torchmembrane view results --video-out press.mp4 --images frames/        # all its frames, in name order; or press.gif
+  torchmembrane view results --rerun                # likewise, in the viewer Rerun; --save press.rrd: in a file
 
 Without --out a window is opened; without a display, NAME_view.png is written beside the results."""
+DEFAULT_RATE = 10.0
 
 
 def add_parser(commands: Any) -> None:
@@ -27,10 +35,73 @@ def add_parser(commands: Any) -> None:
     add("--mesh", metavar="mesh.npz", type=Path, help="the mesh of its folder (default: mesh.npz beside it)")
     add("--image", metavar="IMAGE", type=Path, help="the frame's image, drawn behind the flow")
     add("--out", metavar="FILE.png", type=Path, help="where to draw it (default: in a window, if there is a display)")
+    film = "draw all frames of a folder, one after another: .mp4, .mov, .mkv (extra video) or .gif"
+    add("--video-out", metavar="FILE", type=Path, help=film)
+    add("--rate", metavar="HZ", type=positive, default=DEFAULT_RATE, help="frames per second of that (default: %(default)g)")
+    pictures = "where the images of all frames are, by the frames' names (default: RESULT/images, as live --record has it)"
+    add("--images", metavar="FOLDER", type=Path, help=pictures)
+    add_rerun(add)
 
 
 def run(arguments: Namespace) -> int:
-    """Draw the result; returns the exit code."""
+    """Draw the results; returns the exit code."""
+    from ..io.read import read_results
+
+    rerun = wants_rerun(arguments)
+    if not rerun and arguments.video_out is None:
+        return _draw(arguments)
+    results = read_results(arguments.result)
+    width, height = results.mesh.image_size.tolist()
+    images = _Images(arguments.images or arguments.result / "images", (width, height))
+    if arguments.video_out is not None:
+        _film(results, images, arguments.video_out, arguments.rate)
+    if rerun:
+        _show(results, images, arguments.save)
+    return 0
+
+
+class _Images:
+    """The images of frames, by name."""
+
+    def __init__(self, folder: Path, size: tuple[int, int]):
+        from ..jobs.inputs import IMAGES
+
+        found = folder.iterdir() if folder.is_dir() else ()
+        self.size, self.files = size, {path.stem: path for path in found if path.suffix.lower() in IMAGES}
+
+    def of(self, name: str) -> "np.ndarray | None":
+        """Grey values `[height, width]` in 0..1, or None."""
+        from ..io.images import read_image
+
+        return read_image(self.files[name], self.size) if name in self.files else None
+
+
+def _film(results: "Results", images: _Images, path: Path, rate: float) -> None:
+    from tqdm import tqdm
+
+    from ..plot.film import check_film, picture_of, write_film
+    from ..plot.frames import figure
+
+    check_film(path)
+    named = zip(results.names, tqdm(results, unit="frame", desc="draw"), strict=True)
+    count = 4 if any(bool(frame["traction"].any()) for frame in results) else 3
+    drawn = (figure(frame, results.mesh, images.of(name), name, count) for name, frame in named)
+    write_film(path, map(picture_of, drawn), rate)
+    print(f"{len(results)} frames drawn in {path}")
+
+
+def _show(results: "Results", images: _Images, save: Path | None) -> None:
+    from ..integrations.rerun import RerunLog
+    from ..live.recording import times_of
+
+    times = times_of(results.folder)
+    with RerunLog(results.mesh, save) as log:
+        for number, (name, frame) in enumerate(zip(results.names, results, strict=True)):
+            log.add(number, frame, images.of(name), times.get(name))
+    print(f"{len(results)} frames {f'written to {save}' if save else 'shown in Rerun'}")
+
+
+def _draw(arguments: Namespace) -> int:
     from ..errors import MembraneError
     from ..io.images import read_image
     from ..io.read import read_frame

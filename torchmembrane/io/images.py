@@ -192,6 +192,30 @@ def write_image(stem: str | Path, grey: np.ndarray) -> Path:
     return path
 
 
+def write_as_taken(stem: str | Path, image: np.ndarray) -> Path:
+    """Write an image as a camera gave it, losslessly and fast.
+
+    Args:
+        stem: the file without its ending, `.png` or `.tiff`.
+        image: `[height, width]` or `[height, width, 3]` uint8, or grey values as for `write_image`.
+
+    Returns:
+        The path.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     path = write_as_taken(f"{folder}/red", np.array([[[255, 0, 0]]], np.uint8))
+        ...     path.name, read_image(path).round(3).tolist()
+        ('red.png', [[0.29899999499320984]])
+    """
+    if image.dtype.kind == "f":
+        return write_image(stem, image)
+    path = Path(f"{stem}.png")
+    Image.fromarray(np.ascontiguousarray(image)).save(path, compress_level=1)
+    return path
+
+
 def _array(image: Image.Image) -> np.ndarray:
     if image.mode == "I":  # 16-bit grey as Pillow of some versions opens it
         values = np.asarray(image)

@@ -24,13 +24,30 @@ def load_pyav() -> Any:
     return _load("av", "videos need PyAV", "video")
 
 
-def load_opencv() -> Any:
+def load_opencv(purpose: str = "calibration from boards needs OpenCV") -> Any:
     """The module `cv2`.
+
+    Args:
+        purpose: what it is needed for, as an error says it.
 
     Raises:
         MembraneError: OpenCV is not installed.
     """
-    return _load("cv2", "calibration from boards needs OpenCV", "calibrate")
+    return _load("cv2", purpose, "calibrate")
+
+
+def load_edge() -> Any:
+    """The module `torchmembrane_edge`.
+
+    Raises:
+        MembraneError: it is not installed: it comes with this project's repository, in `export/`.
+    """
+    try:
+        return import_module("torchmembrane_edge")
+    except ImportError as error:
+        raise MembraneError(
+            "exported models need torchmembrane-edge, which is not installed: pip install ./export, in the repository"
+        ) from error
 
 
 def load_pandas() -> Any:
@@ -51,6 +68,15 @@ def load_ray() -> Any:
     ray = _load("ray", "clusters need Ray", "ray")
     import_module("ray.data")
     return ray
+
+
+def load_rerun() -> Any:
+    """The module `rerun`.
+
+    Raises:
+        MembraneError: Rerun is not installed.
+    """
+    return _load("rerun", "its viewer needs rerun-sdk", "rerun")
 
 
 def _load(module: str, purpose: str, extra: str) -> Any:

@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 from zipfile import BadZipFile
@@ -200,8 +201,10 @@ def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
         [1.0, 1.0, 1.0]
     """
     arrays: dict[str, Any] = frame
-    with whole_file(path) as partial, open(partial, "wb") as file:
-        np.savez(file, **arrays)
+    content = BytesIO()  # written at once: each write of a file makes other threads wait for their turn
+    np.savez(content, **arrays)
+    with whole_file(path) as partial:
+        partial.write_bytes(content.getbuffer())
 
 
 def load_frame(path: str | Path) -> dict[str, np.ndarray]:

@@ -34,7 +34,9 @@ BAR_BELOW, BAR_HEIGHT = 0.52, 0.11  # inches: of a colour bar, below its axes, w
 
 
 @rc_context({"font.size": 13, "axes.titlesize": 14.5})
-def figure(frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = None, name: str = "") -> Figure:
+def figure(
+    frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = None, name: str = "", places: int | None = None
+) -> Figure:
     """Flow over the image, side view, displacement along the rest normals and, where forces are known, traction.
 
     Args:
@@ -42,6 +44,7 @@ def figure(frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = 
         mesh: the `Mesh` stored beside it.
         image: its image `[height, width]` in 0..1; without one, none is drawn.
         name: of the frame, for the title.
+        places: for panels, 4 or 3; default: as many as there are. Films need figures of one size.
 
     Returns:
         A figure of three panels, or four; of a frame without a surface its flow, and the reason in words.
@@ -59,16 +62,16 @@ def figure(frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = 
     """
     good = bool(np.isfinite(frame["vertices"]).all())
     forces = good and np.any(frame["traction"])
-    drawing, places = panels(4 if forces else 3)
+    drawing, grid = panels(places or (4 if forces else 3))
     drawing.suptitle(_title(frame, mesh, name), fontsize=17, color="k" if good else VERMILION)
-    draw_flow(drawing.add_subplot(places[0]), frame, mesh, image)
+    draw_flow(drawing.add_subplot(grid[0]), frame, mesh, image)
     if good:
-        draw_side(drawing.add_subplot(places[1]), frame, mesh)
-        draw_displacement(drawing.add_subplot(places[2]), frame, mesh)
+        draw_side(drawing.add_subplot(grid[1]), frame, mesh)
+        draw_displacement(drawing.add_subplot(grid[2]), frame, mesh)
         if forces:
-            draw_traction(drawing.add_subplot(places[3]), frame, mesh)
+            draw_traction(drawing.add_subplot(grid[3]), frame, mesh)
     else:
-        _draw_failure(drawing.add_subplot(places[0, 1:]), frame)
+        _draw_failure(drawing.add_subplot(grid[0, 1:]), frame)
     return drawing
 
 

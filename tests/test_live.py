@@ -1,0 +1,424 @@
+"""A camera that is followed: the newest frame, no lag, what is dropped counted, what is kept readable again.
+
+Cameras are played by a class with the interface of `cv2.VideoCapture`.
+"""
+
+import csv
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import torchmembrane as tm
+from torchmembrane.cli.main import main
+from torchmembrane.io.images import read_image
+from torchmembrane.live.background import Background
+from torchmembrane.live.line import Line, described, summary
+from torchmembrane.live.loop import Seen, Tally, follow
+from torchmembrane.live.mailbox import Mailbox, capture
+from torchmembrane.live.recording import Recording, times_of
+from torchmembrane.live.sources import MOST_MISSED, Timed, camera_images, folder_images, paced, video_images
+from torchmembrane.live.streams import TrackedStream
+from torchmembrane.sensor.sensor import Sensor
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def reconstructor(small_sensor):
+    return tm.Reconstructor.from_file(small_sensor / "sensor.toml")
+
+
+@pytest.fixture
+def stream(reconstructor):
+    return TrackedStream(reconstructor)
+
+
+def frame_of(status: int = 0) -> dict[str, np.ndarray]:
+    return {"status": np.array(status), "wrench": np.arange(6.0), "pressure_change": np.array(0.002)}
+
+
+def seen(number: int, status: int = 0) -> Seen:
+    return Seen(number, 0.1 * number, np.zeros((2, 2), np.uint8), frame_of(status), 0.05)
+
+
+class Slow:
+    """A stream that takes so many seconds for a frame, and finds in it the number that it shows."""
+
+    def __init__(self, seconds: float):
+        self.seconds, self.numbers, self.zeroed = seconds, [], 0
+
+    def __call__(self, image, time_):
+        time.sleep(self.seconds)
+        self.numbers.append(int(image[0, 0]))
+        return frame_of()
+
+    def rezero(self):
+        self.zeroed += 1
+
+
+def numbered(count: int, rate: float):
+    return paced(Timed(k / rate, np.full((2, 2), k)) for k in range(count))
+
+
+def test_the_newest_frame_is_taken_and_no_lag_builds_up():
+    """At ten times the rate that can be kept up: latency is that of one computation and the wait for the one before."""
+    stream, tally = Slow(0.05), Tally()
+    with capture(numbered(200, 200.0)) as mailbox:
+        follow(stream, mailbox, tally, [], Event())
+    assert tally.captured == 200 and stream.numbers == sorted(set(stream.numbers)) and stream.numbers[-1] == 199
+    assert 5 <= tally.followed <= 24 and tally.dropped == 200 - tally.followed
+    assert min(tally.latencies) >= 0.05 and tally.latency(80) < 0.15
+    assert 5 < tally.rate() < 21
+
+
+def test_every_frame_is_taken_where_there_is_time():
+    stream, tally = Slow(0.0), Tally()
+    with capture(numbered(10, 10.0)) as mailbox:
+        follow(stream, mailbox, tally, [], Event())
+    assert stream.numbers == list(range(10)) and tally.dropped == 0 and 9 < tally.rate() < 11
+
+
+def test_what_breaks_the_source_is_raised_after_its_last_frame():
+    def broken():
+        yield np.zeros((2, 2))
+        raise tm.MembraneError("the camera is gone")
+
+    stream, tally = Slow(0.05), Tally()
+    with pytest.raises(tm.MembraneError, match="the camera is gone"), capture(broken()) as mailbox:
+        follow(stream, mailbox, tally, [], Event())
+    assert stream.numbers == [0] and tally.followed == 1
+
+
+def test_a_stop_ends_an_endless_source_at_once():
+    stop, closed = Event(), Event()
+
+    def endless():
+        try:
+            while True:
+                time.sleep(0.01)
+                yield np.zeros((2, 2))
+        finally:
+            closed.set()
+
+    start = time.monotonic()
+    with capture(endless()) as mailbox:
+        follow(Slow(0.0), mailbox, Tally(), [lambda seen, _: seen.number > 5 and stop.set()], stop)
+    assert time.monotonic() - start < 1.0 and closed.wait(1.0)
+
+
+def test_rezero_is_done_once_between_frames_and_its_refusal_is_said(stream):
+    asked, said, slow = Event(), [], Slow(0.0)
+    asked.set()
+    with capture(numbered(3, 100.0)) as mailbox:
+        follow(slow, mailbox, Tally(), [], Event(), asked, said.append)
+    assert slow.zeroed == 1 and said == ["the latest frame is taken for rest"] and not asked.is_set()
+    asked.set()
+    with capture(iter(())) as mailbox:
+        follow(stream, mailbox, Tally(), [], Event(), asked, said.append)
+    assert said[1].startswith("not taken for rest: Tracker.rezero: no frame yet")
+
+
+def test_a_mailbox_that_ended_gives_its_last_picture_first():
+    mailbox = Mailbox()
+    mailbox.put(np.zeros((1, 1)))
+    mailbox.end()
+    assert mailbox.take(0.0).number == 0 and mailbox.take(60.0) is None
+
+
+def test_times_of_captures_go_forward_whatever_the_clock_does(monkeypatch):
+    mailbox, pictures = Mailbox(), []
+    for wall in (2e9, 1e9):
+        monkeypatch.setattr(time, "time", lambda wall=wall: wall)
+        mailbox.put(np.zeros((1, 1)))
+        pictures.append(mailbox.take(0.0))
+    assert 0 < pictures[1].time - pictures[0].time < 1 and abs(pictures[0].time - 2e9) > 1e6
+
+
+def test_background_work_never_holds_up_and_counts_what_it_drops():
+    go, kept = Event(), []
+
+    def keep(item):
+        go.wait(5.0)
+        kept.append(item)
+
+    with Background(keep, depth=4) as later:
+        start = time.monotonic()
+        for item in range(50):
+            later(item)
+        assert time.monotonic() - start < 1.0
+        go.set()
+    assert kept == list(range(len(kept))) and 4 <= len(kept) <= 5 and later.dropped == 50 - len(kept)
+
+
+def test_an_error_in_the_background_is_raised_in_the_end_and_the_rest_is_dropped():
+    def keep(item):
+        raise OSError("no space left")
+
+    with pytest.raises(OSError, match="no space left"), Background(keep) as later:
+        for item in range(3):
+            later(item)
+    assert later.dropped == 3
+
+
+class Capture:
+    """A camera of so many images, played by the interface of `cv2.VideoCapture`: BGR, and at times no image."""
+
+    def __init__(self, images, missed=(), opens=True, after=None):
+        self.images, self.missed, self.opens, self.after = list(images), set(missed), opens, after
+        self.reads, self.released, self.asked = 0, False, {}
+
+    def isOpened(self):  # noqa: N802
+        return self.opens
+
+    def set(self, key, value):
+        self.asked[key] = value
+
+    def read(self):
+        self.reads += 1
+        if self.reads in self.missed or not self.images:
+            if not self.images and self.after:
+                self.after()
+            return False, None
+        time.sleep(0.02)
+        return True, np.ascontiguousarray(self.images.pop(0)[..., ::-1])
+
+    def release(self):
+        self.released = True
+
+
+@pytest.fixture
+def camera(monkeypatch):
+    """Have OpenCV open such a camera."""
+    import cv2
+
+    def given(*arguments, **options) -> Capture:
+        played = Capture(*arguments, **options)
+        monkeypatch.setattr(cv2, "VideoCapture", lambda number: played)
+        return played
+
+    return given
+
+
+def test_a_camera_gives_red_green_blue_of_the_sensor_s_size(camera):
+    import cv2
+
+    images = [np.random.default_rng(k).integers(0, 255, (6, 8, 3), np.uint8) for k in range(4)]
+    played = camera(images, missed=(2, 3))
+    source = camera_images(0, (8, 6))
+    for image in images:
+        np.testing.assert_array_equal(next(source), image)
+    assert played.asked == {cv2.CAP_PROP_FRAME_WIDTH: 8, cv2.CAP_PROP_FRAME_HEIGHT: 6} and not played.released
+    source.close()
+    assert played.released
+
+
+def test_a_camera_s_failures_are_said(camera, monkeypatch):
+    camera([], opens=False)
+    with pytest.raises(tm.MembraneError, match="--camera 3: cannot be opened"):
+        camera_images(3, (8, 6))
+    played = camera([np.zeros((4, 8, 3), np.uint8)])
+    with pytest.raises(tm.MembraneError, match="images of 8 x 4 px; expected the sensor's 8 x 6"):
+        next(camera_images(0, (8, 6)))
+    assert played.released
+    played = camera([np.zeros((6, 8, 3), np.uint8)])
+    monkeypatch.setattr("torchmembrane.live.sources.BREATH", 0.0)
+    source = camera_images(0, (8, 6))
+    next(source)
+    with pytest.raises(tm.MembraneError, match=f"no image in {MOST_MISSED} reads"):
+        next(source)
+    assert played.released
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    """Ten pictures at 25 Hz."""
+    import av
+
+    path = tmp_path_factory.mktemp("video") / "ten.mp4"
+    with av.open(str(path), "w") as container:
+        track = container.add_stream("h264", rate=25)
+        track.width, track.height, track.pix_fmt = 64, 48, "yuv420p"
+        for k in range(10):
+            image = np.full((48, 64, 3), 20 * k, np.uint8)
+            container.mux(track.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(track.encode())
+    return path
+
+
+def test_a_video_is_played_at_its_own_pace_or_at_the_one_given(video):
+    for rate, expected in ((None, 25.0), (100.0, 100.0)):
+        found = list(video_images(video, (64, 48), rate))
+        assert [due for due, _ in found] == pytest.approx([k / expected for k in range(10)])
+        assert [image.mean() for _, image in found] == pytest.approx([20 * k for k in range(10)], abs=4)
+
+
+def test_no_video_is_said(video, tmp_path):
+    (tmp_path / "text.mp4").write_text("none")
+    for path, said in (("text.mp4", "not readable as a video"), ("nothing.mp4", "no such file")):
+        with pytest.raises(tm.MembraneError, match=said):
+            next(video_images(tmp_path / path, (64, 48), None))
+    with pytest.raises(tm.MembraneError, match="images of 64 x 48 px; expected the sensor's 32 x 24"):
+        next(video_images(video, (32, 24), None))
+
+
+def test_frames_come_when_they_are_due_and_late_ones_at_once():
+    def late():
+        yield Timed(1.0, np.zeros(1))
+        time.sleep(0.1)
+        yield Timed(1.02, np.zeros(1))
+        yield Timed(1.2, np.zeros(1))
+
+    start, at = time.monotonic(), []
+    for _ in paced(late()):
+        at.append(time.monotonic() - start)
+    assert all(due - 0.001 <= came < due + 0.09 for due, came in zip((0.0, 0.1, 0.2), at, strict=True))
+
+
+def test_a_broken_image_of_a_folder_is_left_out_and_said(small_images, tmp_path):
+    (tmp_path / "a.png").write_bytes(small_images[0].read_bytes())
+    (tmp_path / "b.png").write_bytes(b"no image")
+    (tmp_path / "c.png").write_bytes(small_images[1].read_bytes())
+    with pytest.warns(UserWarning, match=r"b.png: not readable.*left out"):
+        found = list(folder_images(tmp_path, (160, 120), 10.0))
+    assert [due for due, _ in found] == [0.0, 0.2]
+
+
+def test_a_tracker_keeps_the_time_of_its_latest_frame_and_refuses_an_earlier_one(reconstructor, small_images):
+    tracker, image = tm.Tracker(reconstructor), reconstructor.read(small_images[0])
+    tracker(image, time=2.0)
+    assert tracker.time == 2.0
+    for wrong in (2.0, 1.0):
+        with pytest.raises(tm.MembraneError, match=rf"time {wrong} after one of 2.0.*reset\(\)"):
+            tracker(image, time=wrong)
+    tracker(image)
+    assert tracker.time is None
+    tracker(image, time=1.0)
+    tracker.reset()
+    tracker(image, time=0.5)
+    assert tracker.time == 0.5
+
+
+def test_the_line_says_rate_latency_status_and_wrench(stream):
+    tally = Tally()
+    for k in (0, 2, 4):
+        tally.add(seen(k))
+    text = described(seen(4), tally, stream.mesh)
+    assert text == (
+        "5.0 Hz, 50 ms (95 %: 50), 2 dropped | ok | force +0.000 +1.000 +2.000 N | moment +3.000 +4.000 +5.000 N mm | "
+        "pressure +0.002 N/mm²"
+    )
+    blank = described(seen(6, status=int(tm.Status.BLANK)), tally, stream.mesh)
+    assert "blank or saturated image" in blank and "force" not in blank
+    assert summary(Tally()) == "no frame was captured"
+    tally.add(seen(6, status=int(tm.Status.BLANK)))
+    assert "7 captured, 4 followed, 1 of them without a surface, 3 dropped" in summary(tally)
+
+
+def test_the_line_is_rewritten_in_a_terminal_and_plain_elsewhere(stream, monkeypatch):
+    class Screen:
+        def __init__(self, terminal):
+            self.written, self.isatty = [], lambda: terminal
+
+        def write(self, text):
+            self.written.append(text)
+
+        def flush(self):
+            pass
+
+    monkeypatch.setenv("COLUMNS", "60")
+    tally = Tally()
+    tally.add(seen(0))
+    for terminal in (True, False):
+        screen = Screen(terminal)
+        line = Line(stream.mesh, screen)
+        line(seen(0), tally)
+        line(seen(0), tally)  # too soon
+        line.say("said")
+        shown, said = screen.written
+        assert ("\n" in shown) != terminal and shown.startswith("\r\x1b[K") == terminal and said.endswith("said\n")
+        assert not terminal or len(shown.removeprefix("\r\x1b[K")) == 59
+
+
+def test_a_recording_reads_back_as_results_and_reconstructs_to_the_same(reconstructor, stream, small_images, tmp_path):
+    kept = []
+    with Recording(tmp_path / "day", stream.mesh) as recording:
+        for k, path in enumerate(small_images):
+            grey = np.asarray(Image.open(path).convert("L"))
+            image = np.repeat(grey[..., None], 3, -1) if k % 2 else read_image(path)
+            kept.append(Seen(3 * k, 1e9 + k, image, stream(image, float(k)), 0.01))
+            recording.keep(kept[-1])
+    results = tm.read_results(tmp_path / "day")
+    assert results.names == ["000000", "000003", "000006"]
+    for each in kept:
+        for key, value in each.frame.items():
+            np.testing.assert_array_equal(results[each.name][key], value)
+        np.testing.assert_allclose(
+            read_image(tmp_path / "day" / "images" / f"{each.name}.png"), reconstructor.grey(each.image)[0, 0], atol=1e-6
+        )
+    assert times_of(tmp_path / "day") == {each.name: each.time for each in kept}
+    with open(tmp_path / "day" / "summary.csv", newline="") as file:
+        assert [row["name"] for row in csv.DictReader(file)] == results.names
+    with pytest.raises(tm.MembraneError, match="holds something already"):
+        Recording(tmp_path / "day", stream.mesh)
+
+
+def test_the_command_follows_a_camera_and_says_what_ended_it(small_sensor, small_images, camera, capsys, tmp_path, monkeypatch):
+    """The camera is unplugged after its images: the summary is said, what was recorded is whole."""
+    monkeypatch.setattr("torchmembrane.live.sources.BREATH", 0.0)
+    monkeypatch.setattr(sys, "stdin", [])
+    images = [np.array(Image.open(path).convert("RGB")) for path in small_images]
+    camera(images)
+    record = tmp_path / "kept"
+    code = main(["live", str(small_sensor / "sensor.toml"), "--camera", "0", "--grid", "7", "7", "--record", str(record)])
+    out, err = capsys.readouterr()
+    assert code == 2 and "--camera 0: no image in" in err
+    followed = int(re.search(r"frames: 3 captured, (\d) followed", out)[1])
+    results = tm.read_results(record)
+    assert len(results) == followed and results["000002"]["vertices"].shape == (49, 3)
+    sensor = Sensor.from_file(small_sensor / "sensor.toml")
+    tracker = tm.Tracker(tm.Reconstructor(replace(sensor, membrane=sensor.surface.membrane((7, 7)))))
+    for name in results.names:
+        expected = tracker(images[int(name)])
+        np.testing.assert_allclose(results[name]["vertices"], expected.vertices[0], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ([], "no source; expected one of --camera NUMBER, --video FILE, --images FOLDER"),
+        (["--camera", "0", "--images", "."], "--camera and --images; expected one"),
+        (["--camera", "0", "--rate", "9"], "a camera has its own pace"),
+        (["--camera", "0", "--model", "a.onnx", "--grid", "9", "9"], "--grid with --model"),
+        (["--camera", "0", "--model", "a.onnx", "--estimator", "paper"], "--estimator with --model"),
+    ],
+)
+def test_wrong_usage_of_the_command_is_said(small_sensor, options, said, capsys):
+    assert main(["live", str(small_sensor / "sensor.toml"), *options]) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_command_with_its_summary(small_sensor, small_images, tmp_path, number):
+    """From a folder of a minute; `z` is answered on the way."""
+    for k in range(1800):
+        (tmp_path / f"{k:04d}.png").hardlink_to(small_images[0]) if k else (tmp_path / "0000.png").symlink_to(small_images[0])
+    command = [sys.executable, "-m", "torchmembrane", "live", str(small_sensor / "sensor.toml"), "--images", str(tmp_path)]
+    pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    with subprocess.Popen(command, **pipes) as process:
+        assert " ms " in process.stdout.readline()
+        process.stdin.write("z\n")
+        process.stdin.flush()
+        lines = [process.stdout.readline(), process.stdout.readline()]
+        assert any("is taken for rest" in line for line in lines)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)
+    assert process.returncode == 0 and not err and "latency" in out.splitlines()[-1]

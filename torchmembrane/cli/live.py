@@ -1,0 +1,179 @@
+"""`torchmembrane live`: a camera followed as it goes, or a recording as if it were one."""
+
+import signal
+import sys
+import warnings
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from threading import Event, Thread, current_thread, main_thread
+from typing import TYPE_CHECKING, Any
+
+from .arguments import add_command, add_estimator, add_rerun, add_sensor, camera, count, positive, wants_rerun
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..live.loop import Seen, Tally
+    from ..live.streams import Stream
+    from ..sensor.sensor import Sensor
+
+PURPOSE = "follow a camera: wrench, status, rate and latency as it goes"
+EXAMPLES = """\
+examples:
+  torchmembrane live sensor.toml --camera 0
+  torchmembrane live sensor.toml --camera 0 --grid 17 17 --record today
+  torchmembrane live sensor.toml --camera 0 --model video.onnx         # of torchmembrane export --tracking: faster
+  torchmembrane live sensor.toml --video press.mp4                     # at its own pace; --rate 10 for another
+  torchmembrane live sensor.toml --images frames/ --rate 30
+
+The newest frame is taken; what came meanwhile is dropped and counted. Latency is from the capture (the camera's
+image is read, a file's is due) to the result. `z` and Enter: nothing touches now, take this for rest. Ctrl-C or
+SIGTERM end it with a summary. In a terminal the line is rewritten in place, elsewhere there is one each second.
+
+exit code: 0 ended or stopped, 2 wrong usage, or a source that gives no images (any more)"""
+SOURCES = ("camera", "video", "images")
+OF_TORCH = ("grid", "energy", "element", "volume", "flow", "smoothing", "locator")
+DEFAULT_RATE = 30.0
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command's parser."""
+    add = add_command(commands, "live", run, PURPOSE, EXAMPLES)
+    add_sensor(add)
+    opened = "a camera, by OpenCV: its number, 0 the first, or its path or address"
+    add("--camera", metavar="NUMBER|PATH", type=camera, help=opened)
+    add("--video", metavar="FILE", type=Path, help="a video, as if it came from a camera")
+    add("--images", metavar="FOLDER", type=Path, help="the images of a folder in name order, likewise")
+    add("--rate", metavar="HZ", type=positive, help="pace of files (default: a video's own; of images 30)")
+    add("--grid", metavar=("M", "N"), nargs=2, type=count, help="solver grid (default: the sensor file's)")
+    add_estimator(add, "as for reconstruct (default: %(default)s)")
+    model = "compute by onnxruntime with a model of torchmembrane export; needs torchmembrane-edge"
+    add("--model", metavar="MODEL.onnx", type=Path, help=model)
+    add("--threads", metavar="N", type=count, default=1, help="that compute (default: %(default)s)")
+    kept = "keep images, results and times in a new folder; what the disk is too slow for is dropped and counted"
+    add("--record", metavar="DIR", type=Path, help=kept)
+    add_rerun(add)
+
+
+def run(arguments: Namespace) -> int:
+    """Follow the source until it ends or is stopped; returns the exit code."""
+    from ..live.line import Line, summary
+    from ..live.loop import Tally, follow
+    from ..live.mailbox import capture
+    from ..presets import sensor_file
+    from ..sensor.sensor import Sensor
+
+    _check(arguments)
+    sensor = Sensor.from_file(sensor_file(arguments.sensor))
+    images, stream = _images(arguments, sensor.camera.image_size), _stream(arguments, sensor)
+    line = Line(stream.mesh, sys.stdout)
+    warnings.showwarning = lambda message, *_: line.say(f"torchmembrane: warning: {message}")  # main restores it
+    with ExitStack() as stack:
+        watchers, said = _watchers(arguments, stream, stack)
+        stop, rezero = stack.enter_context(_stopped_by_signals()), _rezero_by_key()
+        mailbox, tally = stack.enter_context(capture(images)), Tally()
+        try:
+            follow(stream, mailbox, tally, [line, *watchers], stop, rezero, line.say)
+        finally:
+            line.say(summary(tally))
+    for each in said:
+        print(each())
+    return 0
+
+
+def _check(arguments: Namespace) -> None:
+    from ..errors import MembraneError
+
+    given = [f"--{name}" for name in SOURCES if getattr(arguments, name) is not None]
+    if len(given) != 1:
+        came = " and ".join(given) or "no source"
+        raise MembraneError(f"live: {came}; expected one of --camera NUMBER, --video FILE, --images FOLDER")
+    if arguments.rate is not None and arguments.camera is not None:
+        raise MembraneError("live: --rate with --camera; a camera has its own pace: leave --rate out")
+    foreign = [name for name in OF_TORCH if getattr(arguments, name) is not None]
+    if arguments.model is not None and (foreign or arguments.estimator != "force-balance"):
+        raise MembraneError(f"live: --{(foreign or ['estimator'])[0]} with --model; a model has its own: export it with that")
+
+
+def _images(arguments: Namespace, size: tuple[int, int]) -> "Iterator[np.ndarray]":
+    from ..live.sources import camera_images, folder_images, paced, video_images
+
+    if arguments.camera is not None:
+        return camera_images(arguments.camera, size)
+    if arguments.video is not None:
+        return paced(video_images(arguments.video, size, arguments.rate))
+    return paced(folder_images(arguments.images, size, arguments.rate or DEFAULT_RATE))
+
+
+def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
+    """What computes."""
+    from dataclasses import replace
+
+    import torch
+
+    from ..live.streams import ModelStream, TrackedStream
+    from .build import build_reconstructor
+
+    if arguments.model is not None:
+        return ModelStream(arguments.model, sensor.fingerprint, arguments.threads)
+    torch.set_num_threads(arguments.threads)
+    if arguments.grid is not None:
+        sensor = replace(sensor, membrane=sensor.surface.membrane(tuple(arguments.grid)))
+    return TrackedStream(build_reconstructor(sensor, arguments))
+
+
+def _watchers(
+    arguments: Namespace, stream: "Stream", stack: ExitStack
+) -> "tuple[list[Callable[[Seen, Tally], None]], list[Callable[[], str]]]":
+    """What else is given the frames, and what is to be said of it in the end."""
+    from ..integrations.rerun import RerunLog
+    from ..live.background import Background
+    from ..live.recording import Recording
+
+    watchers: list[Callable[[Seen, Tally], None]] = []
+    said: list[Callable[[], str]] = []
+    if arguments.record is not None:
+        recording = stack.enter_context(Recording(arguments.record, stream.mesh))
+        later = stack.enter_context(Background(recording.keep))
+        watchers.append(lambda seen, _: later(seen))
+        said.append(lambda: f"recorded in {arguments.record}; {later.dropped} frames left out, for want of time")
+    if wants_rerun(arguments):
+        log = stack.enter_context(RerunLog(stream.mesh, arguments.save))
+        logged: Background[Seen] = Background(lambda seen: log.add(seen.number, seen.frame, seen.image, seen.time))
+        stack.enter_context(logged)
+        watchers.append(lambda seen, _: logged(seen))
+        said.append(lambda: f"shown in Rerun; {logged.dropped} frames left out, for want of time")
+    return watchers, said
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[Event]:
+    """An event that the first SIGINT or SIGTERM sets; the second ends the command as ever."""
+    stop, before = Event(), {}
+
+    def on_signal(number: int, _: object) -> None:
+        stop.set()
+        signal.signal(number, signal.default_int_handler)
+
+    if current_thread() is main_thread():
+        before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _rezero_by_key() -> Event:
+    """An event that a line `z` of the standard input sets."""
+    rezero = Event()
+
+    def read() -> None:
+        for text in sys.stdin or ():
+            if text.strip() == "z":
+                rezero.set()
+
+    Thread(target=read, name="keys", daemon=True).start()
+    return rezero

@@ -1,0 +1,1 @@
+"""Other programs' formats and viewers, each an extra."""

@@ -1,0 +1,69 @@
+"""Work that must not hold up the loop: done by another thread, from a queue of bounded length."""
+
+from collections.abc import Callable
+from queue import Full, Queue
+from threading import Thread
+from types import TracebackType
+from typing import Generic, TypeVar
+
+Item = TypeVar("Item")
+DEPTH = 64
+"""Items that wait at most; of images of 640 x 480 in colour, 59 MB."""
+
+
+class Background(Generic[Item]):
+    """Does something to items in a thread of its own: `with Background(keep) as later`, then `later(item)`, which never waits.
+
+    An item for which the queue has no room is dropped and counted; so is all that comes after an error, which is raised when
+    the block ends. Leaving the block waits until the queue is empty.
+
+    Args:
+        keep: what is done to each item, in their order.
+        depth: items that wait at most.
+
+    Attributes:
+        dropped: items that were not kept.
+        error: what `keep` raised.
+
+    Example:
+        >>> kept = []
+        >>> with Background(kept.append) as later:
+        ...     for item in range(3):
+        ...         later(item)
+        >>> kept, later.dropped
+        ([0, 1, 2], 0)
+    """
+
+    def __init__(self, keep: Callable[[Item], None], depth: int = DEPTH):
+        self.keep, self.dropped = keep, 0
+        self.error: BaseException | None = None
+        self._waiting: Queue[Item | None] = Queue(depth)
+        self._thread = Thread(target=self._work, name="background", daemon=True)
+
+    def __enter__(self) -> "Background[Item]":
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self._waiting.put(None)
+        self._thread.join()
+        if self.error is not None and error is None:
+            raise self.error
+
+    def __call__(self, item: Item) -> None:
+        """Have an item kept later, or drop it."""
+        try:
+            self._waiting.put_nowait(item)
+        except Full:
+            self.dropped += 1
+
+    def _work(self) -> None:
+        while (item := self._waiting.get()) is not None:
+            if self.error is not None:
+                self.dropped += 1
+                continue
+            try:
+                self.keep(item)
+            except BaseException as error:  # whatever it is, the block raises it when it ends
+                self.error = error
+                self.dropped += 1

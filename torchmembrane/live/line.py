@@ -1,0 +1,72 @@
+"""The line that says how a stream goes: rewritten in place in a terminal, line by line elsewhere."""
+
+import shutil
+import time
+from typing import TextIO
+
+from ..io.status import Status
+from ..io.store import Mesh
+from .loop import RECENT, Seen, Tally
+
+TERMINAL_SECONDS, PLAIN_SECONDS = 0.1, 1.0
+"""Between two lines, at least."""
+
+
+class Line:
+    """Shows the latest frame, with rate and latency over the last `RECENT` frames.
+
+    Args:
+        mesh: of the stream.
+        file: where to write.
+    """
+
+    def __init__(self, mesh: Mesh, file: TextIO):
+        self._mesh, self._file, self._in_place = mesh, file, file.isatty()
+        self._next = 0.0
+
+    def __call__(self, seen: Seen, tally: Tally) -> None:
+        """Show a frame, if it is time."""
+        at = time.monotonic()
+        if at < self._next:
+            return
+        self._next = at + (TERMINAL_SECONDS if self._in_place else PLAIN_SECONDS)
+        text = described(seen, tally, self._mesh)
+        if self._in_place:
+            self._write(f"\r\x1b[K{text[: shutil.get_terminal_size().columns - 1]}")
+        else:
+            self._write(f"{text}\n")
+
+    def say(self, text: str) -> None:
+        """A line that stays."""
+        self._write(f"\r\x1b[K{text}\n" if self._in_place else f"{text}\n")
+
+    def _write(self, text: str) -> None:
+        self._file.write(text)
+        self._file.flush()
+
+
+def described(seen: Seen, tally: Tally, mesh: Mesh) -> str:
+    """Rate, latency, dropped pictures, status, wrench and change of pressure in one line."""
+    milliseconds = [1000 * tally.latency(percent, RECENT) for percent in (50, 95)]
+    rate = f"{tally.rate(RECENT):.1f} Hz, " if tally.followed > 1 else ""
+    pace = rate + "{:.0f} ms (95 %: {:.0f}), {} dropped".format(*milliseconds, tally.dropped)
+    status = Status(int(seen.frame["status"]))
+    if not status.has_surface:
+        return f"{pace} | {status.text}"
+    unit = "relative" if mesh.force_unit == "relative" else mesh.force_unit
+    force, moment = (" ".join(f"{value:+.3f}" for value in half) for half in seen.frame["wrench"].reshape(2, 3))
+    pressure = f"{seen.frame['pressure_change']:+.2g} {unit}/{mesh.length_unit}²"
+    words = status.text.partition(":")[0]
+    return f"{pace} | {words} | force {force} {unit} | moment {moment} {unit} {mesh.length_unit} | pressure {pressure}"
+
+
+def summary(tally: Tally) -> str:
+    """What became of all pictures."""
+    if not tally.followed:
+        return "no frame was captured"
+    without = f", {tally.failed} of them without a surface" if tally.failed else ""
+    milliseconds = [1000 * tally.latency(percent) for percent in (50, 95)]
+    return (
+        f"frames: {tally.captured} captured, {tally.followed} followed{without}, {tally.dropped} dropped for newer ones; "
+        "{:.1f} Hz, latency {:.0f} ms in the median, {:.0f} ms at 95 %".format(tally.rate(), *milliseconds)
+    )

@@ -1,0 +1,69 @@
+"""What a stream showed, kept: images as they were captured, results as `torchmembrane reconstruct` writes them, times."""
+
+import csv
+from pathlib import Path
+from types import TracebackType
+
+from ..errors import MembraneError
+from ..io.claim import WHOLE
+from ..io.images import write_as_taken
+from ..io.origin import Origin
+from ..io.results import Stored
+from ..io.store import Mesh
+from ..jobs.frame_reconstructor import Outcome
+from ..jobs.inputs import Inputs
+from ..jobs.result_folder import ResultFolder
+from .loop import Seen
+
+IMAGES, TIMES = "images", "times.csv"
+COLUMNS = ("name", "time", "latency")
+
+
+class Recording:
+    """A new folder of results of a stream: `with Recording(folder, mesh) as recording`, `recording.keep(seen)`.
+
+    The folder holds `images/NAME.png` (`.tiff` where 16 bits do not hold the values), NAME.npz, mesh.npz and summary.csv as of
+    `torchmembrane reconstruct`, and times.csv: `name`, `time` of the capture (seconds since 1970) and `latency` (seconds). NAME
+    is the number of the capture.
+
+    Args:
+        folder: new or empty.
+        mesh: what the frames share.
+
+    Raises:
+        MembraneError: the folder holds something.
+    """
+
+    def __init__(self, folder: Path, mesh: Mesh):
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise MembraneError(f"--record {folder}: holds something already; expected a new folder, one per recording")
+        self.folder = folder
+        self._results = ResultFolder(folder, mesh, Inputs([], []), WHOLE, False, print)
+
+    def __enter__(self) -> "Recording":
+        self._results.__enter__()
+        (self.folder / IMAGES).mkdir()
+        self._times = open(self.folder / TIMES, "w", newline="", encoding="utf-8", buffering=1)
+        csv.writer(self._times).writerow(COLUMNS)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self._times.close()
+        self._results.__exit__(kind, error, traceback)
+
+    def keep(self, seen: Seen) -> None:
+        """Write a frame."""
+        path = write_as_taken(self.folder / IMAGES / seen.name, seen.image)
+        stored = Stored(seen.frame, Origin.of(path), seen.latency)
+        self._results.keep(Outcome(seen.name, path, stored))
+        csv.writer(self._times).writerow((seen.name, f"{seen.time:.6f}", f"{seen.latency:.6f}"))
+
+
+def times_of(folder: Path) -> dict[str, float]:
+    """When the frames of a recording were captured, seconds since 1970, by name; nothing of other folders."""
+    path = folder / TIMES
+    if not path.exists():
+        return {}
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))[1:]
+    return {row[0]: float(row[1]) for row in rows if len(row) == len(COLUMNS)}

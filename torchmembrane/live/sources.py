@@ -1,0 +1,119 @@
+"""Images as they come: of a camera, or of files at a pace."""
+
+import time
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import MembraneError
+from ..io.images import read_image
+from ..io.optional import load_opencv, load_pyav
+from ..jobs.inputs import find_inputs
+
+MOST_MISSED = 100
+"""Reads of a camera that fail in a row before it is given up."""
+BREATH = 0.01
+"""Seconds between them."""
+
+
+class Timed(NamedTuple):
+    """An image of a recording, and when it is due: seconds since the recording's beginning."""
+
+    due: float
+    image: np.ndarray
+
+
+def camera_images(camera: int | str, size: tuple[int, int]) -> Iterator[np.ndarray]:
+    """The images of a camera by OpenCV, RGB `[height, width, 3]` uint8, without end.
+
+    Args:
+        camera: its number, or the path or address of a stream that OpenCV opens.
+        size: width and height that are asked for and expected, px.
+
+    Raises:
+        MembraneError: OpenCV is missing or cannot open it; it gives images of another size, or none any more.
+    """
+    cv2 = load_opencv("cameras need OpenCV")
+    opened = cv2.VideoCapture(camera)
+    if not opened.isOpened():
+        raise MembraneError(f"--camera {camera}: cannot be opened; expected a camera's number, 0 the first, or its path")
+    opened.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+    opened.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+    return _read(opened, camera, size)
+
+
+def _read(opened: Any, camera: int | str, size: tuple[int, int]) -> Iterator[np.ndarray]:
+    missed = 0
+    try:
+        while missed < MOST_MISSED:
+            taken, image = opened.read()
+            if taken:
+                missed = 0
+                yield _checked(image[..., ::-1], size, f"--camera {camera}")
+            else:
+                missed += 1
+                time.sleep(BREATH)
+        raise MembraneError(f"--camera {camera}: no image in {missed} reads; is it unplugged, or used by another program?")
+    finally:
+        opened.release()
+
+
+def video_images(path: Path, size: tuple[int, int], rate: float | None) -> Iterator[Timed]:
+    """The pictures of a video, RGB `[height, width, 3]` uint8, due at its own pace or at `rate`, Hz.
+
+    Raises:
+        MembraneError: PyAV is missing; the file is no video, damaged, or of another size.
+    """
+    av = load_pyav()
+    if not path.is_file():
+        raise MembraneError(f"--video {path}: no such file; expected a video")
+    try:
+        with av.open(str(path)) as container:
+            own = float(container.streams.video[0].average_rate or 1)
+            for number, picture in enumerate(container.decode(video=0)):
+                due = number / rate if rate else number / own if picture.time is None else picture.time
+                yield Timed(due, _checked(picture.to_ndarray(format="rgb24"), size, f"--video {path}"))
+    except (av.FFmpegError, IndexError) as error:
+        raise MembraneError(f"--video {path}: not readable as a video ({error}); expected one that FFmpeg decodes") from error
+
+
+def folder_images(folder: Path, size: tuple[int, int], rate: float) -> Iterator[Timed]:
+    """The images of a folder in name order, grey `[height, width]` in 0..1, due at `rate`, Hz.
+
+    One that cannot be read is left out, with a warning.
+
+    Raises:
+        MembraneError: the folder holds no images.
+    """
+    for number, path in enumerate(find_inputs([folder]).images):
+        try:
+            yield Timed(number / rate, read_image(path, size))
+        except MembraneError as error:
+            warnings.warn(f"{error}; left out", stacklevel=2)
+
+
+def paced(images: Iterable[Timed]) -> Iterator[np.ndarray]:
+    """Images when they are due; those that come too late are given at once.
+
+    Example:
+        >>> [image.item() for image in paced(Timed(0.001 * k, np.array(k)) for k in range(3))]
+        [0, 1, 2]
+    """
+    start = None
+    for due, image in images:
+        start = time.monotonic() - due if start is None else start
+        time.sleep(max(0.0, start + due - time.monotonic()))
+        yield image
+
+
+def _checked(image: np.ndarray, size: tuple[int, int], source: str) -> np.ndarray:
+    height, width = image.shape[:2]
+    if (width, height) != size:
+        raise MembraneError(
+            f"{source}: images of {width} x {height} px; expected the sensor's {size[0]} x {size[1]}: choose that mode of the "
+            "camera, or say in the file's [camera] how its mode crops or bins"
+        )
+    return image

@@ -1,0 +1,96 @@
+"""What turns a stream's images into results, one after another: torch, or an exported model."""
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from ..errors import MembraneError
+from ..io.optional import load_edge
+from ..io.results import Frame, completed
+from ..io.store import Mesh, Settings
+from ..reconstruct import Reconstructor
+from ..track import Tracker
+
+
+class Stream(Protocol):
+    """Called with an image `[height, width]` or `[height, width, 3]` RGB and its time, seconds; gives the frame's arrays.
+
+    Attributes:
+        mesh: what the frames share.
+    """
+
+    mesh: Mesh
+
+    def __call__(self, image: np.ndarray, time: float) -> Frame: ...
+
+    def rezero(self) -> None:
+        """Take the latest frame for rest."""
+
+
+class TrackedStream:
+    """By a `Tracker`.
+
+    Example:
+        >>> import torchmembrane as tm
+        >>> reconstructor = tm.Reconstructor.from_file("examples/sensor.toml")
+        >>> stream = TrackedStream(reconstructor)
+        >>> frame = stream(reconstructor.read("examples/press_on_axis.png"), 0.0)
+        >>> int(frame["status"]), frame["wrench"].shape
+        (0, (6,))
+    """
+
+    def __init__(self, reconstructor: Reconstructor):
+        self.tracker = Tracker(reconstructor)
+        self.mesh = Mesh.of(reconstructor, Settings.of(reconstructor, "npz"))
+
+    def __call__(self, image: np.ndarray, time: float) -> Frame:
+        return self.tracker(image, time=time).frame(0)
+
+    def rezero(self) -> None:
+        """Take the latest frame for rest.
+
+        Raises:
+            MembraneError: there is none, or it does not show the markers.
+        """
+        self.tracker.rezero()
+
+
+class ModelStream:
+    """By a model of `torchmembrane export`, run by onnxruntime; one that tracks starts each frame from the one before.
+
+    Args:
+        path: of the model.
+        sensor: the fingerprint that it must have been exported from.
+        threads: of onnxruntime.
+
+    Raises:
+        MembraneError: torchmembrane-edge is missing; no model, or that of another sensor.
+    """
+
+    def __init__(self, path: Path, sensor: str, threads: int = 1):
+        edge = load_edge()
+        try:
+            self._session = edge.Session(path, threads)
+        except edge.EdgeError as error:
+            raise MembraneError(f"--model {error}") from error
+        known = self._session.mesh
+        if known["sensor"] != sensor:
+            raise MembraneError(
+                f"--model {path}: of another sensor, {known['name']!r} ({known['sensor'][:12]}, here {sensor[:12]}); expected "
+                "one that `torchmembrane export` made of this sensor file"
+            )
+        self.mesh = Mesh(**{key: value for key, value in known.items() if key in Mesh._fields})
+        self._before: dict[str, np.ndarray] | None = None
+
+    def __call__(self, image: np.ndarray, time: float) -> Frame:
+        self._before = self._session.run(image[None], self._before)
+        return completed({key: values[0] for key, values in self._before.items()})
+
+    def rezero(self) -> None:
+        """Refused.
+
+        Raises:
+            MembraneError: always: the rest state is baked into a model.
+        """
+        raise MembraneError("rezero: an exported model has its rest state baked in; leave --model out, or export it again")

@@ -1,0 +1,101 @@
+"""Figures one after another as a film: a video, or an animated GIF."""
+
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from ..errors import MembraneError
+from ..io.atomic import whole_file
+from ..io.optional import load_pyav
+
+VIDEOS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
+COLOURS = 64
+"""Of a GIF."""
+
+
+def picture_of(drawing: Figure) -> np.ndarray:
+    """A figure's pixels, RGB `[height, width, 3]` uint8.
+
+    Example:
+        >>> picture_of(Figure(figsize=(2, 1), dpi=100)).shape
+        (100, 200, 3)
+    """
+    canvas = FigureCanvasAgg(drawing)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def check_film(path: Path) -> None:
+    """Refuse a name that is neither a video's nor a GIF's, or a video that cannot be written for want of PyAV.
+
+    Raises:
+        MembraneError: another ending, or PyAV is not installed.
+    """
+    if path.suffix.lower() not in (".gif", *VIDEOS):
+        raise MembraneError(f"{path}: expected a film's name, ending in .gif, {', '.join(VIDEOS)}")
+    if path.suffix.lower() != ".gif":
+        load_pyav()
+
+
+def write_film(path: str | Path, pictures: Iterable[np.ndarray], rate: float, last: float = 0.0) -> None:
+    """Write pictures as a film, whole or not at all.
+
+    Args:
+        path: `.gif`, or a video (H.264): `.mp4`, `.mov`, `.mkv`; its folder is made if need be.
+        pictures: RGB `[height, width, 3]` uint8, one at least, all of the first one's size.
+        rate: pictures per second.
+        last: seconds for which the last one stays longer, in a GIF, before it begins again.
+
+    Raises:
+        MembraneError: another ending, no picture, one of another size, or PyAV is not installed.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     write_film(f"{folder}/grey.gif", [np.full((8, 8, 3), 60 * k, np.uint8) for k in range(3)], rate=10)
+        ...     Image.open(f"{folder}/grey.gif").n_frames
+        3
+    """
+    path = Path(path)
+    check_film(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    checked = _checked(path, iter(pictures))
+    with whole_file(path) as partial:
+        if path.suffix.lower() == ".gif":
+            _write_gif(partial, checked, rate, last)
+        else:
+            _write_video(partial, VIDEOS[path.suffix.lower()], checked, rate)
+
+
+def _checked(path: Path, pictures: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    first = next(pictures, None)
+    if first is None:
+        raise MembraneError(f"{path}: no pictures; expected one at least")
+    for picture in chain([first], pictures):
+        if picture.shape != first.shape:
+            raise MembraneError(f"{path}: a picture {list(picture.shape)} after one {list(first.shape)}; expected one size")
+        yield picture
+
+
+def _write_gif(path: Path, pictures: Iterator[np.ndarray], rate: float, last: float) -> None:
+    frames = [Image.fromarray(picture).quantize(COLOURS, dither=Image.Dither.NONE) for picture in pictures]
+    times = [1000 / rate] * (len(frames) - 1) + [1000 / rate + 1000 * last]
+    frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], duration=times, loop=0, optimize=True)
+
+
+def _write_video(path: Path, container_format: str, pictures: Iterator[np.ndarray], rate: float) -> None:
+    av, first = load_pyav(), next(pictures)
+    height, width = (size - size % 2 for size in first.shape[:2])  # H.264 takes even sizes
+    with av.open(str(path), "w", format=container_format) as container:
+        track = container.add_stream("h264", rate=Fraction(rate).limit_denominator(1000))
+        track.width, track.height, track.pix_fmt = width, height, "yuv420p"
+        for picture in chain([first], pictures):
+            even = np.ascontiguousarray(picture[:height, :width])
+            container.mux(track.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
+        container.mux(track.encode())
