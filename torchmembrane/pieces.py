@@ -140,7 +140,7 @@ def unless(done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[An
 def mended(
     done: Any, values: Sequence[Any], again: Callable[..., Sequence[Any]], given: Sequence[Any], chosen: Callable[..., Any]
 ) -> Sequence[Any]:
-    """Take `values` in the rows where `done` holds, else what `again(*given)` gives.
+    """Take `values` in the rows where `done` holds, else what `chosen` makes of them and of what `again(*given)` gives.
 
     Tensors: nothing is worked out where all is done, and only the rows that are not where some are; a compiled graph, and a
     device that would have to be waited for, take `values`. A graph works all rows out if one is not done.
@@ -150,7 +150,7 @@ def mended(
         values: what there is, each `[B, ...]`.
         again: gives values of the same number and shapes.
         given: what it needs, each `[B, ...]` or None.
-        chosen: a piece, `chosen(done, values, others)`: `values` where `done` holds, else `others`.
+        chosen: a piece, `chosen(done, values, others)`: `values` where `done` holds, else what is taken of the others.
     """
     if _graph(values) is not None:
         return unless(done, values, lambda: chosen(done, values, again(*given)))
@@ -158,7 +158,8 @@ def mended(
         return values
     rows = (~done).nonzero().ravel()
     others = again(*(None if one is None else one[rows] for one in given))
-    return [value.index_copy(0, rows, other) for value, other in zip(values, others, strict=True)]
+    taken = chosen(done[rows], [value[rows] for value in values], others)
+    return [value.index_copy(0, rows, other) for value, other in zip(values, taken, strict=True)]
 
 
 def at_hand(done: torch.Tensor) -> bool:

@@ -121,11 +121,23 @@ class Descent(nn.Module):
         move, rise = self._bordered_step(x, pressure, loads, solved, corner)
         turn = motion.following(move)
         move = move.unflatten(-1, (3, -1)).mT
-        longest = torch.linalg.vector_norm(move, dim=-1).amax(-1)
-        cap = self.settings.longest_step * self.membrane.size
-        share = (cap / longest.clamp_min(torch.finfo(x.dtype).tiny)).clamp_max(1.0)
-        x = x + pad_border(share[:, None, None] * move, self.membrane.grid)
+        move = pad_border(move, self.membrane.grid)
+        share = self._share(x, move)
+        x = x + share[:, None, None] * move
         return State(x, pressure + share * rise, moved + share[:, None] * turn), made
+
+    def _share(self, x: Tensor, move: Tensor) -> Tensor:
+        """Of a step `move [B, V, 3]`, so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
+        settings, tiny = self.settings, torch.finfo(x.dtype).tiny
+        far = torch.linalg.vector_norm(move, dim=-1).amax(-1) / (settings.longest_step * self.membrane.size)
+        for axis in (1, 2):
+            change, edge = (
+                torch.linalg.vector_norm(field.unflatten(1, self.membrane.grid).diff(dim=axis), dim=-1) for field in (move, x)
+            )
+            stretch = (change / edge.clamp_min(tiny)).flatten(1).amax(-1)
+            far = torch.maximum(far, stretch / settings.largest_stretch)
+        share: Tensor = 1 / far.clamp_min(1.0)
+        return share
 
     def _bordered_step(
         self, x: Tensor, pressure: Tensor, loads: Tensor, solved: Tensor, corner: tuple[Tensor, Tensor]

@@ -197,7 +197,7 @@ class ForceBalance(nn.Module):
         previous frame's."""
         measured = self.equations.bearings.measured(observation)
         found = self._solved(measured, None if start is None else State(*start))
-        again = mended(self.is_converged(found), found, self._patiently, measured, self.chosen)
+        again = mended(self.is_settled(found), found, self._patiently, measured, self.chosen)
         return Equilibrium(*again)
 
     def _patiently(self, *measured: Any) -> Equilibrium:
@@ -206,9 +206,18 @@ class ForceBalance(nn.Module):
 
     @piece
     def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
-        """`values` in the rows where `done [B]` holds, else `others`."""
-        rows = [done.reshape(-1, *(1,) * (value.ndim - 1)) for value in values]
-        return Equilibrium(*(torch.where(*each) for each in zip(rows, values, others, strict=True)))
+        """`values` in the rows where `done [B]` holds, else `others`; one that moves still is as far from its end as both tries
+        are apart."""
+        first, second = Equilibrium(*values), Equilibrium(*others)
+        apart = self._distance(second.vertices, first.vertices.nan_to_num())
+        step = torch.where(self.is_settled(second), second.relative_step, torch.maximum(second.relative_step, apart))
+        rows = [done.reshape(-1, *(1,) * (value.ndim - 1)) for value in first]
+        second = second._replace(relative_step=step)
+        return Equilibrium(*(torch.where(*each) for each in zip(rows, first, second, strict=True)))
+
+    def _distance(self, x: Tensor, y: Tensor) -> Tensor:
+        """Rms over the vertices, over the surface's size, `[B]`."""
+        return (x - y).square().sum(-1).mean(-1).sqrt() / self.size
 
     def _solved(self, measured: Bearings, start: State | None, patient: bool = False) -> Equilibrium:
         warm = start is not None and not self.passes_on_starts
@@ -225,8 +234,8 @@ class ForceBalance(nn.Module):
         if warm and not self.passes_on_starts:
             return settings.gnc_schedule(settings.warm_steps, settings.warm_tau)
         steps = settings.patience * self.steps if patient else self.steps
-        finer = settings.patient_tau if patient else settings.fine_tau
-        return settings.gnc_schedule(steps, settings.tau if self.coarse is None else finer)
+        coarsest, finer = (settings.patient_tau, settings.patient_fine_tau) if patient else (settings.tau, settings.fine_tau)
+        return settings.gnc_schedule(steps, coarsest if self.coarse is None else finer)
 
     @piece
     def at_rest(self, confidence: Tensor) -> State:
@@ -251,8 +260,7 @@ class ForceBalance(nn.Module):
     @piece
     def equilibrium(self, x: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
         """What this state amounts to; `before`: the surface a step earlier."""
-        membrane, loss = self.membrane, self.equations.loss
-        step = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
+        membrane, loss, step = self.membrane, self.equations.loss, self._distance(x, before)
         traction = self.equations.forces(x, pressure) / membrane.rest_area[:, None]
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
         scale = loss.contact_scale(*within, measured.noise_level)
@@ -266,6 +274,12 @@ class ForceBalance(nn.Module):
         error = self.cavity.volume_error(found.volume, found.pressure).abs()
         settings = self.settings
         return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
+
+    @piece
+    def is_settled(self, found: Equilibrium) -> Tensor:
+        """`[B]` bool: neither unfinished nor unexplained, so that more steps would change little."""
+        settled = found.relative_step < self.settings.settled_step
+        return settled & self.is_converged(found) & self.is_explained(found)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the markers are off their rays by no more than their noise and the model's error."""

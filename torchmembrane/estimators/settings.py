@@ -23,8 +23,10 @@ class ForceBalanceSettings:
         tau: first and last scale of the compressive traction's loss, from rest.
         fine_tau: the same, from a coarser grid's solution.
         warm_tau: the same, from the solution of the frame before.
-        patience: so many times the steps, from rest, where these do not converge.
-        patient_tau: as `fine_tau`, then.
+        patience: so many times the steps, from rest, where these do not settle.
+        patient_tau: as `tau`, then.
+        patient_fine_tau: as `fine_tau`, then.
+        settled_step: rms of the last step of a solution that is not solved again.
         camera_motion: of the camera against the rim, px: what is less is nothing, what is more costs hardly more; as tau ends.
         decline: share of the steps over which tau declines.
         sparsity: twice the loss of the compressive traction p0 on the whole surface, while it is quadratic.
@@ -45,6 +47,7 @@ class ForceBalanceSettings:
         pressure_noise: standard deviation of a measured pressure, over the reference traction (mostly the rest pressure); a
             better gauge is best told to be as good as this.
         longest_step: largest step of a vertex.
+        largest_stretch: by how much of its length an edge of the grid changes in a step at most.
         damping: share of a step's matrix' diagonal that is added to it as tau ends; it falls with tau's square.
         coarsest: fewest lines of a coarser grid.
         coarsest_warm: fewest lines of a coarser grid that is given the solution of the frame before.
@@ -68,7 +71,9 @@ class ForceBalanceSettings:
     fine_tau: tuple[float, float] = (0.8, 0.4)
     warm_tau: tuple[float, float] = (0.8, 0.4)
     patience: int = 3
-    patient_tau: tuple[float, float] = (2.0, 0.4)
+    patient_tau: tuple[float, float] = (16.0, 0.4)
+    patient_fine_tau: tuple[float, float] = (2.0, 0.4)
+    settled_step: float = 1e-3
     camera_motion: float = 0.005
     decline: float = 0.6
     sparsity: float = 6400.0
@@ -88,6 +93,7 @@ class ForceBalanceSettings:
     outlier: float = 5.0
     pressure_noise: float = 0.01
     longest_step: float = 0.04
+    largest_stretch: float = 0.3
     damping: float = 1e-6
     coarsest: int = 9
     coarsest_warm: int = 13

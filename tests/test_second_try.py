@@ -1,0 +1,106 @@
+"""When force balance solves a frame a second time, what it takes of both tries, and how far a step goes."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.descent import State
+from torchmembrane.estimators.force_balance import ForceBalance
+from torchmembrane.estimators.settings import ForceBalanceSettings
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
+from torchmembrane.pieces import mended
+from torchmembrane.surface.membrane import Membrane
+from torchmembrane.surface.shapes import spherical_cap
+
+SETTINGS = ForceBalanceSettings()
+DOME = spherical_cap(12, 9, 3, (17, 17))
+
+
+def estimator(**changes) -> ForceBalance:
+    positions = spherical_cap(12, 9, 3, (13, 13)).rest[~spherical_cap(12, 9, 3, (13, 13)).fixed]
+    material = ElasticEnergy(DOME, "neo_hookean", 1.3)
+    markers = DOME.closest_points(positions.numpy())
+    return ForceBalance(DOME, material, markers, positions, noise=1e-3, settings=replace(SETTINGS, **changes))
+
+
+def seen(positions: torch.Tensor) -> Observation:
+    directions = torch.nn.functional.normalize(positions, dim=-1)
+    return Observation(torch.zeros_like(directions), directions, torch.ones_like(directions[..., 0]))
+
+
+@pytest.fixture(scope="module")
+def dented() -> Observation:
+    """Two frames: at rest, and markers drawn to one side by up to a tenth of the dome's size."""
+    rest = estimator().equations.bearings.positions
+    drawn = 0.1 * DOME.size * torch.exp(-((rest - rest[30]) ** 2).sum(-1) / 16)
+    return seen(torch.stack([rest, rest + drawn[:, None] * torch.tensor([1.0, 0.0, 0.0], dtype=rest.dtype)]))
+
+
+def edges(x: torch.Tensor, membrane: Membrane) -> torch.Tensor:
+    grid = x.unflatten(1, membrane.grid)
+    return torch.cat([grid.diff(dim=axis).flatten(1, 2) for axis in (1, 2)], 1)
+
+
+@pytest.mark.parametrize("tau", SETTINGS.tau)
+def test_a_step_changes_no_edge_by_more_than_its_share(dented, tau):
+    one = estimator()
+    measured = one.equations.bearings.measured(dented)
+    x = one.membrane.rest + 0.3 * torch.randn(
+        2, *one.membrane.rest.shape, generator=torch.Generator().manual_seed(0)
+    ).double() * (~one.membrane.fixed[:, None])
+    start = State(x, *one.at_rest(measured.weight)[1:])
+    after = one.descent.step(start, measured, torch.tensor(tau), torch.tensor(50.0))[0]
+    before, now = edges(x, DOME), edges(after.x, DOME)
+    share = ((now - before).norm(dim=-1) / before.norm(dim=-1)).amax(-1)
+    assert (share < SETTINGS.largest_stretch * (1 + 1e-6)).all() and (share > 0.01).all()
+
+
+def test_frames_that_settle_keep_their_first_solution_others_are_solved_patiently_from_rest(dented):
+    kept, again = (
+        estimator(settled_step=1e9, largest_misfit=1e9, largest_relative_step=1e9, largest_volume_error=1e9),
+        estimator(settled_step=0.0),
+    )
+    measured = kept.equations.bearings.measured(dented)
+    torch.testing.assert_close(kept(dented).vertices, kept._solved(measured, None).vertices)
+    torch.testing.assert_close(again(dented).vertices, again._patiently(*measured).vertices)
+    assert (kept(dented).vertices - again(dented).vertices)[1].abs().max() > 1e-4
+
+
+def test_what_broke_down_or_is_unexplained_has_not_settled(dented):
+    one = estimator()
+    found = one(dented)._replace(relative_step=torch.tensor([0.0, 0.0], dtype=torch.float64), misfit=torch.zeros(2).double())
+    found = found._replace(volume=one.cavity.rest_volume.expand(2), pressure=one.rest_pressure.expand(2))
+    assert one.is_settled(found).tolist() == [True, True]
+    assert one.is_settled(found._replace(misfit=torch.tensor([0.0, 9.0]))).tolist() == [True, False]
+    assert one.is_settled(found._replace(relative_step=torch.tensor([torch.nan, 1.5e-3]))).tolist() == [False, False]
+
+
+def test_a_second_try_that_moves_still_has_converged_only_beside_the_first(dented):
+    """Four frames: done; settled; moving still where the first was; moving still elsewhere."""
+    one = estimator()
+    found = one(dented)
+    first = type(found)(*(value[:1].repeat(4, *[1] * (value.ndim - 1)) for value in found))
+    first = first._replace(volume=one.membrane.volume(first.vertices), misfit=torch.zeros(4).double())
+    away = first.vertices.clone()
+    away[[1, 3]] += 0.1 * DOME.size
+    still = torch.tensor([0.0, 0.0, 1.5e-3, 1.5e-3], dtype=torch.float64)
+    second = first._replace(vertices=away, relative_step=still)
+    taken = one.chosen(torch.tensor([True, False, False, False]), first, second)
+    assert taken.relative_step[1:3].tolist() == [0.0, 1.5e-3] and taken.relative_step[3] > 0.05
+    torch.testing.assert_close(taken.vertices, torch.cat([first.vertices[:1], away[1:]]))
+
+
+def test_only_rows_that_are_not_done_are_worked_out_again():
+    asked = []
+
+    def again(x):
+        asked.append(x.tolist())
+        return (10 * x,)
+
+    done = torch.tensor([True, False, True])
+    (taken,) = mended(
+        done, (torch.arange(3.0),), again, (torch.arange(3.0),), lambda _, values, others: (values[0] + others[0],)
+    )
+    assert asked == [[1.0]] and taken.tolist() == [0.0, 11.0, 2.0]
