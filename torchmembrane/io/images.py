@@ -43,10 +43,24 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndar
         >>> image.shape, str(image.dtype), float(image.max()) <= 1
         ((480, 640), 'float32', True)
     """
-    with _opened(path) as (image, content):
+    return decode_image(_content(path), path, size)
+
+
+def decode_image(content: bytes, name: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """The grey values of an image file's content, as `read_image` gives them.
+
+    Args:
+        content: of a PNG, JPEG, BMP, TIFF or WebP file.
+        name: what an error calls it.
+        size: width and height that it must have, px.
+
+    Raises:
+        MembraneError: as `read_image`.
+    """
+    with _opened(name, content) as image:
         if size is not None and image.size != size:
             raise MembraneError(
-                f"{path}: the image is {image.width} x {image.height} px, expected {size[0]} x {size[1]}: use images of this "
+                f"{name}: the image is {image.width} x {image.height} px, expected {size[0]} x {size[1]}: use images of this "
                 "sensor's camera; where its mode crops or bins them, say so in the file's [camera]"
             )
         image.load()
@@ -67,23 +81,26 @@ def image_size(path: str | Path) -> tuple[int, int]:
         >>> image_size("examples/rest.png")
         (640, 480)
     """
-    with _opened(path) as (image, _):
+    with _opened(path, _content(path)) as image:
         return image.size
 
 
-@contextmanager
-def _opened(path: str | Path) -> Iterator[tuple[Image.Image, bytes]]:
-    """An image whose header is read, and its file's content; whatever fails inside is an error that names the file."""
-    path, expected = Path(path), "a whole PNG, JPEG or TIFF"
+def _content(path: str | Path) -> bytes:
     try:
-        content = read_bytes(path, MOST_IMAGE_BYTES, "a readable image file")
+        return read_bytes(Path(path), MOST_IMAGE_BYTES, "a readable image file")
     except MembraneError as error:
         raise MembraneError(str(error).replace("no such file", "no such image")) from error
+
+
+@contextmanager
+def _opened(path: str | Path, content: bytes) -> Iterator[Image.Image]:
+    """An image whose header is read, from its file's content; whatever fails inside is an error that names the file."""
+    expected = "a whole PNG, JPEG or TIFF"
     try:
         with Image.open(io.BytesIO(content), formats=FORMATS) as image:
             if image.width * image.height > MOST_PIXELS:
                 raise ValueError(f"{image.width} x {image.height} px; at most {MOST_PIXELS} px are read")
-            yield image, content
+            yield image
     except MembraneError as error:
         raise MembraneError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     except (*DAMAGE, Image.DecompressionBombError) as error:

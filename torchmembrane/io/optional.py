@@ -79,6 +79,16 @@ def load_rerun() -> Any:
     return _load("rerun", "its viewer needs rerun-sdk", "rerun")
 
 
+def load_rosbags() -> tuple[Any, Any]:
+    """The modules `rosbags.highlevel` and `rosbags.rosbag2`.
+
+    Raises:
+        MembraneError: rosbags is not installed.
+    """
+    _load("rosbags", "bags of ROS 2 need rosbags", "ros")
+    return import_module("rosbags.highlevel"), import_module("rosbags.rosbag2")
+
+
 def _load(module: str, purpose: str, extra: str) -> Any:
     try:
         return import_module(module)

@@ -1,0 +1,135 @@
+"""ROS 2 messages and what they say here: images to grey values, results to fields in N, N m, m and Pa.
+
+A message is whatever has the fields of its type, of a bag (rosbags) or of a live system (rclpy). Frames are the camera's: its
+optical frame, x right, y down, z forward.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..camera.model import Camera
+from ..errors import MembraneError
+from ..io.images import decode_image, to_grey
+from ..io.results import Frame
+from ..io.status import Status
+from ..io.store import Mesh
+from ..sensor.parts import METRE
+from ..sensor.sensor import Sensor
+
+CHANNELS = {
+    **{"mono8": (np.uint8, 1, [0]), "8UC1": (np.uint8, 1, [0]), "mono16": (np.uint16, 1, [0]), "16UC1": (np.uint16, 1, [0])},
+    **{"rgb8": (np.uint8, 3, [0, 1, 2]), "bgr8": (np.uint8, 3, [2, 1, 0]), "8UC3": (np.uint8, 3, [2, 1, 0])},
+    **{"rgba8": (np.uint8, 4, [0, 1, 2]), "bgra8": (np.uint8, 4, [2, 1, 0]), "rgb16": (np.uint16, 3, [0, 1, 2])},
+    **{"bgr16": (np.uint16, 3, [2, 1, 0])},
+}
+"""Of an image's encoding: the type of a value, values of a pixel, and which of them are grey, or red, green and blue."""
+POINT_FIELDS = ("x", "y", "z", "normal_traction", "shear_x", "shear_y", "shear_z")
+"""Of a vertex, each float32: place, m; compressive normal traction and shear traction on the membrane, Pa."""
+SAME = 0.01
+"""Of the focal length: by how much a CameraInfo's intrinsics may differ before it is said."""
+LENSES = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
+
+
+def grey_of(message: Any, size: tuple[int, int]) -> np.ndarray:
+    """Grey values `[height, width]` in 0..1 of a `sensor_msgs/Image` or `CompressedImage`.
+
+    Args:
+        message: the message.
+        size: width and height that it must have, px.
+
+    Raises:
+        MembraneError: another size, an encoding without a grey or colour value for every pixel, or a damaged image.
+    """
+    if not hasattr(message, "encoding"):
+        return decode_image(bytes(message.data), f"an image of format {message.format!r}", size)
+    if message.encoding not in CHANNELS:
+        raise MembraneError(f"image of encoding {message.encoding!r}; expected one of {', '.join(CHANNELS)}")
+    kind, values, colours = CHANNELS[message.encoding]
+    if (message.width, message.height) != size:
+        raise MembraneError(f"the image is {message.width} x {message.height} px, the sensor's {size[0]} x {size[1]}")
+    item = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+    rows, line = np.frombuffer(bytes(message.data), np.uint8), message.width * values * item.itemsize
+    if message.step < line or len(rows) < message.step * message.height:
+        raise MembraneError(f"the image has {len(rows)} bytes in lines of {message.step}; expected {message.height} of {line}")
+    lines = rows[: message.step * message.height].reshape(message.height, message.step)[:, :line]
+    pixels = np.ascontiguousarray(lines).view(item).reshape(message.height, message.width, values).astype(kind)
+    return to_grey(pixels[..., 0] if len(colours) == 1 else pixels[..., colours])
+
+
+def unlike(info: Any, camera: Camera) -> str | None:
+    """What a `sensor_msgs/CameraInfo` says otherwise than the sensor file, in words; None: nothing, or it is not calibrated.
+
+    Raises:
+        MembraneError: it is of images of another size.
+    """
+    width, height = camera.image_size
+    if (info.width, info.height) != (width, height):
+        raise MembraneError(f"CameraInfo is of images of {info.width} x {info.height} px, the sensor file of {width} x {height}")
+    matrix = np.asarray(info.k, float).reshape(3, 3)
+    if matrix[0, 0] == 0:
+        return None
+    found = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    expected = np.array([*camera.focal, *camera.centre], float)
+    lens = LENSES.get(info.distortion_model, camera.model)
+    if lens == camera.model and (abs(found - expected) <= SAME * expected[:2].max()).all():
+        return None
+    return (
+        f"CameraInfo has a {lens} lens, focal {np.round(found[:2], 1).tolist()} and centre {np.round(found[2:], 1).tolist()} px, "
+        f"the sensor file {camera.model}, {np.round(expected[:2], 1).tolist()} and {np.round(expected[2:], 1).tolist()}, which is "
+        "used"
+    )
+
+
+class Wrench(NamedTuple):
+    """Fields of a `geometry_msgs/Wrench`: `force [3]`, N, and `torque [3]` about the camera's centre of projection, N m."""
+
+    force: np.ndarray
+    torque: np.ndarray
+
+
+class SiUnits:
+    """A sensor's results in N, N m, m and Pa.
+
+    Args:
+        mesh: of the results.
+        gas_pressure: `Sensor.gas_pressure`.
+
+    Raises:
+        MembraneError: its forces are relative.
+    """
+
+    def __init__(self, mesh: Mesh, gas_pressure: float | None = None):
+        if mesh.force_unit != "N":
+            raise MembraneError(
+                f"forces of {mesh.name} are relative, messages are in newtons: add shear_modulus and thickness to the sensor "
+                "file, or find them by `torchmembrane calibrate material --weight`"
+            )
+        self.metre = METRE[mesh.length_unit]
+        self.gas_pressure = gas_pressure
+
+    @classmethod
+    def of(cls, sensor: Sensor, mesh: Mesh) -> "SiUnits":
+        """Of a sensor's results."""
+        return cls(mesh, sensor.gas_pressure)
+
+    def wrench(self, frame: Frame) -> Wrench:
+        """Of what touches the membrane, on it."""
+        return Wrench(frame["wrench"][:3].astype(float), frame["wrench"][3:].astype(float) / self.metre)
+
+    def points(self, frame: Frame) -> np.ndarray:
+        """`[V, 7]` float32: `POINT_FIELDS` of every vertex."""
+        traction, normals = frame["traction"] * self.metre**2, frame["normals"]
+        along = (traction * normals).sum(-1, keepdims=True)
+        return np.hstack([frame["vertices"] / self.metre, -along, traction - along * normals]).astype(np.float32)
+
+    def pressure(self, frame: Frame) -> float | None:
+        """Of the gas, absolute, Pa; None of a sensor without one."""
+        if self.gas_pressure is None:
+            return None
+        return (self.gas_pressure + float(frame["pressure_change"])) * self.metre**2
+
+
+def has_wrench(frame: Frame) -> bool:
+    """Whether a frame has a surface, and so messages."""
+    return Status(int(frame["status"])).has_surface
