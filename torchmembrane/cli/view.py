@@ -15,6 +15,7 @@ examples:
   torchmembrane view results/press.npz --image press.png
   torchmembrane view results --frame press          # of a folder of either format; without --frame its first
   torchmembrane view results/frames/part-00000.parquet
+  torchmembrane view results --frame press --ply press.ply   # the contact as a point cloud, nothing drawn
 
 Without --out a window is opened; without a display, NAME_view.png is written beside the results."""
 
@@ -27,6 +28,7 @@ def add_parser(commands: Any) -> None:
     add("--mesh", metavar="mesh.npz", type=Path, help="the mesh of its folder (default: mesh.npz beside it)")
     add("--image", metavar="IMAGE", type=Path, help="the frame's image, drawn behind the flow")
     add("--out", metavar="FILE.png", type=Path, help="where to draw it (default: in a window, if there is a display)")
+    add("--ply", metavar="FILE.ply", type=Path, help="write the touched vertices as a point cloud, and draw nothing")
 
 
 def run(arguments: Namespace) -> int:
@@ -34,11 +36,15 @@ def run(arguments: Namespace) -> int:
     from ..errors import MembraneError
     from ..io.images import read_image
     from ..io.read import read_frame
+    from ..io.results import save_contact_cloud
     from ..io.store import MESH, Mesh
     from ..plot.drawing import save, show
     from ..plot.frames import figure
 
     name, frame, home = read_frame(arguments.result, arguments.frame)
+    if arguments.ply:
+        print(f"{name}: {save_contact_cloud(arguments.ply, frame)} points of contact in {arguments.ply}")
+        return 0
     mesh = Mesh.load(arguments.mesh or home / MESH)
     vertices, expected = len(frame["vertices"]), len(mesh.rest_vertices)
     if vertices != expected:

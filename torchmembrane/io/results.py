@@ -3,7 +3,7 @@
 import struct
 import zlib
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 from zipfile import BadZipFile
 
 import numpy as np
@@ -17,11 +17,37 @@ from .origin import Origin
 
 Frame: TypeAlias = dict[str, np.ndarray]
 """One frame's arrays, as `Reconstruction.frame` gives them."""
+TOUCHED = 0.5
+"""Least `contact` of a vertex in a contact's point cloud."""
 DAMAGE = (
     *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError, ValueError),
     *(BadZipFile, struct.error, zlib.error),
 )
 """What reading a damaged file raises."""
+
+
+class RestSurface(Protocol):
+    """A rest surface, such as `sensor.membrane`: outward normals `[V, 3]`, areas `[V]` of the vertices, the grid's lines."""
+
+    @property
+    def rest_normals(self) -> Tensor: ...
+    @property
+    def rest_area(self) -> Tensor: ...
+    @property
+    def grid(self) -> tuple[int, int]: ...
+
+
+class TactileFields(NamedTuple):
+    """What a visuotactile sensor of Isaac Lab gives, under its names; the points are the vertices.
+
+    penetration_depth      [B, V]     `indentation`, zero where the membrane is not pushed in
+    tactile_normal_force   [B, V]     compressive force on a vertex
+    tactile_shear_force    [B, V, 2]  along the camera's x turned into the rest surface, and along the normal times that
+    """
+
+    penetration_depth: Tensor
+    tactile_normal_force: Tensor
+    tactile_shear_force: Tensor
 
 
 class Reconstruction(NamedTuple):
@@ -103,6 +129,45 @@ class Reconstruction(NamedTuple):
         """The push `[B, V]`, compressive normal traction, and the shear `[B, V, 3]`: `traction = shear - push normals`."""
         push = -(self.traction * self.normals).sum(-1)
         return push, self.traction + push[..., None] * self.normals
+
+    def indentation(self, rest: RestSurface) -> Tensor:
+        """How far the vertices have moved along the inward rest normals, `-displacement . rest_normals`: `[B, m, n]`, length.
+
+        Args:
+            rest: the sensor's `membrane`, on the grid of this result.
+
+        Raises:
+            MembraneError: it has another number of vertices.
+
+        Limitations:
+            Not the depth of an object below the rest surface: where the membrane slides along itself, or bulges beside a
+            contact (negative), it moves without one.
+        """
+        count, expected = len(rest.rest_normals), self.displacement.shape[-2]
+        expect(count == expected, "Reconstruction.indentation: vertices of rest", count, f"{expected}, the result's")
+        moved = -(self.displacement * rest.rest_normals.to(self.displacement)).sum(-1)
+        depth: Tensor = moved.unflatten(-1, rest.grid)
+        return depth
+
+    def tactile_fields(self, rest: RestSurface) -> TactileFields:
+        """Depths and forces of the vertices as Isaac Lab names them.
+
+        Args:
+            rest: the sensor's `membrane`, on the grid of this result.
+
+        Raises:
+            MembraneError: it has another number of vertices.
+
+        Limitations:
+            Its penetration is that of a rigid object into an undeformed pad; here it is the membrane's own indentation.
+        """
+        depth = self.indentation(rest).flatten(-2)
+        normals, area = (part.to(self.displacement) for part in (rest.rest_normals, rest.rest_area))
+        along = torch.nn.functional.normalize(normals.new_tensor([1.0, 0.0, 0.0]) - normals[:, :1] * normals, dim=-1)
+        axes = torch.stack([along, torch.linalg.cross(normals, along)], -2)
+        push = -(self.traction * normals).sum(-1)
+        shear = (axes * self.traction[..., None, :]).sum(-1)
+        return TactileFields(depth.clamp_min(0), push * area, shear * area[:, None])
 
     def wrench_in(self, pose: Pose) -> Tensor:
         """The wrench `[B, 6]` in a tool's frame: total contact force, and its moment about that frame's origin.
@@ -202,6 +267,34 @@ def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
     arrays: dict[str, Any] = frame
     with whole_file(path) as partial, open(partial, "wb") as file:
         np.savez(file, **arrays)
+
+
+def save_contact_cloud(path: str | Path, frame: Frame) -> int:
+    """Write the vertices that something touches as a point cloud, with their normals and tractions.
+
+    Args:
+        path: the file, `.ply` (ASCII), whole or not at all.
+        frame: as `Reconstruction.frame` gives it.
+
+    Returns:
+        The number of points, those with `contact` above 0.5; none where there is no contact.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> frame = Reconstruction(*torch.ones(26, 1, 2, 3)).frame(0) | {"contact": np.array([1.0, 0.0])}
+        >>> with TemporaryDirectory() as folder:
+        ...     save_contact_cloud(f"{folder}/press.ply", frame)
+        1
+    """
+    touched = frame["contact"] > TOUCHED
+    rows = np.concatenate([frame[key][touched] for key in ("vertices", "normals", "traction")], 1)
+    names = ("x", "y", "z", "nx", "ny", "nz", "traction_x", "traction_y", "traction_z")
+    properties = [f"property float {name}" for name in names]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", *properties, "end_header"]
+    lines = [" ".join(f"{value:.7g}" for value in row) for row in rows]
+    with whole_file(path) as partial:
+        Path(partial).write_text("\n".join(header + lines) + "\n")
+    return len(rows)
 
 
 def load_frame(path: str | Path) -> dict[str, np.ndarray]:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from lerobot.cameras.configs import CameraConfig, ColorMode
+
 from torchmembrane import MembraneError, Sensor
 
 

@@ -4,8 +4,9 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-import torchmembrane as tm
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+import torchmembrane as tm
 
 from .tactile import features, keys, points
 

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 import torch
-import torchmembrane as tm
 from lerobot.configs.types import FeatureType, PipelineFeatureType, PolicyFeature
 from lerobot.processor.pipeline import ObservationProcessorStep, ProcessorStepRegistry
+
+import torchmembrane as tm
 
 from .tactile import keys, points
 

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import torchmembrane as tm
 from lerobot.cameras.configs import CameraConfig
 from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -14,6 +13,8 @@ from lerobot.processor import DataProcessorPipeline
 from lerobot.processor.converters import identity_transition
 from lerobot.processor.pipeline import ProcessorStepRegistry
 from lerobot.utils.import_utils import register_third_party_plugins
+
+import torchmembrane as tm
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 SENSOR, PRESSES = EXAMPLES / "sensor.toml", ("press_on_axis", "flat_plate", "two_contacts")
