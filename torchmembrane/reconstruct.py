@@ -14,6 +14,7 @@ from .estimators.camera_motion import in_pixels, in_words, shift_of
 from .estimators.choice import ESTIMATORS, Settings, estimator_of
 from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
+from .estimators.kept_state import keep_small
 from .estimators.precision import PRECISIONS, check_precision, full_precision
 from .estimators.start import checked_previous, solved_from
 from .io.images import read_image
@@ -113,6 +114,7 @@ class Reconstructor(nn.Module):
         self.register_buffer("marker_vertices", torch.from_numpy(markers.points.vertices.astype(np.int64)))
         self.register_buffer("marker_weights", torch.from_numpy(markers.points.weights.copy()))
         self.to(dtype)
+        keep_small(self)
 
     @classmethod
     def from_file(cls, path: str | Path, estimator: str = "force-balance", **options: Any) -> "Reconstructor":

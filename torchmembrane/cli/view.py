@@ -22,6 +22,7 @@ examples:
   torchmembrane view results/frames/part-00000.parquet
   torchmembrane view results --video-out press.mp4 --images frames/        # all its frames, in name order; or press.gif
   torchmembrane view results --rerun                # likewise, in the viewer Rerun; --save press.rrd: in a file
+  torchmembrane view results --frame press --ply press.ply   # the contact as a point cloud, nothing drawn
 
 Without --out a window is opened; without a display, NAME_view.png is written beside the results."""
 DEFAULT_RATE = 10.0
@@ -41,6 +42,7 @@ def add_parser(commands: Any) -> None:
     pictures = "where the images of all frames are, by the frames' names (default: RESULT/images, as live --record has it)"
     add("--images", metavar="FOLDER", type=Path, help=pictures)
     add_rerun(add)
+    add("--ply", metavar="FILE.ply", type=Path, help="write the touched vertices as a point cloud, and draw nothing")
 
 
 def run(arguments: Namespace) -> int:
@@ -104,12 +106,16 @@ def _show(results: "Results", images: _Images, save: Path | None) -> None:
 def _draw(arguments: Namespace) -> int:
     from ..errors import MembraneError
     from ..io.images import read_image
+    from ..io.point_cloud import save_contact_cloud
     from ..io.read import read_frame
     from ..io.store import MESH, Mesh
     from ..plot.drawing import save, show
     from ..plot.frames import figure
 
     name, frame, home = read_frame(arguments.result, arguments.frame)
+    if arguments.ply:
+        print(f"{name}: {save_contact_cloud(arguments.ply, frame)} points of contact in {arguments.ply}")
+        return 0
     mesh = Mesh.load(arguments.mesh or home / MESH)
     vertices, expected = len(frame["vertices"]), len(mesh.rest_vertices)
     if vertices != expected:

@@ -65,7 +65,7 @@ def unlike(info: Any, camera: Camera) -> str | None:
     """
     width, height = camera.image_size
     if (info.width, info.height) != (width, height):
-        raise MembraneError(f"CameraInfo is of images of {info.width} x {info.height} px, the sensor file of {width} x {height}")
+        raise MembraneError(f"CameraInfo is of {info.width} x {info.height} px images, the sensor file of {width} x {height}")
     matrix = np.asarray(info.k, float).reshape(3, 3)
     if matrix[0, 0] == 0:
         return None
@@ -74,11 +74,10 @@ def unlike(info: Any, camera: Camera) -> str | None:
     lens = LENSES.get(info.distortion_model, camera.model)
     if lens == camera.model and (abs(found - expected) <= SAME * expected[:2].max()).all():
         return None
-    return (
-        f"CameraInfo has a {lens} lens, focal {np.round(found[:2], 1).tolist()} and centre {np.round(found[2:], 1).tolist()} px, "
-        f"the sensor file {camera.model}, {np.round(expected[:2], 1).tolist()} and {np.round(expected[2:], 1).tolist()}, which is "
-        "used"
+    given, used = (
+        f"focal {np.round(each[:2], 1).tolist()}, centre {np.round(each[2:], 1).tolist()}" for each in (found, expected)
     )
+    return f"CameraInfo: {lens}, {given} px; used is the sensor file: {camera.model}, {used} px"
 
 
 class Wrench(NamedTuple):

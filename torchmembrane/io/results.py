@@ -4,7 +4,7 @@ import struct
 import zlib
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 from zipfile import BadZipFile
 
 import numpy as np
@@ -23,6 +23,30 @@ DAMAGE = (
     *(BadZipFile, struct.error, zlib.error),
 )
 """What reading a damaged file raises."""
+
+
+class RestSurface(Protocol):
+    """A rest surface, such as `sensor.membrane`: outward normals `[V, 3]`, areas `[V]` of the vertices, the grid's lines."""
+
+    @property
+    def rest_normals(self) -> Tensor: ...
+    @property
+    def rest_area(self) -> Tensor: ...
+    @property
+    def grid(self) -> tuple[int, int]: ...
+
+
+class TactileFields(NamedTuple):
+    """What a visuotactile sensor of Isaac Lab gives, under its names; the points are the vertices.
+
+    penetration_depth      [B, V]     `indentation`, zero where the membrane is not pushed in
+    tactile_normal_force   [B, V]     compressive force on a vertex
+    tactile_shear_force    [B, V, 2]  along the camera's x turned into the rest surface, and along the normal times that
+    """
+
+    penetration_depth: Tensor
+    tactile_normal_force: Tensor
+    tactile_shear_force: Tensor
 
 
 class Reconstruction(NamedTuple):
@@ -104,6 +128,45 @@ class Reconstruction(NamedTuple):
         """The push `[B, V]`, compressive normal traction, and the shear `[B, V, 3]`: `traction = shear - push normals`."""
         push = -(self.traction * self.normals).sum(-1)
         return push, self.traction + push[..., None] * self.normals
+
+    def indentation(self, rest: RestSurface) -> Tensor:
+        """How far the vertices have moved along the inward rest normals, `-displacement . rest_normals`: `[B, m, n]`, length.
+
+        Args:
+            rest: the sensor's `membrane`, on the grid of this result.
+
+        Raises:
+            MembraneError: it has another number of vertices.
+
+        Limitations:
+            Not the depth of an object below the rest surface: where the membrane slides along itself, or bulges beside a
+            contact (negative), it moves without one.
+        """
+        count, expected = len(rest.rest_normals), self.displacement.shape[-2]
+        expect(count == expected, "Reconstruction.indentation: vertices of rest", count, f"{expected}, the result's")
+        moved = -(self.displacement * rest.rest_normals.to(self.displacement)).sum(-1)
+        depth: Tensor = moved.unflatten(-1, rest.grid)
+        return depth
+
+    def tactile_fields(self, rest: RestSurface) -> TactileFields:
+        """Depths and forces of the vertices as Isaac Lab names them.
+
+        Args:
+            rest: the sensor's `membrane`, on the grid of this result.
+
+        Raises:
+            MembraneError: it has another number of vertices.
+
+        Limitations:
+            Its penetration is that of a rigid object into an undeformed pad; here it is the membrane's own indentation.
+        """
+        depth = self.indentation(rest).flatten(-2)
+        normals, area = (part.to(self.displacement) for part in (rest.rest_normals, rest.rest_area))
+        along = torch.nn.functional.normalize(normals.new_tensor([1.0, 0.0, 0.0]) - normals[:, :1] * normals, dim=-1)
+        axes = torch.stack([along, torch.linalg.cross(normals, along)], -2)
+        push = -(self.traction * normals).sum(-1)
+        shear = (axes * self.traction[..., None, :]).sum(-1)
+        return TactileFields(depth.clamp_min(0), push * area, shear * area[:, None])
 
     def wrench_in(self, pose: Pose) -> Tensor:
         """The wrench `[B, 6]` in a tool's frame: total contact force, and its moment about that frame's origin.

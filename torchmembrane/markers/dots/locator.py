@@ -148,7 +148,7 @@ class DotLocator(nn.Module):
         levels, rest = [level_0, level_1, level_2], self.rest
         _, gradient, _ = self.match.predict(certainty, place - rest, strain)
         shape = self.shapes + gradient.clamp(-0.6, 0.6) @ self.shapes
-        pixels, covariance, _, quality = self.fit(levels, place, shape, pixel_noise(level_0))
+        pixels, covariance, _, quality = self.fit(levels, place, shape, pixel_noise(level_0.detach()))
         predicted, _, _ = self.match.predict(certainty * quality, pixels - rest, strain)
         deviation = safe_length(pixels - rest - predicted, -1) / self.match.nearest
         confidence = quality * torch.sigmoid(20 * (OUTLIER - deviation))

@@ -1,0 +1,36 @@
+"""The Python of the page on learning runs, the head learns, and the prestretch is found."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "learning.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def learned():
+    names: dict = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        exec(compile("\n".join(re.findall(r"```python\n(.*?)```", PAGE, re.S)), "learning.md", "exec"), names)
+    return names
+
+
+def test_the_head_learns_which_grasps_are_stable_through_the_reconstruction(learned):
+    model, losses = learned["model"], learned["losses"]
+    assert losses[-1] < 0.6 * losses[0] and model.shift.grad.abs().max() > 0
+    logit, _ = model(learned["pixels"])
+    assert ((logit > 0) == learned["stable"]).float().mean() >= 5 / 6
+
+
+def test_the_prestretch_is_found_and_its_gradient_is_the_finite_difference(learned):
+    found, right = learned["prestretch"], learned["sensor"].material.prestretch
+    assert found.item() == pytest.approx(right, abs=0.02) and f"end at {found.item():.2f}" in " ".join(PAGE.split())
+    at = torch.tensor(1.15, requires_grad=True)
+    (slope,) = torch.autograd.grad(learned["mismatch"](at), at)
+    with torch.no_grad():
+        below, above = (learned["mismatch"](torch.tensor(1.15 + step)) for step in (-0.01, 0.01))
+    assert slope.item() == pytest.approx((above - below).item() / 0.02, rel=0.05)

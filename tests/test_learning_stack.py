@@ -1,0 +1,152 @@
+"""What learning stacks do with a module works with a `Reconstructor`: states, functional calls, export, DDP, autocast."""
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import torch.distributed as dist
+from torch import nn
+from torch.func import functional_call
+from torch.nn.parallel import DistributedDataParallel
+
+import torchmembrane as tm
+from torchmembrane.estimators import kept_state
+from torchmembrane.markers.dots import locator
+from torchmembrane.markers.noise import pixel_noise
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture(scope="module")
+def sensor():
+    full = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
+    return replace(full, membrane=full.surface.membrane((9, 9)))
+
+
+@pytest.fixture(scope="module")
+def reconstructor(sensor):
+    return tm.Reconstructor(sensor)
+
+
+@pytest.fixture(scope="module")
+def images(reconstructor):
+    return reconstructor.read(EXAMPLES / "two_contacts.png", EXAMPLES / "press_on_axis.png")
+
+
+def all_buffers(module):
+    """A state as it was when it held every constant."""
+    return {name: buffer.clone() for name, buffer in module.named_buffers(remove_duplicate=False)}
+
+
+def assert_same(got, expected, **tolerance):
+    for key, value in expected._asdict().items():
+        torch.testing.assert_close(got._asdict()[key], value, equal_nan=True, **tolerance)
+
+
+def test_the_state_is_small_and_carries_the_material(sensor, reconstructor, images):
+    file = io.BytesIO()
+    other = tm.Reconstructor(sensor)
+    other.estimator.set_prestretch(torch.tensor(1.31))
+    torch.save(other.state_dict(), file)
+    assert file.tell() < 40_000
+    file.seek(0)
+    fresh = tm.Reconstructor(sensor)
+    fresh.load_state_dict(torch.load(file, weights_only=True))
+    with torch.no_grad():
+        assert_same(fresh(images), other(images))
+        assert (reconstructor(images).force - fresh(images).force).abs().max() > 1e-3
+
+
+def test_a_state_that_holds_every_constant_still_loads(sensor, reconstructor, images):
+    other = tm.Reconstructor(sensor)
+    other.estimator.set_prestretch(torch.tensor(1.31))
+    fresh = tm.Reconstructor(sensor)
+    assert fresh.load_state_dict(all_buffers(other)) == ([], [])
+    with torch.no_grad():
+        assert_same(fresh(images), other(images))
+
+
+def test_the_state_of_another_grid_or_sensor_is_refused_in_words(sensor, reconstructor):
+    finer = replace(sensor, membrane=sensor.surface.membrane((11, 11)))
+    with pytest.raises(tm.MembraneError, match="another sensor or grid; build the Reconstructor"):
+        reconstructor.load_state_dict(tm.Reconstructor(finer).state_dict())
+    moved = reconstructor.state_dict()
+    moved[kept_state.IDENTITY] = moved[kept_state.IDENTITY] + torch.tensor([0.0, 0.0, 0.5])
+    with pytest.raises(tm.MembraneError, match="rest_markers up to 0.5 off this sensor's"):
+        reconstructor.load_state_dict(moved)
+
+
+def test_a_part_of_a_larger_model_keeps_its_parameters_and_a_small_state(reconstructor):
+    model = nn.ModuleDict({"eye": reconstructor, "head": nn.Linear(6, 1)})
+    names = set(model.state_dict())
+    assert {"head.weight", "head.bias", "eye.rest_markers"} < names and len(names) < 40
+    assert model.load_state_dict(model.state_dict()) == ([], [])
+
+
+def test_a_functional_call_gives_the_derivative_of_a_camera_parameter(reconstructor, images):
+    pixels = reconstructor(images).pixels.detach()
+
+    class FromPixels(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.reconstructor = reconstructor
+
+        def forward(self, pixels):
+            return self.reconstructor.from_pixels(pixels).vertices.sum()
+
+    module, name = FromPixels(), "reconstructor.camera.focal"
+    focal = reconstructor.camera.focal
+    leaf = focal.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(functional_call(module, {name: leaf}, (pixels,)), leaf)
+    assert slope.isfinite().all() and slope.abs().max() > 0 and not reconstructor.camera.focal.requires_grad
+    with torch.no_grad():
+        assert torch.equal(functional_call(module, {name: focal}, (pixels,)), module(pixels))
+
+
+def test_torch_export_takes_the_reconstruction_and_agrees(reconstructor, images):
+    with torch.no_grad():
+        program = torch.export.export(reconstructor, (images,), strict=False)
+        assert_same(program.module()(images), reconstructor(images), rtol=1e-3, atol=1e-3)
+
+
+@pytest.fixture
+def one_process(tmp_path):
+    dist.init_process_group("gloo", init_method=f"file://{tmp_path}/rendezvous", rank=0, world_size=1)
+    yield
+    dist.destroy_process_group()
+
+
+class Grasp(nn.Module):
+    """A linear head on the wrench that a reconstruction finds."""
+
+    def __init__(self, reconstructor):
+        super().__init__()
+        self.reconstructor, self.head = reconstructor, nn.Linear(6, 1)
+
+    def forward(self, images):
+        return self.head(self.reconstructor(images).wrench)
+
+
+@pytest.mark.parametrize("autocast", [False, True])
+def test_a_model_around_it_trains_as_ddp_does_and_under_autocast(reconstructor, images, one_process, autocast):
+    plain, model = Grasp(reconstructor), None
+    plain(images).sum().backward()
+    expected = plain.head.weight.grad.clone()
+    plain.zero_grad()
+    model = DistributedDataParallel(plain)
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        model(images).sum().backward()
+    torch.testing.assert_close(plain.head.weight.grad, expected, rtol=0.02 if autocast else 1e-5, atol=1e-6)
+
+
+def test_the_gradient_of_an_image_takes_its_noise_for_given(reconstructor, images, monkeypatch):
+    def slope():
+        image = images[:1].clone().requires_grad_()
+        reconstructor(image).displacement.square().sum().backward()
+        return image.grad
+
+    expected, noise = slope(), pixel_noise(images[:1])
+    monkeypatch.setattr(locator, "pixel_noise", lambda _: noise)
+    torch.testing.assert_close(slope(), expected)

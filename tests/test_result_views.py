@@ -1,0 +1,63 @@
+"""Views of a result: depth map, Isaac Lab's fields, the contact as a point cloud."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import torchmembrane as tm
+from torchmembrane.cli.main import main
+from torchmembrane.io.point_cloud import save_contact_cloud
+from torchmembrane.io.results import save_frame
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture(scope="module")
+def sensor():
+    full = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
+    return replace(full, membrane=full.surface.membrane((9, 9)))
+
+
+@pytest.fixture(scope="module")
+def result(sensor):
+    reconstructor = tm.Reconstructor(sensor)
+    with torch.no_grad():
+        return reconstructor(reconstructor.read(EXAMPLES / "press_on_axis.png"))
+
+
+def test_the_indentation_is_what_the_surface_is_moved_in(sensor, result):
+    membrane = sensor.membrane
+    moved = -torch.linspace(-1, 2, 81)[:, None] * membrane.rest_normals
+    along = torch.linalg.cross(membrane.rest_normals, torch.ones_like(membrane.rest_normals))
+    shifted = result._replace(displacement=(moved + along).float()[None])
+    expected = torch.linspace(-1, 2, 81).reshape(1, 9, 9)
+    torch.testing.assert_close(shifted.indentation(membrane), expected, atol=1e-5, rtol=1e-5)
+    assert result.indentation(membrane).argmax() == 40  # the middle, where the ball is
+    with pytest.raises(tm.MembraneError, match="vertices of rest is 121; expected 81"):
+        result.indentation(sensor.surface.membrane((11, 11)))
+
+
+def test_the_fields_hold_the_whole_force(sensor, result):
+    fields, normals = result.tactile_fields(sensor.membrane), sensor.membrane.rest_normals.float()
+    along = torch.nn.functional.normalize(torch.tensor([1.0, 0, 0]) - normals[:, :1] * normals, dim=-1)
+    across = torch.linalg.cross(normals, along)
+    shear = fields.tactile_shear_force
+    force = -fields.tactile_normal_force[..., None] * normals + shear[..., :1] * along + shear[..., 1:] * across
+    torch.testing.assert_close(force.sum(1), result.force, rtol=1e-4, atol=1e-4)
+    assert fields.penetration_depth.shape == (1, 81) and fields.penetration_depth.min() == 0
+    assert fields.tactile_normal_force[0, 40] > 0
+
+
+def test_the_command_writes_the_contact_as_a_cloud_that_others_read(result, tmp_path, capsys):
+    frame = result.frame(0)
+    touched = frame["vertices"][frame["contact"] > 0.5]
+    save_frame(tmp_path / "press.npz", frame)
+    assert main(["view", str(tmp_path / "press.npz"), "--ply", str(tmp_path / "press.ply")]) == 0
+    assert f"{len(touched)} points of contact" in capsys.readouterr().out and len(touched) > 0
+    np.testing.assert_allclose(trimesh.load(tmp_path / "press.ply").vertices, touched, rtol=1e-5)
+    nothing = frame | {"contact": np.full_like(frame["contact"], np.nan)}
+    assert save_contact_cloud(tmp_path / "none.ply", nothing) == 0
