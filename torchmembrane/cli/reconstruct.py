@@ -1,11 +1,15 @@
 """`torchmembrane reconstruct`: images or a video to a folder of results."""
 
+import sys
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .arguments import add_command, add_estimator, add_sensor, count, count_or_auto, positive, share
 from .choices import ENGINES, RESULT_FORMATS
+
+if TYPE_CHECKING:
+    from ..jobs.local import FrameCounts
 
 PURPOSE = "reconstruct surfaces from images or a video of one sensor"
 EXAMPLES = """\
@@ -13,6 +17,7 @@ examples:
   torchmembrane reconstruct sensor.toml press.png --out results --figures
   torchmembrane reconstruct sensor.toml 'day1/*.jpg' day2/ --out results --batch 32
   torchmembrane reconstruct sensor.toml press.mp4 --out results --format parquet
+  torchmembrane reconstruct sensor.toml run.mcap --topic /camera/image --out results --bag forces
   torchmembrane reconstruct sensor.toml day1/ --out results --pressure gauge.csv
   torchmembrane reconstruct sensor.toml day1/ --out results --shard 2/8    # on the second of eight machines
 
@@ -21,7 +26,7 @@ DIR then holds
   mesh.npz       rest surface, triangles, units
   summary.csv    one row per frame
   NAME.png       its figure (--figures)
-Frames of a video are called STEM_000000, STEM_000001 ... The same command again continues after an
+Frames of a video or bag are called STEM_000000, STEM_000001 ... The same command again continues after an
 interruption: finished frames are skipped, failed ones, those of damaged results and those whose image
 has changed are done again. In Python,
 torchmembrane.read_results(DIR) gives the frames one by one, by name, or as one batch.
@@ -33,7 +38,7 @@ def add_parser(commands: Any) -> None:
     """Add the command's parser."""
     add = add_command(commands, "reconstruct", run, PURPOSE, EXAMPLES)
     add_sensor(add)
-    add("images", metavar="IMAGES", nargs="+", help="image files, globs (quoted or not), folders, or videos")
+    add("images", metavar="IMAGES", nargs="+", help="image files, globs (quoted or not), folders, videos, or bags")
     add("--out", metavar="DIR", type=Path, required=True, help="folder of the results: new, or of the same sensor")
     add_estimator(add, "triangle (default), or quadrilateral: the paper's, harmonic, with the tension of --energy")
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: %(default)s)")
@@ -45,6 +50,9 @@ def add_parser(commands: Any) -> None:
     part = "do the I-th of N disjoint parts of the frames; others may do theirs in the same DIR at the same time"
     add("--shard", metavar="I/N", type=share, default=(1, 1), help=part)
     add("--video", action="store_true", help="treat every input as a video (mp4, mov, avi, mkv, webm always are)")
+    add("--topic", metavar="TOPIC", help="of the images in bags of ROS 2 (default: the only one; needs the extra ros)")
+    messages = "also a bag of their results, a new folder: wrenches, tractions, of a gas pressures, in N, N m, m and Pa"
+    add("--bag", metavar="BAG", type=Path, help=messages)
     own = "images of this recording without contact, or first:N, its first N frames: their mean is rest (default: the sensor's)"
     add("--rest", metavar="IMAGES", nargs="+", default=[], help=own)
     gauge = "CSV name,pressure (across the membrane) or name,pressure_change (since rest), hPa: a gauge's readings of frames"
@@ -62,7 +70,8 @@ def run(arguments: Namespace) -> int:
 
     from ..errors import MembraneError
     from ..io.claim import Shard
-    from ..io.store import Settings, check_folder
+    from ..io.store import Mesh, Settings, check_folder
+    from ..jobs.bags import bag_remarks, result_bag, write_bag
     from ..jobs.inputs import find_inputs
     from ..jobs.local import reconstruct_files
     from ..jobs.pressure import recording_pressures
@@ -77,13 +86,16 @@ def run(arguments: Namespace) -> int:
     by_ray = arguments.engine == "ray"
     if by_ray and arguments.format == "npz":
         raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
-    inputs = find_inputs(arguments.images, arguments.video)
+    inputs = find_inputs(arguments.images, arguments.video, arguments.topic)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = recording_pressures(reconstructor, arguments.pressure, inputs) if arguments.pressure else None
     format = arguments.format or ("parquet" if by_ray else "npz")
     settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""))
     check_folder(arguments.out, sensor.fingerprint, settings)
+    for remark in bag_remarks(inputs, sensor.camera):
+        print(f"torchmembrane: {remark}", file=sys.stderr)
+    bag = result_bag(arguments.bag, inputs, Mesh.of(reconstructor, settings), sensor) if arguments.bag else None
     rest = recording_rest(reconstructor, arguments.rest, inputs) if arguments.rest else None
     counts = reconstruct_files(
         reconstructor,
@@ -98,11 +110,14 @@ def run(arguments: Namespace) -> int:
         rest_pixels=rest,
         pressure=pressure,
     )
+    if bag is not None:
+        print(f"messages of {write_bag(bag, inputs, arguments.out)} frames in {arguments.bag}")
+    print(f"frames: {_said(counts)}; results in {arguments.out}")
+    return 1 if counts.failed else 0
+
+
+def _said(counts: "FrameCounts") -> str:
     doubts = ("not converged", counts.not_converged), ("unexplained", counts.unexplained), ("partly hidden", counts.hidden)
     said = ", ".join(f"{count} {doubt}" for doubt, count in doubts if count)
     unsure = f" ({said})" if said else ""
-    print(
-        f"frames: {counts.reconstructed} reconstructed{unsure}, {counts.failed} failed, "
-        f"{counts.skipped} finished before; results in {arguments.out}"
-    )
-    return 1 if counts.failed else 0
+    return f"{counts.reconstructed} reconstructed{unsure}, {counts.failed} failed, {counts.skipped} finished before"

@@ -15,7 +15,6 @@ from ..io.results import Frame
 from ..io.status import Status
 from ..io.store import Mesh
 from ..sensor.parts import METRE
-from ..sensor.sensor import Sensor
 
 CHANNELS = {
     **{"mono8": (np.uint8, 1, [0]), "8UC1": (np.uint8, 1, [0]), "mono16": (np.uint16, 1, [0]), "16UC1": (np.uint16, 1, [0])},
@@ -107,11 +106,6 @@ class SiUnits:
         self.metre = METRE[mesh.length_unit]
         self.gas_pressure = gas_pressure
 
-    @classmethod
-    def of(cls, sensor: Sensor, mesh: Mesh) -> "SiUnits":
-        """Of a sensor's results."""
-        return cls(mesh, sensor.gas_pressure)
-
     def wrench(self, frame: Frame) -> Wrench:
         """Of what touches the membrane, on it."""
         return Wrench(frame["wrench"][:3].astype(float), frame["wrench"][3:].astype(float) / self.metre)
@@ -127,6 +121,13 @@ class SiUnits:
         if self.gas_pressure is None:
             return None
         return (self.gas_pressure + float(frame["pressure_change"])) * self.metre**2
+
+
+def cloud_layout(points: np.ndarray) -> dict[str, Any]:
+    """Fields of a `sensor_msgs/PointCloud2` with `points [V, 7]`, as `SiUnits.points` gives them, but for header and fields."""
+    content, step = points.astype("<f4").tobytes(), 4 * len(POINT_FIELDS)
+    shape = {"height": 1, "width": len(points), "is_bigendian": False, "point_step": step, "row_step": len(content)}
+    return {**shape, "data": content, "is_dense": bool(np.isfinite(points).all())}
 
 
 def has_wrench(frame: Frame) -> bool:

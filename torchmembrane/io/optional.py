@@ -79,14 +79,14 @@ def load_rerun() -> Any:
     return _load("rerun", "its viewer needs rerun-sdk", "rerun")
 
 
-def load_rosbags() -> tuple[Any, Any]:
-    """The modules `rosbags.highlevel` and `rosbags.rosbag2`.
+def load_rosbags() -> Any:
+    """The module `rosbags.highlevel`.
 
     Raises:
         MembraneError: rosbags is not installed.
     """
     _load("rosbags", "bags of ROS 2 need rosbags", "ros")
-    return import_module("rosbags.highlevel"), import_module("rosbags.rosbag2")
+    return import_module("rosbags.highlevel")
 
 
 def _load(module: str, purpose: str, extra: str) -> Any:

@@ -1,20 +1,22 @@
-"""Frames decoded in the background: image files and the pictures of videos, a batch ahead of the one that is computed."""
+"""Frames decoded in the background: images, and the pictures of videos and bags, a batch ahead of the one that is computed."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeAlias
 
 import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..integrations.messages import grey_of
+from ..integrations.rosbag import image_topic, messages
 from ..io.images import to_grey
 from ..io.optional import load_pyav
 from ..io.origin import Origin
-from .inputs import Inputs, frame_name
+from .inputs import Inputs, frame_name, is_bag, picture_name
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
@@ -22,6 +24,10 @@ if TYPE_CHECKING:
 DECODERS = 4
 LONGEST_NAME = 251
 """Bytes of a frame's name, so that there can be a file NAME.npz."""
+
+
+Load: TypeAlias = Callable[["Reconstructor"], Tensor]
+"""Gives a frame's image `[1, 1, height, width]` or raises `MembraneError`."""
 
 
 class Source(NamedTuple):
@@ -32,7 +38,7 @@ class Source(NamedTuple):
 
     name: str
     file: Path
-    load: Callable[["Reconstructor"], Tensor]
+    load: Load
     origin: Origin | None = None
 
 
@@ -51,10 +57,10 @@ class DecodedFrame(NamedTuple):
 
 
 def sources(inputs: Inputs, reconstructor: "Reconstructor") -> Iterator[Source]:
-    """All frames of the inputs: the images, then the videos' pictures, which are called STEM_NUMBER."""
+    """All frames of the inputs: the images, then the videos' and bags' pictures, which are called STEM_NUMBER."""
     yield from map(source_of, inputs.images)
     for path in inputs.videos:
-        yield from _video_frames(path, reconstructor)
+        yield from _pictures(path, _bag(path, inputs.topic) if is_bag(path) else _video(path, reconstructor))
 
 
 def source_of(path: Path) -> Source:
@@ -110,8 +116,10 @@ def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch:
             yield group
 
 
-def video_length(path: Path) -> int | None:
-    """The number of frames that a video says it has; None where it does not say, or is no video."""
+def length_of(path: Path, topic: str | None) -> int | None:
+    """The number of frames that a video or bag says it has; None where it does not say, or is none."""
+    if is_bag(path):
+        return image_topic(path, topic)[1]
     av = load_pyav()
     if not path.is_file():
         return None
@@ -126,24 +134,42 @@ def _read(path: Path, reconstructor: "Reconstructor") -> Tensor:
     return reconstructor.read(path)
 
 
-def _video_frames(path: Path, reconstructor: "Reconstructor") -> Iterator[Source]:
-    """The frames of a video one after another; one that cannot be decoded ends it."""
-    av, number = load_pyav(), -1
-    width, height = reconstructor.sensor.camera.image_size
+def _pictures(path: Path, pictures: Iterator[Load]) -> Iterator[Source]:
+    """The frames of a video or bag one after another; one that cannot be decoded ends it."""
+    number = -1
     try:
         origin = origin_of(path)
+        for number, load in enumerate(pictures):
+            yield Source(picture_name(path, number), path, load, origin)
+        if number < 0:
+            raise MembraneError("holds no picture")
+    except MembraneError as error:
+        refusal = partial(_refuse, str(error).removeprefix(f"{path}: "))
+        yield Source(picture_name(path, number + 1), path, refusal, Origin())
+
+
+def _video(path: Path, reconstructor: "Reconstructor") -> Iterator[Load]:
+    av, (width, height) = load_pyav(), reconstructor.sensor.camera.image_size
+    try:
         with av.open(str(path)) as container:
-            for number, picture in enumerate(container.decode(video=0)):
+            for picture in container.decode(video=0):
                 if (picture.width, picture.height) != (width, height):
                     raise MembraneError(
                         f"the video is {picture.width} x {picture.height} px, the sensor's images {width} x {height}"
                     )
-                yield Source(f"{frame_name(path)}_{number:06d}", path, partial(_video_image, picture), origin)
-        if number < 0:
-            raise MembraneError("holds no picture")
-    except (av.FFmpegError, IndexError, MembraneError) as error:
-        refusal = partial(_refuse, str(error).removeprefix(f"{path}: "))
-        yield Source(f"{frame_name(path)}_{number + 1:06d}", path, refusal, Origin())
+                yield partial(_video_image, picture)
+    except (av.FFmpegError, IndexError) as error:
+        raise MembraneError(f"video: {str(error).removeprefix(f'{path}: ')}") from error
+
+
+def _bag(path: Path, topic: str | None) -> Iterator[Load]:
+    for image in messages(path, image_topic(path, topic)[0]):
+        yield partial(_bag_image, image.message)
+
+
+def _bag_image(message: Any, reconstructor: "Reconstructor") -> Tensor:
+    grey = grey_of(message, reconstructor.sensor.camera.image_size)
+    return torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels)
 
 
 def _video_image(picture: Any, reconstructor: "Reconstructor") -> Tensor:
@@ -152,4 +178,4 @@ def _video_image(picture: Any, reconstructor: "Reconstructor") -> Tensor:
 
 
 def _refuse(reason: str, reconstructor: "Reconstructor") -> NoReturn:
-    raise MembraneError(f"video: {reason}")
+    raise MembraneError(reason)

@@ -1,4 +1,4 @@
-"""What a call names - files, globs, folders - as image and video files, in the order of the call."""
+"""What a call names - files, globs, folders - as image files, videos and bags, in the order of the call."""
 
 import glob
 from collections import Counter
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import MembraneError
+from ..integrations.rosbag import BAGS, storage_files
 from ..io.origin import printable
 from ..io.store import MESH
 
@@ -19,11 +20,18 @@ class Inputs(NamedTuple):
 
     Attributes:
         images: image files.
-        videos: video files.
+        videos: video files, and storage files of bags.
+        topic: of the bags' images; None: the only one.
     """
 
     images: list[Path]
     videos: list[Path]
+    topic: str | None = None
+
+    @property
+    def bags(self) -> list[Path]:
+        """Those of the videos that are bags."""
+        return [path for path in self.videos if is_bag(path)]
 
     def video_of(self, name: str) -> Path | None:
         """The video whose frame would have this name, STEM_NUMBER.
@@ -36,6 +44,11 @@ class Inputs(NamedTuple):
         return next((path for path in self.videos if frame_name(path) == stem and number.isdigit()), None)
 
 
+def is_bag(path: Path) -> bool:
+    """Whether it is a storage file of a bag of ROS 2."""
+    return path.suffix.lower() in BAGS
+
+
 def frame_name(path: Path) -> str:
     r"""The name of an image's frame, or the first part of the names of a video's: the file's, without its ending, in UTF-8.
 
@@ -46,12 +59,23 @@ def frame_name(path: Path) -> str:
     return printable(path.stem)
 
 
-def find_inputs(arguments: Iterable[str | Path], video: bool = False) -> Inputs:
+def picture_name(path: Path, number: int) -> str:
+    """The name of a picture of a video or bag.
+
+    Example:
+        >>> picture_name(Path("day/press.mp4"), 12)
+        'press_000012'
+    """
+    return f"{frame_name(path)}_{number:06d}"
+
+
+def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str | None = None) -> Inputs:
     """Files, globs and folders as files.
 
     Args:
-        arguments: paths of files, folders (their images in name order) and glob patterns.
+        arguments: paths of files, folders (their images in name order, or the storage files of a bag) and glob patterns.
         video: take every file for a video.
+        topic: of the bags' images.
 
     Returns:
         The files, images and videos each in the order of the call.
@@ -64,8 +88,10 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False) -> Inputs:
         ['flat_plate.png', 'press_on_axis.png', 'two_contacts.png']
     """
     paths = [path for argument in arguments for path in _expanded(str(argument), VIDEOS if video else IMAGES)]
-    is_video = {path: video or path.suffix.lower() in VIDEOS for path in paths}
-    inputs = Inputs([path for path in paths if not is_video[path]], [path for path in paths if is_video[path]])
+    is_video = {path: video or path.suffix.lower() in VIDEOS or is_bag(path) for path in paths}
+    inputs = Inputs([path for path in paths if not is_video[path]], [path for path in paths if is_video[path]], topic)
+    if topic is not None and not inputs.bags:
+        raise MembraneError(f"--topic {topic}: none of the inputs is a bag, {' or '.join(BAGS)}")
     for name, count in Counter(map(frame_name, paths)).items():
         if count > 1:
             twins = ", ".join(printable(str(path)) for path in paths if frame_name(path) == name)
@@ -81,7 +107,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False) -> Inputs:
 def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
     path = Path(argument)
     if path.is_dir():
-        found = sorted(p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
+        found = storage_files(path) or sorted(p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
         if not found:
             raise MembraneError(f"{path}: the folder holds no files {' '.join(suffixes)}")
         return found

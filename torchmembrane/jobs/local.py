@@ -16,7 +16,7 @@ from ..io.optional import load_pyav
 from ..io.origin import printable
 from ..io.status import Status
 from ..io.store import FINISHED, Mesh, Settings
-from .decode import Source, sources, video_length
+from .decode import Source, length_of, sources
 from .frame_reconstructor import FrameReconstructor, Outcome
 from .inputs import Inputs, frame_name
 from .result_folder import ResultFolder
@@ -98,7 +98,7 @@ def reconstruct_files(
     mesh = Mesh.of(reconstructor, settings)
     if figures and (shadowed := [path for path in inputs.images if path.parent.resolve() == out.resolve()]):
         raise MembraneError(f"--out {out}: figures would overwrite images there ({shadowed[0]}); choose another")
-    if inputs.videos:
+    if len(inputs.videos) > len(inputs.bags):
         load_pyav()
     done: Counter[int] = Counter()
     work = Work(FrameReconstructor(reconstructor, rest_pixels, pressure), (out, mesh) if figures else None)
@@ -146,7 +146,7 @@ class _Progress:
         mine = [name for name in map(frame_name, inputs.images) if shard.holds(name)]
         self.initial = sum(name in finished for name in mine)
         self.initial += sum(inputs.video_of(name) is not None for name in finished) if inputs.videos else 0
-        lengths = [(length or 0) // shard.total for length in map(video_length, inputs.videos)]
+        lengths = [(length or 0) // shard.total for length in (length_of(path, inputs.topic) for path in inputs.videos)]
         total = len(mine) + sum(lengths)
         self.left = total - self.initial
         self.bar = tqdm(total=total if all(lengths) else None, initial=self.initial, unit="frame", desc="reconstruct")

@@ -1,0 +1,85 @@
+"""The node: newest image in, messages out; what arrives meanwhile is dropped.
+
+ros2 run torchmembrane_ros tracker --ros-args -p sensor:=sensor.toml -r image:=/finger/image_raw
+
+Parameters: `sensor`, the sensor file; `compressed`, whether `image` is a CompressedImage. Publishes `wrench`, `points` and, of
+a gas, `pressure`, with the image's header. A frame without a surface is logged and nothing is published. The service `rezero`
+(std_srvs/Trigger) takes the latest image for the rest state.
+"""
+
+import rclpy
+import torch
+from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CompressedImage, FluidPressure, Image, PointCloud2, PointField
+from std_srvs.srv import Trigger
+
+import torchmembrane as tm
+from torchmembrane.integrations.messages import POINT_FIELDS, SiUnits, cloud_layout, grey_of, has_wrench
+from torchmembrane.io.store import Mesh, Settings
+
+FIELDS = [PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, name in enumerate(POINT_FIELDS)]
+NEWEST = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class TrackerNode(Node):
+    """Follows one sensor's camera."""
+
+    def __init__(self) -> None:
+        super().__init__("torchmembrane")
+        reconstructor = tm.Reconstructor.from_file(self.declare_parameter("sensor", "sensor.toml").value)
+        self.tracker = tm.Tracker(reconstructor)
+        self.size = reconstructor.image_size
+        mesh = Mesh.of(reconstructor, Settings.of(reconstructor, "npz"))
+        self.units = SiUnits(mesh, reconstructor.sensor.gas_pressure)
+        kind = CompressedImage if self.declare_parameter("compressed", False).value else Image
+        self.wrenches = self.create_publisher(WrenchStamped, "wrench", 1)
+        self.clouds = self.create_publisher(PointCloud2, "points", 1)
+        self.pressures = self.create_publisher(FluidPressure, "pressure", 1)
+        self.create_subscription(kind, "image", self.follow, NEWEST)
+        self.create_service(Trigger, "rezero", self.rezero)
+
+    def follow(self, message: Image | CompressedImage) -> None:
+        """Reconstruct an image, and publish what it gives."""
+        try:
+            frame = self.tracker(grey_of(message, self.size)).frame(0)
+        except tm.MembraneError as error:
+            self.get_logger().warning(str(error))
+            return
+        if not has_wrench(frame):
+            self.get_logger().warning(tm.Status(int(frame["status"])).text)
+            return
+        force, torque = (Vector3(x=x, y=y, z=z) for x, y, z in (each.tolist() for each in self.units.wrench(frame)))
+        self.wrenches.publish(WrenchStamped(header=message.header, wrench=Wrench(force=force, torque=torque)))
+        points = self.units.points(frame)
+        fields = [
+            PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, name in enumerate(POINT_FIELDS)
+        ]
+        self.clouds.publish(PointCloud2(header=message.header, fields=fields, **cloud_layout(points)))
+        pressure = self.units.pressure(frame)
+        if pressure is not None:
+            self.pressures.publish(FluidPressure(header=message.header, fluid_pressure=pressure, variance=0.0))
+
+    def rezero(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Take the latest image for the rest state."""
+        try:
+            self.tracker.rezero()
+            response.success = True
+        except tm.MembraneError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+
+def main() -> None:
+    """Spin until interrupted."""
+    torch.set_num_threads(1)
+    rclpy.init()
+    node = TrackerNode()
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()

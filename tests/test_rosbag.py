@@ -1,0 +1,207 @@
+"""Laws of ROS 2 bags: images through the command, results back into a bag, in SI units and with the images' times."""
+
+from dataclasses import replace
+from io import BytesIO
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from torchmembrane import MembraneError, Sensor
+from torchmembrane.cli.main import main
+from torchmembrane.integrations.messages import CHANNELS, SiUnits, grey_of, unlike
+from torchmembrane.io.read import read_results
+from torchmembrane.io.store import Mesh
+from torchmembrane.sensor.parts import Cavity
+
+rosbags = pytest.importorskip("rosbags")
+from rosbags.highlevel import AnyReader  # noqa: E402
+from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402
+from rosbags.typesys import Stores, get_typestore  # noqa: E402
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+TYPES = STORE.types
+TOPIC = "/finger/image_raw"
+BLANK = 1
+"""The picture in the bag that shows nothing."""
+
+
+def header(number):
+    stamp = TYPES["builtin_interfaces/msg/Time"](1_700_000_000 + number, 250_000_000 + number)
+    return TYPES["std_msgs/msg/Header"](stamp, "finger_optical")
+
+
+def raw(number, levels, encoding):
+    """An Image of 8-bit levels `[H, W]`, its lines padded to show that `step` is obeyed."""
+    kind, values, _ = CHANNELS[encoding]
+    values = levels.astype(kind)[..., None].repeat(values, -1) * (257 if kind == np.uint16 else 1)
+    lines = values.reshape(len(levels), -1).view(np.uint8)
+    data = np.pad(lines, ((0, 0), (0, 8)))
+    fields = len(levels), levels.shape[1], encoding, 0, data.shape[1], data.ravel()
+    return "sensor_msgs/msg/Image", TYPES["sensor_msgs/msg/Image"](header(number), *fields)
+
+
+def compressed(number, levels):
+    content = BytesIO()
+    Image.fromarray(levels).save(content, "PNG")
+    kind = "sensor_msgs/msg/CompressedImage"
+    return kind, TYPES[kind](header(number), "png", np.frombuffer(content.getvalue(), np.uint8))
+
+
+def camera_info(camera, focal=None):
+    kind, names = "sensor_msgs/msg/CameraInfo", {"pinhole": "plumb_bob", "fisheye": "equidistant"}
+    (f, g), (u, v), (width, height) = focal or camera.focal, camera.centre, camera.image_size
+    k = np.array([f, 0, u, 0, g, v, 0, 0, 1], float)
+    region = TYPES["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    rest = np.zeros(4), k, np.eye(3).ravel(), np.zeros(12), 0, 0, region
+    return kind, TYPES[kind](header(0), height, width, names[camera.model], *rest)
+
+
+def write_bag(path, plugin, messages):
+    """A bag of `(topic, (type, message))`, a tenth of a second apart."""
+    with Writer(path, version=8, storage_plugin=plugin) as writer:
+        connections = {}
+        for number, (topic, (kind, message)) in enumerate(messages):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic], 10**18 + number * 10**8, STORE.serialize_cdr(message, kind))
+    return path
+
+
+def levels_of(path):
+    return np.asarray(Image.open(path))
+
+
+@pytest.fixture(scope="module")
+def gas_sensor(tmp_path_factory, small_sensor):
+    """The small sensor with a gas inside, so that there is an absolute pressure."""
+    sensor = Sensor.from_file(small_sensor / "sensor.toml")
+    gas = replace(sensor, cavity=Cavity("gas", pressure=1013.0))
+    return gas.to_file(tmp_path_factory.mktemp("gas") / "sensor.toml")
+
+
+@pytest.fixture(scope="module")
+def pictures(small_sensor):
+    levels = [levels_of(small_sensor / name) for name in ("press1.png", "press2.png")]
+    return [levels[0], np.zeros_like(levels[0]), levels[1]]
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize("form", ["mono8", "bgr8", "png"])
+def test_a_bag_s_results_come_back_in_a_bag(tmp_path, gas_sensor, pictures, plugin, form, capsys):
+    sensor = Sensor.from_file(gas_sensor)
+    topic = f"{TOPIC}/compressed" if form == "png" else TOPIC
+    made = [compressed(k, each) if form == "png" else raw(k, each, form) for k, each in enumerate(pictures)]
+    messages = [("/finger/camera_info", camera_info(sensor.camera)), *((topic, each) for each in made)]
+    write_bag(tmp_path / "run", plugin, messages)
+    command = ["reconstruct", str(gas_sensor), str(tmp_path / "run"), "--out", str(tmp_path / "out")]
+    assert main([*command, "--bag", str(tmp_path / "forces")]) == 1  # the blank one has failed
+    said = capsys.readouterr()
+    assert "messages of 2 frames" in said.out and "CameraInfo" not in said.err
+    results = read_results(tmp_path / "out")
+    stem = next(each.stem for each in (tmp_path / "run").iterdir() if each.suffix in (".mcap", ".db3"))
+    assert results.names == [f"{stem}_{k:06d}" for k in range(3)]
+
+    found = {}
+    with AnyReader([tmp_path / "forces"]) as reader:
+        for connection, received, content in reader.messages():
+            found.setdefault(connection.topic, []).append((received, reader.deserialize(content, connection.msgtype)))
+    assert {topic: len(each) for topic, each in found.items()} == {
+        "/torchmembrane/wrench": 2,
+        "/torchmembrane/points": 2,
+        "/torchmembrane/pressure": 2,
+    }
+    for k, number in enumerate(n for n in range(3) if n != BLANK):
+        frame = results[f"{stem}_{number:06d}"]
+        for each in found.values():
+            received, message = each[k]
+            assert received == 10**18 + (number + 1) * 10**8
+            assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1_700_000_000 + number, 250_000_000 + number)
+            assert message.header.frame_id == "finger_optical"
+        wrench = found["/torchmembrane/wrench"][k][1].wrench
+        np.testing.assert_allclose([wrench.force.x, wrench.force.y, wrench.force.z], frame["force"])  # N
+        moment = [wrench.torque.x, wrench.torque.y, wrench.torque.z]
+        np.testing.assert_allclose(moment, frame["wrench"][3:] / 1000, rtol=1e-6)  # N mm to N m
+        cloud = found["/torchmembrane/points"][k][1]
+        assert [(each.name, each.offset) for each in cloud.fields] == [
+            (name, 4 * k) for k, name in enumerate("x y z normal_traction shear_x shear_y shear_z".split())
+        ]
+        points = np.frombuffer(cloud.data, "<f4").reshape(cloud.width, -1)
+        np.testing.assert_allclose(points[:, :3], frame["vertices"] / 1000, rtol=1e-6)
+        traction = points[:, 4:] - points[:, 3:4] * frame["normals"]  # N/mm^2 to Pa
+        np.testing.assert_allclose(traction, frame["traction"] * 1e6, atol=1e-5 * abs(frame["traction"]).max() * 1e6 + 1e-6)
+        np.testing.assert_allclose((points[:, 4:] * frame["normals"]).sum(-1), 0, atol=1e-5 * abs(points[:, 3:]).max() + 1e-6)
+        pressure = found["/torchmembrane/pressure"][k][1].fluid_pressure
+        np.testing.assert_allclose(pressure, 101300 + 1e6 * float(frame["pressure_change"]), rtol=1e-9)
+
+
+@pytest.mark.parametrize("encoding", CHANNELS)
+def test_every_encoding_gives_the_same_grey(encoding):
+    levels = np.random.default_rng(0).integers(0, 256, (6, 10), np.uint8)
+    np.testing.assert_allclose(grey_of(raw(0, levels, encoding)[1], (10, 6)), levels / 255, atol=1e-6)
+
+
+def test_channels_and_byte_order_are_obeyed():
+    pixel = np.array([[[10, 20, 30]]], np.uint8)
+    message = SimpleNamespace(encoding="bgr8", width=1, height=1, step=3, is_bigendian=0, data=pixel.ravel())
+    np.testing.assert_allclose(grey_of(message, (1, 1)), (0.299 * 30 + 0.587 * 20 + 0.114 * 10) / 255, rtol=1e-6)
+    message = SimpleNamespace(encoding="mono16", width=1, height=1, step=2, is_bigendian=1, data=np.array([1, 2], np.uint8))
+    np.testing.assert_allclose(grey_of(message, (1, 1)), 258 / 65535, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"encoding": "bayer_rggb8"}, "encoding 'bayer_rggb8'; expected one of mono8"),
+        ({"width": 11}, "11 x 6 px, the sensor's 10 x 6"),
+        ({"data": np.zeros(5, np.uint8)}, "5 bytes in lines of 18; expected 6 of 10"),
+        ({"step": 9}, "in lines of 9"),
+    ],
+)
+def test_other_images_are_refused(change, said):
+    message = SimpleNamespace(**{name: getattr(raw(0, np.zeros((6, 10), np.uint8), "mono8")[1], name) for name in FIELDS})
+    message.__dict__.update(change)
+    with pytest.raises(MembraneError, match=said):
+        grey_of(message, (10, 6))
+
+
+FIELDS = ("encoding", "width", "height", "step", "is_bigendian", "data")
+
+
+def test_a_camera_info_that_disagrees_is_said(small_sensor):
+    camera = Sensor.from_file(small_sensor / "sensor.toml").camera
+    assert unlike(camera_info(camera)[1], camera) is None
+    assert unlike(camera_info(camera, focal=(0.0, 0.0))[1], camera) is None  # not calibrated
+    other = camera_info(camera, focal=(1.05 * camera.focal[0], camera.focal[1]))[1]
+    assert "used is the sensor file" in unlike(other, camera)
+    small = SimpleNamespace(width=64, height=48, k=np.eye(3).ravel(), distortion_model="plumb_bob")
+    with pytest.raises(MembraneError, match="CameraInfo is of 64 x 48 px images"):
+        unlike(small, camera)
+
+
+def test_what_cannot_be_is_refused_in_one_line(tmp_path, gas_sensor, small_images, pictures, capsys):
+    messages = [("/a/image", raw(0, pictures[0], "mono8")), ("/b/image", raw(0, pictures[0], "mono8"))]
+    run = write_bag(tmp_path / "run", StoragePlugin.MCAP, messages)
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(next(run.glob("*.mcap")).read_bytes()[:5000])
+    (tmp_path / "there").mkdir()
+    image = small_images[0]
+    for options, said in (
+        ([run], "image topics: /a/image, /b/image; expected one: name it by --topic"),
+        ([run, "--topic", "/c"], "no images on topic /c"),
+        ([broken], "not readable as a bag of ROS 2"),
+        ([image, "--topic", "/a/image"], "none of the inputs is a bag"),
+        ([image, "--bag", tmp_path / "new"], "none of the inputs is a bag"),
+        ([run, "--topic", "/a/image", "--bag", tmp_path / "there"], "exists already"),
+    ):
+        assert main(["reconstruct", str(gas_sensor), *map(str, options), "--out", str(tmp_path / "out")]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert said in line
+
+
+def test_relative_forces_are_no_newtons(tmp_path, small_sensor):
+    sensor = Sensor.from_file(small_sensor / "sensor.toml")
+    values = dict.fromkeys(Mesh._fields, np.zeros(0)) | {"force_unit": "relative", "length_unit": "mm", "name": "finger"}
+    with pytest.raises(MembraneError, match="forces of finger are relative, messages are in newtons"):
+        SiUnits(Mesh(**values), sensor.gas_pressure)

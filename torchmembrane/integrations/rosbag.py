@@ -1,0 +1,179 @@
+"""Bags of ROS 2 (rosbag2: MCAP and sqlite3) by the package rosbags: images read; wrenches, tractions and pressures written."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from shutil import rmtree
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..camera.model import Camera
+from ..errors import MembraneError
+from ..io.bounded import in_one_line
+from ..io.optional import load_rosbags
+from ..io.results import Frame
+from .messages import POINT_FIELDS, SiUnits, cloud_layout, unlike
+
+BAGS = (".mcap", ".db3")
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+TOPICS = {
+    "wrench": ("/torchmembrane/wrench", "geometry_msgs/msg/WrenchStamped"),
+    "points": ("/torchmembrane/points", "sensor_msgs/msg/PointCloud2"),
+    "pressure": ("/torchmembrane/pressure", "sensor_msgs/msg/FluidPressure"),
+}
+"""Of the messages written: topic and type."""
+FLOAT32 = 7
+"""A PointField's datatype."""
+
+
+class StampedMessage(NamedTuple):
+    """A message, and when it was received, ns."""
+
+    received: int
+    message: Any
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """The storage files of a rosbag2 folder, in name order; none of another folder."""
+    if not (folder / "metadata.yaml").is_file():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix in BAGS and path.is_file())
+
+
+def image_topic(bag: Path, topic: str | None) -> tuple[str, int]:
+    """The topic of a bag's images, and how many there are.
+
+    Args:
+        bag: a storage file.
+        topic: the one that is meant; None: the only one.
+
+    Raises:
+        MembraneError: there is none, or there are several and none is named; or the bag cannot be read.
+    """
+    with _opened(bag) as reader:
+        topics = {each.topic: each.msgcount for each in reader.connections if each.msgtype in IMAGE_TYPES}
+    named = ", ".join(sorted(topics)) or "none"
+    if topic is None and len(topics) != 1:
+        raise MembraneError(f"{bag}: image topics: {named}; expected one: name it by --topic")
+    found = topic or next(iter(topics))
+    if found not in topics:
+        raise MembraneError(f"{bag}: no images on topic {found}; image topics: {named}")
+    return found, topics[found]
+
+
+def messages(bag: Path, topic: str) -> Iterator[StampedMessage]:
+    """The messages of a topic, in the order of their reception.
+
+    Raises:
+        MembraneError: the bag cannot be read, or not to its end.
+    """
+    with _opened(bag) as reader:
+        connections = [each for each in reader.connections if each.topic == topic]
+        for connection, received, content in reader.messages(connections=connections) if connections else ():
+            yield StampedMessage(received, reader.deserialize(content, connection.msgtype))
+
+
+def camera_remark(bag: Path, topic: str, camera: Camera) -> str | None:
+    """What the CameraInfo beside an image topic says otherwise than the sensor file, in words; None: nothing.
+
+    Raises:
+        MembraneError: it is of images of another size.
+    """
+    camera_topic = f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+    first = next(messages(bag, camera_topic), None)
+    try:
+        return None if first is None else unlike(first.message, camera)
+    except MembraneError as error:
+        raise MembraneError(f"{bag}, {camera_topic}: {error}") from error
+
+
+class BagWriter:
+    """A bag of results: `with BagWriter("out", units, mcap=True) as bag`, then `bag.add(image, frame)`.
+
+    A `WrenchStamped`, a `PointCloud2` and, of a gas, a `FluidPressure` for every frame, on `TOPICS`, with the image's header
+    and time of reception.
+
+    Args:
+        path: a folder, new.
+        units: of the results.
+        mcap: store as MCAP; else as sqlite3.
+
+    Raises:
+        MembraneError: the path exists, or rosbags is not installed.
+    """
+
+    def __init__(self, path: str | Path, units: SiUnits, mcap: bool):
+        self.path, self.units, self.mcap = Path(path), units, mcap
+        self.written = 0
+        if self.path.exists():
+            raise MembraneError(f"{path}: exists already; expected a new folder for the bag")
+        load_rosbags()
+
+    def __enter__(self) -> "BagWriter":
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        plugin = StoragePlugin.MCAP if self.mcap else StoragePlugin.SQLITE3
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._writer = Writer(self.path, version=9, storage_plugin=plugin)
+        self._writer.open()
+        self._connections: dict[str, Any] = {}
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self._writer.close()
+        if kind is not None:
+            rmtree(self.path)
+
+    def add(self, image: StampedMessage, frame: Frame) -> None:
+        """Write a frame's messages.
+
+        Args:
+            image: that it was reconstructed from.
+            frame: its result, which has a surface.
+        """
+        header = self._header(image.message.header)
+        wrench = self.units.wrench(frame)
+        vectors = (self._new("geometry_msgs/msg/Vector3", *each.tolist()) for each in wrench)
+        self._write("wrench", image, header, self._new("geometry_msgs/msg/Wrench", *vectors))
+        layout = cloud_layout(self.units.points(frame))
+        kind = "sensor_msgs/msg/PointField"
+        fields = [self._new(kind, name, 4 * k, FLOAT32, 1) for k, name in enumerate(POINT_FIELDS)]
+        self._write("points", image, header, fields=fields, **layout | {"data": np.frombuffer(layout["data"], np.uint8)})
+        pressure = self.units.pressure(frame)
+        if pressure is not None:
+            self._write("pressure", image, header, pressure, 0.0)
+        self.written += 1
+
+    def _header(self, header: Any) -> Any:
+        stamp = self._new("builtin_interfaces/msg/Time", header.stamp.sec, header.stamp.nanosec)
+        return self._new("std_msgs/msg/Header", stamp, header.frame_id)
+
+    def _new(self, kind: str, *fields: Any, **named: Any) -> Any:
+        return self._store.types[kind](*fields, **named)
+
+    def _write(self, name: str, image: StampedMessage, *fields: Any, **named: Any) -> None:
+        topic, kind = TOPICS[name]
+        if name not in self._connections:
+            self._connections[name] = self._writer.add_connection(topic, kind, typestore=self._store)
+        content = self._store.serialize_cdr(self._new(kind, *fields, **named), kind)
+        self._writer.write(self._connections[name], image.received, content)
+
+
+@contextmanager
+def _opened(bag: Path) -> Iterator[Any]:
+    """A reader of a storage file."""
+    highlevel = load_rosbags()
+    from rosbags.typesys import Stores, get_typestore
+
+    try:
+        with highlevel.AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+            yield reader
+    except MembraneError:
+        raise
+    except Exception as error:  # of a damaged file, of whatever kind
+        raise MembraneError(f"{bag}: not readable as a bag of ROS 2 ({in_one_line(error)})") from error
