@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from io import BytesIO
+from shutil import rmtree
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +18,7 @@ from torchmembrane.sensor.parts import Cavity
 
 rosbags = pytest.importorskip("rosbags")
 from rosbags.highlevel import AnyReader  # noqa: E402
-from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer  # noqa: E402
 from rosbags.typesys import Stores, get_typestore  # noqa: E402
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -58,9 +59,12 @@ def camera_info(camera, focal=None):
     return kind, TYPES[kind](header(0), height, width, names[camera.model], *rest)
 
 
-def write_bag(path, plugin, messages):
+def write_bag(path, plugin, messages, compression=None):
     """A bag of `(topic, (type, message))`, a tenth of a second apart."""
-    with Writer(path, version=8, storage_plugin=plugin) as writer:
+    writer = Writer(path, version=8, storage_plugin=plugin)
+    if compression is not None:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
         connections = {}
         for number, (topic, (kind, message)) in enumerate(messages):
             if topic not in connections:
@@ -100,8 +104,7 @@ def test_a_bag_s_results_come_back_in_a_bag(tmp_path, gas_sensor, pictures, plug
     said = capsys.readouterr()
     assert "messages of 2 frames" in said.out and "CameraInfo" not in said.err
     results = read_results(tmp_path / "out")
-    stem = next(each.stem for each in (tmp_path / "run").iterdir() if each.suffix in (".mcap", ".db3"))
-    assert results.names == [f"{stem}_{k:06d}" for k in range(3)]
+    assert results.names == [f"run_{k:06d}" for k in range(3)]
 
     found = {}
     with AnyReader([tmp_path / "forces"]) as reader:
@@ -113,7 +116,7 @@ def test_a_bag_s_results_come_back_in_a_bag(tmp_path, gas_sensor, pictures, plug
         "/torchmembrane/pressure": 2,
     }
     for k, number in enumerate(n for n in range(3) if n != BLANK):
-        frame = results[f"{stem}_{number:06d}"]
+        frame = results[f"run_{number:06d}"]
         for each in found.values():
             received, message = each[k]
             assert received == 10**18 + (number + 1) * 10**8
@@ -134,6 +137,39 @@ def test_a_bag_s_results_come_back_in_a_bag(tmp_path, gas_sensor, pictures, plug
         np.testing.assert_allclose((points[:, 4:] * frame["normals"]).sum(-1), 0, atol=1e-5 * abs(points[:, 3:]).max() + 1e-6)
         pressure = found["/torchmembrane/pressure"][k][1].fluid_pressure
         np.testing.assert_allclose(pressure, 101300 + 1e6 * float(frame["pressure_change"]), rtol=1e-9)
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize("mode", [CompressionMode.MESSAGE, CompressionMode.FILE])
+def test_compressed_bags_and_single_files_are_read(tmp_path, gas_sensor, pictures, plugin, mode):
+    images = [(TOPIC, raw(k, pictures[2 * k], "mono8")) for k in range(2)]
+    for name, compression in (("plain", None), ("packed", mode)):
+        write_bag(tmp_path / name, plugin, images, compression)
+    (storage,) = (each for each in (tmp_path / "plain").iterdir() if each.suffix in (".mcap", ".db3"))
+    storage.rename(tmp_path / f"alone{storage.suffix}")
+    runs = [tmp_path / "packed", tmp_path / f"alone{storage.suffix}"]
+    assert main(["reconstruct", str(gas_sensor), *map(str, runs), "--out", str(tmp_path / "out")]) == 0
+    results = read_results(tmp_path / "out")
+    assert results.names == [f"{name}_{k:06d}" for name in ("alone", "packed") for k in range(2)]
+    for k in range(2):
+        found, expected = (results[f"{name}_{k:06d}"]["vertices"] for name in ("packed", "alone"))
+        np.testing.assert_allclose(found, expected, atol=1e-4)  # equal but for the batches' rounding
+
+
+def test_the_same_command_again_continues_and_its_bag_is_whole(tmp_path, gas_sensor, pictures, capsys):
+    run, forces = tmp_path / "run", tmp_path / "forces"
+    write_bag(run, StoragePlugin.MCAP, [(TOPIC, raw(0, pictures[0], "mono8"))])
+    command = ["reconstruct", str(gas_sensor), str(run), "--out", str(tmp_path / "out"), "--bag", str(forces)]
+    assert main(command) == main(command) == 0
+    assert "0 reconstructed, 0 failed, 1 finished before" in capsys.readouterr().out
+    rmtree(run)
+    write_bag(run, StoragePlugin.MCAP, [(TOPIC, raw(k, pictures[2], "mono8")) for k in range(2)])
+    assert main(command) == 0
+    said = capsys.readouterr()
+    assert "changed, done again" in said.err and "messages of 2 frames" in said.out
+    with AnyReader([forces]) as reader:
+        assert reader.topics["/torchmembrane/wrench"].msgcount == 2
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["forces", "out", "run"]
 
 
 @pytest.mark.parametrize("encoding", CHANNELS)
@@ -186,14 +222,16 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path, gas_sensor, small_image
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(next(run.glob("*.mcap")).read_bytes()[:5000])
     (tmp_path / "there").mkdir()
-    image = small_images[0]
+    image, named = small_images[0], [run, "--topic", "/a/image"]
     for options, said in (
         ([run], "image topics: /a/image, /b/image; expected one: name it by --topic"),
         ([run, "--topic", "/c"], "no images on topic /c"),
         ([broken], "not readable as a bag of ROS 2"),
         ([image, "--topic", "/a/image"], "none of the inputs is a bag"),
         ([image, "--bag", tmp_path / "new"], "none of the inputs is a bag"),
-        ([run, "--topic", "/a/image", "--bag", tmp_path / "there"], "exists already"),
+        ([*named, "--bag", tmp_path / "there"], "exists already"),
+        ([*named, "--bag", tmp_path / "new", "--estimator", "minimum-energy"], "minimum-energy finds no forces"),
+        ([*named, "--bag", tmp_path / "new", "--shard", "1/2"], "--bag with --shard"),
     ):
         assert main(["reconstruct", str(gas_sensor), *map(str, options), "--out", str(tmp_path / "out")]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()

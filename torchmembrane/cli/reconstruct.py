@@ -51,7 +51,7 @@ def add_parser(commands: Any) -> None:
     add("--shard", metavar="I/N", type=share, default=(1, 1), help=part)
     add("--video", action="store_true", help="treat every input as a video (mp4, mov, avi, mkv, webm always are)")
     add("--topic", metavar="TOPIC", help="of the images in bags of ROS 2 (default: the only one; needs the extra ros)")
-    messages = "also a bag of their results, a new folder: wrenches, tractions, of a gas pressures, in N, N m, m and Pa"
+    messages = "also a bag of their results, a folder: wrenches, tractions, of a gas pressures, in N, N m, m and Pa"
     add("--bag", metavar="BAG", type=Path, help=messages)
     own = "images of this recording without contact, or first:N, its first N frames: their mean is rest (default: the sensor's)"
     add("--rest", metavar="IMAGES", nargs="+", default=[], help=own)
@@ -95,7 +95,8 @@ def run(arguments: Namespace) -> int:
     check_folder(arguments.out, sensor.fingerprint, settings)
     for remark in bag_remarks(inputs, sensor.camera):
         print(f"torchmembrane: {remark}", file=sys.stderr)
-    bag = result_bag(arguments.bag, inputs, Mesh.of(reconstructor, settings), sensor) if arguments.bag else None
+    mesh, shard = Mesh.of(reconstructor, settings), Shard(*arguments.shard)
+    bag = result_bag(arguments.bag, inputs, mesh, reconstructor, shard) if arguments.bag else None
     rest = recording_rest(reconstructor, arguments.rest, inputs) if arguments.rest else None
     counts = reconstruct_files(
         reconstructor,
@@ -105,7 +106,7 @@ def run(arguments: Namespace) -> int:
         batch=arguments.batch,
         workers=arguments.workers,
         engine=RayEngine(arguments.device, arguments.workers) if by_ray else None,
-        shard=Shard(*arguments.shard),
+        shard=shard,
         figures=arguments.figures,
         rest_pixels=rest,
         pressure=pressure,

@@ -1,9 +1,11 @@
 """Bags of ROS 2 (rosbag2: MCAP and sqlite3) by the package rosbags: images read; wrenches, tractions and pressures written."""
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from shutil import rmtree
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -16,7 +18,7 @@ from ..io.optional import load_rosbags
 from ..io.results import Frame
 from .messages import POINT_FIELDS, SiUnits, cloud_layout, unlike
 
-BAGS = (".mcap", ".db3")
+BAGS, METADATA = (".mcap", ".db3"), "metadata.yaml"
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 TOPICS = {
@@ -25,6 +27,8 @@ TOPICS = {
     "pressure": ("/torchmembrane/pressure", "sensor_msgs/msg/FluidPressure"),
 }
 """Of the messages written: topic and type."""
+OURS = "torchmembrane reconstruct --bag"
+"""Stands in the metadata of a bag that is written here."""
 FLOAT32 = 7
 """A PointField's datatype."""
 
@@ -36,25 +40,37 @@ class StampedMessage(NamedTuple):
     message: Any
 
 
-def storage_files(folder: Path) -> list[Path]:
-    """The storage files of a rosbag2 folder, in name order; none of another folder."""
-    if not (folder / "metadata.yaml").is_file():
-        return []
-    return sorted(path for path in folder.iterdir() if path.suffix in BAGS and path.is_file())
+def is_bag(path: Path) -> bool:
+    """Whether it is a bag's `metadata.yaml`, which stands for its folder, or a storage file."""
+    return path.name == METADATA or path.suffix.lower() in BAGS
+
+
+def metadata_of(folder: Path) -> list[Path]:
+    """The `metadata.yaml` of a bag's folder; none of another folder."""
+    return [path for path in (folder / METADATA,) if path.is_file()]
+
+
+def is_mcap(bag: Path) -> bool:
+    """Whether a bag is stored as MCAP, not sqlite3."""
+    stored = bag.parent.iterdir() if bag.name == METADATA else [bag]
+    return any(".mcap" in path.suffixes for path in stored)
 
 
 def image_topic(bag: Path, topic: str | None) -> tuple[str, int]:
     """The topic of a bag's images, and how many there are.
 
     Args:
-        bag: a storage file.
+        bag: its `metadata.yaml`, or a storage file.
         topic: the one that is meant; None: the only one.
 
     Raises:
         MembraneError: there is none, or there are several and none is named; or the bag cannot be read.
     """
     with _opened(bag) as reader:
-        topics = {each.topic: each.msgcount for each in reader.connections if each.msgtype in IMAGE_TYPES}
+        topics = Counter[str]()
+        for each in reader.connections:
+            if each.msgtype in IMAGE_TYPES:
+                topics[each.topic] += each.msgcount
     named = ", ".join(sorted(topics)) or "none"
     if topic is None and len(topics) != 1:
         raise MembraneError(f"{bag}: image topics: {named}; expected one: name it by --topic")
@@ -97,19 +113,19 @@ class BagWriter:
     and time of reception.
 
     Args:
-        path: a folder, new.
+        path: a folder: new, or of such a bag, which is replaced when the new one is whole.
         units: of the results.
         mcap: store as MCAP; else as sqlite3.
 
     Raises:
-        MembraneError: the path exists, or rosbags is not installed.
+        MembraneError: there is something else at the path, or rosbags is not installed.
     """
 
     def __init__(self, path: str | Path, units: SiUnits, mcap: bool):
         self.path, self.units, self.mcap = Path(path), units, mcap
         self.written = 0
-        if self.path.exists():
-            raise MembraneError(f"{path}: exists already; expected a new folder for the bag")
+        if self.path.exists() and not any(OURS in found.read_text() for found in metadata_of(self.path)):
+            raise MembraneError(f"{path}: exists already, and is no bag of results; expected a new folder")
         load_rosbags()
 
     def __enter__(self) -> "BagWriter":
@@ -119,15 +135,20 @@ class BagWriter:
         self._store = get_typestore(Stores.ROS2_JAZZY)
         plugin = StoragePlugin.MCAP if self.mcap else StoragePlugin.SQLITE3
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._writer = Writer(self.path, version=9, storage_plugin=plugin)
+        self._work = TemporaryDirectory(prefix=".bag-", dir=self.path.parent)
+        self._writer = Writer(Path(self._work.name) / self.path.name, version=9, storage_plugin=plugin)
+        self._writer.set_custom_data("made by", OURS)
         self._writer.open()
         self._connections: dict[str, Any] = {}
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        self._writer.close()
-        if kind is not None:
-            rmtree(self.path)
+        with self._work:
+            self._writer.close()
+            if kind is None:
+                if self.path.exists():
+                    rmtree(self.path)
+                self._writer.path.rename(self.path)
 
     def add(self, image: StampedMessage, frame: Frame) -> None:
         """Write a frame's messages.
@@ -166,12 +187,12 @@ class BagWriter:
 
 @contextmanager
 def _opened(bag: Path) -> Iterator[Any]:
-    """A reader of a storage file."""
-    highlevel = load_rosbags()
+    """A reader of a bag."""
+    highlevel, path = load_rosbags(), bag.parent if bag.name == METADATA else bag
     from rosbags.typesys import Stores, get_typestore
 
     try:
-        with highlevel.AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        with highlevel.AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
             yield reader
     except MembraneError:
         raise

@@ -2,15 +2,19 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..camera.model import Camera
 from ..errors import MembraneError
 from ..integrations.messages import SiUnits, has_wrench
-from ..integrations.rosbag import BagWriter, camera_remark, image_topic, messages
+from ..integrations.rosbag import BagWriter, camera_remark, image_topic, is_mcap, messages
+from ..io.claim import WHOLE, Shard
 from ..io.read import read_results
 from ..io.store import Mesh
-from ..sensor.sensor import Sensor
 from .inputs import Inputs, picture_name
+
+if TYPE_CHECKING:
+    from ..reconstruct import Reconstructor
 
 
 def bag_remarks(inputs: Inputs, camera: Camera) -> Iterator[str]:
@@ -24,15 +28,20 @@ def bag_remarks(inputs: Inputs, camera: Camera) -> Iterator[str]:
             yield f"{path}: {remark}"
 
 
-def result_bag(path: Path, inputs: Inputs, mesh: Mesh, sensor: Sensor) -> BagWriter:
+def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstructor", shard: Shard) -> BagWriter:
     """Where the results of bags will be written to.
 
     Raises:
-        MembraneError: none of the inputs is a bag, forces are relative, or there is something at the path already.
+        MembraneError: none of the inputs is a bag, only a shard of them is done, the estimator finds no forces or they are
+            relative, or there is something else at the path.
     """
+    if shard != WHOLE:
+        raise MembraneError("--bag with --shard: leave --bag out, and call once more for all when the shards are done")
     if not inputs.bags:
         raise MembraneError(f"--bag {path}: none of the inputs is a bag, whose messages' times the results' would have")
-    return BagWriter(path, SiUnits(mesh, sensor.gas_pressure), inputs.bags[0].suffix.lower() == ".mcap")
+    if not reconstructor.finds_tractions:
+        raise MembraneError(f"--bag {path}: {mesh.estimator} finds no forces; expected force-balance")
+    return BagWriter(path, SiUnits(mesh, reconstructor.sensor.gas_pressure), is_mcap(inputs.bags[0]))
 
 
 def write_bag(writer: BagWriter, inputs: Inputs, results: Path) -> int:

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..integrations.messages import grey_of
-from ..integrations.rosbag import image_topic, messages
+from ..integrations.rosbag import image_topic, is_bag, messages
 from ..io.images import to_grey
 from ..io.optional import load_pyav
 from ..io.origin import Origin
-from .inputs import Inputs, frame_name, is_bag, picture_name
+from .inputs import Inputs, frame_name, picture_name
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import MembraneError
-from ..integrations.rosbag import BAGS, storage_files
+from ..integrations.rosbag import BAGS, METADATA, is_bag, metadata_of
 from ..io.origin import printable
 from ..io.store import MESH
 
@@ -20,7 +20,7 @@ class Inputs(NamedTuple):
 
     Attributes:
         images: image files.
-        videos: video files, and storage files of bags.
+        videos: video files and bags, which are their `metadata.yaml` or a storage file.
         topic: of the bags' images; None: the only one.
     """
 
@@ -44,19 +44,15 @@ class Inputs(NamedTuple):
         return next((path for path in self.videos if frame_name(path) == stem and number.isdigit()), None)
 
 
-def is_bag(path: Path) -> bool:
-    """Whether it is a storage file of a bag of ROS 2."""
-    return path.suffix.lower() in BAGS
-
-
 def frame_name(path: Path) -> str:
-    r"""The name of an image's frame, or the first part of the names of a video's: the file's, without its ending, in UTF-8.
+    r"""The name of an image's frame, or the first part of the names of a video's: the file's, without its ending, or the
+    bag's folder's, in UTF-8.
 
     Example:
         >>> frame_name(Path("day/caf\udce9.png"))
         'caf\\xe9'
     """
-    return printable(path.stem)
+    return printable(path.parent.name if path.name == METADATA else path.stem)
 
 
 def picture_name(path: Path, number: int) -> str:
@@ -73,7 +69,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
     """Files, globs and folders as files.
 
     Args:
-        arguments: paths of files, folders (their images in name order, or the storage files of a bag) and glob patterns.
+        arguments: paths of files, folders (their images in name order, or the bag that it is) and glob patterns.
         video: take every file for a video.
         topic: of the bags' images.
 
@@ -107,7 +103,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
 def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
     path = Path(argument)
     if path.is_dir():
-        found = storage_files(path) or sorted(p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
+        found = metadata_of(path) or sorted(p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
         if not found:
             raise MembraneError(f"{path}: the folder holds no files {' '.join(suffixes)}")
         return found

@@ -7,6 +7,8 @@ a gas, `pressure`, with the image's header. A frame without a surface is logged 
 (std_srvs/Trigger) takes the latest image for the rest state.
 """
 
+from array import array
+
 import rclpy
 import torch
 from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
@@ -52,11 +54,9 @@ class TrackerNode(Node):
             return
         force, torque = (Vector3(x=x, y=y, z=z) for x, y, z in (each.tolist() for each in self.units.wrench(frame)))
         self.wrenches.publish(WrenchStamped(header=message.header, wrench=Wrench(force=force, torque=torque)))
-        points = self.units.points(frame)
-        fields = [
-            PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, name in enumerate(POINT_FIELDS)
-        ]
-        self.clouds.publish(PointCloud2(header=message.header, fields=fields, **cloud_layout(points)))
+        layout = cloud_layout(self.units.points(frame))
+        layout |= {"data": array("B", layout["data"]), "fields": FIELDS}  # bytes would be checked one by one
+        self.clouds.publish(PointCloud2(header=message.header, **layout))
         pressure = self.units.pressure(frame)
         if pressure is not None:
             self.pressures.publish(FluidPressure(header=message.header, fluid_pressure=pressure, variance=0.0))
@@ -75,11 +75,11 @@ def main() -> None:
     """Spin until interrupted."""
     torch.set_num_threads(1)
     rclpy.init()
-    node = TrackerNode()
     try:
-        rclpy.spin(node)
+        rclpy.spin(TrackerNode())
     except KeyboardInterrupt:
         pass
+    except tm.MembraneError as error:  # of the sensor file, or its forces are relative
+        raise SystemExit(f"torchmembrane: error: {error}") from error
     finally:
-        node.destroy_node()
         rclpy.try_shutdown()
