@@ -84,6 +84,16 @@ def test_all_frames_of_a_folder_are_drawn_as_a_film_also_one_without_surface(rec
     assert "expected a film's name" in capsys.readouterr().err
 
 
+def test_a_job_s_frames_are_drawn_as_a_film_with_their_images(small_sensor, small_images, tmp_path, capsys):
+    command = ["reconstruct", str(small_sensor / "sensor.toml"), *map(str, small_images), "--out", str(tmp_path / "out")]
+    assert main([*command, "--video-out", str(tmp_path / "press.txt")]) == 2 and not (tmp_path / "out").exists()
+    assert "expected a film's name" in capsys.readouterr().err
+    assert main([*command, "--video-out", str(tmp_path / "press.gif")]) == 0
+    film = Image.open(tmp_path / "press.gif")
+    flow = np.asarray(film.convert("L"))[200:360, 150:450]
+    assert film.n_frames == 3 and np.median(flow) < 250  # its image, lightened, and not the white of none
+
+
 def test_a_file_of_rerun_is_refused_without_rerun(recording, capsys):
     assert main(["view", str(recording), "--save", "day.rrd"]) == 2
     assert "expected --rerun with it" in capsys.readouterr().err

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from .arguments import add_command, add_estimator, add_sensor, count, count_or_auto, positive, share
 from .choices import ENGINES, RESULT_FORMATS
+from .film import FrameImages, draw_film
 
 if TYPE_CHECKING:
     from ..jobs.local import FrameCounts
@@ -61,18 +62,18 @@ def add_parser(commands: Any) -> None:
     add("--pressure-noise", metavar="SHARE", type=positive, help=noise)
     one = "one .npz per frame, or one dataset (default: npz; of --engine ray: parquet)"
     add("--format", choices=RESULT_FORMATS, help=one)
+    film = "also a film of all frames in DIR, in name order: .mp4, .mov, .mkv (extra video) or .gif; as view DIR --video-out"
+    add("--video-out", metavar="FILE", type=Path, help=film)
     add("--figures", action="store_true", help="also NAME.png: flow, side view and displacement of every frame")
 
 
 def run(arguments: Namespace) -> int:
     """Reconstruct; returns the exit code."""
-    import torch
-
-    from ..errors import MembraneError
     from ..io.claim import Shard
+    from ..io.read import read_results
     from ..io.store import Mesh, Settings, check_folder
     from ..jobs.bags import bag_remarks, result_bag, write_bag
-    from ..jobs.inputs import find_inputs
+    from ..jobs.inputs import find_inputs, frame_name
     from ..jobs.local import reconstruct_files
     from ..jobs.pressure import recording_pressures
     from ..jobs.ray_engine import RayEngine
@@ -81,11 +82,7 @@ def run(arguments: Namespace) -> int:
     from ..sensor.sensor import Sensor
     from .build import build_reconstructor
 
-    if arguments.device == "cuda" and arguments.engine == "local" and not torch.cuda.is_available():
-        raise MembraneError("--device cuda: torch sees no CUDA device; pass --device cpu, or install torch with CUDA")
-    by_ray = arguments.engine == "ray"
-    if by_ray and arguments.format == "npz":
-        raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
+    by_ray = _is_for_ray(arguments)
     inputs = find_inputs(arguments.images, arguments.video, arguments.topic)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
@@ -113,8 +110,28 @@ def run(arguments: Namespace) -> int:
     )
     if bag is not None:
         print(f"messages of {write_bag(bag, inputs, arguments.out)} frames in {arguments.bag}")
+    if arguments.video_out is not None:
+        files = {frame_name(path): path for path in inputs.images}
+        draw_film(read_results(arguments.out), FrameImages(files, reconstructor.image_size), arguments.video_out)
     print(f"frames: {_said(counts)}; results in {arguments.out}")
     return 1 if counts.failed else 0
+
+
+def _is_for_ray(arguments: Namespace) -> bool:
+    """Whether Ray computes; refuses options that cannot be together."""
+    import torch
+
+    from ..errors import MembraneError
+    from ..plot.film import check_film
+
+    if arguments.device == "cuda" and arguments.engine == "local" and not torch.cuda.is_available():
+        raise MembraneError("--device cuda: torch sees no CUDA device; pass --device cpu, or install torch with CUDA")
+    by_ray: bool = arguments.engine == "ray"
+    if by_ray and arguments.format == "npz":
+        raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
+    if arguments.video_out is not None:
+        check_film(arguments.video_out)
+    return by_ray
 
 
 def _said(counts: "FrameCounts") -> str:

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .arguments import add_command, add_rerun, positive, wants_rerun
+from .film import DEFAULT_RATE, FrameImages, draw_film, images_in
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ..io.read import Results
 
 PURPOSE = "draw stored results"
@@ -25,7 +24,6 @@ examples:
   torchmembrane view results --frame press --ply press.ply   # the contact as a point cloud, nothing drawn
 
 Without --out a window is opened; without a display, NAME_view.png is written beside the results."""
-DEFAULT_RATE = 10.0
 
 
 def add_parser(commands: Any) -> None:
@@ -54,45 +52,15 @@ def run(arguments: Namespace) -> int:
         return _draw(arguments)
     results = read_results(arguments.result)
     width, height = results.mesh.image_size.tolist()
-    images = _Images(arguments.images or arguments.result / "images", (width, height))
+    images = FrameImages(images_in(arguments.images or arguments.result / "images"), (width, height))
     if arguments.video_out is not None:
-        _film(results, images, arguments.video_out, arguments.rate)
+        draw_film(results, images, arguments.video_out, arguments.rate)
     if rerun:
         _show(results, images, arguments.save)
     return 0
 
 
-class _Images:
-    """The images of frames, by name."""
-
-    def __init__(self, folder: Path, size: tuple[int, int]):
-        from ..jobs.inputs import IMAGES
-
-        found = folder.iterdir() if folder.is_dir() else ()
-        self.size, self.files = size, {path.stem: path for path in found if path.suffix.lower() in IMAGES}
-
-    def of(self, name: str) -> "np.ndarray | None":
-        """Grey values `[height, width]` in 0..1, or None."""
-        from ..io.images import read_image
-
-        return read_image(self.files[name], self.size) if name in self.files else None
-
-
-def _film(results: "Results", images: _Images, path: Path, rate: float) -> None:
-    from tqdm import tqdm
-
-    from ..plot.film import check_film, picture_of, write_film
-    from ..plot.frames import figure
-
-    check_film(path)
-    named = zip(results.names, tqdm(results, unit="frame", desc="draw"), strict=True)
-    count = 4 if any(bool(frame["traction"].any()) for frame in results) else 3
-    drawn = (figure(frame, results.mesh, images.of(name), name, count) for name, frame in named)
-    write_film(path, map(picture_of, drawn), rate)
-    print(f"{len(results)} frames drawn in {path}")
-
-
-def _show(results: "Results", images: _Images, save: Path | None) -> None:
+def _show(results: "Results", images: FrameImages, save: Path | None) -> None:
     from ..integrations.rerun import RerunLog
     from ..live.recording import times_of
 

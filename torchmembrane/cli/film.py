@@ -1,0 +1,54 @@
+"""Results of a folder drawn as a film: `view --video-out`, `reconstruct --video-out`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..io.read import Results
+
+DEFAULT_RATE = 10.0
+"""Frames per second."""
+
+
+class FrameImages:
+    """The images of frames, by name.
+
+    Args:
+        files: of those that there are.
+        size: width and height that they must have, px.
+    """
+
+    def __init__(self, files: Mapping[str, Path], size: tuple[int, int]):
+        self.files, self.size = files, size
+
+    def of(self, name: str) -> "np.ndarray | None":
+        """Grey values `[height, width]` in 0..1, or None."""
+        from ..io.images import read_image
+
+        return read_image(self.files[name], self.size) if name in self.files else None
+
+
+def images_in(folder: Path) -> dict[str, Path]:
+    """The image files of a folder by the names of their frames; none if there is no such folder."""
+    from ..jobs.inputs import IMAGES, frame_name
+
+    found = folder.iterdir() if folder.is_dir() else ()
+    return {frame_name(path): path for path in found if path.suffix.lower() in IMAGES}
+
+
+def draw_film(results: "Results", images: FrameImages, path: Path, rate: float = DEFAULT_RATE) -> None:
+    """Draw all frames, in name order, and say so."""
+    from tqdm import tqdm
+
+    from ..plot.film import check_film, picture_of, write_film
+    from ..plot.frames import figure
+
+    check_film(path)
+    named = zip(results.names, tqdm(results, unit="frame", desc="draw"), strict=True)
+    count = 4 if any(bool(frame["traction"].any()) for frame in results) else 3
+    drawn = (figure(frame, results.mesh, images.of(name), name, count) for name, frame in named)
+    write_film(path, map(picture_of, drawn), rate)
+    print(f"{len(results)} frames drawn in {path}")
