@@ -17,6 +17,7 @@ from torchmembrane.onnx.check import Agreement, check_images, checked
 from torchmembrane.onnx.trace import traced
 from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
 from torchmembrane.sensor.sensor import Sensor
+from torchmembrane.solve.inverse_root import by_products
 
 SOLVES = [("minimum-energy", dict(element=element, volume=volume)) for element, volume in product(ELEMENTS, VOLUMES)]
 
@@ -121,6 +122,28 @@ def test_lengths_of_the_batch_stay_free(frames, further):
 def test_a_number_that_depends_on_the_batch_is_refused():
     with pytest.raises(ValueError, match="depends on the batch's length, as a number"):
         traced(Lengths(lambda x, batch: x + float(2 * batch)), {"x": torch.rand(2, 3)}, ["y"])
+
+
+class Rooted(torch.nn.Module):
+    """Inverse roots of matrices larger than a leaf, or what cannot be traced behind one."""
+
+    def __init__(self, further=lambda root: root):
+        super().__init__()
+        self.further = further
+
+    def forward(self, *x):
+        return self.further(by_products(x[0]))
+
+
+def test_a_named_function_is_one_node_only_while_a_piece_is_traced():
+    random = torch.randn(2, 60, 60)
+    matrix = random @ random.mT + torch.eye(60)
+    (node,) = traced(Rooted(), {"x": matrix}, ["y"]).graph.node
+    assert (node.domain, node.op_type, list(node.attribute[0].ints)) == ("torchmembrane", "by_products", [60, 60])
+    with pytest.raises(Exception, match="cholesky|decompos"):
+        traced(Rooted(torch.linalg.cholesky), {"x": matrix}, ["y"])
+    root = by_products(matrix)
+    torch.testing.assert_close(root @ matrix @ root.mT, torch.eye(60).expand(2, -1, -1), atol=1e-3, rtol=0)
 
 
 def test_a_model_is_checked_on_the_sensor_at_rest_and_pressed(sensor):

@@ -93,8 +93,10 @@ def named(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[torch.T
 def writing() -> Iterator[None]:
     """Within, functions that are `named` are nodes."""
     token = _writing.set(True)
-    yield
-    _writing.reset(token)
+    try:
+        yield
+    finally:
+        _writing.reset(token)
 
 
 def repeated(
