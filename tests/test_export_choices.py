@@ -164,7 +164,7 @@ def test_a_model_is_checked_on_the_sensor_at_rest_and_pressed(sensor):
 def test_what_is_not_the_same_is_refused(sensor, found, said, monkeypatch):
     monkeypatch.setattr(check, "compare", lambda *_: found)
     monkeypatch.setattr(check, "check_images", lambda *_: None)
-    monkeypatch.setattr(check, "rounding", lambda *_: 0.0049)
+    monkeypatch.setattr(check, "rounding", lambda *_: 0.0024)
     with pytest.raises(MembraneError, match=said):
         checked(b"", Reconstructor(sensor, "minimum-energy"))
 
@@ -174,7 +174,7 @@ def test_what_float32_makes_of_a_model_is_no_disagreement(sensor, monkeypatch):
     assert 0 < check.rounding(made, check_images(made)) < check.LARGEST * made.estimator.membrane.size
     found = Agreement(0.02, [0], [0])
     monkeypatch.setattr(check, "compare", lambda *_: found)
-    monkeypatch.setattr(check, "rounding", lambda *_: 0.0051)
+    monkeypatch.setattr(check, "rounding", lambda *_: 0.0026)
     assert checked(b"", made) == found
 
 

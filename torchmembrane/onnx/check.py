@@ -14,7 +14,7 @@ from ..simulate.dataset import Plan, random_frame
 from ..simulate.simulator import Simulator
 
 LARGEST = 3e-5  # distance between the vertices of both, over the surface's size
-ROUNDING = 4.0  # or over that which float32 makes in torch
+ROUNDING = 8.0  # or over that which float32 makes in torch: a batch's length alone may make it several times as much
 
 
 class Agreement(NamedTuple):
