@@ -21,7 +21,7 @@ from torchmembrane.io import frame_table
 from torchmembrane.io.claim import WHOLE, Claim, Shard
 from torchmembrane.io.origin import Origin
 from torchmembrane.io.read import read_results
-from torchmembrane.io.results import Reconstruction
+from torchmembrane.io.results import Reconstruction, save_frame
 from torchmembrane.jobs import workers
 from torchmembrane.jobs.inputs import find_inputs
 
@@ -357,3 +357,13 @@ def test_view_draws_a_frame_of_a_folder_or_a_part(small_sensor, small_images, tm
         assert "no frame 'press9'" in capsys.readouterr().err
     (tmp_path / "bad.parquet").write_bytes(b"PAR1")
     assert main(["view", str(tmp_path / "bad.parquet")]) == 2 and "not a part" in capsys.readouterr().err
+
+
+def test_an_interruption_amid_a_result_is_one(tmp_path, monkeypatch):
+    def write_array(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("numpy.lib.format.write_array", write_array)
+    with pytest.raises(KeyboardInterrupt):
+        save_frame(tmp_path / "frame.npz", {"force": np.zeros(3)})
+    assert not list(tmp_path.iterdir())

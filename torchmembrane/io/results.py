@@ -265,7 +265,12 @@ def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
     """
     arrays: dict[str, Any] = frame
     content = BytesIO()  # written at once: each write of a file makes other threads wait for their turn
-    np.savez(content, **arrays)
+    try:
+        np.savez(content, **arrays)
+    except ValueError as error:
+        if isinstance(error.__context__, KeyboardInterrupt):  # amid an entry, which zipfile then cannot close
+            raise error.__context__ from None
+        raise
     with whole_file(path) as partial:
         partial.write_bytes(content.getbuffer())
 
