@@ -8,7 +8,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..solve.block_pentadiagonal import BlockPentadiagonal
 from ..solve.stencil_system import NEAR, StencilSystem
 from .bearings import Bearings, MarkerBearings
 from .camera_motion import CameraMotion
@@ -83,7 +82,7 @@ class BalanceEquations(nn.Module):
         own, slope = weighted @ K.movedim(2, 1).flatten(2).mT, (weighted @ angle.flatten(1)[..., None])[..., 0]
         return CameraMotion(coupling.flatten(2), own, slope)
 
-    def matrix(self, normal: NormalEquations, damping: float | Tensor = 1e-6) -> tuple[BlockPentadiagonal, Tensor]:
+    def matrix(self, normal: NormalEquations, damping: float | Tensor = 1e-6) -> tuple[Tensor, Tensor]:
         """`M` as `system.factor` takes it, with a share of its diagonal added."""
         A = normal.stiffness.transpose(2, 3).flatten(2, 3).movedim(-1, 1).contiguous()  # products of strided ones take a loop
         near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1)).permute(0, 3, 1, 4, 2)

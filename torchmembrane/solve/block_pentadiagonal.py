@@ -4,65 +4,53 @@ Their number is odd. Blocks come in pairs, the first and the last, the second an
 the middle. With the last pair it is solved for as a whole. Kept are inverse roots of the pivots: solving takes products alone.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from .inverse_root import inverse_root
 
-
-class BlockPentadiagonal(NamedTuple):
-    """With `t + 1` pairs of blocks and one in the middle, in the order of elimination:
-
-    diagonal  `[..., t + 2, 2, s, s]`, the last pair the one in the middle and zero
-    next      `[..., t + 1, 2, s, s]`, between every block and the next one further in
-    second    `[..., t, 2, s, s]`, between every block and the one after that
-    across    `[..., s, s]`, between both blocks of the last pair
-    """
-
-    diagonal: Tensor
-    next: Tensor
-    second: Tensor
-    across: Tensor
-
-
 Factor = tuple[list[Tensor], list[Tensor]]
 """The pivots' inverse roots `[..., 2, s, s]`, at last `[..., 3 s, 3 s]`; these times what couples them further in, `[..., 2, s,
 2 s]`."""
 
 
-def places(n: int) -> list[tuple[int, int]]:
-    """Which blocks of the matrix, by row and column, `BlockPentadiagonal` has, one after another; -1 for the zero one."""
+def places(n: int) -> list[list[tuple[int, int]]]:
+    """Which blocks of the matrix, by row and column, an elimination takes at a time; (-1, -1) for one that is zero.
+
+    First those of the first pair, those between it and the second, and those of the second; with every pair that is eliminated
+    those between it and the pair after the next, between the next two, and of the last of these, in the end the one in the
+    middle and zero; then the one between the last pair.
+    """
     pairs = [(k, n - 1 - k) for k in range((n + 1) // 2)]
-    own = [(k, k) for pair in pairs for k in pair][:-1] + [(-1, -1)]
-    further = [
-        (i, j) for step in (1, 2) for k in range(len(pairs) - step) for i, j in zip(pairs[k], pairs[k + step], strict=True)
-    ]
-    return [*own, *further, (pairs[-2][0], pairs[-2][1])]
+
+    def between(k: int, other: int) -> list[tuple[int, int]]:
+        return list(zip(pairs[k], pairs[other], strict=True))
+
+    own = [between(k, k) for k in range(len(pairs) - 1)] + [[(n // 2, n // 2), (-1, -1)]]
+    further = [between(k - 2, k) + between(k - 1, k) + own[k] for k in range(2, len(pairs))]
+    return [own[0] + between(0, 1) + own[1], *further, [(pairs[-2][0], pairs[-2][1])]]
 
 
-def split(blocks: Tensor) -> BlockPentadiagonal:
-    """Blocks `[..., 6 t + 7, s, s]` in the order of `places`."""
-    pairs = (blocks.shape[-3] - 1) // 6
-    own, following, second, across = blocks.split([2 * (pairs + 1), 2 * pairs, 2 * (pairs - 1), 1], -3)
-    own, following, second = (part.unflatten(-3, (-1, 2)) for part in (own, following, second))
-    return BlockPentadiagonal(own, following, second, across.squeeze(-3))
+def factor(parts: Sequence[Tensor], dense: Callable[[Tensor], Tensor]) -> Factor:
+    """What `substitute` needs to solve `M x = b`.
 
-
-def factor(matrix: BlockPentadiagonal) -> Factor:
-    """What `substitute` needs to solve `M x = b`; diagonal best about 1."""
-    diagonal, following, second = (part.unbind(-4) for part in matrix[:3])
-    s = matrix.across.shape[-1]
-    pivot, beside, further_in = diagonal[0], following[0], diagonal[1]
-    roots, couplings = [], []
-    for k, two_further in enumerate(second):
+    Args:
+        parts: of `M`, as `places` lists them, best with a diagonal about 1.
+        dense: makes a part's blocks `[..., 6 or 1, s, s]`, which are a matrix's worth of memory if all are there at once.
+    """
+    pivot, beside, further_in = dense(parts[0]).split(2, -3)
+    roots, couplings, s = [], [], pivot.shape[-1]
+    for part in parts[1:-1]:
+        two_further, next_beside, next_further_in = dense(part).split(2, -3)
         roots.append(inverse_root(pivot))
-        couplings.append(roots[k] @ torch.cat([beside, two_further], -1))
-        change = couplings[k].mT @ couplings[k]
-        pivot, beside = further_in - change[..., :s, :s], following[k + 1] - change[..., :s, s:]
-        further_in = diagonal[k + 2] - change[..., s:, s:]
-    return [*roots, inverse_root(_middle(pivot, beside, further_in.sum(-3), matrix.across))], couplings
+        coupling = roots[-1] @ torch.cat([beside, two_further], -1)
+        couplings.append(coupling)
+        near, far = coupling[..., :s], coupling[..., s:]
+        pivot, beside = further_in - near.mT @ near, next_beside - near.mT @ far
+        further_in = next_further_in - far.mT @ far
+    return [*roots, inverse_root(_middle(pivot, beside, further_in.sum(-3), dense(parts[-1]).squeeze(-3)))], couplings
 
 
 def _middle(pivot: Tensor, beside: Tensor, between: Tensor, across: Tensor) -> Tensor:

@@ -3,12 +3,14 @@
 What is left of a system after an elimination, `C - B^T A^-1 B = C - (R B)^T R B`, then stays positive where `A^-1` itself would
 lose it to rounding: in float32 from conditions of some 1e5 on, as a contact on a nearly unstretched sheet has.
 
-By Cholesky factors, or where a runtime has none (ONNX) by matrix products alone: a root is split into 2 x 2 blocks down to
-`LEAF` rows, and there iterated, `T = (3 I - Z Y) / 2, Y <- Y T, Z <- T Z` from `Y = A, Z = I` to `Z = A^-1/2` (Higham 2008,
-Functions of matrices, eq. 6.35), with `Z Y` scaled in between so that its eigenvalues, which go to 1, do so evenly.
+A matrix is split into 2 x 2 blocks down to `LEAF` rows, so that most of the work is matrix products; a leaf's root is by its
+Cholesky factor, or where a runtime has none (ONNX) iterated by products as well, `T = (3 I - Z Y) / 2, Y <- Y T, Z <- T Z` from
+`Y = A, Z = I` to `Z = A^-1/2` (Higham 2008, Functions of matrices, eq. 6.35), with `Z Y` scaled in between so that its
+eigenvalues, which go to 1, do so evenly.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -18,7 +20,7 @@ from ..pieces import at_hand, named
 
 LEAF = 48
 LARGEST_CONDITION = 1e6  # of a leaf
-RIDGE = 1e-5  # of a matrix' largest eigenvalue, where it has no Cholesky factor
+RIDGE = 1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor
 LARGEST_SCALE = 2.8  # of eigenvalues up to 1; near 3 an iteration would make all of them small
 
 
@@ -35,7 +37,9 @@ def inverse_root(matrix: Tensor) -> Tensor:
 
 
 def by_cholesky(matrix: Tensor) -> Tensor:
-    """The inverse of the Cholesky factor; where rounding has left a matrix without one, of that with a `RIDGE`."""
+    """The inverse of the Cholesky factor; where rounding has left a leaf without one, of that with a `RIDGE`."""
+    if matrix.shape[-1] > LEAF:
+        return _by_halves(matrix, by_cholesky)
     factor, info = torch.linalg.cholesky_ex(matrix)
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     if at_hand(info) and bool(info.any()):
@@ -47,15 +51,9 @@ def by_cholesky(matrix: Tensor) -> Tensor:
 @named
 def by_products(matrix: Tensor) -> Tensor:
     """Too small in the directions of a leaf's smallest eigenvalues where its condition exceeds `LARGEST_CONDITION`."""
-    n = matrix.shape[-1]
-    one = torch.eye(n, dtype=matrix.dtype, device=matrix.device)
-    if n > LEAF:
-        A, B, C = matrix[..., : n // 2, : n // 2], matrix[..., : n // 2, n // 2 :], matrix[..., n // 2 :, n // 2 :]
-        root = by_products(A)
-        coupling = root @ B
-        further = by_products(C - coupling.mT @ coupling)
-        first = torch.cat([root, torch.zeros_like(B)], -1)
-        return torch.cat([first, torch.cat([-(further @ coupling.mT) @ root, further], -1)], -2)
+    if matrix.shape[-1] > LEAF:
+        return _by_halves(matrix, by_products)
+    one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     largest = matrix.abs().sum(-1).amax(-1)[..., None, None]
     iteration = Iteration.to(LARGEST_CONDITION, torch.finfo(matrix.dtype).eps)
     Y = (iteration.first / largest) * matrix
@@ -65,6 +63,17 @@ def by_products(matrix: Tensor) -> Tensor:
         T = shift * one - Z @ Y
         Z = T @ Z
     return (iteration.last * largest.rsqrt()) * Z
+
+
+def _by_halves(matrix: Tensor, inverse_root: Callable[[Tensor], Tensor]) -> Tensor:
+    """The inverse root from those of the first half of the rows and of what is left of the second."""
+    half = matrix.shape[-1] // 2
+    A, B, C = matrix[..., :half, :half], matrix[..., :half, half:], matrix[..., half:, half:]
+    root = inverse_root(A)
+    coupling = root @ B
+    further = inverse_root(C - coupling.mT @ coupling)
+    first = torch.cat([root, torch.zeros_like(B)], -1)
+    return torch.cat([first, torch.cat([-(further @ coupling.mT) @ root, further], -1)], -2)
 
 
 class Iteration(NamedTuple):

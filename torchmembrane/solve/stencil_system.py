@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from ..surface.stencil import STENCIL
 from . import block_pentadiagonal
-from .block_pentadiagonal import BlockPentadiagonal
 from .block_tridiagonal import inwards
 
 NEAR = ((0, 0), (0, 1), (1, 0), (1, 1))  # from a vertex to itself and to its neighbours further on
@@ -44,6 +43,7 @@ class StencilSystem(nn.Module):
         self.count, self.inner_grid = (m - 2) * (n - 2), (m - 2, n - 2)
         self.rows = max(3, m - 2 + (m + 1) % 2)  # an odd number
         self.columns = max(n - 2, 2 * REACH + 1)  # no fewer than a row of the matrix reaches
+        self.parts = [3 * self.columns * len(part) for part in block_pentadiagonal.places(self.rows)]
         groups = _offsets()
         offsets = [offset for group in groups for offset, _ in group]
         sources = [np.stack([_product_sources(grid, *joined) for joined in group], 1) for group in groups]
@@ -59,8 +59,8 @@ class StencilSystem(nn.Module):
         self.register_buffer("one", torch.eye(3, dtype=torch.float64))
         self.register_buffer("fixed", (~free).double()[:, None])
 
-    def matrix(self, products: Tensor, near: Tensor, damping: float | Tensor) -> tuple[BlockPentadiagonal, Tensor]:
-        """The matrix, scaled from both sides to a diagonal of 1; by what, `[B, 1, 3 N]`.
+    def matrix(self, products: Tensor, near: Tensor, damping: float | Tensor) -> tuple[Tensor, Tensor]:
+        """The rows' bands `[B, 3 R, 15]` of the matrix, scaled from both sides to a diagonal of 1; by what, `[B, 1, 3 N]`.
 
         Arguments: `products [B, N, 21, 21]` of every stencil row's columns with each other; `near [B, 4, 3, N, 3]`, further
         blocks between the vertices and those at `NEAR` from them; `damping`, a share of the diagonal.
@@ -75,25 +75,23 @@ class StencilSystem(nn.Module):
         rows = blocks.transpose(2, 3)
         constants = torch.stack([torch.zeros_like(self.one), self.one]).to(rows).flatten(1).expand(rows.shape[0], -1, -1)
         entries = torch.cat([rows.flatten(3).flatten(1, 2), rows.mT.flatten(3).flatten(1, 2), constants], 1)
-        matrix = self._from_band(entries.index_select(1, self.band_sources))
-        return block_pentadiagonal.split(matrix), scale.mT.flatten(1)[:, None]
+        band = entries.index_select(1, self.band_sources).unflatten(2, (3, 3)).unflatten(1, (-1, 2 * REACH + 1))
+        return band.transpose(2, 3).flatten(1, 2).flatten(2), scale.mT.flatten(1)[:, None]
 
-    def _from_band(self, band: Tensor) -> Tensor:
-        """Blocks `[B, ..., s, s]` from those of 3 x 3, `[B, ..., 9]`, between every vertex and those at most `REACH` columns
-        from it.
+    def dense(self, band: Tensor) -> Tensor:
+        """Blocks `[B, K, s, s]` from bands `[B, K s, 15]`: their rows, between a vertex and those at most `REACH` columns off.
 
         Behind as many zeros as make a row of the matrix, and three more a vertex, each lies where it belongs, but for a shift.
         """
-        width, columns = 2 * REACH + 1, self.columns
-        band = band.unflatten(2, (3, 3)).unflatten(1, (-1, width)).transpose(2, 3).flatten(3)
-        rows = F.pad(band, (0, 3 * (columns - width))).flatten(2).unflatten(1, (-1, columns))
+        size = 3 * self.columns
+        rows = F.pad(band, (0, size - band.shape[-1])).unflatten(1, (-1, self.columns, 3)).flatten(3)
         skewed = F.pad(rows, (0, 3)).flatten(2)
-        return skewed[..., 3 * REACH : 3 * (REACH - columns)].unflatten(2, (-1, 3 * columns))
+        return skewed[..., 3 * REACH : 3 * (REACH - self.columns)].unflatten(2, (-1, size))
 
-    def factor(self, matrix: tuple[BlockPentadiagonal, Tensor]) -> tuple[Tensor, ...]:
+    def factor(self, matrix: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
         """What `substitute` needs, from what `matrix` gives."""
-        blocks, scale = matrix
-        roots, couplings = block_pentadiagonal.factor(blocks)
+        band, scale = matrix
+        roots, couplings = block_pentadiagonal.factor(band.split(self.parts, 1), self.dense)
         return *roots, *couplings, scale
 
     def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
@@ -177,7 +175,7 @@ def _band_sources(
     number = np.full((2 * REACH + 1,) * 2, -1)
     for k, offset in enumerate(offsets):
         number[offset] = k  # negative indices wrap: the opposite offset has its own place
-    i, other = np.array(block_pentadiagonal.places(rows)).T[:, :, None, None]
+    i, other = np.concatenate(block_pentadiagonal.places(rows)).T[:, :, None, None]
     j, di, dj = np.arange(columns)[:, None], other - i, np.arange(-REACH, REACH + 1)
     p, q = inner.at(i, j), inner.at(i + di, j + dj)
     used, itself = (p >= 0) & free[p], (i >= 0) & (di == 0) & (dj == 0)
