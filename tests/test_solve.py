@@ -7,7 +7,7 @@ import torch
 from torchmembrane.solve import block_tridiagonal
 from torchmembrane.solve.anderson import DEPTH, accelerated, first
 from torchmembrane.solve.conjugate_gradient import conjugate_gradient
-from torchmembrane.solve.inverse_root import RIDGE, by_cholesky, by_products
+from torchmembrane.solve.inverse_root import LEAF, RIDGE, Iteration, by_cholesky, by_products, iteration_scales
 from torchmembrane.solve.kkt import constrained_minimum
 
 
@@ -110,6 +110,31 @@ def test_what_is_left_of_an_ill_conditioned_system_stays_positive_in_float32(mon
     exact = block_tridiagonal.substitute(block_tridiagonal.factor(*matrix), b)
     single = block_tridiagonal.substitute(block_tridiagonal.factor(*(part.float() for part in matrix)), b.float())
     assert (single - exact).norm() < 0.1 * exact.norm()
+
+
+def test_steps_with_their_numbers_folded_are_the_scaled_steps():
+    """Of one eigenvalue: `T = (3 - s z y) sqrt(s) / 2, y <- y T, z <- T z`, to `z = y^-1/2`."""
+    folded, scales, eigenvalue = Iteration.to(1e4, 1e-12), iteration_scales(1e4, 1e-12), 3e-3
+    y, z = eigenvalue, 1.0
+    for scale in scales:
+        T = (3 - scale * z * y) * scale**0.5 / 2
+        y, z = y * T, T * z
+    Y = folded.first * eigenvalue
+    Z = T = folded.shifts[0] - Y
+    for shift in folded.shifts[1:]:
+        Y *= T
+        T = shift - Z * Y
+        Z *= T
+    assert folded.last * Z == pytest.approx(z, rel=1e-12)
+    assert z == pytest.approx(eigenvalue**-0.5, rel=1e-9)
+
+
+def test_a_matrix_split_into_halves_has_a_ridge_only_in_the_leaf_that_needs_one():
+    matrix = torch.eye(2 * LEAF, dtype=torch.float64)
+    matrix[-1, -1] = -1e-9
+    root = by_cholesky(matrix)
+    assert (root.diagonal()[:LEAF] == 1).all()
+    assert root[-1, -1] == pytest.approx((RIDGE - 1e-9) ** -0.5)
 
 
 def test_what_rounding_has_left_without_a_factor_gets_a_ridge_and_nothing_else_does():
