@@ -208,13 +208,25 @@ def test_angles_vanish_on_the_rays_and_grow_with_the_distance_across():
     torch.testing.assert_close(identity, torch.eye(2, dtype=torch.float64).expand_as(identity))
 
 
+@pytest.mark.parametrize("n", [9, 17])
 @pytest.mark.parametrize("options", [{}, dict(filling="open"), dict(filling="gas", gas=(0.1, 2600.0))])
-def test_rest_rays_give_the_rest_surface_without_forces(options):
-    estimator = make(9, **options)
+def test_rest_rays_give_the_rest_surface_without_forces(options, n):
+    """On one grid, and by way of a coarser one, whose rest pressure is another."""
+    estimator = make(n, **options)
     directions = torch.nn.functional.normalize(estimator.equations.bearings.positions, dim=-1)[None]
     result = estimator(seen(torch.zeros_like(directions), directions))
     assert (result.vertices - estimator.membrane.rest).abs().max() < 1e-6
     assert result.traction.abs().max() < 1e-6 * estimator.reference
+    torch.testing.assert_close(result.pressure[0], estimator.rest_pressure)
+
+
+def test_an_open_cavity_stays_at_its_grids_rest_pressure(pressed):
+    estimator, (origins, directions) = make(33, filling="open"), pressed[0]
+    found = estimator(seen(origins, directions))
+    torch.testing.assert_close(found.pressure[0], estimator.rest_pressure)
+    below = estimator.coarsened(found.vertices, found.pressure, found.moved)
+    torch.testing.assert_close(below.pressure[0], estimator.coarse.rest_pressure)
+    assert abs(float(estimator.rest_pressure / estimator.coarse.coarse.rest_pressure) - 1) > 1e-3
 
 
 @pytest.mark.parametrize("n", [13, 17])

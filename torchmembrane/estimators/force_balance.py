@@ -246,8 +246,8 @@ class ForceBalance(nn.Module):
 
     @piece
     def coarsened(self, x: Tensor, pressure: Tensor, moved: Tensor) -> State:
-        """Vertices `[B, V, 3]` on the grid of `coarse`: every second line's; pressure `[B]` and camera `[B, 4]` as they are."""
-        return State(x.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure, moved)
+        """Vertices `[B, V, 3]` of every second line, for `coarse`; pressure `[B]`, as far from rest; camera `[B, 4]`."""
+        return State(x.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure - self._above_coarse(), moved)
 
     @piece
     def refined(self, x: Tensor, pressure: Tensor, moved: Tensor) -> State:
@@ -255,7 +255,12 @@ class ForceBalance(nn.Module):
         assert self.coarse is not None  # only called with what it has found
         u = (x - self.coarse.membrane.rest).unflatten(1, self.coarse.membrane.grid).permute(0, 3, 1, 2)
         u = F.interpolate(u, self.membrane.grid, mode="bicubic", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
-        return State(self.membrane.rest + u * self.equations.forces.free, pressure, moved)
+        return State(self.membrane.rest + u * self.equations.forces.free, pressure + self._above_coarse(), moved)
+
+    def _above_coarse(self) -> Tensor:
+        """By how much the rest pressure is above that of `coarse`, `[]`: every grid has its own."""
+        assert self.coarse is not None
+        return self.rest_pressure - self.coarse.rest_pressure
 
     @piece
     def equilibrium(self, x: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
