@@ -68,6 +68,27 @@ def decode_image(content: bytes, name: str | Path, size: tuple[int, int] | None 
         return to_grey(_array(image))
 
 
+def read_pixels(name: str | Path, content: bytes | None = None) -> np.ndarray:
+    """The values of an image file as they are stored, `[height, width]` or `[height, width, 3]`.
+
+    Args:
+        name: its path.
+        content: what the file holds; default: it is read.
+
+    Raises:
+        MembraneError: as `read_image`.
+
+    Example:
+        >>> read_pixels("examples/rest.png").dtype
+        dtype('uint8')
+    """
+    content = _content(name) if content is None else content
+    with _opened(name, content) as image:
+        image.load()
+        _refuse_damaged(image, content)
+        return _array(image)
+
+
 def image_size(path: str | Path) -> tuple[int, int]:
     """Width and height of an image file, px, without decoding its pixels.
 
