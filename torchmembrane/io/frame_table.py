@@ -171,7 +171,7 @@ class FrameTable:
     def _index(self) -> dict[Path, frozenset[str]]:
         """The names in each part; those of parts that have not changed are not read again."""
         try:
-            versions = {part: (stat.st_ino, stat.st_mtime_ns) for part in self._parts() for stat in [part.stat()]}
+            versions = {part: _version(part) for part in self._parts()}
             for part, version in versions.items():
                 if self._held.get(part, ((), ()))[0] != version:
                     self._held[part] = version, frozenset(_names(_table(part, ["name"]), part))
@@ -215,6 +215,21 @@ def read_part(part: Path) -> dict[str, Frame]:
 
 def _table(part: Path, columns: list[str] | None = None) -> Any:
     return read_table(part, A_PART, AS_WRITTEN, columns)
+
+
+def _version(part: Path) -> tuple[int, int]:
+    """What changes when a part is replaced.
+
+    Raises:
+        FileNotFoundError: it is not there any more.
+    """
+    try:
+        stat = part.stat()
+    except OSError as error:
+        if isinstance(error, FileNotFoundError) and not part.is_symlink():
+            raise
+        raise refusal(part, A_PART, AS_WRITTEN, error) from error
+    return stat.st_ino, stat.st_mtime_ns
 
 
 def _names(table: Any, part: Path) -> list[str]:

@@ -204,16 +204,15 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
         return
     mesh = Mesh.load(folder / MESH)
     if mesh.sensor != sensor:
-        raise MembraneError(
-            f"--out {folder}: holds results of another sensor, {mesh.name!r} ({mesh.sensor[:12]}, here {sensor[:12]}); "
-            "choose another folder"
-        )
+        other = f"{in_one_line(repr(mesh.name))} ({in_one_line(mesh.sensor[:12])}, here {sensor[:12]})"
+        raise MembraneError(f"--out {folder}: holds results of another sensor, {other}; choose another folder")
     for option, before, now in zip(Settings._fields, mesh.settings, settings, strict=True):
         if before != now:
+            held = in_one_line(before) if before else ""
             name, none = option.replace("_", "-"), NONE if option == "pressure" else OWN
-            remedy = f"pass --{name} {before}" if before else f"leave --{name} out"
+            remedy = f"pass --{name} {held}" if held else f"leave --{name} out"
             raise MembraneError(
-                f"--out {folder}: was made with {name} {before or none}, this call asks for {now or none}; choose another "
+                f"--out {folder}: was made with {name} {held or none}, this call asks for {now or none}; choose another "
                 f"folder, or {remedy}"
             )
 
