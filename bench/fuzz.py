@@ -95,14 +95,19 @@ class Tally:
         return dict(cases=self.kinds.total(), kinds=dict(sorted(self.kinds.items())), broken=self.broken, **bounds)
 
 
+def clear_peak() -> None:
+    """Begin anew with `peak`."""
+    Path("/proc/self/clear_refs").write_text("5")
+
+
 def peak() -> int:
-    """Most memory held since the last `clear`, bytes."""
+    """Most memory held since the last `clear_peak`, bytes."""
     return int(re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[1]) * 1024
 
 
 def measured(use: Callable[[Path], str], folder: Path) -> Outcome:
     """What comes of a case: a kind, or in capitals how it broke the rules."""
-    Path("/proc/self/clear_refs").write_text("5")
+    clear_peak()
     before, start, message = peak(), time.process_time(), ""
     signal.alarm(HANGS)
     try:

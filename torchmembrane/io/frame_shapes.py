@@ -33,7 +33,7 @@ def unlike(frame: Mapping[str, np.ndarray], vertices: int, markers: int) -> str:
         'markers is float64 (2, 3), expected numbers (3, 3)'
     """
     sizes = {"V": vertices, "D": markers, "P": len(np.atleast_1d(frame["contact_points"]))}
-    for key, array in frame.items():
+    for key, array in ((key, np.asarray(value)) for key, value in frame.items()):
         if array.dtype.kind not in "iuf" or array.shape != shape_of(key, sizes):
             return f"{key} is {array.dtype} {array.shape}, expected numbers {shape_of(key, sizes)}"
     return ""
