@@ -36,7 +36,7 @@ LARGEST_BATCH = 16
 LARGEST_GPU_BATCH = 256
 CONTAINER = Path("/sys/fs/cgroup/memory.max")
 PIXEL_BYTES = 600
-VERTEX_BYTES = 0
+VERTEX_BYTES = 25000
 """Memory of a frame in computation, over the pixels of its image and the vertices of its surface."""
 MEMORY_SHARE = 0.25
 """Of the machine's memory, for all frames in computation."""
