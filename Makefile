@@ -1,8 +1,11 @@
-# make demo | make test | make lint (style, types, layers) | make bench | make soak SOAK=HOURS | make figures: each sets itself up on a machine with Python 3.11+ only.
+# make demo | make test | make lint (style, types, layers) | make bench | make figures: each sets itself up on a machine with Python 3.11+ only.
+# make soak SOAK=HOURS PRESSES=10000 KILLS=10: damaged files for so many hours, jobs killed, random sensors pressed; all hours long.
 # make docs: the site in out/site, links checked.
 # make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
 PYTHON ?= python3
 SOAK ?= 1
+PRESSES ?= 10000
+KILLS ?= 10
 SEED ?= $(shell date +%s)
 VENV := .venv
 BIN := $(VENV)/bin
@@ -48,6 +51,10 @@ bench: $(READY)
 
 soak: $(READY)
 	$(BIN)/python bench/fuzz.py --hours $(SOAK) --seed $(SEED) --json out/bench/fuzz.json
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[ray]"
+	for way in --format=npz --format=parquet --engine=ray; do $(BIN)/python bench/kills.py --kills $(KILLS) $$way || exit 1; done
+	$(BIN)/python bench/random_sensors.py out/bench/random --sensors $$(( ($(PRESSES) + 3) / 4 )) --presses 4
+	$(BIN)/python bench/range.py out/bench/random --json out/bench/range.json
 
 figures: $(READY)
 	$(BIN)/python docs/figures.py

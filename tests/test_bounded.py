@@ -1,5 +1,6 @@
 """Files that others wrote: whatever they hold, one line that names them, at once, and no memory taken before."""
 
+import ast
 import io
 import os
 import struct
@@ -8,6 +9,7 @@ import sys
 import time
 import tracemalloc
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -155,6 +157,47 @@ def test_what_is_no_text_is_refused(tmp_path, content):
 def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path):
     (tmp_path / "a").write_bytes("\ufeffformat = 1\r\n".encode())
     assert read_text(tmp_path / "a", 100, "text") == "format = 1\r\n"
+
+
+READERS = {"open", "read_text", "read_bytes", "read_table", "read_metadata", "ParquetFile", "fromfile"}
+LOADERS = {"np", "json", "tomllib", "pickle", "trimesh"}
+OTHERS_FILES = {
+    "io/bounded.py": "the one place",
+    "io/images.py": "Image.open, of bytes",
+    "io/parquet.py": "PyArrow reads itself, of what was looked at before",
+    "io/frame_table.py": "JSON of a table's metadata, through io.parquet",
+    "io/summary.py": "line by line, as long as it likes, of a regular file",
+    "io/origin.py": "hashed piece by piece, of a regular file",
+    "sensor/table.py": "tomllib, of text",
+    "cli/calibrate/files.py": "np.loadtxt, of text",
+    "simulate/frames.py": "JSON, of text, and of a table's metadata",
+    "jobs/decode.py": "PyAV reads videos itself",
+    "live/sources.py": "PyAV reads videos itself",
+}
+"""Modules that call a reader themselves, and why that is within bounds."""
+OWN_FILES = {
+    "jobs/workers.py": "what its parent process wrote",
+    "simulate/dataset.py": "what its parent process gave",
+    "accuracy/measure.py": "what its parent process gave",
+    "presets/annotate.py": "what Sensor.to_file wrote just now",
+    "plot/film.py": "written",
+    "live/recording.py": "written",
+    "integrations/rosbag.py": "written",
+    "simulate/mesh_indenter.py": "load_mesh, of bytes",
+}
+
+
+def test_strangers_files_are_opened_in_one_place():
+    """Every call of a reader in the package, but of `read_text`, `read_bytes` and `read_table` as functions of io."""
+    package, found = Path(__file__).parents[1] / "torchmembrane", set()
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call):
+                called, owner = node.func, getattr(getattr(node.func, "value", None), "id", "")
+                name = getattr(called, "attr", "") or (called.id if getattr(called, "id", "") == "open" else "")
+                if name in READERS or (name.startswith("load") and owner in LOADERS):
+                    found.add(path.relative_to(package).as_posix())
+    assert found <= OTHERS_FILES.keys() | OWN_FILES.keys(), found - OTHERS_FILES.keys() - OWN_FILES.keys()
 
 
 @pytest.mark.parametrize("name", ["..", "a/../../b", "/a", "\\a", "c:\\a", "C:a", "\\\\host\\a", "a\0", "..\\a"])

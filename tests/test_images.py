@@ -169,3 +169,16 @@ def test_formats_that_no_camera_writes_are_not_opened(tmp_path, photograph, kind
     photograph.save(tmp_path / "a.png", kind)
     with pytest.raises(MembraneError, match="cannot identify image file"):
         read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("options", [{}, dict(lossless=True), dict(exif=b"Exif\0\0odd")], ids=str)
+def test_a_webp_is_as_long_as_its_chunks_say(tmp_path, options):
+    path = tmp_path / "a.webp"
+    Image.fromarray(RGB).save(path, **options)
+    whole = path.read_bytes()
+    assert read_image(path).shape == (7, 9)
+    spoiled = [whole + b"more", whole[:-1], whole[:4] + bytes([whole[4] ^ 2]) + whole[5:], whole[:30] + whole[20:]]
+    for content in spoiled:
+        path.write_bytes(content)
+        with pytest.raises(MembraneError, match="not readable as an image"):
+            read_image(path)

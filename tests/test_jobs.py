@@ -24,6 +24,7 @@ from torchmembrane.io.read import read_results
 from torchmembrane.io.results import Reconstruction, save_frame
 from torchmembrane.jobs import workers
 from torchmembrane.jobs.inputs import find_inputs
+from torchmembrane.jobs.workers import LARGEST_BATCH, MEMORY_SHARE, batch_for, frame_bytes
 
 both = pytest.mark.parametrize("settings", [NPZ, PARQUET], ids=["npz", "parquet"])
 
@@ -338,6 +339,51 @@ def test_frames_are_the_same_in_any_batch_within_the_stated_bound(small_sensor, 
         alone = reconstructor(images[k : k + 1])
         assert (alone.vertices[0] - together.vertices[k]).abs().max() < 1e-3
         assert (alone.force[0] - together.force[k]).norm() < 1e-3 * together.force[k].norm().clamp_min(0.1)
+        assert (alone.residual[0] - together.residual[k]).abs() < 1e-3
+
+
+def test_progress_says_rate_failed_and_unconverged(images, tmp_path, capfd):
+    images[0].write_bytes(b"broken")
+    grey_image(images[1], 10)  # of these Denting does not converge
+    reconstruct(images, tmp_path / "out")
+    last = capfd.readouterr().err.split("\r")[-1]
+    assert "5/5" in last and "frame/s" in last and "failed=1, not converged=1" in last
+
+
+@pytest.mark.parametrize("workers, vertices, width", [(1, 289, 640), (2, 1089, 1920), (8, 4225, 4000), (1, 4225, 8000)])
+def test_batches_take_their_share_of_the_memory_at_most(monkeypatch, workers, vertices, width):
+    size, memory = (width, 3 * width // 4), 8 * 2**30
+    monkeypatch.setattr("torchmembrane.jobs.workers.memory_here", lambda: memory)
+    batch = batch_for(size, vertices, workers, "cpu")
+    taken = workers * frame_bytes(size, vertices)
+    assert batch == 1 or batch * taken <= MEMORY_SHARE * memory
+    assert batch == LARGEST_BATCH or (batch + 1) * taken > MEMORY_SHARE * memory
+
+
+PEAK = """
+import ctypes, re, sys, torch
+from pathlib import Path
+import torchmembrane as tm
+torch.set_num_threads(1)
+reconstructor = tm.Reconstructor.from_file(sys.argv[1])
+images = reconstructor.read(*sys.argv[2:]).repeat(6, 1, 1, 1)[:16]
+ctypes.CDLL(None).malloc_trim(0)
+Path("/proc/self/clear_refs").write_text("5")
+held = lambda: int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) * 1024
+before = held()
+with torch.no_grad():
+    reconstructor(images)
+print(held() - before, len(reconstructor.vertex_pixels), *reconstructor.image_size)
+"""
+
+
+def test_a_batch_takes_no_more_memory_than_it_is_taken_for(tmp_path):
+    examples = Path(__file__).parents[1] / "examples"
+    presses = [str(examples / f"{name}.png") for name in ("press_on_axis", "two_contacts", "flat_plate")]
+    command = [sys.executable, "-c", PEAK, str(examples / "sensor.toml"), *presses]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    peak, vertices, width, height = map(int, done.stdout.split())
+    assert 10 * 2**20 < peak <= 16 * frame_bytes((width, height), vertices)
 
 
 @both

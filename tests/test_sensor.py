@@ -507,6 +507,10 @@ HOSTILE = [
         "[membrane] grid = [1000000, 1000000]; expected 5 x 5",
     ),
     (
+        replaced("base_z = 8.0", "base_z = 8.0\ngrid = [2000, 2000]"),
+        "[membrane] grid = [2000, 2000]; expected 5 x 5",
+    ),
+    (
         replaced("base_z = 8.0", "base_z = 8.0\ngrid = [66, 65]"),
         "[membrane] grid = [66, 65]; expected 5 x 5",
         "at most 65 x 65",

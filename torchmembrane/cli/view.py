@@ -72,7 +72,6 @@ def _show(results: "Results", images: FrameImages, save: Path | None) -> None:
 
 
 def _draw(arguments: Namespace) -> int:
-    from ..errors import MembraneError
     from ..io.images import read_image
     from ..io.point_cloud import save_contact_cloud
     from ..io.read import read_frame
@@ -85,11 +84,7 @@ def _draw(arguments: Namespace) -> int:
         print(f"{name}: {save_contact_cloud(arguments.ply, frame)} points of contact in {arguments.ply}")
         return 0
     mesh = Mesh.load(arguments.mesh or home / MESH)
-    vertices, expected = len(frame["vertices"]), len(mesh.rest_vertices)
-    if vertices != expected:
-        raise MembraneError(
-            f"{arguments.result}: {vertices} vertices, the mesh has {expected}; pass the {MESH} of its folder as --mesh"
-        )
+    mesh.check(frame, arguments.result)
     image = read_image(arguments.image) if arguments.image else None
     drawing = figure(frame, mesh, image, name)
     if arguments.out is None and _has_display():

@@ -13,12 +13,13 @@ import numpy as np
 
 from ..camera.model import Camera
 from ..errors import MembraneError
-from ..io.bounded import in_one_line
+from ..io.bounded import in_one_line, read_text
 from ..io.optional import load_rosbags
 from ..io.results import Frame
 from .messages import POINT_FIELDS, SiUnits, cloud_layout, unlike
 
 BAGS, METADATA = (".mcap", ".db3"), "metadata.yaml"
+MOST_METADATA_BYTES = 2**24
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 TOPICS = {
@@ -48,6 +49,10 @@ def is_bag(path: Path) -> bool:
 def metadata_of(folder: Path) -> list[Path]:
     """The `metadata.yaml` of a bag's folder; none of another folder."""
     return [path for path in (folder / METADATA,) if path.is_file()]
+
+
+def _metadata(path: Path) -> str:
+    return read_text(path, MOST_METADATA_BYTES, f"a bag's {METADATA}")
 
 
 def is_mcap(bag: Path) -> bool:
@@ -124,7 +129,7 @@ class BagWriter:
     def __init__(self, path: str | Path, units: SiUnits, mcap: bool):
         self.path, self.units, self.mcap = Path(path), units, mcap
         self.written = 0
-        if self.path.exists() and not any(OURS in found.read_text() for found in metadata_of(self.path)):
+        if self.path.exists() and not any(OURS in _metadata(found) for found in metadata_of(self.path)):
             raise MembraneError(f"{path}: exists already, and is no bag of results; expected a new folder")
         load_rosbags()
 

@@ -24,6 +24,8 @@ MOST_ARRAY_BYTES = 2**26
 """Of a file of arrays, and of the arrays that are read from it together."""
 MOST_ARRAYS = 64
 """In a file."""
+NUMBERS, TEXT = "biuf", "U"
+"""Kinds of numpy's types."""
 NPY_MAGIC = b"\x93NUMPY"
 PLAIN_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 ENTRY_MARK = b"PK\x01\x02"  # begins every entry of a zip file's directory
@@ -52,22 +54,41 @@ def read_bytes(path: Path, most: int, expected: str) -> bytes:
         torchmembrane.errors.MembraneError: examples/dots.csv: holds 3893 bytes; expected dots, at most 10 bytes
     """
     try:
-        found = os.stat(path)
-        if not stat.S_ISREG(found.st_mode):
-            raise MembraneError(f"{path}: not readable (it is a {_kind(found.st_mode)}); expected {expected}, a regular file")
-        if found.st_size <= most:
-            with open(path, "rb") as file:
-                content = file.read(found.st_size + 1)
-            if len(content) <= most:
-                return content
-    except MembraneError:
-        raise
+        size = regular_size(path, most, expected)
+        with open(path, "rb") as file:
+            content = file.read(size + 1)
     except FileNotFoundError:
         raise MembraneError(f"{path}: no such file; expected {expected}, check the path") from None
-    except (OSError, ValueError, MemoryError) as error:  # ValueError: a NUL in the path
-        cause = getattr(error, "strerror", None) or in_one_line(error)
-        raise MembraneError(f"{path}: not readable ({cause}); expected {expected}") from error
-    raise MembraneError(f"{path}: holds {found.st_size} bytes; expected {expected}, at most {most} bytes")
+    except (OSError, MemoryError) as error:
+        raise MembraneError(f"{path}: not readable ({_cause(error)}); expected {expected}") from error
+    if len(content) > most:
+        raise MembraneError(f"{path}: holds more than {size} bytes; expected {expected}, at most {most} bytes")
+    return content
+
+
+def regular_size(path: Path, most: int, expected: str) -> int:
+    """How many bytes a regular file holds; it is not opened.
+
+    Args:
+        path: as `read_bytes`.
+        most: bytes that it may hold.
+        expected: what is to be read, for messages.
+
+    Raises:
+        FileNotFoundError: no such file.
+        MembraneError: no regular one, or a larger one.
+    """
+    try:
+        found = os.stat(path)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise MembraneError(f"{path}: not readable ({_cause(error)}); expected {expected}") from error
+    if not stat.S_ISREG(found.st_mode):
+        raise MembraneError(f"{path}: not readable (it is a {_kind(found.st_mode)}); expected {expected}, a regular file")
+    if found.st_size > most:
+        raise MembraneError(f"{path}: holds {found.st_size} bytes; expected {expected}, at most {most} bytes")
+    return found.st_size
 
 
 def read_text(path: Path, most: int, expected: str) -> str:
@@ -90,12 +111,16 @@ def read_text(path: Path, most: int, expected: str) -> str:
     return text
 
 
-def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Arrays of numbers from an `.npz`, by name. Sizes are checked before anything is unpacked; nothing is unpickled.
+def read_arrays(
+    path: Path, names: Sequence[str] | None = None, expected: str = "an .npz as numpy.savez writes it", kinds: str = NUMBERS
+) -> dict[str, np.ndarray]:
+    """Arrays from an `.npz`, by name. Sizes are checked before anything is unpacked; nothing is unpickled.
 
     Args:
         path: of the file.
-        names: of the arrays; others that the file may hold are not read.
+        names: of the arrays, others that the file may hold are not read; None: all.
+        expected: what is read, for messages.
+        kinds: of their types, `NUMBERS` or `NUMBERS + TEXT`.
 
     Raises:
         MembraneError: no such file, a damaged or too large one, or one that lacks an array.
@@ -104,20 +129,20 @@ def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
         >>> read_arrays(Path("examples/rest_grid.npz"), ["vertices"])["vertices"].shape
         (33, 33, 3)
     """
-    expected = "an .npz as numpy.savez writes it"
     content = read_bytes(path, MOST_ARRAY_BYTES, expected)
     try:
         if content.count(ENTRY_MARK) > MOST_ARRAYS:
             raise ValueError(f"it holds more than {MOST_ARRAYS} arrays")
         with zipfile.ZipFile(io.BytesIO(content)) as file:
             members = {member.filename.removesuffix(".npy"): member for member in file.infolist()}
-            if missing := [name for name in names if name not in members]:
-                held = ", ".join(in_one_line(name) for name in members) or "nothing"
-                said = f"{missing[0]} is missing, the file holds {held}"
-                raise MembraneError(f"{path}: {said}; expected {', '.join(names)}: add it")
-            wanted = {name: members[name] for name in names}
+            if missing := [name for name in names or () if name not in members]:
+                said = f"{missing[0]} is missing, the file holds {in_one_line(', '.join(members)) if members else 'nothing'}"
+                raise MembraneError(f"{path}: {said}; expected {', '.join(names or ())}: add it")
+            wanted = members if names is None else {name: members[name] for name in names}
             _refuse_large(sum(member.file_size for member in wanted.values()))
-            return {name: _array(_unpacked(file, member), f"{path}: {name}") for name, member in wanted.items()}
+            return {
+                name: _array(_unpacked(file, member), f"{path}: {in_one_line(name)}", kinds) for name, member in wanted.items()
+            }
     except MembraneError:
         raise
     except DAMAGE as error:
@@ -135,7 +160,7 @@ def read_array(path: Path) -> np.ndarray:
     """
     expected = "an array as numpy.save writes it"
     try:
-        return _array(read_bytes(path, MOST_ARRAY_BYTES, expected), f"{path}: the array")
+        return _array(read_bytes(path, MOST_ARRAY_BYTES, expected), f"{path}: the array", NUMBERS)
     except MembraneError:
         raise
     except DAMAGE as error:
@@ -186,6 +211,10 @@ def printable(text: object) -> str:
     return "".join(c if c.isprintable() else "?" for c in str(text))
 
 
+def _cause(error: BaseException) -> str:
+    return getattr(error, "strerror", None) or in_one_line(error)
+
+
 def _kind(mode: int) -> str:
     kinds = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket"}
     return kinds.get(stat.S_IFMT(mode), "device")
@@ -207,14 +236,14 @@ def _unpacked(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     return content
 
 
-def _array(content: bytes, name: str) -> np.ndarray:
+def _array(content: bytes, name: str, kinds: str) -> np.ndarray:
     """The array of an `.npy` file's content, which must hold as many bytes as its header declares."""
     if not content.startswith(NPY_MAGIC):
         raise ValueError("it does not begin as an .npy does")
     stream = io.BytesIO(content)
     shape, by_columns, dtype = _header(stream)
-    if dtype.kind not in "biuf":
-        raise MembraneError(f"{name} is of type {in_one_line(dtype)}; expected numbers")
+    if dtype.kind not in kinds:
+        raise MembraneError(f"{name} is of type {in_one_line(dtype)}; expected numbers{' or text' if TEXT in kinds else ''}")
     held, declared = len(content) - stream.tell(), math.prod(shape) * dtype.itemsize
     if min(shape, default=1) < 0 or held != declared:
         raise ValueError(f"it holds {held} bytes, its header declares {shortened(str(shape))} of {dtype}")

@@ -1,6 +1,7 @@
 """The frames of a folder of results as rows of one Parquet dataset: small parts as work goes on, merged into large ones."""
 
 import json
+import re
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager
@@ -9,18 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import MembraneError
 from .atomic import whole_file
+from .bounded import DAMAGE
 from .optional import load_pyarrow
 from .origin import Origin
-from .results import DAMAGE, Frame, Reconstruction, Stored
+from .parquet import read_table, refusal
+from .results import Frame, Reconstruction, Stored
 from .status import Status
 from .store import Mesh
 
 PART_ROWS = 256
 """Frames of one Parquet file, at least, once there are as many."""
+PART_BYTES = 2**27
+"""Of the arrays of such a file, about: of large surfaces a file holds fewer frames."""
 SAVE_SECONDS = 5.0
 """Frames are held back for this long at most."""
+PART = re.compile(r"part-\d+")
+A_PART = "a part of torchmembrane's results"
+AS_WRITTEN = "it as it was written: the same reconstruct command again sets it aside and does its frames again"
 COLUMNS = ("name", "status_text", *Origin._fields, "seconds", *Reconstruction._fields)
 
 
@@ -42,9 +49,10 @@ class FrameTable:
 
     def __init__(self, folder: Path, mesh: Mesh, gate: AbstractContextManager[Any]):
         self.arrow, self.parquet = load_pyarrow()
-        self.folder, self.gate = folder, gate
+        self.folder, self.mesh, self.gate = folder, mesh, gate
         self.metadata = {key: getattr(mesh, key) for key in ("length_unit", "force_unit", "name", "sensor")}
         self.damaged: list[Path] = []
+        self.part_rows = max(1, min(PART_ROWS, PART_BYTES // (60 * len(mesh.rest_vertices) + 30 * len(mesh.rest_pixels) + 300)))
         self._waiting: dict[str, Stored] = {}
         self._held: dict[Path, tuple[tuple[int, int], frozenset[str]]] = {}
         self._saved = time.monotonic()
@@ -64,7 +72,9 @@ class FrameTable:
             for part in self._parts():
                 try:
                     table = _table(part)
-                    rows = _stored_rows(table)
+                    rows = _stored_rows(table, part)
+                    for stored in rows.values():
+                        self.mesh.check(stored.frame, part)
                 except DAMAGE:
                     self.damaged.append(part)
                     part.replace(part.with_suffix(".damaged"))
@@ -93,7 +103,7 @@ class FrameTable:
     def write(self, name: str, stored: Stored) -> None:
         """Hold a frame back until there are `PART_ROWS` of them, or `save` finds that it is time."""
         self._waiting[name] = stored
-        if len(self._waiting) >= PART_ROWS:
+        if len(self._waiting) >= self.part_rows:
             self._flush()
 
     def forget(self, name: str) -> None:
@@ -123,16 +133,16 @@ class FrameTable:
             last = max((int(part.stem.rpartition("-")[2]) for part in self._parts()), default=-1)
             self._put(self._table_of(self._waiting), self.folder / f"part-{last + 1:05d}.parquet")
             self._waiting = {}
-            self._merge(least=PART_ROWS)
+            self._merge(least=self.part_rows)
 
     def _merge(self, least: int) -> None:
         """Small parts become one where they have `least` rows together. The first of them is replaced, the others are deleted:
         interrupted in between, rows are there twice until the folder is opened again."""
         group: dict[Path, int] = {}
         for part, held in self._index().items():
-            if len(held) < PART_ROWS:
+            if len(held) < self.part_rows:
                 group[part] = len(held)
-            if sum(group.values()) >= PART_ROWS:
+            if sum(group.values()) >= self.part_rows:
                 self._join(list(group))
                 group = {}
         if sum(group.values()) >= least:
@@ -153,18 +163,18 @@ class FrameTable:
                 part.unlink()
                 continue
             table = _table(part)
-            self._put(table.filter(self.arrow.array([name not in names for name in table["name"].to_pylist()])), part)
+            self._put(table.filter(self.arrow.array([name not in names for name in _names(table, part)])), part)
 
     def _parts(self) -> list[Path]:
-        return sorted(self.folder.glob("part-*.parquet"))
+        return sorted(path for path in self.folder.glob("part-*.parquet") if PART.fullmatch(path.stem))
 
     def _index(self) -> dict[Path, frozenset[str]]:
         """The names in each part; those of parts that have not changed are not read again."""
         try:
-            versions = {part: (stat.st_ino, stat.st_mtime_ns) for part in self._parts() for stat in [part.stat()]}
+            versions = {part: _version(part) for part in self._parts()}
             for part, version in versions.items():
                 if self._held.get(part, ((), ()))[0] != version:
-                    self._held[part] = version, frozenset(_table(part, ["name"])["name"].to_pylist())
+                    self._held[part] = version, frozenset(_names(_table(part, ["name"]), part))
         except FileNotFoundError:  # merged into another one meanwhile
             return self._index()
         return {part: self._held[part][1] for part in versions}
@@ -198,22 +208,38 @@ def read_part(part: Path) -> dict[str, Frame]:
     """
     table = _table(part)
     try:
-        return {name: stored.frame for name, stored in _stored_rows(table).items()}
+        return {name: stored.frame for name, stored in _stored_rows(table, part).items()}
     except DAMAGE as error:
-        raise _refusal(part, error) from error
+        raise refusal(part, A_PART, AS_WRITTEN, error) from error
 
 
 def _table(part: Path, columns: list[str] | None = None) -> Any:
-    parquet = load_pyarrow()[1]
+    return read_table(part, A_PART, AS_WRITTEN, columns)
+
+
+def _version(part: Path) -> tuple[int, int]:
+    """What changes when a part is replaced.
+
+    Raises:
+        FileNotFoundError: it is not there any more.
+    """
     try:
-        return parquet.read_table(part, columns=columns, partitioning=None, page_checksum_verification=True)
-    except FileNotFoundError:
-        raise
-    except (OSError, ValueError, KeyError) as error:
-        raise _refusal(part, error) from error
+        stat = part.stat()
+    except OSError as error:
+        if isinstance(error, FileNotFoundError) and not part.is_symlink():
+            raise
+        raise refusal(part, A_PART, AS_WRITTEN, error) from error
+    return stat.st_ino, stat.st_mtime_ns
 
 
-def _stored_rows(table: Any) -> dict[str, Stored]:
+def _names(table: Any, part: Path) -> list[str]:
+    names: list[str] = table["name"].to_pylist()
+    if not all(isinstance(name, str) for name in names):
+        raise refusal(part, A_PART, AS_WRITTEN, "not all its names are text")
+    return names
+
+
+def _stored_rows(table: Any, part: Path) -> dict[str, Stored]:
     columns = {}
     for key, shape in json.loads(table.schema.metadata[b"shapes"]).items():
         values = table[key].combine_chunks()
@@ -221,12 +247,5 @@ def _stored_rows(table: Any) -> dict[str, Stored]:
             values = values.flatten()
         columns[key] = values.to_numpy(zero_copy_only=False).reshape(len(table), *shape)
     known = {key: table[key].to_pylist() for key in (*Origin._fields, "seconds") if key in table.column_names}
-    names = table["name"].to_pylist()
+    names = _names(table, part)
     return {name: Stored.of({key: values[i] for key, values in (columns | known).items()}) for i, name in enumerate(names)}
-
-
-def _refusal(part: Path, error: BaseException) -> MembraneError:
-    return MembraneError(
-        f"{part}: not a part of torchmembrane's results, or damaged ({error}); the same reconstruct command again sets it "
-        "aside and does its frames again"
-    )

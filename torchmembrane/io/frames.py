@@ -6,10 +6,10 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
-
+from ..errors import MembraneError
+from .bounded import DAMAGE, read_arrays
 from .frame_table import FrameTable
-from .results import DAMAGE, Frame, Stored, load_frame, save_frame
+from .results import Frame, Stored, load_frame, load_stored, save_frame
 from .store import MESH, Mesh, check_folder
 
 Frames: TypeAlias = "FrameFiles | FrameTable"
@@ -37,18 +37,24 @@ def open_folder(folder: str | Path, mesh: Mesh, gate: AbstractContextManager[Any
 
 def frames_of(folder: Path, mesh: Mesh, gate: AbstractContextManager[Any] | None = None) -> Frames:
     """The frames of a folder whose mesh this is."""
-    return FrameTable(folder / "frames", mesh, gate or nullcontext()) if mesh.format == "parquet" else FrameFiles(folder)
+    if mesh.format == "parquet":
+        return FrameTable(folder / "frames", mesh, gate or nullcontext())
+    return FrameFiles(folder, mesh)
 
 
 class FrameFiles:
     """Frames as one NAME.npz each: the keys of `Reconstruction`, and of `Stored`.
 
+    Args:
+        folder: of the files.
+        mesh: what the frames share.
+
     Attributes:
         damaged: files that could not be read, as far as `stored` has come.
     """
 
-    def __init__(self, folder: Path):
-        self.folder = folder
+    def __init__(self, folder: Path, mesh: Mesh):
+        self.folder, self.mesh = folder, mesh
         self.damaged: list[Path] = []
 
     def names(self) -> set[str]:
@@ -60,9 +66,9 @@ class FrameFiles:
         for path in self._files():
             if wanted(path.stem):
                 try:
-                    with np.load(path) as data:
-                        stored = Stored.of(dict(data))
-                except DAMAGE:
+                    stored = load_stored(path)
+                    self.mesh.check(stored.frame, path)
+                except MembraneError:
                     self.damaged.append(path)
                     continue
                 yield path.stem, stored
@@ -95,7 +101,6 @@ class FrameFiles:
 
 def _holds_status(path: Path) -> bool:
     try:
-        with np.load(path) as data:
-            return int(data["status"]) >= 0
+        return int(read_arrays(path, ["status"])["status"]) >= 0
     except DAMAGE:
         return False

@@ -21,7 +21,7 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndar
 
     Grey of 8 and 16 bits and of float (TIFF), RGB, palette, CMYK; alpha is ignored, of several frames the first is taken.
     EXIF orientation is not applied: pixels are the camera's own. Colour of 16 bits arrives as 8 bits (Pillow's limit). Whatever
-    the decoders remark is an error: checksums of PNG, corrupt or missing data in JPEG.
+    the decoders remark is an error: checksums of PNG, corrupt or missing data in JPEG, lengths that do not add up in WebP.
 
     Args:
         path: a PNG, JPEG, BMP, TIFF or WebP file.
@@ -66,6 +66,27 @@ def decode_image(content: bytes, name: str | Path, size: tuple[int, int] | None 
         image.load()
         _refuse_damaged(image, content)
         return to_grey(_array(image))
+
+
+def read_pixels(name: str | Path, content: bytes | None = None) -> np.ndarray:
+    """The values of an image file as they are stored, `[height, width]` or `[height, width, 3]`.
+
+    Args:
+        name: its path.
+        content: what the file holds; default: it is read.
+
+    Raises:
+        MembraneError: as `read_image`.
+
+    Example:
+        >>> read_pixels("examples/rest.png").dtype
+        dtype('uint8')
+    """
+    content = _content(name) if content is None else content
+    with _opened(name, content) as image:
+        image.load()
+        _refuse_damaged(image, content)
+        return _array(image)
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
@@ -113,6 +134,8 @@ def _refuse_damaged(image: Image.Image, content: bytes) -> None:
     if image.format == "PNG":
         with Image.open(io.BytesIO(content), formats=FORMATS) as twin:
             twin.verify()
+    if image.format == "WEBP" and not _fills_its_file(content):
+        raise ValueError("its chunks do not fill the file")
     if image.format in ("JPEG", "MPO") and image.mode in ("L", "RGB"):
         from kornia_rs.io import ImageDecoder
 
@@ -120,6 +143,15 @@ def _refuse_damaged(image: Image.Image, content: bytes) -> None:
             ImageDecoder().decode_gray8(content)
         except Exception as error:  # it raises nothing narrower
             raise ValueError("corrupt JPEG data") from error
+
+
+def _fills_its_file(riff: bytes) -> bool:
+    """Whether the chunks of a RIFF file, one behind the other, are as long as they say together."""
+    at, end = 12, 8 + int.from_bytes(riff[4:8], "little")
+    while at < end:
+        size = int.from_bytes(riff[at + 4 : at + 8], "little")
+        at += 8 + size + size % 2
+    return at == end == len(riff)
 
 
 def mean_image(paths: Sequence[Path]) -> np.ndarray:

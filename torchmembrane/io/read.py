@@ -30,19 +30,22 @@ def read_results(folder: str | Path) -> "Results":
         MembraneError: the folder holds no results, or not one frame.
 
     Example:
-        Here the folder is written by hand, arrays empty; `torchmembrane reconstruct` writes such folders.
+        Here the folder is written by hand, of a surface without vertices; `torchmembrane reconstruct` writes such folders.
 
-        >>> import numpy as np, tempfile, torch
+        >>> import numpy as np, tempfile
+        >>> from torchmembrane.io.frame_shapes import SHAPES, shape_of
         >>> from torchmembrane.io.results import save_frame
         >>> folder = Path(tempfile.mkdtemp())
-        >>> Mesh(*[np.zeros(0)] * 8, "mm", "N", "finger", "", "force-balance", "neo_hookean", "", "npz").save(folder / MESH)
+        >>> none = {2: np.zeros((0, 2)), 3: np.zeros((0, 3))}
+        >>> arrays = [none[3], none[3], none[3], np.zeros(0), np.zeros(2), none[2], none[2], np.zeros(2)]
+        >>> Mesh(*arrays, "mm", "N", "finger", "", "force-balance", "neo_hookean", "", "npz").save(folder / MESH)
         >>> for name in ("rest", "press"):
-        ...     save_frame(folder / f"{name}.npz", Reconstruction(*torch.zeros(26, 1)).frame(0))
+        ...     save_frame(folder / f"{name}.npz", {key: np.zeros(shape_of(key, {"V": 0, "D": 0, "P": 4})) for key in SHAPES})
         >>> results = read_results(folder)
         >>> results.names, results.mesh.length_unit, int(results["press"]["status"])
         (['press', 'rest'], 'mm', 0)
         >>> [float(frame["pressure"]) for frame in results], results.batch().pressure
-        ([0.0, 0.0], tensor([0., 0.]))
+        ([0.0, 0.0], tensor([0., 0.], dtype=torch.float64))
     """
     return Results(Path(folder))
 
@@ -117,12 +120,18 @@ class Results:
     def __getitem__(self, name: str) -> Frame:
         if name not in self._known:
             raise MembraneError(f"{self.folder}: no frame {name!r}; expected one of {len(self)}, {self.names[0]!r} the first")
-        return self._frames.read([name])[0]
+        return self._read([name])[0]
 
     def __iter__(self) -> Iterator[Frame]:
         names = iter(self.names)
         while group := list(islice(names, PART_ROWS)):
-            yield from self._frames.read(group)
+            yield from self._read(group)
+
+    def _read(self, names: list[str]) -> list[Frame]:
+        frames = self._frames.read(names)
+        for name, frame in zip(names, frames, strict=True):
+            self.mesh.check(frame, f"{self.folder}: {name}")
+        return frames
 
     def __repr__(self) -> str:
         return f"Results({str(self.folder)!r}: {len(self)} frames of {self.mesh.name!r})"

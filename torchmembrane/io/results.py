@@ -1,11 +1,8 @@
 """What one frame's reconstruction holds, and how it is stored."""
 
-import struct
-import zlib
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -14,15 +11,12 @@ from torch import Tensor
 from ..errors import MembraneError, expect
 from ..pose import Pose
 from .atomic import whole_file
+from .bounded import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays
+from .frame_shapes import shape_of
 from .origin import Origin
 
 Frame: TypeAlias = dict[str, np.ndarray]
 """One frame's arrays, as `Reconstruction.frame` gives them."""
-DAMAGE = (
-    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError, ValueError),
-    *(BadZipFile, struct.error, zlib.error),
-)
-"""What reading a damaged file raises."""
 
 
 class RestSurface(Protocol):
@@ -202,20 +196,12 @@ class Reconstruction(NamedTuple):
         return Reconstruction(**{key: value.detach().cpu().numpy() for key, value in self._asdict().items()})
 
 
-ADDED: dict[str, tuple[int, ...]] = {
-    "wrench": (6,),
-    "contact_force": (0, 3),
-    "contact_normal": (0, 3),
-    "contact_area": (0,),
-    "contact_slip": (0,),
-    "contact_curvature": (0, 2),
-    "contact_at_rim": (0,),
-    "coverage": (),
-    "camera_motion": (4,),
-    "force_deviation": (3,),
-    "depth_deviation": (),
-}
-"""Arrays that results did not always hold, with their shapes: 0 stands for as many as there are `contact_points`."""
+ADDED = (
+    *("wrench", "contact_force", "contact_normal", "contact_area", "contact_slip", "contact_curvature", "contact_at_rim"),
+    *("coverage", "camera_motion", "force_deviation", "depth_deviation"),
+)
+"""Arrays that results did not always hold."""
+EXPECTED = "a result NAME.npz, the arrays of Reconstruction"
 
 
 class Stored(NamedTuple):
@@ -287,16 +273,20 @@ def load_frame(path: str | Path) -> dict[str, np.ndarray]:
     Raises:
         MembraneError: the file is missing, or not a frame.
     """
+    return load_stored(Path(path)).frame
+
+
+def load_stored(path: Path) -> Stored:
+    """Read a frame, and what it was found in.
+
+    Raises:
+        MembraneError: as `load_frame`.
+    """
+    arrays = read_arrays(path, None, EXPECTED, NUMBERS + TEXT)
     try:
-        with np.load(path) as data:
-            frame = completed({k: data[k] for k in data})
-    except FileNotFoundError as error:
-        raise MembraneError(f"{path}: no such file; expected a result NAME.npz") from error
+        return Stored.of({key: np.array(array, array.dtype.newbyteorder("=")) for key, array in arrays.items()})
     except DAMAGE as error:
-        raise MembraneError(
-            f"{path}: not a result of torchmembrane ({error}); expected the arrays of Reconstruction"
-        ) from error
-    return frame
+        raise MembraneError(f"{path}: not a result of torchmembrane ({in_one_line(error)}); expected {EXPECTED}") from error
 
 
 def completed(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -305,9 +295,8 @@ def completed(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     Raises:
         KeyError: it lacks one that there always was.
     """
-    lacking = {name: shape for name, shape in ADDED.items() if name not in frame}
-    shapes = {name: [n or len(frame["contact_points"]) for n in shape] for name, shape in lacking.items()}
-    added = {name: np.full(shape, np.nan, np.float32) for name, shape in shapes.items()}
+    sizes = {"P": len(frame["contact_points"])}
+    added = {key: np.full(shape_of(key, sizes), np.nan, np.float32) for key in ADDED if key not in frame}
     return {key: added[key] if key in added else frame[key] for key in Reconstruction._fields}
 
 

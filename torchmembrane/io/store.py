@@ -1,14 +1,16 @@
 """A folder of results: the settings that all its frames share, and `mesh.npz`, which holds them beside the rest surface."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
 
 from ..errors import MembraneError
 from ..pose import Pose
-from .results import DAMAGE, save_frame
+from .bounded import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays
+from .frame_shapes import unlike
+from .results import save_frame
 from .status import Status
 
 if TYPE_CHECKING:
@@ -122,15 +124,53 @@ class Mesh(NamedTuple):
 
     @classmethod
     def load(cls, path: str | Path) -> "Mesh":
-        """Read `mesh.npz`; raises `MembraneError` if it is not one."""
+        """Read `mesh.npz`.
+
+        Raises:
+            MembraneError: there is none, or it is damaged, or not one.
+        """
+        expected = f"the {MESH} that is written beside results"
+        if not Path(path).exists():
+            raise MembraneError(f"{path}: no such file; expected {expected}")
         try:
-            with np.load(path) as data:
-                found = {key: data[key] for key in cls._fields if key in data or key not in cls._field_defaults}
-        except FileNotFoundError as error:
-            raise MembraneError(f"{path}: no such file; expected the {MESH} that is written beside results") from error
+            arrays = read_arrays(Path(path), None, expected, NUMBERS + TEXT)
+            found: dict[str, Any] = {key: arrays[key] for key in cls._fields if key in arrays or key not in cls._field_defaults}
+            mesh = cls(**{key: array.item() if array.ndim == 0 else array for key, array in found.items()})
+            mesh._refuse_unlike()
         except DAMAGE as error:
-            raise MembraneError(f"{path}: not a {MESH} of torchmembrane ({error})") from error
-        return cls(**{key: array.item() if array.ndim == 0 else array for key, array in found.items()})
+            cause = in_one_line(str(error).removeprefix(f"{path}: "))
+            raise MembraneError(f"{path}: not a {MESH} of torchmembrane ({cause}); expected {expected}") from error
+        return mesh
+
+    def check(self, frame: dict[str, np.ndarray], path: str | Path) -> None:
+        """Refuse a frame of another membrane or other markers.
+
+        Args:
+            frame: its arrays.
+            path: where it was read, for the message.
+
+        Raises:
+            MembraneError: an array is of another shape or type than here.
+        """
+        if said := unlike(frame, len(self.rest_vertices), len(self.rest_pixels)):
+            raise MembraneError(f"{path}: {said} as of its {MESH}: give the {MESH} of its folder, or reconstruct it again")
+
+    def _refuse_unlike(self) -> None:
+        """Raise `ValueError` where fields do not go together."""
+        V = len(self.rest_vertices)
+        wanted = {"rest_vertices": (V, 3), "rest_normals": (V, 3), "fixed": (V,), "grid": (2,), "image_size": (2,)}
+        wanted |= {"triangles": (len(self.triangles), 3), "vertex_pixels": (V, 2), "rest_pixels": (len(self.rest_pixels), 2)}
+        wanted |= {"camera_in_tool": (3 if len(self.camera_in_tool) else 0, 4)}
+        for name, shape in wanted.items():
+            if (array := getattr(self, name)).shape != shape or array.dtype.kind not in NUMBERS:
+                raise ValueError(f"{name} is {array.dtype} {array.shape}, not {shape}")
+        for name, kind in self.__annotations__.items():
+            if kind in (str, float) and not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name} is {type(getattr(self, name)).__name__}, not {kind.__name__}")
+        if self.triangles.size and not 0 <= self.triangles.min() <= self.triangles.max() < V:
+            raise ValueError("its triangles have other corners than its vertices")
+        if int(np.prod(self.grid)) != V or self.format not in FORMATS:
+            raise ValueError(f"its grid is {self.grid.tolist()}, its format {self.format!r}")
 
     def save(self, path: str | Path) -> None:
         """Write `mesh.npz`, whole or not at all."""
@@ -164,16 +204,15 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
         return
     mesh = Mesh.load(folder / MESH)
     if mesh.sensor != sensor:
-        raise MembraneError(
-            f"--out {folder}: holds results of another sensor, {mesh.name!r} ({mesh.sensor[:12]}, here {sensor[:12]}); "
-            "choose another folder"
-        )
+        other = f"{in_one_line(repr(mesh.name))} ({in_one_line(mesh.sensor[:12])}, here {sensor[:12]})"
+        raise MembraneError(f"--out {folder}: holds results of another sensor, {other}; choose another folder")
     for option, before, now in zip(Settings._fields, mesh.settings, settings, strict=True):
         if before != now:
+            held = in_one_line(before) if before else ""
             name, none = option.replace("_", "-"), NONE if option == "pressure" else OWN
-            remedy = f"pass --{name} {before}" if before else f"leave --{name} out"
+            remedy = f"pass --{name} {held}" if held else f"leave --{name} out"
             raise MembraneError(
-                f"--out {folder}: was made with {name} {before or none}, this call asks for {now or none}; choose another "
+                f"--out {folder}: was made with {name} {held or none}, this call asks for {now or none}; choose another "
                 f"folder, or {remedy}"
             )
 

@@ -3,18 +3,23 @@
 import csv
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .atomic import whole_file
+from .bounded import regular_size
 from .origin import printable
 from .results import Stored
 from .status import Status
 from .store import Mesh
 
 SUMMARY = "summary.csv"
+EXPECTED = "a table of results: delete it, it is made from the frames"
+MOST_BYTES = 2**30
+LONGEST_LINE = 2**16
 UNREADABLE = -1
 """Status of a file that gave no image, hence no result."""
 OF_FILE = ("name", "file", "status", "status_text")
@@ -67,7 +72,7 @@ class Summary:
         """Write the rows added since the last time beside those of the file that are kept, in name order."""
         with self.gate:
             rows = {row["name"]: row for row in _rows(self.path) if kept(row)} | self.rows
-            with whole_file(self.path) as partial, open(partial, "w", newline="", encoding="utf-8") as file:
+            with whole_file(self.path) as unfinished, open(unfinished, "w", newline="", encoding="utf-8") as file:
                 writer = csv.DictWriter(file, COLUMNS)
                 writer.writeheader()
                 writer.writerows({key: _escaped(key, rows[name][key]) for key in COLUMNS} for name in sorted(rows))
@@ -81,14 +86,13 @@ class Summary:
 
 def _rows(path: Path) -> list[dict[str, str]]:
     """The whole rows of an earlier summary.csv; those of other columns, or damaged, are left out."""
-    if not path.exists():
-        return []
-    with open(path, newline="", encoding="utf-8", errors="replace") as file:
-        lines = (line.replace("\0", "") for line in file)
-        try:
+    try:
+        regular_size(path, MOST_BYTES, EXPECTED)
+        with open(path, newline="", encoding="utf-8", errors="replace") as file:
+            lines = (line.replace("\0", "") for line in iter(partial(file.readline, LONGEST_LINE), ""))
             found = [row for row in csv.DictReader(lines) if tuple(row) == COLUMNS and None not in row.values()]
-        except csv.Error:
-            return []
+    except (FileNotFoundError, csv.Error):
+        return []
     return [{key: _unescaped(key, cell) for key, cell in row.items()} for row in found]
 
 

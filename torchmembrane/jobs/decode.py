@@ -152,14 +152,17 @@ def _video(path: Path, reconstructor: "Reconstructor") -> Iterator[Load]:
     av, (width, height) = load_pyav(), reconstructor.sensor.camera.image_size
     try:
         with av.open(str(path)) as container:
+            _refuse_size(container.streams.video[0], width, height)
             for picture in container.decode(video=0):
-                if (picture.width, picture.height) != (width, height):
-                    raise MembraneError(
-                        f"the video is {picture.width} x {picture.height} px, the sensor's images {width} x {height}"
-                    )
+                _refuse_size(picture, width, height)
                 yield partial(_video_image, picture)
     except (av.FFmpegError, IndexError) as error:
         raise MembraneError(f"video: {str(error).removeprefix(f'{path}: ')}") from error
+
+
+def _refuse_size(pictures: Any, width: int, height: int) -> None:
+    if (pictures.width, pictures.height) != (width, height):
+        raise MembraneError(f"the video is {pictures.width} x {pictures.height} px, the sensor's images {width} x {height}")
 
 
 def _bag(path: Path, topic: str | None) -> Iterator[Load]:

@@ -105,7 +105,7 @@ def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
     if path.is_dir():
         found = metadata_of(path) or sorted(p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
         if not found:
-            raise MembraneError(f"{path}: the folder holds no files {' '.join(suffixes)}")
+            raise MembraneError(f"{path}: the folder holds no files {' '.join(suffixes)}; expected one or more")
         return found
     if path.exists():
         return [path]

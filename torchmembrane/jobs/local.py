@@ -132,7 +132,9 @@ def _local(reconstructor: "Reconstructor", workers: int | None, left: int) -> En
     compute = outcomes_here if count == 1 else partial(outcomes_by, count)
 
     def engine(work: Work, waiting: Iterator[Source], batch: int | None) -> Iterator[list[Outcome]]:
-        return compute(work, waiting, batch or batch_for(reconstructor.image_size, count, device))
+        return compute(
+            work, waiting, batch or batch_for(reconstructor.image_size, len(reconstructor.vertex_pixels), count, device)
+        )
 
     return engine
 

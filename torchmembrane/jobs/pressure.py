@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import MembraneError
+from ..io.bounded import in_one_line, read_text, shortened
 from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
 from .inputs import Inputs, frame_name
@@ -13,6 +14,7 @@ from .inputs import Inputs, frame_name
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
 
+MOST_BYTES = 2**26
 HEADERS = (["name", "pressure"], ["name", "pressure_change"])
 EXPECTED = "CSV with the header name,pressure (across the membrane) or name,pressure_change (since rest), hPa, a line per frame"
 
@@ -66,11 +68,13 @@ def read_pressures(path: Path, inputs: Inputs, sensor: Sensor) -> PressureReadin
         MembraneError: the table cannot be read, or has another header, a name that is no frame's, a name twice, no number.
     """
     try:
-        header, *rows = csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
-    except (OSError, ValueError) as error:
-        raise MembraneError(f"{path}: not readable ({error}); expected {EXPECTED}") from error
+        header, *rows = csv.reader(read_text(path, MOST_BYTES, EXPECTED).splitlines())
+    except MembraneError:
+        raise
+    except (csv.Error, ValueError) as error:
+        raise MembraneError(f"{path}: not readable ({in_one_line(error)}); expected {EXPECTED}") from error
     if header not in HEADERS:
-        raise MembraneError(f"{path}: the header is {','.join(header)!r}; expected {EXPECTED}")
+        raise MembraneError(f"{path}: the header is {shortened(repr(','.join(header)))}; expected {EXPECTED}")
     names = [(image.name, frame_name(image)) for image in inputs.images]
     stems = dict(names) | {name: name for _, name in names}
     readings: dict[str, float] = {}
@@ -80,9 +84,9 @@ def read_pressures(path: Path, inputs: Inputs, sensor: Sensor) -> PressureReadin
             raise MembraneError(f"{where}: {len(row)} values; expected two, {','.join(header)}")
         name = stems.get(row[0], row[0])
         if row[0] not in stems and inputs.video_of(name) is None:
-            raise MembraneError(f"{where}: {row[0]!r} is none of the frames; expected {_known(inputs)}")
+            raise MembraneError(f"{where}: {shortened(repr(row[0]))} is none of the frames; expected {_known(inputs)}")
         if name in readings:
-            raise MembraneError(f"{where}: {row[0]!r} stands there twice; expected one reading for each frame")
+            raise MembraneError(f"{where}: {shortened(repr(row[0]))} stands there twice; expected one reading for each frame")
         readings[name] = _number(row[1], where)
     known = {name: value * 100 / METRE[sensor.length_unit] ** 2 for name, value in readings.items() if not math.isnan(value)}
     if not known:
@@ -96,7 +100,7 @@ def _number(text: str, where: str) -> float:
     except ValueError:
         value = math.inf
     if math.isinf(value):
-        raise MembraneError(f"{where}: {text!r}; expected hPa, or nothing where there is no reading")
+        raise MembraneError(f"{where}: {shortened(repr(text))}; expected hPa, or nothing where there is no reading")
     return value
 
 

@@ -47,7 +47,8 @@ class RayEngine:
         gpu = self.device == "cuda"
         room = int(self.ray.cluster_resources().get("GPU" if gpu else "CPU", 1))
         workers = self.workers or max(1, room)
-        batch = batch or batch_for(state.reconstructor.image_size, workers, "cpu")
+        reconstructor = state.reconstructor
+        batch = batch or batch_for(reconstructor.image_size, len(reconstructor.vertex_pixels), workers, "cpu")
         self.ray.data.DataContext.get_current().enable_progress_bars = False
         rows = self.ray.data.from_items([{"path": path} for path in paths], override_num_blocks=-(-len(paths) // batch))
         results = rows.map_batches(

@@ -34,8 +34,10 @@ AHEAD = 3
 LARGEST_BATCH = 16
 """A larger one is no faster on a processor."""
 LARGEST_GPU_BATCH = 256
+CONTAINER = Path("/sys/fs/cgroup/memory.max")
 PIXEL_BYTES = 600
-"""Memory of a frame in computation, over the pixels of its image."""
+VERTEX_BYTES = 25000
+"""Memory of a frame in computation, over the pixels of its image and the vertices of its surface."""
 MEMORY_SHARE = 0.25
 """Of the machine's memory, for all frames in computation."""
 
@@ -105,15 +107,29 @@ def workers_for(frames: int, device: str) -> int:
     return max(1, min(cores(), frames // FRAMES_EACH)) if device == "cpu" else 1
 
 
-def batch_for(image_size: tuple[int, int], workers: int, device: str) -> int:
+def batch_for(image_size: tuple[int, int], vertices: int, workers: int, device: str) -> int:
     """How many frames to compute at once, by the memory that there is."""
     if device == "cuda":
         memory, largest = torch.cuda.mem_get_info()[0], LARGEST_GPU_BATCH
     else:
-        known = hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names
-        memory, largest = (os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if known else 2**32), LARGEST_BATCH
+        memory, largest = memory_here(), LARGEST_BATCH
+    return max(1, min(largest, int(MEMORY_SHARE * memory / (workers * frame_bytes(image_size, vertices)))))
+
+
+def memory_here() -> int:
+    """The machine's memory, or the container's where that has a bound, bytes."""
+    known = hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names
+    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if known else 2**32
+    try:
+        return min(machine, int(CONTAINER.read_text()))
+    except (OSError, ValueError):  # there is none, or it says "max"
+        return machine
+
+
+def frame_bytes(image_size: tuple[int, int], vertices: int) -> int:
+    """Memory that a frame takes in computation, at most, bytes."""
     width, height = image_size
-    return max(1, min(largest, int(MEMORY_SHARE * memory / (workers * width * height * PIXEL_BYTES))))
+    return width * height * PIXEL_BYTES + vertices * VERTEX_BYTES
 
 
 def _portable(source: Source, reconstructor: "Reconstructor") -> Source:

@@ -5,6 +5,7 @@ from pathlib import Path
 from types import TracebackType
 
 from ..errors import MembraneError
+from ..io.bounded import in_one_line, read_text
 from ..io.claim import WHOLE
 from ..io.images import write_as_taken
 from ..io.origin import Origin
@@ -17,6 +18,7 @@ from .loop import Seen
 
 IMAGES, TIMES = "images", "times.csv"
 COLUMNS = ("name", "time", "latency")
+MOST_TIMES_BYTES = 2**28
 
 
 class Recording:
@@ -60,10 +62,18 @@ class Recording:
 
 
 def times_of(folder: Path) -> dict[str, float]:
-    """When the frames of a recording were captured, seconds since 1970, by name; nothing of other folders."""
+    """When the frames of a recording were captured, seconds since 1970, by name; nothing of other folders.
+
+    Raises:
+        MembraneError: its times cannot be read.
+    """
     path = folder / TIMES
     if not path.exists():
         return {}
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.reader(file))[1:]
-    return {row[0]: float(row[1]) for row in rows if len(row) == len(COLUMNS)}
+    expected = f"CSV with the header {','.join(COLUMNS)}"
+    text = read_text(path, MOST_TIMES_BYTES, expected)
+    try:
+        rows = list(csv.reader(text.splitlines()))[1:]
+        return {row[0]: float(row[1]) for row in rows if len(row) == len(COLUMNS)}
+    except (csv.Error, ValueError) as error:
+        raise MembraneError(f"{path}: not readable ({in_one_line(error)}); expected {expected}: delete it") from error

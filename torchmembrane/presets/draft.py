@@ -12,9 +12,11 @@ from scipy.optimize import brentq
 
 from ..camera.model import Camera
 from ..errors import MembraneError
+from ..io.bounded import in_one_line, read_text, shortened
 from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..sensor.parts import METRE, Material, Surface
+from ..sensor.toml import MOST_DOTS_BYTES
 from ..surface.membrane import Membrane
 from .design import cylinder_dots, dome_dots
 
@@ -251,15 +253,16 @@ def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.
     """
     forms = [",".join(form) for form in (*POINTS, *RAYS)]
     expected = f"CSV with the header {', '.join(forms)}, each with ,size or without"
+    text = read_text(path, MOST_DOTS_BYTES, expected)
     try:
-        header, *rows = [[cell.strip() for cell in row] for row in csv.reader(path.read_text("utf-8-sig").splitlines()) if row]
+        header, *rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines()) if row]
         sizes = [row[-1] for row in rows] if header[-1:] == ["size"] else ["small"] * len(rows)
         form = header[: len(header) - (header[-1:] == ["size"])]
         values = np.array([[float(cell) for cell in row[: len(form)]] for row in rows])
-    except (OSError, ValueError) as error:
-        raise MembraneError(f"{path}: not readable ({error}); expected {expected}") from error
+    except (csv.Error, ValueError) as error:
+        raise MembraneError(f"{path}: not readable ({in_one_line(error)}); expected {expected}") from error
     if form not in (*POINTS, *RAYS):
-        raise MembraneError(f"{path}: the header is {','.join(header)!r}; expected {expected}")
+        raise MembraneError(f"{path}: the header is {shortened(repr(','.join(header)))}; expected {expected}")
     if values.shape != (len(rows), len(form)) or not len(rows) or not np.isfinite(values).all():
         raise MembraneError(f"{path}: lines of different length, none, or not finite; expected {expected}")
     base_z = surface.values["base_z"]
@@ -270,7 +273,9 @@ def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.
     origin, direction = _rays(form, values, base_z, camera)
     distance = surface.membrane(FINE).ray_points(origin, direction).distance
     for line in np.flatnonzero(~np.isfinite(distance)):
-        raise MembraneError(f"{path}, line {line + 2}: {','.join(rows[line])} misses the membrane; expected dots in its rim")
+        raise MembraneError(
+            f"{path}, line {line + 2}: {in_one_line(','.join(rows[line]))} misses the membrane; expected dots in its rim"
+        )
     return (origin + distance[:, None] * direction).round(5), sizes
 
 

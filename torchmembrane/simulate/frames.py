@@ -12,13 +12,19 @@ from PIL import Image
 
 from ..errors import MembraneError
 from ..io.atomic import whole_file
+from ..io.bounded import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays, read_text
+from ..io.images import read_pixels
 from ..io.optional import load_pyarrow, load_pyav
+from ..io.parquet import read_table, refusal
 from ..io.results import save_frame
 from ..sensor.sensor import Sensor
 from .simulator import SimulatedFrame, Simulator
 
 SENSOR, SETTINGS, REST = "sensor.toml", "simulation.json", "rest_truth.npz"
 CONSTANT = ("dots_nominal", "uv_nominal", "visible_nominal", "vertices_nominal", "triangles", "p0")
+A_PART, AS_WRITTEN = "a part of simulated frames", "it as it was written: delete it and simulate its frames again"
+A_TRUTH = "the truth of simulated frames"
+MOST_SETTINGS_BYTES = 2**20
 PART_ROWS = 64
 FORMATS = ("png", "parquet")
 
@@ -53,8 +59,9 @@ class SimulatedFrames:
     def __iter__(self) -> Iterator[tuple[str, SimulatedFrame]]:
         """Names and frames in name order."""
         for name in sorted(self.names()):
-            with np.load(self.folder / f"{name}_truth.npz") as truth:
-                yield name, SimulatedFrame(np.asarray(Image.open(self.folder / f"{name}.png")), dict(truth))
+            image = self.folder / f"{name}.png"
+            truth = read_arrays(self.folder / f"{name}_truth.npz", None, A_TRUTH, NUMBERS + TEXT)
+            yield name, SimulatedFrame(read_pixels(image), {key: array.copy() for key, array in truth.items()})
 
 
 class SimulatedFrameTable(SimulatedFrames):
@@ -73,7 +80,7 @@ class SimulatedFrameTable(SimulatedFrames):
         self.waiting: dict[str, SimulatedFrame] = {}
 
     def names(self) -> set[str]:
-        parts = (self.parquet.read_table(part, columns=["name"])["name"].to_pylist() for part in self._parts())
+        parts = (read_table(part, A_PART, AS_WRITTEN, ["name"])["name"].to_pylist() for part in self._parts())
         return {name for part in parts for name in part} | set(self.waiting)
 
     def write(self, name: str, frame: SimulatedFrame) -> None:
@@ -102,18 +109,25 @@ class SimulatedFrameTable(SimulatedFrames):
         self.waiting = {}
 
     def __iter__(self) -> Iterator[tuple[str, SimulatedFrame]]:
-        with np.load(self.folder / REST) as file:
-            constant = dict(file)
+        constant = read_arrays(self.folder / REST, None, A_TRUTH, NUMBERS + TEXT)
         for part in self._parts():
-            table = self.parquet.read_table(part)
-            shapes = json.loads(table.schema.metadata[b"shapes"])
-            for row in table.to_pylist():
-                truth = {key: np.asarray(row[key]).reshape(shape) for key, shape in shapes.items()}
-                truth = {key: a.astype(np.float32) if a.dtype.kind == "f" else a for key, a in truth.items()}
-                yield row["name"], SimulatedFrame(np.asarray(Image.open(io.BytesIO(row["image"]))), truth | constant)
+            table = read_table(part, A_PART, AS_WRITTEN)
+            try:
+                shapes = json.loads(table.schema.metadata[b"shapes"])
+                rows = [(row, _truth(row, shapes)) for row in table.to_pylist()]
+                frames = [(row["name"], read_pixels(f"{part}: {row['name']}", row["image"]), truth) for row, truth in rows]
+            except DAMAGE as error:
+                raise refusal(part, A_PART, AS_WRITTEN, error) from error
+            for name, image, truth in frames:
+                yield name, SimulatedFrame(image, truth | constant)
 
     def _parts(self) -> list[Path]:
         return sorted((self.folder / "frames").glob("part-*.parquet"))
+
+
+def _truth(row: dict[str, Any], shapes: dict[str, list[int]]) -> dict[str, np.ndarray]:
+    truth = {key: np.asarray(row[key]).reshape(shape) for key, shape in shapes.items()}
+    return {key: a.astype(np.float32) if a.dtype.kind == "f" else a for key, a in truth.items()}
 
 
 class Video:
@@ -197,13 +211,14 @@ def _check(folder: Path, settings: dict[str, Any]) -> None:
             raise MembraneError(f"--out {folder}: holds other files (.npz, {SENSOR}) and no {SETTINGS}; choose another folder")
         return
     try:
-        before = json.loads((folder / SETTINGS).read_text())
-    except ValueError as error:
-        raise MembraneError(f"{folder / SETTINGS}: not readable ({error}); choose another folder") from error
+        before = dict(json.loads(read_text(folder / SETTINGS, MOST_SETTINGS_BYTES, "settings of `torchmembrane simulate`")))
+    except DAMAGE as error:
+        said = in_one_line(str(error).removeprefix(f"{folder / SETTINGS}: "))
+        raise MembraneError(f"{folder / SETTINGS}: not readable ({said}); expected another folder") from error
     for key, value in settings.items():
         if before.get(key, value) != value:
             raise MembraneError(
-                f"--out {folder}: was made with {key} {before[key]}, this call has {value}; choose another folder"
+                f"--out {folder}: was made with {key} {in_one_line(before[key])}, this call has {value}; choose another folder"
             )
 
 
