@@ -42,16 +42,15 @@ def marker_rays(camera: Camera, pixels: Tensor, positions: Tensor, confidence: T
     Args:
         camera: the sensor's.
         pixels: `[B, D, 2]`.
-        positions: `[D, 3]`, the markers' rest positions: a ray behind a port moves aside as well as it turns, at a marker by the
-            turn of its origin about it.
+        positions: `[D, 3]`, the markers' rest positions: behind a port a ray's origin moves too, which turns it about a marker.
         confidence: `[B, D]`.
         covariance: of the pixels, `[B, D, 2, 2]` px^2.
 
     Returns:
         The rays; along `across` a turn has the covariance 1: with the derivative `J [3, 2]` of a ray in its pixel, as a marker
-        sees it, and the covariance `C = L L^T` these are the rows of `L^-1 (J^T J)^-1 J^T`. `motion`: what the image's motion against the rim,
-        `p -> p + (du, dv) + (rotation x (p - c) + growth (p - c)) / R` about the image's centre `c`, makes of them; all four in
-        px, those of rotation and growth at half the image's diagonal, `R`.
+        sees it, and the covariance `C = L L^T` these are the rows of `L^-1 (J^T J)^-1 J^T`. `motion`: what the image's motion
+        against the rim, `p -> p + (du, dv) + (rotation x (p - c) + growth (p - c)) / R` about the image's centre `c`, makes of
+        them; all four in px, those of rotation and growth at half the image's diagonal, `R`.
     """
     half = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
     steps = torch.cat([torch.zeros_like(half[:1]), half, -half])[:, None]

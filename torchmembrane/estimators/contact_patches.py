@@ -28,7 +28,7 @@ RIM_SHARE = 0.03
 BESIDE = 0.06
 """Over the surface's size: so near the rim a body that reaches it has moved the surface."""
 MOVED = 0.2
-"""Displacement there over the largest of the patch, above which the patch may reach the rim: it does if both say so."""
+"""Displacement there over the largest of all, above which the patch may reach the rim: it does if both say so."""
 LEAST_STEPS = 2.0
 """Grid steps that a patch spans at least where curvatures are told."""
 
@@ -149,8 +149,8 @@ class ContactPatches(nn.Module):
         normal = torch.nn.functional.normalize(strong @ normals, dim=-1)
         force, normal_force = mine @ load, (mine @ inward[..., None])[..., 0]
         slip = torch.linalg.vector_norm(mine @ shear, dim=-1) / torch.where(normal_force > 0, normal_force, 1.0)
-        moved = mine * torch.linalg.vector_norm(x - self.membrane.rest, dim=-1)[:, None]
-        reaches = (moved * self.beside_rim).amax(-1) > MOVED * moved.amax(-1)
+        moved = torch.linalg.vector_norm(x - self.membrane.rest, dim=-1)[:, None]
+        reaches = (mine * moved * self.beside_rim).amax(-1) > MOVED * moved.amax(-1)
         at_rim = (((push @ self.near_rim) > RIM_SHARE * push.sum(-1)) & reaches).to(push.dtype)
 
         def kept(values: Tensor, where: Tensor = here) -> Tensor:
