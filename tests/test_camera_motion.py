@@ -65,9 +65,12 @@ def test_rays_say_what_the_camera_s_motion_makes_of_their_angles(name):
     root = 0.2 * torch.randn(1, 30, 2, 2, generator=generator) + 0.1 * torch.eye(2)
     covariance, moved = (root @ root.mT).double(), 1e-3 * torch.tensor([[1.0, -2.0, 3.0, 0.5]], dtype=torch.float64)
     pixels, sure = pixels.double(), torch.ones(1, 30, dtype=torch.float64)
-    still = marker_rays(camera, pixels, sure, covariance)
-    shifted = marker_rays(camera, pixels + shift_of(moved, pixels, SIZE), sure, covariance)
-    angles = (shifted.across @ still.directions[..., None])[..., 0]
+    origins, directions = camera.pixel_to_ray(pixels)
+    markers = (origins + 25 * directions)[0]
+    still = marker_rays(camera, pixels, markers, sure, covariance)
+    shifted = marker_rays(camera, pixels + shift_of(moved, pixels, SIZE), markers, sure, covariance)
+    seen_at = torch.nn.functional.normalize(markers - shifted.origins, dim=-1)
+    angles = (shifted.across @ seen_at[..., None])[..., 0]
     torch.testing.assert_close(angles, -(still.motion @ moved[0]), rtol=5e-3, atol=1e-6)
 
 

@@ -20,6 +20,7 @@ CAMERAS = {
     "pinhole": Camera("pinhole", (640, 480), (400, 410), (320, 240), [-0.1, 0.02]),
     "fisheye": Camera("fisheye", (640, 480), (180, 180), (320, 240), [-0.01, 0.002]),
     "port": Camera("pinhole", (640, 480), (300, 300), (320, 240), ports=[(2.0, 3.0, 1.49)], medium_index=1.33),
+    "wide port": Camera("fisheye", (640, 480), (180, 180), (320, 240), ports=[(3.0, 2.4, 1.49)], medium_index=1.33),
 }
 
 
@@ -114,12 +115,17 @@ def test_along_the_two_vectors_across_a_ray_noise_has_the_covariance_one(camera)
     generator = torch.Generator().manual_seed(1)
     pixels = torch.tensor([[[320.0, 240.0], [150.0, 300.0], [500.0, 100.0]]], dtype=torch.float64)
     root = torch.eye(2) + 0.3 * torch.randn(1, 3, 2, 2, generator=generator, dtype=torch.float64)
-    observed = marker_rays(camera, pixels, torch.ones(1, 3), root @ root.mT)
-    step = 1e-3 * root.mT  # rows: independent noises of one standard deviation
-    turned = (camera.pixel_to_ray(pixels[:, :, None] + step).direction - observed.directions[:, :, None]) / 1e-3
-    unit = turned @ observed.across.mT
-    torch.testing.assert_close(unit @ unit.mT, torch.eye(2).expand_as(unit).double(), rtol=0, atol=2e-3)
+    origins, directions = camera.pixel_to_ray(pixels)
+    markers, covariance, sure = (origins + 20 * directions)[0], root @ root.mT, torch.ones(1, 3)
+    observed = marker_rays(camera, pixels, markers, sure, covariance)
     assert (observed.across @ observed.directions[..., None]).abs().max() < 1e-9
+    angles = []
+    for noise in root.unbind(-1):  # independent noises of one standard deviation, a thousandth of them
+        noisy = marker_rays(camera, pixels + 1e-3 * noise, markers, sure, covariance)
+        to_marker = torch.nn.functional.normalize(markers - noisy.origins, dim=-1)
+        angles.append((noisy.across @ to_marker[..., None])[..., 0] / 1e-3)
+    unit = torch.stack(angles, -1)
+    torch.testing.assert_close(unit @ unit.mT, torch.eye(2).expand_as(unit).double(), rtol=0, atol=3e-3)
 
 
 @pytest.mark.parametrize("noise", [0.003, 0.03, 0.1])

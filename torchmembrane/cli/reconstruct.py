@@ -82,7 +82,8 @@ def run(arguments: Namespace) -> int:
     from ..sensor.sensor import Sensor
     from .build import build_reconstructor
 
-    by_ray = _is_for_ray(arguments)
+    _check(arguments)
+    by_ray = arguments.engine == "ray"
     inputs = find_inputs(arguments.images, arguments.video, arguments.topic)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
@@ -117,8 +118,8 @@ def run(arguments: Namespace) -> int:
     return 1 if counts.failed else 0
 
 
-def _is_for_ray(arguments: Namespace) -> bool:
-    """Whether Ray computes; refuses options that cannot be together."""
+def _check(arguments: Namespace) -> None:
+    """Refuse options that cannot be together, or not on this machine, before anything is read."""
     import torch
 
     from ..errors import MembraneError
@@ -126,12 +127,10 @@ def _is_for_ray(arguments: Namespace) -> bool:
 
     if arguments.device == "cuda" and arguments.engine == "local" and not torch.cuda.is_available():
         raise MembraneError("--device cuda: torch sees no CUDA device; pass --device cpu, or install torch with CUDA")
-    by_ray: bool = arguments.engine == "ray"
-    if by_ray and arguments.format == "npz":
+    if arguments.engine == "ray" and arguments.format == "npz":
         raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
     if arguments.video_out is not None:
         check_film(arguments.video_out)
-    return by_ray
 
 
 def _said(counts: "FrameCounts") -> str:

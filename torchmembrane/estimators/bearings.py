@@ -36,25 +36,29 @@ class Bearings(NamedTuple):
     gauge: Tensor | None = None
 
 
-def marker_rays(camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
+def marker_rays(camera: Camera, pixels: Tensor, positions: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
     """The rays of markers, each with its own noise.
 
     Args:
         camera: the sensor's.
         pixels: `[B, D, 2]`.
+        positions: `[D, 3]`, the markers' rest positions: behind a port a ray's origin moves too, which turns it about a marker.
         confidence: `[B, D]`.
         covariance: of the pixels, `[B, D, 2, 2]` px^2.
 
     Returns:
-        The rays; along `across` a turn has the covariance 1: with the derivative `J [3, 2]` of a ray in its pixel and the
-        covariance `C = L L^T` these are the rows of `L^-1 (J^T J)^-1 J^T`. `motion`: what the image's motion against the rim,
-        `p -> p + (du, dv) + (rotation x (p - c) + growth (p - c)) / R` about the image's centre `c`, makes of them; all four in
-        px, those of rotation and growth at half the image's diagonal, `R`.
+        The rays; along `across` a turn has the covariance 1: with the derivative `J [3, 2]` of a ray in its pixel, as a marker
+        sees it, and the covariance `C = L L^T` these are the rows of `L^-1 (J^T J)^-1 J^T`. `motion`: what the image's motion
+        against the rim, `p -> p + (du, dv) + (rotation x (p - c) + growth (p - c)) / R` about the image's centre `c`, makes of
+        them; all four in px, those of rotation and growth at half the image's diagonal, `R`.
     """
     half = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
     steps = torch.cat([torch.zeros_like(half[:1]), half, -half])[:, None]
     origins, directions = camera.pixel_to_ray(pixels[:, None] + steps)
-    by_u, by_v = (directions[:, 1:3] - directions[:, 3:]).unbind(1)
+    direction = directions[:, :1]
+    distance = torch.linalg.vector_norm(positions - origins[:, 0], dim=-1)[:, None, :, None]
+    turns = (directions[:, 1:3] - directions[:, 3:]) + (origins[:, 1:3] - origins[:, 3:]) / distance
+    by_u, by_v = (turns - (turns * direction).sum(-1, keepdim=True) * direction).unbind(1)
     uu, uv, vv = ((a * b).sum(-1, keepdim=True) for a, b in ((by_u, by_u), (by_u, by_v), (by_v, by_v)))
     area2 = uu * vv - uv * uv
     in_u, in_v = (vv * by_u - uv * by_v) / area2, (uu * by_v - uv * by_u) / area2  # px of a small turn
@@ -62,8 +66,6 @@ def marker_rays(camera: Camera, pixels: Tensor, confidence: Tensor, covariance: 
     first = in_u * a.rsqrt()
     second = (in_v - b / a * in_u) * (c - b * b / a).rsqrt()
     across = torch.stack([first, second], 2)
-    direction = directions[:, 0, :, None]
-    across = across - (across * direction).sum(-1, keepdim=True) * direction
     of_u, of_v = motion_of_pixels(pixels, camera.image_size).unbind(-2)
     motion = torch.stack([of_u * a.rsqrt(), (of_v - b / a * of_u) * (c - b * b / a).rsqrt()], 2)
     return Observation(origins[:, 0], directions[:, 0], confidence, across, motion)

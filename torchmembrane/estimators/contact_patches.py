@@ -21,10 +21,14 @@ APART = 0.3
 """By how much of itself a peak stands above the pass to a higher one, if it is a patch of its own."""
 PUSHED = 0.5
 """Indicator above which a vertex is in contact."""
-RIM = 0.08
+RIM = 0.1
 """Over the surface's size: a push within it, or within the markers' spacing, of the rim may go on beyond the rim."""
-RIM_SHARE = 0.1
-"""Share of a patch's push there, above which the patch reaches the rim."""
+RIM_SHARE = 0.03
+"""Share of a patch's push there, above which the patch may reach the rim."""
+BESIDE = 0.06
+"""Over the surface's size: so near the rim a body that reaches it has moved the surface."""
+MOVED = 0.2
+"""Displacement there over the largest of all, above which the patch may reach the rim: it does if both say so."""
 LEAST_STEPS = 2.0
 """Grid steps that a patch spans at least where curvatures are told."""
 
@@ -88,7 +92,8 @@ class ContactPatches(nn.Module):
         spacing: of the markers on it, length unit; 0 where it does not limit what is resolved.
     """
 
-    at_rim: Tensor
+    near_rim: Tensor
+    beside_rim: Tensor
 
     def __init__(self, membrane: Membrane, spacing: float = 0.0):
         super().__init__()
@@ -96,7 +101,10 @@ class ContactPatches(nn.Module):
         m, n = membrane.grid
         self.least_span = max(LEAST_STEPS * membrane.size / ((m - 1) * (n - 1)) ** 0.5, spacing)
         from_rim = torch.cdist(membrane.rest, membrane.rest[membrane.fixed]).amin(1)
-        self.register_buffer("at_rim", (from_rim < max(RIM * membrane.size, spacing)).double())
+        beside = BESIDE * membrane.size
+        reach = torch.clamp(from_rim[~membrane.fixed].min(), min=beside)  # a coarse grid has no vertex as near
+        self.register_buffer("near_rim", (from_rim < max(RIM * membrane.size, spacing)).double())
+        self.register_buffer("beside_rim", (from_rim <= reach) * (beside / from_rim.clamp_min(beside)))
 
     def pushes(self, x: Tensor, normals: Tensor, traction: Tensor, reference: Tensor, surroundings: Tensor) -> Contacts:
         """Where tractions push, and what that tells: a patch around every peak of the push that stands for itself.
@@ -141,7 +149,9 @@ class ContactPatches(nn.Module):
         normal = torch.nn.functional.normalize(strong @ normals, dim=-1)
         force, normal_force = mine @ load, (mine @ inward[..., None])[..., 0]
         slip = torch.linalg.vector_norm(mine @ shear, dim=-1) / torch.where(normal_force > 0, normal_force, 1.0)
-        at_rim = ((push @ self.at_rim) > RIM_SHARE * push.sum(-1)).to(push.dtype)
+        moved = torch.linalg.vector_norm(x - self.membrane.rest, dim=-1)[:, None]
+        reaches = (mine * moved * self.beside_rim).amax(-1) > MOVED * moved.amax(-1)
+        at_rim = (((push @ self.near_rim) > RIM_SHARE * push.sum(-1)) & reaches).to(push.dtype)
 
         def kept(values: Tensor, where: Tensor = here) -> Tensor:
             return torch.where(where.reshape(*where.shape, *(1,) * (values.ndim - 2)), values, torch.nan)

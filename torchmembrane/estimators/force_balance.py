@@ -124,7 +124,7 @@ class ForceBalance(nn.Module):
         variance = problem.rest_covariance.diagonal(dim1=-2, dim2=-1).mean()
         noise = float(variance.sqrt() / problem.camera.focal.mean())
         sure = torch.ones_like(problem.rest_pixels[None, :, 0])
-        rest = marker_rays(problem.camera, problem.rest_pixels[None], sure, problem.rest_covariance[None])
+        rest = marker_rays(problem.camera, problem.rest_pixels[None], problem.positions, sure, problem.rest_covariance[None])
         surface = problem.membrane, problem.elasticity, problem.markers, problem.positions
         return cls(*surface, noise, problem.filling, problem.gas, settings, rest)
 
@@ -172,7 +172,7 @@ class ForceBalance(nn.Module):
         """The rays of the markers seen at `pixels [B, D, 2]`, each with its own noise where its `covariance` is given."""
         if covariance is None:
             return Observation(*camera.pixel_to_ray(pixels), confidence)
-        return marker_rays(camera, pixels, confidence, covariance)
+        return marker_rays(camera, pixels, self.equations.bearings.positions, confidence, covariance)
 
     def check_gauge(self) -> None:
         """Refuse a gauge where it tells nothing."""
