@@ -49,7 +49,8 @@ Image read_pgm(const std::string& path) {
 // What the model says of its sensor, and its results of one image.
 class Model {
   public:
-    explicit Model(const std::string& path) : session_(environment_, path.c_str(), one_thread()), known_(session_.GetModelMetadata()) {
+    explicit Model(const std::string& path)
+        : session_(environment_, path.c_str(), one_thread()), known_(session_.GetModelMetadata()) {
         if (known("format") != "1") throw std::runtime_error(path + ": no model of `torchmembrane export`, format 1");
         if (session_.GetInputCount() != 1)
             throw std::runtime_error(path + ": starts from the frame before; expected one exported without --tracking");
