@@ -2,6 +2,7 @@
 # make soak SOAK=HOURS PRESSES=10000 KILLS=10: damaged files for so many hours, jobs killed, random sensors pressed; all hours long.
 # make docs: the site in out/site, links checked.
 # make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
+# make test-cpp | make test-arm: the C++ example (needs cmake); the edge package on an emulated aarch64. On Debian.
 PYTHON ?= python3
 SOAK ?= 1
 PRESSES ?= 10000
@@ -12,12 +13,13 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 WEB := export/web
+CPP := out/cpp
 PAGE := $(WEB)/dist/index.html
 PACKAGES := $(WEB)/node_modules/.package-lock.json
 SENSOR := examples/sensor.toml examples/rest_grid.npz examples/dots.csv examples/rest.png
 IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
 
-.PHONY: demo test lint style types layers bench soak figures docs web test-web clean
+.PHONY: demo test lint style types layers bench soak figures docs web test-web test-cpp test-arm clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -72,6 +74,25 @@ test-web: $(PAGE)
 	$(BIN)/python $(WEB)/test/reference.py out/web/sensor.toml out/web/model.onnx $(IMAGES) --out out/web/test
 	CHROMIUM=$$($(WEB)/chromium.sh) && export CHROMIUM && \
 		PYTHON=$(BIN)/python REFERENCE=out/web/test node --test --test-reporter=spec $(WEB)/test/page.test.js
+
+test-cpp: $(CPP)/frame out/web/model.onnx
+	$(BIN)/python export/cpp/test.py $(CPP)/frame out/web/model.onnx $(IMAGES)
+
+$(CPP)/frame: export/cpp/main.cpp export/cpp/CMakeLists.txt | $(CPP)/debian/usr/include/onnxruntime $(CPP)/lib
+	cmake -S export/cpp -B $(CPP) -DONNXRUNTIME_LIBRARY=$(CURDIR)/$(CPP)/lib/libonnxruntime.so \
+		-DONNXRUNTIME_INCLUDE=$(CURDIR)/$(CPP)/debian/usr/include/onnxruntime
+	cmake --build $(CPP)
+
+$(CPP)/debian/usr/include/onnxruntime:
+	export/debian.sh $(CPP)/debian $$(dpkg --print-architecture) -n libonnxruntime-dev
+
+$(CPP)/lib: | $(READY)
+	mkdir -p $@
+	for name in libonnxruntime.so libonnxruntime.so.1; do \
+		ln -sf $(CURDIR)/$(VENV)/lib/python3*/site-packages/onnxruntime/capi/libonnxruntime.so.* $@/$$name; done
+
+test-arm: out/web/model.onnx
+	$(BIN)/python export/arm/test.py out/arm out/web/model.onnx $(IMAGES)
 
 $(PAGE): out/web/model.onnx $(IMAGES) $(PACKAGES) $(WEB)/build.js $(wildcard $(WEB)/src/*)
 	node $(WEB)/build.js out/web/model.onnx $(IMAGES)

@@ -206,6 +206,22 @@ def test_edge_runs_without_torch(model_file, reconstructor, images, bare_python,
     assert mesh.sensor == reconstructor.sensor.fingerprint and mesh.fixed.dtype == bool
 
 
+def test_edge_opens_a_model_in_the_format_of_onnxruntime(model_file, images, monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(ROOT / "export")
+    from torchmembrane_edge import Session
+    from torchmembrane_edge.cli import _read
+
+    options = onnxruntime.SessionOptions()
+    options.optimized_model_filepath = str(tmp_path / "model.ort")
+    onnxruntime.InferenceSession(str(model_file), options, providers=["CPUExecutionProvider"])
+    plain, converted = Session(model_file), Session(tmp_path / "model.ort")
+    assert converted.status_texts == plain.status_texts and converted.mesh["sensor"] == plain.mesh["sensor"]
+    image = _read(images[2], plain.image_size)
+    expected, found = plain.run(image), converted.run(image)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, name)
+
+
 @pytest.mark.parametrize("kind, shape", [(np.uint8, (5, 7, 3)), (np.uint16, (5, 7)), (np.float32, (5, 7, 3))])
 def test_edge_sees_the_same_grey(kind, shape, monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "export")
