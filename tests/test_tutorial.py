@@ -3,6 +3,7 @@
 import csv
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from torchmembrane.cli.main import main
 
 ROOT = Path(__file__).parents[1]
-TUTORIAL, RECIPES = ((ROOT / "docs" / f"{name}.md").read_text() for name in ("own_sensor", "recipes"))
+TUTORIAL, BUBBLE, RECIPES = ((ROOT / "docs" / f"{name}.md").read_text() for name in ("own_sensor", "own_bubble", "recipes"))
 
 
 def words(page: str) -> str:
@@ -56,6 +57,23 @@ def test_the_tutorial_s_python_runs(walked, capsys):
     exec(compile(python(TUTORIAL), "own_sensor.md", "exec"), {})
     rest, weight, press = capsys.readouterr().out.splitlines()
     assert "nan" in rest and "nan" not in weight + press
+
+
+def test_the_bubble_s_gauge_gives_newtons(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (readings,) = re.findall(r"```csv\n(.*?)```", BUBBLE, re.S)
+    Path("gauge.csv").write_text(readings)
+    for call in commands(BUBBLE):
+        assert main(call) == 0, call
+    gauged, press = (np.load(f"photos/{name}_truth.npz") for name in ("gauged", "press"))
+    hectopascal = 1e4 * float(gauged["p"] - gauged["p0"])
+    assert float(readings.split("gauged,")[1]) == pytest.approx(hectopascal, abs=0.006)
+    (row,) = csv.DictReader(Path("results/summary.csv").open())
+    true = float(np.linalg.norm(press["force"]))
+    assert row["force_unit"] == "N" and float(row["force"]) == pytest.approx(true, rel=0.1)
+    assert f"says {float(row['force']):.2f} N; the truth is {true:.3f} N" in words(BUBBLE)
+    found = tomllib.loads(Path("material/sensor.toml").read_text())["material"]
+    assert f"prestretch of {found['prestretch']:.2f} ±" in words(BUBBLE)
 
 
 def test_the_recipes_python_runs(monkeypatch):
