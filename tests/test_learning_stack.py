@@ -150,3 +150,21 @@ def test_the_gradient_of_an_image_takes_its_noise_for_given(reconstructor, image
     expected, noise = slope(), pixel_noise(images[:1])
     monkeypatch.setattr(locator, "pixel_noise", lambda _: noise)
     torch.testing.assert_close(slope(), expected)
+
+
+@pytest.mark.parametrize("from_a_start", [False, True])
+def test_gradients_of_markers_are_the_finite_differences(sensor, images, from_a_start):
+    double = tm.Reconstructor(sensor, dtype=torch.float64)
+    with torch.no_grad():
+        first = double(images)
+    previous, direction = first if from_a_start else None, torch.randn(first.pixels.shape, generator=torch.manual_seed(0))
+
+    def found(pixels):
+        result = double.from_pixels(pixels, previous=previous)
+        return result.force.square().sum() + result.displacement.square().sum()
+
+    pixels = first.pixels.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(found(pixels), pixels)
+    with torch.no_grad():
+        above, below = (found(first.pixels + step * direction) for step in (1e-4, -1e-4))
+    assert (slope * direction).sum().item() == pytest.approx((above - below).item() / 2e-4, rel=2e-3)
