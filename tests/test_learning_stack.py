@@ -1,9 +1,12 @@
 """What learning stacks do with a module works with a `Reconstructor`: states, functional calls, export, DDP, autocast."""
 
 import io
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import grasp
 import pytest
 import torch
 import torch.distributed as dist
@@ -139,6 +142,22 @@ def test_a_model_around_it_trains_as_ddp_does_and_under_autocast(reconstructor, 
     with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
         model(images).sum().backward()
     torch.testing.assert_close(plain.head.weight.grad, expected, rtol=0.02 if autocast else 1e-5, atol=1e-6)
+
+
+def test_two_processes_find_the_gradients_of_the_joined_batch(images, tmp_path):
+    whole = grasp.grasp()
+    with torch.no_grad():
+        found, rest = whole.reconstructor(images).pixels, whole.reconstructor.rest_pixels
+    pixels = torch.cat([found, rest + 0.7 * (found - rest)])
+    torch.save(pixels, tmp_path / "pixels.pt")
+    command = [sys.executable, grasp.__file__]
+    running = [subprocess.Popen([*command, str(rank), "2", str(tmp_path)]) for rank in range(2)]
+    assert [each.wait(120) for each in running] == [0, 0]
+    first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in range(2))
+    for here, there, expected in zip(first, second, grasp.gradients(whole, pixels), strict=True):
+        torch.testing.assert_close(here, there, rtol=0, atol=0)
+        torch.testing.assert_close(here, expected, rtol=1e-6, atol=1e-9)
+        assert expected.abs().max() > 0
 
 
 def test_the_gradient_of_an_image_takes_its_noise_for_given(reconstructor, images, monkeypatch):

@@ -76,9 +76,8 @@ def unlike(info: Any, camera: Camera) -> str | None:
     if info.distortion_model not in LENSES:
         return f"CameraInfo: distortion_model {info.distortion_model!r} is not compared; expected one of {', '.join(LENSES)}"
     pixels = np.stack(np.meshgrid(np.linspace(0, width - 1, SAMPLES), np.linspace(0, height - 1, SAMPLES)), -1)
-    lens = Camera(
-        camera.model, camera.image_size, *(each.tolist() for each in (camera.focal, camera.centre, camera.distortion))
-    )
+    focal, centre, distortion = (each.tolist() for each in (camera.focal, camera.centre, camera.distortion))
+    lens = Camera(camera.model, camera.image_size, focal, centre, distortion)
     rays = lens.pixel_to_ray(torch.from_numpy(pixels)).direction.numpy()
     apart = np.linalg.norm(projected(info, rays) - pixels, axis=-1)[np.isfinite(rays).all(-1)]
     apart = np.nan_to_num(apart, nan=np.inf).clip(max=np.hypot(width, height))
