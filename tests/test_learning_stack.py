@@ -23,17 +23,6 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
 @pytest.fixture(scope="module")
-def sensor():
-    full = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
-    return replace(full, membrane=full.surface.membrane((9, 9)))
-
-
-@pytest.fixture(scope="module")
-def reconstructor(sensor):
-    return tm.Reconstructor(sensor)
-
-
-@pytest.fixture(scope="module")
 def images(reconstructor):
     return reconstructor.read(EXAMPLES / "two_contacts.png", EXAMPLES / "press_on_axis.png")
 
