@@ -11,10 +11,9 @@ from PIL import Image
 
 from torchmembrane import Camera, MembraneError, Sensor
 from torchmembrane.cli.main import main
-from torchmembrane.integrations.messages import CHANNELS, SiUnits, grey_of, projected, unlike
+from torchmembrane.integrations.messages import CHANNELS, grey_of, projected, unlike
 from torchmembrane.integrations.rosbag import camera_remark
 from torchmembrane.io.read import read_results
-from torchmembrane.io.store import Mesh
 from torchmembrane.sensor.parts import Cavity
 
 rosbags = pytest.importorskip("rosbags")
@@ -276,8 +275,12 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path, gas_sensor, small_image
         assert said in line
 
 
-def test_relative_forces_are_no_newtons(tmp_path, small_sensor):
-    sensor = Sensor.from_file(small_sensor / "sensor.toml")
-    values = dict.fromkeys(Mesh._fields, np.zeros(0)) | {"force_unit": "relative", "length_unit": "mm", "name": "finger"}
-    with pytest.raises(MembraneError, match="forces of finger are relative, messages are in newtons"):
-        SiUnits(Mesh(**values), sensor.gas_pressure)
+def test_relative_forces_are_no_newtons(tmp_path, gas_sensor, pictures, capsys):
+    """A gas would want its modulus: of a liquid."""
+    full = Sensor.from_file(gas_sensor)
+    material = replace(full.material, shear_modulus=None, thickness=None)
+    sensor = replace(full, material=material, cavity=Cavity("liquid")).to_file(tmp_path / "sensor" / "sensor.toml")
+    run = write_bag(tmp_path / "run", StoragePlugin.MCAP, [(TOPIC, raw(0, pictures[0], "mono8"))])
+    command = ["reconstruct", str(sensor), str(run), "--out", str(tmp_path / "out"), "--bag", str(tmp_path / "forces")]
+    assert main(command) == 2 and not (tmp_path / "forces").exists()
+    assert "forces of cap are relative, messages are in newtons: add shear_modulus" in capsys.readouterr().err
