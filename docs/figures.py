@@ -5,7 +5,7 @@ python docs/figures.py [--out docs/figures] [--only 6,19,chain,slip]
 Presses are simulated on a finer grid, rendered with 30 dB noise, and reconstructed from the images alone. "The paper" is
 `--estimator paper` with the soft locator, "minimum energy" that of the sensor's material. Under each reconstruction stands its
 rms error at the dots over the rms displacement, in the sensor's unit. `chain` makes the pictures of docs/paper_chain.md, `slip`
-that of docs/slip.md, `press` the moving one of the README.
+that of docs/slip.md, `indentation` that of docs/results.md, `press` the moving one of the README.
 """
 
 import argparse
@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from chain import chain_figures
+from indentation import indentation_figure
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from moving import write_film
@@ -234,10 +235,13 @@ def write(drawing: Figure, path: Path) -> None:
     print(path, flush=True)
 
 
+PAGES = ("chain", "slip", "indentation", "press")
+
+
 def main():
     parser = argparse.ArgumentParser(description=textwrap.dedent(__doc__), formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "figures")
-    parser.add_argument("--only", type=lambda text: text.split(","), default=[*FIGURES, "chain", "slip", "press"])
+    parser.add_argument("--only", type=lambda text: text.split(","), default=[*FIGURES, *PAGES])
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(2)
@@ -248,6 +252,8 @@ def main():
                 write(drawing, args.out / f"chain_{part}.png")
         elif name == "slip":
             write(slip_figure(), args.out / "slip.png")
+        elif name == "indentation":
+            write(indentation_figure(), args.out / "indentation.png")
         elif name == "press":
             write_film(args.out / "press.gif")
         else:

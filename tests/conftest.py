@@ -1,21 +1,39 @@
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from torchmembrane.camera.model import Camera
+from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.simulator import Simulator
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
 torch.set_num_threads(1)
 
 
 @pytest.fixture(autouse=True)
 def _seed():
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="module")
+def sensor():
+    """That of the example, on a grid of 9 x 9."""
+    full = Sensor.from_file(EXAMPLES / "sensor.toml")
+    return replace(full, membrane=full.surface.membrane((9, 9)))
+
+
+@pytest.fixture(scope="module")
+def reconstructor(sensor):
+    """Of that sensor."""
+    return Reconstructor(sensor)
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""The Python of the page on learning runs, the head learns, and the prestretch is found."""
+"""The Python of the page on learning runs, the head learns, the prestretch and the rest shape are found."""
 
 import re
 from pathlib import Path
@@ -32,5 +32,14 @@ def test_the_prestretch_is_found_and_its_gradient_is_the_finite_difference(learn
     at = torch.tensor(1.15, requires_grad=True)
     (slope,) = torch.autograd.grad(learned["mismatch"](at), at)
     with torch.no_grad():
-        below, above = (learned["mismatch"](torch.tensor(1.15 + step)) for step in (-0.01, 0.01))
-    assert slope.item() == pytest.approx((above - below).item() / 0.02, rel=0.05)
+        below, above = (learned["mismatch"](torch.tensor(1.15 + step)) for step in (-0.001, 0.001))
+    assert slope.item() == pytest.approx((above - below).item() / 0.002, rel=0.01)
+
+
+def test_the_rest_shape_is_found_and_forces_are_the_better_for_it(learned):
+    mismatches, bulge, (before, after) = learned["mismatches"], learned["bulge"], learned["errors"]
+    assert mismatches[-1] < 0.01 * mismatches[0] and abs(bulge - 1) < 0.08 / 20
+    page = " ".join(PAGE.split())
+    assert f"{bulge:.3f} of the true height" in page and f"from {before:.0%} to {after:.0%}".replace("%", " %") in page
+    truth = learned["force_error"](learned["tm"].Reconstructor(learned["sensor"]))
+    assert after < 0.5 * before and after == pytest.approx(truth, abs=0.005)

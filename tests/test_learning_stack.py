@@ -1,9 +1,12 @@
 """What learning stacks do with a module works with a `Reconstructor`: states, functional calls, export, DDP, autocast."""
 
 import io
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import grasp
 import pytest
 import torch
 import torch.distributed as dist
@@ -17,17 +20,6 @@ from torchmembrane.markers.dots import locator
 from torchmembrane.markers.noise import pixel_noise
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-
-
-@pytest.fixture(scope="module")
-def sensor():
-    full = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
-    return replace(full, membrane=full.surface.membrane((9, 9)))
-
-
-@pytest.fixture(scope="module")
-def reconstructor(sensor):
-    return tm.Reconstructor(sensor)
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +133,22 @@ def test_a_model_around_it_trains_as_ddp_does_and_under_autocast(reconstructor, 
     torch.testing.assert_close(plain.head.weight.grad, expected, rtol=0.02 if autocast else 1e-5, atol=1e-6)
 
 
+def test_two_processes_find_the_gradients_of_the_joined_batch(images, tmp_path):
+    whole = grasp.grasp()
+    with torch.no_grad():
+        found, rest = whole.reconstructor(images).pixels, whole.reconstructor.rest_pixels
+    pixels = torch.cat([found, rest + 0.7 * (found - rest)])
+    torch.save(pixels, tmp_path / "pixels.pt")
+    command = [sys.executable, grasp.__file__]
+    running = [subprocess.Popen([*command, str(rank), "2", str(tmp_path)]) for rank in range(2)]
+    assert [each.wait(120) for each in running] == [0, 0]
+    first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in range(2))
+    for here, there, expected in zip(first, second, grasp.gradients(whole, pixels), strict=True):
+        torch.testing.assert_close(here, there, rtol=0, atol=0)
+        torch.testing.assert_close(here, expected, rtol=1e-6, atol=1e-9)
+        assert expected.abs().max() > 0
+
+
 def test_the_gradient_of_an_image_takes_its_noise_for_given(reconstructor, images, monkeypatch):
     def slope():
         image = images[:1].clone().requires_grad_()
@@ -150,3 +158,21 @@ def test_the_gradient_of_an_image_takes_its_noise_for_given(reconstructor, image
     expected, noise = slope(), pixel_noise(images[:1])
     monkeypatch.setattr(locator, "pixel_noise", lambda _: noise)
     torch.testing.assert_close(slope(), expected)
+
+
+@pytest.mark.parametrize("from_a_start", [False, True])
+def test_gradients_of_markers_are_the_finite_differences(sensor, images, from_a_start):
+    double = tm.Reconstructor(sensor, dtype=torch.float64)
+    with torch.no_grad():
+        first = double(images)
+    previous, direction = first if from_a_start else None, torch.randn(first.pixels.shape, generator=torch.manual_seed(0))
+
+    def found(pixels):
+        result = double.from_pixels(pixels, previous=previous)
+        return result.force.square().sum() + result.displacement.square().sum()
+
+    pixels = first.pixels.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(found(pixels), pixels)
+    with torch.no_grad():
+        above, below = (found(first.pixels + step * direction) for step in (1e-4, -1e-4))
+    assert (slope * direction).sum().item() == pytest.approx((above - below).item() / 2e-4, rel=2e-3)

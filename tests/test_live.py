@@ -399,9 +399,12 @@ def test_the_command_follows_a_camera_and_says_what_ended_it(small_sensor, small
         (["--camera", "0", "--rate", "9"], "a camera has its own pace"),
         (["--camera", "0", "--model", "a.onnx", "--grid", "9", "9"], "--grid with --model"),
         (["--camera", "0", "--model", "a.onnx", "--estimator", "paper"], "--estimator with --model"),
+        (["--camera", "0", "--model", "a.onnx", "--device", "cuda"], "--device with --model"),
+        (["--camera", "0", "--device", "cuda"], "--device cuda: torch sees no CUDA device; pass --device cpu"),
     ],
 )
-def test_wrong_usage_of_the_command_is_said(small_sensor, options, said, capsys):
+def test_wrong_usage_of_the_command_is_said(small_sensor, options, said, capsys, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     assert main(["live", str(small_sensor / "sensor.toml"), *options]) == 2
     assert said in capsys.readouterr().err
 

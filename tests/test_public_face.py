@@ -15,17 +15,6 @@ NAMES = ("press_on_axis", "two_contacts", "flat_plate")
 
 
 @pytest.fixture(scope="module")
-def sensor():
-    whole = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
-    return replace(whole, membrane=whole.membrane.resampled((9, 9)))
-
-
-@pytest.fixture(scope="module")
-def reconstructor(sensor):
-    return tm.Reconstructor(sensor)
-
-
-@pytest.fixture(scope="module")
 def photographs():
     """Grey, as a camera of 8 bits gives it, `[3, H, W]`."""
     return np.stack([np.asarray(Image.open(EXAMPLES / f"{name}.png").convert("L")) for name in NAMES])

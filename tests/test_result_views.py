@@ -1,6 +1,5 @@
 """Views of a result: depth map, Isaac Lab's fields, the contact as a point cloud."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +16,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
 @pytest.fixture(scope="module")
-def sensor():
-    full = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
-    return replace(full, membrane=full.surface.membrane((9, 9)))
-
-
-@pytest.fixture(scope="module")
-def result(sensor):
-    reconstructor = tm.Reconstructor(sensor)
+def result(reconstructor):
     with torch.no_grad():
         return reconstructor(reconstructor.read(EXAMPLES / "press_on_axis.png"))
 

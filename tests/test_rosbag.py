@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchmembrane import MembraneError, Sensor
+from torchmembrane import Camera, MembraneError, Sensor
 from torchmembrane.cli.main import main
-from torchmembrane.integrations.messages import CHANNELS, SiUnits, grey_of, unlike
+from torchmembrane.integrations.messages import CHANNELS, grey_of, projected, unlike
+from torchmembrane.integrations.rosbag import camera_remark
 from torchmembrane.io.read import read_results
-from torchmembrane.io.store import Mesh
 from torchmembrane.sensor.parts import Cavity
 
 rosbags = pytest.importorskip("rosbags")
@@ -50,13 +50,14 @@ def compressed(number, levels):
     return kind, TYPES[kind](header(number), "png", np.frombuffer(content.getvalue(), np.uint8))
 
 
-def camera_info(camera, focal=None):
+def camera_info(camera, focal=None, centre=None, distortion=None, lens=None):
     kind, names = "sensor_msgs/msg/CameraInfo", {"pinhole": "plumb_bob", "fisheye": "equidistant"}
-    (f, g), (u, v), (width, height) = focal or camera.focal, camera.centre, camera.image_size
+    (f, g), (u, v), (width, height) = focal or camera.focal, centre or camera.centre, camera.image_size
     k = np.array([f, 0, u, 0, g, v, 0, 0, 1], float)
     region = TYPES["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    rest = np.zeros(4), k, np.eye(3).ravel(), np.zeros(12), 0, 0, region
-    return kind, TYPES[kind](header(0), height, width, names[camera.model], *rest)
+    d = np.asarray(camera.distortion if distortion is None else distortion, float)
+    rest = d, k, np.eye(3).ravel(), np.zeros(12), 0, 0, region
+    return kind, TYPES[kind](header(0), height, width, lens or names[camera.model], *rest)
 
 
 def write_bag(path, plugin, messages, compression=None):
@@ -209,11 +210,47 @@ def test_a_camera_info_that_disagrees_is_said(small_sensor):
     camera = Sensor.from_file(small_sensor / "sensor.toml").camera
     assert unlike(camera_info(camera)[1], camera) is None
     assert unlike(camera_info(camera, focal=(0.0, 0.0))[1], camera) is None  # not calibrated
-    other = camera_info(camera, focal=(1.05 * camera.focal[0], camera.focal[1]))[1]
-    assert "used is the sensor file" in unlike(other, camera)
+    u, v = camera.centre.tolist()
+    assert unlike(camera_info(camera, centre=(u + 0.6, v - 0.7))[1], camera) is None
+    said = unlike(camera_info(camera, centre=(u + 3, v - 4))[1], camera)
+    assert "5.0 px off (rms over the image, at most 5.0); used is the sensor file" in said
+    assert "distortion_model 'double_sphere' is not compared" in unlike(camera_info(camera, lens="double_sphere")[1], camera)
     small = SimpleNamespace(width=64, height=48, k=np.eye(3).ravel(), distortion_model="plumb_bob")
     with pytest.raises(MembraneError, match="CameraInfo is of 64 x 48 px images"):
         unlike(small, camera)
+
+
+PINHOLE = ("pinhole", (640, 480), (400, 410), (318, 243))
+FISHEYE = ("fisheye", (640, 480), (200, 205), (318, 243))
+
+
+@pytest.mark.parametrize(
+    "lens, distortion, ports",
+    [(PINHOLE, [], []), (PINHOLE, [-0.2, 0.05, 1e-3, -2e-3, 0.01], [(2, 3, 1.49)]), (FISHEYE, [0.02, -5e-3, 1e-3, -1e-4], [])],
+)
+def test_a_camera_info_s_distortion_is_compared_without_the_ports(lens, distortion, ports):
+    camera = Camera(*lens, distortion, ports=ports)
+    assert unlike(camera_info(camera)[1], camera) is None
+    stronger = [0.05, *np.zeros(4)] if not distortion else [distortion[0] + 0.05, *distortion[1:]]
+    assert "px off" in unlike(camera_info(camera, distortion=stronger)[1], camera)
+
+
+def test_a_rational_lens_is_projected_as_opencv_does():
+    cv2 = pytest.importorskip("cv2")
+    camera, d = Camera(*PINHOLE), np.array([-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, -0.02, 0.004])
+    info = camera_info(camera, distortion=d, lens="rational_polynomial")[1]
+    points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 3), (20, 3))
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), info.k.reshape(3, 3), d)[0][:, 0]
+    np.testing.assert_allclose(projected(info, points), expected)
+
+
+def test_only_a_camera_info_beside_the_images_is_one(tmp_path, small_sensor, pictures):
+    """Of another type on its topic, and one that disagrees."""
+    camera, image = Sensor.from_file(small_sensor / "sensor.toml").camera, (TOPIC, raw(0, pictures[0], "mono8"))
+    other = camera_info(camera, centre=(camera.centre + 30).tolist())
+    for name, beside, said in (("image", raw(0, pictures[0], "mono8"), False), ("info", other, True)):
+        bag = write_bag(tmp_path / name, StoragePlugin.MCAP, [("/finger/camera_info", beside), image]) / "metadata.yaml"
+        assert (camera_remark(bag, TOPIC, camera) is not None) == said
 
 
 def test_what_cannot_be_is_refused_in_one_line(tmp_path, gas_sensor, small_images, pictures, capsys):
@@ -238,8 +275,12 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path, gas_sensor, small_image
         assert said in line
 
 
-def test_relative_forces_are_no_newtons(tmp_path, small_sensor):
-    sensor = Sensor.from_file(small_sensor / "sensor.toml")
-    values = dict.fromkeys(Mesh._fields, np.zeros(0)) | {"force_unit": "relative", "length_unit": "mm", "name": "finger"}
-    with pytest.raises(MembraneError, match="forces of finger are relative, messages are in newtons"):
-        SiUnits(Mesh(**values), sensor.gas_pressure)
+def test_relative_forces_are_no_newtons(tmp_path, gas_sensor, pictures, capsys):
+    """A gas would want its modulus: of a liquid."""
+    full = Sensor.from_file(gas_sensor)
+    material = replace(full.material, shear_modulus=None, thickness=None)
+    sensor = replace(full, material=material, cavity=Cavity("liquid")).to_file(tmp_path / "sensor" / "sensor.toml")
+    run = write_bag(tmp_path / "run", StoragePlugin.MCAP, [(TOPIC, raw(0, pictures[0], "mono8"))])
+    command = ["reconstruct", str(sensor), str(run), "--out", str(tmp_path / "out"), "--bag", str(tmp_path / "forces")]
+    assert main(command) == 2 and not (tmp_path / "forces").exists()
+    assert "forces of cap are relative, messages are in newtons: add shear_modulus" in capsys.readouterr().err

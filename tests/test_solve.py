@@ -7,6 +7,7 @@ import torch
 from torchmembrane.solve import block_tridiagonal
 from torchmembrane.solve.anderson import DEPTH, accelerated, first
 from torchmembrane.solve.conjugate_gradient import conjugate_gradient
+from torchmembrane.solve.implicit import differentiable
 from torchmembrane.solve.inverse_root import LEAF, RIDGE, Iteration, by_cholesky, by_products, iteration_scales
 from torchmembrane.solve.kkt import constrained_minimum
 
@@ -36,6 +37,20 @@ def test_steps_after_convergence_and_zero_loads_stay_finite():
     x = conjugate_gradient(lambda y: y @ A, lambda y: y, b, steps=40)
     assert (x[0] == 0).all()
     torch.testing.assert_close(x @ A, b)
+
+
+def test_gradients_of_a_solution_are_the_dense_solution_s_and_there_are_no_second_ones():
+    A, b = spd(6, (3,)).requires_grad_(), torch.randn(3, 2, 6, dtype=torch.float64, requires_grad=True)
+    inverse, weights = torch.linalg.inv(A.detach()), torch.arange(12, dtype=torch.float64).reshape(2, 6)
+    x = differentiable(lambda r: r @ inverse, lambda y: y @ A, b)
+    dense = torch.linalg.solve(A, b.mT).mT
+    torch.testing.assert_close(x, dense)
+    expected = torch.autograd.grad((weights * dense**2).sum(), (A, b))
+    got = torch.autograd.grad((weights * x**2).sum(), (A, b), create_graph=True)
+    torch.testing.assert_close((got[0] + got[0].mT) / 2, (expected[0] + expected[0].mT) / 2)
+    torch.testing.assert_close(got[1], expected[1])
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        got[1].sum().backward()
 
 
 @pytest.mark.parametrize("compliance", [0.0, 0.7])

@@ -59,6 +59,23 @@ def add_estimator(add: Add, element: str) -> None:
     add("--locator", choices=LOCATORS, help=how)
 
 
+def add_device(add: Add) -> None:
+    """Where torch computes."""
+    add("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: %(default)s)")
+
+
+def check_device(device: str) -> None:
+    """Refuse a device that torch does not see here.
+
+    Raises:
+        MembraneError: there is no CUDA.
+    """
+    import torch
+
+    if device == "cuda" and not torch.cuda.is_available():
+        raise MembraneError("--device cuda: torch sees no CUDA device; pass --device cpu, or install torch with CUDA")
+
+
 def add_rerun(add: Add) -> None:
     """Whether frames are shown in the viewer Rerun."""
     add("--rerun", action="store_true", help='show image, surface, contacts, wrench and pressure in Rerun (extra "rerun")')

@@ -10,7 +10,18 @@ from pathlib import Path
 from threading import Event, Thread, current_thread, main_thread
 from typing import TYPE_CHECKING, Any
 
-from .arguments import add_command, add_estimator, add_rerun, add_sensor, camera, count, positive, wants_rerun
+from .arguments import (
+    add_command,
+    add_device,
+    add_estimator,
+    add_rerun,
+    add_sensor,
+    camera,
+    check_device,
+    count,
+    positive,
+    wants_rerun,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,6 +46,8 @@ SIGTERM end it with a summary. In a terminal the line is rewritten in place, els
 exit code: 0 ended or stopped, 2 wrong usage, or a source that gives no images (any more)"""
 SOURCES = ("camera", "video", "images")
 OF_TORCH = ("grid", "energy", "element", "volume", "flow", "smoothing", "locator")
+DEFAULTS = {"estimator": "force-balance", "device": "cpu"}
+"""Of torch as well."""
 DEFAULT_RATE = 30.0
 
 
@@ -51,6 +64,7 @@ def add_parser(commands: Any) -> None:
     add_estimator(add, "as for reconstruct (default: %(default)s)")
     model = "compute by onnxruntime with a model of torchmembrane export; needs torchmembrane-edge"
     add("--model", metavar="MODEL.onnx", type=Path, help=model)
+    add_device(add)
     add("--threads", metavar="N", type=count, default=1, help="that compute (default: %(default)s)")
     kept = "keep images, results and times in a new folder; what the disk is too slow for is dropped and counted"
     add("--record", metavar="DIR", type=Path, help=kept)
@@ -93,8 +107,10 @@ def _check(arguments: Namespace) -> None:
     if arguments.rate is not None and arguments.camera is not None:
         raise MembraneError("live: --rate with --camera; a camera has its own pace: leave --rate out")
     foreign = [name for name in OF_TORCH if getattr(arguments, name) is not None]
-    if arguments.model is not None and (foreign or arguments.estimator != "force-balance"):
-        raise MembraneError(f"live: --{(foreign or ['estimator'])[0]} with --model; a model has its own: export it with that")
+    foreign += [name for name, default in DEFAULTS.items() if getattr(arguments, name) != default]
+    if arguments.model is not None and foreign:
+        raise MembraneError(f"live: --{foreign[0]} with --model; a model has its own: export it with that")
+    check_device(arguments.device)
 
 
 def _images(arguments: Namespace, size: tuple[int, int]) -> "Iterator[np.ndarray]":
@@ -121,7 +137,7 @@ def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
     torch.set_num_threads(arguments.threads)
     if arguments.grid is not None:
         sensor = replace(sensor, membrane=sensor.surface.membrane(tuple(arguments.grid)))
-    return TrackedStream(build_reconstructor(sensor, arguments))
+    return TrackedStream(build_reconstructor(sensor, arguments).to(arguments.device))
 
 
 def _watchers(

@@ -5,7 +5,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .arguments import add_command, add_estimator, add_sensor, count, count_or_auto, positive, share
+from .arguments import add_command, add_device, add_estimator, add_sensor, check_device, count, count_or_auto, positive, share
 from .choices import ENGINES, RESULT_FORMATS
 from .film import FrameImages, draw_film
 
@@ -42,7 +42,7 @@ def add_parser(commands: Any) -> None:
     add("images", metavar="IMAGES", nargs="+", help="image files, globs (quoted or not), folders, videos, or bags")
     add("--out", metavar="DIR", type=Path, required=True, help="folder of the results: new, or of the same sensor")
     add_estimator(add, "triangle (default), or quadrilateral: the paper's, harmonic, with the tension of --energy")
-    add("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: %(default)s)")
+    add_device(add)
     add("--batch", metavar="N", type=count_or_auto, help="frames computed at once (default: auto, by the memory there is)")
     each = "processes of one thread each; 1: none but this one (default: one per core, if there are frames enough)"
     add("--workers", metavar="N", type=count, help=each)
@@ -120,13 +120,11 @@ def run(arguments: Namespace) -> int:
 
 def _check(arguments: Namespace) -> None:
     """Refuse options that cannot be together, or not on this machine, before anything is read."""
-    import torch
-
     from ..errors import MembraneError
     from ..plot.film import check_film
 
-    if arguments.device == "cuda" and arguments.engine == "local" and not torch.cuda.is_available():
-        raise MembraneError("--device cuda: torch sees no CUDA device; pass --device cpu, or install torch with CUDA")
+    if arguments.engine == "local":
+        check_device(arguments.device)
     if arguments.engine == "ray" and arguments.format == "npz":
         raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
     if arguments.video_out is not None:

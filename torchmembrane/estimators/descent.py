@@ -1,5 +1,6 @@
 """Gauss-Newton steps of force balance: surface and pressure, the volume linearised."""
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -8,10 +9,11 @@ from torch import Tensor, nn
 from ..mechanics.cavity import CavityLaw
 from ..pieces import piece, repeated
 from ..solve.conjugate_gradient import conjugate_gradient
+from ..solve.implicit import differentiable
 from ..solve.kkt import BorderedStep, solve_bordered
 from ..surface.stencil import pad_border
 from .bearings import Bearings
-from .normal_equations import BalanceEquations
+from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import pulled
 from .settings import ForceBalanceSettings
 
@@ -57,7 +59,7 @@ class Descent(nn.Module):
         self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings, tau: float, outlier: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Factor | None]:
         """The state, the surface before; the factor of the step's matrix."""
-        state, factor = self._traced_once(State(x, pressure, moved), measured, tau, outlier, None)
+        state, factor = self._traced_once(State(x, pressure, moved), measured, tau, outlier, None, keeps=True)
         return *state, x, factor
 
     @piece
@@ -77,44 +79,39 @@ class Descent(nn.Module):
         return *state, x
 
     def _traced_once(
-        self, state: State, measured: Bearings, tau: float, outlier: float, factor: Factor | None
+        self, state: State, measured: Bearings, tau: float, outlier: float, factor: Factor | None, keeps: bool = False
     ) -> tuple[State, Factor | None]:
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself."""
         scales = [torch.as_tensor(scale, dtype=state.x.dtype, device=state.x.device) for scale in (tau, outlier)]
         step = self.step if torch.compiler.is_exporting() else self._compiled_once
-        taken: tuple[State, Factor | None] = step(state, measured, scales[0], scales[1], factor)
+        taken: tuple[State, Factor | None] = step(state, measured, scales[0], scales[1], factor, keeps)
         return taken
 
     @torch.compiler.nested_compile_region
     def _compiled_once(
-        self, state: State, measured: Bearings, tau: Tensor, outlier: Tensor, factor: Factor | None
+        self, state: State, measured: Bearings, tau: Tensor, outlier: Tensor, factor: Factor | None, keeps: bool
     ) -> tuple[State, Factor | None]:
-        return self.step(state, measured, tau, outlier, factor)
+        return self.step(state, measured, tau, outlier, factor, keeps)
 
     def step(
-        self, state: State, measured: Bearings, tau: Tensor, outlier: Tensor, factor: Factor | None = None
+        self,
+        state: State,
+        measured: Bearings,
+        tau: Tensor,
+        outlier: Tensor,
+        factor: Factor | None = None,
+        keeps: bool = False,
     ) -> tuple[State, Factor | None]:
         """One reweighted Gauss-Newton step, the volume linearised, the longest vertex step capped.
 
-        Also returns the factor of its matrix if it made one: with the `factor` of a step near this one it makes none.
+        Also returns the factor of its matrix if it `keeps` it: with the `factor` of a step near this one it makes none.
         """
         equations, (x, pressure, moved) = self.equations, state
         _, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier)
-        loads, made = torch.cat([loads, motion.coupling], 1), None
+        loads = torch.cat([loads, motion.coupling], 1)
         first, last = self.settings.tau
         blunt = (tau.clamp_max(first) / last) ** 2  # 1 as tau ends
-        if factor is None:
-            made = equations.system.factor(equations.matrix(normal, self.settings.damping * blunt))
-            solved = equations.system.substitute(made, loads)  # refined once: of rounding and damping little is left
-            solved = solved + equations.system.substitute(made, loads - equations.product(normal, solved))
-        else:
-            known = factor
-            solved = conjugate_gradient(
-                lambda u: equations.product(normal, u),
-                lambda r: equations.system.substitute(known, r),
-                loads,
-                self.settings.conjugate_steps,
-            )
+        made, solved = self._solved(normal, loads, self.settings.damping * blunt, factor, keeps)
         motion = motion.held(moved, self.settings.camera_motion * blunt)
         loads, solved = motion.eliminated(loads[:, :3], solved[:, :3], solved[:, 3:])
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
@@ -125,6 +122,38 @@ class Descent(nn.Module):
         share = self._share(x, move)
         x = x + share[:, None, None] * move
         return State(x, pressure + share * rise, moved + share[:, None] * turn), made
+
+    def _solved(
+        self, normal: NormalEquations, loads: Tensor, damping: Tensor, factor: Factor | None, keeps: bool
+    ) -> tuple[Factor | None, Tensor]:
+        """The factor, of what is damped, if it is kept, and the solutions `[B, C, 3 N]`.
+
+        Gradients go through the steps of the solve where its error, which they change, counts: by conjugate gradients with a
+        kept factor. Elsewhere they are those of the exact solution, which take none of the factor's.
+        """
+        if factor is not None:
+            return None, self._conjugated(normal, factor, loads)
+        if keeps or torch.compiler.is_compiling():
+            kept = self._factor(normal, damping)
+            return kept, self._refined(normal, kept, loads)
+        with torch.no_grad():
+            passing = self._factor(normal, damping)
+        return None, differentiable(partial(self._refined, normal, passing), partial(self.equations.product, normal), loads)
+
+    def _factor(self, normal: NormalEquations, damping: Tensor) -> Factor:
+        return self.equations.system.factor(self.equations.matrix(normal, damping))
+
+    def _refined(self, normal: NormalEquations, factor: Factor, loads: Tensor) -> Tensor:
+        """Solutions with the factor of these equations, refined once: of rounding and damping little is left."""
+        substitute = self.equations.system.substitute
+        solved = substitute(factor, loads)
+        return solved + substitute(factor, loads - self.equations.product(normal, solved))
+
+    def _conjugated(self, normal: NormalEquations, factor: Factor, loads: Tensor) -> Tensor:
+        """Solutions with the factor of equations near these."""
+        equations, steps = self.equations, self.settings.conjugate_steps
+        product, precondition = partial(equations.product, normal), partial(equations.system.substitute, factor)
+        return conjugate_gradient(product, precondition, loads, steps)
 
     def _share(self, x: Tensor, move: Tensor) -> Tensor:
         """Of a step `move [B, V, 3]`, so that no vertex goes far and no line of the grid is stretched or shrunk by much."""

@@ -7,6 +7,8 @@ optical frame, x right, y down, z forward.
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from numpy.polynomial.polynomial import polyval
 
 from ..camera.model import Camera
 from ..errors import MembraneError
@@ -25,8 +27,10 @@ CHANNELS = {
 """Of an image's encoding: the type of a value, values of a pixel, and which of them are grey, or red, green and blue."""
 POINT_FIELDS = ("x", "y", "z", "normal_traction", "shear_x", "shear_y", "shear_z")
 """Of a vertex, each float32: place, m; compressive normal traction and shear traction on the membrane, Pa."""
-SAME = 0.01
-"""Of the focal length: by how much a CameraInfo's intrinsics may differ before it is said."""
+SAME = 1.0
+"""Pixels, rms over the image: by how much a CameraInfo may see the same ray elsewhere before it is said."""
+SAMPLES = 32
+"""Pixels of the image, in each direction, at which that is worked out."""
 LENSES = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
 
 
@@ -57,7 +61,9 @@ def grey_of(message: Any, size: tuple[int, int]) -> np.ndarray:
 
 
 def unlike(info: Any, camera: Camera) -> str | None:
-    """What a `sensor_msgs/CameraInfo` says otherwise than the sensor file, in words; None: nothing, or it is not calibrated.
+    """By how many pixels the lens of a `sensor_msgs/CameraInfo` is off the sensor file's, in words.
+
+    None: by no more than `SAME`, or it is not calibrated. Distortion counts, ports do not: a CameraInfo knows none.
 
     Raises:
         MembraneError: it is of images of another size.
@@ -65,18 +71,46 @@ def unlike(info: Any, camera: Camera) -> str | None:
     width, height = camera.image_size
     if (info.width, info.height) != (width, height):
         raise MembraneError(f"CameraInfo is of {info.width} x {info.height} px images, the sensor file of {width} x {height}")
-    matrix = np.asarray(info.k, float).reshape(3, 3)
-    if matrix[0, 0] == 0:
+    if info.k[0] == 0:
         return None
-    found = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
-    expected = np.array([*camera.focal, *camera.centre], float)
-    lens = LENSES.get(info.distortion_model, camera.model)
-    if lens == camera.model and (abs(found - expected) <= SAME * expected[:2].max()).all():
+    if info.distortion_model not in LENSES:
+        return f"CameraInfo: distortion_model {info.distortion_model!r} is not compared; expected one of {', '.join(LENSES)}"
+    pixels = np.stack(np.meshgrid(np.linspace(0, width - 1, SAMPLES), np.linspace(0, height - 1, SAMPLES)), -1)
+    focal, centre, distortion = (each.tolist() for each in (camera.focal, camera.centre, camera.distortion))
+    lens = Camera(camera.model, camera.image_size, focal, centre, distortion)
+    rays = lens.pixel_to_ray(torch.from_numpy(pixels)).direction.numpy()
+    apart = np.linalg.norm(projected(info, rays) - pixels, axis=-1)[np.isfinite(rays).all(-1)]
+    apart = np.nan_to_num(apart, nan=np.inf).clip(max=np.hypot(width, height))
+    rms = np.sqrt((apart**2).mean())
+    if rms <= SAME:
         return None
-    given, used = (
-        f"focal {np.round(each[:2], 1).tolist()}, centre {np.round(each[2:], 1).tolist()}" for each in (found, expected)
+    return (
+        f"CameraInfo ({info.distortion_model}) sees what the sensor file ({camera.model}) does {rms:.1f} px off (rms over the "
+        f"image, at most {apart.max():.1f}); used is the sensor file"
     )
-    return f"CameraInfo: {lens}, {given} px; used is the sensor file: {camera.model}, {used} px"
+
+
+def projected(info: Any, rays: np.ndarray) -> np.ndarray:
+    """Where the lens of a CameraInfo sees `rays [..., 3]`, `[..., 2]` px; NaN behind a pinhole."""
+    (f, _, u), (_, g, v) = np.asarray(info.k, float).reshape(3, 3)[:2]
+    k = np.concatenate([np.asarray(info.d, float), np.zeros(8)])[:8]
+    x, y, z = np.moveaxis(rays, -1, 0)
+    if LENSES[info.distortion_model] == "fisheye":
+        off_axis = np.hypot(x, y)
+        angle = np.arctan2(off_axis, z)
+        radius = angle * polyval(angle**2, [1, *k[:4]])
+        along = radius / np.maximum(off_axis, np.finfo(float).tiny)
+        x, y = x * along, y * along
+    else:
+        x, y = x / np.where(z > 0, z, np.nan), y / np.where(z > 0, z, np.nan)
+        k1, k2, p1, p2, k3, k4, k5, k6 = k
+        square = x * x + y * y
+        radial = polyval(square, [1, k1, k2, k3]) / polyval(square, [1, k4, k5, k6])
+        x, y = (
+            x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+            y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+        )
+    return np.stack([f * x + u, g * y + v], -1)
 
 
 class Wrench(NamedTuple):
@@ -107,17 +141,17 @@ class SiUnits:
         self.gas_pressure = gas_pressure
 
     def wrench(self, frame: Frame) -> Wrench:
-        """Of what touches the membrane, on it."""
+        """Of what touches the membrane, on it; from the frame's `wrench [6]`, N and N x length unit."""
         return Wrench(frame["wrench"][:3].astype(float), frame["wrench"][3:].astype(float) / self.metre)
 
     def points(self, frame: Frame) -> np.ndarray:
-        """`[V, 7]` float32: `POINT_FIELDS` of every vertex."""
+        """`[V, 7]` float32: `POINT_FIELDS` of every vertex; from its `vertices`, `normals` and `traction`, `[V, 3]` each."""
         traction, normals = frame["traction"] * self.metre**2, frame["normals"]
         along = (traction * normals).sum(-1, keepdims=True)
         return np.hstack([frame["vertices"] / self.metre, -along, traction - along * normals]).astype(np.float32)
 
     def pressure(self, frame: Frame) -> float | None:
-        """Of the gas, absolute, Pa; None of a sensor without one."""
+        """Of the gas, absolute, Pa; from the frame's `pressure_change []`; None of a sensor without one."""
         if self.gas_pressure is None:
             return None
         return (self.gas_pressure + float(frame["pressure_change"])) * self.metre**2

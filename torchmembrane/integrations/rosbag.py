@@ -85,14 +85,14 @@ def image_topic(bag: Path, topic: str | None) -> tuple[str, int]:
     return found, topics[found]
 
 
-def messages(bag: Path, topic: str) -> Iterator[StampedMessage]:
-    """The messages of a topic, in the order of their reception.
+def messages(bag: Path, topic: str, kinds: tuple[str, ...] = IMAGE_TYPES) -> Iterator[StampedMessage]:
+    """The messages of a topic that are of one of these types, in the order of their reception.
 
     Raises:
         MembraneError: the bag cannot be read, or not to its end.
     """
     with _opened(bag) as reader:
-        connections = [each for each in reader.connections if each.topic == topic]
+        connections = [each for each in reader.connections if each.topic == topic and each.msgtype in kinds]
         for connection, received, content in reader.messages(connections=connections) if connections else ():
             yield StampedMessage(received, reader.deserialize(content, connection.msgtype))
 
@@ -104,7 +104,7 @@ def camera_remark(bag: Path, topic: str, camera: Camera) -> str | None:
         MembraneError: it is of images of another size.
     """
     camera_topic = f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
-    first = next(messages(bag, camera_topic), None)
+    first = next(messages(bag, camera_topic, (INFO_TYPE,)), None)
     try:
         return None if first is None else unlike(first.message, camera)
     except MembraneError as error:
