@@ -204,6 +204,7 @@ def test_edge_runs_without_torch(model_file, reconstructor, images, bare_python,
     mesh = Mesh.load(tmp_path / "mesh.npz")
     np.testing.assert_array_equal(mesh.rest_vertices, reconstructor.estimator.membrane.rest.numpy())
     assert mesh.sensor == reconstructor.sensor.fingerprint and mesh.fixed.dtype == bool
+    assert mesh.camera_in_tool.shape == (0, 4) and mesh.tool is None
 
 
 def test_edge_opens_a_model_in_the_format_of_onnxruntime(model_file, images, monkeypatch, tmp_path):

@@ -120,4 +120,5 @@ def grey(images) -> np.ndarray:
 def _array(key: str, value):
     if not isinstance(value, list):
         return value
-    return np.array(value, np.int64 if key in WHOLE else bool if key in FLAGS else np.float32)
+    array = np.array(value, np.int64 if key in WHOLE else bool if key in FLAGS else np.float32)
+    return array.reshape(-1, 4) if key == "camera_in_tool" else array  # none is `[]` in JSON, whatever its shape

@@ -160,7 +160,8 @@ class Mesh(NamedTuple):
         V = len(self.rest_vertices)
         wanted = {"rest_vertices": (V, 3), "rest_normals": (V, 3), "fixed": (V,), "grid": (2,), "image_size": (2,)}
         wanted |= {"triangles": (len(self.triangles), 3), "vertex_pixels": (V, 2), "rest_pixels": (len(self.rest_pixels), 2)}
-        wanted |= {"camera_in_tool": (3 if len(self.camera_in_tool) else 0, 4)}
+        if self.camera_in_tool.size:  # none is `[0]` as `torchmembrane-edge` once wrote it
+            wanted["camera_in_tool"] = (3, 4)
         for name, shape in wanted.items():
             if (array := getattr(self, name)).shape != shape or array.dtype.kind not in NUMBERS:
                 raise ValueError(f"{name} is {array.dtype} {array.shape}, not {shape}")
