@@ -2,15 +2,20 @@
 
 import csv
 import math
+import re
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from torchmembrane import Camera, Sensor
+from torchmembrane import Camera, MembraneError, Sensor
+from torchmembrane.calibrate.rim import find_rim
 from torchmembrane.cli.main import main
 from torchmembrane.presets.draft import RimCircle, balanced, drafted_dots, drafted_surface, overpressure, read_drafted_dots
-from torchmembrane.sensor.parts import METRE, Material
+from torchmembrane.sensor.parts import METRE, Cavity, Markers, Material
+from torchmembrane.simulate.appearance import noisy
+from torchmembrane.simulate.render import Renderer
 
 FISHEYE = "--image-size 640,480 --lens fisheye --view 150".split()
 SHAPES = {
@@ -129,6 +134,70 @@ def test_a_rest_image_and_the_rim_s_circle_give_the_sensor_and_check_finds_all_o
     assert f"{dots} placed on the rest surface" in said and f"{dots} of {dots} found in the rest image" in said
 
 
+def photographed(tmp_path, focal=(200.0, 200.0)):
+    """A rest image, its noise 40 dB, of a dome whose rim is about (327.5, 231); and its radius, px."""
+    centre, surface = (327.5, 231.0), drafted_surface("dome", {"radius": 12.0}, 12.0)
+    camera, dots = Camera("fisheye", (640, 480), focal, centre), drafted_dots(surface)
+    markers, material = Markers("dots", "dark", *dots), Material("neo_hookean", 1.2)
+    sensor = Sensor("dome", "mm", camera, surface.membrane((17, 17)), material, Cavity("liquid"), markers, surface)
+    image = noisy(Renderer(sensor, samples=2)(sensor.membrane.rest), 40.0, np.random.default_rng(0))
+    path = tmp_path / "rest.png"
+    cv2.imwrite(str(path), (255 * image).round().byte().numpy())
+    on_rim = camera.point_to_pixel(torch.tensor([12.0, 0.0, 12.0], dtype=torch.float64))
+    return path, float(on_rim[0]) - centre[0]
+
+
+def test_the_rim_is_found_in_the_rest_image(tmp_path, capsys):
+    image, radius = photographed(tmp_path)
+    made, view = tmp_path / "made.toml", str(np.degrees(640 / 200.0))
+    call = [
+        "init",
+        str(made),
+        *"--shape dome --radius 12 --lens fisheye --rim auto".split(),
+        "--view",
+        view,
+        "--rest",
+        str(image),
+    ]
+    assert main(call) == 0
+    u, v, found = (float(number) for number in re.findall(r"--rim ([\d.]+),([\d.]+),([\d.]+)", capsys.readouterr().out)[0])
+    assert [u, v, found] == pytest.approx([327.5, 231.0, radius], abs=0.15)
+    assert Sensor.from_file(made).surface.values["base_z"] == pytest.approx(12.0, abs=0.02)
+
+
+def test_a_rim_that_is_no_circle_is_refused(tmp_path, capsys):
+    image, _ = photographed(tmp_path, focal=(220.0, 180.0))
+    call = ["init", str(tmp_path / "made.toml"), *"--shape dome --radius 12 --lens fisheye --view 150 --rim auto".split()]
+    assert main([*call, "--rest", str(image)]) == 2
+    assert "is an ellipse of 172" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("outside", [0.02, 0.9])
+@pytest.mark.parametrize("markers", [True, False])
+def test_an_ellipse_is_found_whether_lighter_or_darker_outside(outside, markers):
+    v, u = np.mgrid[:240, :320]
+    radius = np.hypot((u - 150) / 110, (v - 125) / 90)
+    slope = 50 * np.sign(outside - 0.5)
+    image = np.clip((0.5 + outside) / 2 + (radius - 1) * slope, min(outside, 0.5), max(outside, 0.5))
+    dots = np.stack(np.meshgrid(np.arange(90, 220, 30), np.arange(75, 185, 25)), -1).reshape(-1, 2)
+    for x, y in dots:
+        image[np.hypot(u - x, v - y) < 6] = 0.1
+    rim = find_rim(image + 0.02 * np.random.default_rng(0).standard_normal(image.shape), dots if markers else None)
+    assert [*rim.centre, *rim.half_axes] == pytest.approx([150, 125, 110, 90], abs=0.3)
+    assert rim.share > 0.95
+
+
+def test_a_rim_that_is_not_in_the_image_is_not_found():
+    dots = np.stack(np.meshgrid(np.arange(90, 220, 30), np.arange(75, 185, 25)), -1).reshape(-1, 2)
+    v, u = np.mgrid[:240, :320]
+    image = 0.7 + 0.02 * np.random.default_rng(0).standard_normal((240, 320))
+    for x, y in dots:
+        image[np.hypot(u - x, v - y) < 6] = 0.1
+    for inside in (dots, None):
+        with pytest.raises(MembraneError, match="no rim is seen"):
+            find_rim(image, inside)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -145,6 +214,7 @@ def test_a_rest_image_and_the_rim_s_circle_give_the_sensor_and_check_finds_all_o
         ("--shape dome --radius 12 --image-size 640,480 --distance 12 --view 100 --focal 300", "one of them"),
         ("--shape dome --radius 12 --image-size 640,480 --distance 12 --view 100 --overpressure 20hPa", "follows"),
         ("--shape dome --radius 12 --image-size 640,480 --distance 12 --view 100 --rim 1,2,3", "--rest"),
+        ("--shape dome --radius 12 --image-size 640,480 --view 100 --rim auto", "--rest"),
     ],
 )
 def test_what_is_missing_or_too_much_is_named(tmp_path, capsys, arguments, said):

@@ -12,6 +12,7 @@ import torchmembrane as tm
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NAMES = ("press_on_axis", "two_contacts", "flat_plate")
+BATCHED = 1e-3  # mm, that a frame alone may be off the same frame in a batch (docs/jobs.md)
 
 
 @pytest.fixture(scope="module")
@@ -197,14 +198,14 @@ def test_a_status_is_its_number_and_says_its_text(result):
 def test_a_tracker_gives_what_frames_with_their_previous_give(reconstructor, photographs, result):
     tracker = tm.Tracker(reconstructor)
     first, second = tracker(photographs[0]), tracker(photographs[1])
-    torch.testing.assert_close(first.vertices, result.vertices[:1], rtol=0, atol=1e-4)
+    torch.testing.assert_close(first.vertices, result.vertices[:1], rtol=0, atol=BATCHED)
     with torch.no_grad():
         expected = reconstructor(photographs[1], first)
     torch.testing.assert_close(second.vertices, expected.vertices)
     dark = tracker(np.zeros((480, 640), np.uint8))
     assert dark.status.tolist() == [tm.Status.BLANK]
     again = tracker(photographs[1])  # from rest again
-    torch.testing.assert_close(again.vertices, result.vertices[1:2], rtol=0, atol=1e-4)
+    torch.testing.assert_close(again.vertices, result.vertices[1:2], rtol=0, atol=BATCHED)
     tracker.reset()
     torch.testing.assert_close(tracker(photographs[0]).vertices, first.vertices)
     with pytest.raises(tm.MembraneError, match="2 frames; expected one"):

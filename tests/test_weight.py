@@ -79,6 +79,7 @@ def test_the_modulus_is_in_proportion_to_the_weight(told):
     [
         ({"contact_at_rim": torch.tensor([[0, 0], [1.0, 0], [0, 0]])}, "image 2: the press reaches the rim"),
         ({"force_deviation": torch.full((3, 3), 1.0)}, "image 1 shows a force that is known to 50 % only"),
+        ({"force_deviation": torch.full((3, 3), 0.2)}, "scale of forces to 5.8% only"),
         ({"status": torch.tensor([0, 0, 3])}, "image 3: the solve has not converged"),
         ({"force": torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, -2.0], [0.0, 0.0, -4.0]])}, "image 3 shows"),
     ],

@@ -181,9 +181,9 @@ def _material(
     alone = np.exp(each[:, :1]) * np.stack([np.ones(len(each)), np.sqrt(variances)], -1)
     covariance = np.array(effects) @ np.array(effects).T
     made = replace(sensor, material=material)
-    if pressures is not None and sensor.cavity.filling == "gas" and sensor.force_unit == "relative":
+    if made.force_unit != "relative" and sensor.cavity.filling == "gas" and sensor.force_unit == "relative":
         # without a modulus the gas acted as a liquid
-        return _material(made, _reconstructor(made), displacement, confidence, None, pressures)
+        return _material(made, _reconstructor(made), displacement, confidence, forces, pressures)
     return MaterialFit(made, np.array(values), covariance, profile, alone, magnitudes, gauged)
 
 

@@ -15,6 +15,7 @@ from ..sensor.sensor import Sensor
 from .gauge import CONTRADICTION, UNSURE
 from .material import GAS_ROUNDS, MaterialFit, material_from_images
 
+SURE = 0.05  # relative standard deviation of the scale, at most: two of them are a tenth
 AT_THE_RIM = 0.1  # share of the force in patches that reach the rim, from which on it is refused
 
 
@@ -50,8 +51,8 @@ def material_from_weight(sensor: Sensor, images: Tensor, weight: float) -> Weigh
         The sensor, and how surely its forces are scaled.
 
     Raises:
-        MembraneError: a press reaches the rim, which bears a part of the weight; a force that the markers hardly tell; images
-            that contradict one another; as of `material_from_images`.
+        MembraneError: a press reaches the rim, which bears a part of the weight; a force that the markers hardly tell, or a
+            scale known worse than `SURE`; images that contradict one another; as of `material_from_images`.
 
     Limitations:
         The scale is that of presses such as these: pushed by the same weight elsewhere, or ten times as hard, the grid's and
@@ -73,7 +74,13 @@ def material_from_weight(sensor: Sensor, images: Tensor, weight: float) -> Weigh
             "times the others' force; expected images under this weight alone: leave it out"
         )
     scatter = float(np.sqrt((((forces - weight) / sigma) ** 2).sum() / max(len(forces) - 1, 1)))
-    return WeightFit(made, material, forces, float((deviations**-2).sum() ** -0.5 * max(1.0, scatter)))
+    deviation = float((deviations**-2).sum() ** -0.5 * max(1.0, scatter))
+    if deviation > SURE:
+        raise MembraneError(
+            f"calibrate material: the weight tells the scale of forces to {deviation:.1%} only; expected {SURE:.0%} at most, "
+            "for forces right to a tenth: a heavier weight, or several photographs of it"
+        )
+    return WeightFit(made, material, forces, deviation)
 
 
 def _mean(forces: np.ndarray, deviations: np.ndarray) -> float:

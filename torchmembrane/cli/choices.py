@@ -18,6 +18,7 @@ LENSES = ("pinhole", "fisheye")
 LONGEST_SIDE = 16384
 FILLINGS = ("liquid", "gas", "open")
 POLARITIES = ("dark", "light")
+FROM_IMAGE = "auto"  # of --rim: the circle is found in the rest image
 
 PRESETS = ("fingertip", "bubble", "half_cylinder")
 INDENTERS = ("sphere", "cylinder", "wedge", "box", "plane")

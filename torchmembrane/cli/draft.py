@@ -5,9 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..calibrate.rim import find_rim
 from ..camera.model import Camera
 from ..errors import MembraneError
 from ..io.images import read_image
+from ..markers.dots.pattern import find_dots
 from ..presets.annotate import annotate
 from ..presets.design import AIR
 from ..presets.draft import (
@@ -24,7 +26,9 @@ from ..reconstruct import Reconstructor
 from ..sensor.parts import Cavity, Markers, Surface
 from ..sensor.sensor import Sensor
 from ..sensor.toml import default_grid
+from .choices import FROM_IMAGE
 
+ROUND = 0.95  # shorter over longer half axis of a rim, from which on it is taken for a circle
 LENGTHS = ("radius", "height", "semi_axes", "length", "half_angle")
 
 
@@ -52,6 +56,7 @@ def write_draft(arguments: Namespace) -> list[str]:
     """Write the sensor that the arguments describe; returns what was made, assumed and derived, in lines."""
     _refuse_foreign(arguments)
     rest = None if arguments.rest is None else read_image(arguments.rest)
+    seen = _rim_in_words(arguments, rest) if arguments.rim == FROM_IMAGE and rest is not None else []
     camera, distance = _optics(arguments, rest)
     lengths = {name: value for name in LENGTHS if (value := getattr(arguments, name)) is not None}
     surface = drafted_surface(arguments.shape, lengths, distance)
@@ -67,7 +72,7 @@ def write_draft(arguments: Namespace) -> list[str]:
     found = _dots_in_words(sensor)
     path = sensor.to_file(arguments.sensor)
     annotate(path, said, sensor.force_unit == "relative")
-    return [f"sensor file: {path}", *found, *said, f"next: torchmembrane check {path} --out {path.with_suffix('.png')}"]
+    return [f"sensor file: {path}", *seen, *found, *said, f"next: torchmembrane check {path} --out {path.with_suffix('.png')}"]
 
 
 def _refuse_foreign(arguments: Namespace) -> None:
@@ -100,6 +105,24 @@ def _optics(arguments: Namespace, rest: np.ndarray | None) -> Optics:
         distance = distance or circle.distance(focal)
         focal = focal or circle.focal(distance)
     return Optics(Camera(arguments.lens, tuple(size), (round(focal, 3),) * 2, centre), round(distance, 5))
+
+
+def _rim_in_words(arguments: Namespace, rest: np.ndarray) -> list[str]:
+    """Put the rim's circle, as found in the rest image, in the place of `FROM_IMAGE`; returns what was found."""
+    rim = find_rim(rest, find_dots(rest, arguments.polarity).pixels)
+    (u, v), (longer, shorter) = rim.centre, rim.half_axes
+    if shorter < ROUND * longer:
+        raise MembraneError(
+            f"init: the rim in {arguments.rest} is an ellipse of {longer:.1f} x {shorter:.1f} px about {u:.1f},{v:.1f}; "
+            "expected a circle, as a camera on the membrane's axis sees it: take the photograph along the axis, or pass --rim "
+            "U,V,RADIUS for a first guess and list the dots, --dots, for `calibrate rest`, which finds the tilt"
+        )
+    radius = (longer + shorter) / 2
+    arguments.rim = [round(number, 2) for number in (u, v, radius)]
+    return [
+        f"rim found in the rest image: --rim {u:.2f},{v:.2f},{radius:.2f}, to {rim.deviation:.1f} px; an edge along "
+        f"{rim.share:.0%} of it: see that `check --out` draws it where it is"
+    ]
 
 
 def _markers(arguments: Namespace, rest: np.ndarray | None, surface: Surface, camera: Camera) -> Markers:

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..errors import MembraneError
 from .arguments import Add, add_command, count_pair, positive, positive_pair, vector
-from .choices import DRAFTS, FILLINGS, LENGTH_UNITS, LENSES, LONGEST_SIDE, POLARITIES
+from .choices import DRAFTS, FILLINGS, FROM_IMAGE, LENGTH_UNITS, LENSES, LONGEST_SIDE, POLARITIES
 
 PURPOSE = "write a sensor file, with a word on every key, from a few numbers"
 EXAMPLES = """\
@@ -17,6 +17,7 @@ examples:
   torchmembrane init sensor.toml --shape bubble --radius 30 --height 18 --distance 60 --rest rest.png --focal 440 \\
       --overpressure 71hPa --shear-modulus 0.3 --thickness 0.3
   torchmembrane init sensor.toml --shape dome --radius 12 --rest rest.png --rim 322,239,210 --focal 385 --lens fisheye
+  torchmembrane init sensor.toml --shape dome --radius 12 --rest rest.png --rim auto --view 120 --lens fisheye
   torchmembrane init sensor.toml            # on a terminal: asks
 
 What is needed: the shape and its lengths, the image's size (--image-size, or --rest), a focal length (--focal or --view),
@@ -78,7 +79,8 @@ def _add_camera(add: Add) -> None:
     add("--view", metavar="DEGREES", type=positive, help="in place of --focal: field of view across the image's width")
     centre = positive_pair("two numbers, U,V")
     add("--centre", metavar="U,V", type=centre, help="principal point, px (default: the rim's centre, else the image's)")
-    add("--rim", metavar="U,V,RADIUS", type=vector, help="the rim's circle in the rest image, px, as an image viewer tells it")
+    rim = "the rim's circle in the rest image, px, as an image viewer tells it; auto: found in the image"
+    add("--rim", metavar="U,V,RADIUS|auto", type=_rim, help=rim)
 
 
 def _add_material(add: Add) -> None:
@@ -94,6 +96,10 @@ def _add_markers(add: Add) -> None:
     add("--dots", metavar="FILE.csv", type=Path, help="list of dots, in one of the frames below")
     add("--pitch", metavar="LENGTH", type=positive, help="without either: of a pattern of dots along the membrane")
     add("--polarity", choices=POLARITIES, default=POLARITIES[0], help="of dots against their ground (default: %(default)s)")
+
+
+def _rim(text: str) -> list[float] | str:
+    return text if text == FROM_IMAGE else vector(text)
 
 
 def _pressure(text: str) -> float:
