@@ -173,6 +173,8 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     product = equations.product(normal, steps)[0].T
     torch.testing.assert_close(product[unknowns], (A.T @ W @ A + J.T @ w @ J) @ steps[0].T[unknowns])
     assert (product.count_nonzero(0) == len(unknowns)).all()
+    damped = equations.product(normal, steps, damping=0.25)[0].T - product
+    torch.testing.assert_close(damped[unknowns], 0.25 * (A.T @ W @ A + J.T @ w @ J).diagonal()[:, None] * steps[0].T[unknowns])
     of_camera = equations.motion(normal, measured, angle)
     K = motion[0].movedim(1, -1).flatten(0, 1)
     torch.testing.assert_close(of_camera.coupling[0, :, unknowns], K.T @ w @ J)

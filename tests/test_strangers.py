@@ -1,6 +1,8 @@
 """Results, summaries and readings that others wrote or damaged: one line that names the file, or done again."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -127,6 +129,31 @@ def test_parts_whose_columns_or_shapes_are_others_are_refused(images, tmp_path):
         pq.write_table(table, part)
         assert str(tmp_path / "out") in refused(lambda: list(read_results(tmp_path / "out"))), number
         assert reconstruct(images, tmp_path / "out", PARQUET)[0].reconstructed == FRAMES, number
+
+
+def test_a_damaged_footer_ends_no_process(images, tmp_path):
+    """Footers have no checksum; PyArrow ends the process where it is asked what a damaged one says of a column."""
+    part = part_of(images, tmp_path / "out")
+    script = """
+import sys, random
+from pathlib import Path
+from torchmembrane.errors import MembraneError
+from torchmembrane.io.parquet import read_table
+part = Path(sys.argv[1])
+whole, draw, refused = part.read_bytes(), random.Random(0), 0
+begin = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
+for _ in range(400):
+    content = bytearray(whole)
+    content[draw.randrange(begin, len(whole))] ^= 1 << draw.randrange(8)
+    part.write_bytes(content)
+    try:
+        read_table(part, "a part", "one")
+    except MembraneError:
+        refused += 1
+print(refused)
+"""
+    done = subprocess.run([sys.executable, "-c", script, str(part)], capture_output=True, text=True)
+    assert done.returncode == 0 and int(done.stdout) > 100, done.stderr[-500:]
 
 
 def test_a_part_that_unpacks_to_more_than_the_bound_is_refused_before(images, tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """Gauss-Newton steps of force balance: surface and pressure, the volume linearised."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -128,26 +129,26 @@ class Descent(nn.Module):
     ) -> tuple[Factor | None, Tensor]:
         """The factor, of what is damped, if it is kept, and the solutions `[B, C, 3 N]`.
 
-        Gradients go through the steps of the solve where its error, which they change, counts: by conjugate gradients with a
-        kept factor. Elsewhere they are those of the exact solution, which take none of the factor's.
+        Gradients of a factor that is not kept take what it solves, not how it was made.
         """
+        equations = self.equations
         if factor is not None:
             return None, self._conjugated(normal, factor, loads)
         if keeps or torch.compiler.is_compiling():
             kept = self._factor(normal, damping)
-            return kept, self._refined(normal, kept, loads)
+            return kept, self._refined(normal, partial(equations.system.substitute, kept), loads)
         with torch.no_grad():
-            passing = self._factor(normal, damping)
-        return None, differentiable(partial(self._refined, normal, passing), partial(self.equations.product, normal), loads)
+            substitute = partial(equations.system.substitute, self._factor(normal, damping))
+        damped = partial(equations.product, normal, damping=damping)
+        return None, self._refined(normal, partial(differentiable, substitute, damped), loads)
 
     def _factor(self, normal: NormalEquations, damping: Tensor) -> Factor:
         return self.equations.system.factor(self.equations.matrix(normal, damping))
 
-    def _refined(self, normal: NormalEquations, factor: Factor, loads: Tensor) -> Tensor:
-        """Solutions with the factor of these equations, refined once: of rounding and damping little is left."""
-        substitute = self.equations.system.substitute
-        solved = substitute(factor, loads)
-        return solved + substitute(factor, loads - self.equations.product(normal, solved))
+    def _refined(self, normal: NormalEquations, substitute: Callable[[Tensor], Tensor], loads: Tensor) -> Tensor:
+        """Solutions by those of the damped equations, refined once: of rounding and damping little is left."""
+        solved = substitute(loads)
+        return solved + substitute(loads - self.equations.product(normal, solved))
 
     def _conjugated(self, normal: NormalEquations, factor: Factor, loads: Tensor) -> Tensor:
         """Solutions with the factor of equations near these."""

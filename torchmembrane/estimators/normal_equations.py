@@ -6,6 +6,7 @@ Fields have their components first and the inner vertices, or the markers, last.
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..solve.stencil_system import NEAR, StencilSystem
@@ -88,12 +89,23 @@ class BalanceEquations(nn.Module):
         near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1)).permute(0, 3, 1, 4, 2)
         return self.system.matrix(A.mT @ (normal.weights.movedim(-1, 1).contiguous() @ A), near, damping)
 
-    def product(self, normal: NormalEquations, u: Tensor) -> Tensor:
-        """`M u` for `u [B, C, 3 N]`, without the matrix."""
+    def product(self, normal: NormalEquations, u: Tensor, damping: float | Tensor | None = None) -> Tensor:
+        """`M u` for `u [B, C, 3 N]`, without the matrix; with `damping` as of `matrix`."""
+        if damping is not None:
+            return self.product(normal, u) + damping * self._diagonal(normal).flatten(1)[:, None] * u
         u, change, shares = u.unflatten(-1, (3, -1)), self.forces.change, self.bearings.vertex_shares
         of_forces = change(normal.stiffness, _weighed(normal.weights[:, None], change(normal.stiffness, u)))
         of_markers = _weighed(normal.marker_blocks[:, None], u @ shares.transpose(0, 1)) @ shares
         return (of_forces + of_markers).flatten(2)
+
+    def _diagonal(self, normal: NormalEquations) -> Tensor:
+        """Of `M`, `[B, 3, N]`."""
+        A, (m, n) = normal.stiffness, self.forces.membrane.grid
+        squares = (A * (normal.weights[:, :, :, None, None] * A[:, None]).sum(2)).sum(1)
+        planes = squares.unflatten(-1, (m - 2, n - 2)).flatten(0, 1)
+        of_forces = F.conv_transpose2d(planes, self.forces.kernels[:, None], padding=1).reshape(-1, 3, squares.shape[-1])
+        of_markers = normal.marker_blocks.diagonal(dim1=1, dim2=2).mT @ self.bearings.pair_shares[:, : squares.shape[-1]]
+        return of_forces + of_markers
 
 
 def _weighed(blocks: Tensor, field: Tensor) -> Tensor:
