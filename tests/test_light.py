@@ -76,8 +76,9 @@ def test_nothing_is_a_push_that_the_noise_makes_by_itself():
 
 @pytest.mark.parametrize("options", [{}, dict(filling="open"), dict(filling="gas", gas=(0.1, 2600.0))])
 def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
-    """One quadratic step from rest for a small error of every marker in either direction; their squares add up."""
+    """One undamped quadratic step from rest for a small error of every marker in either direction; their squares add up."""
     estimator, small = make(13, **options), 1e-4
+    estimator.descent.settings = replace(estimator.descent.settings, damping=0.0)
     bearings, loss = estimator.equations.bearings, estimator.equations.loss
     true = torch.nn.functional.normalize(bearings.positions, dim=-1)
     unit = bearings.measured(seen(torch.zeros_like(true), true)).across[0].movedim(-1, 0) * bearings.noise  # [D, 2, 3]

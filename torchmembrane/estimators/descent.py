@@ -1,6 +1,5 @@
 """Gauss-Newton steps of force balance: surface and pressure, the volume linearised."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -136,19 +135,13 @@ class Descent(nn.Module):
             return None, self._conjugated(normal, factor, loads)
         if keeps or torch.compiler.is_compiling():
             kept = self._factor(normal, damping)
-            return kept, self._refined(normal, partial(equations.system.substitute, kept), loads)
+            return kept, equations.system.substitute(kept, loads)
         with torch.no_grad():
             substitute = partial(equations.system.substitute, self._factor(normal, damping))
-        damped = partial(equations.product, normal, damping=damping)
-        return None, self._refined(normal, partial(differentiable, substitute, damped), loads)
+        return None, differentiable(substitute, partial(equations.product, normal, damping=damping), loads)
 
     def _factor(self, normal: NormalEquations, damping: Tensor) -> Factor:
         return self.equations.system.factor(self.equations.matrix(normal, damping))
-
-    def _refined(self, normal: NormalEquations, substitute: Callable[[Tensor], Tensor], loads: Tensor) -> Tensor:
-        """Solutions by those of the damped equations, refined once: of rounding and damping little is left."""
-        solved = substitute(loads)
-        return solved + substitute(loads - self.equations.product(normal, solved))
 
     def _conjugated(self, normal: NormalEquations, factor: Factor, loads: Tensor) -> Tensor:
         """Solutions with the factor of equations near these."""

@@ -94,7 +94,7 @@ class ForceBalanceSettings:
     pressure_noise: float = 0.01
     longest_step: float = 0.04
     largest_stretch: float = 0.3
-    damping: float = 1e-6
+    damping: float = 3e-7
     coarsest: int = 9
     coarsest_warm: int = 13
     largest_relative_step: float = 2e-3

@@ -1,5 +1,6 @@
 """Images of the dots with their resolution halved twice: means, so that a pixel covers those it replaces."""
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -18,11 +19,19 @@ def mean_pyramid(image: Tensor) -> list[Tensor]:
         `LEVELS` images `[B, 1, H // 2^k, W // 2^k]`, the finest first.
 
     Example:
-        >>> import torch
         >>> [level.flatten().tolist() for level in mean_pyramid(torch.arange(16.0).reshape(1, 1, 4, 4))[1:]]
         [[2.5, 4.5, 10.5, 12.5], [7.5]]
     """
     levels = [image]
     for _ in range(LEVELS - 1):
-        levels.append(F.avg_pool2d(levels[-1], 2))
+        levels.append(_halved(levels[-1]))
     return levels
+
+
+def _halved(image: Tensor) -> Tensor:
+    """`F.avg_pool2d(image, 2)`; on a processor sums of slices take a sixth of its time, but not in exported models."""
+    if torch.compiler.is_exporting():
+        return F.avg_pool2d(image, 2)
+    height, width = (side // 2 * 2 for side in image.shape[-2:])
+    rows = image[..., 0:height:2, :] + image[..., 1:height:2, :]
+    return 0.25 * (rows[..., 0:width:2] + rows[..., 1:width:2])
