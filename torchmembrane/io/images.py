@@ -207,6 +207,8 @@ def to_grey(array: np.ndarray) -> np.ndarray:
         array = GREY[0] * red.astype(np.float64)
         array += GREY[1] * green.astype(np.float64)
         array += GREY[2] * blue.astype(np.float64)
+    if array.dtype.kind == "u":  # a float32 holds them, and the quotient is the rounded one
+        return array.astype(np.float32) / np.float32(white)
     return (array.astype(np.float64) / white).astype(np.float32)
 
 
