@@ -44,19 +44,25 @@ RADIUS = (0.08, 0.35)  # of bodies
 OFF_RIM = 0.1
 INCREMENT = 0.03  # of the size, of a stroke
 PATIENCE = 30  # s, for one equilibrium; a stroke that takes longer is drawn again
+DOTS = (40, 300)
+PRESTRETCH = (1.005, 1.8)
 SHAPES = ("spherical_cap", "ellipsoid_cap", "half_cylinder")
 BODIES = ("sphere", "sphere", "cylinder", "box", "plane")
 
 
-def random_sensor(number: int, seed: int = 0) -> Sensor:
+def random_sensor(
+    number: int, seed: int = 0, dots: tuple[float, float] = DOTS, prestretch: tuple[float, float] = PRESTRETCH
+) -> Sensor:
     """The sensor of that number, with a noisy rest image."""
     rng = np.random.default_rng([seed, number])
     surface, outline = _surface(rng)
-    positions, sizes = _dots(surface, outline, rng)
+    positions, sizes = _dots(surface, outline, dots, rng)
     markers = Markers("dots", "dark", positions, sizes)
     membrane = surface.membrane(default_grid(markers))
     camera, shape = _camera(surface, rng, outline), str(rng.choice(["neo_hookean", "neo_hookean", "mooney_rivlin"]))
-    material = Material(shape, float(1 + np.exp(rng.uniform(*np.log([0.005, 0.8])))), 0.1 if shape == "mooney_rivlin" else None)
+    material = Material(
+        shape, float(1 + np.exp(rng.uniform(*np.log(np.array(prestretch) - 1)))), 0.1 if shape == "mooney_rivlin" else None
+    )
     filling = str(rng.choice(["liquid", "liquid", "gas", "open"]))
     thickness = float(outline * np.exp(rng.uniform(*np.log([0.003, 0.02]))))
     material = replace(material, shear_modulus=0.3, thickness=thickness)
@@ -84,9 +90,11 @@ def _surface(rng: np.random.Generator) -> tuple[Surface, float]:
     return Surface(kind, values | {"base_z": radius * rng.uniform(0.8, 2.5)}), radius
 
 
-def _dots(surface: Surface, radius: float, rng: np.random.Generator) -> tuple[np.ndarray, list[str]]:
-    """40 to 300 dots, at positions of a square pattern."""
-    v, count = surface.values, np.exp(rng.uniform(*np.log([40, 300])))
+def _dots(
+    surface: Surface, radius: float, least_most: tuple[float, float], rng: np.random.Generator
+) -> tuple[np.ndarray, list[str]]:
+    """So many dots, at positions of a square pattern."""
+    v, count = surface.values, np.exp(rng.uniform(*np.log(least_most)))
     area = float(surface.membrane((17, 17)).rest_area.sum())
     spacing = float(np.sqrt(0.86 * area / count))
     if surface.shape == "half_cylinder":

@@ -95,7 +95,7 @@ class ForceBalanceSettings:
     longest_step: float = 0.04
     largest_stretch: float = 0.3
     damping: float = 3e-7
-    coarsest: int = 9
+    coarsest: int = 6
     coarsest_warm: int = 13
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3

@@ -213,7 +213,7 @@ def export(
 def previous_of(reconstructor: Reconstructor) -> tuple[str, ...]:
     """A tracking model's further inputs: `previous_` and the field of `Reconstruction` that they continue."""
     names = ("previous_vertices", "previous_pressure", "previous_camera_motion", "previous_pixels")
-    return names[: 4 if reconstructor.observer.locator.follows else 2]
+    return names[: 4 if reconstructor.observer.locator.follows else 3]
 
 
 def _finished(tracer: Tracer, inputs: list[Known], result: Any, reconstructor: Reconstructor) -> onnx.ModelProto:
