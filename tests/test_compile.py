@@ -28,3 +28,21 @@ def test_the_compiled_reconstruction_is_one_graph_and_agrees(estimator):
     for got, want in pairs:
         for key, value in want._asdict().items():
             torch.testing.assert_close(got._asdict()[key], value, rtol=1e-4, atol=1e-4, equal_nan=True)
+
+
+def test_gradients_compile_in_one_graph_and_agree():
+    sensor = Sensor.from_file(EXAMPLES / "sensor.toml")
+    reconstructor = Reconstructor(replace(sensor, membrane=sensor.membrane.resampled((9, 9))), dtype=torch.float64)
+    with torch.no_grad():
+        pixels = reconstructor(reconstructor.read(EXAMPLES / "two_contacts.png")).pixels
+
+    def slope(function):
+        leaf = pixels.clone().requires_grad_()
+        return torch.autograd.grad(function(leaf), leaf)[0]
+
+    def loss(pixels):
+        return reconstructor.from_pixels(pixels).force.square().sum()
+
+    expected = slope(loss)
+    assert expected.abs().max() > 0.01
+    torch.testing.assert_close(slope(torch.compile(loss, fullgraph=True, backend="eager")), expected, rtol=1e-4, atol=1e-6)

@@ -176,3 +176,97 @@ def test_gradients_of_markers_are_the_finite_differences(sensor, images, from_a_
     with torch.no_grad():
         above, below = (found(first.pixels + step * direction) for step in (1e-4, -1e-4))
     assert (slope * direction).sum().item() == pytest.approx((above - below).item() / 2e-4, rel=2e-3)
+
+
+@pytest.fixture(scope="module")
+def double(sensor):
+    return tm.Reconstructor(sensor, dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def pixels(double, images):
+    with torch.no_grad():
+        return double(images.double()).pixels
+
+
+def test_second_derivatives_are_refused_in_words(double, pixels):
+    leaf = pixels.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(double.from_pixels(leaf).force.sum(), leaf, create_graph=True)
+    with pytest.raises(tm.MembraneError, match="second derivatives of a reconstruction"):
+        torch.autograd.grad(slope.sum(), leaf)
+
+
+def test_transforms_of_functions_give_the_gradients_of_a_reconstruction(double, pixels):
+    def force(shift):
+        return double.from_pixels(pixels[:1] + shift).force[0]
+
+    rest = torch.zeros(2, dtype=torch.float64)
+    expected = torch.autograd.functional.jacobian(force, rest)
+    assert expected.abs().max() > 0.1
+    torch.testing.assert_close(torch.func.jacrev(force)(rest), expected)
+    torch.testing.assert_close(torch.func.grad(lambda shift: force(shift)[2])(rest), expected[2])
+
+
+def of_what_is_found(result):
+    """A loss that leaves out what was not found."""
+    return sum(each.nan_to_num().square().sum() for each in (result.displacement, result.force, result.contact_area))
+
+
+def too_far(rest, times):
+    """Pixels of markers that all moved away from the middle."""
+    return (rest.mean(0) + times * (rest - rest.mean(0)))[None]
+
+
+@pytest.mark.parametrize("from_a_start", [False, True])
+def test_frames_without_a_surface_pass_no_gradient_to_what_they_share(sensor, double, pixels, from_a_start):
+    """Nor do they change that of others: of a shift of all pixels, and of the prestretch."""
+    rest, other = double.rest_pixels, tm.Reconstructor(sensor, dtype=torch.float64)
+    bad = [torch.full_like(rest[None], torch.nan), too_far(rest, 1e3), too_far(rest, 3.0)]
+    with torch.no_grad():
+        previous = double.from_pixels(pixels[:1]) if from_a_start else None
+
+    def slopes(frames):
+        shift, stretch = (torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in ([0.0, 0.0], 1.2))
+        other.estimator.set_prestretch(stretch)
+        before = previous and tm.Reconstruction(*(each.expand(len(frames), *each.shape[1:]) for each in previous))
+        result = other.from_pixels(frames + shift, previous=before)
+        of_what_is_found(result).backward()
+        return result, shift.grad, stretch.grad
+
+    result, *found = slopes(torch.cat([pixels[:1], *bad]))
+    Status = tm.Status
+    assert result.status.tolist() == [Status.OK, Status.TOO_FEW_MARKERS, Status.TOO_FEW_MARKERS, Status.NO_SOLUTION]
+    assert not result.vertices[1:].isfinite().any() and result.confidence[3].max() > 0
+    for got, expected in zip(found, slopes(pixels[:1])[1:], strict=True):
+        assert expected.abs().max() > 0
+        torch.testing.assert_close(got, expected)
+
+
+def test_a_frame_that_has_not_converged_passes_finite_gradients(double, pixels):
+    rest = double.rest_pixels
+    leaf = (rest + 15 * (pixels[:1] - rest)).requires_grad_()
+    result = double.from_pixels(leaf)
+    assert result.status.tolist() == [tm.Status.NOT_CONVERGED]
+    (slope,) = torch.autograd.grad(of_what_is_found(result), leaf)
+    assert slope.isfinite().all() and slope.abs().max() > 0
+
+
+def test_images_without_a_surface_pass_no_gradient(sensor, images):
+    """Nor do they change that of the prestretch; an image with NaN gets NaN itself."""
+    noise = torch.rand(images[:1].shape, generator=torch.manual_seed(0))
+    reconstructor = tm.Reconstructor(sensor, dtype=torch.float64)
+
+    def slopes(*given):
+        leaf, stretch = torch.cat(given).double().requires_grad_(), torch.tensor(1.2, requires_grad=True)
+        reconstructor.estimator.set_prestretch(stretch)
+        result = reconstructor(leaf)
+        of_what_is_found(result).backward()
+        assert not result.vertices[1:].isfinite().any()
+        return result.status.tolist(), leaf.grad, stretch.grad
+
+    Status, nan = tm.Status, torch.nan * noise
+    status, of_images, of_stretch = slopes(images[:1], 0 * noise, noise, nan)
+    assert status == [Status.OK, Status.BLANK, Status.TOO_FEW_MARKERS, Status.BAD_VALUES]
+    assert (of_images[1:3] == 0).all() and of_images[0].isfinite().all() and of_images[0].abs().max() > 0
+    torch.testing.assert_close(of_stretch, slopes(images[:1])[2])
+    assert of_stretch.abs() > 0

@@ -1,6 +1,7 @@
 """The node of ROS 2 beside stand-ins of rclpy and its messages: it was not run in a live ROS 2."""
 
 import sys
+from dataclasses import replace
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -12,6 +13,7 @@ from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.io.images import to_grey
+from torchmembrane.sensor.parts import Cavity
 
 NODE = Path(__file__).parents[1] / "ros/torchmembrane_ros/torchmembrane_ros/node.py"
 PARAMETERS = {"compressed": False}
@@ -45,7 +47,8 @@ class FakeNode:
 
 
 @pytest.fixture
-def node(small_sensor, monkeypatch):
+def node_of(monkeypatch):
+    """The node of a sensor file."""
     types = "Vector3 Wrench WrenchStamped CompressedImage FluidPressure Image PointCloud2 PointField".split()
     messages = dict.fromkeys(types, Message)
     modules = {"rclpy": {}, "rclpy.node": {"Node": FakeNode}, "std_srvs": {}, "std_srvs.srv": {"Trigger": MagicMock()}}
@@ -55,11 +58,20 @@ def node(small_sensor, monkeypatch):
         module = ModuleType(name)
         module.__dict__.update(content)
         monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.setitem(PARAMETERS, "sensor", str(small_sensor / "sensor.toml"))
-    spec = spec_from_file_location("node", NODE)
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.TrackerNode()
+
+    def made(path):
+        monkeypatch.setitem(PARAMETERS, "sensor", str(path))
+        spec = spec_from_file_location("node", NODE)
+        module = module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module.TrackerNode()
+
+    return made
+
+
+@pytest.fixture
+def node(node_of, small_sensor):
+    return node_of(small_sensor / "sensor.toml")
 
 
 def message(levels, header="header"):
@@ -80,6 +92,24 @@ def test_an_image_s_messages_are_the_tracker_s_result(node, small_sensor, small_
     points = np.frombuffer(cloud.data, "<f4").reshape(cloud.width, -1)
     np.testing.assert_allclose(points[:, :3], frame["vertices"] / 1000, rtol=1e-6)
     assert [field.name for field in cloud.fields] == "x y z normal_traction shear_x shear_y shear_z".split()
+
+
+def test_of_a_gas_the_absolute_pressure_is_published(node_of, small_sensor, small_images, tmp_path):
+    sensor = replace(tm.Sensor.from_file(small_sensor / "sensor.toml"), cavity=Cavity("gas", pressure=1013.0))
+    node = node_of(sensor.to_file(tmp_path / "sensor.toml"))
+    levels = np.asarray(Image.open(small_images[2]))
+    node.callback(message(levels))
+    change = tm.Tracker(tm.Reconstructor(sensor))(to_grey(levels)).pressure_change.item()
+    (found,) = node.published["pressure"]
+    assert change > 0 and found.header == "header"
+    assert found.fluid_pressure == pytest.approx(101300 + 1e6 * change, rel=1e-9)  # Pa
+
+
+def test_forces_that_are_relative_are_refused_at_the_start(node_of, small_sensor, tmp_path):
+    full = tm.Sensor.from_file(small_sensor / "sensor.toml")
+    sensor = replace(full, material=replace(full.material, shear_modulus=None, thickness=None))
+    with pytest.raises(tm.MembraneError, match="forces of cap are relative, messages are in newtons"):
+        node_of(sensor.to_file(tmp_path / "sensor.toml"))
 
 
 def test_what_has_no_surface_is_logged_and_not_published(node, small_images):

@@ -1,5 +1,7 @@
 """Laws of ROS 2 bags: images through the command, results back into a bag, in SI units and with the images' times."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from io import BytesIO
 from shutil import rmtree
@@ -106,6 +108,8 @@ def test_a_bag_s_results_come_back_in_a_bag(tmp_path, gas_sensor, pictures, plug
     assert "messages of 2 frames" in said.out and "CameraInfo" not in said.err
     results = read_results(tmp_path / "out")
     assert results.names == [f"run_{k:06d}" for k in range(3)]
+    stored = {each.suffix for each in (tmp_path / "forces").iterdir()}
+    assert stored == {".yaml", ".mcap" if plugin == StoragePlugin.MCAP else ".db3"}
 
     found = {}
     with AnyReader([tmp_path / "forces"]) as reader:
@@ -138,6 +142,36 @@ def test_a_bag_s_results_come_back_in_a_bag(tmp_path, gas_sensor, pictures, plug
         np.testing.assert_allclose((points[:, 4:] * frame["normals"]).sum(-1), 0, atol=1e-5 * abs(points[:, 3:]).max() + 1e-6)
         pressure = found["/torchmembrane/pressure"][k][1].fluid_pressure
         np.testing.assert_allclose(pressure, 101300 + 1e6 * float(frame["pressure_change"]), rtol=1e-9)
+
+
+def test_another_reader_of_mcap_finds_the_same(tmp_path, gas_sensor, pictures):
+    """Rerun's, which knows the messages by the definitions that the bag carries."""
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed: it is too large for the tests' own set-up")
+    run = write_bag(tmp_path / "run", StoragePlugin.MCAP, [(TOPIC, raw(k, pictures[2 * k], "mono8")) for k in range(2)])
+    forces, found = tmp_path / "forces", tmp_path / "found.rrd"
+    assert main(["reconstruct", str(gas_sensor), str(run), "--out", str(tmp_path / "out"), "--bag", str(forces)]) == 0
+    (bag,), rerun = forces.glob("*.mcap"), [sys.executable, "-m", "rerun", "mcap"]
+    subprocess.run([*rerun, "check", "--full", str(bag)], check=True, capture_output=True)
+    subprocess.run([*rerun, "convert", str(bag), "-o", str(found)], check=True, capture_output=True)
+    values = {}
+    from rerun.chunk import RrdReader
+
+    for chunk in RrdReader(found).stream().to_chunks():
+        for row in chunk.to_record_batch().to_pylist():
+            for name, value in row.items():
+                values.setdefault(f"{chunk.entity_path.removeprefix('/torchmembrane/')} {name}", []).append(value)
+    results = read_results(tmp_path / "out")
+    wrenches = values["wrench geometry_msgs.msg.WrenchStamped:message"]
+    pressures = np.ravel(values["pressure Measurements:values"])
+    for k, frame in enumerate(results):
+        (message,) = wrenches[k]
+        np.testing.assert_allclose([message["wrench"]["force"][axis] for axis in "xyz"], frame["force"])
+        assert message["header"] == {
+            "stamp": {"sec": 1_700_000_000 + k, "nanosec": 250_000_000 + k},
+            "frame_id": "finger_optical",
+        }
+        np.testing.assert_allclose(values["points Points3D:positions"][k], frame["vertices"] / 1000, rtol=1e-6)
+        np.testing.assert_allclose(pressures[k], 101300 + 1e6 * float(frame["pressure_change"]), rtol=1e-9)  # Pa
 
 
 @pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchmembrane.errors import MembraneError
 from torchmembrane.solve import block_tridiagonal
 from torchmembrane.solve.anderson import DEPTH, accelerated, first
 from torchmembrane.solve.conjugate_gradient import conjugate_gradient
@@ -49,8 +50,29 @@ def test_gradients_of_a_solution_are_the_dense_solution_s_and_there_are_no_secon
     got = torch.autograd.grad((weights * x**2).sum(), (A, b), create_graph=True)
     torch.testing.assert_close((got[0] + got[0].mT) / 2, (expected[0] + expected[0].mT) / 2)
     torch.testing.assert_close(got[1], expected[1])
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        got[1].sum().backward()
+    for loss in (lambda x: (x**2).sum(), lambda x: x.sum()):  # the gradient of the second holds no x
+        x = differentiable(lambda r: r @ inverse, lambda y: y @ A, b)
+        first = torch.autograd.grad(loss(x), (A, b), create_graph=True)
+        for gradient in first:
+            for of in (A, b):
+                with pytest.raises(MembraneError, match="second derivatives .* differentiated once; expected first ones"):
+                    torch.autograd.grad(gradient.square().sum(), of, retain_graph=True)
+
+
+def test_transforms_of_functions_give_the_gradients_of_a_solution():
+    A, b = spd(6), torch.randn(6, dtype=torch.float64)
+
+    def solution(A, b):
+        inverse = torch.linalg.inv(A.detach())
+        return differentiable(lambda r: r @ inverse, lambda y: y @ A, b)
+
+    weights = torch.arange(6, dtype=torch.float64)
+    dense = torch.func.grad(lambda b: (weights * torch.linalg.solve(A, b) ** 2).sum())(b)
+    torch.testing.assert_close(torch.func.grad(lambda b: (weights * solution(A, b) ** 2).sum())(b), dense)
+    torch.testing.assert_close(torch.func.jacrev(lambda b: solution(A, b))(b), torch.linalg.inv(A))
+    (of_matrix,) = torch.func.vjp(lambda A: solution(A, b), A)[1](weights)
+    (expected,) = torch.func.vjp(lambda A: torch.linalg.solve(A, b), A)[1](weights)
+    torch.testing.assert_close(of_matrix + of_matrix.mT, expected + expected.mT)
 
 
 @pytest.mark.parametrize("compliance", [0.0, 0.7])

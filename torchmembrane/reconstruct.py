@@ -16,7 +16,7 @@ from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
 from .estimators.kept_state import keep_small
 from .estimators.precision import PRECISIONS, check_precision, full_precision
-from .estimators.start import checked_previous, solved_from
+from .estimators.start import broken_down, checked_previous, solved_from
 from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
@@ -223,6 +223,8 @@ class Reconstructor(nn.Module):
         start = None if previous is None else self.start(previous.vertices, previous.pressure, previous.camera_motion)
         observation = self._gauged(self.observation(usable, confidence, covariance), pressure)
         found = self.estimator(observation, start)
+        if (broken := broken_down(status, found.vertices)) is not None:
+            return self._solve(flow._replace(status=broken), previous, pressure)
         return self.result(found, observation, flow.displacement, confidence, status)
 
     @piece

@@ -81,9 +81,12 @@ class Descent(nn.Module):
     def _traced_once(
         self, state: State, measured: Bearings, tau: float, outlier: float, factor: Factor | None, keeps: bool = False
     ) -> tuple[State, Factor | None]:
-        """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself."""
+        """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.
+
+        With gradients every step is: those of a nested region come with strides that torch 2.13 does not follow."""
         scales = [torch.as_tensor(scale, dtype=state.x.dtype, device=state.x.device) for scale in (tau, outlier)]
-        step = self.step if torch.compiler.is_exporting() else self._compiled_once
+        unrolled = torch.compiler.is_exporting() or torch.is_grad_enabled()
+        step = self.step if unrolled else self._compiled_once
         taken: tuple[State, Factor | None] = step(state, measured, scales[0], scales[1], factor, keeps)
         return taken
 

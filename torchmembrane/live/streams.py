@@ -78,7 +78,7 @@ class ModelStream:
         if known["sensor"] != sensor:
             raise MembraneError(
                 f"--model {path}: of another sensor, {known['name']!r} ({known['sensor'][:12]}, here {sensor[:12]}); expected "
-                "one that `torchmembrane export` made of this sensor file"
+                "one that `torchmembrane export` made of this sensor file, grid included"
             )
         self.mesh = Mesh(**{key: value for key, value in known.items() if key in Mesh._fields})
         self._before: dict[str, np.ndarray] | None = None

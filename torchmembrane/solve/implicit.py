@@ -5,7 +5,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+
+from ..errors import MembraneError
 
 Linear = Callable[[Tensor], Tensor]
 
@@ -22,7 +23,7 @@ def differentiable(solve: Linear, apply: Linear, b: Tensor) -> Tensor:
         b: `[..., N]`.
 
     Limitations:
-        Once: no second derivatives. As exact as `solve` is.
+        Once: second derivatives raise a `MembraneError`, and forward-mode ones are not there. As exact as `solve` is.
 
     Example:
         >>> a, b = torch.tensor(2.0, requires_grad=True), torch.tensor([3.0])
@@ -41,12 +42,41 @@ def differentiable(solve: Linear, apply: Linear, b: Tensor) -> Tensor:
 class _Solution(torch.autograd.Function):
     """`x`, its gradients those of `A^-1 residual`."""
 
+    generate_vmap_rule = True
+
     @staticmethod
-    def forward(ctx: Any, residual: Tensor, x: Tensor, solve: Linear) -> Tensor:
-        ctx.solve = solve
+    def forward(residual: Tensor, x: Tensor, solve: Linear) -> Tensor:
         return x.clone()
 
     @staticmethod
-    @once_differentiable
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Linear], output: Tensor) -> None:
+        residual, _, ctx.solve = inputs
+        ctx.save_for_backward(residual)
+
+    @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        return ctx.solve(gradient), None, None
+        (residual,) = ctx.saved_tensors
+        with torch.no_grad():
+            solved = ctx.solve(gradient)
+        return _Once.apply(solved, gradient, residual), None, None
+
+
+class _Once(torch.autograd.Function):
+    """A gradient, and what it depends on: by that it has no derivatives."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(solved: Tensor, gradient: Tensor, residual: Tensor) -> Tensor:
+        return solved.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        raise MembraneError(
+            "second derivatives of a reconstruction: its solves are differentiated once; expected first ones: leave out "
+            "create_graph, or take finite differences of the gradient"
+        )
