@@ -145,6 +145,11 @@ class MarkerBearings(nn.Module):
         angles2 = self.angles(x, measured, moved)[0].square().mean(1).clamp_max(outlier**2)
         return ((measured.weight * angles2).sum(-1) / measured.weight.sum(-1).clamp_min(1)).sqrt()
 
+    def outlying(self, x: Tensor, measured: Bearings, moved: Tensor, limit: float) -> Tensor:
+        """The share `[B]` of the markers that are seen and more than `limit` standard deviations off their rays."""
+        far = self.angles(x, measured, moved)[0].square().sum(1) > limit**2
+        return (measured.weight * far).mean(-1)
+
 
 def _shares(membrane: Membrane, markers: SurfacePoints) -> tuple[Tensor, Tensor]:
     """Every marker's share in what is summed at the inner vertices, `[D, N]`, and at them with those at `NEAR`, `[D, 4 N]`."""

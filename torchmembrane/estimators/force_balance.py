@@ -55,9 +55,8 @@ RESOLVED = 17
 class ForceBalance(nn.Module):
     """Surface, contact tractions and pressure from marker rays.
 
-    A grid with an odd number of lines, at least 17, holds the estimator on every second line as `coarse`. The reference
-    traction
-    `p0` is the rest pressure, or tension / size or (C1 + C2) / size where that is larger.
+    A grid with an odd number of lines, at least 11, holds the estimator on every second line as `coarse`. The reference
+    traction `p0` is the rest pressure, or tension / size or (C1 + C2) / size where that is larger.
 
     Args:
         membrane: the rest surface on the solver's grid.
@@ -197,7 +196,7 @@ class ForceBalance(nn.Module):
         previous frame's."""
         measured = self.equations.bearings.measured(observation)
         found = self._solved(measured, None if start is None else State(*start))
-        again = mended(self.is_settled(found), found, self._patiently, measured, self.chosen)
+        again = mended(self.is_done(found, measured), found, self._patiently, measured, self.chosen)
         return Equilibrium(*again)
 
     def _patiently(self, *measured: Any) -> Equilibrium:
@@ -276,8 +275,7 @@ class ForceBalance(nn.Module):
     @piece
     def is_converged(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the last step was short and the volume is what the cavity's law asks for."""
-        error = self.cavity.volume_error(found.volume, found.pressure).abs()
-        settings = self.settings
+        error, settings = self.cavity.volume_error(found.volume, found.pressure).abs(), self.settings
         return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
 
     @piece
@@ -286,11 +284,16 @@ class ForceBalance(nn.Module):
         settled = found.relative_step < self.settings.settled_step
         return settled & self.is_converged(found) & self.is_explained(found)
 
+    @piece
+    def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
+        """`[B]` bool: settled, and hardly a marker is left far outside, as beside a contact that the steps went past."""
+        outlying = self.equations.bearings.outlying(found.vertices, measured, found.moved, 2 * self.settings.outlier)
+        return self.is_settled(found) & (outlying <= self.settings.largest_outlying)
+
     def is_explained(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the markers are off their rays by no more than their noise and the model's error."""
         coarse = max(1.0, (RESOLVED - 1) / (min(self.membrane.grid) - 1))
-        explained: Tensor = ~(found.misfit > self.settings.largest_misfit * coarse**2)
-        return explained
+        return torch.logical_not(found.misfit > self.settings.largest_misfit * coarse**2)
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes."""

@@ -55,6 +55,7 @@ class ForceBalanceSettings:
         largest_volume_error: volume error of a converged solution, over the rest volume.
         largest_misfit: rms of the markers' angles off their rays where a surface of this sensor explains them, over their
             noise and the model's error; on grids of fewer than `force_balance.RESOLVED` lines more.
+        largest_outlying: share of the markers that may be more than twice `outlier` off before a second try is made.
 
     Example:
         >>> ForceBalanceSettings(steps=12).gnc_schedule(2, (4.0, 0.4))
@@ -100,6 +101,7 @@ class ForceBalanceSettings:
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3
     largest_misfit: float = 1.3
+    largest_outlying: float = 0.01
 
     def __post_init__(self) -> None:
         for name in ("steps", "coarse_steps", "fine_steps", "finer_steps", "warm_steps"):
