@@ -1,6 +1,8 @@
 """What the command's choices are put together of, exported and run; models that cannot be written, or are not the same."""
 
+from inspect import signature
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import onnx
@@ -193,6 +195,13 @@ def test_a_failure_is_said_in_one_line_and_nothing_is_written(part, small_sensor
     said = capsys.readouterr().err.strip().splitlines()
     assert code == 2 and len(said) == 1 and list(tmp_path.iterdir()) == []
     assert ("not the same" if part == "checked" else "cannot be written as ONNX: [ShapeInferenceError] ranks differ") in said[0]
+
+
+@pytest.mark.parametrize("follows", [True, False])
+def test_a_tracking_model_is_given_what_a_solve_starts_from(follows):
+    made = SimpleNamespace(observer=SimpleNamespace(locator=SimpleNamespace(follows=follows)))
+    starts = {f"previous_{name}" for name in signature(Reconstructor.start).parameters if name != "self"}
+    assert set(export.previous_of(made)) == starts | ({"previous_pixels"} if follows else set())
 
 
 def test_single_precision_only(sensor, tmp_path):

@@ -142,7 +142,9 @@ def _calibrated(camera: Camera) -> dict[str, list[float]]:
 
 
 def default_grid(markers: Markers) -> tuple[int, int]:
-    """The solver grid where the file names none: 2.8 times as fine as the dots listed, 25, 29 or 33; 25 for texture.
+    """The solver grid where the file names none: some 2.8 times as fine as the dots listed, 25 or 33; 25 for texture.
+
+    Of 29 lines the coarsest grid, 8, finds the basin of a deep press less surely than 7 of 25 and 9 of 33.
 
     Args:
         markers: listed dots, dots still to be found in the rest image (33), or texture.
@@ -152,13 +154,13 @@ def default_grid(markers: Markers) -> tuple[int, int]:
 
     Example:
         >>> default_grid(Markers("dots", positions=np.zeros((100, 3))))
-        (29, 29)
+        (33, 33)
     """
     if markers.kind == "texture":
         return COARSEST, COARSEST
     if markers.positions is None:
         return FINEST, FINEST
-    n = min(max(4 * round(2.8 * math.sqrt(len(markers.positions)) / 4) + 1, COARSEST), FINEST)
+    n = COARSEST if 2.8 * math.sqrt(len(markers.positions)) < COARSEST + 2 else FINEST
     return n, n
 
 
