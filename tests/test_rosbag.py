@@ -188,7 +188,7 @@ def test_compressed_bags_and_single_files_are_read(tmp_path, gas_sensor, picture
     assert results.names == [f"{name}_{k:06d}" for name in ("alone", "packed") for k in range(2)]
     for k in range(2):
         found, expected = (results[f"{name}_{k:06d}"]["vertices"] for name in ("packed", "alone"))
-        np.testing.assert_allclose(found, expected, atol=1e-4)  # equal but for the batches' rounding
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)  # mm, a batch's rounding (docs/jobs.md)
 
 
 def test_the_same_command_again_continues_and_its_bag_is_whole(tmp_path, gas_sensor, pictures, capsys):

@@ -88,6 +88,7 @@ def test_a_second_try_that_moves_still_has_converged_only_beside_the_first(dente
     away = first.vertices.clone()
     away[[1, 3]] += 0.1 * DOME.size
     still = torch.tensor([0.0, 0.0, 1.5e-3, 1.5e-3], dtype=torch.float64)
+    first = first._replace(relative_step=torch.ones(4).double())
     second = first._replace(vertices=away, relative_step=still)
     taken = one.chosen(torch.tensor([True, False, False, False]), first, second)
     assert taken.relative_step[1:3].tolist() == [0.0, 1.5e-3] and taken.relative_step[3] > 0.05
@@ -128,3 +129,14 @@ def test_markers_far_outside_are_a_reason_for_a_second_try_one_in_a_hundred_is_n
     found = one.equilibrium(*state, state.x, measured)
     assert one.is_settled(found).all()
     assert one.is_done(found, measured).tolist() == [True, True, False, True, True]
+
+
+def test_a_settled_solution_gives_way_to_one_that_explains_the_markers_better_only(dented):
+    one = estimator()
+    found = one(dented)
+    first = type(found)(*(value[:1].repeat(2, *[1] * (value.ndim - 1)) for value in found))
+    first = first._replace(volume=one.membrane.volume(first.vertices), misfit=torch.tensor([0.5, 0.5]).double())
+    second = first._replace(vertices=first.vertices + 1.0, misfit=torch.tensor([0.6, 0.4]).double())
+    assert one.is_settled(first).all()
+    taken = one.chosen(torch.tensor([False, False]), first, second)
+    torch.testing.assert_close(taken.vertices, torch.stack([first.vertices[0], second.vertices[1]]))

@@ -98,7 +98,7 @@ class ForceBalance(nn.Module):
         super().__init__()
         self.settings = settings = settings or ForceBalanceSettings()
         self.cavity = CavityLaw(membrane, rest_balance(membrane, elasticity)[0], filling, gas)
-        self.size = membrane.size
+        self.size, self.coarseness = membrane.size, max(1.0, (RESOLVED - 1) / (min(membrane.grid) - 1)) ** 2
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
         bearings = MarkerBearings(membrane, markers, positions, noise, rest)
@@ -196,8 +196,7 @@ class ForceBalance(nn.Module):
         previous frame's."""
         measured = self.equations.bearings.measured(observation)
         found = self._solved(measured, None if start is None else State(*start))
-        again = mended(self.is_done(found, measured), found, self._patiently, measured, self.chosen)
-        return Equilibrium(*again)
+        return Equilibrium(*mended(self.is_done(found, measured), found, self._patiently, measured, self.chosen))
 
     def _patiently(self, *measured: Any) -> Equilibrium:
         """From rest, in many small steps: deep presses need them."""
@@ -205,9 +204,10 @@ class ForceBalance(nn.Module):
 
     @piece
     def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
-        """`values` in the rows where `done [B]` holds, else `others`; one that moves still is as far from its end as both tries
-        are apart."""
+        """`values` in the rows where `done [B]` holds, or that are settled and explain the markers as well, else `others`; one
+        that moves still is as far from its end as both tries are apart."""
         first, second = Equilibrium(*values), Equilibrium(*others)
+        done = done | (self.is_settled(first) & ~(second.misfit < first.misfit))
         apart = self._distance(second.vertices, first.vertices.nan_to_num())
         step = torch.where(self.is_settled(second), second.relative_step, torch.maximum(second.relative_step, apart))
         rows = [done.reshape(-1, *(1,) * (value.ndim - 1)) for value in first]
@@ -240,8 +240,8 @@ class ForceBalance(nn.Module):
     def at_rest(self, confidence: Tensor) -> State:
         """The rest surface and pressure and a camera that has not moved, for every row of `confidence [B, D]`."""
         frames, pressure = confidence.shape[0], self.rest_pressure
-        still = torch.zeros_like(pressure).expand(4)
-        return State(self.membrane.rest.repeat(frames, 1, 1), pressure.repeat(frames), still.repeat(frames, 1))
+        still = torch.zeros_like(pressure).expand(frames, 4)
+        return State(self.membrane.rest.repeat(frames, 1, 1), pressure.repeat(frames), still.clone())
 
     @piece
     def coarsened(self, x: Tensor, pressure: Tensor, moved: Tensor) -> State:
@@ -287,13 +287,13 @@ class ForceBalance(nn.Module):
     @piece
     def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
         """`[B]` bool: settled, and hardly a marker is left far outside, as beside a contact that the steps went past."""
-        outlying = self.equations.bearings.outlying(found.vertices, measured, found.moved, 2 * self.settings.outlier)
+        far = 2 * self.settings.outlier * self.coarseness
+        outlying = self.equations.bearings.outlying(found.vertices, measured, found.moved, far)
         return self.is_settled(found) & (outlying <= self.settings.largest_outlying)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the markers are off their rays by no more than their noise and the model's error."""
-        coarse = max(1.0, (RESOLVED - 1) / (min(self.membrane.grid) - 1))
-        return torch.logical_not(found.misfit > self.settings.largest_misfit * coarse**2)
+        return torch.logical_not(found.misfit > self.settings.largest_misfit * self.coarseness)
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes."""
@@ -338,9 +338,8 @@ class ForceBalance(nn.Module):
             Noise must not change which vertices are pushed, as it does in the shallowest presses and where two answers
             compete; the grid's and the material's errors are not in it.
         """
-        equations = self.equations
+        equations, plain = self.equations, tangent_frame(observation.directions)
         measured = equations.bearings.measured(observation)
-        plain = tangent_frame(observation.directions)
         noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * plain
         scales = self.settings.tau[1], self.settings.outlier
         state, play = State(x, pressure, moved), self.settings.camera_motion
