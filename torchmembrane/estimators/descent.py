@@ -11,10 +11,11 @@ from ..pieces import piece, repeated
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..solve.implicit import differentiable
 from ..solve.kkt import BorderedStep, solve_bordered
-from ..surface.stencil import pad_border
+from ..surface.stencil import inner, pad_border
 from .bearings import Bearings
 from .normal_equations import BalanceEquations, NormalEquations
-from .pressure_gauge import pulled
+from .pressure_gauge import gauge_loss, pulled
+from .robust import Cauchy
 from .settings import ForceBalanceSettings
 
 Factor = tuple[Tensor, ...]
@@ -53,6 +54,19 @@ class Descent(nn.Module):
             state, schedule = State(x, pressure, moved), schedule[1:]
         x, pressure, moved, before = repeated(self._next, schedule, (*state, before), measured, factor)
         return State(x, pressure, moved), before
+
+    def objective(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> Tensor:
+        """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
+        equations, (x, pressure, moved) = self.equations, state
+        misfit = measured.weight * equations.bearings.angles(x, measured, moved)[0].square().sum(1)
+        of_markers: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1)
+        of_tractions: Tensor = equations.loss(traction, normal, measured.noise_level)
+        return of_markers + of_tractions + gauge_loss(measured.gauge, pressure - self.cavity.rest_pressure)
+
+    def tractions(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
+        """The contact tractions of the inner vertices and their outward normals, `[B, 3, N]` each."""
+        traction = self.equations.forces(x, pressure) / self.membrane.rest_area[:, None]
+        return inner(traction, self.membrane.grid).mT, inner(self.membrane.normals(x), self.membrane.grid).mT
 
     @piece
     def _first(

@@ -16,8 +16,8 @@ neighbourhood of radius `reach` (contacts are patches), and the weights of the s
 
 Iteratively reweighted least squares (IRLS) by Gauss-Newton steps, while `tau` declines from where everything is quadratic
 (graduated non-convexity, GNC): no start but the rest surface is needed. A fine grid starts from the solution on every second of
-its lines, that one from one coarser still: it takes few vertices to find the basin. From the solution of the previous frame the
-first step's factor does for all: with it, two conjugate-gradient steps solve the others' equations well enough.
+its lines, and so on: few vertices find the basin, and a `Dent` where something pushes. From the previous frame's solution one
+factor serves the last steps, by two conjugate-gradient steps each.
 """
 
 from typing import Any, ClassVar
@@ -40,11 +40,11 @@ from .bearings import Bearings, MarkerBearings, marker_rays, seen_from_origin
 from .contact_force import ContactForce
 from .contact_patches import ContactPatches
 from .covariance import StandardDeviations, linearise, noise_loads, push_noise, spread
+from .dent import Dent
 from .descent import Descent, State
 from .deviations import depths, of_presses, spreads
 from .normal_equations import BalanceEquations
-from .pressure_gauge import gauge_loss, gauge_reading
-from .robust import Cauchy
+from .pressure_gauge import gauge_reading
 from .settings import ForceBalanceSettings
 from .traction_loss import TractionLoss
 
@@ -107,12 +107,11 @@ class ForceBalance(nn.Module):
         loss = TractionLoss(membrane, self.reference, cone, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
         self.descent = Descent(self.equations, self.cavity, settings)
+        self.dent = Dent(self.descent) if self.coarse is not None and self.coarse.coarse is None else None
         self.spacing = self.size / len(bearings.positions) ** 0.5
         self.patches = ContactPatches(membrane, self.spacing)
-        if self.coarse is None:
-            self.steps = settings.coarse_steps if is_coarse else settings.steps
-        else:
-            self.steps = settings.fine_steps if self.coarse.coarse is None else settings.finer_steps
+        first = settings.coarse_steps if is_coarse else settings.steps
+        self.steps = first if self.coarse is None else settings.finer_steps if self.dent is None else settings.fine_steps
         self.passes_on_starts = self.coarse is not None and min(self.coarse.membrane.grid) >= settings.coarsest_warm
         rest = seen_from_origin(bearings.positions) if rest is None else rest
         loss.push_noise = push_noise(self.equations, self.cavity, rest, settings.camera_motion)
@@ -141,9 +140,7 @@ class ForceBalance(nn.Module):
             return None
         every_second = Membrane(*(a.unflatten(0, grid)[::2, ::2].numpy() for a in (membrane.rest, membrane.fixed)))
         markers, material = every_second.closest_points(positions.numpy()), elasticity.on(every_second)
-        return ForceBalance(
-            every_second, material, markers, positions, bearings.noise, filling, gas, self.settings, rest, is_coarse=True
-        )
+        return ForceBalance(every_second, material, markers, positions, bearings.noise, filling, gas, self.settings, rest, True)
 
     @property
     def membrane(self) -> Membrane:
@@ -198,8 +195,7 @@ class ForceBalance(nn.Module):
         found = self._solved(measured, None if start is None else State(*start))
         return Equilibrium(*mended(self.is_done(found, measured), found, self._patiently, measured, self.chosen))
 
-    def _patiently(self, *measured: Any) -> Equilibrium:
-        """From rest, in many small steps: deep presses need them."""
+    def _patiently(self, *measured: Any) -> Equilibrium:  # from rest, in many small steps: deep presses need them
         return self._solved(Bearings(*measured), None, patient=True)
 
     @piece
@@ -224,7 +220,15 @@ class ForceBalance(nn.Module):
             coarse = self.coarse._solved(measured, None if start is None else self.coarsened(*start), patient)
             start = self.refined(coarse.vertices, coarse.pressure, coarse.moved)
         state = self.at_rest(measured.weight) if start is None else start
-        state, before = self.descent(state, measured, self.schedule(warm, patient), one_factor=warm)
+        schedule = self.schedule(warm, patient)
+        if self.dent is not None:
+            if not warm:
+                state, _ = self.descent(state, measured, schedule[:1])
+            state = self.dent(*state, measured)
+            if warm:  # the factor that serves all others is made where the dent has filled
+                state, _ = self.descent(state, measured, 2 * schedule[-1:])
+            schedule = schedule[-1:] * len(schedule)
+        state, before = self.descent(state, measured, schedule, one_factor=warm)
         return self.equilibrium(state.x, state.pressure, state.moved, before, measured)
 
     def schedule(self, warm: bool = False, patient: bool = False) -> list[tuple[float, float]]:
@@ -312,14 +316,10 @@ class ForceBalance(nn.Module):
 
     def objective(self, found: Equilibrium, observation: Observation) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
-        equations, grid = self.equations, self.membrane.grid
-        measured = equations.bearings.measured(observation)
-        traction, normal = inner(found.traction, grid).mT, inner(self.membrane.normals(found.vertices), grid).mT
-        misfit = measured.weight * equations.bearings.angles(found.vertices, measured, found.moved)[0].square().sum(1)
-        objective: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1) + equations.loss(
-            traction, normal, measured.noise_level
-        )
-        return objective + gauge_loss(measured.gauge, found.pressure - self.rest_pressure)
+        state, measured = State(found.vertices, found.pressure, found.moved), self.equations.bearings.measured(observation)
+        normals = self.membrane.normals(found.vertices)
+        traction, normal = (inner(field, self.membrane.grid).mT for field in (found.traction, normals))
+        return self.descent.objective(state, traction, normal, measured)
 
     def standard_deviations(
         self, x: Tensor, pressure: Tensor, moved: Tensor, observation: Observation, marker_noise: float | Tensor

@@ -1,0 +1,108 @@
+"""Contacts are dented in their middle for the steps to find pits that look like mounds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import torchmembrane as tm
+from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.dent import DEPTH, REACH, WIDTH
+from torchmembrane.estimators.force_balance import ForceBalance
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
+from torchmembrane.simulate import Simulator, Sphere
+from torchmembrane.simulate.dataset import stroke_to
+from torchmembrane.surface.shapes import spherical_cap
+from torchmembrane.surface.stencil import inner
+
+DOME = spherical_cap(12, 9, 30, (17, 17))
+SLACK = 1.1
+
+
+@pytest.fixture(scope="module")
+def estimator() -> ForceBalance:
+    positions = spherical_cap(12, 9, 30, (13, 13)).rest[~spherical_cap(12, 9, 30, (13, 13)).fixed]
+    return ForceBalance(
+        DOME, ElasticEnergy(DOME, "neo_hookean", 1.3), DOME.closest_points(positions.numpy()), positions, noise=1e-3
+    )
+
+
+def dented(estimator: ForceBalance, middles: list[int], push: float = 1.0) -> torch.Tensor:
+    """How far every vertex of the dome is moved, `[V, 3]`, when what is within a seventh of its size of some is pushed."""
+    rest = estimator.membrane.rest
+    near = (torch.cdist(rest, rest[middles]) < DOME.size / 7).any(1)
+    normal = inner(DOME.rest_normals, DOME.grid).mT[None]
+    tractions = -push * estimator.reference * inner(near.double()[:, None], DOME.grid).mT * normal, normal
+    rays = torch.nn.functional.normalize(estimator.equations.bearings.positions, dim=-1)[None]
+    measured = estimator.equations.bearings.measured(Observation(torch.zeros_like(rays), rays, torch.ones_like(rays[..., 0])))
+    held = estimator.descent.tractions
+    estimator.descent.tractions = lambda x, pressure: tractions
+    try:
+        return estimator.dent(*estimator.at_rest(measured.weight), measured).x[0] - rest
+    finally:
+        estimator.descent.tractions = held
+
+
+def vertex_near(x: float, y: float) -> int:
+    return int((DOME.rest[:, :2] - torch.tensor([x, y])).square().sum(1).argmin())
+
+
+@pytest.mark.parametrize("middles", [[vertex_near(0, 0)], [vertex_near(5, 0)], [vertex_near(-8, 0), vertex_near(8, 0)]])
+def test_the_middle_of_a_contact_is_dented_inwards_along_the_normals(estimator, middles):
+    """Nearly as deep as `DEPTH` says, half where another contact draws the middle aside; far from one, hardly at all."""
+    move, step = dented(estimator, middles), DOME.size / 16
+    depth = -(move * DOME.rest_normals).sum(-1)
+    torch.testing.assert_close(move, -depth[:, None] * DOME.rest_normals, rtol=0, atol=1e-9)
+    distance = torch.cdist(DOME.rest, DOME.rest[middles])
+    for near in distance.T:
+        least = 0.75 if len(middles) == 1 else 0.5
+        assert least * DEPTH * DOME.size < depth[near < 1.5 * step].max() <= DEPTH * DOME.size
+    if len(middles) == 1:  # half way between two is a middle as well
+        assert depth[distance[:, 0] > 3 * WIDTH * DOME.size + 2 * step].max() < 0.1 * DEPTH * DOME.size
+    assert (depth[DOME.fixed] == 0).all()
+
+
+def test_contacts_nearer_than_their_reach_have_one_middle(estimator):
+    apart = 0.5 * REACH * DOME.size / 2
+    depth = dented(estimator, [vertex_near(-apart, 0), vertex_near(apart, 0)]).norm(dim=-1)
+    assert (DOME.rest[depth.argmax(), :2]).norm() < DOME.size / 16
+
+
+def test_no_push_no_dent(estimator):
+    assert dented(estimator, [vertex_near(0, 0)], push=0.0).abs().max() < 1e-9
+
+
+@pytest.fixture(scope="module")
+def bubble():
+    """A bubble of little prestretch, a ball of a seventh of its size pressed in by 0.08 of it, on another grid."""
+    sensor = tm.preset("bubble")
+    sensor = replace(
+        sensor,
+        material=replace(sensor.material, prestretch=SLACK),
+        membrane=sensor.surface.membrane((17, 17)),
+    )
+    simulator, size = Simulator(sensor, (38, 38)), sensor.membrane.size
+    aim = sensor.membrane.rest[sensor.membrane.fixed].mean(0).numpy()
+    stroke = stroke_to(simulator, Sphere(size / 7), aim, np.array([0.0, 0.0, -1.0]), 0.08 * size)
+    (state,) = simulator.presses(stroke, ("push",))
+    return sensor, simulator.frame(state, stroke, np.random.default_rng(0)).truth
+
+
+def errors(reconstructor: tm.Reconstructor, truth: dict) -> tuple[float, float]:
+    """Of the markers over their displacement, and of the force, relative."""
+    with torch.no_grad():
+        found = reconstructor.from_pixels(torch.as_tensor(truth["uv_deformed"]).float())
+    rest, pressed = truth["dots_nominal"], truth["dots_deformed"]
+    off = np.linalg.norm(found.markers[0].numpy() - pressed) / np.linalg.norm(pressed - rest)
+    return float(off), float(np.linalg.norm(found.force[0].numpy() - truth["force"]) / np.linalg.norm(truth["force"]))
+
+
+def test_a_pit_in_a_slack_bubble_is_not_taken_for_a_mound(bubble):
+    sensor, truth = bubble
+    reconstructor = tm.Reconstructor(sensor, check_rest=False)
+    surface, force = errors(reconstructor, truth)
+    assert surface < 0.15 and force < 0.1
+    reconstructor.estimator.dent = None
+    without, _ = errors(reconstructor, truth)
+    assert without > 0.3
