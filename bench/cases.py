@@ -50,7 +50,7 @@ DOME = {"rim_radius": 12.5, "height": 8.5}
 SENSORS = {  # surface, dots, lens, focal length in px, through a port
     "dome15_pinhole": (Surface("spherical_cap", DOME | {"base_z": 16.0}), 121, "pinhole", 280.0, False),
     "dome15_fisheye": (Surface("spherical_cap", DOME | {"base_z": 16.0}), 121, "fisheye", 325.0, False),
-    "dome15_port": (Surface("spherical_cap", DOME | {"base_z": 16.0}), 121, "pinhole", 200.0, True),
+    "dome15_port": (Surface("spherical_cap", DOME | {"base_z": 16.0}), 121, "pinhole", 172.0, True),
     "dome3_fisheye": (Surface("spherical_cap", DOME | {"base_z": 3.5}), 121, "fisheye", 165.0, False),
     "finger_fisheye": (Surface("ellipsoid_cap", {"semi_axes": [12.5, 9.5, 11.5], "base_z": 5.0}), 121, "fisheye", 195.0, False),
     "halfcyl_fisheye": (
