@@ -2,12 +2,12 @@
 
 python bench/cases.py OUT [--seed 0] [--grid 48]
 
-Six sensors of 121 or 169 dots, a dome far from the camera (pinhole, fisheye, through Plexiglas and water) and near (fisheye), a
-fingertip and a half cylinder, of three materials (neo-Hookean with prestretch 1.3 and 1.05, Mooney-Rivlin); spheres, plates and
-cylinders, two at once, 1.5 to 4 mm deep with friction 0 to 0.8, one ball that slides. Of each press NAME_clean.png,
-NAME_snr30.png (30 dB) and NAME_truth.npz, as of `torchmembrane simulate`; index.json lists all. Places and directions come from
-the seed, the equilibrium from the project's simulator on a finer grid than the estimator's. What is there is kept; seconds are
-printed.
+Six sensors of 137 to 187 dots, a dome far from the camera (pinhole, fisheye, through Plexiglas and water) and near (fisheye),
+a fingertip and a half cylinder, of three materials (neo-Hookean with prestretch 1.3 and 1.05, Mooney-Rivlin); spheres, plates
+and cylinders, two at once, 1.5 to 4 mm deep with friction 0 to 0.8, one ball that slides. Of each press NAME_clean.png,
+NAME_snr30.png (30 dB) and NAME_truth.npz, as of `torchmembrane simulate`; index.json lists all. Places and directions come
+from the seed, the equilibrium from the project's simulator on a finer grid than the estimator's. What is there is kept;
+seconds are printed.
 """
 
 import argparse
@@ -47,7 +47,7 @@ MATERIALS = {
     "mr130": Material("mooney_rivlin", 1.3, 0.1, shear_modulus=1.0, thickness=1.0),
 }
 DOME = {"rim_radius": 12.5, "height": 8.5}
-SENSORS = {  # surface, dots, lens, focal length in px, through a port
+SENSORS = {  # surface, about how many dots, lens, focal length in px, through a port
     "dome15_pinhole": (Surface("spherical_cap", DOME | {"base_z": 16.0}), 121, "pinhole", 280.0, False),
     "dome15_fisheye": (Surface("spherical_cap", DOME | {"base_z": 16.0}), 121, "fisheye", 325.0, False),
     "dome15_port": (Surface("spherical_cap", DOME | {"base_z": 16.0}), 121, "pinhole", 172.0, True),
