@@ -127,8 +127,8 @@ def unjudged(reconstructor: tm.Reconstructor, pixels, confidence, rest, assumed:
     """As `from_pixels`, without asking whether most markers are found: one dot in four is enough here."""
     displacement, confidence, covariance, status = reconstructor.observer.from_pixels(pixels, confidence, rest)
     usable = torch.where(confidence > FOUND, confidence, 0.0)
-    found = reconstructor.estimator(reconstructor.observation(displacement, usable, assumed**2 * covariance))
-    return reconstructor.result(found, displacement, usable, status)
+    observation = reconstructor.observation(displacement, usable, assumed**2 * covariance)
+    return reconstructor.result(reconstructor.estimator(observation), observation, displacement, usable, status)
 
 
 def main():

@@ -1,5 +1,6 @@
 """Marker and surface accuracy on rendered cases with truth.
 
+python bench/cases.py CASES
 python bench/accuracy.py CASES [--only NAME ...] [--json FILE]
 
 CASES holds index.json, a list of cases with `sensor`, `images` (files), `truth` (npz with `uv_deformed [D, 2]`, `dots_nominal`

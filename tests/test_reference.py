@@ -1,5 +1,6 @@
 """The reference has every key, column, option, status and public name; every page has its place."""
 
+import ast
 import re
 import sys
 import tomllib
@@ -108,6 +109,34 @@ def test_every_array_column_and_status_is_in_the_reference():
     for status in tm.Status:
         assert f"| {int(status)} | `{status.name}` |" in RESULTS
         assert f"| {int(status)} `{status.name}` |" in (DOCS / "faq.md").read_text() or status is tm.Status.OK
+
+
+def words_of_warnings() -> list[str]:
+    """The constant words of every warning in the package, also where a function of the same module words it."""
+    found = []
+    for path in sorted((ROOT / "torchmembrane").rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        functions = {node.name: node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+        for call in (
+            node for node in ast.walk(tree) if isinstance(node, ast.Call) and ast.unparse(node.func) == "warnings.warn"
+        ):
+            worded = call.args[0]
+            if isinstance(worded, ast.Call):
+                worded = functions[ast.unparse(worded.func)]
+            constants = [node.value for node in ast.walk(worded) if isinstance(node, ast.Constant)]
+            found.append("\n".join(text for text in constants if isinstance(text, str)))
+    return found
+
+
+def test_every_warning_has_its_line_among_the_questions_and_no_other_has_one():
+    section = re.search(r"^## A warning$(.*?)^## ", (DOCS / "faq.md").read_text(), re.M | re.S)[1]
+    lines = [re.findall(r"`([^`]+)`", row.split(" | ")[0]) for row in section.splitlines() if row.startswith("| `")]
+    warnings = words_of_warnings()
+    assert len(warnings) == len(lines) >= 4
+    for warning in warnings:
+        assert sum(all(words in warning for words in line) for line in lines) == 1, warning
+    for line in lines:
+        assert sum(all(words in warning for words in line) for warning in warnings) == 1, line
 
 
 def test_every_option_is_in_the_reference():
