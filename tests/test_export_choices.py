@@ -17,6 +17,7 @@ from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.settings import ELEMENTS, FLOWS, VOLUMES
 from torchmembrane.onnx import check, export, trace
 from torchmembrane.onnx.check import Agreement, check_images, checked
+from torchmembrane.onnx.graph import Assembly
 from torchmembrane.onnx.trace import traced
 from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
 from torchmembrane.sensor.sensor import Sensor
@@ -120,6 +121,18 @@ def test_lengths_of_the_batch_stay_free(frames, further):
     x = torch.rand(frames, 3)
     found = onnxruntime.InferenceSession(model.SerializeToString()).run(None, {"x": x.numpy()})[0]
     np.testing.assert_array_equal(found, Lengths(further)(x))
+
+
+@pytest.mark.parametrize("every, share", [(2, 0.7), (3, 0.45), (300, 0.03), (70_000, 0.01)])
+def test_what_is_mostly_zero_is_stored_by_its_places(every, share):
+    array, assembly = np.zeros((300, 500), np.float32), Assembly()
+    array.ravel()[7::every] = np.random.default_rng(0).random(array.ravel()[7::every].size) + 1
+    assembly.nodes.append(onnx.helper.make_node("MatMul", ["x", assembly.constant(array)], ["y"]))
+    x, y = (onnx.helper.make_tensor_value_info(*given) for given in (("x", 1, ["batch", 300]), ("y", 1, ["batch", 500])))
+    stored = assembly.model([x], [y], {}).SerializeToString()
+    assert len(stored) < share * array.nbytes
+    session = onnxruntime.InferenceSession(stored, providers=["CPUExecutionProvider"])
+    np.testing.assert_array_equal(session.run(None, {"x": np.eye(300, dtype=np.float32)})[0], array)
 
 
 class Composite(torch.nn.Module):

@@ -14,8 +14,8 @@ from .trace import OPSET
 
 IR_VERSION = 8
 """onnxruntime reads it, and the operators' set, from 1.14 on."""
-SPARSE_SIZE, SPARSE_SHARE = 4096, 0.45
-"""A constant of more numbers, of which less are not zero, is stored by these and their places."""
+SPARSE_SIZE, SPARSE_SHARE = 4096, 0.7
+"""A constant of more numbers, of which less are not zero, is stored by these and the distances between their places."""
 
 
 def inlined(model: onnx.ModelProto, function: Callable[[onnx.NodeProto], onnx.ModelProto]) -> onnx.ModelProto:
@@ -85,21 +85,24 @@ class Assembly:
 
     def _scattered(self, array: np.ndarray, nonzero: np.ndarray) -> str:
         """The name of a constant that is mostly zero, put together when the model is loaded."""
+        distances = np.diff(nonzero, prepend=0)[:, None]
         parts = {
             "values": array.ravel()[nonzero],
-            "places": nonzero[:, None].astype(np.int32),
+            "distances": distances.astype(np.min_scalar_type(distances.max(initial=0))),
+            "axis": np.array(0),
             "length": np.array([array.size]),
             "shape": np.array(array.shape),
         }
         names = {name: self.constant(part) for name, part in parts.items()}
-        dense = f"{names['values']}/{names['places']}/{names['shape']}"
+        dense = f"{names['values']}/{names['distances']}/{names['shape']}"
         if dense not in self.scattered:
-            made = [f"{dense}/{step}" for step in ("places", "zero", "flat")]
+            made = [f"{dense}/{step}" for step in ("distances", "places", "zero", "flat")]
             self.scattered[dense] = [
-                helper.make_node("Cast", [names["places"]], [made[0]], to=TensorProto.INT64),
-                helper.make_node("ConstantOfShape", [names["length"]], [made[1]]),
-                helper.make_node("ScatterND", [made[1], made[0], names["values"]], [made[2]]),
-                helper.make_node("Reshape", [made[2], names["shape"]], [dense]),
+                helper.make_node("Cast", [names["distances"]], [made[0]], to=TensorProto.INT64),
+                helper.make_node("CumSum", [made[0], names["axis"]], [made[1]]),
+                helper.make_node("ConstantOfShape", [names["length"]], [made[2]]),
+                helper.make_node("ScatterND", [made[2], made[1], names["values"]], [made[3]]),
+                helper.make_node("Reshape", [made[3], names["shape"]], [dense]),
             ]
         return dense
 
