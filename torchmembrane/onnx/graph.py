@@ -54,7 +54,7 @@ def renamed(nodes: Iterable[onnx.NodeProto], known: dict[str, str], prefix: str)
 class Assembly:
     """An ONNX graph that grows by pieces; equal constants are kept once.
 
-    Nodes are named `PART/NUMBER/...` after the `part` at the time and the number of the piece.
+    Nodes are named `PART/...` after the `part` at the time.
 
     `append` and `repeat` take a model from `traced` and the names that its inputs have here, and return its outputs' names.
     """
@@ -160,6 +160,7 @@ class Assembly:
         """The whole as a checked model of such inputs and outputs, with metadata."""
         nodes = [*chain.from_iterable(self.scattered.values()), *self.nodes]
         graph = helper.make_graph(nodes, "torchmembrane", inputs, outputs, list(self.constants.values()))
+        _shorten(graph, {value.name: value.name for value in [*inputs, *outputs]} | {"": ""})
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="torchmembrane")
         model.ir_version = IR_VERSION
         helper.set_model_props(model, metadata)
@@ -180,6 +181,21 @@ def described(name: str, kind: int = TensorProto.FLOAT, shape: Sequence[str | in
     """A value's description, as ONNX declares it: its name, element type and shape (None: not said; strings: free lengths)."""
     description: onnx.ValueInfoProto = helper.make_tensor_value_info(name, kind, shape)
     return description
+
+
+def _shorten(graph: onnx.GraphProto, names: dict[str, str]) -> None:
+    """Number the values but those in `names`, which is extended, and the nodes behind their part; as written by their pieces
+    they would be a quarter of the file."""
+    parts = [node.name.partition("/")[0] for node in graph.node]
+    for value in chain(graph.initializer, graph.input, graph.output):
+        value.name = names.setdefault(value.name, f"v{len(names):x}")
+    for node, part in zip(graph.node, parts, strict=True):
+        for values in (node.input, node.output):
+            values[:] = [names.setdefault(name, f"v{len(names):x}") for name in values]
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                _shorten(attribute.g, names)
+        node.name = part and f"{part}/{node.output[0]}"
 
 
 def _bare(node: onnx.NodeProto) -> onnx.NodeProto:
