@@ -165,6 +165,10 @@ def test_the_file_is_plain_onnx_and_says_what_it_is(model_file, reconstructor):
     assert {node.domain for node in model.graph.node} == {""}
     assert model_file.stat().st_size < 25e6
     assert [output.name for output in model.graph.output] == list(Reconstruction._fields)
+    nodes = [inner for node in model.graph.node for inner in (node, *(n for a in node.attribute for n in a.g.node))]
+    numbered = {name for node in nodes for name in node.output} - {*Reconstruction._fields}
+    assert len(nodes) > 1000 and all(len(name) < 7 for name in numbered)
+    assert {node.name.partition("/")[0] for node in nodes} == {"markers", "estimators", "reconstruct", ""}
     known = {entry.key: entry.value for entry in model.metadata_props}
     assert {int(code): text for code, text in json.loads(known["status_texts"]).items()} == {
         status.value: status.text for status in Status

@@ -1,5 +1,6 @@
 """What the command's choices are put together of, exported and run; models that cannot be written, or are not the same."""
 
+from contextlib import nullcontext
 from inspect import signature
 from itertools import product
 from types import SimpleNamespace
@@ -14,8 +15,9 @@ from torchmembrane import MembraneError
 from torchmembrane.cli import main as cli
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.settings import ELEMENTS, FLOWS, VOLUMES
-from torchmembrane.onnx import check, export
+from torchmembrane.onnx import check, export, trace
 from torchmembrane.onnx.check import Agreement, check_images, checked
+from torchmembrane.onnx.graph import Assembly
 from torchmembrane.onnx.trace import traced
 from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
 from torchmembrane.sensor.sensor import Sensor
@@ -119,6 +121,37 @@ def test_lengths_of_the_batch_stay_free(frames, further):
     x = torch.rand(frames, 3)
     found = onnxruntime.InferenceSession(model.SerializeToString()).run(None, {"x": x.numpy()})[0]
     np.testing.assert_array_equal(found, Lengths(further)(x))
+
+
+@pytest.mark.parametrize("every, share", [(2, 0.7), (3, 0.45), (300, 0.03), (70_000, 0.01)])
+def test_what_is_mostly_zero_is_stored_by_its_places(every, share):
+    array, assembly = np.zeros((300, 500), np.float32), Assembly()
+    array.ravel()[7::every] = np.random.default_rng(0).random(array.ravel()[7::every].size) + 1
+    assembly.nodes.append(onnx.helper.make_node("MatMul", ["x", assembly.constant(array)], ["y"]))
+    x, y = (onnx.helper.make_tensor_value_info(*given) for given in (("x", 1, ["batch", 300]), ("y", 1, ["batch", 500])))
+    stored = assembly.model([x], [y], {}).SerializeToString()
+    assert len(stored) < share * array.nbytes
+    session = onnxruntime.InferenceSession(stored, providers=["CPUExecutionProvider"])
+    np.testing.assert_array_equal(session.run(None, {"x": np.eye(300, dtype=np.float32)})[0], array)
+
+
+class Composite(torch.nn.Module):
+    """Operators that ONNX has and torch composes of others, one that it has not, and one that changes its argument."""
+
+    def forward(self, x, y):
+        angle = torch.atan2((x @ y).sum(-1), torch.einsum("bij,bkj->bi", x, y)) + torch.linalg.vector_norm(x, dim=-1)
+        angle[:, 1:] += 2
+        return torch.nn.functional.layer_norm(angle, (3,)), angle[:, None].expand_as(x).diff(dim=-1).clamp(max=1)
+
+
+def test_a_graph_captured_at_once_is_what_torch_makes_of_it_in_two_steps(monkeypatch):
+    inputs = {"x": torch.rand(2, 3, 3), "y": torch.rand(2, 3, 3)}
+    at_once = traced(Composite(), inputs, ["a", "b"])
+    monkeypatch.setattr(trace, "_captured", torch.export.export)
+    monkeypatch.setattr(trace, "_quick", nullcontext)
+    in_two_steps = traced(Composite(), inputs, ["a", "b"])
+    assert [node.op_type for node in at_once.graph.node] == [node.op_type for node in in_two_steps.graph.node]
+    assert at_once.SerializeToString(deterministic=True) == in_two_steps.SerializeToString(deterministic=True)
 
 
 def test_a_number_that_depends_on_the_batch_is_refused():

@@ -14,8 +14,8 @@ from .trace import OPSET
 
 IR_VERSION = 8
 """onnxruntime reads it, and the operators' set, from 1.14 on."""
-SPARSE_SIZE, SPARSE_SHARE = 4096, 0.45
-"""A constant of more numbers, of which less are not zero, is stored by these and their places."""
+SPARSE_SIZE, SPARSE_SHARE = 4096, 0.7
+"""A constant of more numbers, of which less are not zero, is stored by these and the distances between their places."""
 
 
 def inlined(model: onnx.ModelProto, function: Callable[[onnx.NodeProto], onnx.ModelProto]) -> onnx.ModelProto:
@@ -54,7 +54,7 @@ def renamed(nodes: Iterable[onnx.NodeProto], known: dict[str, str], prefix: str)
 class Assembly:
     """An ONNX graph that grows by pieces; equal constants are kept once.
 
-    Nodes are named `PART/NUMBER/...` after the `part` at the time and the number of the piece.
+    Nodes are named `PART/...` after the `part` at the time.
 
     `append` and `repeat` take a model from `traced` and the names that its inputs have here, and return its outputs' names.
     """
@@ -85,21 +85,24 @@ class Assembly:
 
     def _scattered(self, array: np.ndarray, nonzero: np.ndarray) -> str:
         """The name of a constant that is mostly zero, put together when the model is loaded."""
+        distances = np.diff(nonzero, prepend=0)[:, None]
         parts = {
             "values": array.ravel()[nonzero],
-            "places": nonzero[:, None].astype(np.int32),
+            "distances": distances.astype(np.min_scalar_type(distances.max(initial=0))),
+            "axis": np.array(0),
             "length": np.array([array.size]),
             "shape": np.array(array.shape),
         }
         names = {name: self.constant(part) for name, part in parts.items()}
-        dense = f"{names['values']}/{names['places']}/{names['shape']}"
+        dense = f"{names['values']}/{names['distances']}/{names['shape']}"
         if dense not in self.scattered:
-            made = [f"{dense}/{step}" for step in ("places", "zero", "flat")]
+            made = [f"{dense}/{step}" for step in ("distances", "places", "zero", "flat")]
             self.scattered[dense] = [
-                helper.make_node("Cast", [names["places"]], [made[0]], to=TensorProto.INT64),
-                helper.make_node("ConstantOfShape", [names["length"]], [made[1]]),
-                helper.make_node("ScatterND", [made[1], made[0], names["values"]], [made[2]]),
-                helper.make_node("Reshape", [made[2], names["shape"]], [dense]),
+                helper.make_node("Cast", [names["distances"]], [made[0]], to=TensorProto.INT64),
+                helper.make_node("CumSum", [made[0], names["axis"]], [made[1]]),
+                helper.make_node("ConstantOfShape", [names["length"]], [made[2]]),
+                helper.make_node("ScatterND", [made[2], made[1], names["values"]], [made[3]]),
+                helper.make_node("Reshape", [made[3], names["shape"]], [dense]),
             ]
         return dense
 
@@ -157,6 +160,7 @@ class Assembly:
         """The whole as a checked model of such inputs and outputs, with metadata."""
         nodes = [*chain.from_iterable(self.scattered.values()), *self.nodes]
         graph = helper.make_graph(nodes, "torchmembrane", inputs, outputs, list(self.constants.values()))
+        _shorten(graph, {value.name: value.name for value in [*inputs, *outputs]} | {"": ""})
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="torchmembrane")
         model.ir_version = IR_VERSION
         helper.set_model_props(model, metadata)
@@ -177,6 +181,21 @@ def described(name: str, kind: int = TensorProto.FLOAT, shape: Sequence[str | in
     """A value's description, as ONNX declares it: its name, element type and shape (None: not said; strings: free lengths)."""
     description: onnx.ValueInfoProto = helper.make_tensor_value_info(name, kind, shape)
     return description
+
+
+def _shorten(graph: onnx.GraphProto, names: dict[str, str]) -> None:
+    """Number the values but those in `names`, which is extended, and the nodes behind their part; as written by their pieces
+    they would be a quarter of the file."""
+    parts = [node.name.partition("/")[0] for node in graph.node]
+    for value in chain(graph.initializer, graph.input, graph.output):
+        value.name = names.setdefault(value.name, f"v{len(names):x}")
+    for node, part in zip(graph.node, parts, strict=True):
+        for values in (node.input, node.output):
+            values[:] = [names.setdefault(name, f"v{len(names):x}") for name in values]
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                _shorten(attribute.g, names)
+        node.name = part and f"{part}/{node.output[0]}"
 
 
 def _bare(node: onnx.NodeProto) -> onnx.NodeProto:

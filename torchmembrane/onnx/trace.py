@@ -2,7 +2,9 @@
 
 import logging
 import warnings
-from functools import cache
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache, partial
 from typing import Any
 from unittest.mock import patch
 
@@ -15,6 +17,10 @@ from onnx_ir.passes import common
 from onnxscript.optimizer import fold_constants_ir
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.export import _trace
+from torch.export.exported_program import _override_composite_implicit_decomp, _split_decomp_table_to_cia_and_python_decomp
+from torch.onnx._internal.exporter import _fx_passes
+from torch.onnx._internal.exporter._decomp import create_onnx_friendly_decomposition_table, get_onnx_implemented_overloads
 from torch.onnx._internal.exporter._registration import ONNXRegistry
 from torch.onnx._internal.fx.passes.type_promotion import _TypePromotionInterpreter, get_type_promotion_rule
 
@@ -38,7 +44,7 @@ TIDY = passes.Sequential(
     common.NameFixPass(),
 )
 """What torch's exporter does too, but for its patterns, which take most of its time and change next to nothing here."""
-_registry = staticmethod(cache(ONNXRegistry.from_torchlib))
+_registry = cache(ONNXRegistry.from_torchlib)
 """Torch's exporter reads its operators anew for every model, a second each; nothing here changes them."""
 
 
@@ -56,6 +62,32 @@ def _promoted(interpreter: _TypePromotionInterpreter, node: torch.fx.Node) -> An
     return node.meta.get("val")
 
 
+def _captured(module: nn.Module, examples: tuple[Tensor, ...]) -> torch.export.ExportedProgram:
+    """The module's operators as ONNX has them, captured in one go: by torch's exporter it would be in two."""
+    kept, decomposed = _decompositions()
+    at_once = partial(_trace._export_to_aten_ir, decomp_table=decomposed)
+    with patch.object(_trace, "_export_to_aten_ir", at_once), _override_composite_implicit_decomp(kept):
+        return _trace._export(module, examples, strict=False, pre_dispatch=False)
+
+
+@cache
+def _decompositions() -> tuple[dict[Any, Any], ...]:
+    """What operators without ONNX are made of, composite ones and others."""
+    table: dict[Any, Any] = create_onnx_friendly_decomposition_table(set(get_onnx_implemented_overloads(_registry())))
+    return _split_decomp_table_to_cia_and_python_decomp(table)
+
+
+@contextmanager
+def _quick() -> Iterator[None]:
+    """Torch's exporter without what it does again for every model, or to what `_captured` is already."""
+    with (
+        patch.object(ONNXRegistry, "from_torchlib", staticmethod(_registry)),
+        patch.object(_TypePromotionInterpreter, "run_node", _promoted),
+        patch.object(_fx_passes, "decompose_with_registry", lambda program, _: program),
+    ):
+        yield
+
+
 def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> onnx.ModelProto:
     """A module as ONNX, its inputs and outputs named in order; the first axis of every input is the batch (of scalars none).
 
@@ -66,17 +98,15 @@ def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> 
         ValueError: a number, not a length, depends on the batch's length.
     """
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    registered_once = patch.object(ONNXRegistry, "from_torchlib", _registry)
     with FakeTensorMode(allow_non_fake_inputs=True):
         examples = tuple(
             torch.empty(MANY, *value.shape[1:], dtype=value.dtype) if value.ndim else torch.empty_like(value)
             for value in inputs.values()
         )
-    with warnings.catch_warnings(), registered_once, patch.object(_TypePromotionInterpreter, "run_node", _promoted), writing():
+    with warnings.catch_warnings(), _quick(), writing():
         warnings.simplefilter("ignore")  # of the exporter about itself
         program = torch.onnx.export(
-            module.eval(),
-            examples,
+            _captured(module.eval(), examples),
             input_names=list(inputs),
             output_names=outputs,
             opset_version=OPSET,

@@ -1,0 +1,17 @@
+"""Exported models of random sensors of the whole span against torch, those of `bench/exports.py` on small grids."""
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.mark.parametrize("number, lines", [(1, 9), (2, 9), (4, 9), (6, 9), (9, 9)])
+def test_an_exported_model_gives_what_torch_gives(number, lines, monkeypatch, tmp_path):
+    """Odd ones track."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "bench")
+    from exports import compared, drawn
+
+    sensor = drawn(number, lines)
+    row = compared(number, tmp_path, sensor)
+    assert row["same"], row
+    assert sensor.membrane.grid == (lines, lines) and row["displacement"] > 0.1 and row["megabytes"] < 5
