@@ -5,7 +5,7 @@ python bench/basins.py [--sensors dome_24 bubble_60 ...] [--grid N]
 The sensors of weight.py, each pressed eight times by the simulator, 0.025 to 0.14 of its size deep, tilted up to 27 degrees, by
 balls of a ninth to a quarter of its size and, every third time, by a plate (seed: the sensor's place in the list); markers are
 where their centres are seen, with 0.03 px of noise. Printed: how many presses end with the markers' surface off by over 0.15
-and 0.25 of its displacement, and the force by over a tenth; medians of both. A press that the simulator cannot make is left out.
+and 0.25 of its displacement, and the force by over a tenth; medians of both. What the simulator cannot make is left out.
 """
 
 import argparse
