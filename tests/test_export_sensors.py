@@ -14,4 +14,4 @@ def test_an_exported_model_gives_what_torch_gives(number, lines, monkeypatch, tm
     sensor = drawn(number, lines)
     row = compared(number, tmp_path, sensor)
     assert row["same"], row
-    assert sensor.membrane.grid == (lines, lines) and row["displacement"] > 0.1 and row["megabytes"] < 5
+    assert sensor.membrane.grid == (lines, lines) and row["displacement"] > 0.1 and row["megabytes"] < 10

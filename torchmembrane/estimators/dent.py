@@ -16,7 +16,7 @@ from .descent import Descent, State
 DEPTH = 0.08  # over the surface's size
 WIDTH = 0.06  # standard deviation, over the size
 REACH = 0.25  # of the surroundings whose pushes have one middle, over the size
-FAINT = 0.1  # of the push that the markers' noise makes: less hardly dents
+FAINT = 1.0  # of the push that the markers' noise makes: less hardly dents
 TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle of none finite
 
 

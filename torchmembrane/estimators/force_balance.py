@@ -16,8 +16,8 @@ neighbourhood of radius `reach` (contacts are patches), and the weights of the s
 
 Iteratively reweighted least squares (IRLS) by Gauss-Newton steps, while `tau` declines from where everything is quadratic
 (graduated non-convexity, GNC): no start but the rest surface is needed. A fine grid starts from the solution on every second of
-its lines, and so on: few vertices find the basin, and a `Dent` where something pushes. From the previous frame's solution one
-factor serves the last steps, by two conjugate-gradient steps each.
+its lines, and so on: few vertices find the basin, and a `Dent` where something pushes. From the previous frame's solution
+one factor serves all steps, by two conjugate-gradient steps each.
 """
 
 from typing import Any, ClassVar
@@ -221,13 +221,9 @@ class ForceBalance(nn.Module):
             start = self.refined(coarse.vertices, coarse.pressure, coarse.moved)
         state = self.at_rest(measured.weight) if start is None else start
         schedule = self.schedule(warm, patient)
-        if self.dent is not None:
-            if not warm:
-                state, _ = self.descent(state, measured, schedule[:1])
-            state = self.dent(*state, measured)
-            if warm:  # the factor that serves all others is made where the dent has filled
-                state, _ = self.descent(state, measured, 2 * schedule[-1:])
-            schedule = schedule[-1:] * len(schedule)
+        if self.dent is not None and not warm:
+            state, _ = self.descent(state, measured, schedule[:1])
+            state, schedule = self.dent(*state, measured), schedule[-1:] * len(schedule)
         state, before = self.descent(state, measured, schedule, one_factor=warm)
         return self.equilibrium(state.x, state.pressure, state.moved, before, measured)
 
