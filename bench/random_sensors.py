@@ -5,8 +5,8 @@ python bench/random_sensors.py OUT [--sensors 250] [--first 0] [--presses 4] [--
 OUT/sNNNN holds a sensor: sensor.toml with its rest image, press_K.npz (an image with its truth, as of `torchmembrane
 simulate`), and with --light N the frames light_K.npz of one stroke whose depth grows quadratically from the first touch; with
 --rest N as many images at rest. Caps, ellipsoids and half cylinders of radius 8 to 60, prestretch 1.005 to 1.8, liquid, gas and
-open, 40 to 300 dots and (one in ten) speckle, pinhole, fisheye and ports, views that cut the membrane (one in ten). The same
-for the same numbers. What is there is kept.
+open, 40 to 300 dots and (one in ten) speckle, pinhole, fisheye and ports, views that cut the membrane (one in ten). No
+body goes through the rim, which something rigid holds. The same for the same numbers. What is there is kept.
 """
 
 import argparse
@@ -42,6 +42,7 @@ DEPTH = (0.02, 0.3)  # of presses, over the surface's size
 LIGHT_DEPTH = (0.06, 0.15)  # at the end of a stroke that begins lightly
 RADIUS = (0.08, 0.35)  # of bodies
 OFF_RIM = 0.1
+BODIES_TRIED = 30  # at a depth
 INCREMENT = 0.03  # of the size, of a stroke
 PATIENCE = 30  # s, for one equilibrium; a stroke that takes longer is drawn again
 DOTS = (40, 300)
@@ -134,19 +135,27 @@ def random_body(size: float, rng: np.random.Generator) -> Indenter:
 
 
 def random_stroke(simulator: Simulator, depths: tuple[float, float], rng: np.random.Generator) -> Stroke:
-    """A stroke towards a point off the rim that the camera sees, up to 20 degrees off the normal there."""
+    """A stroke towards a point off the rim that the camera sees, up to 20 degrees off the normal there.
+
+    Raises:
+        MembraneError: every body drawn goes through the rim at that depth, which what holds the membrane keeps it from.
+    """
     membrane, size = simulator.membrane, simulator.membrane.size
     X, normals, fixed = (a.numpy() for a in (membrane.rest, membrane.rest_normals, membrane.fixed))
     off_rim = np.linalg.norm(X[:, None] - X[fixed], axis=-1).min(1) > OFF_RIM * size
     seen = simulator.sensor.camera.point_to_pixel(membrane.rest).numpy()
     in_view = ((seen > 10) & (seen < np.array(IMAGE) - 10)).all(1)
     weight = np.where(off_rim & in_view, membrane.rest_area.numpy(), 0.0)
-    target = rng.choice(len(X), p=weight / weight.sum())
-    across = np.cross(normals[target], rng.normal(size=3))
-    travel = -normals[target] + np.tan(np.deg2rad(20 * rng.random())) * across / np.linalg.norm(across)
     depth, friction = size * np.exp(rng.uniform(*np.log(depths))), float(rng.choice([0.0, 0.0, 0.3, 0.6]))
-    body, turn = random_body(size, rng), rng.uniform(0, 2 * np.pi)
-    return stroke_to(simulator, body, X[target], travel, depth, turn=turn, friction=friction)
+    for _ in range(BODIES_TRIED):
+        target = rng.choice(len(X), p=weight / weight.sum())
+        across = np.cross(normals[target], rng.normal(size=3))
+        travel = -normals[target] + np.tan(np.deg2rad(20 * rng.random())) * across / np.linalg.norm(across)
+        body, turn = random_body(size, rng), rng.uniform(0, 2 * np.pi)
+        stroke = stroke_to(simulator, body, X[target], travel, depth, turn=turn, friction=friction)
+        if stroke.indenter.moved(depth * stroke.travel).distance(membrane.rest[membrane.fixed]).min() > 0:
+            return stroke
+    raise MembraneError(f"none of {BODIES_TRIED} bodies stays clear of the rim at {depth / size:.3g} of the size")
 
 
 def press(simulator: Simulator, rng: np.random.Generator, depths: tuple[float, float] = DEPTH) -> SimulatedFrame:
@@ -164,7 +173,7 @@ def stroke_frames(
     simulator: Simulator, rng: np.random.Generator, depths: tuple[float, float], shares: list[float]
 ) -> list[SimulatedFrame]:
     """Frames at these shares of a stroke's depth."""
-    for _ in range(6):
+    for _ in range(12):
         try:
             stroke = random_stroke(simulator, depths, rng)
             poses = [stroke.indenter, *(stroke.indenter.moved(stroke.depth * share * stroke.travel) for share in shares)]

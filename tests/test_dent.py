@@ -89,10 +89,13 @@ def bubble():
     return sensor, simulator.frame(state, stroke, np.random.default_rng(0)).truth
 
 
-def errors(reconstructor: tm.Reconstructor, truth: dict) -> tuple[float, float]:
-    """Of the markers over their displacement, and of the force, relative."""
+def solved(reconstructor: tm.Reconstructor, truth: dict, previous: tm.Reconstruction | None = None) -> tm.Reconstruction:
     with torch.no_grad():
-        found = reconstructor.from_pixels(torch.as_tensor(truth["uv_deformed"]).float())
+        return reconstructor.from_pixels(torch.as_tensor(truth["uv_deformed"]).float(), previous=previous)
+
+
+def errors(found: tm.Reconstruction, truth: dict) -> tuple[float, float]:
+    """Of the markers over their displacement, and of the force, relative."""
     rest, pressed = truth["dots_nominal"], truth["dots_deformed"]
     off = np.linalg.norm(found.markers[0].numpy() - pressed) / np.linalg.norm(pressed - rest)
     return float(off), float(np.linalg.norm(found.force[0].numpy() - truth["force"]) / np.linalg.norm(truth["force"]))
@@ -101,8 +104,35 @@ def errors(reconstructor: tm.Reconstructor, truth: dict) -> tuple[float, float]:
 def test_a_pit_in_a_slack_bubble_is_not_taken_for_a_mound(bubble):
     sensor, truth = bubble
     reconstructor = tm.Reconstructor(sensor, check_rest=False)
-    surface, force = errors(reconstructor, truth)
+    surface, force = errors(solved(reconstructor, truth), truth)
     assert surface < 0.15 and force < 0.1
     reconstructor.estimator.dent = None
-    without, _ = errors(reconstructor, truth)
+    without, _ = errors(solved(reconstructor, truth), truth)
     assert without > 0.3
+
+
+def test_a_tracked_frame_leaves_the_mound_of_the_frame_before(bubble):
+    """As from rest, within a fiftieth of the press; without another dent it stays there."""
+    sensor, truth = bubble
+    reconstructor = tm.Reconstructor(sensor, check_rest=False)
+    cold = solved(reconstructor, truth)
+    dent, reconstructor.estimator.dent = reconstructor.estimator.dent, None
+    mound = solved(reconstructor, truth)
+    stays, _ = errors(solved(reconstructor, truth, mound), truth)
+    reconstructor.estimator.dent = dent
+    tracked = solved(reconstructor, truth, mound)
+    assert stays > 0.3
+    assert (tracked.displacement - cold.displacement).norm() < 0.02 * cold.displacement.norm()
+
+
+def test_a_dent_is_kept_only_where_its_objective_is_clearly_lower(estimator):
+    """Row by row; a step that broke down is never taken."""
+    blown = estimator.membrane.rest_normals * estimator.equations.forces.free
+    x = torch.stack([estimator.membrane.rest + depth * blown for depth in (0.0, 0.1, 0.2, 0.1)])
+    pressure, moved = torch.full((4,), float(estimator.rest_pressure)), torch.zeros(4, 4)
+    rays = torch.nn.functional.normalize(estimator.equations.bearings.positions, dim=-1)[None].repeat(4, 1, 1)
+    measured = estimator.equations.bearings.measured(Observation(torch.zeros_like(rays), rays, torch.ones_like(rays[..., 0])))
+    other = x[[1, 0, 0, 0]].clone()
+    other[3] = torch.nan
+    taken, *_ = estimator.dent.lower((x, pressure, moved, x), (other, pressure, moved, other), measured)
+    torch.testing.assert_close(taken, torch.stack([x[0], other[1], other[2], x[3]]))

@@ -17,7 +17,12 @@ DEPTH = 0.08  # over the surface's size
 WIDTH = 0.06  # standard deviation, over the size
 REACH = 0.25  # of the surroundings whose pushes have one middle, over the size
 FAINT = 1.0  # of the push that the markers' noise makes: less hardly dents
+CLEARLY_LOWER = 0.8  # objective, over another's
 TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle of none finite
+
+Schedule = list[tuple[float, float]]
+Stepped = tuple[Tensor, Tensor, Tensor, Tensor]
+"""A `State`, and the surface a step before."""
 
 
 class Dent(nn.Module):
@@ -51,3 +56,21 @@ class Dent(nn.Module):
         share = (push2.amax(-1) / (push2.amax(-1) + faint2))[:, None]
         depth = DEPTH * membrane.size * share * torch.exp(-off2 / (2 * WIDTH**2)) * self.free
         return State(x - depth[..., None] * membrane.normals(x), pressure, moved)
+
+    def again(self, state: State, before: Tensor, measured: Bearings, schedule: Schedule) -> tuple[State, Tensor]:
+        """The state and the surface a step before it, or those after the steps of a schedule from its dent where these have
+        clearly the lower objective: a state that was taken over may be in a mound."""
+        dented, last = self.descent(self(*state, measured), measured, schedule)
+        x, pressure, moved, before = self.lower((*state, before), (*dented, last), measured)
+        return State(x, pressure, moved), before
+
+    @piece
+    def lower(self, kept: Stepped, dented: Stepped, measured: Bearings) -> Stepped:
+        """`dented` in the rows where its objective is clearly lower than that of `kept`."""
+        objective, other = (
+            self.descent.objective(State(*each[:3]), *self.descent.tractions(*each[:2]), measured) for each in (kept, dented)
+        )
+        is_lower = other < CLEARLY_LOWER * objective
+        rows = [is_lower.reshape(-1, *(1,) * (value.ndim - 1)) for value in kept]
+        x, pressure, moved, before = (torch.where(*each) for each in zip(rows, dented, kept, strict=True))
+        return x, pressure, moved, before

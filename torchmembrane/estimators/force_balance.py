@@ -17,7 +17,7 @@ neighbourhood of radius `reach` (contacts are patches), and the weights of the s
 Iteratively reweighted least squares (IRLS) by Gauss-Newton steps, while `tau` declines from where everything is quadratic
 (graduated non-convexity, GNC): no start but the rest surface is needed. A fine grid starts from the solution on every second of
 its lines, and so on: few vertices find the basin, and a `Dent` where something pushes. From the previous frame's solution
-one factor serves all steps, by two conjugate-gradient steps each.
+one factor serves all steps, by two conjugate-gradient steps each; a dent is tried again, and kept if its objective is lower.
 """
 
 from typing import Any, ClassVar
@@ -225,6 +225,8 @@ class ForceBalance(nn.Module):
             state, _ = self.descent(state, measured, schedule[:1])
             state, schedule = self.dent(*state, measured), schedule[-1:] * len(schedule)
         state, before = self.descent(state, measured, schedule, one_factor=warm)
+        if self.dent is not None and warm:
+            state, before = self.dent.again(state, before, measured, schedule[-1:] * (len(schedule) - 1))
         return self.equilibrium(state.x, state.pressure, state.moved, before, measured)
 
     def schedule(self, warm: bool = False, patient: bool = False) -> list[tuple[float, float]]:
