@@ -73,9 +73,8 @@ def test_no_push_no_dent(estimator):
     assert dented(estimator, [vertex_near(0, 0)], push=0.0).abs().max() < 1e-9
 
 
-@pytest.fixture(scope="module")
-def bubble():
-    """A bubble of little prestretch, a ball of a seventh of its size pressed in by 0.08 of it, on another grid."""
+def pressed_bubble(depth: float) -> tuple[tm.Sensor, dict]:
+    """A bubble of little prestretch, a ball of a seventh of its size pressed in so far over it, on another grid."""
     sensor = tm.preset("bubble")
     sensor = replace(
         sensor,
@@ -84,9 +83,14 @@ def bubble():
     )
     simulator, size = Simulator(sensor, (38, 38)), sensor.membrane.size
     aim = sensor.membrane.rest[sensor.membrane.fixed].mean(0).numpy()
-    stroke = stroke_to(simulator, Sphere(size / 7), aim, np.array([0.0, 0.0, -1.0]), 0.08 * size)
+    stroke = stroke_to(simulator, Sphere(size / 7), aim, np.array([0.0, 0.0, -1.0]), depth * size)
     (state,) = simulator.presses(stroke, ("push",))
     return sensor, simulator.frame(state, stroke, np.random.default_rng(0)).truth
+
+
+@pytest.fixture(scope="module")
+def bubble():
+    return pressed_bubble(0.08)
 
 
 def solved(reconstructor: tm.Reconstructor, truth: dict, previous: tm.Reconstruction | None = None) -> tm.Reconstruction:
@@ -125,6 +129,19 @@ def test_a_tracked_frame_leaves_the_mound_of_the_frame_before(bubble):
     assert (tracked.displacement - cold.displacement).norm() < 0.02 * cold.displacement.norm()
 
 
+def test_a_deep_press_is_found_from_a_deep_dent():
+    """A quarter of the size deep; from shallow dents alone the second try ends in a mound as the first does."""
+    sensor, truth = pressed_bubble(0.27)
+    reconstructor = tm.Reconstructor(sensor, check_rest=False)
+    found = solved(reconstructor, truth)
+    surface, force = errors(found, truth)
+    assert found.status[0] == 0 and surface < 0.1 and force < 0.1
+    dent = reconstructor.estimator.dent
+    dent.deep = dent.wide = dent.forward
+    without, _ = errors(solved(reconstructor, truth), truth)
+    assert without > 0.5
+
+
 def test_a_dent_is_kept_only_where_its_objective_is_clearly_lower(estimator):
     """Row by row; a step that broke down is never taken."""
     blown = estimator.membrane.rest_normals * estimator.equations.forces.free
@@ -134,5 +151,5 @@ def test_a_dent_is_kept_only_where_its_objective_is_clearly_lower(estimator):
     measured = estimator.equations.bearings.measured(Observation(torch.zeros_like(rays), rays, torch.ones_like(rays[..., 0])))
     other = x[[1, 0, 0, 0]].clone()
     other[3] = torch.nan
-    taken, *_ = estimator.dent.lower((x, pressure, moved, x), (other, pressure, moved, other), measured)
+    taken, *_ = estimator.dent.clearly_lower((x, pressure, moved, x), (other, pressure, moved, other), measured)
     torch.testing.assert_close(taken, torch.stack([x[0], other[1], other[2], x[3]]))

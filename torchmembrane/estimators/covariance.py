@@ -20,6 +20,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..mechanics.cavity import CavityLaw
+from ..surface.stencil import pad_border
+from ..surface.tangent import tangent_frame
 from .base import Observation
 from .bearings import Bearings
 from .camera_motion import CameraMotion
@@ -27,6 +29,7 @@ from .contact_force import Linearised
 from .descent import State
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import pulled
+from .settings import ForceBalanceSettings
 
 
 class StandardDeviations(NamedTuple):
@@ -164,6 +167,24 @@ def spread(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, T
     dx, dp = changes(solution, noise_loads)
     dF = dx @ solution.force.mT - dp[..., None] * solution.of_pressure[:, None]
     return _root_sum_square(dx), _root_sum_square(dF), _root_sum_square(dp)
+
+
+def standard_deviations(
+    equations: BalanceEquations,
+    cavity: CavityLaw,
+    settings: ForceBalanceSettings,
+    state: State,
+    observation: Observation,
+    marker_noise: float | Tensor,
+) -> StandardDeviations:
+    """At a solution; `marker_noise` as of `ForceBalance.standard_deviations`."""
+    measured = equations.bearings.measured(observation)
+    noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * tangent_frame(observation.directions)
+    scales = settings.tau[1], settings.outlier
+    _, normal, solution = linearise(equations, cavity, state, measured, scales, settings.camera_motion, curvature=True)
+    turned = torch.einsum("bdrj,bajd->bdra", noise, measured.across)
+    dx, dF, dp = spread(solution, noise_loads(equations, normal, measured, solution.motion, turned))
+    return StandardDeviations(pad_border(dx.unflatten(-1, (3, -1)).mT, equations.forces.membrane.grid), dF, dp)
 
 
 def _root_sum_square(changes: Tensor) -> Tensor:

@@ -15,12 +15,14 @@ from .descent import Descent, State
 
 DEPTH = 0.08  # over the surface's size
 WIDTH = 0.06  # standard deviation, over the size
+DEEP, WIDE = (0.16, 0.08), (0.25, 0.15)  # depth and width of those for a press that the first does not find
 REACH = 0.25  # of the surroundings whose pushes have one middle, over the size
 FAINT = 1.0  # of the push that the markers' noise makes: less hardly dents
 CLEARLY_LOWER = 0.8  # objective, over another's
 TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle of none finite
 
 Schedule = list[tuple[float, float]]
+Found = tuple[State, Tensor]
 Stepped = tuple[Tensor, Tensor, Tensor, Tensor]
 """A `State`, and the surface a step before."""
 
@@ -47,6 +49,19 @@ class Dent(nn.Module):
     @piece
     def forward(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
         """The state, its surface dented where the middle of the pushes around, weighted by their squares, is near."""
+        return self._dented(x, pressure, moved, measured, DEPTH, WIDTH)
+
+    @piece
+    def deep(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
+        """The state, dented deeper."""
+        return self._dented(x, pressure, moved, measured, *DEEP)
+
+    @piece
+    def wide(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
+        """The state, dented deeper and wider."""
+        return self._dented(x, pressure, moved, measured, *WIDE)
+
+    def _dented(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings, depth: float, width: float) -> State:
         membrane, loss = self.membrane, self.descent.equations.loss
         push2 = loss.parts(*self.descent.tractions(x, pressure))[2]
         weight = (pad_border(push2[..., None], membrane.grid)[..., 0] + TINY) * self.area
@@ -54,23 +69,40 @@ class Dent(nn.Module):
         off2 = (middle.mT - membrane.rest).square().sum(-1) / membrane.size**2
         faint2 = (FAINT * measured.noise_level[:, None] * loss.push_noise).square().mean(-1) + TINY
         share = (push2.amax(-1) / (push2.amax(-1) + faint2))[:, None]
-        depth = DEPTH * membrane.size * share * torch.exp(-off2 / (2 * WIDTH**2)) * self.free
-        return State(x - depth[..., None] * membrane.normals(x), pressure, moved)
+        inwards = depth * membrane.size * share * torch.exp(-off2 / (2 * width**2)) * self.free
+        return State(x - inwards[..., None] * membrane.normals(x), pressure, moved)
 
-    def again(self, state: State, before: Tensor, measured: Bearings, schedule: Schedule) -> tuple[State, Tensor]:
+    def again(self, state: State, before: Tensor, measured: Bearings, schedule: Schedule) -> Found:
         """The state and the surface a step before it, or those after the steps of a schedule from its dent where these have
         clearly the lower objective: a state that was taken over may be in a mound."""
         dented, last = self.descent(self(*state, measured), measured, schedule)
-        x, pressure, moved, before = self.lower((*state, before), (*dented, last), measured)
-        return State(x, pressure, moved), before
+        *kept, before = self.clearly_lower((*state, before), (*dented, last), measured)
+        return State(*kept), before
+
+    def sought(self, quick: State, slow: State, measured: Bearings, schedule: Schedule) -> Found:
+        """The best of what the steps of a schedule make of several dents in two states, and the surface a step before."""
+        starts = self(*slow, measured), self.deep(*slow, measured), self.wide(*slow, measured), self.deep(*quick, measured)
+        found: list[Found] = [self.descent(start, measured, schedule) for start in starts]
+        best: Stepped = (*found[0][0], found[0][1])
+        for state, before in found[1:]:
+            best = self.lower(best, (*state, before), measured)
+        return State(*best[:3]), best[3]
+
+    @piece
+    def clearly_lower(self, kept: Stepped, dented: Stepped, measured: Bearings) -> Stepped:
+        """`dented` in the rows where its objective is clearly lower than that of `kept`, or `kept` has none."""
+        return self._lower(kept, dented, measured, CLEARLY_LOWER)
 
     @piece
     def lower(self, kept: Stepped, dented: Stepped, measured: Bearings) -> Stepped:
-        """`dented` in the rows where its objective is clearly lower than that of `kept`."""
+        """`dented` in the rows where its objective is lower than that of `kept`, or `kept` has none."""
+        return self._lower(kept, dented, measured, 1.0)
+
+    def _lower(self, kept: Stepped, dented: Stepped, measured: Bearings, share: float) -> Stepped:
         objective, other = (
             self.descent.objective(State(*each[:3]), *self.descent.tractions(*each[:2]), measured) for each in (kept, dented)
         )
-        is_lower = other < CLEARLY_LOWER * objective
+        is_lower = other < torch.where(objective.isnan(), torch.inf, share * objective)
         rows = [is_lower.reshape(-1, *(1,) * (value.ndim - 1)) for value in kept]
         x, pressure, moved, before = (torch.where(*each) for each in zip(rows, dented, kept, strict=True))
         return x, pressure, moved, before

@@ -27,24 +27,22 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..camera.model import Camera
-from ..errors import MembraneError
 from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..pieces import mended, piece
 from ..surface.membrane import Membrane
 from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner, pad_border
-from ..surface.tangent import tangent_frame
 from .base import Contacts, Deviations, Equilibrium, Observation, Problem
 from .bearings import Bearings, MarkerBearings, marker_rays, seen_from_origin
 from .contact_force import ContactForce
 from .contact_patches import ContactPatches
-from .covariance import StandardDeviations, linearise, noise_loads, push_noise, spread
+from .covariance import StandardDeviations, push_noise, standard_deviations
 from .dent import Dent
 from .descent import Descent, State
 from .deviations import depths, of_presses, spreads
 from .normal_equations import BalanceEquations
-from .pressure_gauge import gauge_reading
+from .pressure_gauge import gauge_reading, refuse_open
 from .settings import ForceBalanceSettings
 from .traction_loss import TractionLoss
 
@@ -112,7 +110,7 @@ class ForceBalance(nn.Module):
         self.patches = ContactPatches(membrane, self.spacing)
         first = settings.coarse_steps if is_coarse else settings.steps
         self.steps = first if self.coarse is None else settings.finer_steps if self.dent is None else settings.fine_steps
-        self.passes_on_starts = self.coarse is not None and min(self.coarse.membrane.grid) >= settings.coarsest_warm
+        self.passes_on_starts = self.coarse is not None and self.dent is None
         rest = seen_from_origin(bearings.positions) if rest is None else rest
         loss.push_noise = push_noise(self.equations, self.cavity, rest, settings.camera_motion)
 
@@ -172,11 +170,7 @@ class ForceBalance(nn.Module):
 
     def check_gauge(self) -> None:
         """Refuse a gauge where it tells nothing."""
-        if self.cavity.filling == "open":
-            raise MembraneError(
-                "pressure: the cavity is open, its pressure is known to stay at rest: a gauge tells nothing; leave it out, or "
-                "describe the cavity as a liquid or a gas"
-            )
+        refuse_open(self.cavity.filling)
 
     def gauged(self, observation: Observation, pressure: Tensor | float) -> Observation:
         """The observation with the pressure `[B]` or `[]` that a gauge reads, NaN where there is no reading.
@@ -216,18 +210,33 @@ class ForceBalance(nn.Module):
 
     def _solved(self, measured: Bearings, start: State | None, patient: bool = False) -> Equilibrium:
         warm = start is not None and not self.passes_on_starts
-        if self.coarse is not None and not warm:
-            coarse = self.coarse._solved(measured, None if start is None else self.coarsened(*start), patient)
-            start = self.refined(coarse.vertices, coarse.pressure, coarse.moved)
-        state = self.at_rest(measured.weight) if start is None else start
         schedule = self.schedule(warm, patient)
-        if self.dent is not None and not warm:
-            state, _ = self.descent(state, measured, schedule[:1])
-            state, schedule = self.dent(*state, measured), schedule[-1:] * len(schedule)
-        state, before = self.descent(state, measured, schedule, one_factor=warm)
-        if self.dent is not None and warm:
-            state, before = self.dent.again(state, before, measured, schedule[-1:] * (len(schedule) - 1))
+        last = schedule[-1:] * len(schedule)
+        if start is not None and warm:
+            state, before = self.descent(start, measured, schedule, one_factor=True)
+            if self.dent is not None:
+                state, before = self.dent.again(state, before, measured, last[1:])
+        elif self.dent is None:
+            state, before = self.descent(self._begun(measured, start, patient), measured, schedule)
+        elif patient:
+            quick, slow = (self._undented(measured, patient) for patient in (False, True))
+            state, before = self.dent.sought(quick, slow, measured, last)
+        else:
+            state, before = self.descent(self.dent(*self._undented(measured), measured), measured, last)
         return self.equilibrium(state.x, state.pressure, state.moved, before, measured)
+
+    def _begun(self, measured: Bearings, start: State | None, patient: bool) -> State:
+        """At what is found on the coarser grid, without one at rest."""
+        if self.coarse is None:
+            return self.at_rest(measured.weight)
+        coarse = self.coarse._solved(measured, None if start is None else self.coarsened(*start), patient)
+        return self.refined(coarse.vertices, coarse.pressure, coarse.moved)
+
+    def _undented(self, measured: Bearings, patient: bool = False) -> State:
+        """The state after a first step, whose pushes say where to dent it."""
+        begun, schedule = self._begun(measured, None, patient), self.schedule(patient=patient)
+        state: State = self.descent(begun, measured, schedule[:1])[0]
+        return state
 
     def schedule(self, warm: bool = False, patient: bool = False) -> list[tuple[float, float]]:
         """`tau` and `R` of every step on this grid; `warm`: with a start; `patient`: a second time, from rest."""
@@ -336,12 +345,5 @@ class ForceBalance(nn.Module):
             Noise must not change which vertices are pushed, as it does in the shallowest presses and where two answers
             compete; the grid's and the material's errors are not in it.
         """
-        equations, plain = self.equations, tangent_frame(observation.directions)
-        measured = equations.bearings.measured(observation)
-        noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * plain
-        scales = self.settings.tau[1], self.settings.outlier
-        state, play = State(x, pressure, moved), self.settings.camera_motion
-        _, normal, solution = linearise(equations, self.cavity, state, measured, scales, play, curvature=True)
-        turned = torch.einsum("bdrj,bajd->bdra", noise, measured.across)
-        dx, dF, dp = spread(solution, noise_loads(equations, normal, measured, solution.motion, turned))
-        return StandardDeviations(pad_border(dx.unflatten(-1, (3, -1)).mT, self.membrane.grid), dF, dp)
+        state = State(x, pressure, moved)
+        return standard_deviations(self.equations, self.cavity, self.settings, state, observation, marker_noise)

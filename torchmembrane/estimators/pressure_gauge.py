@@ -12,6 +12,15 @@ from ..errors import MembraneError
 from ..pieces import at_hand
 
 
+def refuse_open(filling: str) -> None:
+    """Refuse a gauge of a cavity where it tells nothing."""
+    if filling == "open":
+        raise MembraneError(
+            "pressure: the cavity is open, its pressure is known to stay at rest: a gauge tells nothing; leave it out, or "
+            "describe the cavity as a liquid or a gas"
+        )
+
+
 def gauge_reading(pressure: Tensor | float, rest_pressure: Tensor, deviation: float, confidence: Tensor) -> Tensor:
     """Change of the pressure since rest as measured, and its weight `1 / sigma^2`, both zero where there is no reading,
     `[B, 2]`.
