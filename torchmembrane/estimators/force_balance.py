@@ -110,7 +110,8 @@ class ForceBalance(nn.Module):
         self.patches = ContactPatches(membrane, self.spacing)
         first = settings.coarse_steps if is_coarse else settings.steps
         self.steps = first if self.coarse is None else settings.finer_steps if self.dent is None else settings.fine_steps
-        self.passes_on_starts = self.coarse is not None and self.dent is None
+        passes = self.coarse is not None and (self.dent is None or min(self.coarse.membrane.grid) >= settings.coarsest_warm)
+        self.passes_on_starts = passes
         rest = seen_from_origin(bearings.positions) if rest is None else rest
         loss.push_noise = push_noise(self.equations, self.cavity, rest, settings.camera_motion)
 
@@ -219,10 +220,10 @@ class ForceBalance(nn.Module):
         elif self.dent is None:
             state, before = self.descent(self._begun(measured, start, patient), measured, schedule)
         elif patient:
-            quick, slow = (self._undented(measured, patient) for patient in (False, True))
+            quick, slow = (self._undented(measured, start, patient) for patient in (False, True))
             state, before = self.dent.sought(quick, slow, measured, last)
         else:
-            state, before = self.descent(self.dent(*self._undented(measured), measured), measured, last)
+            state, before = self.descent(self.dent(*self._undented(measured, start), measured), measured, last)
         return self.equilibrium(state.x, state.pressure, state.moved, before, measured)
 
     def _begun(self, measured: Bearings, start: State | None, patient: bool) -> State:
@@ -232,9 +233,9 @@ class ForceBalance(nn.Module):
         coarse = self.coarse._solved(measured, None if start is None else self.coarsened(*start), patient)
         return self.refined(coarse.vertices, coarse.pressure, coarse.moved)
 
-    def _undented(self, measured: Bearings, patient: bool = False) -> State:
+    def _undented(self, measured: Bearings, start: State | None, patient: bool = False) -> State:
         """The state after a first step, whose pushes say where to dent it."""
-        begun, schedule = self._begun(measured, None, patient), self.schedule(patient=patient)
+        begun, schedule = self._begun(measured, start, patient), self.schedule(patient=patient)
         state: State = self.descent(begun, measured, schedule[:1])[0]
         return state
 

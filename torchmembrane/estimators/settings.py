@@ -50,6 +50,7 @@ class ForceBalanceSettings:
         largest_stretch: by how much of its length an edge of the grid changes in a step at most.
         damping: share of a step's matrix' diagonal that is added to it as tau ends; it falls with tau's square.
         coarsest: fewest lines of a coarser grid.
+        coarsest_warm: fewest lines of a coarser grid that is given the solution of the frame before, but of that of the dents.
         largest_relative_step: rms of the last step of a converged solution.
         largest_volume_error: volume error of a converged solution, over the rest volume.
         largest_misfit: rms of the markers' angles off their rays where a surface of this sensor explains them, over their
@@ -96,6 +97,7 @@ class ForceBalanceSettings:
     largest_stretch: float = 0.3
     damping: float = 3e-7
     coarsest: int = 6
+    coarsest_warm: int = 13
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3
     largest_misfit: float = 1.3
