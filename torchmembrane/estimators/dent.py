@@ -18,7 +18,7 @@ WIDTH = 0.06  # standard deviation, over the size
 DEEP, WIDE = (0.16, 0.08), (0.25, 0.15)  # depth and width of those for a press that the first does not find
 REACH = 0.25  # of the surroundings whose pushes have one middle, over the size
 FAINT = 1.0  # of the push that the markers' noise makes: less hardly dents
-CLEARLY_LOWER = 0.8  # objective, over another's
+CLEARLY_LOWER = 0.9  # objective, over another's
 TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle of none finite
 
 Schedule = list[tuple[float, float]]
@@ -76,11 +76,12 @@ class Dent(nn.Module):
         """The state and the surface a step before it, or those after the steps of a schedule from its dent where these have
         clearly the lower objective: a state that was taken over may be in a mound."""
         dented, last = self.descent(self(*state, measured), measured, schedule)
-        *kept, before = self.clearly_lower((*state, before), (*dented, last), measured)
+        *kept, before = self.lower((*state, before), (*dented, last), measured)
         return State(*kept), before
 
     def sought(self, quick: State, slow: State, measured: Bearings, schedule: Schedule) -> Found:
-        """The best of what the steps of a schedule make of several dents in two states, and the surface a step before."""
+        """The best of what the steps of a schedule make of several dents in two states, and the surface a step before; the
+        first of those that are about as good, for answers must not jump between them."""
         starts = self(*slow, measured), self.deep(*slow, measured), self.wide(*slow, measured), self.deep(*quick, measured)
         found: list[Found] = [self.descent(start, measured, schedule) for start in starts]
         best: Stepped = (*found[0][0], found[0][1])
@@ -89,20 +90,12 @@ class Dent(nn.Module):
         return State(*best[:3]), best[3]
 
     @piece
-    def clearly_lower(self, kept: Stepped, dented: Stepped, measured: Bearings) -> Stepped:
-        """`dented` in the rows where its objective is clearly lower than that of `kept`, or `kept` has none."""
-        return self._lower(kept, dented, measured, CLEARLY_LOWER)
-
-    @piece
     def lower(self, kept: Stepped, dented: Stepped, measured: Bearings) -> Stepped:
-        """`dented` in the rows where its objective is lower than that of `kept`, or `kept` has none."""
-        return self._lower(kept, dented, measured, 1.0)
-
-    def _lower(self, kept: Stepped, dented: Stepped, measured: Bearings, share: float) -> Stepped:
+        """`dented` in the rows where its objective is clearly lower than that of `kept`, or `kept` has none."""
         objective, other = (
             self.descent.objective(State(*each[:3]), *self.descent.tractions(*each[:2]), measured) for each in (kept, dented)
         )
-        is_lower = other < torch.where(objective.isnan(), torch.inf, share * objective)
+        is_lower = other < torch.where(objective.isnan(), torch.inf, CLEARLY_LOWER * objective)
         rows = [is_lower.reshape(-1, *(1,) * (value.ndim - 1)) for value in kept]
         x, pressure, moved, before = (torch.where(*each) for each in zip(rows, dented, kept, strict=True))
         return x, pressure, moved, before
