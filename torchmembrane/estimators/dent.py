@@ -18,7 +18,8 @@ WIDTH = 0.06  # standard deviation, over the size
 DEEP, WIDE = (0.16, 0.08), (0.25, 0.15)  # depth and width of those for a press that the first does not find
 REACH = 0.25  # of the surroundings whose pushes have one middle, over the size
 FAINT = 1.0  # of the push that the markers' noise makes: less hardly dents
-CLEARLY_LOWER = 0.9  # objective, over another's
+LOWER = 0.9  # objective over another's of which it is taken
+MUCH_LOWER = 0.8  # the same of a tracked frame's, which ought not to jump
 TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle of none finite
 
 Schedule = list[tuple[float, float]]
@@ -74,9 +75,9 @@ class Dent(nn.Module):
 
     def again(self, state: State, before: Tensor, measured: Bearings, schedule: Schedule) -> Found:
         """The state and the surface a step before it, or those after the steps of a schedule from its dent where these have
-        clearly the lower objective: a state that was taken over may be in a mound."""
+        a much lower objective: a state that was taken over may be in a mound."""
         dented, last = self.descent(self(*state, measured), measured, schedule)
-        *kept, before = self.lower((*state, before), (*dented, last), measured)
+        *kept, before = self.much_lower((*state, before), (*dented, last), measured)
         return State(*kept), before
 
     def sought(self, quick: State, slow: State, measured: Bearings, schedule: Schedule) -> Found:
@@ -91,11 +92,19 @@ class Dent(nn.Module):
 
     @piece
     def lower(self, kept: Stepped, dented: Stepped, measured: Bearings) -> Stepped:
-        """`dented` in the rows where its objective is clearly lower than that of `kept`, or `kept` has none."""
+        """`dented` in the rows where its objective is lower than that of `kept`, or `kept` has none."""
+        return self._taken(kept, dented, measured, LOWER)
+
+    @piece
+    def much_lower(self, kept: Stepped, dented: Stepped, measured: Bearings) -> Stepped:
+        """The same where it is much lower."""
+        return self._taken(kept, dented, measured, MUCH_LOWER)
+
+    def _taken(self, kept: Stepped, dented: Stepped, measured: Bearings, share: float) -> Stepped:
         objective, other = (
             self.descent.objective(State(*each[:3]), *self.descent.tractions(*each[:2]), measured) for each in (kept, dented)
         )
-        is_lower = other < torch.where(objective.isnan(), torch.inf, CLEARLY_LOWER * objective)
+        is_lower = other < torch.where(objective.isnan(), torch.inf, share * objective)
         rows = [is_lower.reshape(-1, *(1,) * (value.ndim - 1)) for value in kept]
         x, pressure, moved, before = (torch.where(*each) for each in zip(rows, dented, kept, strict=True))
         return x, pressure, moved, before
