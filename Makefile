@@ -70,10 +70,11 @@ $(VENV)/.docs: $(READY)
 
 web: $(PAGE)
 
-test-web: $(PAGE)
-	$(BIN)/python $(WEB)/test/reference.py out/web/sensor.toml out/web/model.onnx $(IMAGES) --out out/web/test
+test-web: $(PAGE) out/web/tracking.onnx
+	PYTHONPATH=export $(BIN)/python $(WEB)/test/reference.py out/web/sensor.toml out/web/model.onnx $(IMAGES) \
+		--tracking out/web/tracking.onnx --out out/web/test
 	CHROMIUM=$$($(WEB)/chromium.sh) && export CHROMIUM && \
-		PYTHON=$(BIN)/python REFERENCE=out/web/test node --test --test-reporter=spec $(WEB)/test/page.test.js
+		PYTHON=$(BIN)/python REFERENCE=out/web/test TRACKING=out/web/tracking.onnx node --test --test-reporter=spec $(WEB)/test/page.test.js
 
 test-cpp: $(CPP)/frame out/web/model.onnx
 	$(BIN)/python export/cpp/test.py $(CPP)/frame out/web/model.onnx $(IMAGES)
@@ -99,6 +100,9 @@ $(PAGE): out/web/model.onnx $(IMAGES) $(PACKAGES) $(WEB)/build.js $(wildcard $(W
 
 out/web/model.onnx: out/web/sensor.toml $(wildcard torchmembrane/*.py torchmembrane/*/*.py)
 	$(BIN)/torchmembrane export $< --out $@
+
+out/web/tracking.onnx: out/web/sensor.toml $(wildcard torchmembrane/*.py torchmembrane/*/*.py)
+	$(BIN)/torchmembrane export $< --tracking --out $@
 
 out/web/sensor.toml: $(SENSOR) | $(READY)
 	mkdir -p out/web

@@ -58,7 +58,7 @@ def errors(sensor: tm.Sensor, model: str | None, pixels: torch.Tensor, counts: l
     for dtype in (torch.float64, torch.float32):
         for steps in counts:
             estimator = with_steps(sensor, model, steps, dtype).estimator
-            got = estimator(Observation(*(part.to(dtype) for part in observation)))
+            got = estimator(Observation(*(None if part is None else part.to(dtype) for part in observation)))
             error = rms(got.vertices.double() - exact) / displacement
             found[str(dtype)[6:], steps] = torch.stack([error, got.relative_step.double()])
     return found

@@ -18,11 +18,11 @@ SETTINGS = ForceBalanceSettings()
 DOME = spherical_cap(12, 9, 3, (17, 17))
 
 
-def estimator(**changes) -> ForceBalance:
+def estimator(dome: Membrane = DOME, **changes) -> ForceBalance:
     positions = spherical_cap(12, 9, 3, (13, 13)).rest[~spherical_cap(12, 9, 3, (13, 13)).fixed]
-    material = ElasticEnergy(DOME, "neo_hookean", 1.3)
-    markers = DOME.closest_points(positions.numpy())
-    return ForceBalance(DOME, material, markers, positions, noise=1e-3, settings=replace(SETTINGS, **changes))
+    material = ElasticEnergy(dome, "neo_hookean", 1.3)
+    markers = dome.closest_points(positions.numpy())
+    return ForceBalance(dome, material, markers, positions, noise=1e-3, settings=replace(SETTINGS, **changes))
 
 
 def seen(positions: torch.Tensor) -> Observation:
@@ -58,12 +58,9 @@ def test_a_step_changes_no_edge_by_more_than_its_share(dented, tau):
 
 
 def test_frames_that_settle_keep_their_first_solution_others_are_solved_patiently_from_rest(dented):
-    kept, again = (
-        estimator(
-            settled_step=1e9, largest_misfit=1e9, largest_relative_step=1e9, largest_volume_error=1e9, largest_outlying=1.0
-        ),
-        estimator(settled_step=0.0),
-    )
+    anything = dict(settled_step=1e9, largest_misfit=1e9, largest_relative_step=1e9, largest_volume_error=1e9)
+    anything |= dict(largest_outlying=1.0, largest_objective=1e9, likely_objective=1e9)
+    kept, again = estimator(**anything), estimator(settled_step=0.0, largest_relative_step=0.0)
     measured = kept.equations.bearings.measured(dented)
     torch.testing.assert_close(kept(dented).vertices, kept._solved(measured, None).vertices)
     torch.testing.assert_close(again(dented).vertices, again._patiently(*measured).vertices)
@@ -79,20 +76,26 @@ def test_what_broke_down_or_is_unexplained_has_not_settled(dented):
     assert one.is_settled(found._replace(relative_step=torch.tensor([torch.nan, 1.5e-3]))).tolist() == [False, False]
 
 
-def test_a_second_try_that_moves_still_has_converged_only_beside_the_first(dented):
-    """Four frames: done; settled; moving still where the first was; moving still elsewhere."""
+def test_a_second_try_that_broke_down_is_not_taken(dented):
+    """Four frames: done; not settled, and then settled; moving still; broken down."""
     one = estimator()
     found = one(dented)
     first = type(found)(*(value[:1].repeat(4, *[1] * (value.ndim - 1)) for value in found))
-    first = first._replace(volume=one.membrane.volume(first.vertices), misfit=torch.zeros(4).double())
-    away = first.vertices.clone()
-    away[[1, 3]] += 0.1 * DOME.size
-    still = torch.tensor([0.0, 0.0, 1.5e-3, 1.5e-3], dtype=torch.float64)
     first = first._replace(relative_step=torch.ones(4).double())
-    second = first._replace(vertices=away, relative_step=still)
+    steps = torch.tensor([0.0, 0.0, 1.5e-3, torch.nan], dtype=torch.float64)
+    second = first._replace(vertices=first.vertices + 0.1 * DOME.size, relative_step=steps, objective=0 * steps)
     taken = one.chosen(torch.tensor([True, False, False, False]), first, second)
-    assert taken.relative_step[1:3].tolist() == [0.0, 1.5e-3] and taken.relative_step[3] > 0.05
-    torch.testing.assert_close(taken.vertices, torch.cat([first.vertices[:1], away[1:]]))
+    assert taken.relative_step.tolist() == [1.0, 0.0, 1.5e-3, 1.0]
+    torch.testing.assert_close(taken.vertices, torch.cat([first.vertices[:1], second.vertices[1:3], first.vertices[3:]]))
+
+
+def test_a_second_try_settles_on_the_grids_that_are_finer_than_its_dents():
+    """Of three grids, with 9, 17 and 33 lines."""
+    fine = estimator(spherical_cap(12, 9, 3, (33, 33)))
+    for one, settling in ((fine, SETTINGS.settling_steps), (fine.coarse, 0), (fine.coarse.coarse, 0)):
+        first, second = one.schedule(), one.schedule(patient=True)
+        assert len(second) == SETTINGS.patience * len(first) + settling
+        assert second[len(second) - settling :] == [second[-1]] * settling
 
 
 def test_only_rows_that_are_not_done_are_worked_out_again():
@@ -131,12 +134,40 @@ def test_markers_far_outside_are_a_reason_for_a_second_try_one_in_a_hundred_is_n
     assert one.is_done(found, measured).tolist() == [True, True, False, True, True]
 
 
-def test_a_settled_solution_gives_way_to_one_that_explains_the_markers_better_only(dented):
+def test_a_converged_solution_gives_way_to_a_likelier_one_only(dented):
+    """Four frames: the second less likely; likelier; less likely, but the first has not converged, or does not explain."""
     one = estimator()
     found = one(dented)
-    first = type(found)(*(value[:1].repeat(2, *[1] * (value.ndim - 1)) for value in found))
-    first = first._replace(volume=one.membrane.volume(first.vertices), misfit=torch.tensor([0.5, 0.5]).double())
-    second = first._replace(vertices=first.vertices + 1.0, misfit=torch.tensor([0.6, 0.4]).double())
-    assert one.is_settled(first).all()
-    taken = one.chosen(torch.tensor([False, False]), first, second)
-    torch.testing.assert_close(taken.vertices, torch.stack([first.vertices[0], second.vertices[1]]))
+    first = type(found)(*(value[:1].repeat(4, *[1] * (value.ndim - 1)) for value in found))
+    steps = torch.tensor([1.5e-3, 1.5e-3, 3e-3, 1.5e-3], dtype=torch.float64)
+    misfit = torch.tensor([0.5, 0.5, 0.5, 9.0], dtype=torch.float64)
+    first = first._replace(volume=one.membrane.volume(first.vertices), relative_step=steps, misfit=misfit)
+    first = first._replace(objective=torch.full_like(steps, 2.0))
+    second = first._replace(vertices=first.vertices + 1.0, objective=torch.tensor([3.0, 1.0, 3.0, 3.0]).double())
+    assert one.is_converged(first).tolist() == [True, True, False, True]
+    assert one.is_explained(first).tolist() == [True, True, True, False]
+    taken = one.chosen(torch.zeros(4, dtype=torch.bool), first, second)
+    torch.testing.assert_close(taken.vertices, torch.cat([first.vertices[:1], second.vertices[1:]]))
+
+
+def test_unlikely_solutions_are_tried_again_and_very_unlikely_ones_explain_nothing(dented):
+    """On a grid that resolves the contacts, and on one of half the lines, whose model errs four times as much."""
+    for one, error in ((estimator(), 1.0), (estimator(spherical_cap(12, 9, 3, (9, 9))), 16.0)):
+        found = one(dented)
+        likely, largest = SETTINGS.likely_objective * error, SETTINGS.largest_objective * error
+        first = type(found)(*(value[:1].repeat(3, *[1] * (value.ndim - 1)) for value in found))
+        objective = torch.tensor([0.9 * likely, 1.1 * likely, 1.1 * largest]).double()
+        first = first._replace(objective=objective, misfit=0 * objective, relative_step=0 * objective)
+        first = first._replace(volume=one.membrane.volume(first.vertices))
+        rows = type(dented)(*(None if value is None else value[:1].expand(3, *value.shape[1:]) for value in dented))
+        measured = one.equations.bearings.measured(rows)
+        assert one.is_explained(first).tolist() == [True, True, False]
+        assert one.is_done(first, measured).tolist() == [True, False, False]
+
+
+def test_the_objective_of_a_solution_is_over_the_markers_seen(dented):
+    one = estimator()
+    half = dented._replace(confidence=dented.confidence * (torch.arange(dented.confidence.shape[1]) % 2))
+    for observation in (dented, half):
+        found = one(observation)
+        torch.testing.assert_close(found.objective, one.objective(found, observation) / observation.confidence.sum(-1))

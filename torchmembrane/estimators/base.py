@@ -65,7 +65,8 @@ class Equilibrium(NamedTuple):
     """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`
     (zero for minimum energy), `relative_step [...]`: the last step over the surface's size, `reference [..., V]`: the traction
     against which pushes are measured (zero where no tractions are found), `misfit [...]`: rms of the markers' angles off their
-    rays, in standard deviations (zero where the surface is on every ray), and `moved [..., 4]`: the camera, against the rim."""
+    rays, in standard deviations (zero where the surface is on every ray), `moved [..., 4]`: the camera, against the rim, and
+    `objective [...]`: how unlikely markers and tractions are, over the markers seen (zero where no tractions are found)."""
 
     vertices: Tensor
     pressure: Tensor
@@ -75,6 +76,7 @@ class Equilibrium(NamedTuple):
     reference: Tensor
     misfit: Tensor
     moved: Tensor
+    objective: Tensor
 
 
 class Contacts(NamedTuple):

@@ -13,8 +13,9 @@ from ..surface.stencil import pad_border
 from .bearings import Bearings
 from .descent import Descent, State
 
-DEPTH = 0.08  # over the surface's size
-WIDTH = 0.06  # standard deviation, over the size
+DEPTH = 0.05  # over the surface's size
+WIDTH = 0.1  # standard deviation, over the size
+STEEP = (0.08, 0.06)  # depth and width of one that leaves a mound
 DEEP, WIDE = (0.16, 0.08), (0.25, 0.15)  # depth and width of those for a press that the first does not find
 REACH = 0.25  # of the surroundings whose pushes have one middle, over the size
 FAINT = 1.0  # of the push that the markers' noise makes: less hardly dents
@@ -53,6 +54,11 @@ class Dent(nn.Module):
         return self._dented(x, pressure, moved, measured, DEPTH, WIDTH)
 
     @piece
+    def steep(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
+        """The state, dented steeply."""
+        return self._dented(x, pressure, moved, measured, *STEEP)
+
+    @piece
     def deep(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
         """The state, dented deeper."""
         return self._dented(x, pressure, moved, measured, *DEEP)
@@ -74,9 +80,9 @@ class Dent(nn.Module):
         return State(x - inwards[..., None] * membrane.normals(x), pressure, moved)
 
     def again(self, state: State, before: Tensor, measured: Bearings, schedule: Schedule) -> Found:
-        """The state and the surface a step before it, or those after the steps of a schedule from its dent where these have
-        a much lower objective: a state that was taken over may be in a mound."""
-        dented, last = self.descent(self(*state, measured), measured, schedule)
+        """The state and the surface a step before it, or those after the steps of a schedule from a steep dent in it
+        where these have a much lower objective: a state that was taken over may be in a mound."""
+        dented, last = self.descent(self.steep(*state, measured), measured, schedule)
         *kept, before = self.much_lower((*state, before), (*dented, last), measured)
         return State(*kept), before
 

@@ -195,19 +195,13 @@ class ForceBalance(nn.Module):
 
     @piece
     def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
-        """`values` in the rows where `done [B]` holds, or that are settled and explain the markers as well, else `others`; one
-        that moves still is as far from its end as both tries are apart."""
+        """`values` in the rows where `done [B]` holds, or the second solution broke down or is no likelier than one that has
+        converged; else `others`."""
         first, second = Equilibrium(*values), Equilibrium(*others)
-        done = done | (self.is_settled(first) & ~(second.misfit < first.misfit))
-        apart = self._distance(second.vertices, first.vertices.nan_to_num())
-        step = torch.where(self.is_settled(second), second.relative_step, torch.maximum(second.relative_step, apart))
+        stands = self.is_converged(first) & self.is_explained(first) & ~(second.objective < first.objective)
+        done = done | stands | second.objective.isnan()
         rows = [done.reshape(-1, *(1,) * (value.ndim - 1)) for value in first]
-        second = second._replace(relative_step=step)
         return Equilibrium(*(torch.where(*each) for each in zip(rows, first, second, strict=True)))
-
-    def _distance(self, x: Tensor, y: Tensor) -> Tensor:
-        """Rms over the vertices, over the surface's size, `[B]`."""
-        return (x - y).square().sum(-1).mean(-1).sqrt() / self.size
 
     def _solved(self, measured: Bearings, start: State | None, patient: bool = False) -> Equilibrium:
         warm = start is not None and not self.passes_on_starts
@@ -246,7 +240,9 @@ class ForceBalance(nn.Module):
             return settings.gnc_schedule(settings.warm_steps, settings.warm_tau)
         steps = settings.patience * self.steps if patient else self.steps
         coarsest, finer = (settings.patient_tau, settings.patient_fine_tau) if patient else (settings.tau, settings.fine_tau)
-        return settings.gnc_schedule(steps, coarsest if self.coarse is None else finer)
+        schedule = settings.gnc_schedule(steps, coarsest if self.coarse is None else finer)
+        settling = settings.settling_steps if patient and self.coarse is not None and self.dent is None else 0
+        return schedule + schedule[-1:] * settling
 
     @piece
     def at_rest(self, confidence: Tensor) -> State:
@@ -276,13 +272,15 @@ class ForceBalance(nn.Module):
     @piece
     def equilibrium(self, x: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
         """What this state amounts to; `before`: the surface a step earlier."""
-        membrane, loss, step = self.membrane, self.equations.loss, self._distance(x, before)
+        membrane, loss = self.membrane, self.equations.loss
+        step = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
         traction = self.equations.forces(x, pressure) / membrane.rest_area[:, None]
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
         scale = loss.contact_scale(*within, measured.noise_level)
         reference = self.reference * (1 + pad_border(scale[..., None] - 1, membrane.grid)[..., 0])
         misfit = self.equations.bearings.misfit(x, measured, moved, self.settings.outlier)
-        return Equilibrium(x, pressure, membrane.volume(x), traction, step, reference, misfit, moved)
+        objective = self.descent.objective(State(x, pressure, moved), *within, measured) / measured.weight.sum(-1).clamp_min(1)
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, reference, misfit, moved, objective)
 
     @piece
     def is_converged(self, found: Equilibrium) -> Tensor:
@@ -298,14 +296,17 @@ class ForceBalance(nn.Module):
 
     @piece
     def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
-        """`[B]` bool: settled, and hardly a marker is left far outside, as beside a contact that the steps went past."""
+        """`[B]` bool: settled and likely, and hardly a marker is far outside, as beside a contact that the steps went past."""
         far = 2 * self.settings.outlier * self.coarseness
         outlying = self.equations.bearings.outlying(found.vertices, measured, found.moved, far)
-        return self.is_settled(found) & (outlying <= self.settings.largest_outlying)
+        likely = found.objective <= self.settings.likely_objective * self.coarseness**2
+        done: Tensor = self.is_settled(found) & likely & (outlying <= self.settings.largest_outlying)
+        return done
 
     def is_explained(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: the markers are off their rays by no more than their noise and the model's error."""
-        return torch.logical_not(found.misfit > self.settings.largest_misfit * self.coarseness)
+        """`[B]` bool: the markers are off their rays by their noise and the model's error alone, by likely tractions."""
+        off = found.misfit > self.settings.largest_misfit * self.coarseness
+        return torch.logical_not(off | (found.objective > self.settings.largest_objective * self.coarseness**2))
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes."""

@@ -148,8 +148,8 @@ class MinimumEnergy(VertexRays):
         x = (origins + t[..., None, :] * directions).mT
         move, pressure = self._move(t, origins, directions, relaxed)
         error = move.abs().amax(-1) / self.membrane.size
-        none = torch.zeros_like(x)
-        return Equilibrium(x, pressure, self.membrane.volume(x), none, error, none[..., 0], none[..., 0, 0], none[..., :4, 0])
+        none, volume = torch.zeros_like(x), self.membrane.volume(x)
+        return Equilibrium(x, pressure, volume, none, error, none[..., 0], none[..., 0, 0], none[..., :4, 0], none[..., 0, 0])
 
     def _move(self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None) -> tuple[Tensor, Tensor]:
         """Where the rest's stiffness would have the ranges go, `[..., V]`: zero at the solution; and the pressure `[...]`."""

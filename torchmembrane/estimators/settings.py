@@ -26,6 +26,7 @@ class ForceBalanceSettings:
         patience: so many times the steps, from rest, where these do not settle.
         patient_tau: as `tau`, then.
         patient_fine_tau: as `fine_tau`, then.
+        settling_steps: so many more at their last scale, then, on grids finer than that of the dents.
         settled_step: rms of the last step of a solution that is not solved again.
         camera_motion: of the camera against the rim, px: what is less is nothing, what is more costs hardly more; as tau ends.
         decline: share of the steps over which tau declines.
@@ -55,6 +56,8 @@ class ForceBalanceSettings:
         largest_volume_error: volume error of a converged solution, over the rest volume.
         largest_misfit: rms of the markers' angles off their rays where a surface of this sensor explains them, over their
             noise and the model's error; on grids of fewer than `force_balance.RESOLVED` lines more.
+        largest_objective: what is minimised, over the markers seen, where a surface of this sensor explains them; as before.
+        likely_objective: the same, of a solution that is not solved again.
         largest_outlying: share of the markers that may be more than twice `outlier` off before a second try is made.
 
     Example:
@@ -74,6 +77,7 @@ class ForceBalanceSettings:
     patience: int = 3
     patient_tau: tuple[float, float] = (16.0, 0.4)
     patient_fine_tau: tuple[float, float] = (2.0, 0.4)
+    settling_steps: int = 8
     settled_step: float = 1e-3
     camera_motion: float = 0.005
     decline: float = 0.6
@@ -101,6 +105,8 @@ class ForceBalanceSettings:
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3
     largest_misfit: float = 1.3
+    largest_objective: float = 20.0
+    likely_objective: float = 5.0
     largest_outlying: float = 0.01
 
     def __post_init__(self) -> None:

@@ -4,13 +4,13 @@ import { sensorOf } from "./metadata.js";
 export class Model {
   #worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
 
-  /** The model of a .onnx file's bytes, ready to run; `sensor` as `sensorOf`. */
+  /** The model of a .onnx file's bytes, ready to run; `sensor` as `sensorOf`; `tracks`: a frame starts from the one before. */
   static async open(bytes) {
     const model = new Model();
     try {
       model.sensor = sensorOf(bytes);
       const [width, height] = model.sensor.mesh.image_size;
-      await model.#ask({ model: { bytes, width, height } });
+      model.tracks = (await model.#ask({ model: { bytes, width, height } })).tracks;
     } catch (error) {
       model.close();
       throw error;
@@ -25,6 +25,11 @@ export class Model {
       throw new Error(`the image is ${image.width} x ${image.height} px, the sensor's are ${width} x ${height}`);
     }
     return this.#ask({ image });
+  }
+
+  /** The next frame starts from rest. */
+  forget() {
+    return this.#ask({});
   }
 
   close() {

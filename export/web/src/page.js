@@ -15,7 +15,8 @@ async function openModel(file) {
   model = next;
   result = null;
   at("sensor").textContent = model.sensor.name;
-  at("status").textContent = "ready for an image";
+  at("status").textContent = model.tracks ? "ready for a video's images" : "ready for an image";
+  at("forget").hidden = !model.tracks;
   for (const id of READINGS) at(id).textContent = "–";
   at("save").disabled = true;
   document.body.classList.remove("failed");
@@ -121,7 +122,10 @@ function inTurn(name, job) {
   });
 }
 
+/** Files as they are given; several at once in the order of their names, for a model that tracks takes them for a video. */
 function open(files) {
+  const order = new Intl.Collator("en", { numeric: true });
+  files.sort((one, other) => other.name.endsWith(".onnx") - one.name.endsWith(".onnx") || order.compare(one.name, other.name));
   for (const file of files) inTurn(file.name, () => (file.name.endsWith(".onnx") ? openModel(file) : openImage(file, file.name)));
 }
 
@@ -154,6 +158,8 @@ at("save").onclick = () => {
   link.click();
   URL.revokeObjectURL(link.href);
 };
+
+at("forget").onclick = () => inTurn("from rest", () => model.forget());
 
 at("turn").checked = !matchMedia("(prefers-reduced-motion: reduce)").matches;
 at("turn").onchange = () => (surface.turning = at("turn").checked);

@@ -5,30 +5,47 @@ import wasm from "onnxruntime-web/ort-wasm-simd-threaded.wasm";
 ort.env.wasm.wasmPaths = { wasm: new URL(wasm, import.meta.url).href };
 ort.env.wasm.numThreads = 1; // more need cross-origin isolation, and a single frame gains nothing by them
 
-let session;
+const PREVIOUS = "previous_";
+const SETTLING = 4; // runs of a frame that starts from rest, as in torchmembrane_edge
+
+let session, given, state;
 
 /** A model of images `width` x `height`, run once, as browsers compile what they run more slowly than they run it. */
 async function open({ bytes, width, height }) {
   session = await ort.InferenceSession.create(bytes, { executionProviders: ["wasm"], logSeverityLevel: 3 });
-  if (session.inputNames.join() !== "image") {
-    throw new Error(`a model with the inputs ${session.inputNames.join(", ")}; expected one exported without --tracking`);
-  }
-  await run({ grey: new Float32Array(width * height), width, height });
+  given = session.inputMetadata.filter(({ name }) => name.startsWith(PREVIOUS));
+  forget();
+  await session.run({ image: imageOf({ grey: new Float32Array(width * height), width, height }), ...state });
+  return { tracks: given.length > 0 };
 }
 
-/** One frame's outputs, { name: { data, shape } }, and the milliseconds of the run. */
-async function run({ grey, width, height }) {
-  const image = new ort.Tensor("float32", grey, [1, 1, height, width]);
+/** The next frame starts from rest. */
+function forget() {
+  state = Object.fromEntries(given.map(({ name, shape }) => [name, unknown([1, ...shape.slice(1)])]));
+}
+
+const unknown = (dims) => new ort.Tensor("float32", new Float32Array(dims.reduce((size, n) => size * n, 1)).fill(NaN), dims);
+const imageOf = ({ grey, width, height }) => new ort.Tensor("float32", grey, [1, 1, height, width]);
+
+/** One frame's outputs, { name: { data, shape } }, and the milliseconds of the run; a model that tracks keeps where it ended. */
+async function run(pixels) {
+  const image = imageOf(pixels);
   const start = performance.now();
-  const outputs = await session.run({ image });
+  let outputs;
+  for (let turn = given.length && isFromRest() ? SETTLING : 1; turn > 0; turn--) {
+    outputs = await session.run({ image, ...state });
+    state = Object.fromEntries(given.map(({ name }) => [name, outputs[name.slice(PREVIOUS.length)]]));
+  }
   const milliseconds = performance.now() - start;
   const frame = Object.entries(outputs).map(([name, { data, dims }]) => [name, { data, shape: dims.slice(1) }]);
   return { frame: Object.fromEntries(frame), milliseconds };
 }
 
+const isFromRest = () => !state[`${PREVIOUS}pressure`].data.every(Number.isFinite);
+
 onmessage = async ({ data: { model, image } }) => {
   try {
-    postMessage({ answer: await (model ? open(model) : run(image)) });
+    postMessage({ answer: await (model ? open(model) : image ? run(image) : forget()) });
   } catch (error) {
     postMessage({ error: error.message });
   }

@@ -9,7 +9,7 @@ import { context } from "esbuild";
 import { chromium } from "playwright-core";
 import { greyOf } from "../src/image.js";
 
-const { CHROMIUM, PYTHON, REFERENCE, SCREENSHOTS } = process.env;
+const { CHROMIUM, PYTHON, REFERENCE, TRACKING, SCREENSHOTS } = process.env;
 const EXAMPLES = { "Two contacts": "two_contacts", "Press on axis": "press_on_axis", "Flat plate": "flat_plate" };
 const FLAGS =
   "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking " +
@@ -62,13 +62,13 @@ async function drop(...paths) {
   await idle();
 }
 
-/** The result that the page saves, compared with Python's of the same name. */
-async function compared(name) {
+/** The result that the page saves, compared with Python's. */
+async function compared(name, expected = name) {
   const [download] = await Promise.all([page.waitForEvent("download"), page.getByRole("button", { name: "Save result" }).click()]);
   assert.equal(download.suggestedFilename(), `${name}.npz`);
   const saved = reference(`saved_${name}.npz`);
   await download.saveAs(saved);
-  return JSON.parse(execFileSync(PYTHON, [join(here, "compare.py"), saved, reference(`${name}.npz`)]));
+  return JSON.parse(execFileSync(PYTHON, [join(here, "compare.py"), saved, reference(`${expected}.npz`)]));
 }
 
 function agree({ status, arrays, expected, vertices, force }) {
@@ -190,13 +190,29 @@ test("a narrow screen needs no scrolling sideways", async () => {
   await page.setViewportSize(WIDE);
 });
 
-test("another model takes its place; what is none is refused in words", async () => {
-  await drop(reference("tracking.onnx"));
-  assert.match(await text("#message"), /tracking.onnx: a model with the inputs image, previous_pressure; expected one exported/);
+test("another model takes its place, what is none is refused in words", async () => {
   await drop(reference("foreign.onnx"));
   assert.match(await text("#message"), /foreign.onnx: not a model of format 1 from "torchmembrane export"/);
   assert.equal(await text("#sensor"), "finger_fisheye_nh130");
   await drop(reference("another.onnx"), reference("blank.png"));
   assert.equal(await text("#sensor"), "another sensor");
   assert.equal(await text("#name"), "blank.png");
+});
+
+test("a model that tracks starts a frame from the one before, and from rest when told", async () => {
+  const images = Object.values(EXAMPLES).map((name) => `examples/${name}.png`);
+  await drop(TRACKING);
+  assert.equal(await text("#status"), "ready for a video's images");
+  for (const round of [1, 2]) {
+    for (const [place, image] of images.toSorted().entries()) {
+      await drop(image);
+      agree(await compared(basename(image, ".png"), `tracked_${place}`));
+    }
+    await page.getByRole("button", { name: "Next from rest" }).click();
+    await idle();
+  }
+  await drop(...images.toReversed()); // in the order of their names
+  agree(await compared("two_contacts", "tracked_2"));
+  await drop(reference("another.onnx"));
+  assert.equal(await page.locator("#forget").isHidden(), true);
 });

@@ -1,6 +1,6 @@
 """What the page is tested with and against: images, models, and what Python makes of them.
 
-python export/web/test/reference.py SENSOR.toml MODEL.onnx EXAMPLE.png... --out DIR
+python export/web/test/reference.py SENSOR.toml MODEL.onnx EXAMPLE.png... --tracking MODEL.onnx --out DIR
 """
 
 import argparse
@@ -12,6 +12,7 @@ import numpy as np
 import onnx
 import torch
 from PIL import Image, PngImagePlugin
+from torchmembrane_edge import Session
 
 from torchmembrane import Reconstructor
 from torchmembrane.io.images import read_image
@@ -23,6 +24,7 @@ def main() -> None:
     for name in ("sensor", "model"):
         parser.add_argument(name, type=Path)
     parser.add_argument("examples", nargs="+", type=Path)
+    parser.add_argument("--tracking", required=True, type=Path)
     parser.add_argument("--out", required=True, type=Path)
     arguments = parser.parse_args()
     shutil.rmtree(arguments.out, ignore_errors=True)
@@ -34,6 +36,9 @@ def main() -> None:
     for path in [*arguments.examples, arguments.out / "blank.png"]:
         with torch.no_grad():
             save_frame(arguments.out / f"{path.stem}.npz", reconstructor(reconstructor.read(path)).frame(0))
+    frames = [np.asarray(Image.open(path)) for path in sorted(arguments.examples)]
+    for place, found in enumerate(Session(arguments.tracking).track(frames)):
+        np.savez(arguments.out / f"tracked_{place}.npz", **{name: values[0] for name, values in found.items()})
 
 
 def images(example: Path, out: Path) -> None:
@@ -55,13 +60,11 @@ def images(example: Path, out: Path) -> None:
 
 
 def models(path: Path, out: Path) -> None:
-    """The model under another name; one that tracks, by its inputs; and one that no `torchmembrane export` wrote."""
+    """The model under another name, and one that no `torchmembrane export` wrote."""
     model = onnx.load(path)
     name = next(entry for entry in model.metadata_props if entry.key == "name")
     name.value = "another sensor"
     onnx.save(model, out / "another.onnx")
-    model.graph.input.append(onnx.helper.make_tensor_value_info("previous_pressure", onnx.TensorProto.FLOAT, ["batch"]))
-    onnx.save(model, out / "tracking.onnx")
     del model.metadata_props[:]
     onnx.save(model, out / "foreign.onnx")
 
