@@ -35,8 +35,8 @@ def mismatched(rest: np.ndarray, pixels: np.ndarray, rng) -> tuple[np.ndarray, n
 def believed(r: tm.Reconstructor, flow: torch.Tensor) -> tm.Reconstruction:
     """What `from_pixels` makes of displacements `[B, D, 2]` px, but for its screen."""
     one = torch.ones_like(flow[..., 0])
-    found = r.estimator(r.observation(flow, one))
-    return r.result(found, flow, one, torch.full((len(flow),), tm.Status.OK.value))
+    observation = r.observation(flow, one)
+    return r.result(r.estimator(observation), observation, flow, one, torch.full((len(flow),), tm.Status.OK.value))
 
 
 def grown(errors: np.ndarray, clean: np.ndarray) -> str:

@@ -57,9 +57,10 @@ def segmented(r: tm.Reconstructor, seen: tm.Reconstruction, free_part_only=False
     moved, usual = (seen.pixels - r.rest_pixels).nan_to_num(), r.estimator.settings
     if free_part_only:
         r.estimator.settings = replace(usual, free_part_only=True)
-    got = reconstruct_and_segment(r.estimator, r.estimator.segmentation, r.observation(moved, seen.confidence), ROUNDS)
+    observation = r.observation(moved, seen.confidence)
+    got = reconstruct_and_segment(r.estimator, r.estimator.segmentation, observation, ROUNDS)
     r.estimator.settings = usual
-    return got, r.result(got.surface, moved, seen.confidence, seen.status)
+    return got, r.result(got.surface, observation, moved, seen.confidence, seen.status)
 
 
 def ways(root: Path, case: dict, images: bool) -> dict[str, tuple[float, float, int]]:

@@ -93,7 +93,8 @@ def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(na
     pixels = exact + NOISE * torch.randn(DRAWS, *exact.shape, generator=generator, dtype=torch.float64)
     with torch.no_grad():
         clean = estimate(estimator, camera, exact[None])
-        start = clean.vertices.repeat(DRAWS, 1, 1), clean.pressure.repeat(DRAWS), clean.moved.repeat(DRAWS, 1)
+        known = torch.ones(DRAWS, dtype=torch.bool)
+        start = clean.vertices.repeat(DRAWS, 1, 1), clean.pressure.repeat(DRAWS), clean.moved.repeat(DRAWS, 1), known
         result = estimate(estimator, camera, pixels, start)
         noise = turns(estimator, camera, pixels, result.vertices)
         observation = estimator.prepare(camera, pixels, torch.ones_like(pixels[..., 0]))

@@ -368,7 +368,8 @@ def test_four_steps_from_the_frame_before_follow_a_press(pressed, n):
     before = torch.nn.functional.normalize(0.1 * rest + 0.9 * directions, dim=-1)
     cold = estimator(seen(origins, directions))
     previous = estimator(seen(origins, before))
-    warm = estimator(seen(origins, directions), (previous.vertices, previous.pressure, previous.moved))
+    known = torch.ones(len(previous.vertices), dtype=torch.bool)
+    warm = estimator(seen(origins, directions), (previous.vertices, previous.pressure, previous.moved, known))
 
     def rms(u):
         return u.square().sum(-1).mean().sqrt()

@@ -29,10 +29,10 @@ def test_the_head_learns_which_grasps_are_stable_through_the_reconstruction(lear
 def test_the_prestretch_is_found_and_its_gradient_is_the_finite_difference(learned):
     found, right = learned["prestretch"], learned["sensor"].material.prestretch
     assert found.item() == pytest.approx(right, abs=0.02) and f"end at {found.item():.2f}" in " ".join(PAGE.split())
-    at = torch.tensor(1.15, requires_grad=True)
+    at = torch.tensor(1.25, requires_grad=True)  # where a frame's steps have not settled, differences are those of their noise
     (slope,) = torch.autograd.grad(learned["mismatch"](at), at)
     with torch.no_grad():
-        below, above = (learned["mismatch"](torch.tensor(1.15 + step)) for step in (-0.001, 0.001))
+        below, above = (learned["mismatch"](torch.tensor(1.25 + step)) for step in (-0.001, 0.001))
     assert slope.item() == pytest.approx((above - below).item() / 0.002, rel=0.01)
 
 

@@ -7,7 +7,7 @@ graph that is being written, they are added to its `graph` instead. Between piec
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 import torch
@@ -139,8 +139,20 @@ def unless(done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[An
     return written
 
 
+def rowwise(done: torch.Tensor, values: Sequence[torch.Tensor], others: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """`values` in the rows where `done [B]` holds, else `others`; each `[B, ...]`."""
+    return [
+        torch.where(done.reshape(-1, *(1,) * (value.ndim - 1)), value, other)
+        for value, other in zip(values, others, strict=True)
+    ]
+
+
 def mended(
-    done: Any, values: Sequence[Any], again: Callable[..., Sequence[Any]], given: Sequence[Any], chosen: Callable[..., Any]
+    done: Any,
+    values: Sequence[Any],
+    again: Callable[..., Sequence[Any]],
+    given: Sequence[Any],
+    chosen: Callable[..., Any] | None = None,
 ) -> Sequence[Any]:
     """Take `values` in the rows where `done` holds, else what `chosen` makes of them and of what `again(*given)` gives.
 
@@ -152,8 +164,10 @@ def mended(
         values: what there is, each `[B, ...]`.
         again: gives values of the same number and shapes.
         given: what it needs, each `[B, ...]` or None.
-        chosen: a piece, `chosen(done, values, others)`: `values` where `done` holds, else what is taken of the others.
+        chosen: a piece, `chosen(done, values, others)`: `values` where `done` holds, else what is taken of the others;
+            default: all of them.
     """
+    chosen = chosen or partial(_taken, None)
     if _graph(values) is not None:
         return unless(done, values, lambda: chosen(done, values, again(*given)))
     if not at_hand(done) or bool(done.all()):
@@ -162,6 +176,11 @@ def mended(
     others = again(*(None if one is None else one[rows] for one in given))
     taken = chosen(done[rows], [value[rows] for value in values], others)
     return [value.index_copy(0, rows, other) for value, other in zip(values, taken, strict=True)]
+
+
+@piece
+def _taken(_: None, done: torch.Tensor, values: Sequence[torch.Tensor], others: Sequence[torch.Tensor]) -> Any:
+    return rowwise(done, values, others)
 
 
 def at_hand(done: torch.Tensor) -> bool:

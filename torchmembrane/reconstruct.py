@@ -16,7 +16,7 @@ from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
 from .estimators.kept_state import keep_small
 from .estimators.precision import PRECISIONS, check_precision, full_precision
-from .estimators.start import broken_down, checked_previous, solved_from
+from .estimators.start import broken_down, checked_previous
 from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
@@ -30,7 +30,7 @@ from .sensor.sensor import Sensor
 
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
 LEAST_ERROR = 0.02  # px
-LEAST_COVERAGE = 0.88  # less of what the markers see at rest is a part hidden
+LEAST_COVERAGE = 0.85  # less of what the markers see at rest is a part hidden
 
 
 class Reconstructor(nn.Module):
@@ -174,8 +174,7 @@ class Reconstructor(nn.Module):
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
             grey = self.grey(images)
-            before = self._checked(previous, len(grey))
-            return solved_from(before, lambda p, g, q: self.reconstruct_grey(g, p, rest_pixels, q), grey, pressure)
+            return self.reconstruct_grey(grey, self._checked(previous, len(grey)), rest_pixels, pressure)
 
     def grey(self, images: Tensor | np.ndarray) -> Tensor:
         """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
@@ -215,8 +214,7 @@ class Reconstructor(nn.Module):
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
             flow = self.observer.from_pixels(pixels, confidence, rest_pixels)
-            before = self._checked(previous, len(flow.status))
-            return solved_from(before, lambda p, q, *rows: self._solve(MarkerFlow(*rows), p, q), pressure, *flow)
+            return self._solve(flow, self._checked(previous, len(flow.status)), pressure)
 
     def _solve(self, flow: MarkerFlow, previous: Reconstruction | None, pressure: Tensor | float | None) -> Reconstruction:
         usable, confidence, covariance, status = self.observer.judge(*flow)
@@ -228,12 +226,13 @@ class Reconstructor(nn.Module):
         return self.result(found, observation, flow.displacement, confidence, status)
 
     @piece
-    def start(self, vertices: Tensor, pressure: Tensor, camera_motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def start(self, vertices: Tensor, pressure: Tensor, camera_motion: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Vertices `[B, V, 3]`, pressure `[B]` and the camera's motion `[B, 4]` of the frames before, those of rest where there
-        are none (NaN)."""
+        are none (NaN), and `[B]` bool: where there are some."""
+        known = vertices.flatten(1).isfinite().all(1) & pressure.isfinite()
         vertices = torch.where(vertices.isfinite(), vertices, self.estimator.membrane.rest)
         pressure = torch.where(pressure.isfinite(), pressure, self.estimator.rest_pressure)
-        return vertices, pressure, in_pixels(camera_motion, self.image_size).nan_to_num()
+        return vertices, pressure, in_pixels(camera_motion, self.image_size).nan_to_num(), known
 
     @piece
     def observation(self, displacement: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
@@ -336,7 +335,7 @@ class Reconstructor(nn.Module):
         noise = torch.linalg.cholesky(2 * self.observer.rest_covariance).mT @ turn
         observation = self._gauged(self.observation(pixels - self.rest_pixels, result.confidence), pressure)
         state = result.vertices, result.pressure, result.camera_motion
-        found = self.estimator.standard_deviations(*self.start(*state), observation, noise)
+        found = self.estimator.standard_deviations(*self.start(*state)[:3], observation, noise)
         return found.known(result.vertices.flatten(1).isfinite().all(1))
 
     def _checked(self, previous: Reconstruction | None, frames: int) -> Reconstruction | None:

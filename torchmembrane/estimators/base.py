@@ -132,8 +132,8 @@ class Estimator(Protocol):
         [B, D, 2, 2]` of the pixels, px^2."""
         ...
 
-    def __call__(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:
-        """The surface; `start`: vertices `[B, V, 3]` and pressure `[B]` near it, such as the previous frame's."""
+    def __call__(self, observation: Observation, start: tuple[Tensor, ...] | None = None) -> Equilibrium:
+        """The surface; `start`: of a solution near it, such as the previous frame's, as the estimator says."""
         ...
 
     def is_converged(self, found: Equilibrium) -> Tensor:

@@ -8,7 +8,7 @@ whose tractions cost several times those of the pit. From a dent they find the p
 import torch
 from torch import Tensor, nn
 
-from ..pieces import piece
+from ..pieces import piece, rowwise
 from ..surface.stencil import pad_border
 from .bearings import Bearings
 from .descent import Descent, State
@@ -111,6 +111,5 @@ class Dent(nn.Module):
             self.descent.objective(State(*each[:3]), *self.descent.tractions(*each[:2]), measured) for each in (kept, dented)
         )
         is_lower = other < torch.where(objective.isnan(), torch.inf, share * objective)
-        rows = [is_lower.reshape(-1, *(1,) * (value.ndim - 1)) for value in kept]
-        x, pressure, moved, before = (torch.where(*each) for each in zip(rows, dented, kept, strict=True))
+        x, pressure, moved, before = rowwise(is_lower, dented, kept)
         return x, pressure, moved, before

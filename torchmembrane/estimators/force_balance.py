@@ -20,6 +20,7 @@ its lines, and so on: few vertices find the basin, and a `Dent` where something 
 one factor serves all steps, by two conjugate-gradient steps each; a dent is tried again, and kept if its objective is lower.
 """
 
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -29,7 +30,7 @@ from torch import Tensor, nn
 from ..camera.model import Camera
 from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
-from ..pieces import mended, piece
+from ..pieces import mended, piece, rowwise
 from ..surface.membrane import Membrane
 from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner, pad_border
@@ -100,7 +101,7 @@ class ForceBalance(nn.Module):
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
         bearings = MarkerBearings(membrane, markers, positions, noise, rest)
-        self.coarse = self._coarser(membrane, elasticity, bearings, filling, gas, rest)
+        self.coarse = self._coarser(membrane, elasticity, bearings, rest, filling=filling, gas=gas)
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
@@ -126,20 +127,15 @@ class ForceBalance(nn.Module):
         return cls(*surface, noise, problem.filling, problem.gas, settings, rest)
 
     def _coarser(
-        self,
-        membrane: Membrane,
-        elasticity: ElasticEnergy,
-        bearings: MarkerBearings,
-        filling: str,
-        gas: tuple[float, float] | None,
-        rest: Observation | None,
+        self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerBearings, rest: Observation | None, **cavity: Any
     ) -> "ForceBalance | None":
         grid, positions = membrane.grid, bearings.positions
         if any(count % 2 == 0 or count < 2 * self.settings.coarsest - 1 for count in grid):
             return None
         every_second = Membrane(*(a.unflatten(0, grid)[::2, ::2].numpy() for a in (membrane.rest, membrane.fixed)))
         markers, material = every_second.closest_points(positions.numpy()), elasticity.on(every_second)
-        return ForceBalance(every_second, material, markers, positions, bearings.noise, filling, gas, self.settings, rest, True)
+        given = every_second, material, markers, positions, bearings.noise
+        return ForceBalance(*given, settings=self.settings, rest=rest, is_coarse=True, **cavity)
 
     @property
     def membrane(self) -> Membrane:
@@ -183,25 +179,26 @@ class ForceBalance(nn.Module):
         deviation = self.settings.pressure_noise * self.reference
         return observation._replace(gauge=gauge_reading(pressure, self.rest_pressure, deviation, observation.confidence))
 
-    def forward(self, observation: Observation, start: tuple[Tensor, Tensor, Tensor] | None = None) -> Equilibrium:
+    def forward(self, observation: Observation, start: tuple[Tensor, ...] | None = None) -> Equilibrium:
         """The surface that the markers' rays show; `start`: vertices, pressure and the camera's motion near it, such as the
-        previous frame's."""
+        previous frame's, and the rows `[B]` that have one: few steps do not do from rest."""
         measured = self.equations.bearings.measured(observation)
-        found = self._solved(measured, None if start is None else State(*start))
-        return Equilibrium(*mended(self.is_done(found, measured), found, self._patiently, measured, self.chosen))
+        found = self._solved(measured, None if start is None else State(*start[:3]))
+        if start is not None:
+            found = Equilibrium(*mended(start[3], found, self._from_rest, measured))
+        patiently = partial(self._from_rest, patient=True)
+        return Equilibrium(*mended(self.is_done(found, measured), found, patiently, measured, self.chosen))
 
-    def _patiently(self, *measured: Any) -> Equilibrium:  # from rest, in many small steps: deep presses need them
-        return self._solved(Bearings(*measured), None, patient=True)
+    def _from_rest(self, *measured: Any, patient: bool = False) -> Equilibrium:  # in many small steps: deep presses need them
+        return self._solved(Bearings(*measured), None, patient)
 
     @piece
     def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
-        """`values` in the rows where `done [B]` holds, or the second solution broke down or is no likelier than one that has
-        converged; else `others`."""
+        """`values` where `done [B]` holds, where the others broke down or are worse than what has converged; else `others`."""
         first, second = Equilibrium(*values), Equilibrium(*others)
-        stands = self.is_converged(first) & self.is_explained(first) & ~(second.objective < first.objective)
-        done = done | stands | second.objective.isnan()
-        rows = [done.reshape(-1, *(1,) * (value.ndim - 1)) for value in first]
-        return Equilibrium(*(torch.where(*each) for each in zip(rows, first, second, strict=True)))
+        is_worse = second.objective > self.settings.worse_objective * first.objective
+        stands = self.is_converged(first) & self.is_explained(first) & is_worse
+        return Equilibrium(*rowwise(done | stands | second.objective.isnan(), first, second))
 
     def _solved(self, measured: Bearings, start: State | None, patient: bool = False) -> Equilibrium:
         warm = start is not None and not self.passes_on_starts

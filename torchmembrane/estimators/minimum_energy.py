@@ -105,7 +105,7 @@ class MinimumEnergy(VertexRays):
     def _smoother(self, psi: Tensor) -> Tensor:
         return grid_laplacian(psi, self.membrane.grid)
 
-    def forward(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:
+    def forward(self, observation: Observation, start: tuple[Tensor, ...] | None = None) -> Equilibrium:
         """The surface on the rays of the grid's vertices.
 
         Args:

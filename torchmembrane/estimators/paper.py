@@ -96,7 +96,7 @@ class PaperEstimator(VertexRays):
         """The weight of the smoother of eq. 28."""
         return self.settings.smoothing
 
-    def forward(self, observation: Observation, start: tuple[Tensor, Tensor] | None = None) -> Equilibrium:
+    def forward(self, observation: Observation, start: tuple[Tensor, ...] | None = None) -> Equilibrium:
         """The surface on the rays of the grid's vertices.
 
         Args:

@@ -58,6 +58,7 @@ class ForceBalanceSettings:
             noise and the model's error; on grids of fewer than `force_balance.RESOLVED` lines more.
         largest_objective: what is minimised, over the markers seen, where a surface of this sensor explains them; as before.
         likely_objective: the same, of a solution that is not solved again.
+        worse_objective: what is minimised, over that of a first solution that has converged, of a second that is not taken.
         largest_outlying: share of the markers that may be more than twice `outlier` off before a second try is made.
 
     Example:
@@ -104,9 +105,10 @@ class ForceBalanceSettings:
     coarsest_warm: int = 13
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3
-    largest_misfit: float = 1.3
+    largest_misfit: float = 1.35
     largest_objective: float = 20.0
     likely_objective: float = 5.0
+    worse_objective: float = 1.1
     largest_outlying: float = 0.01
 
     def __post_init__(self) -> None:

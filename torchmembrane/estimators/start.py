@@ -1,7 +1,5 @@
 """What a solve can start from: results of the frames before, refused where they cannot be that."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -45,26 +43,6 @@ def checked_previous(
                 "sensor's; it is of another one, or from before a calibration: leave previous out to start from rest"
             )
     return previous
-
-
-def solved_from(
-    previous: Reconstruction | None, solve: Callable[..., Reconstruction], *given: Tensor | float | None
-) -> Reconstruction:
-    """`solve(previous, *given)`; frames whose previous one had no surface as without it: few steps do not do from rest.
-
-    Args:
-        previous: results of the frames before, `[B, ...]`.
-        solve: gives a batch's results; `None` stands for no previous results.
-        given: what it needs; tensors `[B, ...]` are of the frames.
-    """
-    result = solve(previous, *given)
-    if previous is None or not at_hand(previous.vertices):
-        return result
-    rows = (~previous.vertices.flatten(1).isfinite().all(1)).nonzero().ravel()
-    if not len(rows):
-        return result
-    others = solve(None, *(one[rows] if isinstance(one, Tensor) and one.ndim else one for one in given))
-    return Reconstruction(*(value.index_copy(0, rows, other) for value, other in zip(result, others, strict=True)))
 
 
 def broken_down(status: Tensor, vertices: Tensor) -> Tensor | None:
