@@ -144,7 +144,7 @@ def test_a_converged_solution_gives_way_to_a_likelier_one_only(dented):
     misfit = torch.tensor([0.5, 0.5, 0.5, 9.0, 0.5], dtype=torch.float64)
     first = first._replace(volume=one.membrane.volume(first.vertices), relative_step=steps, misfit=misfit)
     first = first._replace(objective=torch.full_like(steps, 2.0))
-    second = first._replace(vertices=first.vertices + 1.0, objective=torch.tensor([3.0, 1.0, 3.0, 3.0, 2.1]).double())
+    second = first._replace(vertices=first.vertices + 1.0, objective=torch.tensor([3.0, 1.0, 3.0, 3.0, 2.02]).double())
     assert one.is_converged(first).tolist() == [True, True, False, True, True]
     assert one.is_explained(first).tolist() == [True, True, True, False, True]
     taken = one.chosen(torch.zeros(5, dtype=torch.bool), first, second)

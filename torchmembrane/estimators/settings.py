@@ -108,7 +108,7 @@ class ForceBalanceSettings:
     largest_misfit: float = 1.35
     largest_objective: float = 20.0
     likely_objective: float = 5.0
-    worse_objective: float = 1.1
+    worse_objective: float = 1.02
     largest_outlying: float = 0.01
 
     def __post_init__(self) -> None:
