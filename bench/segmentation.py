@@ -109,7 +109,8 @@ def main():
         contact, surface, count = np.array([row[name] for row in rows]).T
         true = np.array([row["contacts"] for row in rows])
         several = [f"{int(n)} of {k}" for n, k in zip(count, true, strict=True) if k > 1]
-        of_surface = "" if name == "eq. 29" else f"; surface {np.median(surface):.3f}, {surface.max():.3f}"
+        shape = f"{np.nanmedian(surface):.3f}, {np.nanmax(surface):.3f}, none in {np.isnan(surface).sum()}"
+        of_surface = "" if name == "eq. 29" else f"; surface {shape}"
         print(f"{name}: contacts {np.median(contact):.2f} in the median, {contact.max():.2f} at worst{of_surface}")
         print(f"    of several at once: {', '.join(several)}; none at all in {int((count == 0).sum())} presses")
     write(args.json, dict(segmentation=rows))

@@ -240,7 +240,6 @@ def test_edge_sees_the_same_grey(kind, shape, monkeypatch):
 def test_edge_follows_a_video(model_files, reconstructor, images, monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "export")
     from torchmembrane_edge import EdgeError, Session
-    from torchmembrane_edge.session import SETTLING
 
     frames = reconstructor.read(*images)[:, 0].numpy()
     state, found = None, list(Session(model_files[True]).track([*frames[:2], 0 * frames[0], frames[2]]))
@@ -250,12 +249,6 @@ def test_edge_follows_a_video(model_files, reconstructor, images, monkeypatch):
                 assert frame["status"].tolist() == [Status.BLANK] and np.isnan(frame["vertices"]).all()
                 state = None
                 continue
-            if state is None:
-                rest = reconstructor(reconstructor.read(images[k]))
-                nothing = {key: getattr(rest, key) * torch.nan for key in ("vertices", "pressure", "camera_motion")}
-                state = rest._replace(**nothing)
-                for _ in range(SETTLING - 1):
-                    state = reconstructor(reconstructor.read(images[k]), state)
             state = reconstructor(reconstructor.read(images[k]), state)
             assert np.abs(frame["vertices"] - state.vertices.numpy()).max() < 1e-3
     with pytest.raises(EdgeError, match="does not track"):

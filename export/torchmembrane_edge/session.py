@@ -9,7 +9,6 @@ import onnxruntime
 
 FORMAT = "1"
 GREY = (0.299, 0.587, 0.114)
-SETTLING = 4  # runs of a frame that starts from rest
 WHOLE, FLAGS = ("triangles", "grid", "image_size"), ("fixed",)  # of the mesh; other arrays are float32
 
 
@@ -55,7 +54,7 @@ class Session:
         `images`: `[height, width]` or `[B, height, width]` grey, or `[B, height, width, 3]` RGB; uint8, uint16 or float in
         0..1. A frame that cannot be reconstructed has a status and NaN.
         `previous`, for a model that tracks: the results of the frames before. Without them, or where a frame had no surface,
-        it starts from rest, and the batch is run `SETTLING` times.
+        it starts from rest.
         """
         images = grey(images)
         width, height = self.image_size
@@ -69,10 +68,8 @@ class Session:
         state = self._rest(len(images)) if previous is None else previous
         if len(state["pressure"]) != len(images):
             raise EdgeError(f"{len(images)} images after results of {len(state['pressure'])}; expected as many")
-        for _ in range(1 if np.isfinite(state["pressure"]).all() else SETTLING):
-            feed |= {f"previous_{key}": state[key] for key in self._state}
-            state = dict(zip(self._outputs, self._session.run(None, feed), strict=True))
-        return state
+        feed |= {f"previous_{key}": state[key] for key in self._state}
+        return dict(zip(self._outputs, self._session.run(None, feed), strict=True))
 
     def track(self, images):
         """Results of a video's images, one after another, each from that before (a generator)."""

@@ -6,7 +6,6 @@ ort.env.wasm.wasmPaths = { wasm: new URL(wasm, import.meta.url).href };
 ort.env.wasm.numThreads = 1; // more need cross-origin isolation, and a single frame gains nothing by them
 
 const PREVIOUS = "previous_";
-const SETTLING = 4; // runs of a frame that starts from rest, as in torchmembrane_edge
 
 let session, given, state;
 
@@ -31,17 +30,12 @@ const imageOf = ({ grey, width, height }) => new ort.Tensor("float32", grey, [1,
 async function run(pixels) {
   const image = imageOf(pixels);
   const start = performance.now();
-  let outputs;
-  for (let turn = given.length && isFromRest() ? SETTLING : 1; turn > 0; turn--) {
-    outputs = await session.run({ image, ...state });
-    state = Object.fromEntries(given.map(({ name }) => [name, outputs[name.slice(PREVIOUS.length)]]));
-  }
+  const outputs = await session.run({ image, ...state });
   const milliseconds = performance.now() - start;
+  state = Object.fromEntries(given.map(({ name }) => [name, outputs[name.slice(PREVIOUS.length)]]));
   const frame = Object.entries(outputs).map(([name, { data, dims }]) => [name, { data, shape: dims.slice(1) }]);
   return { frame: Object.fromEntries(frame), milliseconds };
 }
-
-const isFromRest = () => !state[`${PREVIOUS}pressure`].data.every(Number.isFinite);
 
 onmessage = async ({ data: { model, image } }) => {
   try {
