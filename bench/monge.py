@@ -62,8 +62,7 @@ def main():
             for name, estimator in estimators.items():
                 got = estimator(observation)
                 vertices = got.vertices.reshape(first.shape)
-                moved = (vertices - r.estimator.membrane.rest)[0, r.marker_vertices]
-                markers = r.rest_markers + (r.marker_weights[..., None] * moved).sum(-2)
+                markers = r.rest_markers + r.marker_shares @ (vertices - r.estimator.membrane.rest)[0]
                 error = float(((markers - Y).square().sum() / (Y - X).square().sum()).sqrt())
                 apart = float((vertices - first).square().sum(-1).mean().sqrt())
                 rise = float(got.pressure / r.estimator.rest_pressure - 1)

@@ -103,6 +103,16 @@ def jacobian_at_inner_vertices(function, x, estimator):
     return inner(jacobian.flatten(0, -4).squeeze(1), estimator.membrane.grid).flatten(1)
 
 
+def linear_angles(bearings, x, y, measured, moved):
+    """The angles at `y` where the markers' step from `x` is linear in their triangles, as the equations have it."""
+    at, step = bearings.markers(x), inner(y - x, bearings.grid)
+    bearings.markers = lambda _: at + bearings.vertex_shares @ step
+    try:
+        return bearings.angles(y, measured, moved)[0]
+    finally:
+        del bearings.markers
+
+
 def test_linearised_force_and_volume_are_those_and_their_derivatives():
     estimator = make(9)
     membrane, forces = estimator.membrane, estimator.equations.forces
@@ -154,7 +164,7 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     moving = equations.forces.inner_free.repeat(3) > 0
     unknowns = torch.nonzero(moving).ravel()
     A = jacobian_at_inner_vertices(lambda y: inner(equations.forces(y, p), dome.grid).mT, x, estimator)
-    J = jacobian_at_inner_vertices(lambda y: equations.bearings.angles(y, measured, moved)[0], x, estimator)
+    J = jacobian_at_inner_vertices(lambda y: linear_angles(equations.bearings, x, y, measured, moved), x, estimator)
     A, J = (by_component(rows)[:, unknowns] for rows in (A, J))
     W = torch.diag_embed(W[0]).movedim(2, 1).flatten(2).flatten(0, 1)
     w = torch.diag(weight[0].repeat(2))
@@ -194,8 +204,42 @@ def test_the_bearing_jacobian_is_the_derivative_of_the_angles():
     x = bent(estimator.membrane)
     _, jacobian = bearings.angles(x, measured, moved)
     exact = torch.autograd.functional.jacobian(lambda y: bearings.angles(y, measured, moved)[0], x)[0, :, :, 0]
-    expected = torch.einsum("acd,dn->adnc", jacobian[0], bearings.vertex_shares)
+    expected = torch.einsum("acd,dn->adnc", jacobian[0], bearings.smooth_shares)
     torch.testing.assert_close(inner(exact, estimator.membrane.grid), expected)
+
+
+def test_steps_take_the_cone_they_are_given(pressed):
+    """As an estimator with that cone in its settings takes them; the loss that answers are compared by keeps its own."""
+    (origins, directions), *_ = pressed
+    steep, usual = make(13), make(13)
+    steep.equations.loss.cone = 0.0
+    found = []
+    for one, cone in ((steep, None), (usual, 0.0), (usual, None)):
+        measured = one.equations.bearings.measured(seen(origins, directions))
+        schedule = SETTINGS.gnc_schedule(4, SETTINGS.tau)
+        found.append(one.descent(one.at_rest(measured.weight), measured, schedule, cone=cone)[0].x)
+    torch.testing.assert_close(found[1], found[0], rtol=0, atol=0)
+    assert (found[2] - found[0]).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("n", [9, 17, 33])
+def test_markers_follow_a_curved_displacement_between_the_grids_lines(n):
+    """A dent a quarter of the dome wide: markers carried along by it, several times closer than along the triangles' chords."""
+    estimator = make(n)
+    bearings, membrane = estimator.equations.bearings, estimator.membrane
+    normals = spherical_cap(12, 9, 3, (65, 65)).closest_points(bearings.positions.numpy())
+
+    def dent(X):
+        inwards = torch.nn.functional.normalize(X - torch.tensor([0.0, 0.0, -0.5], dtype=torch.float64), dim=-1)
+        return -2.0 * torch.exp(-(X - X.new_tensor([1.0, 2.0, 11.7])).square().sum(-1, keepdim=True) / (2 * 3.0**2)) * inwards
+
+    assert (abs(normals.distance) < 0.05).all()  # of the same surface
+    free = estimator.equations.forces.free
+    x = (membrane.rest + dent(membrane.rest) * free)[None]
+    exact = bearings.positions + dent(bearings.positions)
+    smooth = (bearings.markers(x)[0] - exact).norm(dim=-1)
+    linear = bearings.positions + bearings.vertex_shares @ inner(x - membrane.rest, membrane.grid)[0]
+    assert smooth.square().mean() < (0.5 if n == 9 else 0.2) ** 2 * (linear - exact).square().sum(-1).mean()
 
 
 def test_angles_vanish_on_the_rays_and_grow_with_the_distance_across():

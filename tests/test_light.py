@@ -89,7 +89,7 @@ def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
     measured = bearings.measured(seen(torch.zeros_like(rays), rays))
     state = estimator.at_rest(torch.ones(2 * D, 1, dtype=torch.float64))
     infinite = torch.tensor(torch.inf, dtype=torch.float64)
-    (x, pressure, moved), _ = estimator.descent.step(state, measured, infinite, infinite)
+    (x, pressure, moved), _ = estimator.descent.step(state, measured, infinite, infinite, torch.tensor(SETTINGS.cone))
     traction = estimator.equilibrium(x, pressure, moved, x, measured).traction
     _, normal = at_rest(estimator)
     push = (inner(traction, estimator.membrane.grid) * normal).sum(-1) / estimator.reference / small

@@ -21,7 +21,6 @@ from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity
 from torchmembrane.sensor.sensor import Sensor
-from torchmembrane.surface.projection import SurfacePoints
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PAPERS = "minimum-energy"
@@ -308,8 +307,7 @@ def test_the_linear_volume_reaches_the_estimator_and_is_off_by_what_it_leaves_ou
 def test_bilinear_flow_reaches_the_estimator(plain, papers):
     """Section 5: the vertices lie on the rays of their rest pixels moved by the bilinear matrix, not by the smooth flow."""
     made, free = papers.made, papers.made.estimator.membrane.free_vertices
-    points = SurfacePoints(made.marker_vertices.numpy(), made.marker_weights.numpy(), np.zeros(len(made.marker_vertices)))
-    moved = made.vertex_pixels + torch.from_numpy(bilinear_matrix(made.estimator.membrane, points)) @ papers.flow
+    moved = made.vertex_pixels + torch.from_numpy(bilinear_matrix(made.estimator.membrane, made.marker_points)) @ papers.flow
     seen, smooth = (made.camera.point_to_pixel(one.vertices)[free] for one in (papers, plain))
     torch.testing.assert_close(seen, moved[free], rtol=0, atol=1e-6)
     assert (smooth - moved[free]).abs().max() > 0.2

@@ -51,7 +51,7 @@ def test_a_step_changes_no_edge_by_more_than_its_share(dented, tau):
         2, *one.membrane.rest.shape, generator=torch.Generator().manual_seed(0)
     ).double() * (~one.membrane.fixed[:, None])
     start = State(x, *one.at_rest(measured.weight)[1:])
-    after = one.descent.step(start, measured, torch.tensor(tau), torch.tensor(50.0))[0]
+    after = one.descent.step(start, measured, *(torch.tensor(scale) for scale in (tau, 50.0, SETTINGS.cone)))[0]
     before, now = edges(x, DOME), edges(after.x, DOME)
     share = ((now - before).norm(dim=-1) / before.norm(dim=-1)).amax(-1)
     assert (share < SETTINGS.largest_stretch * (1 + 1e-6)).all() and (share > 0.01).all()

@@ -27,6 +27,7 @@ from .markers.placement import imaged_vertices, place_markers
 from .pieces import piece
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
+from .surface.bicubic import bicubic_shares
 
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
 LEAST_ERROR = 0.02  # px
@@ -63,8 +64,7 @@ class Reconstructor(nn.Module):
 
     vertex_pixels: Tensor
     rest_markers: Tensor
-    marker_vertices: Tensor
-    marker_weights: Tensor
+    marker_shares: Tensor
 
     def __init__(
         self,
@@ -93,6 +93,7 @@ class Reconstructor(nn.Module):
         imaged = imaged_vertices(sensor, vertex_pixels, whole=estimator != "force-balance")
         markers, cavity = place_markers(sensor, vertex_pixels, locator), cavity_filling(sensor, membrane, warn=True)
         positions, model_pixels = torch.from_numpy(markers.positions), torch.from_numpy(markers.model_pixels)
+        self.marker_points = markers.points
         rim_pixels, rest_image = vertex_pixels[membrane.fixed & imaged].numpy(), sensor.markers.rest_image
         self.observer = MarkerObserver(markers, rim_pixels, sensor.name, dtype, rest_image, self.image_size, check_rest)
         problem = Problem(
@@ -111,8 +112,8 @@ class Reconstructor(nn.Module):
         self.coverage = Coverage(membrane, positions, self.observer.seen_at_rest)
         self.register_buffer("vertex_pixels", vertex_pixels)
         self.register_buffer("rest_markers", positions)
-        self.register_buffer("marker_vertices", torch.from_numpy(markers.points.vertices.astype(np.int64)))
-        self.register_buffer("marker_weights", torch.from_numpy(markers.points.weights.copy()))
+        shares = bicubic_shares(markers.points, membrane.grid, membrane.fixed)
+        self.register_buffer("marker_shares", torch.from_numpy(shares))
         self.to(dtype)
         keep_small(self)
 
@@ -252,8 +253,7 @@ class Reconstructor(nn.Module):
         """The frames' results, NaN where there is no surface."""
         membrane, lost, x = self.estimator.membrane, confidence <= FOUND, found.vertices
         u = x - membrane.rest
-        corner_u = u[:, self.marker_vertices.ravel()].unflatten(1, (-1, 3))
-        markers = self.rest_markers + (self.marker_weights[..., None] * corner_u).sum(-2)
+        markers = self.rest_markers + self.marker_shares @ u
         pixels = self.rest_pixels + displacement
         modelled = self.camera.point_to_pixel(markers) + shift_of(found.moved, pixels, self.image_size)
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))

@@ -16,7 +16,6 @@ from ..io.status import Status
 from ..reconstruct import Reconstructor
 from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor
-from ..surface.projection import SurfacePoints
 from .gauge import FoundPressures, GaugeModulus, modulus_from_pressures
 
 GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
@@ -227,8 +226,7 @@ class Presses:
         assert isinstance(known, ForceBalance)  # as `_reconstructor` chooses
         cavity, membrane = known.cavity, known.membrane if grid is None else r.sensor.surface.membrane(grid)
         elasticity = elastic_energy(r.sensor, membrane, prestretch=stretch, modulus=modulus)
-        points = SurfacePoints(r.marker_vertices.numpy(), r.marker_weights.numpy(), np.zeros(len(r.rest_markers)))
-        points = points if grid is None else membrane.closest_points(r.rest_markers.numpy())
+        points = r.marker_points if grid is None else membrane.closest_points(r.rest_markers.numpy())
         gas = tuple(cavity.gas.tolist())
         estimator = ForceBalance(
             membrane, elasticity, points, r.rest_markers, known.equations.bearings.noise, cavity.filling, gas

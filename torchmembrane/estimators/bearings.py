@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from ..camera.model import Camera
 from ..pieces import piece
 from ..solve.stencil_system import NEAR
+from ..surface.bicubic import bicubic_shares
 from ..surface.membrane import Membrane
 from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner
@@ -97,6 +98,7 @@ class MarkerBearings(nn.Module):
     positions: Tensor
     rest_spread: Tensor
     inner_rest: Tensor
+    smooth_shares: Tensor
     vertex_shares: Tensor
     pair_shares: Tensor
 
@@ -108,6 +110,8 @@ class MarkerBearings(nn.Module):
         vertex_shares, pair_shares = _shares(membrane, markers)
         self.register_buffer("vertex_shares", vertex_shares)
         self.register_buffer("pair_shares", pair_shares)
+        smooth = torch.from_numpy(bicubic_shares(markers, membrane.grid, membrane.fixed)) * ~membrane.fixed
+        self.register_buffer("smooth_shares", inner(smooth.mT, membrane.grid).mT.contiguous())
         across = None if rest is None else rest.across
         spread = torch.tensor(noise**2, dtype=torch.float64) if across is None else _spread(across).mean()
         self.register_buffer("rest_spread", spread)
@@ -126,8 +130,9 @@ class MarkerBearings(nn.Module):
         return Bearings(origins.mT, across.movedim(1, -1), confidence, noise_level, motion.movedim(1, -1), gauge)
 
     def markers(self, x: Tensor) -> Tensor:
-        """The markers' positions on the surface `x [B, V, 3]`, `[B, D, 3]`."""
-        return self.positions + self.vertex_shares @ (inner(x, self.grid) - self.inner_rest)
+        """The markers' positions on the surface `x [B, V, 3]`, `[B, D, 3]`: their displacement is bicubic between the grid's
+        lines. In the equations it is linear, for their sparsity: steps are short, and smooth as the chords' errors are not."""
+        return self.positions + self.smooth_shares @ (inner(x, self.grid) - self.inner_rest)
 
     def angles(self, x: Tensor, measured: Bearings, moved: Tensor) -> tuple[Tensor, Tensor]:
         """Angles across the measured rays `[B, 2, D]`, and the bearing Jacobian: their derivatives in the markers' positions,

@@ -86,10 +86,20 @@ class Dent(nn.Module):
         *kept, before = self.much_lower((*state, before), (*dented, last), measured)
         return State(*kept), before
 
-    def sought(self, quick: State, slow: State, measured: Bearings, schedule: Schedule) -> Found:
-        """The best of what the steps of a schedule make of several dents in two states, and the surface a step before; the
-        first of those that are about as good, for answers must not jump between them."""
-        starts = self(*slow, measured), self.deep(*slow, measured), self.wide(*slow, measured), self.deep(*quick, measured)
+    def sought(self, quick: State, slow: State, rest: State, measured: Bearings, schedule: Schedule) -> Found:
+        """The best of what the steps of a schedule make of several dents in two states, and of two states found from `rest` on
+        this grid, and the surface a step before; the first of those that are about as good, for answers must not jump between
+        them. The two from rest: by a sharp loss from the start, and without a cone, where shear is dear even under a push."""
+        settings = self.descent.settings
+        steps = 2 * settings.steps
+        starts = (
+            self(*slow, measured),
+            self.deep(*slow, measured),
+            self.wide(*slow, measured),
+            self.deep(*quick, measured),
+            self.descent(rest, measured, settings.gnc_schedule(steps, settings.sharp_tau))[0],
+            self.descent(rest, measured, settings.gnc_schedule(steps, settings.tau), cone=0.0)[0],
+        )
         found: list[Found] = [self.descent(start, measured, schedule) for start in starts]
         best: Stepped = (*found[0][0], found[0][1])
         for state, before in found[1:]:

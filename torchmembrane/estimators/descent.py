@@ -1,5 +1,6 @@
 """Gauss-Newton steps of force balance: surface and pressure, the volume linearised."""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -44,15 +45,21 @@ class Descent(nn.Module):
         self.membrane = equations.forces.membrane
 
     def forward(
-        self, state: State, measured: Bearings, schedule: list[tuple[float, float]], one_factor: bool = False
+        self,
+        state: State,
+        measured: Bearings,
+        schedule: list[tuple[float, float]],
+        one_factor: bool = False,
+        cone: float | None = None,
     ) -> tuple[State, Tensor]:
         """The state after the steps of a schedule, and the surface before the last; `one_factor`: all with the factor of the
-        first step."""
+        first step; `cone`: as for `TractionLoss.weights`."""
         before, factor = state.x, None
+        rows = [(*scales, self.equations.loss.cone if cone is None else cone) for scales in schedule]
         if one_factor:
-            x, pressure, moved, before, factor = self._first(*state, measured, *schedule[0])
-            state, schedule = State(x, pressure, moved), schedule[1:]
-        x, pressure, moved, before = repeated(self._next, schedule, (*state, before), measured, factor)
+            x, pressure, moved, before, factor = self._first(*state, measured, *rows[0])
+            state, rows = State(x, pressure, moved), rows[1:]
+        x, pressure, moved, before = repeated(self._next, rows, (*state, before), measured, factor)
         return State(x, pressure, moved), before
 
     def objective(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> Tensor:
@@ -70,10 +77,10 @@ class Descent(nn.Module):
 
     @piece
     def _first(
-        self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings, tau: float, outlier: float
+        self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings, *scales: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Factor | None]:
         """The state, the surface before; the factor of the step's matrix."""
-        state, factor = self._traced_once(State(x, pressure, moved), measured, tau, outlier, None, keeps=True)
+        state, factor = self._traced_once(State(x, pressure, moved), measured, scales, None, keeps=True)
         return *state, x, factor
 
     @piece
@@ -85,30 +92,29 @@ class Descent(nn.Module):
         before: Tensor,
         measured: Bearings,
         factor: Factor | None,
-        tau: float,
-        outlier: float,
+        *scales: float,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The state, and the surface before."""
-        state, _ = self._traced_once(State(x, pressure, moved), measured, tau, outlier, factor)
+        state, _ = self._traced_once(State(x, pressure, moved), measured, scales, factor)
         return *state, x
 
     def _traced_once(
-        self, state: State, measured: Bearings, tau: float, outlier: float, factor: Factor | None, keeps: bool = False
+        self, state: State, measured: Bearings, scales: Sequence[float], factor: Factor | None, keeps: bool = False
     ) -> tuple[State, Factor | None]:
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.
 
         With gradients every step is: those of a nested region come with strides that torch 2.13 does not follow."""
-        scales = [torch.as_tensor(scale, dtype=state.x.dtype, device=state.x.device) for scale in (tau, outlier)]
+        tau, outlier, cone = (torch.as_tensor(scale, dtype=state.x.dtype, device=state.x.device) for scale in scales)
         unrolled = torch.compiler.is_exporting() or torch.is_grad_enabled()
         step = self.step if unrolled else self._compiled_once
-        taken: tuple[State, Factor | None] = step(state, measured, scales[0], scales[1], factor, keeps)
+        taken: tuple[State, Factor | None] = step(state, measured, tau, outlier, cone, factor, keeps)
         return taken
 
     @torch.compiler.nested_compile_region
     def _compiled_once(
-        self, state: State, measured: Bearings, tau: Tensor, outlier: Tensor, factor: Factor | None, keeps: bool
+        self, state: State, measured: Bearings, tau: Tensor, outlier: Tensor, cone: Tensor, factor: Factor | None, keeps: bool
     ) -> tuple[State, Factor | None]:
-        return self.step(state, measured, tau, outlier, factor, keeps)
+        return self.step(state, measured, tau, outlier, cone, factor, keeps)
 
     def step(
         self,
@@ -116,6 +122,7 @@ class Descent(nn.Module):
         measured: Bearings,
         tau: Tensor,
         outlier: Tensor,
+        cone: Tensor,
         factor: Factor | None = None,
         keeps: bool = False,
     ) -> tuple[State, Factor | None]:
@@ -124,7 +131,7 @@ class Descent(nn.Module):
         Also returns the factor of its matrix if it `keeps` it: with the `factor` of a step near this one it makes none.
         """
         equations, (x, pressure, moved) = self.equations, state
-        _, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier)
+        _, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier, cone)
         loads = torch.cat([loads, motion.coupling], 1)
         first, last = self.settings.tau
         blunt = (tau.clamp_max(first) / last) ** 2  # 1 as tau ends

@@ -212,7 +212,7 @@ class ForceBalance(nn.Module):
             state, before = self.descent(self._begun(measured, start, patient), measured, schedule)
         elif patient:
             quick, slow = (self._undented(measured, start, patient) for patient in (False, True))
-            state, before = self.dent.sought(quick, slow, measured, last)
+            state, before = self.dent.sought(quick, slow, self.at_rest(measured.weight), measured, last)
         else:
             state, before = self.descent(self.dent(*self._undented(measured, start), measured), measured, last)
         return self.equilibrium(state.x, state.pressure, state.moved, before, measured)
@@ -236,10 +236,11 @@ class ForceBalance(nn.Module):
         if warm and not self.passes_on_starts:
             return settings.gnc_schedule(settings.warm_steps, settings.warm_tau)
         steps = settings.patience * self.steps if patient else self.steps
-        coarsest, finer = (settings.patient_tau, settings.patient_fine_tau) if patient else (settings.tau, settings.fine_tau)
-        schedule = settings.gnc_schedule(steps, coarsest if self.coarse is None else finer)
-        settling = settings.settling_steps if patient and self.coarse is not None and self.dent is None else 0
-        return schedule + schedule[-1:] * settling
+        if self.coarse is not None and self.dent is None:
+            settling = settings.settling_steps if patient else 0
+            return settings.gnc_schedule(steps, settings.fine_tau)[-1:] * (steps + settling)
+        coarsest, fine = (settings.patient_tau, settings.patient_fine_tau) if patient else (settings.tau, settings.fine_tau)
+        return settings.gnc_schedule(steps, coarsest if self.coarse is None else fine)
 
     @piece
     def at_rest(self, confidence: Tensor) -> State:

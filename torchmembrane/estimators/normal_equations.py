@@ -50,12 +50,13 @@ class BalanceEquations(nn.Module):
         measured: Bearings,
         tau: Tensor | float,
         outlier: Tensor | float,
+        cone: Tensor | float | None = None,
         curvature: bool = False,
     ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor], CameraMotion]:
-        """The forces, the normal equations, their loads and the camera's motion at a surface; `curvature` as for
+        """The forces, the normal equations, their loads and the camera's motion at a surface; `cone` and `curvature` as for
         `TractionLoss.weights`."""
         at = self.forces.linearised(x, pressure)
-        W = self.loss.weights(at.normal, at.force, measured.noise_level, tau, curvature)
+        W = self.loss.weights(at.normal, at.force, measured.noise_level, tau, cone, curvature)
         angle, jacobian = self.bearings.angles(x, measured, moved)
         weight = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
         normal = self.normal_equations(at, W, jacobian, weight)

@@ -21,8 +21,9 @@ class ForceBalanceSettings:
         warm_steps: from the solution of the frame before.
         conjugate_steps: conjugate-gradient steps of a step that has the factor of another.
         tau: first and last scale of the compressive traction's loss, from rest.
-        fine_tau: the same, from a coarser grid's solution.
+        fine_tau: the same, from the coarsest grid's solution; finer grids begin with the last, not to leave the basin.
         warm_tau: the same, from the solution of the frame before.
+        sharp_tau: the same, from rest on the grid of the dents, in a second try.
         patience: so many times the steps, from rest, where these do not settle.
         patient_tau: as `tau`, then.
         patient_fine_tau: as `fine_tau`, then.
@@ -69,12 +70,13 @@ class ForceBalanceSettings:
     steps: int = 8
     coarse_steps: int = 4
     fine_steps: int = 4
-    finer_steps: int = 4
+    finer_steps: int = 3
     warm_steps: int = 4
     conjugate_steps: int = 2
     tau: tuple[float, float] = (4.0, 0.4)
     fine_tau: tuple[float, float] = (0.8, 0.4)
     warm_tau: tuple[float, float] = (0.8, 0.4)
+    sharp_tau: tuple[float, float] = (1.0, 0.4)
     patience: int = 3
     patient_tau: tuple[float, float] = (16.0, 0.4)
     patient_fine_tau: tuple[float, float] = (2.0, 0.4)
@@ -92,7 +94,7 @@ class ForceBalanceSettings:
     decrease: float = 2.0
     friction: float = 3.75
     slip: float = 0.05
-    cone: float = 15.0
+    cone: float = 20.0
     coarse_cone: float = 5.0
     reach: float = 0.04
     floor: float = 1e-3

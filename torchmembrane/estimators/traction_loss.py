@@ -70,10 +70,10 @@ class TractionLoss(nn.Module):
         push2 = (-q_n / p0).clamp_min(0) ** 2 @ self.surroundings
         return q_n / p0, q_t.square().sum(1) / p0**2, push2
 
-    def shear_weight(self, push2: Tensor) -> Tensor:
-        """`kappa [B, N]`."""
-        settings = self.settings
-        return settings.friction / (1 + self.cone * (push2 + settings.slip**4).sqrt())
+    def shear_weight(self, push2: Tensor, cone: float | Tensor | None = None) -> Tensor:
+        """`kappa [B, N]`; `cone`: default, that of this loss."""
+        settings, cone = self.settings, self.cone if cone is None else cone
+        return settings.friction / (1 + cone * (push2 + settings.slip**4).sqrt())
 
     def scale2(self, push2: Tensor, noise_level: Tensor, tau: float | Tensor) -> Tensor:
         """`rho^2 [B, N]`, from `S^2 [B, N]` and the frames' noise over that at rest `[B]`.
@@ -102,7 +102,13 @@ class TractionLoss(nn.Module):
         return torch.where(above, rho, BEYOND)
 
     def weights(
-        self, normal: Tensor, force: Tensor, noise_level: Tensor, tau: float | Tensor, curvature: bool = False
+        self,
+        normal: Tensor,
+        force: Tensor,
+        noise_level: Tensor,
+        tau: float | Tensor,
+        cone: float | Tensor | None = None,
+        curvature: bool = False,
     ) -> Tensor:
         """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, 3, 3, N]`: the parabolas that touch the loss of a force.
 
@@ -111,6 +117,7 @@ class TractionLoss(nn.Module):
             force: `[B, 3, N]`.
             noise_level: `[B]`, of the frames over that at rest.
             tau: scale of the compressive traction's loss.
+            cone: how much less shear weighs where something pushes; default, that of this loss.
             curvature: the curvature of a push's loss instead of its weight, zero where it bends down.
         """
         q_n, shear2, push2 = self.parts(force / self.area, normal)
@@ -119,7 +126,7 @@ class TractionLoss(nn.Module):
         compressive = GemanMcClure(tau)
         pushed = compressive.curvature(push2) if curvature else compressive.weight(push2)
         w_n = self.settings.floor + torch.where(q_n < 0, pushed, 1.0)
-        w_t = self.shear_weight(push2) * self.shear.weight(shear2)
+        w_t = self.shear_weight(push2, cone) * self.shear.weight(shear2)
         scale = self.settings.sparsity / (self.reference * self.size) ** 2 / self.area / rho2
         one = torch.eye(3, dtype=force.dtype, device=force.device)[..., None]
         along = (scale * (w_n - w_t))[:, None] * normal
