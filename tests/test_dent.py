@@ -116,17 +116,16 @@ def test_a_pit_in_a_slack_bubble_is_not_taken_for_a_mound(bubble):
 
 
 def test_a_tracked_frame_leaves_the_mound_of_the_frame_before(bubble):
-    """As from rest, within a fiftieth of the press; without another dent it stays there."""
+    """For what is as right as from rest; without another dent it stays there."""
     sensor, truth = bubble
     reconstructor = tm.Reconstructor(sensor, check_rest=False)
-    cold = solved(reconstructor, truth)
     dent, reconstructor.estimator.dent = reconstructor.estimator.dent, None
     mound = solved(reconstructor, truth)
     stays, _ = errors(solved(reconstructor, truth, mound), truth)
     reconstructor.estimator.dent = dent
-    tracked = solved(reconstructor, truth, mound)
+    surface, force = errors(solved(reconstructor, truth, mound), truth)
     assert stays > 0.3
-    assert (tracked.displacement - cold.displacement).norm() < 0.02 * cold.displacement.norm()
+    assert surface < 0.15 and force < 0.1
 
 
 def test_a_deep_press_is_found_from_a_deep_dent():

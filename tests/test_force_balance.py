@@ -222,9 +222,9 @@ def test_steps_take_the_cone_they_are_given(pressed):
     assert (found[2] - found[0]).abs().max() > 0.01
 
 
-@pytest.mark.parametrize("n", [9, 17, 33])
-def test_markers_follow_a_curved_displacement_between_the_grids_lines(n):
-    """A dent a quarter of the dome wide: markers carried along by it, several times closer than along the triangles' chords."""
+@pytest.mark.parametrize(("n", "share"), [(9, 0.7), (17, 0.3), (33, 0.1)])
+def test_markers_follow_a_curved_displacement_between_the_grids_lines(n, share):
+    """A dent a quarter of the dome wide: markers are carried along by it, and not by the triangles' chords."""
     estimator = make(n)
     bearings, membrane = estimator.equations.bearings, estimator.membrane
     normals = spherical_cap(12, 9, 3, (65, 65)).closest_points(bearings.positions.numpy())
@@ -239,7 +239,8 @@ def test_markers_follow_a_curved_displacement_between_the_grids_lines(n):
     exact = bearings.positions + dent(bearings.positions)
     smooth = (bearings.markers(x)[0] - exact).norm(dim=-1)
     linear = bearings.positions + bearings.vertex_shares @ inner(x - membrane.rest, membrane.grid)[0]
-    assert smooth.square().mean() < (0.5 if n == 9 else 0.2) ** 2 * (linear - exact).square().sum(-1).mean()
+    chord = (linear - exact).norm(dim=-1)
+    assert smooth.square().mean().sqrt() < share * chord.square().mean().sqrt()
 
 
 def test_angles_vanish_on_the_rays_and_grow_with_the_distance_across():

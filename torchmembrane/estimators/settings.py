@@ -70,7 +70,7 @@ class ForceBalanceSettings:
     steps: int = 8
     coarse_steps: int = 4
     fine_steps: int = 4
-    finer_steps: int = 3
+    finer_steps: int = 4
     warm_steps: int = 4
     conjugate_steps: int = 2
     tau: tuple[float, float] = (4.0, 0.4)
