@@ -80,7 +80,7 @@ def bent(membrane, batch=1, size=0.05):
 
 def dense(system, matrix):
     """The dense matrix `[3 N, 3 N]` of one frame's scaled blocks."""
-    values, scale = system.dense(matrix[0])[0], matrix[1][0]
+    values, scale = system.dense(matrix[0]), matrix[1][0]
     rows, s = system.rows, values.shape[-1]
     full = values.new_zeros(rows, s, rows, s)
     for (i, j), block in zip(chain(*block_pentadiagonal.places(rows)), values, strict=True):

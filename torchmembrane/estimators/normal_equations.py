@@ -85,9 +85,8 @@ class BalanceEquations(nn.Module):
 
     def matrix(self, normal: NormalEquations, damping: float | Tensor = 1e-6) -> tuple[Tensor, Tensor]:
         """`M` as `system.factor` takes it, with a share of its diagonal added."""
-        A = normal.stiffness.transpose(2, 3).flatten(2, 3).movedim(-1, 1).contiguous()  # products of strided ones take a loop
-        near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1)).permute(0, 3, 1, 4, 2)
-        return self.system.matrix(A.mT @ (normal.weights.movedim(-1, 1).contiguous() @ A), near, damping)
+        near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1))
+        return self.system.matrix(normal.stiffness, normal.weights, near, damping)
 
     def product(self, normal: NormalEquations, u: Tensor, damping: float | Tensor | None = None) -> Tensor:
         """`M u` for `u [B, C, 3 N]`, without the matrix; with `damping` as of `matrix`."""
