@@ -4,14 +4,15 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..mechanics.cavity import CavityLaw
 from ..pieces import piece, repeated
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..solve.implicit import differentiable
-from ..solve.kkt import BorderedStep, solve_bordered
-from ..surface.stencil import inner, pad_border
+from ..solve.kkt import border_unknowns
+from ..surface.stencil import inner
 from .bearings import Bearings
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
@@ -42,6 +43,7 @@ class Descent(nn.Module):
         super().__init__()
         self.equations, self.cavity, self.settings = equations, cavity, settings
         self.membrane = equations.forces.membrane
+        self.inner_grid = self.membrane.grid[0] - 2, self.membrane.grid[1] - 2
 
     def forward(
         self, state: State, measured: Bearings, schedule: list[tuple[float, float]], one_factor: bool = False
@@ -130,15 +132,14 @@ class Descent(nn.Module):
         blunt = (tau.clamp_max(first) / last) ** 2  # 1 as tau ends
         made, solved = self._solved(normal, loads, self.settings.damping * blunt, factor, keeps)
         motion = motion.held(moved, self.settings.camera_motion * blunt)
-        loads, solved = motion.eliminated(loads[:, :3], solved[:, :3], solved[:, 3:])
+        products, following = motion.eliminated(loads @ solved.mT)
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
-        move, rise = self._bordered_step(x, pressure, loads, solved, corner)
-        turn = motion.following(move)
-        move = move.unflatten(-1, (3, -1)).mT
-        move = pad_border(move, self.membrane.grid)
+        shares = self._shares(x, pressure, products, corner)
+        turn = (following @ shares[..., None])[..., 0]
+        move = F.pad(-(torch.cat([shares, turn], 1)[:, None] @ solved).unflatten(-1, (3, *self.inner_grid))[:, 0], (1, 1, 1, 1))
         share = self._share(x, move)
-        x = x + share[:, None, None] * move
-        return State(x, pressure + share * rise, moved + share[:, None] * turn), made
+        x = x + share[:, None, None] * move.flatten(2).mT
+        return State(x, pressure + share * shares[:, 2], moved + share[:, None] * turn), made
 
     def _solved(
         self, normal: NormalEquations, loads: Tensor, damping: Tensor, factor: Factor | None, keeps: bool
@@ -166,25 +167,25 @@ class Descent(nn.Module):
         product, precondition = partial(equations.product, normal), partial(equations.system.substitute, factor)
         return conjugate_gradient(product, precondition, loads, steps)
 
-    def _share(self, x: Tensor, move: Tensor) -> Tensor:
-        """Of a step `move [B, V, 3]`, so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
-        settings, tiny = self.settings, torch.finfo(x.dtype).tiny
-        far = torch.linalg.vector_norm(move, dim=-1).amax(-1) / (settings.longest_step * self.membrane.size)
-        for axis in (1, 2):
-            change, edge = (
-                torch.linalg.vector_norm(field.unflatten(1, self.membrane.grid).diff(dim=axis), dim=-1) for field in (move, x)
-            )
-            stretch = (change / edge.clamp_min(tiny)).flatten(1).amax(-1)
-            far = torch.maximum(far, stretch / settings.largest_stretch)
-        share: Tensor = 1 / far.clamp_min(1.0)
-        return share
-
-    def _bordered_step(
-        self, x: Tensor, pressure: Tensor, loads: Tensor, solved: Tensor, corner: tuple[Tensor, Tensor]
-    ) -> BorderedStep:
-        """Step `d` and rise of the pressure: `M d + m dp + n lambda = -g` with the rows of the pressure and of the volume."""
+    def _shares(self, x: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:
+        """Shares `[B, 3]` in a step, but for its sign, of what solves the volume's row, the loads and the pressure's row: the
+        second is 1, the third what the pressure rises by."""
+        one = torch.ones_like(pressure)
         if self.cavity.filling == "open":
-            return BorderedStep(-solved[:, 1], torch.zeros_like(pressure))
+            return torch.stack([0 * one, one, 0 * one], 1)
         fWv, vWv = corner
         target, compliance = self.cavity.condition(self.membrane.volume(x) - self.membrane.rest_volume, pressure)
-        return solve_bordered(loads, solved, vWv, fWv, compliance, target)
+        multiplier, rise = border_unknowns(products, vWv, fWv, compliance, target)
+        return torch.stack([multiplier, one, rise], 1)
+
+    def _share(self, x: Tensor, move: Tensor) -> Tensor:
+        """Of a step `move [B, 3, m, n]`, so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
+        settings, tiny = self.settings, torch.finfo(x.dtype).tiny
+        both = torch.stack([move, x.transpose(1, 2).unflatten(-1, self.membrane.grid)], 1)  # mT of an input would be aliased
+        far2 = move.square().sum(1).flatten(1).amax(-1) / (settings.longest_step * self.membrane.size) ** 2
+        for axis in (-2, -1):
+            change2, edge2 = both.diff(dim=axis).square().sum(2).unbind(1)
+            stretch2 = (change2 / edge2.clamp_min(tiny)).flatten(1).amax(-1)
+            far2 = torch.maximum(far2, stretch2 / settings.largest_stretch**2)
+        share: Tensor = far2.clamp_min(1.0).rsqrt()
+        return share
