@@ -1,14 +1,14 @@
 """Gauss-Newton steps of force balance: surface and pressure, the volume linearised."""
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..mechanics.cavity import CavityLaw
-from ..pieces import piece, repeated
+from ..pieces import in_parts, piece, repeated
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..solve.implicit import differentiable
 from ..solve.kkt import border_unknowns
@@ -20,6 +20,8 @@ from .robust import Cauchy
 from .settings import ForceBalanceSettings
 
 Factor = tuple[Tensor, ...]
+VERTICES = 4500
+"""Of a batch's surfaces that are worked on at a time: what a step makes of more does not stay in a processor's cache."""
 
 
 class State(NamedTuple):
@@ -50,12 +52,19 @@ class Descent(nn.Module):
     ) -> tuple[State, Tensor]:
         """The state after the steps of a schedule, and the surface before the last; `one_factor`: all with the factor of the
         first step."""
-        before, factor = state.x, None
-        if one_factor:
-            x, pressure, moved, before, factor = self._first(*state, measured, *schedule[0])
-            state, schedule = State(x, pressure, moved), schedule[1:]
-        x, pressure, moved, before = repeated(self._next, schedule, (*state, before), measured, factor)
+        frames = max(1, VERTICES // self.membrane.rest.shape[0])
+        x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), schedule, one_factor)
         return State(x, pressure, moved), before
+
+    def _stepped(self, x: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The state after the steps, and the surface before the last; `given`: what is measured, the schedule, `one_factor`."""
+        *of_markers, schedule, one_factor = given
+        measured, before, factor = Bearings(*of_markers), x, None
+        if one_factor:
+            x, pressure, moved, before, factor = self._first(x, pressure, moved, measured, *schedule[0])
+            schedule = schedule[1:]
+        x, pressure, moved, before = repeated(self._next, schedule, (x, pressure, moved, before), measured, factor)
+        return x, pressure, moved, before
 
     def objective(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""

@@ -69,11 +69,12 @@ class BalanceEquations(nn.Module):
     def loads(self, normal: NormalEquations, at: Linearised, angle: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """`v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, 3, 3 N]`; `f^T W v` and `v^T W v`, `[B]`."""
         W, v = normal.weights, at.volume
-        weighted = torch.stack([_weighed(W, at.force), -_weighed(W, v)], 1)
+        weighted = _weighed(W[:, None], torch.stack([at.force, -v], 1))
         of_forces, of_fluid = self.forces.change(at.stiffness, weighted).split(1, 1)
         of_markers = (normal.weighted_jacobian * angle[:, :, None]).sum(1) @ self.bearings.vertex_shares
         loads = torch.cat([v[:, None], of_forces + of_markers[:, None], of_fluid], 1).flatten(2)
-        return loads, ((weighted[:, 0] * v).sum((1, 2)), (-weighted[:, 1] * v).sum((1, 2)))
+        of_force, of_volume = (weighted * v[:, None]).sum((2, 3)).unbind(1)
+        return loads, (of_force, -of_volume)
 
     def motion(self, normal: NormalEquations, measured: Bearings, angle: Tensor) -> CameraMotion:
         """The camera's motion in the equations, with the angles `r [B, 2, D]`."""

@@ -38,6 +38,7 @@ class StencilSystem(nn.Module):
     slots: Tensor
     band_sources: Tensor
     ends: Tensor
+    offsets_of_pairs: Tensor
     fixed: Tensor
 
     def __init__(self, grid: tuple[int, int], free: Tensor):
@@ -55,6 +56,7 @@ class StencilSystem(nn.Module):
             ("ends", _ends(grid).ravel()),
         ):
             self.register_buffer(name, torch.from_numpy(index.astype(np.int32)))
+        self.register_buffer("offsets_of_pairs", _offsets_of_pairs())
         self.register_buffer("fixed", (~free).double())
 
     def matrix(self, stencils: Tensor, weights: Tensor, near: Tensor, damping: float | Tensor) -> tuple[Tensor, Tensor]:
@@ -67,16 +69,16 @@ class StencilSystem(nn.Module):
             damping: a share of the diagonal that is added.
         """
         blocks = self._blocks(stencils, weights)
-        blocks = torch.cat([blocks[:, : len(NEAR)] + near.movedim(3, 1), blocks[:, len(NEAR) :]], 1)
-        scale = (blocks[:, 0].diagonal(dim1=1, dim2=2).mT * (1 + damping) + self.fixed).rsqrt()
-        there = scale.flatten(1).index_select(1, self.ends).reshape(-1, len(OFFSETS), 1, *scale.shape[1:])
-        scaled = (blocks * scale[:, None, :, None] * there).flatten(1)
+        blocks = torch.cat([blocks[:, :, :, : len(NEAR)] + near, blocks[:, :, :, len(NEAR) :]], 3)
+        scale = (blocks[:, :, :, 0].diagonal(dim1=1, dim2=2).mT * (1 + damping) + self.fixed).rsqrt()
+        there = scale.flatten(1).index_select(1, self.ends).reshape(-1, 1, 3, *blocks.shape[3:])
+        scaled = (blocks * scale[:, :, None, None] * there).flatten(1)
         constants = torch.stack([torch.zeros_like(scaled[:, 0]), torch.ones_like(scaled[:, 0])], 1)
         band = torch.cat([scaled, constants], 1).index_select(1, self.band_sources)
         return band.unflatten(1, (-1, WIDTH)), scale.flatten(1)[:, None]
 
     def _blocks(self, stencils: Tensor, weights: Tensor) -> Tensor:
-        """Blocks of `A^T W A`, `[B, 10, 3, 3, N]`, between the vertices and those at `OFFSETS` from them.
+        """Blocks of `A^T W A`, `[B, 3, 3, 10, N]`, between the vertices and those at `OFFSETS` from them.
 
         Both vertices are in the stencil of a third one. Grid rows between two zeros, two rows of zeros around all: so what
         belongs with the stencil of a vertex at an offset is as far behind as that has places.
@@ -85,16 +87,14 @@ class StencilSystem(nn.Module):
         A = stencils.index_select(3, self.slots)
         WA = (weights[:, :, :, None, None] * A[:, None]).sum(2)
         left, right = (F.pad(part.unflatten(-1, self.inner_grid), (1, 1, 2, 2)).flatten(-2) for part in (A, WA))
-        sums: dict[tuple[int, int], Tensor] = {}
+        products = []
         for k, slot in enumerate(SLOTS):
             i, j = STENCIL[slot]
-            here = slice((2 - i) * n - j, (2 - i + rows) * n - j)
-            x, y = left[:, :, :, None, k, None, here], right[:, :, None, :, k:, here]
-            products = torch.addcmul(torch.addcmul(x[:, 0] * y[:, 0], x[:, 1], y[:, 1]), x[:, 2], y[:, 2])
-            for other, product in zip(SLOTS[k:], products.unbind(3), strict=True):
-                offset = STENCIL[other][0] - i, STENCIL[other][1] - j
-                sums[offset] = sums[offset] + product if offset in sums else product
-        inside = torch.stack([sums[offset] for offset in OFFSETS], 1).unflatten(-1, (rows, n))
+            here, later = (2 - i) * n - j, len(SLOTS) - k
+            x1, x2, x3 = left.narrow(4, here, rows * n).narrow(3, k, 1)[:, :, :, None].unbind(1)
+            y1, y2, y3 = right.narrow(4, here, rows * n).narrow(3, k, later)[:, :, None].unbind(1)
+            products.append(torch.addcmul(torch.addcmul(x1 * y1, x2, y2), x3, y3))
+        inside = (self.offsets_of_pairs @ torch.cat(products, 3)).unflatten(-1, (rows, n))
         return inside[..., 1:-1].flatten(-2)
 
     def dense(self, band: Tensor) -> Tensor:
@@ -152,16 +152,22 @@ class _Inner(NamedTuple):
 
 
 def _ends(grid: tuple[int, int]) -> np.ndarray:
-    """The numbers of every vertex' neighbours at `OFFSETS`, of some vertex where there is none, in fields `[3, N]`: `[10, 3,
+    """The numbers of every vertex' neighbours at `OFFSETS`, of some vertex where there is none, in fields `[3, N]`: `[3, 10,
     N]`."""
     inner = _Inner.of(grid)
     beside = np.stack([inner.at(inner.row + i, inner.column + j) for i, j in OFFSETS]).clip(min=0)
-    return beside[:, None] + len(inner.row) * np.arange(3)[:, None]
+    return beside + len(inner.row) * np.arange(3)[:, None, None]
+
+
+def _offsets_of_pairs() -> Tensor:
+    """`[10, 28]`: 1 where an offset is that between a pair of a stencil's vertices, the first by `SLOTS`, then the second."""
+    pairs = [(STENCIL[a], STENCIL[b]) for k, a in enumerate(SLOTS) for b in SLOTS[k:]]
+    return torch.tensor([[float((q[0] - p[0], q[1] - p[1]) == offset) for p, q in pairs] for offset in OFFSETS]).double()
 
 
 def _band_sources(grid: tuple[int, int], free: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """Where the entries of a matrix' places are, between the numbers of a vertex and those of the ones at most `REACH` columns
-    from it, `[places, columns, 3, WIDTH]`: among the vertices' blocks `[10, 3, 3, N]`, a zero and a one."""
+    from it, `[places, columns, 3, WIDTH]`: among the vertices' blocks `[3, 3, 10, N]`, a zero and a one."""
     inner, N, K = _Inner.of(grid), len(free), len(OFFSETS)
     number = np.full((2 * REACH + 1,) * 2, -1)
     for k, offset in enumerate(OFFSETS):
@@ -173,7 +179,7 @@ def _band_sources(grid: tuple[int, int], free: np.ndarray, rows: int, columns: i
     close = (p >= 0) & free[p] & (q >= 0) & free[q] & (abs(di) <= REACH)
     di, dj_close = np.where(close, di, 0), np.where(close, dj, 0)
     upper, lower = number[di, dj_close], number[-di, -dj_close]
-    entry = np.where(upper >= 0, ((3 * upper + a) * 3 + b) * N + p, ((3 * lower + b) * 3 + a) * N + q)
+    entry = np.where(upper >= 0, ((3 * a + b) * K + upper) * N + p, ((3 * b + a) * K + lower) * N + q)
     zero, is_own = 9 * K * N, (i >= 0) & (other == i) & (dj == 0) & (a == b)
     entry = np.where(is_own, zero + 1, np.where(close & ((upper >= 0) | (lower >= 0)), entry, zero))
     sources = np.full((*entry.shape[:3], WIDTH), zero)
