@@ -163,6 +163,27 @@ def in_parts(
     return [torch.cat(values) for values in zip(*parts, strict=True)]
 
 
+def unrecorded(function: Callable[..., Output], *given: Any) -> Output:
+    """`function(*given)`, a named tuple of tensors; where no gradient is recorded in inference mode, a tenth faster for many
+    small tensors, of which copies come out that gradients may be taken of later.
+
+    Example:
+        >>> from typing import NamedTuple
+        >>> class Twice(NamedTuple):
+        ...     value: torch.Tensor
+        >>> with torch.no_grad():
+        ...     found = unrecorded(lambda x: Twice(2 * x), torch.tensor(3.0))
+        >>> found, found.value.is_inference()
+        (Twice(value=tensor(6.)), False)
+    """
+    if torch.is_grad_enabled() or torch.compiler.is_compiling() or _graph(given) is not None:
+        return function(*given)
+    with torch.inference_mode():
+        found: Any = function(*given)
+    copies: Output = type(found)(*(value.clone() for value in found))
+    return copies
+
+
 def rowwise(done: torch.Tensor, values: Sequence[torch.Tensor], others: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     """`values` in the rows where `done [B]` holds, else `others`; each `[B, ...]`."""
     return [
