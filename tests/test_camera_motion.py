@@ -25,15 +25,14 @@ def test_elimination_solves_the_whole_system():
     whole = root.mT @ root
     M, B, T = whole[:, :30, :30], whole[:, 30:, :30], whole[:, 30:, 30:]
     loads, k = (torch.randn(*shape, generator=generator, dtype=torch.float64) for shape in ((2, 3, 30), (2, 4)))
-    motion = CameraMotion(B, T, k)
-    kept, solved = motion.eliminated(loads, (torch.linalg.inv(M) @ loads.mT).mT, (torch.linalg.inv(M) @ B.mT).mT)
-    expected = torch.linalg.solve(whole, torch.cat([loads[:, 1], k], -1))
-    torch.testing.assert_close(solved[:, 1], expected[:, :30])
-    torch.testing.assert_close(motion.following(-solved[:, 1]), -expected[:, 30:])
-    alone = torch.linalg.solve(whole, torch.cat([loads[:, 0], torch.zeros_like(k)], -1))
-    torch.testing.assert_close(solved[:, 0], alone[:, :30])
-    torch.testing.assert_close(kept[:, [0, 2]], loads[:, [0, 2]])
-    torch.testing.assert_close(motion.without(loads[:, 1:2], k[:, None]), kept[:, 1:2])
+    motion, all_loads = CameraMotion(B, T, k), torch.cat([loads, B], 1)
+    products, following = motion.eliminated(all_loads @ torch.linalg.inv(M) @ all_loads.mT)
+    pull = torch.stack([torch.zeros_like(k), k, torch.zeros_like(k)], 1)
+    expected = torch.linalg.solve(whole, torch.cat([loads, pull], 2).mT)
+    torch.testing.assert_close(following, -expected[:, 30:])
+    torch.testing.assert_close(products, loads @ expected[:, :30])
+    kept = motion.without(loads[:, 1:2], k[:, None])
+    torch.testing.assert_close(kept @ torch.linalg.inv(M - B.mT @ torch.linalg.solve(T, B)), expected[:, :30, 1:2].mT)
 
 
 def test_what_holds_the_camera_is_the_slope_of_its_loss():

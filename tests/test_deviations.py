@@ -87,7 +87,8 @@ def turns(estimator, camera, pixels, vertices):
 
 @pytest.mark.parametrize("name", PRESSES)
 def test_intervals_of_one_standard_deviation_hold_two_thirds_of_the_estimates(name):
-    """On as many lines as default grids have: draws of the markers' noise, each estimated from the solution without noise, about the mean of the estimates."""
+    """On as many lines as default grids have: draws of the markers' noise, each estimated from the solution without noise,
+    about the mean of the estimates."""
     estimator, camera, exact = observed(name, 25, truth_grid=31)
     generator = torch.Generator().manual_seed(1)
     pixels = exact + NOISE * torch.randn(DRAWS, *exact.shape, generator=generator, dtype=torch.float64)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from torchmembrane.camera.model import Camera
+from torchmembrane.estimators import descent
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.bearings import Bearings
 from torchmembrane.estimators.contact_patches import contact_indicator, contact_points
@@ -80,7 +81,7 @@ def bent(membrane, batch=1, size=0.05):
 
 def dense(system, matrix):
     """The dense matrix `[3 N, 3 N]` of one frame's scaled blocks."""
-    values, scale = system.dense(matrix[0])[0], matrix[1][0]
+    values, scale = system.dense(matrix[0]), matrix[1][0]
     rows, s = system.rows, values.shape[-1]
     full = values.new_zeros(rows, s, rows, s)
     for (i, j), block in zip(chain(*block_pentadiagonal.places(rows)), values, strict=True):
@@ -457,6 +458,21 @@ def test_batch_equals_singles_and_lost_markers_have_zero_weight(pressed):
     alone = estimator(seen(origins[None], spoiled[1:], weight[1:]))
     torch.testing.assert_close(both.vertices[1:], alone.vertices, rtol=0, atol=1e-7)
     assert relative(estimator, alone, positions, moved) < 0.5
+
+
+def test_a_batch_in_parts_is_what_it_is_at_once(pressed, monkeypatch):
+    """Five frames, two at a time and the last alone, also from a start, where a part has its own factor."""
+    (origins, directions), positions, *_ = pressed
+    estimator = make(9, steps=4)
+    turned = torch.nn.functional.normalize(directions + 2e-3 * torch.arange(5).double()[:, None, None], dim=-1)
+    frames = seen(origins.expand(5, -1, -1), turned)
+    at_once = estimator(frames)
+    start = at_once.vertices, at_once.pressure, at_once.moved, torch.ones(5, dtype=torch.bool)
+    followed = estimator(frames, start)
+    monkeypatch.setattr(descent, "VERTICES", 2 * 81)
+    torch.testing.assert_close(estimator(frames).vertices, at_once.vertices, rtol=0, atol=1e-7)
+    torch.testing.assert_close(estimator(frames, start).vertices, followed.vertices, rtol=0, atol=1e-7)
+    assert (at_once.vertices.diff(dim=0).flatten(1).norm(dim=1) > 1e-3).all()
 
 
 def test_float32_agrees_with_float64(pressed):

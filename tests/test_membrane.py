@@ -10,6 +10,7 @@ from torchmembrane import MembraneError
 from torchmembrane.linalg import symmetric_adjugate_product, symmetric_determinant
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, half_cylinder, heightfield, spherical_cap
+from torchmembrane.surface.stencil import FEW, apply_stencil
 from torchmembrane.surface.tangent import tangent_axes, tangent_frame
 from torchmembrane.surface.topology import (
     TRIANGLE_CORNERS,
@@ -293,3 +294,21 @@ def test_symmetric_closed_forms_solve_their_systems():
     matrix = np.stack([np.stack([a, b], -1), np.stack([b, c], -1)], -2)
     solved = np.stack(symmetric_adjugate_product(a, b, c, u, v), -1) / symmetric_determinant(a, b, c)[:, None]
     np.testing.assert_allclose((matrix @ solved[..., None])[..., 0], np.stack([u, v], -1), atol=1e-9)
+
+
+@pytest.mark.parametrize("planes", [1, FEW, FEW + 1])
+@pytest.mark.parametrize("border", [False, True])
+def test_stencils_combine_the_values_around_however_many_there_are(planes, border):
+    """Sums of shifted slices, with and without gradients."""
+    generator = torch.Generator().manual_seed(planes)
+    kernels = torch.randn(2, 3, 3, generator=generator)
+    field = torch.randn(1, 7 * 6, planes, generator=generator)
+    wide = torch.nn.functional.pad(field.mT.unflatten(-1, (7, 6)), (1, 1, 1, 1) if border else (0, 0, 0, 0))
+    m, n = wide.shape[2] - 2, wide.shape[3] - 2
+    shifted = torch.stack([wide[..., i : i + m, j : j + n] for i in range(3) for j in range(3)], 2)
+    expected = torch.einsum("wk,bckij->bcwij", kernels.flatten(1), shifted).flatten(2)
+    recorded = field.clone().requires_grad_()
+    with torch.no_grad():
+        found = apply_stencil(field, kernels, (7, 6), border)
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(apply_stencil(recorded, kernels, (7, 6), border), expected)

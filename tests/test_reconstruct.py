@@ -376,3 +376,12 @@ def test_senseless_pixels_give_no_surface_and_say_so(reconstructor):
     got = reconstructor.from_pixels(pixels)
     assert got.status.tolist() == [Status.TOO_FEW_MARKERS, Status.OK]
     assert got.vertices[0].isnan().all() and got.vertices[1].isfinite().all()
+
+
+def test_what_is_found_without_gradients_can_be_used_where_they_are_taken(sensor):
+    reconstructor = Reconstructor(sensor)
+    with torch.no_grad():
+        found = reconstructor(reconstructor.read(EXAMPLES / "press_on_axis.png"))
+    leaf = found.pixels.clone().requires_grad_()
+    (reconstructor.from_pixels(leaf, found.confidence).force * found.force).sum().backward()
+    assert leaf.grad.abs().max() > 0

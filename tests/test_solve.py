@@ -130,7 +130,7 @@ def test_elimination_by_products_agrees_with_cholesky(monkeypatch, blocks, size,
 
 
 @pytest.mark.parametrize("root", [by_cholesky, by_products])
-@pytest.mark.parametrize("size", [3, 47, 96])
+@pytest.mark.parametrize("size", [3, 47, 96, 190])
 def test_the_square_of_an_inverse_root_is_the_inverse(root, size):
     generator = torch.Generator().manual_seed(size)
     q, _ = torch.linalg.qr(torch.randn(2, size, size, dtype=torch.float64, generator=generator))

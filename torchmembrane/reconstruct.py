@@ -24,7 +24,7 @@ from .io.status import Status
 from .markers.coverage import Coverage
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
 from .markers.placement import imaged_vertices, place_markers
-from .pieces import piece
+from .pieces import piece, unrecorded
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
 from .surface.bicubic import bicubic_shares
@@ -190,7 +190,7 @@ class Reconstructor(nn.Module):
     ) -> Reconstruction:
         """As `forward`, from grey images `[B, 1, height, width]` in 0..1 of this module's precision; nothing is checked."""
         flow = self.observer(grey, None if previous is None else previous.pixels, rest_pixels)
-        return self._solve(flow, previous, pressure)
+        return unrecorded(self._solve, flow, previous, pressure)
 
     def from_pixels(
         self,
@@ -215,7 +215,7 @@ class Reconstructor(nn.Module):
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
             flow = self.observer.from_pixels(pixels, confidence, rest_pixels)
-            return self._solve(flow, self._checked(previous, len(flow.status)), pressure)
+            return unrecorded(self._solve, flow, self._checked(previous, len(flow.status)), pressure)
 
     def _solve(self, flow: MarkerFlow, previous: Reconstruction | None, pressure: Tensor | float | None) -> Reconstruction:
         usable, confidence, covariance, status = self.observer.judge(*flow)

@@ -6,13 +6,14 @@ surface. With the angles' derivatives `K` in it, a step solves
     [M  B'] [d ]     [g]         B = K^T w J,  T = K^T w K + stiffness,  k = K^T w r + stiffness x motion
     [B  T ] [dm] = - [k],
 
-`dm` eliminated: `(M - B' T^-1 B) d = -(g - B' T^-1 k)`, by the factor of `M` (Woodbury), `dm = -T^-1 (k + B d)`.
+by the factor of `M`: with `d = -M^-1 (g + B' dm)` the second row is `(T - B M^-1 B') dm = B M^-1 g - k`.
 """
 
 import math
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..solve.elimination import solve_positive
@@ -42,11 +43,17 @@ class CameraMotion(NamedTuple):
         eased: Tensor = solved + share.mT @ of_motion
         return eased
 
-    def eliminated(self, loads: Tensor, solved: Tensor, of_motion: Tensor) -> tuple[Tensor, Tensor]:
-        """Loads and solutions `[B, 3, 3 N]` of the surface alone, of which the second load is `g`."""
-        alone = _solve(self.own, self.slope[..., None])[..., 0]
-        of_second = torch.stack([torch.zeros_like(alone), alone, torch.zeros_like(alone)], 1)
-        return loads - of_second @ self.coupling, self.eased(solved - of_second @ of_motion, of_motion)
+    def eliminated(self, products: Tensor) -> tuple[Tensor, Tensor]:
+        """What three loads' solutions of the surface alone have to do with the loads, `[B, 3, 3]` (row x, column y: `x . M^-1
+        y`), and how the camera follows each, `[B, 4, 3]`; the camera's slope comes with the second load.
+
+        Args:
+            products: the same with `M` alone, of these loads and the coupling, `[B, 7, 7]`.
+        """
+        loads, coupling = products[:, :, :3], products[:, :, 3:]
+        pulled = loads[:, 3:] - F.pad(self.slope[..., None], (1, 1))
+        following = _solve(self.own - coupling[:, 3:], pulled)
+        return loads[:, :3] + coupling[:, :3] @ following, following
 
     def without(self, loads: Tensor, slopes: Tensor) -> Tensor:
         """Loads `[B, L, 3 N]` on the surface alone, of those that pull the camera by `slopes [B, L, 4]` as well."""
@@ -57,11 +64,6 @@ class CameraMotion(NamedTuple):
         """`T^-1 B y`, `[B, L, 4]`, of fields `y [B, L, 3 N]`."""
         turned: Tensor = _solve(self.own, self.coupling @ y.mT).mT
         return turned
-
-    def following(self, move: Tensor) -> Tensor:
-        """By how much the camera moves, `[B, 4]`, when the vertices move by `move [B, 3 N]`."""
-        moved: Tensor = -_solve(self.own, (self.slope[..., None] + self.coupling @ move[..., None]))[..., 0]
-        return moved
 
 
 def motion_of_pixels(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:

@@ -6,7 +6,6 @@ With the elastic energy `U`, the rest load `h`, the pressure `p` and the volume 
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..mechanics.cavity import rest_balance
@@ -61,15 +60,16 @@ class ContactForce(nn.Module):
 
     def linearised(self, x: Tensor, pressure: Tensor) -> Linearised:
         """The force and what it and the volume do when vertices move, at the inner vertices."""
-        grid = self.membrane.grid
-        edges = apply_stencil(x, self.edges, grid, border=False).unflatten(-1, (2, -1))
-        gradient, volume_ring = self.membrane.volume_one_ring(edges)
-        stress, elastic_ring = self.elasticity.one_ring(edges)
-        elastic = (stress[:, None] * edges[:, :, 0].unflatten(-1, (6, -1))).sum(2)
-        force = elastic - inner(self.rest_load, grid).mT - pressure[:, None, None] * gradient
-        beside = self.free_neighbours * (elastic_ring - pressure[:, None, None, None, None] * volume_ring)
+        grid, p = self.membrane.grid, pressure[:, None, None]
+        edges, chords = apply_stencil(x, self.edges, grid, border=False).chunk(2, -1)
+        edges, volume_ring = edges.unflatten(-1, (6, -1))[:, None], self.membrane.volume_one_ring(chords)
+        gradient = 0.5 * (volume_ring * edges).sum((2, 3))
+        stress, elastic_ring = self.elasticity.one_ring(x)
+        force = (stress[:, None] * edges[:, 0]).sum(2) - inner(self.rest_load, grid).mT - p * gradient
+        beside = self.free_neighbours * torch.addcmul(elastic_ring, volume_ring, p[..., None, None], value=-1)
         stiffness = torch.cat([-elastic_ring.sum(3, keepdim=True), beside], 3) * self.inner_free
-        return Linearised(force * self.inner_free, stiffness, gradient * self.inner_free, F.normalize(gradient, dim=1))
+        normal = gradient * gradient.square().sum(1, keepdim=True).clamp_min(torch.finfo(x.dtype).tiny).rsqrt()
+        return Linearised(force * self.inner_free, stiffness, gradient * self.inner_free, normal)
 
     def change(self, stiffness: Tensor, step: Tensor) -> Tensor:
         """How forces change, `A u [B, C, 3, N]`, for steps `u` of that shape of the inner vertices: `A^T u` as well."""

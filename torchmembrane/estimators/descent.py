@@ -2,17 +2,18 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..mechanics.cavity import CavityLaw
-from ..pieces import piece, repeated
+from ..pieces import in_parts, piece, repeated
 from ..solve.conjugate_gradient import conjugate_gradient
 from ..solve.implicit import differentiable
-from ..solve.kkt import BorderedStep, solve_bordered
-from ..surface.stencil import inner, pad_border
+from ..solve.kkt import border_unknowns
+from ..surface.stencil import inner
 from .bearings import Bearings
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
@@ -20,6 +21,8 @@ from .robust import Cauchy
 from .settings import ForceBalanceSettings
 
 Factor = tuple[Tensor, ...]
+VERTICES = 4500
+"""Of a batch's surfaces that are worked on at a time: what a step makes of more does not stay in a processor's cache."""
 
 
 class State(NamedTuple):
@@ -43,6 +46,7 @@ class Descent(nn.Module):
         super().__init__()
         self.equations, self.cavity, self.settings = equations, cavity, settings
         self.membrane = equations.forces.membrane
+        self.inner_grid = self.membrane.grid[0] - 2, self.membrane.grid[1] - 2
 
     def forward(
         self,
@@ -54,13 +58,21 @@ class Descent(nn.Module):
     ) -> tuple[State, Tensor]:
         """The state after the steps of a schedule, and the surface before the last; `one_factor`: all with the factor of the
         first step; `cone`: as for `TractionLoss.weights`."""
-        before, factor = state.x, None
+        frames = max(1, VERTICES // self.membrane.rest.shape[0])
         rows = [(*scales, self.equations.loss.cone if cone is None else cone) for scales in schedule]
-        if one_factor:
-            x, pressure, moved, before, factor = self._first(*state, measured, *rows[0])
-            state, rows = State(x, pressure, moved), rows[1:]
-        x, pressure, moved, before = repeated(self._next, rows, (*state, before), measured, factor)
+        x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows, one_factor)
         return State(x, pressure, moved), before
+
+    def _stepped(self, x: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The state after the steps, and the surface before the last; `given`: what is measured, the steps' scales,
+        `one_factor`."""
+        *of_markers, rows, one_factor = given
+        measured, before, factor = Bearings(*of_markers), x, None
+        if one_factor:
+            x, pressure, moved, before, factor = self._first(x, pressure, moved, measured, *rows[0])
+            rows = rows[1:]
+        x, pressure, moved, before = repeated(self._next, rows, (x, pressure, moved, before), measured, factor)
+        return x, pressure, moved, before
 
     def objective(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
@@ -137,15 +149,14 @@ class Descent(nn.Module):
         blunt = (tau.clamp_max(first) / last) ** 2  # 1 as tau ends
         made, solved = self._solved(normal, loads, self.settings.damping * blunt, factor, keeps)
         motion = motion.held(moved, self.settings.camera_motion * blunt)
-        loads, solved = motion.eliminated(loads[:, :3], solved[:, :3], solved[:, 3:])
+        products, following = motion.eliminated(loads @ solved.mT)
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
-        move, rise = self._bordered_step(x, pressure, loads, solved, corner)
-        turn = motion.following(move)
-        move = move.unflatten(-1, (3, -1)).mT
-        move = pad_border(move, self.membrane.grid)
+        shares = self._shares(x, pressure, products, corner)
+        turn = (following @ shares[..., None])[..., 0]
+        move = F.pad(-(torch.cat([shares, turn], 1)[:, None] @ solved).unflatten(-1, (3, *self.inner_grid))[:, 0], (1, 1, 1, 1))
         share = self._share(x, move)
-        x = x + share[:, None, None] * move
-        return State(x, pressure + share * rise, moved + share[:, None] * turn), made
+        x = x + share[:, None, None] * move.flatten(2).mT
+        return State(x, pressure + share * shares[:, 2], moved + share[:, None] * turn), made
 
     def _solved(
         self, normal: NormalEquations, loads: Tensor, damping: Tensor, factor: Factor | None, keeps: bool
@@ -173,25 +184,25 @@ class Descent(nn.Module):
         product, precondition = partial(equations.product, normal), partial(equations.system.substitute, factor)
         return conjugate_gradient(product, precondition, loads, steps)
 
-    def _share(self, x: Tensor, move: Tensor) -> Tensor:
-        """Of a step `move [B, V, 3]`, so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
-        settings, tiny = self.settings, torch.finfo(x.dtype).tiny
-        far = torch.linalg.vector_norm(move, dim=-1).amax(-1) / (settings.longest_step * self.membrane.size)
-        for axis in (1, 2):
-            change, edge = (
-                torch.linalg.vector_norm(field.unflatten(1, self.membrane.grid).diff(dim=axis), dim=-1) for field in (move, x)
-            )
-            stretch = (change / edge.clamp_min(tiny)).flatten(1).amax(-1)
-            far = torch.maximum(far, stretch / settings.largest_stretch)
-        share: Tensor = 1 / far.clamp_min(1.0)
-        return share
-
-    def _bordered_step(
-        self, x: Tensor, pressure: Tensor, loads: Tensor, solved: Tensor, corner: tuple[Tensor, Tensor]
-    ) -> BorderedStep:
-        """Step `d` and rise of the pressure: `M d + m dp + n lambda = -g` with the rows of the pressure and of the volume."""
+    def _shares(self, x: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:
+        """Shares `[B, 3]` in a step, but for its sign, of what solves the volume's row, the loads and the pressure's row: the
+        second is 1, the third what the pressure rises by."""
+        one = torch.ones_like(pressure)
         if self.cavity.filling == "open":
-            return BorderedStep(-solved[:, 1], torch.zeros_like(pressure))
+            return torch.stack([0 * one, one, 0 * one], 1)
         fWv, vWv = corner
         target, compliance = self.cavity.condition(self.membrane.volume(x) - self.membrane.rest_volume, pressure)
-        return solve_bordered(loads, solved, vWv, fWv, compliance, target)
+        multiplier, rise = border_unknowns(products, vWv, fWv, compliance, target)
+        return torch.stack([multiplier, one, rise], 1)
+
+    def _share(self, x: Tensor, move: Tensor) -> Tensor:
+        """Of a step `move [B, 3, m, n]`, so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
+        settings, tiny = self.settings, torch.finfo(x.dtype).tiny
+        both = torch.stack([move, x.transpose(1, 2).unflatten(-1, self.membrane.grid)], 1)  # mT of an input would be aliased
+        far2 = move.square().sum(1).flatten(1).amax(-1) / (settings.longest_step * self.membrane.size) ** 2
+        for axis in (-2, -1):
+            change2, edge2 = both.diff(dim=axis).square().sum(2).unbind(1)
+            stretch2 = (change2 / edge2.clamp_min(tiny)).flatten(1).amax(-1)
+            far2 = torch.maximum(far2, stretch2 / settings.largest_stretch**2)
+        share: Tensor = far2.clamp_min(1.0).rsqrt()
+        return share

@@ -201,34 +201,38 @@ class ForceBalance(nn.Module):
         return Equilibrium(*rowwise(done | stands | second.objective.isnan(), first, second))
 
     def _solved(self, measured: Bearings, start: State | None, patient: bool = False) -> Equilibrium:
+        state, before = self._stepped(measured, start, patient)
+        return self.equilibrium(*state, before, measured)
+
+    def _stepped(self, measured: Bearings, start: State | None, patient: bool) -> tuple[State, Tensor]:
+        """The state after all steps, on coarser grids too, and the surface before the last."""
         warm = start is not None and not self.passes_on_starts
         schedule = self.schedule(warm, patient)
         last = schedule[-1:] * len(schedule)
+        found: tuple[State, Tensor]
         if start is not None and warm:
-            state, before = self.descent(start, measured, schedule, one_factor=True)
-            if self.dent is not None:
-                state, before = self.dent.again(state, before, measured, last[1:])
-        elif self.dent is None:
-            state, before = self.descent(self._begun(measured, start, patient), measured, schedule)
+            found = self.descent(start, measured, schedule, one_factor=True)
+            return found if self.dent is None else self.dent.again(*found, measured, last[1:])
+        if self.dent is None:
+            found = self.descent(self._begun(measured, start, patient), measured, schedule)
         elif patient:
             quick, slow = (self._undented(measured, start, patient) for patient in (False, True))
-            state, before = self.dent.sought(quick, slow, self.at_rest(measured.weight), measured, last)
+            found = self.dent.sought(quick, slow, self.at_rest(measured.weight), measured, last)
         else:
-            state, before = self.descent(self.dent(*self._undented(measured, start), measured), measured, last)
-        return self.equilibrium(state.x, state.pressure, state.moved, before, measured)
+            found = self.descent(self.dent(*self._undented(measured, start), measured), measured, last)
+        return found
 
     def _begun(self, measured: Bearings, start: State | None, patient: bool) -> State:
         """At what is found on the coarser grid, without one at rest."""
         if self.coarse is None:
             return self.at_rest(measured.weight)
-        coarse = self.coarse._solved(measured, None if start is None else self.coarsened(*start), patient)
-        return self.refined(coarse.vertices, coarse.pressure, coarse.moved)
+        begun = None if start is None else self.coarsened(*start)
+        return State(*self.refined(*self.coarse._stepped(measured, begun, patient)[0]))
 
     def _undented(self, measured: Bearings, start: State | None, patient: bool = False) -> State:
         """The state after a first step, whose pushes say where to dent it."""
         begun, schedule = self._begun(measured, start, patient), self.schedule(patient=patient)
-        state: State = self.descent(begun, measured, schedule[:1])[0]
-        return state
+        return State(*self.descent(begun, measured, schedule[:1])[0])
 
     def schedule(self, warm: bool = False, patient: bool = False) -> list[tuple[float, float]]:
         """`tau` and `R` of every step on this grid; `warm`: with a start; `patient`: a second time, from rest."""
@@ -237,8 +241,7 @@ class ForceBalance(nn.Module):
             return settings.gnc_schedule(settings.warm_steps, settings.warm_tau)
         steps = settings.patience * self.steps if patient else self.steps
         if self.coarse is not None and self.dent is None:
-            settling = settings.settling_steps if patient else 0
-            return settings.gnc_schedule(steps, settings.fine_tau)[-1:] * (steps + settling)
+            return [(settings.fine_tau[-1], settings.outlier)] * (steps + patient * settings.settling_steps)
         coarsest, fine = (settings.patient_tau, settings.patient_fine_tau) if patient else (settings.tau, settings.fine_tau)
         return settings.gnc_schedule(steps, coarsest if self.coarse is None else fine)
 
@@ -246,8 +249,7 @@ class ForceBalance(nn.Module):
     def at_rest(self, confidence: Tensor) -> State:
         """The rest surface and pressure and a camera that has not moved, for every row of `confidence [B, D]`."""
         frames, pressure = confidence.shape[0], self.rest_pressure
-        still = torch.zeros_like(pressure).expand(frames, 4)
-        return State(self.membrane.rest.repeat(frames, 1, 1), pressure.repeat(frames), still.clone())
+        return State(self.membrane.rest.repeat(frames, 1, 1), pressure.repeat(frames), (0 * pressure).repeat(frames, 4))
 
     @piece
     def coarsened(self, x: Tensor, pressure: Tensor, moved: Tensor) -> State:
@@ -274,11 +276,10 @@ class ForceBalance(nn.Module):
         step = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
         traction = self.equations.forces(x, pressure) / membrane.rest_area[:, None]
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
-        scale = loss.contact_scale(*within, measured.noise_level)
-        reference = self.reference * (1 + pad_border(scale[..., None] - 1, membrane.grid)[..., 0])
+        scale = 1 + pad_border(loss.contact_scale(*within, measured.noise_level)[..., None] - 1, membrane.grid)[..., 0]
         misfit = self.equations.bearings.misfit(x, measured, moved, self.settings.outlier)
         objective = self.descent.objective(State(x, pressure, moved), *within, measured) / measured.weight.sum(-1).clamp_min(1)
-        return Equilibrium(x, pressure, membrane.volume(x), traction, step, reference, misfit, moved, objective)
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, misfit, moved, objective)
 
     @piece
     def is_converged(self, found: Equilibrium) -> Tensor:

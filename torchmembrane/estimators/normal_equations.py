@@ -70,11 +70,12 @@ class BalanceEquations(nn.Module):
     def loads(self, normal: NormalEquations, at: Linearised, angle: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """`v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, 3, 3 N]`; `f^T W v` and `v^T W v`, `[B]`."""
         W, v = normal.weights, at.volume
-        weighted = torch.stack([_weighed(W, at.force), -_weighed(W, v)], 1)
+        weighted = _weighed(W[:, None], torch.stack([at.force, -v], 1))
         of_forces, of_fluid = self.forces.change(at.stiffness, weighted).split(1, 1)
         of_markers = (normal.weighted_jacobian * angle[:, :, None]).sum(1) @ self.bearings.vertex_shares
         loads = torch.cat([v[:, None], of_forces + of_markers[:, None], of_fluid], 1).flatten(2)
-        return loads, ((weighted[:, 0] * v).sum((1, 2)), (-weighted[:, 1] * v).sum((1, 2)))
+        of_force, of_volume = (weighted * v[:, None]).sum((2, 3)).unbind(1)
+        return loads, (of_force, -of_volume)
 
     def motion(self, normal: NormalEquations, measured: Bearings, angle: Tensor) -> CameraMotion:
         """The camera's motion in the equations, with the angles `r [B, 2, D]`."""
@@ -86,9 +87,8 @@ class BalanceEquations(nn.Module):
 
     def matrix(self, normal: NormalEquations, damping: float | Tensor = 1e-6) -> tuple[Tensor, Tensor]:
         """`M` as `system.factor` takes it, with a share of its diagonal added."""
-        A = normal.stiffness.transpose(2, 3).flatten(2, 3).movedim(-1, 1).contiguous()  # products of strided ones take a loop
-        near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1)).permute(0, 3, 1, 4, 2)
-        return self.system.matrix(A.mT @ (normal.weights.movedim(-1, 1).contiguous() @ A), near, damping)
+        near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1))
+        return self.system.matrix(normal.stiffness, normal.weights, near, damping)
 
     def product(self, normal: NormalEquations, u: Tensor, damping: float | Tensor | None = None) -> Tensor:
         """`M u` for `u [B, C, 3 N]`, without the matrix; with `damping` as of `matrix`."""

@@ -94,7 +94,7 @@ class ForceBalanceSettings:
     decrease: float = 2.0
     friction: float = 3.75
     slip: float = 0.05
-    cone: float = 20.0
+    cone: float = 23.0
     coarse_cone: float = 5.0
     reach: float = 0.04
     floor: float = 1e-3

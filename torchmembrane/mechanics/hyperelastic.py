@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..surface.membrane import Membrane
-from ..surface.stencil import apply_stencil, one_ring_edges, stencil_kernels
+from ..surface.stencil import ONE_RING, apply_stencil, convolved, stencil_kernels
 from ..surface.topology import corners, triangles_of
 from .metric import adjugate, determinant, edge_vectors, metric, metric_constants, tensile_part
 
@@ -30,15 +30,6 @@ class Derivatives(NamedTuple):
     DD: Tensor
     convex_D: Tensor
     """The part of `D` that comes from terms convex in the metric; the rest is left out of the stiffness (Gauss-Newton)."""
-
-
-class Rest(NamedTuple):
-    """Of `T` triangles at rest: inverse metric `[3, T]` (11, 12, 22) of the two edges from the first vertex, the metric's
-    determinant and the area `[1, T]`."""
-
-    inverse_metric: Tensor
-    det: Tensor
-    area: Tensor
 
 
 class Strain(NamedTuple):
@@ -79,7 +70,12 @@ class ElasticEnergy(nn.Module):
     prestretch: Tensor
     c1: Tensor
     c2: Tensor
+    inverse_metric: Tensor
+    det: Tensor
     area: Tensor
+    around: Tensor
+    transposed: Tensor
+    one: Tensor
     twice_12: Tensor
     bend: Tensor
     metric_to_pairs: Tensor
@@ -108,21 +104,14 @@ class ElasticEnergy(nn.Module):
         c2 = modulus / 2 * c2_ratio / (1 + c2_ratio) if model == "mooney_rivlin" else 0.0
         for name, value in (("prestretch", prestretch), ("c1", modulus / 2 - c2), ("c2", c2)):
             self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
-        self._register_rest("", edge_vectors(membrane.rest, self.grid))
-        around = apply_stencil(membrane.rest, one_ring_edges(), self.grid, border=False)
-        self._register_rest("around_", around.unflatten(-1, (2, -1)))
-        for name, constant in metric_constants().items():
+        g = metric(edge_vectors(membrane.rest, self.grid))
+        det = determinant(g)
+        self.register_buffer("inverse_metric", adjugate(g) / det)
+        self.register_buffer("det", det)
+        self.register_buffer("area", det.sqrt() / 2)
+        for name, constant in {**metric_constants(), **_one_ring_constants()}.items():
             self.register_buffer(name, constant)
         self._register_one_ring(membrane)
-
-    def _register_rest(self, which: str, edges: Tensor) -> None:
-        g = metric(edges)
-        det = determinant(g)
-        for name, value in Rest(adjugate(g) / det, det, det.sqrt() / 2)._asdict().items():
-            self.register_buffer(f"{which}{name}", value)
-
-    def _rest(self, which: str = "") -> Rest:
-        return Rest(*(getattr(self, f"{which}{name}") for name in Rest._fields))
 
     def _register_one_ring(self, membrane: Membrane) -> None:
         """Of the six triangles around every vertex, `[6 V]` in all: sides (two from the vertex, the one across), constants."""
@@ -153,7 +142,10 @@ class ElasticEnergy(nn.Module):
 
     def strain(self, x: Tensor) -> Strain:
         """The strain of `x [..., V, 3]`: of all triangles, `T = 2 (m-1) (n-1)`."""
-        return self._strain(edge_vectors(x, self.grid), self._rest())
+        edges = edge_vectors(x, self.grid)
+        g = metric(edges)
+        first = (self.twice_12 * self.inverse_metric * g).sum(-2, keepdim=True)
+        return Strain(edges, adjugate(g), first, determinant(g) / self.det)
 
     def principal_stretches(self, x: Tensor) -> Tensor:
         """How much every triangle is stretched along its two principal directions, relative to the rest state.
@@ -181,11 +173,6 @@ class ElasticEnergy(nn.Module):
         larger = (I + (I * I - 4 * D).clamp_min(0).sqrt()) / 2
         squared = torch.cat([larger, D / larger], -2).unflatten(-1, (2, -1))  # first and second halves of all quadrilaterals
         return squared.transpose(-3, -1).flatten(-3, -2).sqrt()
-
-    def _strain(self, edges: Tensor, rest: Rest) -> Strain:
-        g = metric(edges)
-        first = (self.twice_12 * rest.inverse_metric * g).sum(-2, keepdim=True)
-        return Strain(edges, adjugate(g), first, determinant(g) / rest.det)
 
     def density(self, I: Tensor, D: Tensor) -> Tensor:  # noqa: E741
         """Energy per rest area `W(I, D)`."""
@@ -251,46 +238,47 @@ class ElasticEnergy(nn.Module):
         Arguments: `x [..., V, 3]`. Exact; with `positive` the convex part: compression and (Mooney-Rivlin) the term of `D`
         that is not convex are left out, so that every block is positive semi-definite. Vertices as in `TRIANGLE_CORNERS`.
         """
-        blocks, stress = self._pairs(self.strain(x), self._rest(), positive)
-        blocks = (blocks + stress * torch.eye(3, dtype=x.dtype, device=x.device)[..., None]).unflatten(
-            -1, (2, *_cells(self.grid))
-        )
-        ab, ac, bc = blocks.movedim((-3, -6, -5, -4), (-4, -3, -2, -1)).unbind(-3)
+        pairs = self._pairs(self.strain(x), positive)[..., :9, :, :].unflatten(-1, (2, *_cells(self.grid)))
+        ab, ac, bc = pairs.unflatten(-5, (3, 3)).movedim((-3, -4, -6, -5), (-4, -3, -2, -1)).unbind(-3)
         rows = [[-(ab + ac), ab, ac], [ab.mT, -(ab.mT + bc), bc], [ac.mT, bc.mT, -(ac.mT + bc.mT)]]
         return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
-    def one_ring(self, edges: Tensor) -> tuple[Tensor, Tensor]:
+    def one_ring(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Inner vertices' forces and tangent stiffness, by their six neighbours: `s [..., 6, N]`, `H [..., 3, 3, 6, N]`.
 
         The force (as `gradient`) is `sum_i s_i (x_i - x_k)` over the six neighbours; its derivative in neighbour `i` is `H_i`,
-        in the vertex itself minus the sum of the six. `edges [..., 3, 2, 6 N]`, from `one_ring_edges`. A neighbour is the
-        second vertex of the triangle with its number, and the third of that before.
-        """
-        rest = self._rest("around_")
-        blocks, stress = (a.unflatten(-1, (6, -1)) for a in self._pairs(self._strain(edges, rest), rest, count=2))
-        blocks, stress = (second + third.roll(1, -2) for second, third in (a.unbind(-5) for a in (blocks, stress)))
-        one = torch.eye(3, dtype=edges.dtype, device=edges.device)[..., None, None]
-        return stress[..., 0, 0, :, :], blocks + stress * one
+        in the vertex itself minus the sum of the six.
 
-    def _pairs(self, strain: Strain, rest: Rest, positive: bool = False, count: int = 3) -> tuple[Tensor, Tensor]:
-        """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2), or the first `count` of these pairs:
-        `B [..., count, 3, 3, T]` and `S [..., count, 1, 1, T]` of `B + S 1`.
+        Args:
+            x: `[..., V, 3]`.
+        """
+        pairs = self._pairs(self.strain(x))
+        planes = pairs.reshape(-1, 6, *_cells(self.grid))
+        found = convolved(planes, self.around).reshape(*pairs.shape[:-2], 2, 6, -1)
+        direct, transposed = found.unbind(-3)
+        both = direct + transposed.index_select(-3, self.transposed)
+        return both[..., 9, :, :], both[..., :9, :, :].unflatten(-3, (3, 3))
+
+    def _pairs(self, strain: Strain, positive: bool = False) -> Tensor:
+        """Second derivatives in a triangle's vertices (0, 1), (0, 2), (1, 2): the nine entries of `B + S 1`, and `S`, `[...,
+        10, 3, T]`.
 
         Those in its edges `a`, `b` from vertex 0 are `sum_cd T_cd e_c e_d^T + S_ab 1`: `S` is the stress, force on edge a is
         `sum_b S_ab e_b`, and `T` comes from the second derivatives `Q` in the metric.
         """
         e, adjugate, I, D = strain  # noqa: E741
-        w, q = self.derivatives(I, D), self.twice_12 / rest.det * adjugate
-        stress = 2 * rest.area * rest.inverse_metric * w.I + 2 * rest.area / rest.det * w.D * adjugate
-        Q = _outer(q, rest.area * w.DD * q) + rest.area / rest.det * (w.convex_D if positive else w.D) * self.bend
+        w, q = self.derivatives(I, D), self.twice_12 / self.det * adjugate
+        stress = 2 * self.area * self.inverse_metric * w.I + 2 * self.area / self.det * w.D * adjugate
+        Q = _outer(q, self.area * w.DD * q) + self.area / self.det * (w.convex_D if positive else w.D) * self.bend
         if self.model == "mooney_rivlin":
-            p = rest.area * w.ID * self.twice_12 * rest.inverse_metric
+            p = self.area * w.ID * self.twice_12 * self.inverse_metric
             Q = Q + _outer(p, q) + _outer(q, p)
-        T = (self.metric_to_pairs[: 4 * count] @ Q).unflatten(-2, (count, 2, 1, 2))
-        S = (self.stress_to_pairs[:count] @ (tensile_part(stress) if positive else stress))[..., None, None, :]
-        first, second = (T * e[..., None, None, :, :, :]).sum(-2).unbind(-3)
-        e1, e2 = e[..., None, :, None, :, :].unbind(-2)
-        return e1 * first[..., None, :, :] + e2 * second[..., None, :, :], S
+        S = (self.stress_to_pairs @ (tensile_part(stress) if positive else stress))[..., None, :, :]
+        T1, T2 = (self.metric_to_pairs @ Q).unflatten(-2, (1, 3, 2, 2)).unbind(-2)
+        e1, e2 = e[..., :, None, None, :, :].unbind(-2)
+        first, second = torch.addcmul(T1 * e1, T2, e2)[..., None, :, :, :, :].unbind(-2)
+        blocks = torch.addcmul(e1 * first, e2, second).flatten(-4, -3)
+        return torch.cat([torch.addcmul(blocks, self.one, S), S], -3)
 
     @staticmethod
     def _quadrilaterals(K: Tensor) -> Tensor:
@@ -312,3 +300,18 @@ def _outer(a: Tensor, b: Tensor) -> Tensor:
 
 def _cells(grid: tuple[int, int]) -> tuple[int, int]:
     return grid[0] - 1, grid[1] - 1
+
+
+def _one_ring_constants() -> dict[str, Tensor]:
+    """`around [12, 6, 2, 2]`: of the three pairs in the first and in the second triangles of the quadrilaterals about a vertex
+    those that join it with `ONE_RING`, then those that do so the other way round, whose blocks count `transposed [10]`; `one
+    [9, 1, 1]`, the entries of the unit matrix."""
+    joins = ((0, 0, 0, 1, 1), (1, 1, 0, 1, 1), (1, 0, 1, 1, 1), (2, 2, 0, 0, 1), (2, 1, 1, 1, 1), (3, 2, 1, 0, 0))
+    back = ((0, 2, 1, 1, 0), (3, 0, 0, 0, 1), (4, 1, 0, 0, 0), (4, 0, 1, 0, 0), (5, 2, 0, 0, 0), (5, 1, 1, 1, 0))
+    around = torch.zeros(2, len(ONE_RING), 3, 2, 2, 2, dtype=torch.float64)
+    for way, found in enumerate((joins, back)):
+        for neighbour, pair, triangle, i, j in found:
+            around[way, neighbour, pair, triangle, i, j] = 1.0
+    order = torch.arange(9).unflatten(0, (3, 3)).T.flatten()
+    one = torch.eye(3, dtype=torch.float64).reshape(9, 1, 1)
+    return dict(around=around.flatten(0, 1).flatten(1, 2), transposed=torch.cat([order, torch.tensor([9])]), one=one)

@@ -9,7 +9,7 @@ from ..linalg import symmetric_determinant
 
 def edge_vectors(x: Tensor, grid: tuple[int, int]) -> Tensor:
     """The two edges from the first vertex of all triangles, `[..., V, 3]` to `[..., 3, 2, T]`."""
-    g = x.transpose(-2, -1).unflatten(-1, grid)
+    g = x.transpose(-2, -1).contiguous().unflatten(-1, grid)  # or the components stay last in memory, at triple the time
     a, b, c, d = g[..., :-1, :-1], g[..., 1:, :-1], g[..., 1:, 1:], g[..., :-1, 1:]
     ac = c - a
     return torch.stack([torch.stack([b - a, ac], -3), torch.stack([ac, d - a], -3)], -4).flatten(-3)

@@ -4,9 +4,9 @@ What is left of a system after an elimination, `C - B^T A^-1 B = C - (R B)^T R B
 lose it to rounding: in float32 from conditions of some 1e5 on, as a contact on a nearly unstretched sheet has.
 
 A matrix is split into 2 x 2 blocks down to `LEAF` rows, so that most of the work is matrix products; a leaf's root is by its
-Cholesky factor, or where a runtime has none (ONNX) iterated by products as well, `T = (3 I - Z Y) / 2, Y <- Y T, Z <- T Z` from
-`Y = A, Z = I` to `Z = A^-1/2` (Higham 2008, Functions of matrices, eq. 6.35), with `Z Y` scaled in between so that its
-eigenvalues, which go to 1, do so evenly.
+Cholesky factor. Where a runtime has none (ONNX) it is split down to `ITERATED_LEAF` rows, whose roots are iterated by products
+as well, `T = (3 I - Z Y) / 2, Y <- Y T, Z <- T Z` from `Y = A, Z = I` to `Z = A^-1/2` (Higham 2008, Functions of matrices, eq.
+6.35), with `Z Y` scaled in between so that its eigenvalues, which go to 1, do so evenly.
 """
 
 import math
@@ -14,11 +14,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..pieces import at_hand, named
 
-LEAF = 48
+LEAF = 140  # rows: halves of a smaller one take no less time
+ITERATED_LEAF = 48
 LARGEST_CONDITION = 1e6  # of a leaf
 RIDGE = 1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor
 LARGEST_SCALE = 2.8  # of eigenvalues up to 1; near 3 an iteration would make all of them small
@@ -42,7 +44,7 @@ def by_cholesky(matrix: Tensor) -> Tensor:
         return _by_halves(matrix, by_cholesky)
     factor, info = torch.linalg.cholesky_ex(matrix)
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    if at_hand(info) and bool(info.any()):
+    if at_hand(info) and any(info.flatten().tolist()):
         ridge = torch.where(info > 0, RIDGE * matrix.abs().sum(-1).amax(-1), 0.0)
         factor = torch.linalg.cholesky_ex(matrix + ridge[..., None, None] * one).L
     return torch.linalg.solve_triangular(factor, one.expand_as(matrix), upper=False)
@@ -51,7 +53,7 @@ def by_cholesky(matrix: Tensor) -> Tensor:
 @named
 def by_products(matrix: Tensor) -> Tensor:
     """Too small in the directions of a leaf's smallest eigenvalues where its condition exceeds `LARGEST_CONDITION`."""
-    if matrix.shape[-1] > LEAF:
+    if matrix.shape[-1] > ITERATED_LEAF:
         return _by_halves(matrix, by_products)
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     largest = matrix.abs().sum(-1).amax(-1)[..., None, None]
@@ -72,7 +74,7 @@ def _by_halves(matrix: Tensor, inverse_root: Callable[[Tensor], Tensor]) -> Tens
     root = inverse_root(A)
     coupling = root @ B
     further = inverse_root(C - coupling.mT @ coupling)
-    first = torch.cat([root, torch.zeros_like(B)], -1)
+    first = F.pad(root, (0, B.shape[-1]))
     return torch.cat([first, torch.cat([-(further @ coupling.mT) @ root, further], -1)], -2)
 
 

@@ -64,14 +64,21 @@ def solve_bordered(
         compliance: `C`, `[...]` or `[]`.
         target: `t [...]`.
     """
-    products = (loads @ solved.mT).flatten(-2).unbind(-1)
-    nMn, nMg, nMm, mMg, mMm = *products[:3], *products[7:]
+    multiplier, rise = border_unknowns(loads @ solved.mT, corner, load, compliance, target)
+    of_border, of_load, of_second = solved.unbind(-2)
+    return BorderedStep(-(multiplier[..., None] * of_border + of_load + rise[..., None] * of_second), rise)
+
+
+def border_unknowns(
+    products: Tensor, corner: Tensor, load: Tensor, compliance: Tensor, target: Tensor
+) -> tuple[Tensor, Tensor]:
+    """`lambda` and `r` of `solve_bordered`, `[...]` each, from the products of the loads (rows) with their solutions, `[..., 3,
+    3]`, and the other arguments."""
+    nMn, nMg, nMm, _, _, _, _, mMg, mMm = products.flatten(-2).unbind(-1)
     a11, a12, a22 = corner - mMm, compliance - nMm, -nMn
     b1, b2 = load + mMg, target + nMg
     det = a11 * a22 - a12 * a12
-    rise, multiplier = (b1 * a22 - a12 * b2) / det, (a11 * b2 - a12 * b1) / det
-    of_border, of_load, of_second = solved.unbind(-2)
-    return BorderedStep(-(multiplier[..., None] * of_border + of_load + rise[..., None] * of_second), rise)
+    return (a11 * b2 - a12 * b1) / det, (b1 * a22 - a12 * b2) / det
 
 
 def _dot(p: Tensor, q: Tensor) -> Tensor:

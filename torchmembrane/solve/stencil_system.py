@@ -1,8 +1,5 @@
 """Symmetric systems on a grid from products of seven-point stencils, solved by elimination over grid rows."""
 
-from itertools import groupby
-from math import prod
-from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -15,14 +12,21 @@ from . import block_pentadiagonal
 from .block_tridiagonal import inwards
 
 NEAR = ((0, 0), (0, 1), (1, 0), (1, 1))  # from a vertex to itself and to its neighbours further on
+OFFSETS = (*NEAR, (0, 2), (1, -1), (1, 2), (2, 0), (2, 1), (2, 2))
+"""Between two vertices of a stencil, none beside its opposite."""
 REACH = 2  # lines, between two vertices of a stencil
+SLOTS = sorted(range(len(STENCIL)), key=STENCIL.__getitem__)
+"""Of a stencil, in the order of the vertices: from one to a later one leads an offset, never its opposite."""
+WIDTH = 3 * (2 * REACH + 1) + 2
+"""Entries of a row of the matrix between two grid rows, each a place further to the left in the three rows of a vertex."""
+LEFT = 3 * REACH + 2
+"""Entries of a vertex's first row before the diagonal."""
 
 
 class StencilSystem(nn.Module):
     """Three unknowns per inner vertex of an `m x n` grid, one block per grid row; the matrix is block pentadiagonal.
 
-    Vectors are fields `[3, N]` over the inner vertices, flattened. Sums are gathered, not scattered, three numbers at a time:
-    where they come from is known beforehand.
+    Vectors are fields `[3, N]` over the inner vertices, flattened.
 
     Args:
         grid: `(m, n)`.
@@ -31,74 +35,89 @@ class StencilSystem(nn.Module):
 
     order: Tensor
     place_of_row: Tensor
-    product_sources: Tensor
+    slots: Tensor
     band_sources: Tensor
     ends: Tensor
-    one: Tensor
+    offsets_of_pairs: Tensor
     fixed: Tensor
 
     def __init__(self, grid: tuple[int, int], free: Tensor):
         super().__init__()
         m, n = grid
-        self.count, self.inner_grid = (m - 2) * (n - 2), (m - 2, n - 2)
+        self.grid, self.inner_grid = grid, (m - 2, n - 2)
         self.rows = max(3, m - 2 + (m + 1) % 2)  # an odd number
-        self.columns = max(n - 2, 2 * REACH + 1)  # no fewer than a row of the matrix reaches
+        self.columns = max(n - 2, 2 * REACH + 2)  # no fewer than a row of the matrix reaches
         self.parts = [3 * self.columns * len(part) for part in block_pentadiagonal.places(self.rows)]
-        groups = _offsets()
-        offsets = [offset for group in groups for offset, _ in group]
-        sources = [np.stack([_product_sources(grid, *joined) for joined in group], 1) for group in groups]
-        self.sizes = [source.shape for source in sources]
         for name, index in (
             ("order", np.array(inwards(self.rows))),
             ("place_of_row", np.argsort(inwards(self.rows))),
-            ("product_sources", np.concatenate([source.ravel() for source in sources])),
-            ("band_sources", _band_sources(grid, offsets, free.cpu().numpy(), self.rows, self.columns).ravel()),
-            ("ends", np.concatenate([_Inner.of(grid).beside(offset) for offset in offsets])),
+            ("slots", np.array(SLOTS)),
+            ("band_sources", _band_sources(grid, free.cpu().numpy(), self.rows, self.columns).ravel()),
+            ("ends", _ends(grid).ravel()),
         ):
             self.register_buffer(name, torch.from_numpy(index.astype(np.int32)))
-        self.register_buffer("one", torch.eye(3, dtype=torch.float64))
-        self.register_buffer("fixed", (~free).double()[:, None])
+        self.register_buffer("offsets_of_pairs", _offsets_of_pairs())
+        self.register_buffer("fixed", (~free).double())
 
-    def matrix(self, products: Tensor, near: Tensor, damping: float | Tensor) -> tuple[Tensor, Tensor]:
-        """The rows' bands `[B, 3 R, 15]` of the matrix, scaled from both sides to a diagonal of 1; by what, `[B, 1, 3 N]`.
+    def matrix(self, stencils: Tensor, weights: Tensor, near: Tensor, damping: float | Tensor) -> tuple[Tensor, Tensor]:
+        """The rows' bands of `A^T W A` and further blocks, scaled from both sides to a diagonal of 1; by what, `[B, 1, 3 N]`.
 
-        Arguments: `products [B, N, 21, 21]` of every stencil row's columns with each other; `near [B, 4, 3, N, 3]`, further
-        blocks between the vertices and those at `NEAR` from them; `damping`, a share of the diagonal.
+        Args:
+            stencils: `A [B, 3, 3, 7, N]`, of every vertex's three numbers, in the three of every vertex of its stencil.
+            weights: `W [B, 3, 3, N]`, symmetric.
+            near: `[B, 3, 3, 4, N]`, the further blocks, between the vertices and those at `NEAR` from them.
+            damping: a share of the diagonal that is added.
         """
-        chunks = products.unflatten(-1, (-1, 3)).flatten(1, 3).index_select(1, self.product_sources)
-        parts = chunks.split([prod(size) for size in self.sizes], 1)
-        own, beside, *further = (part.unflatten(1, size).sum(1) for part, size in zip(parts, self.sizes, strict=True))
-        own = (own + near[:, :1]) * (1 + damping * self.one[:, None])
-        scale = (own.diagonal(dim1=2, dim2=4).squeeze(1) + self.fixed).rsqrt()
-        there = scale.index_select(1, self.ends).unflatten(1, (-1, 1, self.count))
-        blocks = torch.cat([own, beside + near[:, 1:], *further], 1) * scale.mT[:, None, :, :, None] * there
-        rows = blocks.transpose(2, 3)
-        constants = torch.stack([torch.zeros_like(self.one), self.one]).to(rows).flatten(1).expand(rows.shape[0], -1, -1)
-        entries = torch.cat([rows.flatten(3).flatten(1, 2), rows.mT.flatten(3).flatten(1, 2), constants], 1)
-        band = entries.index_select(1, self.band_sources).unflatten(2, (3, 3)).unflatten(1, (-1, 2 * REACH + 1))
-        return band.transpose(2, 3).flatten(1, 2).flatten(2), scale.mT.flatten(1)[:, None]
+        blocks = self._blocks(stencils, weights)
+        blocks = torch.cat([blocks[:, :, :, : len(NEAR)] + near, blocks[:, :, :, len(NEAR) :]], 3)
+        scale = (blocks[:, :, :, 0].diagonal(dim1=1, dim2=2).mT * (1 + damping) + self.fixed).rsqrt()
+        there = scale.flatten(1).index_select(1, self.ends).reshape(-1, 1, 3, *blocks.shape[3:])
+        scaled = (blocks * scale[:, :, None, None] * there).flatten(1)
+        constants = torch.stack([torch.zeros_like(scaled[:, 0]), torch.ones_like(scaled[:, 0])], 1)
+        band = torch.cat([scaled, constants], 1).index_select(1, self.band_sources)
+        return band.unflatten(1, (-1, WIDTH)), scale.flatten(1)[:, None]
+
+    def _blocks(self, stencils: Tensor, weights: Tensor) -> Tensor:
+        """Blocks of `A^T W A`, `[B, 3, 3, 10, N]`, between the vertices and those at `OFFSETS` from them.
+
+        Both vertices are in the stencil of a third one. Grid rows between two zeros, two rows of zeros around all: so what
+        belongs with the stencil of a vertex at an offset is as far behind as that has places.
+        """
+        n, (rows, _) = self.grid[1], self.inner_grid
+        A = stencils.index_select(3, self.slots)
+        WA = (weights[:, :, :, None, None] * A[:, None]).sum(2)
+        left, right = (F.pad(part.unflatten(-1, self.inner_grid), (1, 1, 2, 2)).flatten(-2) for part in (A, WA))
+        products = []
+        for k, slot in enumerate(SLOTS):
+            i, j = STENCIL[slot]
+            here, later = (2 - i) * n - j, len(SLOTS) - k
+            x1, x2, x3 = left.narrow(4, here, rows * n).narrow(3, k, 1)[:, :, :, None].unbind(1)
+            y1, y2, y3 = right.narrow(4, here, rows * n).narrow(3, k, later)[:, :, None].unbind(1)
+            products.append(torch.addcmul(torch.addcmul(x1 * y1, x2, y2), x3, y3))
+        inside = (self.offsets_of_pairs @ torch.cat(products, 3)).unflatten(-1, (rows, n))
+        return inside[..., 1:-1].flatten(-2)
 
     def dense(self, band: Tensor) -> Tensor:
-        """Blocks `[B, K, s, s]` from bands `[B, K s, 15]`: their rows, between a vertex and those at most `REACH` columns off.
+        """Blocks `[B K, s, s]` from bands `[B, K s, 17]`: their rows, between a vertex and those at most `REACH` columns off.
 
-        Behind as many zeros as make a row of the matrix, and three more a vertex, each lies where it belongs, but for a shift.
+        Behind as many zeros as make a row of the matrix and one more, each lies where it belongs, but for a shift.
         """
         size = 3 * self.columns
-        rows = F.pad(band, (0, size - band.shape[-1])).unflatten(1, (-1, self.columns, 3)).flatten(3)
-        skewed = F.pad(rows, (0, 3)).flatten(2)
-        return skewed[..., 3 * REACH : 3 * (REACH - self.columns)].unflatten(2, (-1, size))
+        rows = F.pad(band, (0, size + 1 - WIDTH)).reshape(-1, size * (size + 1))
+        return rows[:, LEFT : LEFT - size].unflatten(1, (size, size))
 
     def factor(self, matrix: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
         """What `substitute` needs, from what `matrix` gives."""
         band, scale = matrix
-        roots, couplings = block_pentadiagonal.factor(band.split(self.parts, 1), self.dense)
-        return *roots, *couplings, scale
+        roots, near, far = block_pentadiagonal.factor(band.split(self.parts, 1), self.dense)
+        return *roots, *near, *far, scale
 
     def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
         """Solutions `[B, C, 3 N]` for `loads` of that shape."""
         *blocks, scale = factor
-        roots = len(blocks) // 2 + 1  # and a coupling between two
-        x = block_pentadiagonal.substitute((blocks[:roots], blocks[roots:]), self.in_blocks(scale * loads))
+        turns = len(blocks) // 3
+        found = block_pentadiagonal.Factor(blocks[: turns + 1], blocks[turns + 1 : -turns], blocks[-turns:])
+        x = block_pentadiagonal.substitute(found, self.in_blocks(scale * loads))
         return scale * self.from_blocks(x)
 
     def in_blocks(self, vector: Tensor) -> Tensor:
@@ -131,56 +150,39 @@ class _Inner(NamedTuple):
         inside = (row >= 0) & (row < self.size[0]) & (column >= 0) & (column < self.size[1])
         return np.where(inside, row * self.size[1] + column, -1)
 
-    def beside(self, offset: tuple[int, int]) -> np.ndarray:
-        """The number of every vertex' neighbour at an offset; of some vertex where there is none."""
-        return self.at(self.row + offset[0], self.column + offset[1]).clip(min=0)
+
+def _ends(grid: tuple[int, int]) -> np.ndarray:
+    """The numbers of every vertex' neighbours at `OFFSETS`, of some vertex where there is none, in fields `[3, N]`: `[3, 10,
+    N]`."""
+    inner = _Inner.of(grid)
+    beside = np.stack([inner.at(inner.row + i, inner.column + j) for i, j in OFFSETS]).clip(min=0)
+    return beside + len(inner.row) * np.arange(3)[:, None, None]
 
 
-def _offsets() -> list[list[tuple[tuple[int, int], list[tuple[int, int]]]]]:
-    """Offsets between two vertices of a stencil, none beside its opposite, and the pairs of slots they join, by how many.
-
-    The first group is a vertex's offset to itself, the second those to its neighbours: together `NEAR`.
-    """
-    pairs: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for a, start in enumerate(STENCIL):
-        for b, end in enumerate(STENCIL):
-            pairs.setdefault((end[0] - start[0], end[1] - start[1]), []).append((a, b))
-    upper = sorted((-len(found), offset, found) for offset, found in pairs.items() if offset >= (0, 0))
-    return [[(offset, found) for _, offset, found in group] for _, group in groupby(upper, key=itemgetter(0))]
+def _offsets_of_pairs() -> Tensor:
+    """`[10, 28]`: 1 where an offset is that between a pair of a stencil's vertices, the first by `SLOTS`, then the second."""
+    pairs = [(STENCIL[a], STENCIL[b]) for k, a in enumerate(SLOTS) for b in SLOTS[k:]]
+    return torch.tensor([[float((q[0] - p[0], q[1] - p[1]) == offset) for p, q in pairs] for offset in OFFSETS]).double()
 
 
-_ZERO = STENCIL.index((-1, -1))  # the first inner vertex's column for this neighbour, on the border, is zero
-
-
-def _product_sources(grid: tuple[int, int], offset: tuple[int, int], pairs: list[tuple[int, int]]) -> np.ndarray:
-    """Where in products `[N, 21, 7]` the rows of the block between a vertex and that at an `offset` from it have their parts:
-    `[K, 3, N]`."""
-    inner, component, slots = _Inner.of(grid), np.arange(3)[:, None], len(STENCIL)
-    di, dj = offset
-    sources = []
-    for a, b in pairs:
-        i, j = STENCIL[a]
-        row, other = inner.at(inner.row - i, inner.column - j), inner.at(inner.row + di, inner.column + dj)
-        source = (row * 3 * slots + 3 * a + component) * slots + b
-        sources.append(np.where((row >= 0) & (other >= 0), source, 3 * _ZERO * slots + _ZERO))
-    return np.stack(sources)
-
-
-def _band_sources(
-    grid: tuple[int, int], offsets: list[tuple[int, int]], free: np.ndarray, rows: int, columns: int
-) -> np.ndarray:
-    """Where the blocks between a vertex and those at most `REACH` columns from it are, `[places, columns, 5]`, in a matrix'
-    places: among the vertices' blocks at the `offsets`, the transposed ones, a zero and a one."""
-    inner, N, K = _Inner.of(grid), len(free), len(offsets)
+def _band_sources(grid: tuple[int, int], free: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Where the entries of a matrix' places are, between the numbers of a vertex and those of the ones at most `REACH` columns
+    from it, `[places, columns, 3, WIDTH]`: among the vertices' blocks `[3, 3, 10, N]`, a zero and a one."""
+    inner, N, K = _Inner.of(grid), len(free), len(OFFSETS)
     number = np.full((2 * REACH + 1,) * 2, -1)
-    for k, offset in enumerate(offsets):
+    for k, offset in enumerate(OFFSETS):
         number[offset] = k  # negative indices wrap: the opposite offset has its own place
-    i, other = np.concatenate(block_pentadiagonal.places(rows)).T[:, :, None, None]
-    j, di, dj = np.arange(columns)[:, None], other - i, np.arange(-REACH, REACH + 1)
+    i, other = (at[:, None, None, None, None] for at in np.concatenate(block_pentadiagonal.places(rows)).T)
+    j, a, b = np.arange(columns)[:, None, None, None], np.arange(3)[:, None, None], np.arange(3)
+    di, dj = other - i, np.arange(-REACH, REACH + 1)[:, None]
     p, q = inner.at(i, j), inner.at(i + di, j + dj)
-    used, itself = (p >= 0) & free[p], (i >= 0) & (di == 0) & (dj == 0)
-    close = used & (q >= 0) & free[q] & (abs(di) <= REACH)
-    di, dj = np.where(close, di, 0), np.where(close, dj, 0)
-    upper, lower = number[di, dj], number[-di, -dj]
-    entry = np.where(upper >= 0, upper * N + p, (K + lower) * N + q)
-    return np.where(close & ((upper >= 0) | (lower >= 0)), entry, 2 * K * N + (itself & ~used))
+    close = (p >= 0) & free[p] & (q >= 0) & free[q] & (abs(di) <= REACH)
+    di, dj_close = np.where(close, di, 0), np.where(close, dj, 0)
+    upper, lower = number[di, dj_close], number[-di, -dj_close]
+    entry = np.where(upper >= 0, ((3 * a + b) * K + upper) * N + p, ((3 * b + a) * K + lower) * N + q)
+    zero, is_own = 9 * K * N, (i >= 0) & (other == i) & (dj == 0) & (a == b)
+    entry = np.where(is_own, zero + 1, np.where(close & ((upper >= 0) | (lower >= 0)), entry, zero))
+    sources = np.full((*entry.shape[:3], WIDTH), zero)
+    for row in range(3):
+        sources[:, :, row, 2 - row : WIDTH - row] = entry[:, :, row].reshape(*entry.shape[:2], -1)
+    return sources

@@ -33,13 +33,14 @@ def bicubic_shares(points: SurfacePoints, grid: tuple[int, int], fixed: Tensor) 
     """
     (m, n), rows = grid, np.arange(len(points.vertices))[:, None]
     place = (points.weights[..., None] * np.stack(np.divmod(points.vertices, n), -1)).sum(1)
-    shares = (_along(place[:, 0], m)[:, :, None] * _along(place[:, 1], n)[:, None]).reshape(len(rows), m * n)
+    shares: np.ndarray = (_along(place[:, 0], m)[:, :, None] * _along(place[:, 1], n)[:, None]).reshape(len(rows), m * n)
     inside = np.zeros((m, n), bool)
     inside[1:-1, 1:-1] = fixed.numpy().reshape(m, n)[1:-1, 1:-1]
     linear = np.zeros_like(shares)
     np.add.at(linear, (rows, points.vertices), points.weights)
     kinked = (abs(shares) @ inside.ravel()) > 0
-    return np.where(kinked[:, None], linear, shares)
+    shares[kinked] = linear[kinked]
+    return shares
 
 
 def _along(place: np.ndarray, count: int) -> np.ndarray:

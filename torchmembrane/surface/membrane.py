@@ -5,7 +5,6 @@ Which vertices form the triangles: `topology`. Sums around a vertex are convolut
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
@@ -148,7 +147,8 @@ class Membrane(nn.Module):
             [0.0, 0.0, 1.0]
         """
         beyond = self.chords_beyond_border * torch.cat([x.transpose(-2, -1)] * 4, -1)  # vertices beyond are the vertex itself
-        return F.normalize(self._crossed_chords(apply_stencil(x, self.chord_kernels, self.grid) - beyond), dim=-1)
+        along = self._crossed_chords(apply_stencil(x, self.chord_kernels, self.grid) - beyond)
+        return (along * along.square().sum(-2, keepdim=True).clamp_min(torch.finfo(x.dtype).tiny).rsqrt()).mT
 
     def volume(self, x: Tensor) -> Tensor:
         """Volume between the surface and the camera's centre (eq. 19).
@@ -191,7 +191,7 @@ class Membrane(nn.Module):
             >>> plane.volume_gradient(plane.rest)[4].round(decimals=9).abs().tolist()
             [0.0, 0.0, 1.0]
         """
-        return self._crossed_chords(apply_stencil(x, self.chord_kernels, self.grid))
+        return self._crossed_chords(apply_stencil(x, self.chord_kernels, self.grid)).mT
 
     def volume_hessian_blocks(self, x: Tensor) -> Tensor:
         """Second derivatives of every triangle's share of the volume in its nine vertex coordinates.
@@ -205,21 +205,19 @@ class Membrane(nn.Module):
         blocks: Tensor = (triangles_of(corners(x, self.grid)).flatten(-2) @ self.volume_third_derivatives).unflatten(-1, (9, 9))
         return blocks
 
-    def volume_one_ring(self, edges: Tensor) -> tuple[Tensor, Tensor]:
-        """First and second derivatives of `volume` in the inner vertices.
+    def volume_one_ring(self, chords: Tensor) -> Tensor:
+        """Second derivatives of `volume` in an inner vertex and its six neighbours; those in one vertex alone are zero.
+
+        Half of what they give of the edges to the neighbours is the gradient.
 
         Args:
-            edges: `[..., 3, 2, 6 N]`, from `one_ring_edges`.
+            chords: `[..., 3, 6 N]`, from the neighbour after each to that before it (`one_ring_edges`).
 
         Returns:
-            The gradient `[..., 3, N]`, and `[..., 3, 3, 6, N]`, the second derivatives in a vertex and its six neighbours;
-            those in one vertex alone are zero.
+            `[..., 3, 3, 6, N]`.
         """
-        first, second = edges.unbind(-2)
-        gradient = torch.linalg.cross(first, second, dim=-2).unflatten(-1, (6, -1)).sum(-2)
-        before = first.unflatten(-1, (6, -1)).roll(1, -2).flatten(-2)
-        crossed = (self.volume_cross_products @ (before - second)).unflatten(-2, (3, 3))
-        return self.outward / 6 * gradient, crossed.unflatten(-1, (6, -1))
+        blocks: Tensor = (self.volume_cross_products @ chords).unflatten(-2, (3, 3)).unflatten(-1, (6, -1))
+        return blocks
 
     @property
     def cavity_volume(self) -> float:
@@ -293,10 +291,12 @@ class Membrane(nn.Module):
         return torch.stack([self.outward / 6 * (p[2] - p[0]), self.outward / 6 * (p[4] - p[0]), p[3] - p[1], p[5] - p[3]])
 
     def _crossed_chords(self, chords: Tensor) -> Tensor:
-        """A sixth of `sum p_i x p_i+1` at every vertex, outwards, from chords `[..., 3, 4 V]` as `chord_kernels` has them."""
+        """A sixth of `sum p_i x p_i+1` at every vertex, outwards, `[..., 3, V]`, from chords `[..., 3, 4 V]` as
+        `chord_kernels` has them."""
         (u1, u2), (v1, v2) = (a.chunk(2, -2) for a in chords.index_select(-2, self.xyz_to_yzxzxy).chunk(2, -1))
         first, second = (u1 * v2 - u2 * v1).chunk(2, -1)
-        return (first + second).mT
+        crossed: Tensor = first + second
+        return crossed
 
     def _thirds_to_vertices(self, per_triangle: Tensor) -> Tensor:
         thirds = (per_triangle / 3).unsqueeze(-2).expand(*per_triangle.shape[:-1], 3, per_triangle.shape[-1])
