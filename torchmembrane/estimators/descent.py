@@ -21,7 +21,7 @@ from .robust import Cauchy
 from .settings import ForceBalanceSettings
 
 Factor = tuple[Tensor, ...]
-VERTICES = 4500
+VERTICES = 9000
 """Of a batch's surfaces that are worked on at a time: what a step makes of more does not stay in a processor's cache."""
 
 
@@ -169,8 +169,8 @@ class Descent(nn.Module):
         if factor is not None:
             return None, self._conjugated(normal, factor, loads)
         if keeps or torch.compiler.is_compiling():
-            kept = self._factor(normal, damping)
-            return kept, equations.system.substitute(kept, loads)
+            made = self._factor(normal, damping)
+            return equations.system.by_frame(made) if keeps else None, equations.system.substitute(made, loads)
         with torch.no_grad():
             substitute = partial(equations.system.substitute, self._factor(normal, damping))
         return None, differentiable(substitute, partial(equations.product, normal, damping=damping), loads)
@@ -181,6 +181,7 @@ class Descent(nn.Module):
     def _conjugated(self, normal: NormalEquations, factor: Factor, loads: Tensor) -> Tensor:
         """Solutions with the factor of equations near these."""
         equations, steps = self.equations, self.settings.conjugate_steps
+        factor = equations.system.in_pairs(factor)
         product, precondition = partial(equations.product, normal), partial(equations.system.substitute, factor)
         return conjugate_gradient(product, precondition, loads, steps)
 
