@@ -9,6 +9,7 @@ from ..camera.mode import Mode
 from ..camera.model import Camera
 from ..io.results import Frame
 from ..io.status import Status
+from ..markers.placement import in_view
 from ..reconstruct import Reconstructor
 from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
@@ -125,6 +126,8 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
     if markers.positions is not None:
         listed, large = len(markers.positions), sum(size == "large" for size in markers.sizes or ())
         lines[0] += f", {listed} listed: {large} large, {listed - large} small"
+        seen = in_view(sensor.camera.point_to_pixel(torch.from_numpy(markers.positions)).numpy(), sensor.camera.image_size)
+        lines += [f"{seen.sum()} of {listed} in the camera's view"] * (not seen.all())
     if reconstructor is not None and markers.positions is None:
         lines[0] += f", {len(reconstructor.rest_pixels)} placed on the rest surface from the rest image"
     if frame is None or reconstructor is None:
