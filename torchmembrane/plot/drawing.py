@@ -22,6 +22,7 @@ readable = rc_context({"font.size": 13, "axes.titlesize": 14.5, "axes.titlepad":
 """Decorates what draws a figure: its letters can be read where a page shows it at half its width."""
 ROW = 6.0  # inches, of a row of panels
 ABOVE, UNDER = 0.9, 1.3  # of it: the headline and titles of two lines; labels and a legend of two rows
+TITLE = 0.6  # inches, of the titles of a further row
 LINES = 16  # of a grid that are drawn each way, at most about
 
 
@@ -55,13 +56,15 @@ def show(drawing: Figure) -> None:
     pyplot.show()
 
 
-def panels(count: int, below: float = 0.0) -> tuple[Figure, GridSpec]:
-    """A figure with places for `count` panels in a row, and `below` them as many inches more."""
-    height = ROW + below
+def panels(count: int, below: float = 0.0, rows: int = 1) -> tuple[Figure, GridSpec]:
+    """A figure with places for `count` panels in each of its rows, and `below` them as many inches more."""
+    panel, between = ROW - ABOVE - UNDER, UNDER + TITLE
+    height = rows * panel + (rows - 1) * between + ABOVE + UNDER + below
     drawing = Figure(figsize=(16 * count / 3, height), dpi=100)
     top, bottom = 1 - ABOVE / height, (below + UNDER) / height
+    left, right = 0.155 / count, 1 - 0.045 / count
     return drawing, drawing.add_gridspec(
-        1, count, left=0.155 / count, right=1 - 0.045 / count, top=top, bottom=bottom, wspace=0.2
+        rows, count, left=left, right=right, top=top, bottom=bottom, wspace=0.2, hspace=between / panel
     )
 
 

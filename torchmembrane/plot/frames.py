@@ -1,4 +1,4 @@
-"""A frame's result in one row of panels: marker flow, surface from the side, map of displacements, map of traction."""
+"""A frame's result in panels: marker flow, surface from the side, map of displacements, map of traction."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -64,7 +64,8 @@ def figure(
     """
     good = bool(np.isfinite(frame["vertices"]).all())
     forces = good and np.any(frame["traction"])
-    drawing, grid = panels(places or (4 if forces else 3))
+    square = (places or (4 if forces else 3)) == 4
+    drawing, grid = panels(2, rows=2) if square else panels(3)
     headline = _title(frame, mesh, name)
     fitting = 72 * drawing.get_figwidth() / (WIDEST_LETTER * len(headline))
     drawing.suptitle(headline, fontsize=min(HEADLINE, fitting), color="k" if good else VERMILION)
@@ -75,7 +76,7 @@ def figure(
         if forces:
             draw_traction(drawing.add_subplot(grid[3]), frame, mesh)
     else:
-        _draw_failure(drawing.add_subplot(grid[0, 1:]), frame)
+        _draw_failure(drawing.add_subplot(grid[1, :] if square else grid[0, 1:]), frame)
     return drawing
 
 

@@ -125,7 +125,7 @@ def _draw_projection(
         pixels = sensor.camera.point_to_pixel(sensor.membrane.rest).numpy()
     image_axes(axes, sensor.camera.image_size, image)
     axes.add_collection(mesh_lines(pixels, grid, color=BLUE, lw=0.4))
-    axes.plot(*pixels[closed_rim(grid)].T, color=BLUE, lw=1.8, label="rim and grid, projected")
+    axes.plot(*pixels[closed_rim(grid)].T, color=BLUE, lw=1.8, label="rim and grid")
     if frame is not None and reconstructor is not None:
         place, found = reconstructor.observer.measured_rest.cpu().numpy(), frame["confidence"] > 0
         size, label = 6 if len(found) < 300 else 2.5, f"markers found ({found.sum()})"
