@@ -49,7 +49,8 @@ def draw_sheet(drawing: Figure, sheet: SpecSheet) -> None:
     _draw_pairs(axes[3], sheet)
     for each in axes:
         each.grid(lw=0.3, alpha=0.5)
-        each.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, ncols=2, fontsize=9.5, handlelength=1.4, columnspacing=0.8)
+        narrow: dict[str, Any] = dict(fontsize=9.5, handlelength=1.4, columnspacing=0.8)
+        each.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, ncols=2, **narrow)
 
 
 def _draw_force(axes: Axes, sheet: SpecSheet) -> None:
