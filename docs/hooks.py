@@ -1,16 +1,19 @@
-"""Code in the site's pages breaks where it can be read: not within an option, in a table not within a short name."""
+"""Code in the site's pages breaks where it can be read: not within an option, in a table not within a short name. Pictures open
+in their own size where they are clicked."""
 
 import re
 
 LONGEST = 18  # letters of a name that is kept whole in a table
 OPTION = re.compile(r"(?<![\w-])--?[A-Za-z][\w-]*")
 CODE = re.compile(r"(<code[^>]*>)(.*?)(</code>)", re.S)
-CELL = re.compile(r"<td.*?</td>", re.S)
+PICTURE = re.compile(r'<img [^>]*src="([^"]+)"[^>]*>')
+CELL = re.compile(r"<(t[dh]).*?</\1>", re.S)
 JOINT = re.compile(r"(?<=\w)(::|[._/(\[,=])(?=[\w\]])")
 
 
 def on_page_content(html: str, **_: object) -> str:
-    """A page's HTML, options in code made whole, code in tables broken at its joints."""
+    """A page's HTML, options in code made whole, code in tables broken at its joints, pictures as links to themselves."""
+    html = PICTURE.sub(r'<a href="\1">\g<0></a>', html)
     return CODE.sub(_with_whole_options, CELL.sub(lambda cell: CODE.sub(_in_cell, cell[0]), html))
 
 
