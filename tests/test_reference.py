@@ -88,6 +88,8 @@ def keys(tmp_path, monkeypatch):
             read_sensor(Path("sensor.toml"))
         except tm.MembraneError as error:
             assert "off the rest surface" in str(error)  # the one dot; all tables have been read
+    Path("design.toml").write_text(Path("sensor.toml").read_text().replace('file = "dots.csv"\n', ""))
+    read_sensor(Path("design.toml"), undotted=True)
     return found
 
 
