@@ -14,7 +14,7 @@ JOINT = re.compile(r"(?<=\w)(::|[._/(\[,=])(?=[\w\]])")
 def on_page_content(html: str, **_: object) -> str:
     """A page's HTML, options in code made whole, code in tables broken at its joints, pictures as links to themselves."""
     html = PICTURE.sub(r'<a href="\1">\g<0></a>', html)
-    return CODE.sub(_with_whole_options, CELL.sub(lambda cell: CODE.sub(_in_cell, cell[0]), html))
+    return CODE.sub(_with_whole_options, CELL.sub(lambda cell: CODE.sub(_in_cell, cell[0].replace("\\|", "|")), html))
 
 
 def _with_whole_options(code: re.Match[str]) -> str:

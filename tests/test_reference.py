@@ -161,11 +161,12 @@ def test_the_site_keeps_options_and_short_names_whole_and_opens_pictures(monkeyp
     monkeypatch.syspath_prepend(str(DOCS))
     page = importlib.import_module("hooks").on_page_content(
         "<pre><code>check --out a.png</code></pre><table><tr><td><code>UNLIKE_REST</code></td>"
-        '<td><code>tm.calibrate.rest_from_image</code></td></tr></table><img alt="x" src="a.png" />'
+        '<td><code>tm.calibrate.rest_from_image</code></td><td><code>a\\|b</code></td></tr></table><img alt="x" src="a.png" />'
     )
     assert '<code>check <span class="whole">--out</span> a.png</code>' in page
     assert '<td><span class="whole"><code>UNLIKE_REST</code></span></td>' in page
     assert "<code>tm.<wbr>calibrate.<wbr>rest_<wbr>from_<wbr>image</code>" in page
+    assert "<code>a|b</code>" in page
     assert page.endswith('<a href="a.png"><img alt="x" src="a.png" /></a>')
 
 
