@@ -50,8 +50,6 @@ MEANT = {
 """What is written, by the word that is meant."""
 HINTS = {
     "spherical_cap": "half a sphere has rim_radius = height",
-    "rim_radius": "half the diameter",
-    "radius": "half the diameter",
     "pressure": "of a gas, absolute: the atmosphere's, about 1013 hPa, and the overpressure",
     "shear_modulus": "a third of Young's modulus",
 }
@@ -69,5 +67,5 @@ def did_you_mean(word: object, choices: Iterable[str], otherwise: str = "") -> s
     found = known or difflib.get_close_matches(plain, choices, 1)
     if not found:
         return otherwise
-    hint = f" ({HINTS[found[0]]})" if found[0] in HINTS else ""
-    return f"did you mean {found[0]!r}{hint}?"
+    hint = "half the diameter" if plain == "diameter" else HINTS.get(found[0], "")
+    return f"did you mean {found[0]!r}{f' ({hint})' if hint else ''}?"
