@@ -43,7 +43,7 @@ from torchmembrane.jobs.local import reconstruct_files
 from torchmembrane.jobs.pressure import read_pressures
 from torchmembrane.jobs.result_folder import ResultFolder
 from torchmembrane.plot.film import write_film
-from torchmembrane.presets.draft import read_drafted_dots
+from torchmembrane.presets.dot_list import read_drafted_dots
 
 KEPT = Path("out/fuzz")
 COUNTS = dict(sensors=1000, images=700, npz=300, parquet=300, readings=300, dots=300, videos=100)

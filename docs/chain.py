@@ -48,7 +48,7 @@ def chain_figures() -> Iterator[tuple[str, Figure]]:
 
 
 def row_of_panels(count: int, height: float = 4.4) -> tuple[Figure, list]:
-    drawing = Figure(figsize=(15, height), dpi=100, layout="constrained")
+    drawing = Figure(figsize=(11, 0.78 * height), dpi=100, layout="constrained")
     return drawing, list(drawing.subplots(1, count))
 
 
@@ -66,14 +66,14 @@ def dots_figure(names: dict, shown: Shown) -> Figure:
     for what, place in small.items():
         b.plot(*place[0].numpy().T, marks[what][0], ms=6, mfc="none", mec=marks[what][1], mew=1, label=what)
         words.append(f"{what} {np.median(np.linalg.norm(place[0].numpy() - true, axis=1)):.2f} px off")
-    b.set_xlabel("; ".join(words) + " in the median, on a coarse level", fontsize=10)
+    b.set_xlabel("\n".join(words) + " in the median, on a coarse level", fontsize=10)
     draw_image(c, shown.image, "all refined, close up")
     found = rest + names["u"][0].numpy()
     c.plot(*shown.pixels.T, "o", ms=9, mfc="none", mec=BLUE, label="true")
     c.plot(*found.T, "+", ms=9, mec=VERMILION, mew=1.3, label="found")
     c.set(xlim=CLOSE_UP[:2], ylim=CLOSE_UP[2:])
     off = np.linalg.norm(found - shown.pixels, axis=1)
-    c.set_xlabel(f"{np.median(off):.3f} px off in the median, {off.max():.2f} at most; against the rest image", fontsize=10)
+    c.set_xlabel(f"{np.median(off):.3f} px off in the median,\n{off.max():.2f} at most; against the rest image", fontsize=10)
     for axes in (a, b, c):
         axes.legend(fontsize=8, loc="lower left")
     return drawing

@@ -64,7 +64,7 @@ def all_errors(shown: Shown, results: dict[str, Reconstruction]) -> str:
 
 def reconstruction_rows(name: str, across: int, *rows: tuple[str, tuple], height: float = 3.4) -> Figure:
     """Image, matches, and all reconstructions, a row for each press."""
-    drawing = Figure(figsize=(18, 0.8 + height * len(rows)), dpi=100, layout="constrained")
+    drawing = Figure(figsize=(13.5, 0.8 + 0.8 * height * len(rows)), dpi=100, layout="constrained")
     drawing.suptitle(name)
     for axes, (sensor, strokes) in zip(drawing.subplots(len(rows), 5, squeeze=False, gridspec_kw=WIDTHS), rows, strict=True):
         shown = pressed(sensor, *strokes)
@@ -197,7 +197,7 @@ def profile_figure(name: str, discs: list[Disc], radius=15.0, noise=2e-4) -> Fig
         ENERGY: MinimumEnergyProfile(radius, strip, 61),
         BALANCE: ForceBalanceProfile(radius, strip, 61, 2 * noise),
     }
-    drawing = Figure(figsize=(13, 4.6), dpi=100, layout="constrained")
+    drawing = Figure(figsize=(9.5, 3.6), dpi=100, layout="constrained")
     drawing.suptitle(name)
     for axes, (title, estimator) in zip(drawing.subplots(1, 2), estimators.items(), strict=True):
         got = estimator(theta, psi)

@@ -12,8 +12,8 @@ HEAD = """\
 # The command
 
 Made by `python docs/reference.py` from the command's own parsers; `torchmembrane COMMAND --help` says the same, with examples.
-`SENSOR.toml` may be `preset:NAME` ([which](presets.md)). A value that begins with a minus needs `=`, as in
-`--direction=-0.5,0,0.87`. Exit codes: 0 all well, 1 some frames failed, 2 wrong usage, 130 interrupted.
+`SENSOR.toml` may be `preset:NAME` ([which](presets.md)). Exit codes: 0 all well, 1 some frames failed, 2 wrong usage, 130
+interrupted.
 """
 
 
@@ -51,7 +51,8 @@ def section(title: str, parser: argparse.ArgumentParser, called: str) -> str:
 
 def row(action: argparse.Action) -> str:
     """A line of the table: how it is written, what it says, which values it takes."""
-    value = "" if action.nargs == 0 else str(action.metavar or action.dest.upper())
+    named = action.metavar or action.dest.upper()
+    value = "" if action.nargs == 0 else named if isinstance(named, str) else " ".join(named)
     names = ", ".join(f"{name} {value}".strip() for name in action.option_strings) or value
     help = (action.help or "") % {"default": action.default, "dest": action.dest}
     words = [help] + ([f"one of {', '.join(map(str, action.choices))}"] if action.choices else [])

@@ -436,7 +436,7 @@ def test_figures_beside_results(images, tmp_path):
     outcome, _, made = reconstruct(images[:2], tmp_path / "out", figures=True)
     assert outcome == (2, 0, 0, 0, 0, 0)
     for path in images[:2]:
-        assert Image.open(tmp_path / "out" / f"{path.stem}.png").width == 2133
+        assert Image.open(tmp_path / "out" / f"{path.stem}.png").size == (1066, 1170)
     assert reconstruct(images[:2], tmp_path / "out", figures=True)[0] == (0, 0, 0, 0, 0, 2)
 
 

@@ -146,6 +146,30 @@ def test_usage_errors_exit_with_2(arguments, capsys):
     assert stop.value.code == 2 and "usage: torchmembrane" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("init a.toml --diameter 24", "unrecognized arguments: --diameter 24; did you mean --radius (half the diameter)?"),
+        ("init a.toml --fov 90", "did you mean --view?"),
+        ("init a.toml --lens equidistant", "did you mean 'fisheye'?"),
+        ("check a.toml --acuracy", "did you mean --accuracy?"),
+        ("calibrate weight a.toml", "did you mean 'material'?"),
+        ("reconstrct a.toml", "did you mean 'reconstruct'?"),
+        ("check a.toml b.toml", "torchmembrane check: error: unrecognized arguments: b.toml"),
+    ],
+)
+def test_wrong_arguments_are_answered_in_two_lines_with_what_was_meant(arguments, said, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(arguments.split())
+    lines = capsys.readouterr().err.splitlines()
+    assert stop.value.code == 2 and len(lines) == 2 and said in lines[1]
+
+
+def test_a_vector_may_begin_with_a_minus():
+    call = "simulate a.toml --indenter sphere --radius 1 --depth 1 --direction -0.5,0,0.87 --out out".split()
+    assert cli.command_parser().parse_args(call).direction == [-0.5, 0.0, 0.87]
+
+
 def test_cuda_without_a_device_is_refused(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     code, _, errors = run(capsys, "reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out", "--device", "cuda")
@@ -200,7 +224,7 @@ def test_view_draws_a_stored_result(built_once, monkeypatch, tmp_path, capsys):
     assert run(capsys, "reconstruct", SENSOR, EXAMPLES / "rest.png", "--out", tmp_path / "out")[0] == 0
     result = tmp_path / "out" / "rest.npz"
     code, said, _ = run(capsys, "view", result, "--image", EXAMPLES / "rest.png", "--out", tmp_path / "a.png")
-    assert code == 0 and str(tmp_path / "a.png") in said and Image.open(tmp_path / "a.png").width == 2133
+    assert code == 0 and str(tmp_path / "a.png") in said and Image.open(tmp_path / "a.png").size == (1066, 1170)
     assert run(capsys, "view", result)[0] == 0 and (tmp_path / "out" / "rest_view.png").exists()
     code, _, errors = run(capsys, "view", shutil.copy(result, tmp_path))
     assert code == 2 and "mesh.npz" in errors

@@ -1,6 +1,8 @@
 """Dots: found and measured in the rest image, located and matched in frames, all through rendered pixels."""
 
 import importlib
+import warnings
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +19,7 @@ from torchmembrane.markers.dots.coherence import Coherence
 from torchmembrane.markers.dots.deformation import monomial_map
 from torchmembrane.markers.dots.ellipse import metric_of
 from torchmembrane.markers.dots.fit import EllipseFit
-from torchmembrane.markers.dots.locator import DotLocator
+from torchmembrane.markers.dots.locator import DotLocator, membrane_mask
 from torchmembrane.markers.dots.pattern import DotPattern, find_dots, measure_dots
 from torchmembrane.markers.dots.pyramid import mean_pyramid
 
@@ -534,6 +536,29 @@ def test_the_fit_does_not_run_off_to_a_neighbour():
     fit = EllipseFit(pixels, shapes, SIZE, 0.45, steps=8).double()
     centre, *_ = fit(levels, begin, torch.tensor(shapes)[None], torch.zeros(1))
     assert (centre - begin).abs().max() <= 2.7 + 1 + 1e-9
+
+
+def test_images_of_anything_and_any_size_are_searched_or_refused():
+    """Few dots or none that are alike, edges, images smaller than a dot: one error, and no warning of numpy's."""
+    rng, refused = np.random.default_rng(0), 0
+    shapes, sizes = np.tile(np.eye(2), (12, 1, 1)), np.ones(12, int)
+    for number, size in enumerate(rng.integers(1, 60, (90, 2))):
+        image = (rng.random(size), (rng.random(size) > 0.5) * 1.0, np.full(size, rng.random()))[number % 3]
+        listed = rng.random((12, 2)) * size[::-1], shapes, sizes
+        for search in (partial(find_dots, image), partial(measure_dots, image, *listed)):
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                try:
+                    search(polarity="dark")
+                except MembraneError as error:
+                    refused += "dots found, expected at least 6" in str(error)
+    assert refused > 150
+
+
+def test_a_membrane_outside_the_image_is_refused():
+    s = scene()
+    with pytest.raises(MembraneError, match="dots is not in the image of 320 x 240 px"):
+        membrane_mask(s.pixels + 1e4, s.pixels[:4] + 1e4, (320, 240))
 
 
 def test_wrong_arguments_are_named():

@@ -75,7 +75,7 @@ def test_films_that_cannot_be_are_said_and_leave_nothing(tmp_path):
 def test_all_frames_of_a_folder_are_drawn_as_a_film_also_one_without_surface(recording, tmp_path, capsys):
     assert main(["view", str(recording), "--video-out", str(tmp_path / "day.gif"), "--rate", "4"]) == 0
     film = Image.open(tmp_path / "day.gif")
-    assert film.n_frames == 4 and film.size == (2133, 600) and film.info["duration"] == 250
+    assert film.n_frames == 4 and film.size == (1066, 1170) and film.info["duration"] == 250
     assert "4 frames drawn" in capsys.readouterr().out
     film.seek(3)
     flow = np.asarray(film.convert("L"))[200:360, 150:450]

@@ -12,7 +12,8 @@ import torch
 from torchmembrane import Camera, MembraneError, Sensor
 from torchmembrane.calibrate.rim import find_rim
 from torchmembrane.cli.main import main
-from torchmembrane.presets.draft import RimCircle, balanced, drafted_dots, drafted_surface, overpressure, read_drafted_dots
+from torchmembrane.presets.dot_list import read_drafted_dots
+from torchmembrane.presets.draft import RimCircle, balanced, drafted_dots, drafted_surface, overpressure
 from torchmembrane.sensor.parts import METRE, Cavity, Markers, Material
 from torchmembrane.simulate.appearance import noisy
 from torchmembrane.simulate.render import Renderer
@@ -251,12 +252,97 @@ def test_the_lens_centre_need_not_be_whole(tmp_path):
     assert Sensor.from_file(drafted(tmp_path, "dome", "--centre", "307.9,241.6")).camera.centre.tolist() == [307.9, 241.6]
 
 
-def test_bad_dots_are_named_with_their_line(tmp_path):
+ROWS = "\n".join(f"{x},{y}" for x in (-4, 0, 4) for y in (-4, 0, 4))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (f"x,y\n{ROWS}\n30,0\n", "line 11: 30,0 misses the membrane"),
+        ("a,b\n1,2\n", "the header is 'a,b'; expected CSV, its columns parted by commas"),
+        ("x;y\n1;2\n", "the header is 'x;y'"),
+        (f"x,y\n{ROWS}\n1,a\n", "line 11: 1,a; expected 2 finite numbers, x,y"),
+        (f"x,y\n{ROWS}\n1,nan\n", "line 11: 1,nan; expected 2 finite numbers"),
+        (f"x,y\n{ROWS}\n1,2,3\n", "line 11: 1,2,3; expected 2 finite numbers"),
+        ("x,y,size\n" + ROWS.replace("\n", ",large\n") + ",medium\n", "line 10: size = 'medium'; expected small or large"),
+        ("x,y\n", "0 dots; expected 8 to 2000"),
+        ("x,y\n1,2\n", "1 dots; expected 8 to 2000"),
+        ("x,y\n" + "1,2\n" * 2001, "2001 dots; expected 8 to 2000"),
+    ],
+)
+def test_bad_dots_are_named_with_their_line(tmp_path, text, said):
     surface, camera = drafted_surface("dome", {"radius": 12.0}, 20.0), Camera("pinhole", (640, 480), (400, 400), (320, 240))
-    for text, said in (("x,y\n1,2\n30,0\n", "line 3"), ("a,b\n1,2\n", "header"), ("x,y\n1,a\n", "readable"), ("x,y\n", "none")):
-        (tmp_path / "dots.csv").write_text(text)
-        with pytest.raises(ValueError, match=said):
-            read_drafted_dots(tmp_path / "dots.csv", surface, camera)
+    (tmp_path / "dots.csv").write_text(text)
+    with pytest.raises(MembraneError, match=re.escape(said)):
+        read_drafted_dots(tmp_path / "dots.csv", surface, camera)
+
+
+def test_heights_over_the_rim_that_are_called_z_are_recognised(tmp_path):
+    surface, camera = drafted_surface("dome", {"radius": 12.0}, 20.0), Camera("pinhole", (640, 480), (400, 400), (320, 240))
+    X, _ = drafted_dots(surface)
+    path = tmp_path / "dots.csv"
+    np.savetxt(path, X - [0, 0, 20.0], delimiter=",", header="x,y,z", comments="")
+    with pytest.raises(MembraneError, match="expected the header x,y,h"):
+        read_drafted_dots(path, surface, camera)
+
+
+@pytest.mark.parametrize("unit", METRE)
+def test_a_draft_is_as_exact_in_any_unit(tmp_path, unit):
+    """Dots from above are written as near the membrane, and as many are drawn."""
+    made, one = tmp_path / f"{unit}.toml", METRE[unit] / METRE["mm"]
+    dots, places = tmp_path / "dots.csv", np.array([[x, y] for x in (-5.1, 0.3, 4.7) for y in (-5.2, 0.1, 4.9)])
+    np.savetxt(dots, one * places, "%.17g", ",", header="x,y", comments="")
+    lengths = ["--radius", f"{12 * one!r}", "--distance", f"{12.3456 * one!r}", "--unit", unit]
+    assert main(["init", str(made), "--shape", "dome", *lengths, *FISHEYE, "--dots", str(dots)]) == 0
+    sensor = Sensor.from_file(made)
+    assert sensor.surface.values["base_z"] == pytest.approx(12.3456 * one, rel=1e-7)
+    X = sensor.markers.positions / one - [0, 0, 12.3456]
+    assert np.abs(np.linalg.norm(X, axis=1) - 12).max() < 0.005  # of the fine surface's facets
+    assert len(drafted_dots(drafted_surface("dome", {"radius": 12 * one}, 12 * one))[1]) == 137
+
+
+@pytest.mark.parametrize("pitch", ["30", "0.05", "1e-9"])
+def test_a_pitch_of_too_few_or_too_many_dots_is_refused_with_one_that_serves(tmp_path, capsys, pitch):
+    design = ["--shape", "dome", *SHAPES["dome"].split(), *FISHEYE]
+    assert main(["init", str(tmp_path / "a.toml"), *design, "--pitch", pitch]) == 2
+    assert "gives 8 to 2000 dots, such as 2.73" in capsys.readouterr().err
+
+
+def test_a_camera_that_hardly_sees_the_dots_is_refused_and_one_that_sees_a_part_says_so(tmp_path, capsys):
+    call = ["init", str(tmp_path / "a.toml"), *"--shape dome --radius 12 --distance 15 --image-size 640,480".split()]
+    assert main([*call, "--view", "90", "--centre", "3000,20"]) == 2
+    assert "0 of 137 dots are in the camera's view" in capsys.readouterr().err and not (tmp_path / "a.toml").exists()
+    assert main([*call, "--view", "40"]) == 0 and "137 dots, to be made on the membrane, 35 of them" in capsys.readouterr().out
+    assert main(["check", str(tmp_path / "a.toml")]) == 0 and "35 of 137 in the camera's view" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("shape", "said"),
+    [
+        ("half_sphere", "did you mean 'dome'?"),
+        ("Hemisphere", "did you mean 'dome'?"),
+        ("spherical_cap", "did you mean 'cap'?"),
+        ("ellipsoid_cap", "did you mean 'fingertip'?"),
+        ("cylinder", "did you mean 'half_cylinder'?"),
+        ("bubbel", "did you mean 'bubble'?"),
+        ("height_field", "as arrays: shape = 'heightfield' or 'grid'"),
+        ("mesh", "as arrays: shape = 'heightfield' or 'grid'"),
+        ("octopus", "as arrays: shape = 'heightfield' or 'grid'"),
+    ],
+)
+def test_other_words_for_a_shape_are_answered_with_the_right_one(tmp_path, capsys, monkeypatch, shape, said):
+    with pytest.raises(SystemExit):
+        main(["init", str(tmp_path / "a.toml"), "--shape", shape])
+    assert said in capsys.readouterr().err
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda question: shape)
+    assert main(["init", str(tmp_path / "a.toml")]) == 2 and said in capsys.readouterr().err
+
+
+def test_what_gives_a_missing_number_in_its_place_is_said(tmp_path, capsys):
+    call = ["init", str(tmp_path / "a.toml"), *"--shape dome --radius 12 --image-size 640,480".split()]
+    assert main([*call, "--view", "90"]) == 2 and "or --rim, the rim's circle in the rest image" in capsys.readouterr().err
+    assert main([*call, "--distance", "15"]) == 2 and "or --focal, px" in capsys.readouterr().err
 
 
 def test_a_pattern_is_laid_out_for_a_design_without_dots_as_for_one_with_dots(tmp_path, capsys):

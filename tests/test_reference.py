@@ -1,6 +1,7 @@
 """The reference has every key, column, option, status and public name; every page has its place."""
 
 import ast
+import importlib
 import re
 import sys
 import tomllib
@@ -88,6 +89,8 @@ def keys(tmp_path, monkeypatch):
             read_sensor(Path("sensor.toml"))
         except tm.MembraneError as error:
             assert "off the rest surface" in str(error)  # the one dot; all tables have been read
+    Path("design.toml").write_text(Path("sensor.toml").read_text().replace('file = "dots.csv"\n', ""))
+    read_sensor(Path("design.toml"), undotted=True)
     return found
 
 
@@ -152,6 +155,19 @@ def test_every_option_is_in_the_reference():
 def test_every_public_name_is_in_the_reference(face):
     named = set(re.findall(r"^::: torchmembrane\.(?:\w+\.)*(\w+)$", API, re.M)) | {"simulate", "calibrate", "__version__"}
     assert set(face.__all__) <= named
+
+
+def test_the_site_keeps_options_and_short_names_whole_and_opens_pictures(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS))
+    page = importlib.import_module("hooks").on_page_content(
+        "<pre><code>check --out a.png</code></pre><table><tr><td><code>UNLIKE_REST</code></td>"
+        '<td><code>tm.calibrate.rest_from_image</code></td><td><code>a\\|b</code></td></tr></table><img alt="x" src="a.png" />'
+    )
+    assert '<code>check <span class="whole">--out</span> a.png</code>' in page
+    assert '<td><span class="whole"><code>UNLIKE_REST</code></span></td>' in page
+    assert "<code>tm.<wbr>calibrate.<wbr>rest_<wbr>from_<wbr>image</code>" in page
+    assert "<code>a|b</code>" in page
+    assert page.endswith('<a href="a.png"><img alt="x" src="a.png" /></a>')
 
 
 def test_every_page_has_its_place_in_the_navigation():

@@ -69,6 +69,8 @@ def test_a_press_gives_image_truth_and_the_sensor_as_simulated(sensor_path, tmp_
     sensor = Sensor.from_file(tmp_path / "out" / "sensor.toml")
     with np.load(tmp_path / "out" / "one_truth.npz") as file:
         truth = dict(file)
+    change = float(truth["p"] - truth["p0"])
+    assert f"pressure change {change:.4g} N/mm² = {1e4 * change:.4g} hPa" in said
     with np.load(EXAMPLES / "two_contacts_truth.npz") as example:
         assert set(example) <= set(truth)
     image = np.asarray(Image.open(tmp_path / "out" / "one.png"))

@@ -2,12 +2,14 @@
 
 import subprocess
 import sys
+from itertools import combinations
 
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
+from matplotlib.transforms import Bbox
 
 from torchmembrane.camera.model import Camera
 from torchmembrane.io.status import Status
@@ -17,7 +19,7 @@ from torchmembrane.plot.drawing import save
 from torchmembrane.plot.sensor import sensor_figure
 from torchmembrane.sensor.parts import Cavity, Markers, Material
 from torchmembrane.sensor.sensor import Sensor
-from torchmembrane.surface.shapes import spherical_cap
+from torchmembrane.surface.shapes import ellipsoid_cap, spherical_cap
 
 GRID = (15, 15)
 DENT = 7 * 15 + 10
@@ -239,3 +241,57 @@ def test_colour_bars_are_whole_and_below_their_axes_whatever_the_image_s_shape(m
     for axes in drawing.axes[2:4]:
         (bar,) = axes.child_axes
         assert bar.get_tightbbox().y0 >= 0 and bar.get_tightbbox().y1 < axes.xaxis.label.get_window_extent().y0
+
+
+def boxes(drawing) -> dict[str, Bbox]:
+    """Where the words of a figure lie: headline, titles, axes' labels, legends, colour bars, remarks."""
+    canvas = FigureCanvasAgg(drawing)
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    found = {"headline": drawing._suptitle.get_window_extent(renderer)}
+    for i, axes in enumerate(drawing.axes):
+        remarks = {f"{k}": text for k, text in enumerate(axes.texts) if text.get_text()}
+        parts = {"title": axes.title, "legend": axes.get_legend(), **remarks}
+        found |= {f"{i} {name}": part.get_window_extent(renderer) for name, part in parts.items() if part is not None}
+        found |= {f"{i} bar": bar.get_tightbbox(renderer) for bar in axes.child_axes}
+        found |= {f"{i} {name}": getattr(axes, name).get_tightbbox(renderer) for name in ("xaxis", "yaxis") if axes.axison}
+    return {name: box for name, box in found.items() if box is not None}
+
+
+def overlap(a: Bbox, b: Bbox) -> float:
+    """px, the less of the two directions."""
+    return min(min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0))
+
+
+SIZES = [(640, 480), (256, 256), (200, 900), (1200, 200), (64, 48), (1920, 1080), (4000, 3000)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(
+    ("name", "unit", "status"),
+    [("press", "N", Status.OK), ("a_recording_of_the_left_hand_2026-11-24_frame_000123", "relative", Status.HIDDEN)],
+)
+def test_no_words_are_clipped_or_on_one_another_whatever_the_image_s_shape(monkeypatch, size, name, unit, status):
+    monkeypatch.setattr(sys.modules[__name__], "SIZE", size)
+    mesh = cap_mesh(Camera("fisheye", size, (0.36 * min(size),) * 2, (size[0] / 2, size[1] / 2)), force_unit=unit)
+    frame = pressed(mesh, flow=4 * size[0] / 640) | {"status": np.int32(status)}
+    for traction in (0.0, 1.2345e-3):
+        frame |= {"traction": -traction * mesh.rest_normals, "force": np.array([-0.0123, -10.1, -123.4])}
+        drawing = view.figure(frame, mesh, np.zeros(size[::-1]), name)
+        found = boxes(drawing)
+        for part, box in found.items():
+            assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= drawing.bbox.width and box.y1 <= drawing.bbox.height, part
+        for (one, a), (other, b) in combinations(found.items(), 2):
+            of_one_axes = "axis" in one and "axis" in other and one[0] == other[0]
+            assert of_one_axes or overlap(a, b) < 3, (one, other)
+
+
+@pytest.mark.parametrize("size", [(200, 900), (1200, 200), (4000, 3000)])
+def test_no_words_of_a_sensor_s_figure_are_clipped(size):
+    for height in (2.0, 12.0, 40.0):
+        membrane = ellipsoid_cap((12.0, 12.0, height), 20.0, grid=(9, 9))
+        markers = Markers("dots", positions=membrane.rest[membrane.free_vertices].numpy())
+        camera = Camera("fisheye", size, (0.3 * min(size),) * 2, (size[0] / 2, size[1] / 2))
+        drawing = sensor_figure(Sensor("a" * 40, "mm", camera, membrane, Material("harmonic", 1.2), Cavity("liquid"), markers))
+        for part, box in boxes(drawing).items():
+            assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= drawing.bbox.width and box.y1 <= drawing.bbox.height, part

@@ -108,3 +108,11 @@ def test_a_weight_beside_forces_is_refused(tmp_path, capsys):
     call = ["calibrate", "material", str(EXAMPLES / "sensor.toml"), str(EXAMPLES / "flat_plate.png"), "--weight", "2N"]
     assert main([*call, "--forces", str(tmp_path / "forces.csv"), "--out", str(tmp_path / "out")]) == 2
     assert "--weight and --forces" in capsys.readouterr().err
+
+
+def test_an_image_that_is_not_pressed_tells_no_modulus(tmp_path, capsys):
+    (tmp_path / "forces.csv").write_text("image,force\nrest.png,1\nflat_plate.png,1\n")
+    for given in (["--weight", "2N"], [str(EXAMPLES / "flat_plate.png"), "--forces", str(tmp_path / "forces.csv")]):
+        call = ["calibrate", "material", str(EXAMPLES / "sensor.toml"), str(EXAMPLES / "rest.png"), *given]
+        assert main([*call, "--out", str(tmp_path / "out")]) == 2
+        assert "image 1 hardly shows a force" in capsys.readouterr().err

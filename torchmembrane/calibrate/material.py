@@ -16,7 +16,7 @@ from ..io.status import Status
 from ..reconstruct import Reconstructor
 from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor
-from .gauge import FoundPressures, GaugeModulus, modulus_from_pressures
+from .gauge import UNSURE, FoundPressures, GaugeModulus, modulus_from_pressures
 
 GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
 PRESSURE_GRID = (33, 33)  # on coarser ones pressure changes are off by up to a tenth
@@ -287,6 +287,7 @@ class Presses:
             of the forces found and measured, `[B, 2]`.
         """
         modulus = self.reconstructor.sensor.material.modulus
+        self._refuse_unpressed(float(np.exp(log_stretch)), modulus, np.isfinite(forces).all(1))
         for _ in range(GAS_ROUNDS if self.reconstructor.estimator.cavity.filling == "gas" else 1):
             ratios, magnitudes = self._ratios(np.exp(log_stretch), modulus, forces)
             modulus = float(ratios.mean() * modulus)
@@ -294,6 +295,20 @@ class Presses:
         change = -modulus * np.abs(np.array(sides) - 1).max()
         relative = max(FORCE_ERROR, ratios.std(ddof=1) / ratios.mean() if len(ratios) > 1 else 0.0)
         return modulus, modulus * relative / np.sqrt(len(ratios)), change, magnitudes
+
+    def _refuse_unpressed(self, stretch: float, modulus: float, known: np.ndarray) -> None:
+        """Refuse images of known force `[B]` in which the markers show hardly any."""
+        estimator, it = self.explained(stretch, modulus)
+        noise = estimator.equations.bearings.noise
+        with torch.no_grad():
+            spread = estimator.standard_deviations(it.vertices, it.pressure, it.moved, self.observation, noise)
+        force = (it.traction * estimator.membrane.rest_area[:, None]).sum(1)
+        unsure = (spread.force.norm(dim=1) > UNSURE * force.norm(dim=1)).numpy()
+        for i in np.flatnonzero(known & unsure):
+            raise MembraneError(
+                f"calibrate material: image {i + 1} hardly shows a force, though one is given for it; expected presses that "
+                "dent the membrane visibly: leave it out"
+            )
 
     def _ratios(self, stretch: float, modulus: float, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Forces measured over found of the presses of known force `[F]`, and all magnitudes, found and measured `[B, 2]`."""

@@ -9,6 +9,7 @@ from ..camera.mode import Mode
 from ..camera.model import Camera
 from ..io.results import Frame
 from ..io.status import Status
+from ..markers.placement import in_view
 from ..reconstruct import Reconstructor
 from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
@@ -29,6 +30,20 @@ def rest_frame(reconstructor: Reconstructor) -> Frame | None:
         return None
     with torch.no_grad():
         return reconstructor(torch.from_numpy(image)).frame(0)
+
+
+def pressure_in_words(pressure: float, sensor: Sensor) -> str:
+    """A pressure of a sensor's results, with its unit, and in hPa, as gauges and `--pressure` have it.
+
+    Example:
+        >>> from torchmembrane.presets import preset
+        >>> pressure_in_words(0.0005, preset("bubble"))
+        '0.0005 N/mm² = 5 hPa'
+    """
+    if sensor.force_unit == "relative":
+        return f"{pressure:.4g} (relative)"
+    unit = sensor.length_unit
+    return f"{pressure:.4g} N/{unit}² = {pressure * METRE[unit] ** 2 / 100:.4g} hPa"
 
 
 def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame: Frame | None = None) -> list[str]:
@@ -103,9 +118,8 @@ def _material(sensor: Sensor, reconstructor: Reconstructor | None) -> list[str]:
         lines.append("without shear_modulus and thickness forces are relative, in units of their product")
     if reconstructor is not None:
         tension, pressure = float(reconstructor.estimator.elasticity.tension), float(reconstructor.estimator.rest_pressure)
-        hectopascal = pressure * METRE[unit] ** 2 / 100
-        units = ("(relative)",) * 2 if relative else (f"N/{unit}", f"N/{unit}² = {hectopascal:.4g} hPa")
-        lines.append(f"at rest: tension {tension:.4g} {units[0]}, pressure difference {pressure:.4g} {units[1]}")
+        held = f"{tension:.4g} {'(relative)' if relative else f'N/{unit}'}"
+        lines.append(f"at rest: tension {held}, pressure difference {pressure_in_words(pressure, sensor)}")
     return lines
 
 
@@ -125,6 +139,8 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
     if markers.positions is not None:
         listed, large = len(markers.positions), sum(size == "large" for size in markers.sizes or ())
         lines[0] += f", {listed} listed: {large} large, {listed - large} small"
+        seen = in_view(sensor.camera.point_to_pixel(torch.from_numpy(markers.positions)).numpy(), sensor.camera.image_size)
+        lines += [f"{seen.sum()} of {listed} in the camera's view"] * (not seen.all())
     if reconstructor is not None and markers.positions is None:
         lines[0] += f", {len(reconstructor.rest_pixels)} placed on the rest surface from the rest image"
     if frame is None or reconstructor is None:

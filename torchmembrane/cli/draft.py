@@ -4,14 +4,17 @@ from argparse import Namespace
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from ..calibrate.rim import find_rim
 from ..camera.model import Camera
 from ..errors import MembraneError
 from ..io.images import read_image
 from ..markers.dots.pattern import find_dots
+from ..markers.placement import FEWEST_MARKERS, in_view
 from ..presets.annotate import annotate
 from ..presets.design import AIR
+from ..presets.dot_list import read_drafted_dots
 from ..presets.draft import (
     SHAPES,
     RimCircle,
@@ -20,7 +23,6 @@ from ..presets.draft import (
     drafted_surface,
     focal_of_view,
     overpressure,
-    read_drafted_dots,
 )
 from ..reconstruct import Reconstructor
 from ..sensor.parts import Cavity, Markers, Surface
@@ -54,7 +56,6 @@ def needed(arguments: Namespace) -> list[str]:
 
 def write_draft(arguments: Namespace) -> list[str]:
     """Write the sensor that the arguments describe; returns what was made, assumed and derived, in lines."""
-    _refuse_foreign(arguments)
     rest = None if arguments.rest is None else read_image(arguments.rest)
     seen = _rim_in_words(arguments, rest) if arguments.rim == FROM_IMAGE and rest is not None else []
     camera, distance = _optics(arguments, rest)
@@ -75,7 +76,7 @@ def write_draft(arguments: Namespace) -> list[str]:
     return [f"sensor file: {path}", *seen, *found, *said, f"next: torchmembrane check {path} --out {path.with_suffix('.png')}"]
 
 
-def _refuse_foreign(arguments: Namespace) -> None:
+def refuse_foreign(arguments: Namespace) -> None:
     """Refuse lengths of other shapes, and two answers to one question."""
     allowed = {*SHAPES[arguments.shape], *(["half_angle"] if arguments.shape == "half_cylinder" else [])}
     for name in LENGTHS:
@@ -104,7 +105,7 @@ def _optics(arguments: Namespace, rest: np.ndarray | None) -> Optics:
         circle, centre = RimCircle(arguments.radius, pixels, arguments.lens), arguments.centre or [u, v]
         distance = distance or circle.distance(focal)
         focal = focal or circle.focal(distance)
-    return Optics(Camera(arguments.lens, tuple(size), (round(focal, 3),) * 2, centre), round(distance, 5))
+    return Optics(Camera(arguments.lens, tuple(size), (round(focal, 3),) * 2, centre), float(f"{distance:.7g}"))
 
 
 def _rim_in_words(arguments: Namespace, rest: np.ndarray) -> list[str]:
@@ -135,9 +136,18 @@ def _markers(arguments: Namespace, rest: np.ndarray | None, surface: Surface, ca
 
 
 def _dots_in_words(sensor: Sensor) -> list[str]:
-    """How many dots there are, and how many of them the rest image shows."""
-    if sensor.markers.rest_image is None:
-        return [f"{len(sensor.markers.sizes or ())} dots, to be made on the membrane"]
+    """How many dots there are, and how many of them the rest image shows; refused where the camera sees hardly any."""
+    listed = sensor.markers.positions
+    if sensor.markers.rest_image is None and listed is not None:
+        seen = int(in_view(sensor.camera.point_to_pixel(torch.from_numpy(listed)).numpy(), sensor.camera.image_size).sum())
+        if seen < FEWEST_MARKERS:
+            raise MembraneError(
+                f"init: {seen} of {len(listed)} dots are in the camera's view; expected at least {FEWEST_MARKERS}: check "
+                "--distance, --view or --focal, and --centre"
+            )
+        return [
+            f"{len(listed)} dots, to be made on the membrane" + f", {seen} of them in the camera's view" * (seen < len(listed))
+        ]
     observer = Reconstructor(sensor, check_rest=False).observer
     found = int(observer.seen_at_rest.sum())
     return [f"{found} of {len(observer.measured_rest)} dots found in the rest image"]

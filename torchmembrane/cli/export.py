@@ -26,7 +26,7 @@ def add_parser(commands: Any) -> None:
     add = add_command(commands, "export", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     add("-o", "--out", metavar="MODEL.onnx", type=Path, required=True, help="the model's file")
-    add_estimator(add, "as for reconstruct (default: %(default)s)")
+    add_estimator(add, "as for reconstruct (default: triangle)")
     add("--tracking", action="store_true", help="start from the frame before, given with the image (force balance)")
 
 

@@ -36,7 +36,23 @@ Of overpressure, prestretch and shear modulus x thickness any two give the third
 said. SENSOR.toml's files are written beside it. Next: torchmembrane check SENSOR.toml --out sensor.png
 
 exit code: 0 written, 2 wrong usage"""
+ARRAYS = ("heightfield", "grid")
+"""What the file takes of other surfaces, which are given as arrays."""
+
+
+def _shape(text: str) -> str:
+    if text in DRAFTS:
+        return text
+    from ..sensor.synonyms import did_you_mean
+
+    of_arrays = f"any other surface goes into the file as arrays: shape = {' or '.join(map(repr, ARRAYS))}, with file"
+    meant = did_you_mean(text, (*DRAFTS, *ARRAYS))
+    remedy = of_arrays if not meant or any(repr(shape) in meant for shape in ARRAYS) else meant
+    raise ArgumentTypeError(f"{text!r}; expected one of {', '.join(DRAFTS)}; {remedy}")
+
+
 QUESTIONS = {
+    "shape": (f"shape, {' | '.join(DRAFTS)}", _shape),
     "radius": ("radius of the dome, of the cap's rim, or of the cylinder", positive),
     "height": ("height of the cap over its rim", positive),
     "semi_axes": ("half axes A,B,C of the fingertip along x, y, z", vector),
@@ -46,6 +62,10 @@ QUESTIONS = {
     "distance": ("distance from the camera's pinhole to the rim's plane", positive),
 }
 """What is asked for on a terminal, and the type of the answer."""
+INSTEAD = {
+    "distance": "; or --rim, the rim's circle in the rest image, with --view or --focal, which give it",
+    "view": "; or --focal, px; or --rim with --distance, which give it",
+}
 
 
 def add_parser(commands: Any) -> None:
@@ -62,7 +82,12 @@ def add_parser(commands: Any) -> None:
 
 
 def _add_membrane(add: Add) -> None:
-    add("--shape", choices=DRAFTS, help="half a sphere, a cap of one, such a cap of gas, half an ellipsoid, half a cylinder")
+    add(
+        "--shape",
+        metavar=f"{{{','.join(DRAFTS)}}}",
+        type=_shape,
+        help="half a sphere, a cap of one, such a cap of gas, half an ellipsoid, half a cylinder",
+    )
     add("--radius", metavar="R", type=positive, help="of the dome, of the cap's or bubble's rim, or of the half cylinder")
     add("--height", metavar="H", type=positive, help="of the cap or bubble, from its rim's plane to its pole")
     add("--semi-axes", metavar="A,B,C", type=vector, help="of the fingertip along x, y, z")
@@ -119,11 +144,10 @@ def run(arguments: Namespace) -> int:
     if path.exists() and not arguments.force:
         raise MembraneError(f"init {path}: is there already; choose another name, or pass --force to write over it")
     if arguments.shape is None:
-        arguments.shape = _asked("shape", f"shape, {' | '.join(DRAFTS)}", str)
-    if arguments.shape not in DRAFTS:
-        raise MembraneError(f"init: shape {arguments.shape!r}; expected one of {', '.join(DRAFTS)}")
-    from .draft import needed, write_draft
+        arguments.shape = _asked("shape", *QUESTIONS["shape"])
+    from .draft import needed, refuse_foreign, write_draft
 
+    refuse_foreign(arguments)
     for name in needed(arguments):
         setattr(arguments, name, _asked(name, *QUESTIONS[name]))
     print("\n".join(write_draft(arguments)))
@@ -134,7 +158,7 @@ def _asked(name: str, question: str, kind: Callable[[str], Any]) -> Any:
     """An answer from the terminal; without one, the option that is missing is named."""
     option = f"--{name.replace('_', '-')}"
     if not sys.stdin.isatty():
-        raise MembraneError(f"init: {option} is missing; expected the {question}")
+        raise MembraneError(f"init: {option} is missing; expected the {question}{INSTEAD.get(name, '')}")
     try:
         return kind(input(f"{question}: ").strip())
     except (ArgumentTypeError, EOFError) as error:

@@ -14,6 +14,7 @@ from threading import current_thread, main_thread
 from .. import __version__
 from ..errors import MembraneError
 from . import calibrate, check, export, init, live, reconstruct, simulate, view
+from .parser import CommandParser
 
 COMMANDS = (init, check, reconstruct, live, view, calibrate, simulate, export)
 
@@ -49,7 +50,7 @@ def _terminated_as_interrupted() -> Iterator[None]:
 
 def command_parser() -> ArgumentParser:
     """The parser of the whole command."""
-    parser = ArgumentParser(
+    parser = CommandParser(
         prog="torchmembrane", description="3-D shape of a deformable membrane from one image of its markings."
     )
     parser.add_argument("--version", action="version", version=f"torchmembrane {__version__}")

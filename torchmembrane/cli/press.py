@@ -20,6 +20,7 @@ from ..simulate.frames import Video, open_frames
 from ..simulate.indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge
 from ..simulate.mesh_indenter import MeshIndenter
 from ..simulate.simulator import Simulator, Stroke
+from .describe import pressure_in_words
 
 LENGTHS = {
     "radius": (1e-3, 100.0),
@@ -65,9 +66,10 @@ def _single(arguments: Namespace, simulator: Simulator) -> int:
     frame = simulator.frame(state, stroke, np.random.default_rng(arguments.seed))
     open_frames(arguments.out, simulator, {}).write(arguments.name, frame)
     force, touching = float(state.force.norm()), int(state.contact.sum())
+    change = pressure_in_words(float(state.pressure - state.rest_pressure), simulator.sensor)
     print(
-        f"{arguments.out / arguments.name}.png: force {force:.4g} {simulator.sensor.force_unit}, pressure change "
-        f"{state.pressure - state.rest_pressure:.4g}, {touching} of {len(state.contact)} vertices in contact"
+        f"{arguments.out / arguments.name}.png: force {force:.4g} {simulator.sensor.force_unit}, pressure change {change}, "
+        f"{touching} of {len(state.contact)} vertices in contact"
     )
     return 0
 

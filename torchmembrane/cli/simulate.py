@@ -45,7 +45,7 @@ examples:
   torchmembrane simulate sensor.toml --random 1000 --seed 1 --jobs 8 --format parquet --out data
 
 SENSOR.toml may be preset:NAME, one of {", ".join(PRESETS)}. Lengths are in the sensor's unit, in the camera's frame: +z
-points from the camera to the membrane. A value that begins with a minus needs =, as in --direction=-0.5,0,0.87.
+points from the camera to the membrane.
 
 DIR then holds
   sensor.toml       the sensor as simulated, its rest image in the same light: torchmembrane reconstruct DIR/sensor.toml ...

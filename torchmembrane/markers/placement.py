@@ -112,6 +112,16 @@ def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]
     raise MembraneError(f"Reconstructor: locator = {name!r}; expected one of {', '.join(LOCATORS)}")
 
 
+def in_view(pixels: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+    """Which of `pixels [D, 2]` lie in an image of that width and height, `[D]` bool.
+
+    Example:
+        >>> in_view(np.array([[0.0, 479.0], [640.0, 3.0], [np.nan, 3.0]]), (640, 480)).tolist()
+        [True, False, False]
+    """
+    return np.all(np.logical_and(pixels >= 0, pixels <= np.array(image_size) - 1), axis=1)
+
+
 def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
     """Where the camera sees `positions [D, 3]`; what it cannot image lies far outside, each point elsewhere."""
     pixels = sensor.camera.point_to_pixel(torch.from_numpy(positions)).numpy()
@@ -140,9 +150,9 @@ def _listed_pattern(sensor: Sensor, positions: np.ndarray) -> DotPattern:
     markers, pixels = sensor.markers, _model_pixels(sensor, positions)
     sizes = np.array([int(size == "large") for size in markers.sizes or ()], dtype=int)
     shapes = _unit_dot_shapes(sensor, positions)
-    in_view = np.all(np.logical_and(pixels >= 0, pixels <= np.array(sensor.camera.image_size) - 1), axis=1)
-    if in_view.any():  # what is outside, some of it behind the camera, tells nothing of how dots look
-        shapes = np.where(in_view[:, None, None], shapes, np.median(shapes[in_view], 0))
+    seen = in_view(pixels, sensor.camera.image_size)
+    if seen.any():  # what is outside, some of it behind the camera, tells nothing of how dots look
+        shapes = np.where(seen[:, None, None], shapes, np.median(shapes[seen], 0))
     if markers.rest_image is None:
         pitch = (float(sensor.membrane.rest_area.sum()) / len(sizes)) ** 0.5
         return DotPattern(pixels, shapes * np.array(DOT_RADIUS)[sizes][:, None, None] * pitch, sizes)

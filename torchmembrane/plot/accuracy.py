@@ -38,7 +38,7 @@ def draw_sheet(drawing: Figure, sheet: SpecSheet) -> None:
     """
     height = ROW + BELOW
     places = drawing.add_gridspec(
-        1, 4, left=0.045, right=0.985, top=(BELOW - 0.75) / height, bottom=1.35 / height, wspace=0.3, hspace=0
+        1, 4, left=0.05, right=0.98, top=(BELOW - 0.85) / height, bottom=1.35 / height, wspace=0.42, hspace=0
     )
     words = f"What to expect: {len(sheet.presses)} simulated presses, images with {sheet.noise:.1f} dB noise, seed {sheet.seed}"
     drawing.text(0.5, (BELOW - 0.3) / height, words, ha="center", fontsize=14)
@@ -49,7 +49,8 @@ def draw_sheet(drawing: Figure, sheet: SpecSheet) -> None:
     _draw_pairs(axes[3], sheet)
     for each in axes:
         each.grid(lw=0.3, alpha=0.5)
-        each.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, ncols=2, fontsize=9, columnspacing=1)
+        narrow: dict[str, Any] = dict(fontsize=9.5, handlelength=1.4, columnspacing=0.8)
+        each.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, ncols=2, **narrow)
 
 
 def _draw_force(axes: Axes, sheet: SpecSheet) -> None:

@@ -6,6 +6,7 @@ A figure here is a matplotlib `Figure` that belongs to no window, so that drawin
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -17,7 +18,11 @@ from ..surface.topology import rim_loop
 BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # distinct with any colour vision
 Grid = tuple[int, int] | np.ndarray
 
+readable = rc_context({"font.size": 13, "axes.titlesize": 14.5, "axes.titlepad": 9})
+"""Decorates what draws a figure: its letters can be read where a page shows it at half its width."""
 ROW = 6.0  # inches, of a row of panels
+ABOVE, UNDER = 0.9, 1.3  # of it: the headline and titles of two lines; labels and a legend of two rows
+TITLE = 0.6  # inches, of the titles of a further row
 LINES = 16  # of a grid that are drawn each way, at most about
 
 
@@ -51,13 +56,15 @@ def show(drawing: Figure) -> None:
     pyplot.show()
 
 
-def panels(count: int, below: float = 0.0) -> tuple[Figure, GridSpec]:
-    """A figure with places for `count` panels in a row, and `below` them as many inches more."""
-    height = ROW + below
+def panels(count: int, below: float = 0.0, rows: int = 1) -> tuple[Figure, GridSpec]:
+    """A figure with places for `count` panels in each of its rows, and `below` them as many inches more."""
+    panel, between = ROW - ABOVE - UNDER, UNDER + TITLE
+    height = rows * panel + (rows - 1) * between + ABOVE + UNDER + below
     drawing = Figure(figsize=(16 * count / 3, height), dpi=100)
-    top, bottom = 1 - 0.13 * ROW / height, (below + 0.19 * ROW) / height
+    top, bottom = 1 - ABOVE / height, (below + UNDER) / height
+    left, right = 0.155 / count, 1 - 0.045 / count
     return drawing, drawing.add_gridspec(
-        1, count, left=0.135 / count, right=1 - 0.045 / count, top=top, bottom=bottom, wspace=0.2
+        rows, count, left=left, right=right, top=top, bottom=bottom, wspace=0.2, hspace=between / panel
     )
 
 
@@ -80,7 +87,8 @@ def side_axes(axes: Axes, letter: str, unit: str) -> None:
 
 def legend_below(axes: Axes) -> None:
     """The legend, below the axes."""
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=4, ncols=2, frameon=False)
+    narrow = dict(handlelength=1.4, handletextpad=0.5, columnspacing=1.2)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=3.4, ncols=2, frameon=False, **narrow)
 
 
 def few_lines(points: np.ndarray, grid: Grid) -> np.ndarray:

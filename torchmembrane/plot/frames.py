@@ -1,12 +1,11 @@
-"""A frame's result in one row of panels: marker flow, surface from the side, map of displacements, map of traction."""
+"""A frame's result in panels: marker flow, surface from the side, map of displacements, map of traction."""
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from matplotlib.transforms import ScaledTranslation, blended_transform_factory
+from matplotlib.transforms import ScaledTranslation
 from matplotlib.tri import Triangulation, TriContourSet
 
 from ..io.status import Status
@@ -22,6 +21,7 @@ from .drawing import (
     line_through,
     mesh_lines,
     panels,
+    readable,
     side_axes,
 )
 
@@ -30,10 +30,12 @@ FORCE_ARROW = 0.2  # of the image's width: a force across the optical axis; shor
 MAGNIFICATIONS = (1, 2, 3, 5, 10, 20)
 LONGEST_ARROW, LEAST_SCALE = 0.07, 0.002  # of the image's width; of the surface's extent
 ARROWS_ACROSS = 22
-BAR_BELOW, BAR_HEIGHT = 0.52, 0.11  # inches: of a colour bar, below its axes, whatever the image's shape
+HEADLINE, WIDEST_LETTER = 17, 0.64  # points; of a font's size, in the mean of a headline's letters at most
+LABEL_OFF, LOWEST = (34, 44), 62  # points, of a label from its point; its height over it where the image is as high as wide
+BAR_BELOW, BAR_HEIGHT, BAR_WIDTH = 0.52, 0.11, 3.8  # inches: of a colour bar, below its axes, whatever the image's shape
 
 
-@rc_context({"font.size": 13, "axes.titlesize": 14.5})
+@readable
 def figure(
     frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = None, name: str = "", places: int | None = None
 ) -> Figure:
@@ -62,8 +64,11 @@ def figure(
     """
     good = bool(np.isfinite(frame["vertices"]).all())
     forces = good and np.any(frame["traction"])
-    drawing, grid = panels(places or (4 if forces else 3))
-    drawing.suptitle(_title(frame, mesh, name), fontsize=17, color="k" if good else VERMILION)
+    square = (places or (4 if forces else 3)) == 4
+    drawing, grid = panels(2, rows=2) if square else panels(3)
+    headline = _title(frame, mesh, name)
+    fitting = 72 * drawing.get_figwidth() / (WIDEST_LETTER * len(headline))
+    drawing.suptitle(headline, fontsize=min(HEADLINE, fitting), color="k" if good else VERMILION)
     draw_flow(drawing.add_subplot(grid[0]), frame, mesh, image)
     if good:
         draw_side(drawing.add_subplot(grid[1]), frame, mesh)
@@ -71,7 +76,7 @@ def figure(
         if forces:
             draw_traction(drawing.add_subplot(grid[3]), frame, mesh)
     else:
-        _draw_failure(drawing.add_subplot(grid[0, 1:]), frame)
+        _draw_failure(drawing.add_subplot(grid[1, :] if square else grid[0, 1:]), frame)
     return drawing
 
 
@@ -163,7 +168,7 @@ def draw_traction(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
     )
     axes.plot(*place[closed_rim(mesh.grid)].T, color="k", lw=1)
     bar = _colour_bar(axes, shades)
-    bar.locator = MaxNLocator(5)
+    bar.locator = MaxNLocator(4)
     bar.update_ticks()
     bar.set_label(f"compressive normal traction [{_pressure_unit(mesh)}]")
     image_axes(axes, mesh.image_size, None)
@@ -185,11 +190,11 @@ def _pressure_unit(mesh: Mesh) -> str:
 
 
 def _colour_bar(axes: Axes, shades: TriContourSet, ticks: np.ndarray | None = None) -> Colorbar:
-    """A flat bar below the axes."""
-    foot = ScaledTranslation(0, 0, axes.transAxes)  # type: ignore[arg-type]
-    inches_below = blended_transform_factory(axes.transAxes, axes.figure.dpi_scale_trans + foot)
-    place = axes.inset_axes((0.05, -BAR_BELOW - BAR_HEIGHT, 0.9, BAR_HEIGHT), transform=inches_below)
-    bar = axes.figure.colorbar(shades, cax=place, ticks=ticks, orientation="horizontal")
+    """A flat bar below the axes, as wide whatever their width is."""
+    foot = ScaledTranslation(0.5, 0, axes.transAxes)  # type: ignore[arg-type]
+    inches = axes.figure.dpi_scale_trans + foot
+    place = axes.inset_axes((-BAR_WIDTH / 2, -BAR_BELOW - BAR_HEIGHT, BAR_WIDTH, BAR_HEIGHT), transform=inches)
+    bar = axes.figure.colorbar(shades, cax=place, ticks=ticks, orientation="horizontal", format="{x:g}")
     bar.ax.tick_params(labelsize=12)
     return bar
 
@@ -230,7 +235,7 @@ def _annotate(axes: Axes, text: str, place: np.ndarray, size: np.ndarray) -> Non
     axes.annotate(
         text,
         tuple(place),
-        xytext=(34 * side, 44 * up),
+        xytext=(LABEL_OFF[0] * side, min(LABEL_OFF[1], LOWEST * size[1] / size[0]) * up),
         textcoords="offset points",
         ha="left" if side > 0 else "right",
         va="center",

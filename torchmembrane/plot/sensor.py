@@ -10,6 +10,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ..camera.model import Camera
 from ..io.spec_sheet import SpecSheet
@@ -26,13 +27,17 @@ from .drawing import (
     line_through,
     mesh_lines,
     panels,
+    readable,
     side_axes,
 )
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
 
+TICKS = 4  # of the longest side of the rest surface in space, at most about
 
+
+@readable
 def sensor_figure(
     sensor: Sensor,
     reconstructor: "Reconstructor | None" = None,
@@ -53,10 +58,10 @@ def sensor_figure(
     Example:
         >>> from torchmembrane.presets import preset
         >>> [axes.get_title() for axes in sensor_figure(preset("bubble")).axes]
-        ['From the side', 'Rest surface', 'Rest image']
+        ['From the side', 'Rest surface, markers (185)', 'Rest image']
     """
     drawing, places = panels(3, 0.0 if sheet is None else BELOW)
-    drawing.suptitle(f"Sensor {sensor.name!r}", fontsize=14)
+    drawing.suptitle(f"Sensor {sensor.name!r}", fontsize=17)
     X, grid = sensor.membrane.rest.numpy(), sensor.membrane.grid
     markers = sensor.markers.positions if reconstructor is None else reconstructor.rest_markers.cpu().numpy()
     _draw_rays(drawing.add_subplot(places[0]), sensor, X)
@@ -98,17 +103,18 @@ def _leaves_port(camera: Camera, points: np.ndarray, depth: float) -> np.ndarray
 def _draw_space(axes: Any, X: np.ndarray, grid: tuple[int, int], markers: np.ndarray | None, unit: str) -> None:
     """The rest surface and its markers `[D, 3]` on three-dimensional axes."""
     axes.plot_wireframe(*X.T.reshape(3, *grid), color=BLUE, lw=0.5, rcount=LINES + 1, ccount=LINES + 1)
+    title = "Rest surface"
     if markers is not None:
-        size = 3 if len(markers) < 300 else 1.5
-        axes.plot(*np.asarray(markers).T, "o", ms=size, color="k", label=f"markers ({len(markers)})")
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.14), frameon=False)
+        axes.plot(*np.asarray(markers).T, "o", ms=3 if len(markers) < 300 else 1.5, color="k")
+        title += f", markers ({len(markers)})"
     axes.set_aspect("equal")
     axes.set_box_aspect(axes.get_box_aspect(), zoom=0.85)
-    axes.locator_params(nbins=4)
+    for axis, extent in zip((axes.xaxis, axes.yaxis, axes.zaxis), np.ptp(X, 0) / np.ptp(X, 0).max(), strict=True):
+        axis.set_major_locator(MaxNLocator(max(1, round(TICKS * extent))))  # as many as a short side has room for
     axes.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]", zlabel=f"z [{unit}]")
     axes.xaxis.labelpad = axes.yaxis.labelpad = 8
     axes.view_init(elev=22, azim=-60)
-    axes.set_title("Rest surface")
+    axes.set_title(title)
 
 
 def _draw_projection(
@@ -119,7 +125,7 @@ def _draw_projection(
         pixels = sensor.camera.point_to_pixel(sensor.membrane.rest).numpy()
     image_axes(axes, sensor.camera.image_size, image)
     axes.add_collection(mesh_lines(pixels, grid, color=BLUE, lw=0.4))
-    axes.plot(*pixels[closed_rim(grid)].T, color=BLUE, lw=1.8, label="rim and grid, projected")
+    axes.plot(*pixels[closed_rim(grid)].T, color=BLUE, lw=1.8, label="rim and grid")
     if frame is not None and reconstructor is not None:
         place, found = reconstructor.observer.measured_rest.cpu().numpy(), frame["confidence"] > 0
         size, label = 6 if len(found) < 300 else 2.5, f"markers found ({found.sum()})"

@@ -1,22 +1,18 @@
-"""A sensor from a few numbers: rest surface, camera on its axis, material in balance with its pressure, dots in any frame."""
+"""A sensor from a few numbers: rest surface, camera on its axis, material in balance with its pressure, a pattern of dots."""
 
-import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-import torch
 from scipy.optimize import brentq
 
-from ..camera.model import Camera
 from ..errors import MembraneError
-from ..io.bounded import in_one_line, read_text, shortened
+from ..markers.placement import FEWEST_MARKERS
 from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..sensor.parts import METRE, Material, Surface
-from ..sensor.toml import MOST_DOTS_BYTES
+from ..sensor.toml import MOST_DOTS
 from ..surface.membrane import Membrane
 from .design import cylinder_dots, dome_dots
 
@@ -31,10 +27,7 @@ SHAPES: dict[str, tuple[str, ...]] = {
 ASSUMED_PRESTRETCH = 1.2
 DISAGREEMENT = 0.1  # between the overpressure stated and the one that the material holds, relative: above, it is said
 LARGEST_STRETCH = 4.0
-FINE = (97, 97)  # vertices of the surface on which dots are put
 PITCHES = 11  # of dots across the square root of the area, where nothing else is said
-RAYS = (["x", "y"], ["angle", "azimuth"], ["u", "v"])  # columns of dots that a ray puts on the surface
-POINTS = (["x", "y", "z"], ["x", "y", "h"])
 PRESSURE_UNITS = {"Pa": 0.01, "hPa": 1.0, "mbar": 1.0, "kPa": 10.0, "bar": 1000.0, "psi": 68.94757}  # in hPa
 
 
@@ -170,7 +163,8 @@ def balanced(
         if not 0 < stated < most:
             raise MembraneError(
                 f"init: overpressure {stated:g} hPa; expected more than 0 and less than {most:.4g}, what this membrane holds "
-                f"at a prestretch of {LARGEST_STRETCH:g}: check unit, shear modulus and thickness"
+                f"at a prestretch of {LARGEST_STRETCH:g}: check unit, shear modulus and thickness, and that it is over the "
+                "surroundings' pressure, not absolute"
             )
         prestretch = float(brentq(lambda stretch: held(stretch) - stated, 1.0, LARGEST_STRETCH))
         return Material("neo_hookean", round(prestretch, 6), None, shear_modulus, thickness), [
@@ -218,12 +212,26 @@ def drafted_dots(surface: Surface, pitch: float | None = None) -> tuple[np.ndarr
     Returns:
         Positions `[D, 3]` in the camera's frame, and sizes.
 
+    Raises:
+        MembraneError: the pitch gives fewer than `FEWEST_MARKERS` dots, or more than `MOST_DOTS`.
+
     Example:
         >>> positions, sizes = drafted_dots(drafted_surface("dome", {"radius": 12.0}, 15.0), 2.4)
         >>> len(positions), sizes[:2]
         (177, ['small', 'large'])
     """
-    pitch = pitch or round(float(surface.membrane((33, 33)).rest_area.sum()) ** 0.5 / PITCHES, 3)
+    side = float(surface.membrane((33, 33)).rest_area.sum()) ** 0.5
+    pitch = pitch or float(f"{side / PITCHES:.4g}")
+    wanted = f"one that gives {FEWEST_MARKERS} to {MOST_DOTS} dots, such as {side / PITCHES:.3g}"
+    if pitch < side * MOST_DOTS**-0.5:
+        raise MembraneError(f"init: a pitch of {pitch:g} gives {(side / pitch) ** 2:.0f} dots; expected {wanted}")
+    positions, sizes = _pattern(surface, pitch)
+    if len(sizes) < FEWEST_MARKERS:
+        raise MembraneError(f"init: a pitch of {pitch:g} gives {len(sizes)} dots; expected {wanted}")
+    return positions, sizes
+
+
+def _pattern(surface: Surface, pitch: float) -> tuple[np.ndarray, list[str]]:
     v = surface.values
     if surface.shape == "half_cylinder":
         return cylinder_dots(v["radius"], v["length"], math.radians(v["half_angle"]), v["base_z"], pitch)
@@ -231,63 +239,3 @@ def drafted_dots(surface: Surface, pitch: float | None = None) -> tuple[np.ndarr
         return dome_dots(v["semi_axes"], math.pi / 2, v["base_z"], pitch)
     radius = (v["rim_radius"] ** 2 + v["height"] ** 2) / (2 * v["height"])
     return dome_dots((radius,) * 3, math.atan2(v["rim_radius"], radius - v["height"]), v["base_z"], pitch)
-
-
-def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.ndarray, list[str]]:
-    """Dots from a table whose header says in which frame they are.
-
-    `x,y,z` camera frame; `x,y,h` h above the rim's plane; `x,y` from above, the height is the membrane's; `angle,azimuth`
-    degrees from the pole and about the axis (from x to y), seen from the rim's centre; `u,v` px in the image at rest. A further
-    column `size`: small or large (default: small).
-
-    Args:
-        path: of the CSV file.
-        surface: the rest surface.
-        camera: for `u,v`.
-
-    Returns:
-        Positions `[D, 3]` in the camera's frame, and sizes.
-
-    Raises:
-        MembraneError: the file cannot be read, has another header, or a dot whose ray misses the membrane: the line is named.
-    """
-    forms = [",".join(form) for form in (*POINTS, *RAYS)]
-    expected = f"CSV with the header {', '.join(forms)}, each with ,size or without"
-    text = read_text(path, MOST_DOTS_BYTES, expected)
-    try:
-        header, *rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines()) if row]
-        sizes = [row[-1] for row in rows] if header[-1:] == ["size"] else ["small"] * len(rows)
-        form = header[: len(header) - (header[-1:] == ["size"])]
-        values = np.array([[float(cell) for cell in row[: len(form)]] for row in rows])
-    except (csv.Error, ValueError) as error:
-        raise MembraneError(f"{path}: not readable ({in_one_line(error)}); expected {expected}") from error
-    if form not in (*POINTS, *RAYS):
-        raise MembraneError(f"{path}: the header is {shortened(repr(','.join(header)))}; expected {expected}")
-    if values.shape != (len(rows), len(form)) or not len(rows) or not np.isfinite(values).all():
-        raise MembraneError(f"{path}: lines of different length, none, or not finite; expected {expected}")
-    base_z = surface.values["base_z"]
-    if form == ["x", "y", "z"]:
-        return values, sizes
-    if form == ["x", "y", "h"]:
-        return values + [0.0, 0.0, base_z], sizes
-    origin, direction = _rays(form, values, base_z, camera)
-    distance = surface.membrane(FINE).ray_points(origin, direction).distance
-    for line in np.flatnonzero(~np.isfinite(distance)):
-        raise MembraneError(
-            f"{path}, line {line + 2}: {in_one_line(','.join(rows[line]))} misses the membrane; expected dots in its rim"
-        )
-    return (origin + distance[:, None] * direction).round(5), sizes
-
-
-def _rays(form: list[str], values: np.ndarray, base_z: float, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Rays on which dots lie, origins and directions `[D, 3]`."""
-    a, b = values.T
-    if form == ["u", "v"]:
-        rays = camera.pixel_to_ray(torch.from_numpy(values))
-        return rays.origin.numpy(), rays.direction.numpy()
-    nothing = np.zeros_like(a)
-    if form == ["x", "y"]:
-        return np.stack([a, b, nothing + base_z], -1), np.stack([nothing, nothing, nothing + 1], -1)
-    angle, azimuth = np.radians(a), np.radians(b)
-    direction = np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], -1)
-    return np.stack([nothing, nothing, nothing + base_z], -1), direction

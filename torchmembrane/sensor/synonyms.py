@@ -21,8 +21,9 @@ MEANT = {
     "light": ("white", "bright", "light_on_dark"),
     "pinhole": ("perspective", "opencv", "rectilinear"),
     "fisheye": ("kannala_brandt", "equidistant", "omnidirectional", "wide"),
-    "rim_radius": ("radius", "rim", "base_radius"),
+    "rim_radius": ("radius", "rim", "base_radius", "diameter"),
     "base_z": ("distance", "z", "rim_z", "offset"),
+    "half_angle": ("angle", "opening", "opening_angle"),
     "semi_axes": ("axes", "radii", "half_axes"),
     "pressure": ("overpressure", "gauge_pressure", "absolute_pressure"),
     "shear_modulus": ("modulus", "mu", "youngs_modulus", "stiffness"),
@@ -30,6 +31,21 @@ MEANT = {
     "image_size": ("resolution", "size", "width", "height"),
     "focal": ("focal_length", "fx", "fy", "f"),
     "centre": ("center", "principal_point", "cx", "cy"),
+    # of the command
+    "dome": ("half_sphere", "hemisphere", "sphere", "spherical"),
+    "cap": ("spherical_cap", "spherical_segment"),
+    "bubble": ("balloon", "pillow"),
+    "fingertip": ("ellipsoid_cap", "half_ellipsoid", "ellipsoid", "finger"),
+    "radius": ("rim_radius", "diameter"),
+    "view": ("fov", "hfov", "field_of_view", "angle_of_view"),
+    "distance": ("base_z", "z", "rim_z", "working_distance"),
+    "overpressure": ("pressure", "gauge_pressure", "gauge"),
+    "rest": ("rest_image", "reference", "image"),
+    "unit": ("units", "length_unit"),
+    "weight": ("mass", "load"),
+    "out": ("output", "outdir", "output_dir"),
+    "camera": ("lens", "intrinsics"),
+    "material": ("weight", "newtons", "stiffness", "modulus", "gauge", "force"),
 }
 """What is written, by the word that is meant."""
 HINTS = {
@@ -51,5 +67,5 @@ def did_you_mean(word: object, choices: Iterable[str], otherwise: str = "") -> s
     found = known or difflib.get_close_matches(plain, choices, 1)
     if not found:
         return otherwise
-    hint = f" ({HINTS[found[0]]})" if found[0] in HINTS else ""
-    return f"did you mean {found[0]!r}{hint}?"
+    hint = "half the diameter" if plain == "diameter" else HINTS.get(found[0], "")
+    return f"did you mean {found[0]!r}{f' ({hint})' if hint else ''}?"

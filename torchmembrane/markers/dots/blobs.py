@@ -11,6 +11,7 @@ SCALES = 1.25  # ratio of neighbouring scales
 SMALLEST = 1.2  # px, radius of the smallest dot looked for
 LARGEST = 1 / 16  # radius of the largest, of the image's shorter side
 ELONGATION = 4.0  # long over short axis of a dot at most
+FEWEST = 6
 SOLIDITY = 0.75  # of its ellipse that a dot fills, or a dot that its ellipse fills
 
 
@@ -25,7 +26,7 @@ class Blob(NamedTuple):
 
 def blob_seeds(dark: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Maxima `[S, 2]` (u, v) over place and scale of the Hessian's determinant, and their radii `[S]`, best first."""
-    count = int(np.log(min(dark.shape) * LARGEST / SMALLEST) / np.log(SCALES)) + 1
+    count = max(1, int(np.log(min(dark.shape) * LARGEST / SMALLEST) / np.log(SCALES)) + 1)
     radii = SMALLEST * SCALES ** np.arange(count)
     scales = []
     for sigma in radii / np.sqrt(2):
@@ -46,7 +47,8 @@ def grow_blob(dark: np.ndarray, seed: np.ndarray, radius: float) -> Blob | None:
     v, u = np.mgrid[: patch.shape[0], : patch.shape[1]]
     distance = np.hypot(u + u0 - seed[0], v + v0 - seed[1])
     core = patch[distance <= max(0.5 * radius, 1)].mean()
-    background = np.median(patch[(distance > 1.5 * radius + 1) & (distance < 2.4 * radius + 2)])
+    around = patch[(distance > 1.5 * radius + 1) & (distance < 2.4 * radius + 2)]
+    background = np.median(around) if around.size else core
     if background - core < 0.04:
         return None
     labels, _ = ndimage.label(patch < (core + background) / 2)
@@ -69,6 +71,14 @@ def is_dot(area: float, moments: np.ndarray, filled: float) -> bool:
     """
     small, large = np.linalg.eigvalsh(moments)
     return bool(large < ELONGATION**2 * small and abs(np.log(area / (4 * np.pi * np.sqrt(small * large)))) < filled)
+
+
+def check_count(count: int) -> None:
+    """Refuse fewer than `FEWEST` dots."""
+    if count < FEWEST:
+        raise MembraneError(
+            f"find_dots: {count} dots found, expected at least {FEWEST}; check the polarity, the rest image and the mask"
+        )
 
 
 def find_blobs(dark: np.ndarray, mask: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -101,10 +111,7 @@ def find_blobs(dark: np.ndarray, mask: np.ndarray | None = None) -> tuple[np.nda
         reach = np.ceil(size).astype(int)
         taken[max(v - reach, 0) : v + reach + 1, max(u - reach, 0) : u + reach + 1] = True
         blobs.append((blob.centre, _ellipse(blob), blob.contrast))
-    if len(blobs) < 6:
-        raise MembraneError(
-            f"find_dots: {len(blobs)} dots found, expected at least 6; check the polarity, the rest image and the mask"
-        )
+    check_count(len(blobs))
     centres, shapes, contrasts = (np.array(x) for x in zip(*blobs, strict=True))
     return centres, shapes, contrasts
 

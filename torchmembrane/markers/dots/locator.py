@@ -23,7 +23,11 @@ FEWEST = 0.2  # mean confidence of a frame that is half trusted
 
 
 def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tuple[int, int]) -> Tensor:
-    """`[1, 1, H, W]` 1 inside the rim and 2 pixels off it, else 0: the short triangles between dots and anchors."""
+    """`[1, 1, H, W]` 1 inside the rim and 2 pixels off it, else 0: the short triangles between dots and anchors.
+
+    Raises:
+        MembraneError: all of them lie outside the image.
+    """
     width, height = image_size
     if anchors is None:
         return torch.ones(1, 1, height, width, dtype=torch.float64)
@@ -35,6 +39,11 @@ def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tu
     kept = np.append(longest < 3 * pitch, False)
     inside = kept[triangulation.find_simplex(np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1))]
     inside = ndimage.binary_erosion(ndimage.binary_closing(inside, iterations=2), iterations=2)
+    if not inside.any():
+        raise MembraneError(
+            f"the membrane with its {len(pixels)} dots is not in the image of {width} x {height} px; expected it in the "
+            "camera's view: check the camera's pose, centre and focal length"
+        )
     return torch.as_tensor(inside, dtype=torch.float64)[None, None]
 
 

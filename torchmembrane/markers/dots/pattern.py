@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..spacing import neighbours
-from .blobs import find_blobs
+from .blobs import check_count, find_blobs
 from .ellipse import log_radii, rms_half_axes, size_tolerance
 from .fit import EllipseFit
 from .match import DotMatcher
@@ -97,10 +97,12 @@ def find_dots(image: np.ndarray, polarity: str, mask: np.ndarray | None = None) 
     dark = _dark(image, polarity)
     pixels, shapes, contrasts = find_blobs(dark, mask)
     keep = population(pixels, shapes, contrasts)
+    check_count(int(keep.sum()))
     pixels, shapes, contrasts = pixels[keep], shapes[keep], contrasts[keep]
     pixels, growth, quality = refine(dark, pixels, shapes)
     shapes = shapes * (1 + growth / rms_half_axes(shapes))[:, None, None]
     keep = population(pixels, shapes, contrasts) & (quality > 0.3)
+    check_count(int(keep.sum()))
     pixels, shapes = pixels[keep], shapes[keep]
     order = np.lexsort((pixels[:, 0], pixels[:, 1]))
     return DotPattern(pixels[order], shapes[order], size_classes(pixels, shapes)[order])
@@ -136,6 +138,7 @@ def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, size
     pixels, shapes, sizes = np.asarray(pixels, float), np.asarray(shapes, float), np.asarray(sizes, int)
     found, outlines, contrasts = find_blobs(dark)
     keep = population(found, outlines, contrasts)
+    check_count(int(keep.sum()))
     found, outlines = found[keep], outlines[keep]
     unit, log_radius = log_radii(shapes), log_radii(outlines)
     nearest = cKDTree(found).query(pixels)[1]
@@ -149,7 +152,8 @@ def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, size
     centre, growth, quality = refine(dark, position[0].numpy(), scaled, tolerance)
     deviation = _deviation(match, certainty * torch.as_tensor(quality), centre - pixels, strain)
     visible = (quality > 0.3) & (deviation < OUTLIER * match.nearest.numpy())
-    for size in np.unique(sizes):
+    check_count(int(visible.sum()))
+    for size in np.unique(sizes[visible]):
         scaled[sizes == size] *= 1 + np.median((growth / np.exp(expected))[visible & (sizes == size)])
     return DotPattern(np.where(visible[:, None], centre, np.nan), scaled, sizes)
 
