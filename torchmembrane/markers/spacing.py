@@ -51,7 +51,7 @@ def thin_out(points: np.ndarray, gap: float) -> np.ndarray:
 
 def square_distance(x: Tensor, y: Tensor) -> Tensor:
     """`[..., K, D]` between the points `x [..., K, 2]` and `y [..., D, 2]`."""
-    return (x.square().sum(-1)[..., None] + y.square().sum(-1)[..., None, :] - 2 * x @ y.mT).clamp_min(0)
+    return (x.square().sum(-1)[..., None] + y.square().sum(-1)[..., None, :]).sub(x @ y.mT, alpha=2).clamp_min(0)
 
 
 def safe_length(x: Tensor, dim: int) -> Tensor:
