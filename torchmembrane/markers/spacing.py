@@ -4,6 +4,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+FADED = 30.0
+"""Exponent of a weight that no longer counts; products with subnormal numbers take fifty times as long."""
+
+
+def faded(exponent: np.ndarray) -> np.ndarray:
+    """`exp(exponent)`, 0 where it no longer counts.
+
+    Example:
+        >>> faded(np.array([0.0, -40.0])).tolist()
+        [1.0, 0.0]
+    """
+    return np.where(exponent > -FADED, np.exp(exponent), 0.0)
+
 
 def spacing(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The local spacing of markers.

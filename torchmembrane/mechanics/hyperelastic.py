@@ -223,16 +223,26 @@ class ElasticEnergy(nn.Module):
     def gradient(self, x: Tensor) -> Tensor:
         """`dU/dx`, `[..., V, 3]`: the membrane's forces with opposite sign, at every vertex from the six triangles around it.
 
-        `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron).
+        `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron). Harmonic, the force
+        along a side is a constant times the side.
         """
         batch, V = x.shape[:-2], x.shape[-2]
+        if self.model == "harmonic":
+            from_vertex = apply_stencil(x, self.sides[:12], self.grid)
+            return self._summed(from_vertex, self.c1 * self.prestretch**2 * self.force_of_I)
         e = apply_stencil(x, self.sides, self.grid)
         squared = (self.total @ (e * e)).reshape(*batch, 3, 6 * V)
         dD = self.heron @ squared  # det dD/dl
         D = self.total @ (squared * dD) * self.half_over_det + self.missing
         w_I, w_D = self.first_derivatives(self.total @ (self.first * squared), D)
         of_sides = self.force_of_I * w_I + self.force_of_D * w_D * dD[..., :2, :]
-        return (e[..., : 12 * V].reshape(*batch, 3, 12, V) * of_sides.reshape(*batch, 1, 12, V)).sum(-2).mT
+        return self._summed(e[..., : 12 * V], of_sides)
+
+    def _summed(self, sides: Tensor, factors: Tensor) -> Tensor:
+        """At every vertex the sum of `sides [..., 3, 12 V]` from it times `factors [..., 2, 6 V]`, `[..., V, 3]`."""
+        sides, factors = sides.unflatten(-1, (12, -1)), factors.flatten(-2).unflatten(-1, (12, -1))
+        total: Tensor = (sides * factors.unsqueeze(-3)).sum(-2)
+        return total.mT
 
     def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
         """Positive semi-definite stiffness of displacements along one direction a vertex.

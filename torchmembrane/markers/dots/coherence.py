@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..spacing import neighbours, safe_length, spacing, square_distance
+from ..spacing import FADED, faded, neighbours, safe_length, spacing, square_distance
 
 NEIGHBOURS = 6
 SEAM = 2.0  # width of the neighbourhood in which a seam is looked for, pitches
@@ -47,7 +47,7 @@ class Coherence(nn.Module):
         step = np.moveaxis(pixels[near] - pixels, -1, 0).copy()
         nearest, mean = spacing(pixels)
         square = ((pixels[:, None] - pixels) ** 2).sum(-1)
-        kernel = np.exp(-square / (2 * (SEAM * mean) ** 2))  # [from, to]
+        kernel = faded(-square / (2 * (SEAM * mean) ** 2))  # [from, to]
         self.register_buffer("near", torch.as_tensor(near))
         self.register_buffer("step", torch.as_tensor(step))
         self.register_buffer("half_step", torch.as_tensor(step / 2))
@@ -89,7 +89,7 @@ class Coherence(nn.Module):
         nearer = safe_length(pixels - predicted, -1) + self.rival
         margin = nearer[:, None] - other.clamp_min(1e-12).sqrt()
         alone = 1 - (left[..., None] * torch.sigmoid(margin * self.decision)).amax(1)
-        left = (left[:, None] @ torch.exp(square * self.narrowness)).squeeze(1) / self.total
+        left = (left[:, None] @ torch.exp((square * self.narrowness).clamp_min(-FADED))).squeeze(1) / self.total
         lost = (1 - sure) @ self.share
         error = self._error_of_steps(pixels, sure, gradient)
         tear = torch.minimum(lost, left).clamp_min(1e-12).sqrt() * error

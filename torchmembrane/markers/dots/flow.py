@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..spacing import spacing
+from ..spacing import faded, spacing
 
 RIDGE = 0.5  # draws the flow's gradient to the one measured, where neighbours do not fix it
 SUPPORT = 0.8  # sure nodes, weighted by distance, that a prediction needs
@@ -33,7 +33,7 @@ class FlowAverages(nn.Module):
         super().__init__()
         count, h = len(pixels), width * spacing(pixels)[1]
         y = (nodes[:, None] - pixels) / h[None, :, None]  # [N, D, 2]
-        self.kernel = np.exp(-0.5 * (y**2).sum(-1))
+        self.kernel = faded(-0.5 * (y**2).sum(-1))
         self.kernel[np.arange(count), np.arange(count)] = 0
         u, v = y[..., 0], y[..., 1]
         moments = self.kernel * np.stack([np.ones_like(u), u, v, u * u, u * v, u * v, v * v])  # [7, N, D]
