@@ -14,6 +14,7 @@ from ..errors import MembraneError
 from ..surface.membrane import Membrane
 from ..surface.stencil import apply_stencil, one_ring_edges, stencil_kernels
 from ..surface.topology import corners, triangles_of
+from .cell_forces import cell_edges, cell_metric, forces_of_stress
 from .metric import adjugate, determinant, edge_vectors, metric, metric_constants, tensile_part
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
@@ -92,6 +93,10 @@ class ElasticEnergy(nn.Module):
     force_of_D: Tensor
     heron: Tensor
     total: Tensor
+    cell_inverse: Tensor
+    cell_det: Tensor
+    cell_first: Tensor
+    cell_second: Tensor
 
     def __init__(
         self,
@@ -114,6 +119,7 @@ class ElasticEnergy(nn.Module):
         for name, constant in metric_constants().items():
             self.register_buffer(name, constant)
         self._register_one_ring(membrane)
+        self._register_cells(membrane)
 
     def _register_rest(self, which: str, edges: Tensor) -> None:
         g = metric(edges)
@@ -145,6 +151,15 @@ class ElasticEnergy(nn.Module):
         self.register_buffer("force_of_D", -twice_area / det)
         self.register_buffer("heron", 0.5 - torch.eye(3, dtype=torch.float64))
         self.register_buffer("total", torch.ones(1, 3, dtype=torch.float64))
+
+    def _register_cells(self, membrane: Membrane) -> None:
+        g11, g12, g22 = cell_metric(cell_edges(membrane.rest, self.grid)).unbind(-4)
+        det = g11 * g22 - g12 * g12
+        inverse = torch.stack([g22, -g12, g11]) / det
+        self.register_buffer("cell_inverse", inverse * torch.tensor([1, 2, 1])[:, None, None, None])
+        self.register_buffer("cell_det", 1 / det)
+        self.register_buffer("cell_first", det.sqrt() * inverse)
+        self.register_buffer("cell_second", 1 / det.sqrt())
 
     def on(self, membrane: Membrane) -> "ElasticEnergy":
         """The same material on another membrane or grid."""
@@ -221,28 +236,33 @@ class ElasticEnergy(nn.Module):
         return (self.area * self.density(I, D)).sum((-1, -2))
 
     def gradient(self, x: Tensor) -> Tensor:
-        """`dU/dx`, `[..., V, 3]`: the membrane's forces with opposite sign, at every vertex from the six triangles around it.
+        """`dU/dx`, `[..., V, 3]`: the membrane's forces with opposite sign."""
+        if torch.compiler.is_exporting():
+            return self.gradient_by_rings(x)
+        edges = cell_edges(x, self.grid)
+        if self.model == "harmonic":
+            return forces_of_stress(edges, self.c1 * self.prestretch**2 * self.cell_first)
+        g = cell_metric(edges)
+        g11, g12, g22 = g.unbind(-4)
+        D = (g11 * g22).addcmul(g12, g12, value=-1) * self.cell_det
+        w_I, w_D = self.first_derivatives((g * self.cell_inverse).sum(-4), D)
+        tensile = self.cell_second * w_D
+        stress = torch.stack([tensile * g22, -tensile * g12, tensile * g11], -4)
+        return forces_of_stress(edges, stress + self.cell_first * w_I.expand(D.shape).unsqueeze(-4))
 
-        `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron). Harmonic, the force
-        along a side is a constant times the side.
+    def gradient_by_rings(self, x: Tensor) -> Tensor:
+        """`gradient`, at every vertex from the six triangles around it: by convolution, fast in exported models.
+
+        `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron).
         """
         batch, V = x.shape[:-2], x.shape[-2]
-        if self.model == "harmonic":
-            from_vertex = apply_stencil(x, self.sides[:12], self.grid)
-            return self._summed(from_vertex, self.c1 * self.prestretch**2 * self.force_of_I)
         e = apply_stencil(x, self.sides, self.grid)
         squared = (self.total @ (e * e)).reshape(*batch, 3, 6 * V)
         dD = self.heron @ squared  # det dD/dl
         D = self.total @ (squared * dD) * self.half_over_det + self.missing
         w_I, w_D = self.first_derivatives(self.total @ (self.first * squared), D)
         of_sides = self.force_of_I * w_I + self.force_of_D * w_D * dD[..., :2, :]
-        return self._summed(e[..., : 12 * V], of_sides)
-
-    def _summed(self, sides: Tensor, factors: Tensor) -> Tensor:
-        """At every vertex the sum of `sides [..., 3, 12 V]` from it times `factors [..., 2, 6 V]`, `[..., V, 3]`."""
-        sides, factors = sides.unflatten(-1, (12, -1)), factors.flatten(-2).unflatten(-1, (12, -1))
-        total: Tensor = (sides * factors.unsqueeze(-3)).sum(-2)
-        return total.mT
+        return (e[..., : 12 * V].reshape(*batch, 3, 12, V) * of_sides.reshape(*batch, 1, 12, V)).sum(-2).mT
 
     def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
         """Positive semi-definite stiffness of displacements along one direction a vertex.
