@@ -1,10 +1,11 @@
-"""What a frame costs against grid lines, dots, image size and batch: a table, exponents, and with --figure a picture.
+"""What a frame costs against grid lines, dots, image size and batch: a table, exponents, and with --page the page on it.
 
-python bench/scaling.py [--turns 5] [--figure docs/scaling.png] [--json FILE]
+python bench/scaling.py [--turns 5] [--page docs/scaling.md] [--json FILE]
 
 A dome of radius 20 with a fisheye camera in it, pressed by a ball; of 33 x 33 lines, some 150 dots and 640 x 480 pixels but for
 what is varied. Markers (image to flow) and solve (flow to result, from rest) apart, one thread, processor time, the least of
-several turns. The exponent is the slope of a line through the logarithms of the upper half of a row.
+several turns. The exponent is the slope of a line through the logarithms of the upper half of a row. The page's figure is
+written to figures/scaling.png beside it.
 """
 
 import argparse
@@ -38,6 +39,25 @@ SWEEPS = dict(
     batch=(1, 2, 4, 8, 16, 32, 64),
 )
 PARTS = ("markers", "solve")
+NAMES = dict(lines="grid lines a side", dots="dots", width="image width, px", batch="frames in a batch")
+PAGE = """# What a frame costs
+
+Processor time of one thread of a shared core against the lines of the grid, the dots, the size of the image and the frames
+in a batch; of a dome of radius 20 pressed by a ball, 33 x 33 vertices, some 150 dots and 640 x 480 pixels but for what is
+varied, every frame from rest. **Markers** is from the image to the markers' displacements, **solve** from these to the
+result. Figure and tables are made anew by
+
+    python bench/scaling.py --page docs/scaling.md
+
+![Milliseconds a frame against grid lines, dots, image width and batch](figures/scaling.png)
+
+The power is the slope of a line through the logarithms of the upper half of what was measured; of a batch, of the time of the
+whole batch.
+
+{exponents}
+
+{costs}
+"""
 HEIGHT = {320: 240, 640: 480, 1280: 960, 1920: 1200}
 
 
@@ -91,20 +111,48 @@ def exponent(rows: list[dict], sweep: str, part: str) -> float:
     return float(np.polyfit(np.log([row[sweep] for row in upper]), np.log(cost), 1)[0])
 
 
+def page(table: dict[str, list[dict]]) -> str:
+    """The page of the documents."""
+    exponents = [[NAMES[sweep], *(f"{exponent(rows, sweep, part):.1f}" for part in PARTS)] for sweep, rows in table.items()]
+    costs = [
+        [NAMES[sweep] if k == 0 else "", str(row[sweep]), *(f"{row[part]:.3g}" for part in PARTS)]
+        for sweep, rows in table.items()
+        for k, row in enumerate(rows)
+    ]
+    return PAGE.format(
+        exponents=markdown(["cost grows with the power of", *PARTS], exponents),
+        costs=markdown(["varied", "", *(f"{part}, ms a frame" for part in PARTS)], costs),
+    )
+
+
+def markdown(head: list[str], rows: list[list[str]]) -> str:
+    """A table."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])
+
+
 def draw(table: dict[str, list[dict]], path: Path) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, len(table), figsize=(11, 3), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, len(table), figsize=(11, 3.2), sharey=True, layout="constrained")
     for ax, (sweep, rows) in zip(axes, table.items(), strict=True):
         for part, mark in zip(PARTS, "os", strict=True):
-            label = f"{part}, exponent {exponent(rows, sweep, part):.1f}"
+            label = f"{part}: power {exponent(rows, sweep, part):.1f}"
             ax.loglog([row[sweep] for row in rows], [row[part] for row in rows], marker=mark, markersize=4, label=label)
-        ax.set(xlabel={"lines": "grid lines a side", "width": "image width, px"}.get(sweep, sweep))
+        values = [row[sweep] for row in rows]
+        shown = values if len(values) < 5 else values[::2]
+        ax.set(xlabel=NAMES[sweep])
+        ax.set_xticks(shown, [str(value) for value in shown])
+        ax.set_xticks([], minor=True)
         ax.grid(alpha=0.3)
-        ax.legend(fontsize=8)
+        ax.legend(fontsize=8, loc="upper left")
+    low, high = axes[0].get_ylim()
+    axes[0].set_ylim(low, 3 * high)
+    ticks = [value for value in (1, 3, 10, 30, 100, 300, 1000) if low < value < high]
+    axes[0].set_yticks(ticks, [str(value) for value in ticks])
+    axes[0].set_yticks([], minor=True)
     axes[0].set_ylabel("ms a frame")
     figure.savefig(path, dpi=110)
 
@@ -112,7 +160,7 @@ def draw(table: dict[str, list[dict]], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--figure", type=Path)
+    parser.add_argument("--page", type=Path)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -125,8 +173,9 @@ def main() -> None:
         for row in table[sweep]:
             print(f"{sweep:6s} {row[sweep]:5d}: " + ", ".join(f"{part} {row[part]:.1f} ms" for part in PARTS), flush=True)
         print(f"exponents of {sweep}: " + ", ".join(f"{part} {exponent(table[sweep], sweep, part):.2f}" for part in PARTS))
-    if args.figure:
-        draw(table, args.figure)
+    if args.page:
+        draw(table, args.page.parent / "figures" / "scaling.png")
+        args.page.write_text(page(table))
     write(args.json, dict(rows=table))
 
 

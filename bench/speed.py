@@ -2,12 +2,13 @@
 
 python bench/speed.py [--sensor examples/sensor.toml] [--image examples/two_contacts.png] [--device cpu] [--json FILE]
 
-The paper: its estimator with the soft locator, stage by stage, and `paper_twin` of its solve. Minimum energy: the twin solves
-the same constrained harmonic problem (linear triangles, volume linearised once, eq. 22) as one would write it for one frame:
-sparse assembly and factorisation by scipy. Force balance (17 x 17): cold from rest and warm from the solution, beside
-`balance_twin`, which makes the same steps. The paper and force balance: processor time, the least of several turns, taken in
-turn, as other programs may share the cores. How accurate the 17 x 17 grid is: `ablation.py`, its base row. With 2000000000 as
-the environment's MALLOC_TRIM_THRESHOLD_ and MALLOC_MMAP_THRESHOLD_ glibc keeps freed memory: a quarter less time in batches.
+The paper: its estimator with the soft locator, stage by stage, and `paper_twin` of its solve. Minimum energy: the twin of the
+harmonic problem (linear triangles, volume linearised once, eq. 22) is as one would write it for one frame, sparse assembly and
+factorisation by scipy; that of the sensor's material with an exact volume, `energy_twin`, makes the same steps. Force balance
+(17 x 17): cold from rest and warm from the solution, beside `balance_twin`, which makes the same steps. Paper, force balance
+and solves alone: processor time, the least of several turns, taken in turn, as other programs may share the cores. How accurate
+the 17 x 17 grid is: `ablation.py`, its base row. With 2000000000 as the environment's MALLOC_TRIM_THRESHOLD_ and
+MALLOC_MMAP_THRESHOLD_ glibc keeps freed memory: a quarter less time in batches.
 """
 
 import argparse
@@ -22,6 +23,7 @@ import numpy as np
 import scipy.sparse as sparse
 import torch
 from balance_twin import BalanceTwin
+from energy_twin import EnergyTwin
 from paper_twin import PaperTwin
 from record import median_seconds, write
 from scipy.sparse.linalg import splu
@@ -86,12 +88,16 @@ def minimum_energy(args):
                 times = {name: [1000 * t / batch for t in median_seconds(part)] for name, part in parts.items()}
                 yield dict(estimator=label, batch=batch, milliseconds_a_frame=times)
                 print(f"{label}, batch {batch}: " + ", ".join(f"{k} {t[0]:.2f} ms" for k, t in times.items()), flush=True)
-            if options and args.device == "cpu":
-                twin, d = scipy_twin(reconstructor), observation.directions[0].double().numpy()
-                gap = np.abs(twin(d) - estimator(observation).vertices[0].numpy()).max()
-                seconds = median_seconds(partial(twin, d))
-                yield dict(estimator="scipy twin", batch=1, milliseconds_a_frame=dict(solve=[1000 * s for s in seconds]))
-                print(f"scipy twin of the same solve, a frame: {1000 * seconds[0]:.2f} ms (largest difference {gap:.1e})")
+            if args.device == "cpu":
+                twin = scipy_twin(reconstructor) if options else EnergyTwin(estimator)
+                one = Observation(*(None if part is None else part[:1] for part in observation))
+                d = one.directions[0].double().numpy()
+                gap = np.abs(twin(d) - estimator(one).vertices[0].numpy()).max()
+                times = least_milliseconds({"solve": partial(estimator, one), "scipy twin": partial(twin, d)}, 25)
+                yield dict(estimator=label, batch=1, solve_alone=times)
+                print(
+                    f"the solve alone, a frame: {times['solve']:.2f} ms, its twin {times['scipy twin']:.2f} ms (gap {gap:.1e})"
+                )
 
 
 def least_milliseconds(functions: dict, turns: int) -> dict[str, float]:

@@ -508,7 +508,7 @@ def test_windows_hold_the_pixels_around_each_dot_at_their_places(radius):
     pixels = np.random.default_rng(0).uniform(60, 180, (7, 2))
     fit = EllipseFit(pixels, np.broadcast_to(radius * np.eye(2), (7, 2, 2)), SIZE, 0.45).double()
     values, middle = fit.windows(mean_pyramid(batch(u + 1000 * v, dtype=torch.float64)), torch.tensor(pixels)[None])
-    place = middle[..., None] + fit.stride[:, None, None] * fit.linear[1:]
+    place = middle[..., None] + fit.stride[..., None] * fit.linear[1:]
     torch.testing.assert_close(values, place[..., 0, :] + 1000 * place[..., 1, :])
     assert (middle - torch.tensor(pixels)).abs().max() <= 0.5 * fit.stride.max() + 1e-9
 
@@ -533,8 +533,8 @@ def test_the_fit_does_not_run_off_to_a_neighbour():
     shapes = np.broadcast_to(2.7 * np.eye(2), (25, 2, 2))
     levels = mean_pyramid(batch(render(pixels, shapes), dtype=torch.float64))
     begin = torch.tensor(pixels + [9.0, 0.0])[None]
-    fit = EllipseFit(pixels, shapes, SIZE, 0.45, steps=8).double()
-    centre, *_ = fit(levels, begin, torch.tensor(shapes)[None], torch.zeros(1))
+    fit = EllipseFit(pixels, shapes, SIZE, 0.45).double()
+    centre, *_ = fit(levels, begin, torch.tensor(shapes)[None], torch.zeros(1), 8)
     assert (centre - begin).abs().max() <= 2.7 + 1 + 1e-9
 
 

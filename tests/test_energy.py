@@ -94,6 +94,13 @@ def test_gradient_is_autograd_of_energy(membrane):
         torch.testing.assert_close(energy.gradient(x.detach()), gradient)
 
 
+@pytest.mark.parametrize("model", MODELS)
+def test_forces_by_triangles_are_those_by_rings(membrane, model):
+    energy, x = ElasticEnergy(membrane, model, **ELASTIC), stretched(membrane)
+    x = torch.stack([x, 1.1 * x])
+    torch.testing.assert_close(energy.gradient(x), energy.gradient_by_rings(x))
+
+
 def test_stiffness_is_the_hessian_along_the_directions_in_tension(membrane):
     x = stretched(membrane)
     d = torch.nn.functional.normalize(x + 0.3, dim=-1)

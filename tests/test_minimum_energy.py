@@ -331,3 +331,19 @@ def test_steps_after_convergence_change_nothing_in_float32():
     estimator = make(membrane).float()
     for estimator.steps in (10, 20, 30):
         assert estimator(seen(origins, directions)).relative_step.max() < 3e-7
+
+
+@pytest.mark.parametrize(
+    "options", [dict(model="harmonic"), dict(element="quadrilateral"), dict(model="harmonic", filling="open")]
+)
+def test_a_linear_problem_is_solved_in_four_steps(options):
+    """By the end of them what is left is less than single precision resolves; two are not enough."""
+    membrane = ellipsoid_cap((12, 9, 12), 2, (13, 13))
+    observation = seen(*bent_rays(membrane, 0.06, (4,)))
+    estimator = make(membrane, volume="linear", **options)
+    assert estimator.steps == MinimumEnergySettings().linear_steps == 4
+    found = estimator(observation)
+    assert found.relative_step.max() < 1e-7
+    estimator.steps = 2
+    assert estimator(observation).relative_step.max() > 10 * found.relative_step.max()
+    assert make(membrane, volume="exact", **options).steps == MinimumEnergySettings().steps

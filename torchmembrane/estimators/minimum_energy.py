@@ -65,7 +65,10 @@ class MinimumEnergy(VertexRays):
         triangles = settings.element == "triangle"
         energy = elasticity if triangles else AffineQuadrilaterals(membrane, elasticity.tension)
         super().__init__(membrane, energy, rest_rays, filling, gas, flow)
-        self.settings, self.elasticity, self.steps = settings, elasticity, settings.steps
+        harmonic = not triangles or elasticity.model == "harmonic"
+        linear = harmonic and settings.volume == "linear" and filling != "gas"
+        self.settings, self.elasticity = settings, elasticity
+        self.steps = settings.linear_steps if linear else settings.steps
         self.smooths = settings.weight_of_smoother > 0
         self.register_buffer("smoothing", elasticity.tension * settings.weight_of_smoother)
         self.register_buffer("inverse", self._rest_inverse(rest_rays[1]))
@@ -119,42 +122,65 @@ class MinimumEnergy(VertexRays):
     def solve(self, observation: Observation, relaxed: Tensor | None = None) -> Equilibrium:
         """The surface; `relaxed [..., V]` bool: vertices in contact, where the slope may jump: the smoother of eq. 28 leaves
         them alone."""
-        t, latest, changes, origins, directions = self.start(observation.origins, observation.directions, relaxed)
+        origins, directions, *linear = self.rays(observation.origins, observation.directions)
+        t, latest, changes = self.start(origins, directions, relaxed, *linear)
         for _ in range((self.steps if relaxed is None else self.settings.relaxed_steps) - 1):
-            t, latest, changes = self.step(t, latest, changes, origins, directions, relaxed)
-        return self.equilibrium(t, origins, directions, relaxed)
+            t, latest, changes = self.step(t, latest, changes, origins, directions, relaxed, *linear)
+        return self.equilibrium(t, origins, directions, relaxed, *linear)
 
     @piece
-    def start(
-        self, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Ranges `[..., V]` and history after the first step, from rest; rays `[..., 3, V]` on which the rim stays: `d = 0`."""
+    def rays(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, ...]:
+        """Rays `[..., 3, V]` on which the rim stays: `d = 0`; where the volume is linear also its derivative `v [..., V]`, and
+        by how much it is above that at rest at the rest ranges `[...]`."""
         fixed = self.membrane.fixed
-        origins, directions = torch.where(fixed, self.membrane.rest.mT, origins.mT), torch.where(fixed, 0.0, directions.mT)
+        origins = torch.where(fixed, self.membrane.rest.mT, origins.mT).contiguous()
+        directions = torch.where(fixed, 0.0, directions.mT).contiguous()
+        if self.settings.volume == "exact":
+            return origins, directions
+        return origins, directions, *self._volume(origins + self.rest_range * directions, directions)
+
+    @piece
+    def start(self, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None, *linear: Tensor) -> State:
+        """Ranges `[..., V]` and history after the first step, from rest, on rays as `rays` gives them."""
         t = self.rest_range.expand(directions[..., 0, :].shape)
-        return *first(t, self._move(t, origins, directions, relaxed)[0]), origins, directions
+        return first(t, self._move(t, origins, directions, relaxed, *linear)[0])
 
     @piece
     def step(
-        self, t: Tensor, latest: Tensor, changes: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None
+        self,
+        t: Tensor,
+        latest: Tensor,
+        changes: Tensor,
+        origins: Tensor,
+        directions: Tensor,
+        relaxed: Tensor | None = None,
+        *linear: Tensor,
     ) -> State:
         """One step in the ranges `t [..., V]`; `latest` and `changes` as `accelerated` has them."""
-        move, _ = self._move(t, origins, directions, relaxed)
+        move, _ = self._move(t, origins, directions, relaxed, *linear)
         return accelerated(t, move, latest, changes)
 
     @piece
-    def equilibrium(self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None) -> Equilibrium:
+    def equilibrium(
+        self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None, *linear: Tensor
+    ) -> Equilibrium:
         """What these ranges amount to, and how far they are from a solution."""
         x = (origins + t[..., None, :] * directions).mT
-        move, pressure = self._move(t, origins, directions, relaxed)
+        move, pressure = self._move(t, origins, directions, relaxed, *linear)
         error = move.abs().amax(-1) / self.membrane.size
         none, volume = torch.zeros_like(x), self.membrane.volume(x)
         return Equilibrium(x, pressure, volume, none, error, none[..., 0], none[..., 0, 0], none[..., :4, 0], none[..., 0, 0])
 
-    def _move(self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _move(
+        self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None, *linear: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Where the rest's stiffness would have the ranges go, `[..., V]`: zero at the solution; and the pressure `[...]`."""
         x = origins + t[..., None, :] * directions
-        rise, v = self._rise(t, x, origins, directions)
+        if linear:
+            v, rise = linear
+            rise = rise + (v * (t - self.rest_range)).sum(-1)
+        else:
+            v, rise = self._volume(x, directions)
         load = self.rest_pressure * v + ((self.rest_load - self.energy.gradient(x.mT)).mT * directions).sum(-2)
         if self.smooths:
             load = load - self._smoothing_force(t, relaxed)
@@ -164,13 +190,10 @@ class MinimumEnergy(VertexRays):
         minimum = constrained_minimum(y, g, v, *self.cavity.condition(rise, self.rest_pressure))
         return minimum.y, self.rest_pressure - minimum.multiplier
 
-    def _rise(self, t: Tensor, x: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Volume above that at rest `[...]` and its derivative `v [..., V]`: exact, or linear about the rest ranges."""
-        linear = self.settings.volume == "linear"
-        x = origins + self.rest_range * directions if linear else x
+    def _volume(self, x: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """The volume's derivative `v [..., V]` along the rays at `x [..., 3, V]`, and its rise above that at rest `[...]`."""
         gradient = self.membrane.volume_gradient(x.mT).mT
-        v, rise = (gradient * directions).sum(-2), (gradient * x).sum((-1, -2)) / 3 - self.membrane.rest_volume
-        return (rise + (v * (t - self.rest_range)).sum(-1) if linear else rise), v
+        return (gradient * directions).sum(-2), (gradient * x).sum((-1, -2)) / 3 - self.membrane.rest_volume
 
     def _smoothing_force(self, t: Tensor, relaxed: Tensor | None) -> Tensor:
         bend = self._smoother((self.free * (t - self.rest_range))[..., None])

@@ -138,6 +138,7 @@ class MinimumEnergySettings:
         volume: "exact", or "linear": linearised once, at the rest ranges (eq. 21).
         flow: of the grid's vertices, "smooth", or "bilinear" between the dots (section 5).
         steps: of the solve.
+        linear_steps: of the solve of a linear problem: a harmonic material, the volume linear, no gas.
         relaxed_steps: of the solve where the smoother is relaxed, which the constant inverse knows nothing of.
 
     Raises:
@@ -153,6 +154,7 @@ class MinimumEnergySettings:
     volume: str = "exact"
     flow: str = "smooth"
     steps: int = 10
+    linear_steps: int = 4
     relaxed_steps: int = 60
 
     def __post_init__(self) -> None:

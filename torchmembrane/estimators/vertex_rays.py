@@ -53,7 +53,7 @@ class VertexRays(nn.Module):
         self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
         origins, directions = rest_rays
         self.register_buffer("rest_range", ((membrane.rest - origins) * directions).sum(-1))
-        self.register_buffer("rest_load", rest_load)
+        self.register_buffer("rest_load", rest_load.mT.contiguous().mT)  # as forces come: components first in memory
         self.register_buffer("free", (~membrane.fixed).double())
 
     @classmethod

@@ -163,13 +163,12 @@ class MarkerObserver(nn.Module):
     @piece
     def check(self, images: Tensor) -> Tensor:
         """Status `[B]` of images."""
-        flat, sparse = images.flatten(1), images[..., ::SPARSE, ::SPARSE].flatten(1)
+        flat, sparse = images.flatten(1), images[..., ::SPARSE, ::SPARSE]
         mean, low, high = flat.mean(1), flat.amin(1), flat.amax(1)
-        bad = ~(mean.isfinite() & (low > -1e-3) & (high < 1.001))  # one value that is not finite makes the mean so
-        saturated = ((sparse - 0.5).abs() > 0.495).to(sparse.dtype).mean(1)
+        bad = ~((mean < torch.inf) & (low > -1e-3) & (high < 1.001))  # one value that is not finite makes the mean so
+        saturated = ((sparse - 0.5).abs() > 0.495).to(sparse.dtype).mean((1, 2, 3))
         blank = (high - low < LEAST_CONTRAST) | ((saturated > SATURATED_SHARE) & (mean > 0.5))
-        status = torch.where(blank, Status.BLANK.value, Status.OK.value)
-        return torch.where(bad, Status.BAD_VALUES.value, status)
+        return (Status.BLANK.value * blank.to(torch.int64)).masked_fill(bad, Status.BAD_VALUES.value)
 
     @piece
     def located(self, pixels: Tensor) -> Tensor:
@@ -184,8 +183,8 @@ class MarkerObserver(nn.Module):
         values."""
         bad = (status == Status.BAD_VALUES.value)[:, None]
         rest = self.measured_rest if rest_pixels is None else rest_pixels
-        displacement, confidence = torch.where(bad[..., None], 0.0, pixels - rest), torch.where(bad, 0.0, confidence)
-        return displacement, confidence, self.rest_covariance + torch.where(bad[..., None, None], 0.0, covariance)
+        displacement, confidence = (pixels - rest).masked_fill(bad[..., None], 0.0), confidence.masked_fill(bad, 0.0)
+        return displacement, confidence, self.rest_covariance + covariance.masked_fill(bad[..., None, None], 0.0)
 
     def from_pixels(self, pixels: Tensor, confidence: Tensor | None, rest_pixels: Tensor | None) -> MarkerFlow:
         """What markers located elsewhere show, those that belong with no neighbour without confidence.
@@ -213,11 +212,11 @@ class MarkerObserver(nn.Module):
         """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""
         found = confidence > FOUND
         count, D = found.sum(-1), self.seen_at_rest.sum()
-        unlike = torch.where(count < ALIKE_SHARE * D, Status.UNLIKE_REST.value, Status.OK.value)
-        few = torch.where(count < (FEWEST_SHARE * D).clamp_min(FEWEST_MARKERS), Status.TOO_FEW_MARKERS.value, unlike)
-        status = torch.where(status == Status.OK.value, few, status)
+        unlike = Status.UNLIKE_REST.value * (count < ALIKE_SHARE * D).to(torch.int64)
+        few = count < (FEWEST_SHARE * D).clamp_min(FEWEST_MARKERS)
+        status = torch.where(status == Status.OK.value, unlike.masked_fill(few, Status.TOO_FEW_MARKERS.value), status)
         usable = (status == Status.OK.value)[:, None, None]
-        return MarkerFlow(displacement * usable, torch.where(found, confidence, 0.0), covariance, status)
+        return MarkerFlow(displacement * usable, confidence * found, covariance, status)
 
 
 def _checked_confidence(confidence: Tensor | None, pixels: Tensor) -> Tensor:

@@ -4,6 +4,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+FADED = 30.0
+"""Exponent of a weight that no longer counts; products with subnormal numbers take fifty times as long."""
+
+
+def faded(exponent: np.ndarray) -> np.ndarray:
+    """`exp(exponent)`, 0 where it no longer counts.
+
+    Example:
+        >>> faded(np.array([0.0, -40.0])).tolist()
+        [1.0, 0.0]
+    """
+    return np.where(exponent > -FADED, np.exp(exponent), 0.0)
+
 
 def spacing(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The local spacing of markers.
@@ -51,7 +64,7 @@ def thin_out(points: np.ndarray, gap: float) -> np.ndarray:
 
 def square_distance(x: Tensor, y: Tensor) -> Tensor:
     """`[..., K, D]` between the points `x [..., K, 2]` and `y [..., D, 2]`."""
-    return (x.square().sum(-1)[..., None] + y.square().sum(-1)[..., None, :] - 2 * x @ y.mT).clamp_min(0)
+    return (x.square().sum(-1)[..., None] + y.square().sum(-1)[..., None, :]).sub(x @ y.mT, alpha=2).clamp_min(0)
 
 
 def safe_length(x: Tensor, dim: int) -> Tensor:

@@ -14,6 +14,7 @@ from ..errors import MembraneError
 from ..surface.membrane import Membrane
 from ..surface.stencil import ONE_RING, apply_stencil, convolved, stencil_kernels
 from ..surface.topology import corners, triangles_of
+from .cell_forces import cell_edges, cell_metric, forces_of_stress
 from .metric import adjugate, determinant, edge_vectors, metric, metric_constants, tensile_part
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
@@ -88,6 +89,10 @@ class ElasticEnergy(nn.Module):
     force_of_D: Tensor
     heron: Tensor
     total: Tensor
+    cell_inverse: Tensor
+    cell_det: Tensor
+    cell_first: Tensor
+    cell_second: Tensor
 
     def __init__(
         self,
@@ -112,6 +117,7 @@ class ElasticEnergy(nn.Module):
         for name, constant in {**metric_constants(), **_one_ring_constants()}.items():
             self.register_buffer(name, constant)
         self._register_one_ring(membrane)
+        self._register_cells(membrane)
 
     def _register_one_ring(self, membrane: Membrane) -> None:
         """Of the six triangles around every vertex, `[6 V]` in all: sides (two from the vertex, the one across), constants."""
@@ -134,6 +140,15 @@ class ElasticEnergy(nn.Module):
         self.register_buffer("force_of_D", -twice_area / det)
         self.register_buffer("heron", 0.5 - torch.eye(3, dtype=torch.float64))
         self.register_buffer("total", torch.ones(1, 3, dtype=torch.float64))
+
+    def _register_cells(self, membrane: Membrane) -> None:
+        g11, g12, g22 = cell_metric(cell_edges(membrane.rest, self.grid)).unbind(-4)
+        det = g11 * g22 - g12 * g12
+        inverse = torch.stack([g22, -g12, g11]) / det
+        self.register_buffer("cell_inverse", inverse * torch.tensor([1, 2, 1])[:, None, None, None])
+        self.register_buffer("cell_det", 1 / det)
+        self.register_buffer("cell_first", det.sqrt() * inverse)
+        self.register_buffer("cell_second", 1 / det.sqrt())
 
     def on(self, membrane: Membrane) -> "ElasticEnergy":
         """The same material on another membrane or grid."""
@@ -208,7 +223,22 @@ class ElasticEnergy(nn.Module):
         return (self.area * self.density(I, D)).sum((-1, -2))
 
     def gradient(self, x: Tensor) -> Tensor:
-        """`dU/dx`, `[..., V, 3]`: the membrane's forces with opposite sign, at every vertex from the six triangles around it.
+        """`dU/dx`, `[..., V, 3]`: the membrane's forces with opposite sign."""
+        if torch.compiler.is_exporting():
+            return self.gradient_by_rings(x)
+        edges = cell_edges(x, self.grid)
+        if self.model == "harmonic":
+            return forces_of_stress(edges, self.c1 * self.prestretch**2 * self.cell_first)
+        g = cell_metric(edges)
+        g11, g12, g22 = g.unbind(-4)
+        D = (g11 * g22).addcmul(g12, g12, value=-1) * self.cell_det
+        w_I, w_D = self.first_derivatives((g * self.cell_inverse).sum(-4), D)
+        tensile = self.cell_second * w_D
+        stress = torch.stack([tensile * g22, -tensile * g12, tensile * g11], -4)
+        return forces_of_stress(edges, stress + self.cell_first * w_I.expand(D.shape).unsqueeze(-4))
+
+    def gradient_by_rings(self, x: Tensor) -> Tensor:
+        """`gradient`, at every vertex from the six triangles around it: by convolution, fast in exported models.
 
         `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron).
         """

@@ -19,3 +19,12 @@ def solve_positive(system: Tensor) -> Tensor:
         column, rest = system.split([1, system.shape[1] - 1], 1)
         system = rest - (column - unit[:, i : i + 1]) * (rest[i : i + 1] / column[i : i + 1])
     return system
+
+
+def solve_dense(matrix: Tensor, loads: Tensor) -> Tensor:
+    """`x [..., n, k]` with `matrix x = loads`, of positive definite `matrix [..., n, n]`: by LAPACK, in exported models by
+    `solve_positive`."""
+    if torch.compiler.is_exporting():
+        return solve_positive(torch.cat([matrix, loads], -1).movedim((-2, -1), (0, 1))).movedim((0, 1), (-2, -1))
+    solution: Tensor = torch.linalg.solve_ex(matrix, loads).result
+    return solution

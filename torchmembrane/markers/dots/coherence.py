@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..spacing import neighbours, safe_length, spacing, square_distance
+from ..spacing import FADED, faded, neighbours, safe_length, spacing, square_distance
 
 NEIGHBOURS = 6
 SEAM = 2.0  # width of the neighbourhood in which a seam is looked for, pitches
@@ -29,12 +29,15 @@ class Coherence(nn.Module):
 
     near: Tensor
     step: Tensor
+    half_step: Tensor
     length: Tensor
     share: Tensor
     total: Tensor
-    reach: Tensor
+    narrowness: Tensor
     origin: Tensor
-    nearest: Tensor
+    claim: Tensor
+    rival: Tensor
+    decision: Tensor
     log_radius: Tensor
 
     def __init__(self, pixels: np.ndarray, log_radius: np.ndarray, size_tolerance: float):
@@ -44,15 +47,18 @@ class Coherence(nn.Module):
         step = np.moveaxis(pixels[near] - pixels, -1, 0).copy()
         nearest, mean = spacing(pixels)
         square = ((pixels[:, None] - pixels) ** 2).sum(-1)
-        kernel = np.exp(-square / (2 * (SEAM * mean) ** 2))  # [from, to]
+        kernel = faded(-square / (2 * (SEAM * mean) ** 2))  # [from, to]
         self.register_buffer("near", torch.as_tensor(near))
         self.register_buffer("step", torch.as_tensor(step))
+        self.register_buffer("half_step", torch.as_tensor(step / 2))
         self.register_buffer("length", torch.as_tensor(np.linalg.norm(step, axis=0)))
         self.register_buffer("share", torch.as_tensor(kernel / kernel.sum(0)))
         self.register_buffer("total", torch.as_tensor(kernel.sum(0)))
-        self.register_buffer("reach", torch.as_tensor(SEAM * mean))
+        self.register_buffer("narrowness", torch.as_tensor(-0.5 / (SEAM * mean) ** 2))
         self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
-        self.register_buffer("nearest", torch.as_tensor(nearest))
+        self.register_buffer("claim", torch.as_tensor((CLAIM * nearest) ** 2))
+        self.register_buffer("rival", torch.as_tensor(RIVAL * nearest))
+        self.register_buffer("decision", torch.as_tensor(20 / nearest))
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
 
     def forward(
@@ -75,16 +81,15 @@ class Coherence(nn.Module):
             blobs: `[B, K, 2]`, px; log_radius, valid: `[B, K]`, as for `DotMatcher`.
         """
         sure = torch.sigmoid(20 * (confidence - 0.5))
-        blobs, pixels, predicted = (x - self.origin for x in (blobs, pixels, predicted))
-        square = square_distance(blobs, pixels)  # [B, K, D]
-        claimed = ((square < (CLAIM * self.nearest) ** 2) * sure[:, None]).amax(-1)
-        misfit = (log_radius - self.log_radius[square.argmin(-1)]) / self.size_tolerance
-        left = valid * torch.exp(-0.5 * misfit.square()) * (1 - claimed)
-        own = safe_length(pixels - predicted, -1)
-        other = square_distance(blobs, predicted).clamp_min(1e-12).sqrt()
-        margin = (other - own[:, None]) / self.nearest
-        alone = 1 - (left[..., None] * torch.sigmoid(20 * (RIVAL - margin))).amax(1)
-        left = (left[:, None] @ torch.exp(-square / (2 * self.reach**2))).squeeze(1) / self.total
+        places = torch.cat([pixels, predicted], 1) - self.origin
+        square, other = square_distance(blobs - self.origin, places).chunk(2, -1)  # [B, K, D]
+        claimed = ((square < self.claim) * sure[:, None]).amax(-1)
+        misfit = log_radius - self.log_radius[square.argmin(-1)]
+        left = valid * torch.exp(misfit.square() * (-0.5 / self.size_tolerance**2)) * (1 - claimed)
+        nearer = safe_length(pixels - predicted, -1) + self.rival
+        margin = nearer[:, None] - other.clamp_min(1e-12).sqrt()
+        alone = 1 - (left[..., None] * torch.sigmoid(margin * self.decision)).amax(1)
+        left = (left[:, None] @ torch.exp((square * self.narrowness).clamp_min(-FADED))).squeeze(1) / self.total
         lost = (1 - sure) @ self.share
         error = self._error_of_steps(pixels, sure, gradient)
         tear = torch.minimum(lost, left).clamp_min(1e-12).sqrt() * error
@@ -95,8 +100,8 @@ class Coherence(nn.Module):
         here = torch.cat([gradient.flatten(2), pixels, sure[..., None]], -1)
         there = here.index_select(1, self.near.flatten()).mT.unflatten(-1, self.near.shape)  # [B, 7, neighbours, D]
         here = here.mT[:, :, None]
-        ends = (there[:, :4] + here[:, :4]).unflatten(1, (2, 2)) / 2
-        change = there[:, 4:6] - here[:, 4:6] - self.step - (ends * self.step).sum(2)
+        ends = (there[:, :4] + here[:, :4]).unflatten(1, (2, 2))
+        change = there[:, 4:6] - here[:, 4:6] - self.step - (ends * self.half_step).sum(2)
         pair = there[:, 6] * here[:, 6]
         error = (pair * safe_length(change, 1) / self.length).sum(1) @ self.share
         return error / (pair.sum(1) @ self.share + 1e-3)

@@ -5,12 +5,11 @@ import torch
 from torch import Tensor, nn
 
 from ...pieces import piece, repeated
-from ..spacing import neighbours, spacing, square_distance
+from ..spacing import FADED, neighbours, spacing, square_distance
 
 WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
 NEIGHBOURS = 8
 FAR = 1e6
-FADED = 30.0  # exponent of a weight that no longer counts; subnormal numbers are slow
 
 
 def monomial_map() -> Tensor:

@@ -25,12 +25,12 @@ class HessianScale(nn.Module):
     def __init__(self, level: int, sigma: float, cell: int, box: tuple[Span, Span], size: tuple[int, int]):
         """`sigma`: pixels of the level; `cell`, `box` (v, u) and `size` (height, width): pixels of the image."""
         super().__init__()
-        self.level, self.sigma, self.cell = level, sigma, cell
+        self.level, self.cell = level, cell
         stride = 2**level
         self.rows, self.columns = ((end - begin) // stride for begin, end in box)
         rows = [np.arange(begin // stride - 1, end // stride + 1) for begin, end in box]
         self.blur_v, self.blur_u = (
-            BandProduct(blur_rows(side // stride, sigma, on)) for on, side in zip(rows, size, strict=True)
+            BandProduct(sigma * blur_rows(side // stride, sigma, on)) for on, side in zip(rows, size, strict=True)
         )
         self.spread = None
         if stride > cell:
@@ -42,14 +42,14 @@ class HessianScale(nn.Module):
         blurred = self.blur_u(self.blur_v(levels[self.level]))
         above, middle, below = (blurred[..., n : n + self.rows, :] for n in range(3))
         left, centre, right = (slice(n, n + self.columns) for n in range(3))
-        uu = middle[..., right] + middle[..., left] - 2 * middle[..., centre]
-        vv = (below + above - 2 * middle)[..., centre]
+        uu = (middle[..., right] + middle[..., left]).sub(middle[..., centre], alpha=2)
+        vv = (below + above)[..., centre].sub(middle[..., centre], alpha=2)
         along = below - above
         uv = along[..., right] - along[..., left]
-        response = (uu.relu() * vv.relu() - uv * uv / 16).relu()  # uu and vv have one sign where the determinant is positive
+        response = (uu.relu() * vv).addcmul(uv, uv, value=-1 / 16).relu()  # where it is positive, uu and vv have one sign
         if self.spread is not None:
             response = self.spread(response)
-        return self.sigma**4 * (F.max_pool2d(response, 2) if 2**self.level < self.cell else response)
+        return pair_maxima(response) if 2**self.level < self.cell else response
 
 
 class BlobDetector(nn.Module):
@@ -69,6 +69,8 @@ class BlobDetector(nn.Module):
         0 fill up the list.
     """
 
+    sides: Tensor
+    corner: Tensor
     log_radii: Tensor
     inside: Tensor
 
@@ -85,6 +87,9 @@ class BlobDetector(nn.Module):
         lit = inside[0, 0].numpy() > 0
         self.box = _span(np.any(lit, 1), block), _span(np.any(lit, 0), block)
         (v0, v1), (u0, u1) = self.box
+        columns = (u1 - u0) // self.cell
+        self.register_buffer("sides", torch.tensor([-1, 1, -columns, columns]))
+        self.register_buffer("corner", torch.tensor([u0, v0], dtype=torch.float64) + (self.cell - 1) / 2)
         self.register_buffer("log_radii", torch.as_tensor(np.log(radii)))
         self.register_buffer("inside", (F.avg_pool2d(inside[..., v0:v1, u0:u1], self.cell) > 0.5).double())
         self.scales = nn.ModuleList(
@@ -100,10 +105,7 @@ class BlobDetector(nn.Module):
         background = self.background(levels[-1]) + 0.05
         scales = [scale(levels) for scale in self.scales]
         peak = reduce(torch.maximum, scales) / background.square() * self.inside
-        reach = self.reach
-        highest = F.max_pool2d(peak, (1, 2 * reach + 1), 1, (0, reach))
-        highest = F.max_pool2d(highest, (2 * reach + 1, 1), 1, (reach, 0))
-        strength, cell = (peak * (peak == highest)).flatten(1).topk(self.count)
+        strength, cell = (peak * (peak == highest_around(peak, self.reach))).flatten(1).topk(self.count)
         strength = strength.clamp_min(1e-20).sqrt()
         scale = torch.cat(scales, 1).flatten(2).gather(2, cell[:, None].expand(-1, len(scales), -1)).square()
         log_radius = (scale * self.log_radii[:, None]).sum(1) / scale.sum(1).clamp_min(1e-20)
@@ -112,13 +114,41 @@ class BlobDetector(nn.Module):
     def _centre(self, peak: Tensor, cell: Tensor, strength: Tensor) -> Tensor:
         """Centres `[B, K, 2]` px of the maxima at `cell [B, K]`, by a parabola through the cells beside each."""
         rows, columns = peak.shape[-2:]
-        sides = torch.stack([cell - 1, cell + 1, cell - columns, cell + columns], -1).clamp(0, rows * columns - 1)
+        sides = (cell[..., None] + self.sides).clamp(0, rows * columns - 1)
         beside = peak.flatten(1).gather(1, sides.flatten(1)).unflatten(1, (-1, 2, 2))  # [B, K, uv, before or after]
         before, after = beside.clamp_min(1e-12).sqrt().unbind(-1)
         shift = 0.5 * (after - before) / (2 * strength[..., None] - after - before).clamp_min(1e-12)
         centre = torch.stack([cell % columns, cell // columns], -1) + shift.clamp(-0.5, 0.5)
-        (v0, _), (u0, _) = self.box
-        return centre * self.cell + (self.cell - 1) / 2 + centre.new_tensor([u0, v0])
+        return centre * self.cell + self.corner
+
+
+def highest_around(field: Tensor, reach: int) -> Tensor:
+    """The largest value within `reach` rows and columns of every entry of `field [..., H, W]`, which is nowhere negative.
+
+    Example:
+        >>> highest_around(torch.tensor([[0.0, 1.0, 0.0, 5.0, 4.0]]), 1).tolist()
+        [[1.0, 1.0, 5.0, 5.0, 5.0]]
+    """
+    if torch.compiler.is_exporting():
+        return F.max_pool2d(field, 2 * reach + 1, 1, reach)
+    field = F.pad(field, (reach,) * 4)
+    for dim in (-2, -1):
+        size = field.shape[dim] - 2 * reach
+        field = reduce(torch.maximum, (field.narrow(dim, k, size) for k in range(2 * reach + 1)))
+    return field
+
+
+def pair_maxima(field: Tensor) -> Tensor:
+    """The largest of every 2 x 2 entries of `field [..., H, W]`, of even sides.
+
+    Example:
+        >>> pair_maxima(torch.tensor([[1.0, 0.0, 0.0, 2.0], [0.0, 3.0, 0.0, 0.0]])).tolist()
+        [[3.0, 2.0]]
+    """
+    if torch.compiler.is_exporting():
+        return F.max_pool2d(field, 2)
+    field = torch.maximum(field[..., 0::2], field[..., 1::2])
+    return torch.maximum(field[..., 0::2, :], field[..., 1::2, :])
 
 
 def _span(lit: np.ndarray, block: int) -> Span:

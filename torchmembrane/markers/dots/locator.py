@@ -10,7 +10,7 @@ from ...errors import MembraneError
 from ...pieces import piece
 from ..locator import LocatedMarkers
 from ..noise import pixel_noise
-from ..spacing import safe_length, spacing, square_distance
+from ..spacing import safe_length, spacing
 from .coherence import Coherence
 from .detect import BlobDetector
 from .ellipse import draw_dots, size_tolerance
@@ -19,6 +19,7 @@ from .match import DotMatcher
 from .pattern import OUTLIER, DotPattern
 from .pyramid import mean_pyramid
 
+STEPS = 2  # of the fit
 FEWEST = 0.2  # mean confidence of a frame that is half trusted
 
 
@@ -133,8 +134,7 @@ class DotLocator(nn.Module):
         """The levels of the pyramid, and the blobs: centres `[B, K, 2]`, log radius `[B, K]`, and how surely one is a dot."""
         levels = mean_pyramid(1 - image if self.polarity == "light" else image)
         blobs, log_radius, strength = self.detect(levels)
-        nearest = square_distance(blobs - self.match.origin, self.match.pixels).argmin(-1)
-        relative = strength / self.strength[nearest]
+        relative = strength / self.strength[self.match.nearest_dots(blobs)]
         level = relative[:, : self.rest.shape[0] // 2].mean(1, keepdim=True)
         valid = torch.sigmoid(20 * (relative / (level + 1e-3) - 0.4))
         level_0, level_1, level_2 = levels
@@ -155,12 +155,13 @@ class DotLocator(nn.Module):
     ) -> LocatedMarkers:
         """The dots, by the fit about where the matcher places the dots."""
         levels, rest = [level_0, level_1, level_2], self.rest
-        _, gradient, _ = self.match.predict(certainty, place - rest, strain)
+        gradient = self.match.gradient(certainty, place - rest, strain).movedim(-1, 1)
         shape = self.shapes + gradient.clamp(-0.6, 0.6) @ self.shapes
-        pixels, covariance, _, quality = self.fit(levels, place, shape, pixel_noise(level_0.detach()))
-        predicted, _, _ = self.match.predict(certainty * quality, pixels - rest, strain)
-        deviation = safe_length(pixels - rest - predicted, -1) / self.match.nearest
+        pixels, covariance, _, quality = self.fit(levels, place, shape, pixel_noise(level_0.detach()), STEPS)
+        flow, _, _ = self.match.predict(certainty * quality, pixels - rest, strain)
+        predicted = rest + flow
+        deviation = safe_length(pixels - predicted, -1) / self.match.nearest
         confidence = quality * torch.sigmoid(20 * (OUTLIER - deviation))
-        confidence = confidence * self.coherence(pixels, confidence, strain, rest + predicted, blobs, log_radius, valid)
+        confidence = confidence * self.coherence(pixels, confidence, strain, predicted, blobs, log_radius, valid)
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
-        return LocatedMarkers(torch.where(confidence[..., None] > 0.05, pixels, rest + predicted), confidence, covariance)
+        return LocatedMarkers(torch.where(confidence[..., None] > 0.05, pixels, predicted), confidence, covariance)

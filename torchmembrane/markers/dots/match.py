@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...pieces import piece, repeated, unless
@@ -50,8 +51,10 @@ class DotMatcher(nn.Module):
 
     origin: Tensor
     pixels: Tensor
+    square: Tensor
     nearest: Tensor
     stiffness: Tensor
+    slope: Tensor
     log_radius: Tensor
     starts: Tensor
 
@@ -65,19 +68,28 @@ class DotMatcher(nn.Module):
         self.averages = FlowAverages(pixels, nodes, WIDTH)
         self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
         self.register_buffer("pixels", torch.as_tensor(pixels - pixels.mean(0)))
+        self.register_buffer("square", self.pixels.square().sum(-1))
         self.register_buffer("nearest", torch.as_tensor(nearest))
         self.register_buffer("stiffness", torch.as_tensor((TOLERANCE * nearest) ** -2.0))
+        self.register_buffer("slope", -2 * self.stiffness)
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
         starts = np.zeros((1, len(pixels))) if len(anchors) else sectors(pixels)
         self.register_buffer("starts", torch.as_tensor(starts))
         self.steps = self.averages.rings(np.column_stack([starts, np.ones((len(starts), len(anchors)))])) + 3
 
+    def nearest_dots(self, blobs: Tensor) -> Tensor:
+        """Which dot at rest is nearest to each of `blobs [B, K, 2]`, `[B, K]`."""
+        return F.linear(blobs - self.origin, -2 * self.pixels, self.square).argmin(-1)
+
     def predict(self, weight: Tensor, flow: Tensor, strain: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Flow `[B, D, 2]`, gradient `[B, D, 2, 2]` and support `[B, D]` at the dots, from weight, flow and strain there."""
-        flow, strain = flow.mT, strain.movedim(1, -1)
-        gradient = self.averages.gradient(weight, flow, strain)
-        predicted, support = self.averages.along(weight, flow, gradient)
+        gradient = self.gradient(weight, flow, strain)
+        predicted, support = self.averages.along(weight, flow.mT, gradient)
         return predicted.mT, gradient.movedim(-1, 1), support
+
+    def gradient(self, weight: Tensor, flow: Tensor, strain: Tensor) -> Tensor:
+        """Gradient `[B, 2, 2, D]` of the flow at the dots, from what `predict` takes."""
+        return self.averages.gradient(weight, flow.mT, strain.movedim(1, -1))
 
     def choose(self, predicted: Tensor, support: Tensor, blobs: Tensor, base: Tensor) -> State:
         """Each dot's blob.
@@ -93,7 +105,7 @@ class DotMatcher(nn.Module):
         """
         expected = self.pixels.mT + predicted
         alone = (expected * expected).sum(1) * self.stiffness + FAR * (support < SUPPORT)
-        cost = torch.cat([alone[:, None], -2 * self.stiffness * expected], 1).mT @ blobs[:, :3] + base
+        cost = torch.cat([alone[:, None], self.slope * expected], 1).mT @ blobs[:, :3] + base
         best = cost.amin(-1)
         chosen = (cost <= best[..., None]).to(cost.dtype)
         taken = torch.cat([blobs, cost.amin(1, keepdim=True)], 1) @ chosen.mT

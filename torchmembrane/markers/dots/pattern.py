@@ -35,9 +35,9 @@ def refine(
     dark: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, tolerance: float = 0.45
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centres `[D, 2]` fitted to sub-pixel accuracy, the outline's growth `[D]` px, quality `[D]` in 0..1."""
-    fit = EllipseFit(pixels, shapes, dark.shape[::-1], tolerance, steps=8)
+    fit = EllipseFit(pixels, shapes, dark.shape[::-1], tolerance)
     levels = mean_pyramid(torch.as_tensor(dark)[None, None])
-    found = fit(levels, torch.as_tensor(pixels)[None], torch.as_tensor(shapes)[None], torch.zeros(1))
+    found = fit(levels, torch.as_tensor(pixels)[None], torch.as_tensor(shapes)[None], torch.zeros(1), 8)
     return found.centre[0].numpy(), found.growth[0].numpy(), found.quality[0].numpy()
 
 
