@@ -123,7 +123,7 @@ def test_one_press_gives_an_unknown_modulus_and_several_give_it_more_surely(pres
     with_rest = material_from_pixels(unknown, pixels[:2], pressures=KnownPressures(1000 + pressures[:2]))
     several = material_from_pixels(unknown, pixels[1:], pressures=KnownPressures(changes[1:], since_rest=True))
     for found in (one, with_rest, several):
-        assert abs(found.values[1] / MODULUS - 1) < 0.1, found.values
+        assert abs(found.values[1] / MODULUS - 1) < 0.15, found.values
         assert abs(found.values[1] - MODULUS) < 2 * found.deviations[1]
         assert found.sensor.force_unit == "N" and found.sensor.material.modulus == pytest.approx(found.values[1])
         assert found.covariance[0, 1] < 0  # more tension at rest, or a stiffer membrane

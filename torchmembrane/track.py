@@ -165,7 +165,7 @@ def drift_in_words(size: float, camera_motion: Tensor | None = None, is_steady: 
     """
     camera = ""
     if camera_motion is not None:
-        camera = "; it is a moved camera's: {:.1f}, {:.1f} px, {:.2f} degrees, scale {:.4f}".format(*camera_motion.tolist())
+        camera = "; it is a moved camera's: {:z.1f}, {:z.1f} px, {:z.2f} degrees, scale {:.4f}".format(*camera_motion.tolist())
     where = f"in a contact that has held still from the beginning, for {STEADY} frames," if is_steady else "without contact"
     aged = "if nothing touches, it" if is_steady else "it"
     return (

@@ -282,9 +282,9 @@ class ElasticEnergy(nn.Module):
         Args:
             x: `[..., V, 3]`.
         """
-        pairs = self._pairs(self.strain(x))
+        (m, n), pairs = self.grid, self._pairs(self.strain(x))
         planes = pairs.reshape(-1, 6, *_cells(self.grid))
-        found = convolved(planes, self.around).reshape(*pairs.shape[:-2], 2, 6, -1)
+        found = convolved(planes, self.around).reshape(*pairs.shape[:-2], 2, 6, (m - 2) * (n - 2))
         direct, transposed = found.unbind(-3)
         both = direct + transposed.index_select(-3, self.transposed)
         return both[..., 9, :, :], both[..., :9, :, :].unflatten(-3, (3, 3))

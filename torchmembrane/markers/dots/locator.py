@@ -19,7 +19,7 @@ from .match import DotMatcher
 from .pattern import OUTLIER, DotPattern
 from .pyramid import mean_pyramid
 
-STEPS = 2  # of the fit
+STEPS = 3  # of the fit
 FEWEST = 0.2  # mean confidence of a frame that is half trusted
 
 
