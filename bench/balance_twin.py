@@ -39,7 +39,7 @@ class BalanceTwin:
         self.count = 3 * len(index)
 
     def __call__(self, observation: Observation) -> tuple[np.ndarray, float]:
-        e, single = self.estimator, Observation(*(part[None] for part in observation))
+        e, single = self.estimator, Observation(*(None if part is None else part[None] for part in observation))
         measured = e.equations.bearings.measured(single)
         if self.coarse is None:
             x, pressure, _ = e.at_rest(single.confidence)

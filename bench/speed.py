@@ -149,13 +149,13 @@ def force_balance(args):
     displacement, confidence, covariance, _ = reconstructor.observer(reconstructor.read(args.image))
     frame = reconstructor.observation(displacement, confidence, covariance)
     frame = frame._replace(motion=torch.zeros_like(frame.motion))  # the twin's camera stays
-    twin, single = BalanceTwin(exact), Observation(*(part[0].double() for part in frame))
+    twin, single = BalanceTwin(exact), Observation(*(None if part is None else part[0].double() for part in frame))
     gap = np.abs(twin(single)[0] - estimator(frame).vertices[0].numpy()).max()
     functions, batches = {"scipy twin, cold": partial(twin, single)}, {}
     for batch in args.batches:
-        frames = Observation(*(part.expand(batch, *part.shape[1:]).contiguous() for part in frame))
+        frames = Observation(*(None if part is None else part.expand(batch, *part.shape[1:]).contiguous() for part in frame))
         found = estimator(frames)
-        start = found.vertices, found.pressure, found.moved
+        start = found.vertices, found.pressure, found.moved, torch.ones(batch, dtype=torch.bool)
         functions[f"batch {batch}, cold"] = partial(estimator, frames)
         functions[f"batch {batch}, warm"] = partial(estimator, frames, start)
         batches |= {f"batch {batch}, cold": batch, f"batch {batch}, warm": batch}
