@@ -47,6 +47,7 @@ class BalanceTwin:
             surface, pressure = self.coarse(observation)
             still = torch.zeros(1, 4).double()
             x, pressure, _ = e.refined(torch.from_numpy(surface)[None], torch.tensor([pressure]).double(), still)
+        self.weights = None
         for tau, outlier in e.schedule():
             x, pressure = self.step(x, pressure, measured, tau, outlier)
         return x[0].numpy(), float(pressure)
@@ -55,9 +56,9 @@ class BalanceTwin:
         e, free, count = self.estimator, self.free, self.count
         forces, bearings, loss = e.equations.forces, e.equations.bearings, e.equations.loss
         force, normals = forces(x, pressure), e.membrane.normals(x)
-        inner_weights = loss.weights(
-            *(inner(field, e.membrane.grid).mT for field in (normals, force)), measured.noise_level, tau
-        )
+        within = (inner(field, e.membrane.grid).mT for field in (normals, force))
+        memory = None if self.weights is None else (self.weights, e.settings.renewal)
+        inner_weights, self.weights = loss.reweighted(*within, measured.noise_level, tau, memory=memory)
         weights = pad_border(inner_weights.flatten(1, 2).mT, e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
         blocks = e.elasticity.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)
         angle, jacobian = bearings.angles(x, measured, torch.zeros(1, 4).double())

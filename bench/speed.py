@@ -5,7 +5,7 @@ python bench/speed.py [--sensor examples/sensor.toml] [--image examples/two_cont
 The paper: its estimator with the soft locator, stage by stage, and `paper_twin` of its solve. Minimum energy: the twin of the
 harmonic problem (linear triangles, volume linearised once, eq. 22) is as one would write it for one frame, sparse assembly and
 factorisation by scipy; that of the sensor's material with an exact volume, `energy_twin`, makes the same steps. Force balance
-(17 x 17): cold from rest and warm from the solution, beside `balance_twin`, which makes the same steps. Paper, force balance
+(17 x 17): beside `balance_twin`, which makes the same steps. Paper, force balance
 and solves alone: processor time, the least of several turns, taken in turn, as other programs may share the cores. How accurate
 the 17 x 17 grid is: `ablation.py`, its base row. With 2000000000 as the environment's MALLOC_TRIM_THRESHOLD_ and
 MALLOC_MMAP_THRESHOLD_ glibc keeps freed memory: a quarter less time in batches.
@@ -154,16 +154,12 @@ def force_balance(args):
     functions, batches = {"scipy twin, cold": partial(twin, single)}, {}
     for batch in args.batches:
         frames = Observation(*(None if part is None else part.expand(batch, *part.shape[1:]).contiguous() for part in frame))
-        found = estimator(frames)
-        start = found.vertices, found.pressure, found.moved, torch.ones(batch, dtype=torch.bool)
         functions[f"batch {batch}, cold"] = partial(estimator, frames)
-        functions[f"batch {batch}, warm"] = partial(estimator, frames, start)
-        batches |= {f"batch {batch}, cold": batch, f"batch {batch}, warm": batch}
+        batches[f"batch {batch}, cold"] = batch
         if args.compiled:
             compiled = torch.compile(estimator, fullgraph=True)
             functions[f"batch {batch}, compiled, cold"] = partial(compiled, frames)
-            functions[f"batch {batch}, compiled, warm"] = partial(compiled, frames, start)
-            batches |= {f"batch {batch}, compiled, cold": batch, f"batch {batch}, compiled, warm": batch}
+            batches[f"batch {batch}, compiled, cold"] = batch
     times = {name: value / batches.get(name, 1) for name, value in least_milliseconds(functions, 5).items()}
     for name, value in times.items():
         ratio = value / times["scipy twin, cold"]

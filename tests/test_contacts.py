@@ -11,7 +11,7 @@ from torchmembrane.estimators.contact_patches import ContactPatches
 from torchmembrane.estimators.settings import ForceBalanceSettings
 from torchmembrane.estimators.traction_loss import TractionLoss
 from torchmembrane.io.results import ADDED, Reconstruction, completed
-from torchmembrane.markers.coverage import Coverage
+from torchmembrane.markers.coverage import Coverage, facings
 from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
 from torchmembrane.simulate.appearance import Appearance
@@ -216,6 +216,34 @@ def test_traction_splits_into_push_and_shear(pressed):
     push, shear = got.split_traction()
     torch.testing.assert_close(shear - push[..., None] * got.normals, got.traction)
     assert (shear * got.normals).sum(-1).abs().max() < 1e-5 * got.traction.abs().max()
+
+
+def test_a_marker_faces_the_camera_by_the_cosine_between_its_normal_and_its_ray():
+    normal = torch.tensor([[0.0, 0.6, 0.8], [0.0, 0.0, 3.0], [0.0, 2.0, -1.0]])
+    point, origin = torch.tensor([[1.0, 2.0, 9.0]]).expand(3, 3), torch.tensor([[[1.0, 2.0, 4.0]]]).expand(1, 3, 3)
+    torch.testing.assert_close(facings(point, normal, origin), torch.tensor([[0.8, 1.0, -(5**-0.5)]]))
+
+
+def test_markers_that_the_press_turns_away_are_not_hidden(fingertip):
+    """Of a dent whose walls are seen at a grazing angle: lost markers on the walls are its doing, as many others are not."""
+    reconstructor = fingertip[1]
+    net, rest = reconstructor.estimator, reconstructor.estimator.membrane.rest
+    off2 = (rest - rest[rest[:, 2].argmax()]).square().sum(-1) / net.size**2
+    dent = 1.4 * net.size * torch.exp(-off2 / 0.08)[:, None] * net.membrane.rest_normals * ~net.membrane.fixed[:, None]
+    x, (_, pressure, moved) = (rest - dent)[None], net.at_rest(torch.ones(1, len(reconstructor.rest_markers)))
+    seen = torch.ones(1, len(reconstructor.rest_markers))
+    observation = reconstructor.observation(torch.zeros(1, seen.shape[1], 2), seen)
+    found = net.equilibrium(x, pressure, moved, x, net.equations.bearings.measured(observation))
+    found = found._replace(volume=net.membrane.rest_volume[None], misfit=0 * pressure, objective=0 * pressure)
+    markers = reconstructor.rest_markers + reconstructor.marker_shares @ (x - rest)
+    facing = facings(markers, reconstructor.marker_shares @ net.membrane.normals(x), observation.origins)
+    walls, number = facing < 0.4, int((facing < 0.4).sum())
+    others = torch.zeros_like(walls)
+    others[0, facing[0].argsort(descending=True)[:number]] = True
+    for lost, status in ((walls, Status.OK), (others, Status.HIDDEN)):
+        confidence = torch.where(lost, 0.0, seen)
+        told = reconstructor.result(found, observation, torch.zeros(1, seen.shape[1], 2), confidence, torch.zeros(1))
+        assert int(told.status) == status and float(told.coverage) < 0.85
 
 
 def test_a_hidden_part_is_said(fingertip, pressed):

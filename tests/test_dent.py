@@ -115,17 +115,15 @@ def test_a_pit_in_a_slack_bubble_is_not_taken_for_a_mound(bubble):
     assert without > 0.3
 
 
-def test_a_tracked_frame_leaves_the_mound_of_the_frame_before(bubble):
-    """For what is as right as from rest; without another dent it stays there."""
+def test_a_tracked_frame_does_not_hang_on_the_mound_of_the_frame_before(bubble):
     sensor, truth = bubble
     reconstructor = tm.Reconstructor(sensor, check_rest=False)
+    alone = solved(reconstructor, truth)
     dent, reconstructor.estimator.dent = reconstructor.estimator.dent, None
     mound = solved(reconstructor, truth)
-    stays, _ = errors(solved(reconstructor, truth, mound), truth)
     reconstructor.estimator.dent = dent
-    surface, force = errors(solved(reconstructor, truth, mound), truth)
-    assert stays > 0.3
-    assert surface < 0.15 and force < 0.1
+    assert errors(mound, truth)[0] > 0.3
+    torch.testing.assert_close(solved(reconstructor, truth, mound).vertices, alone.vertices, rtol=0, atol=0)
 
 
 def test_a_deep_press_is_found_from_a_deep_dent():
@@ -139,10 +137,11 @@ def test_a_deep_press_is_found_from_a_deep_dent():
     dent.deep = dent.wide = dent.forward
     without, _ = errors(solved(reconstructor, truth), truth)
     assert without > 0.5
+    followed, _ = errors(solved(reconstructor, truth, found), truth)  # the frame before is one more start of the second try
+    assert followed < 0.1
 
 
-@pytest.mark.parametrize("choice", ["lower", "much_lower"])
-def test_a_dent_is_kept_only_where_its_objective_is_lower(estimator, choice):
+def test_a_dent_is_kept_only_where_its_objective_is_lower(estimator):
     """Row by row; a step that broke down is never taken."""
     blown = estimator.membrane.rest_normals * estimator.equations.forces.free
     x = torch.stack([estimator.membrane.rest + depth * blown for depth in (0.0, 0.1, 0.2, 0.1)])
@@ -151,5 +150,5 @@ def test_a_dent_is_kept_only_where_its_objective_is_lower(estimator, choice):
     measured = estimator.equations.bearings.measured(Observation(torch.zeros_like(rays), rays, torch.ones_like(rays[..., 0])))
     other = x[[1, 0, 0, 0]].clone()
     other[3] = torch.nan
-    taken, *_ = getattr(estimator.dent, choice)((x, pressure, moved, x), (other, pressure, moved, other), measured)
+    taken, *_ = estimator.dent.lower((x, pressure, moved, x), (other, pressure, moved, other), measured)
     torch.testing.assert_close(taken, torch.stack([x[0], other[1], other[2], x[3]]))

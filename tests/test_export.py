@@ -39,7 +39,7 @@ def images(small_images):
 def reconstructor(small_sensor):
     """With a coarser grid, which only finer ones than this would have; so coarse the default does not settle beside lost
     markers."""
-    settings = ForceBalanceSettings(coarsest=5, coarsest_warm=5, fine_steps=24)
+    settings = ForceBalanceSettings(coarsest=5, fine_steps=24)
     made = Reconstructor.from_file(small_sensor / "sensor.toml", settings=settings)
     assert made.estimator.coarse.membrane.grid == (5, 5)
     return made

@@ -10,6 +10,7 @@ from test_force_balance import ONE, SETTINGS, along_y, at_rest, make, seen
 from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.bearings import marker_rays
+from torchmembrane.estimators.descent import Scales
 from torchmembrane.markers.noise import pixel_noise
 from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
@@ -78,7 +79,6 @@ def test_nothing_is_a_push_that_the_noise_makes_by_itself():
 def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
     """One undamped quadratic step from rest for a small error of every marker in either direction; their squares add up."""
     estimator, small = make(13, **options), 1e-4
-    estimator.descent.settings = replace(estimator.descent.settings, damping=0.0)
     bearings, loss = estimator.equations.bearings, estimator.equations.loss
     true = torch.nn.functional.normalize(bearings.positions, dim=-1)
     unit = bearings.measured(seen(torch.zeros_like(true), true)).across[0].movedim(-1, 0) * bearings.noise  # [D, 2, 3]
@@ -88,8 +88,9 @@ def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
     rays = torch.nn.functional.normalize(true + small * turn.flatten(0, 1), dim=-1)
     measured = bearings.measured(seen(torch.zeros_like(rays), rays))
     state = estimator.at_rest(torch.ones(2 * D, 1, dtype=torch.float64))
-    infinite = torch.tensor(torch.inf, dtype=torch.float64)
-    (x, pressure, moved), _ = estimator.descent.step(state, measured, infinite, infinite, torch.tensor(SETTINGS.cone))
+    scales = Scales(*torch.tensor((torch.inf, torch.inf, SETTINGS.cone, 1.0, 0.0), dtype=torch.float64))
+    unweighted = torch.ones(1, len(estimator.equations.loss.area), dtype=torch.float64)
+    (x, pressure, moved), *_ = estimator.descent.step(state, unweighted, measured, scales)
     traction = estimator.equilibrium(x, pressure, moved, x, measured).traction
     _, normal = at_rest(estimator)
     push = (inner(traction, estimator.membrane.grid) * normal).sum(-1) / estimator.reference / small

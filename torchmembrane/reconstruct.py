@@ -21,7 +21,7 @@ from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
 from .io.status import Status
-from .markers.coverage import Coverage
+from .markers.coverage import LEAST_COVERAGE, TURNED_AWAY, Coverage, facings
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
 from .markers.placement import imaged_vertices, place_markers
 from .pieces import piece, unrecorded
@@ -31,7 +31,6 @@ from .surface.bicubic import bicubic_shares
 
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
 LEAST_ERROR = 0.02  # px
-LEAST_COVERAGE = 0.85  # less of what the markers see at rest is a part hidden
 
 
 class Reconstructor(nn.Module):
@@ -160,7 +159,8 @@ class Reconstructor(nn.Module):
         Args:
             images: torch or numpy, uint8, uint16 or float in 0..1: `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or
                 `[B, H, W, 1 | 3]`. Grey is 0.299 R + 0.587 G + 0.114 B.
-            previous: results of the frames before, to start from (force balance): a few steps then do.
+            previous: results of the frames before (force balance): where markers are looked for, and one more start of
+                what has to be solved again.
             rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: in the sensor's rest image.
             pressure: `[B]` or a number, difference across the membrane that a gauge reads, unit as of the result's, NaN where
                 none is (force balance; `pressure_noise` in its settings). Of a change since rest, add `rest_pressure`.
@@ -227,13 +227,12 @@ class Reconstructor(nn.Module):
         return self.result(found, observation, flow.displacement, confidence, status)
 
     @piece
-    def start(self, vertices: Tensor, pressure: Tensor, camera_motion: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def start(self, vertices: Tensor, pressure: Tensor, camera_motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Vertices `[B, V, 3]`, pressure `[B]` and the camera's motion `[B, 4]` of the frames before, those of rest where there
-        are none (NaN), and `[B]` bool: where there are some."""
-        known = vertices.flatten(1).isfinite().all(1) & pressure.isfinite()
+        are none (NaN)."""
         vertices = torch.where(vertices.isfinite(), vertices, self.estimator.membrane.rest)
         pressure = torch.where(pressure.isfinite(), pressure, self.estimator.rest_pressure)
-        return vertices, pressure, in_pixels(camera_motion, self.image_size).nan_to_num(), known
+        return vertices, pressure, in_pixels(camera_motion, self.image_size).nan_to_num()
 
     @piece
     def observation(self, displacement: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
@@ -257,9 +256,13 @@ class Reconstructor(nn.Module):
         pixels = self.rest_pixels + displacement
         modelled = self.camera.point_to_pixel(markers) + shift_of(found.moved, pixels, self.image_size)
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))
-        coverage, broken = self.coverage(confidence), ~x.flatten(1).isfinite().all(1)
-        gone, status = (status != Status.OK.value) | broken, self._judged(status, found, coverage, broken)
-        normals = membrane.normals(x)
+        normals, broken = membrane.normals(x), ~x.flatten(1).isfinite().all(1)
+        facing, at_rest = (
+            facings(point, self.marker_shares @ normal, observation.origins)
+            for point, normal in ((markers, normals), (self.rest_markers, membrane.rest_normals))
+        )
+        in_view = self.coverage(torch.where(facing < TURNED_AWAY * at_rest, 1.0, confidence))
+        gone, status = (status != Status.OK.value) | broken, self._judged(status, found, in_view, broken)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
         deviations = self.estimator.deviations(found, observation, contacts)
         wrench = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1)
@@ -276,7 +279,7 @@ class Reconstructor(nn.Module):
             volume_error=self.estimator.cavity.volume_error(found.volume, found.pressure),
             residual=(miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt(),
             wrench=wrench,
-            coverage=coverage,
+            coverage=self.coverage(confidence),
             camera_motion=in_words(found.moved, self.image_size),
             force_deviation=deviations.force,
             depth_deviation=deviations.depth,
@@ -335,7 +338,7 @@ class Reconstructor(nn.Module):
         noise = torch.linalg.cholesky(2 * self.observer.rest_covariance).mT @ turn
         observation = self._gauged(self.observation(pixels - self.rest_pixels, result.confidence), pressure)
         state = result.vertices, result.pressure, result.camera_motion
-        found = self.estimator.standard_deviations(*self.start(*state)[:3], observation, noise)
+        found = self.estimator.standard_deviations(*self.start(*state), observation, noise)
         return found.known(result.vertices.flatten(1).isfinite().all(1))
 
     def _checked(self, previous: Reconstruction | None, frames: int) -> Reconstruction | None:

@@ -1,4 +1,4 @@
-"""One stream of images: every frame starts from the one before, and a rest state that has aged is noticed."""
+"""One stream of images: every frame is followed from the one before, and a rest state that has aged is noticed."""
 
 import warnings
 
@@ -22,8 +22,9 @@ LARGEST_STEADY = 0.3
 class Tracker:
     """Reconstructs the frames of one camera one after another.
 
-    A frame starts from the solution of the frame before, which takes a few steps only; after a frame without a surface the next
-    one starts from rest. Estimators that start from rest always are given nothing.
+    Markers are looked for where the frame before had them, and where a frame has to be solved again, the solution of the frame
+    before is one more start. All else is as for a frame alone, and so are its answers: they do not hang on where a stream
+    began. After a frame without a surface the next one is alone; so is every frame of an estimator that takes no start.
 
     Frames without contact tell whether the markers still rest where the rest image has them. When they do not, beyond chance,
     for temperature, creep, swelling, another pressure or a moved camera, the tracker warns once, with the remedy, `rezero`. A

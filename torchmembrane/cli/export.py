@@ -27,7 +27,7 @@ def add_parser(commands: Any) -> None:
     add_sensor(add)
     add("-o", "--out", metavar="MODEL.onnx", type=Path, required=True, help="the model's file")
     add_estimator(add, "as for reconstruct (default: triangle)")
-    add("--tracking", action="store_true", help="start from the frame before, given with the image (force balance)")
+    add("--tracking", action="store_true", help="follow the dots of the frame before, given with the image (force balance)")
 
 
 def run(arguments: Namespace) -> int:

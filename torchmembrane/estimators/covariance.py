@@ -86,7 +86,7 @@ def linearise(
         play: of the camera, px, as for `CameraMotion.held`.
         curvature: as for `TractionLoss.weights`.
     """
-    at, normal, loads, corner, motion = equations.linearised(*state, measured, *scales, curvature=curvature)
+    at, normal, loads, corner, motion, _ = equations.linearised(*state, measured, *scales, curvature=curvature)
     vWv = pulled(corner, measured.gauge, state.pressure - cavity.rest_pressure)[1]
     factor, membrane = equations.system.factor(equations.matrix(normal)), equations.forces.membrane
     compliance = cavity.condition(membrane.volume(state.x) - membrane.rest_volume, state.pressure)[1]

@@ -15,12 +15,10 @@ from .descent import Descent, State
 
 DEPTH = 0.05  # over the surface's size
 WIDTH = 0.1  # standard deviation, over the size
-STEEP = (0.08, 0.06)  # depth and width of one that leaves a mound
 DEEP, WIDE = (0.16, 0.08), (0.25, 0.15)  # depth and width of those for a press that the first does not find
 REACH = 0.25  # of the surroundings whose pushes have one middle, over the size
 FAINT = 1.0  # of the push that the markers' noise makes: less hardly dents
 LOWER = 0.9  # objective over another's of which it is taken
-MUCH_LOWER = 0.8  # the same of a tracked frame's, which ought not to jump
 TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle of none finite
 
 Schedule = list[tuple[float, float]]
@@ -54,11 +52,6 @@ class Dent(nn.Module):
         return self._dented(x, pressure, moved, measured, DEPTH, WIDTH)
 
     @piece
-    def steep(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
-        """The state, dented steeply."""
-        return self._dented(x, pressure, moved, measured, *STEEP)
-
-    @piece
     def deep(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
         """The state, dented deeper."""
         return self._dented(x, pressure, moved, measured, *DEEP)
@@ -79,27 +72,24 @@ class Dent(nn.Module):
         inwards = depth * membrane.size * share * torch.exp(-off2 / (2 * width**2)) * self.free
         return State(x - inwards[..., None] * membrane.normals(x), pressure, moved)
 
-    def again(self, state: State, before: Tensor, measured: Bearings, schedule: Schedule) -> Found:
-        """The state and the surface a step before it, or those after the steps of a schedule from a steep dent in it
-        where these have a much lower objective: a state that was taken over may be in a mound."""
-        dented, last = self.descent(self.steep(*state, measured), measured, schedule)
-        *kept, before = self.much_lower((*state, before), (*dented, last), measured)
-        return State(*kept), before
-
-    def sought(self, quick: State, slow: State, rest: State, measured: Bearings, schedule: Schedule) -> Found:
-        """The best of what the steps of a schedule make of several dents in two states, and of two states found from `rest` on
-        this grid, and the surface a step before; the first of those that are about as good, for answers must not jump between
-        them. The two from rest: by a sharp loss from the start, and without a cone, where shear is dear even under a push."""
+    def sought(
+        self, quick: State, slow: State, rest: State, start: State | None, measured: Bearings, schedule: Schedule
+    ) -> Found:
+        """The best of what the steps of a schedule make of several dents in two states, of two states found from `rest` on this
+        grid, and of a `start`, and the surface a step before; the first of those that are about as good, for answers must not
+        jump between them. The two from rest: by a sharp loss from the start, and without a cone, where shear is dear even under
+        a push."""
         settings = self.descent.settings
         steps = 2 * settings.steps
-        starts = (
+        starts = [
             self(*slow, measured),
             self.deep(*slow, measured),
             self.wide(*slow, measured),
             self.deep(*quick, measured),
             self.descent(rest, measured, settings.gnc_schedule(steps, settings.sharp_tau))[0],
             self.descent(rest, measured, settings.gnc_schedule(steps, settings.tau), cone=0.0)[0],
-        )
+        ]
+        starts += [] if start is None else [start]
         found: list[Found] = [self.descent(start, measured, schedule) for start in starts]
         best: Stepped = (*found[0][0], found[0][1])
         for state, before in found[1:]:
@@ -107,19 +97,11 @@ class Dent(nn.Module):
         return State(*best[:3]), best[3]
 
     @piece
-    def lower(self, kept: Stepped, dented: Stepped, measured: Bearings) -> Stepped:
-        """`dented` in the rows where its objective is lower than that of `kept`, or `kept` has none."""
-        return self._taken(kept, dented, measured, LOWER)
-
-    @piece
-    def much_lower(self, kept: Stepped, dented: Stepped, measured: Bearings) -> Stepped:
-        """The same where it is much lower."""
-        return self._taken(kept, dented, measured, MUCH_LOWER)
-
-    def _taken(self, kept: Stepped, dented: Stepped, measured: Bearings, share: float) -> Stepped:
-        objective, other = (
-            self.descent.objective(State(*each[:3]), *self.descent.tractions(*each[:2]), measured) for each in (kept, dented)
+    def lower(self, kept: Stepped, other: Stepped, measured: Bearings) -> Stepped:
+        """`other` in the rows where its objective is lower than that of `kept`, or `kept` has none."""
+        of_kept, of_other = (
+            self.descent.objective(State(*each[:3]), *self.descent.tractions(*each[:2]), measured) for each in (kept, other)
         )
-        is_lower = other < torch.where(objective.isnan(), torch.inf, share * objective)
-        x, pressure, moved, before = rowwise(is_lower, dented, kept)
+        is_lower = of_other < torch.where(of_kept.isnan(), torch.inf, LOWER * of_kept)
+        x, pressure, moved, before = rowwise(is_lower, other, kept)
         return x, pressure, moved, before

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from ..mechanics.cavity import CavityLaw
 from ..pieces import in_parts, piece, repeated
-from ..solve.conjugate_gradient import conjugate_gradient
 from ..solve.implicit import differentiable
 from ..solve.kkt import border_unknowns
 from ..surface.stencil import inner
@@ -20,7 +19,6 @@ from .pressure_gauge import gauge_loss, pulled
 from .robust import Cauchy
 from .settings import ForceBalanceSettings
 
-Factor = tuple[Tensor, ...]
 VERTICES = 9000
 """Of a batch's surfaces that are worked on at a time: what a step makes of more does not stay in a processor's cache."""
 
@@ -31,6 +29,17 @@ class State(NamedTuple):
     x: Tensor
     pressure: Tensor
     moved: Tensor
+
+
+class Scales(NamedTuple):
+    """Numbers of a step, `[]` each: the scales `tau` of the compressive traction's loss and `outlier` of the markers'; `cone`
+    and `renewal` as for `TractionLoss.reweighted`, and `damping`, the share of the matrix' diagonal that is added to it."""
+
+    tau: Tensor
+    outlier: Tensor
+    cone: Tensor
+    renewal: Tensor
+    damping: Tensor
 
 
 class Descent(nn.Module):
@@ -53,26 +62,38 @@ class Descent(nn.Module):
         state: State,
         measured: Bearings,
         schedule: list[tuple[float, float]],
-        one_factor: bool = False,
         cone: float | None = None,
+        settling: int = 1,
     ) -> tuple[State, Tensor]:
-        """The state after the steps of a schedule, and the surface before the last; `one_factor`: all with the factor of the
-        first step; `cone`: as for `TractionLoss.weights`."""
+        """The state after the steps of a schedule, and the surface before the last; `cone`: as for `TractionLoss.weights`;
+        `settling`: so many steps, the last ones, are damped to settle."""
         frames = max(1, VERTICES // self.membrane.rest.shape[0])
-        rows = [(*scales, self.equations.loss.cone if cone is None else cone) for scales in schedule]
-        x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows, one_factor)
+        cone = self.equations.loss.cone if cone is None else cone
+        rows = [
+            (*scales, cone, *self._numbers(k, len(schedule) - k <= settling, scales[0])) for k, scales in enumerate(schedule)
+        ]
+        x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows)
         return State(x, pressure, moved), before
 
+    def _numbers(self, done: int, settles: bool, tau: float) -> tuple[float, float]:
+        """The renewal and the damping of a step after so many others."""
+        settings, (first, last) = self.settings, self.settings.tau
+        damping = settings.damping * (min(tau, first) / last) ** 2
+        if settles and done > 0:
+            damping = max(damping, settings.settling_damping)
+        return settings.renewal if done > 0 else 1.0, damping
+
     def _stepped(self, x: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The state after the steps, and the surface before the last; `given`: what is measured, the steps' scales,
-        `one_factor`."""
-        *of_markers, rows, one_factor = given
-        measured, before, factor = Bearings(*of_markers), x, None
-        if one_factor:
-            x, pressure, moved, before, factor = self._first(x, pressure, moved, measured, *rows[0])
-            rows = rows[1:]
-        x, pressure, moved, before = repeated(self._next, rows, (x, pressure, moved, before), measured, factor)
+        """The state after the steps, and the surface before the last; `given`: what is measured, the steps' scales."""
+        *of_markers, rows = given
+        state = x, pressure, moved, x, self._unweighted(x)
+        x, pressure, moved, before, _ = repeated(self._next, rows, state, Bearings(*of_markers))
         return x, pressure, moved, before
+
+    @piece
+    def _unweighted(self, x: Tensor) -> Tensor:
+        """What the first step has for the weights of a step before, `[B, N]`, and does not ask."""
+        return torch.ones_like(x[:, : self.equations.loss.area.shape[0], 0])
 
     def objective(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
@@ -88,66 +109,55 @@ class Descent(nn.Module):
         return inner(traction, self.membrane.grid).mT, inner(self.membrane.normals(x), self.membrane.grid).mT
 
     @piece
-    def _first(
-        self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings, *scales: float
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Factor | None]:
-        """The state, the surface before; the factor of the step's matrix."""
-        state, factor = self._traced_once(State(x, pressure, moved), measured, scales, None, keeps=True)
-        return *state, x, factor
-
-    @piece
     def _next(
         self,
         x: Tensor,
         pressure: Tensor,
         moved: Tensor,
         before: Tensor,
+        weights: Tensor,
         measured: Bearings,
-        factor: Factor | None,
         *scales: float,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The state, and the surface before."""
-        state, _ = self._traced_once(State(x, pressure, moved), measured, scales, factor)
-        return *state, x
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The state, the surface before, and the weights of normal tractions."""
+        state, weights = self._traced_once(State(x, pressure, moved), weights, measured, scales)
+        return *state, x, weights
 
-    def _traced_once(
-        self, state: State, measured: Bearings, scales: Sequence[float], factor: Factor | None, keeps: bool = False
-    ) -> tuple[State, Factor | None]:
+    def _traced_once(self, state: State, weights: Tensor, measured: Bearings, scales: Sequence[float]) -> tuple[State, Tensor]:
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.
 
         With gradients every step is: those of a nested region come with strides that torch 2.13 does not follow."""
-        tau, outlier, cone = (torch.as_tensor(scale, dtype=state.x.dtype, device=state.x.device) for scale in scales)
+        numbers = Scales(*(torch.as_tensor(scale, dtype=state.x.dtype, device=state.x.device) for scale in scales))
         unrolled = torch.compiler.is_exporting() or torch.is_grad_enabled()
         step = self.step if unrolled else self._compiled_once
-        taken: tuple[State, Factor | None] = step(state, measured, tau, outlier, cone, factor, keeps)
+        taken: tuple[State, Tensor] = step(state, weights, measured, numbers)
         return taken
 
     @torch.compiler.nested_compile_region
-    def _compiled_once(
-        self, state: State, measured: Bearings, tau: Tensor, outlier: Tensor, cone: Tensor, factor: Factor | None, keeps: bool
-    ) -> tuple[State, Factor | None]:
-        return self.step(state, measured, tau, outlier, cone, factor, keeps)
+    def _compiled_once(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
+        return self.step(state, weights, measured, scales)
 
-    def step(
-        self,
-        state: State,
-        measured: Bearings,
-        tau: Tensor,
-        outlier: Tensor,
-        cone: Tensor,
-        factor: Factor | None = None,
-        keeps: bool = False,
-    ) -> tuple[State, Factor | None]:
+    def step(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
         """One reweighted Gauss-Newton step, the volume linearised, the longest vertex step capped.
 
-        Also returns the factor of its matrix if it `keeps` it: with the `factor` of a step near this one it makes none.
+        Args:
+            state: before the step.
+            weights: of the normal tractions in the step before, `[B, N]`.
+            measured: the markers' rays.
+            scales: of the losses, and the step's other numbers.
+
+        Returns:
+            The state and the weights after it.
         """
+        tau, outlier, cone, renewal, damping = scales
         equations, (x, pressure, moved) = self.equations, state
-        _, normal, loads, corner, motion = equations.linearised(*state, measured, tau, outlier, cone)
+        _, normal, loads, corner, motion, weights = equations.linearised(
+            *state, measured, tau, outlier, cone, memory=(weights, renewal)
+        )
         loads = torch.cat([loads, motion.coupling], 1)
         first, last = self.settings.tau
         blunt = (tau.clamp_max(first) / last) ** 2  # 1 as tau ends
-        made, solved = self._solved(normal, loads, self.settings.damping * blunt, factor, keeps)
+        solved = self._solved(normal, loads, damping)
         motion = motion.held(moved, self.settings.camera_motion * blunt)
         products, following = motion.eliminated(loads @ solved.mT)
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
@@ -156,34 +166,16 @@ class Descent(nn.Module):
         move = F.pad(-(torch.cat([shares, turn], 1)[:, None] @ solved).unflatten(-1, (3, *self.inner_grid))[:, 0], (1, 1, 1, 1))
         share = self._share(x, move)
         x = x + share[:, None, None] * move.flatten(2).mT
-        return State(x, pressure + share * shares[:, 2], moved + share[:, None] * turn), made
+        return State(x, pressure + share * shares[:, 2], moved + share[:, None] * turn), weights
 
-    def _solved(
-        self, normal: NormalEquations, loads: Tensor, damping: Tensor, factor: Factor | None, keeps: bool
-    ) -> tuple[Factor | None, Tensor]:
-        """The factor, of what is damped, if it is kept, and the solutions `[B, C, 3 N]`.
-
-        Gradients of a factor that is not kept take what it solves, not how it was made.
-        """
+    def _solved(self, normal: NormalEquations, loads: Tensor, damping: Tensor) -> Tensor:
+        """The solutions `[B, C, 3 N]` of the equations, damped; gradients take what was solved, not how."""
         equations = self.equations
-        if factor is not None:
-            return None, self._conjugated(normal, factor, loads)
-        if keeps or torch.compiler.is_compiling():
-            made = self._factor(normal, damping)
-            return equations.system.by_frame(made) if keeps else None, equations.system.substitute(made, loads)
+        if torch.compiler.is_compiling():
+            return equations.system.substitute(equations.system.factor(equations.matrix(normal, damping)), loads)
         with torch.no_grad():
-            substitute = partial(equations.system.substitute, self._factor(normal, damping))
-        return None, differentiable(substitute, partial(equations.product, normal, damping=damping), loads)
-
-    def _factor(self, normal: NormalEquations, damping: Tensor) -> Factor:
-        return self.equations.system.factor(self.equations.matrix(normal, damping))
-
-    def _conjugated(self, normal: NormalEquations, factor: Factor, loads: Tensor) -> Tensor:
-        """Solutions with the factor of equations near these."""
-        equations, steps = self.equations, self.settings.conjugate_steps
-        factor = equations.system.in_pairs(factor)
-        product, precondition = partial(equations.product, normal), partial(equations.system.substitute, factor)
-        return conjugate_gradient(product, precondition, loads, steps)
+            substitute = partial(equations.system.substitute, equations.system.factor(equations.matrix(normal, damping)))
+        return differentiable(substitute, partial(equations.product, normal, damping=damping), loads)
 
     def _shares(self, x: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:
         """Shares `[B, 3]` in a step, but for its sign, of what solves the volume's row, the loads and the pressure's row: the

@@ -16,11 +16,10 @@ neighbourhood of radius `reach` (contacts are patches), and the weights of the s
 
 Iteratively reweighted least squares (IRLS) by Gauss-Newton steps, while `tau` declines from where everything is quadratic
 (graduated non-convexity, GNC): no start but the rest surface is needed. A fine grid starts from the solution on every second of
-its lines, and so on: few vertices find the basin, and a `Dent` where something pushes. From the previous frame's solution
-one factor serves all steps, by two conjugate-gradient steps each; a dent is tried again, and kept if its objective is lower.
+its lines, and so on: few vertices find the basin, and a `Dent` where something pushes. What has not settled is solved again, by
+more steps from several starts, the previous frame's solution among them: a stream's answers are those of its frames alone.
 """
 
-from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -111,8 +110,6 @@ class ForceBalance(nn.Module):
         self.patches = ContactPatches(membrane, self.spacing)
         first = settings.coarse_steps if is_coarse else settings.steps
         self.steps = first if self.coarse is None else settings.finer_steps if self.dent is None else settings.fine_steps
-        passes = self.coarse is not None and (self.dent is None or min(self.coarse.membrane.grid) >= settings.coarsest_warm)
-        self.passes_on_starts = passes
         rest = seen_from_origin(bearings.positions) if rest is None else rest
         loss.push_noise = push_noise(self.equations, self.cavity, rest, settings.camera_motion)
 
@@ -181,16 +178,16 @@ class ForceBalance(nn.Module):
 
     def forward(self, observation: Observation, start: tuple[Tensor, ...] | None = None) -> Equilibrium:
         """The surface that the markers' rays show; `start`: vertices, pressure and the camera's motion near it, such as the
-        previous frame's, and the rows `[B]` that have one: few steps do not do from rest."""
+        previous frame's, for what has to be solved again."""
         measured = self.equations.bearings.measured(observation)
-        found = self._solved(measured, None if start is None else State(*start[:3]))
-        if start is not None:
-            found = Equilibrium(*mended(start[3], found, self._from_rest, measured))
-        patiently = partial(self._from_rest, patient=True)
-        return Equilibrium(*mended(self.is_done(found, measured), found, patiently, measured, self.chosen))
+        found, given = self._solved(measured), (*(start or ()), *measured)
+        return Equilibrium(*mended(self.is_done(found, measured), found, self._patiently, given, self.chosen))
 
-    def _from_rest(self, *measured: Any, patient: bool = False) -> Equilibrium:  # in many small steps: deep presses need them
-        return self._solved(Bearings(*measured), None, patient)
+    def _patiently(self, *given: Any) -> Equilibrium:
+        """From rest in many small steps: deep presses need them; `given`: a start, where there is one, and what is measured."""
+        measured = Bearings(*given[-len(Bearings._fields) :])
+        start = given[: -len(Bearings._fields)]
+        return self._solved(measured, patient=True, start=State(*start) if start else None)
 
     @piece
     def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
@@ -200,45 +197,40 @@ class ForceBalance(nn.Module):
         stands = self.is_converged(first) & self.is_explained(first) & is_worse
         return Equilibrium(*rowwise(done | stands | second.objective.isnan(), first, second))
 
-    def _solved(self, measured: Bearings, start: State | None, patient: bool = False) -> Equilibrium:
-        state, before = self._stepped(measured, start, patient)
+    def _solved(self, measured: Bearings, patient: bool = False, start: State | None = None) -> Equilibrium:
+        state, before = self._stepped(measured, patient, start)
         return self.equilibrium(*state, before, measured)
 
-    def _stepped(self, measured: Bearings, start: State | None, patient: bool) -> tuple[State, Tensor]:
+    def _stepped(self, measured: Bearings, patient: bool, start: State | None = None) -> tuple[State, Tensor]:
         """The state after all steps, on coarser grids too, and the surface before the last."""
-        warm = start is not None and not self.passes_on_starts
-        schedule = self.schedule(warm, patient)
+        schedule = self.schedule(patient)
         last = schedule[-1:] * len(schedule)
         found: tuple[State, Tensor]
-        if start is not None and warm:
-            found = self.descent(start, measured, schedule, one_factor=True)
-            return found if self.dent is None else self.dent.again(*found, measured, last[1:])
         if self.dent is None:
-            found = self.descent(self._begun(measured, start, patient), measured, schedule)
+            settling = self.settings.settling_steps if patient and self.coarse is not None else 1
+            found = self.descent(self._begun(measured, patient, start), measured, schedule, settling=settling)
         elif patient:
-            quick, slow = (self._undented(measured, start, patient) for patient in (False, True))
-            found = self.dent.sought(quick, slow, self.at_rest(measured.weight), measured, last)
+            quick, slow = (self._undented(measured, patient) for patient in (False, True))
+            found = self.dent.sought(quick, slow, self.at_rest(measured.weight), start, measured, last)
         else:
-            found = self.descent(self.dent(*self._undented(measured, start), measured), measured, last)
+            found = self.descent(self.dent(*self._undented(measured), measured), measured, last)
         return found
 
-    def _begun(self, measured: Bearings, start: State | None, patient: bool) -> State:
+    def _begun(self, measured: Bearings, patient: bool, start: State | None = None) -> State:
         """At what is found on the coarser grid, without one at rest."""
         if self.coarse is None:
             return self.at_rest(measured.weight)
         begun = None if start is None else self.coarsened(*start)
-        return State(*self.refined(*self.coarse._stepped(measured, begun, patient)[0]))
+        return State(*self.refined(*self.coarse._stepped(measured, patient, begun)[0]))
 
-    def _undented(self, measured: Bearings, start: State | None, patient: bool = False) -> State:
+    def _undented(self, measured: Bearings, patient: bool = False) -> State:
         """The state after a first step, whose pushes say where to dent it."""
-        begun, schedule = self._begun(measured, start, patient), self.schedule(patient=patient)
+        begun, schedule = self._begun(measured, patient), self.schedule(patient)
         return State(*self.descent(begun, measured, schedule[:1])[0])
 
-    def schedule(self, warm: bool = False, patient: bool = False) -> list[tuple[float, float]]:
-        """`tau` and `R` of every step on this grid; `warm`: with a start; `patient`: a second time, from rest."""
+    def schedule(self, patient: bool = False) -> list[tuple[float, float]]:
+        """`tau` and `R` of every step on this grid; `patient`: a second time."""
         settings = self.settings
-        if warm and not self.passes_on_starts:
-            return settings.gnc_schedule(settings.warm_steps, settings.warm_tau)
         steps = settings.patience * self.steps if patient else self.steps
         if self.coarse is not None and self.dent is None:
             return [(settings.fine_tau[-1], settings.outlier)] * (steps + patient * settings.settling_steps)
@@ -305,7 +297,9 @@ class ForceBalance(nn.Module):
     def is_explained(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the markers are off their rays by their noise and the model's error alone, by likely tractions."""
         off = found.misfit > self.settings.largest_misfit * self.coarseness
-        return torch.logical_not(off | (found.objective > self.settings.largest_objective * self.coarseness**2))
+        moved = (found.vertices - self.membrane.rest).square().sum(-1).mean(-1).sqrt() / self.size
+        largest = self.settings.largest_objective + self.settings.objective_of_press * moved
+        return torch.logical_not(off | (found.objective > largest * self.coarseness**2))
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes."""

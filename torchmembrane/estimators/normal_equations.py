@@ -14,7 +14,7 @@ from .bearings import Bearings, MarkerBearings
 from .camera_motion import CameraMotion
 from .contact_force import ContactForce, Linearised
 from .robust import Cauchy
-from .traction_loss import TractionLoss
+from .traction_loss import Memory, TractionLoss
 
 
 class NormalEquations(NamedTuple):
@@ -52,15 +52,16 @@ class BalanceEquations(nn.Module):
         outlier: Tensor | float,
         cone: Tensor | float | None = None,
         curvature: bool = False,
-    ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor], CameraMotion]:
-        """The forces, the normal equations, their loads and the camera's motion at a surface; `cone` and `curvature` as for
-        `TractionLoss.weights`."""
+        memory: Memory | None = None,
+    ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor], CameraMotion, Tensor]:
+        """The forces, the normal equations, their loads, the camera's motion and the weights `w_n [B, N]` at a surface; `cone`,
+        `curvature` and `memory` as for `TractionLoss.reweighted`."""
         at = self.forces.linearised(x, pressure)
-        W = self.loss.weights(at.normal, at.force, measured.noise_level, tau, cone, curvature)
+        W, w_n = self.loss.reweighted(at.normal, at.force, measured.noise_level, tau, cone, curvature, memory)
         angle, jacobian = self.bearings.angles(x, measured, moved)
         weight = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
         normal = self.normal_equations(at, W, jacobian, weight)
-        return at, normal, *self.loads(normal, at, angle), self.motion(normal, measured, angle)
+        return at, normal, *self.loads(normal, at, angle), self.motion(normal, measured, angle), w_n
 
     def normal_equations(self, at: Linearised, W: Tensor, jacobian: Tensor, weight: Tensor) -> NormalEquations:
         """Of forces weighted by `W [B, 3, 3, N]` and angles by `weight [B, D]`, with the bearing Jacobian of the angles."""

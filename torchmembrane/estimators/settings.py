@@ -18,11 +18,8 @@ class ForceBalanceSettings:
         coarse_steps: from rest, where a finer grid follows.
         fine_steps: from the coarsest grid's solution.
         finer_steps: from the solution of a grid that is not the coarsest.
-        warm_steps: from the solution of the frame before.
-        conjugate_steps: conjugate-gradient steps of a step that has the factor of another.
         tau: first and last scale of the compressive traction's loss, from rest.
         fine_tau: the same, from the coarsest grid's solution; finer grids begin with the last, not to leave the basin.
-        warm_tau: the same, from the solution of the frame before.
         sharp_tau: the same, from rest on the grid of the dents, in a second try.
         patience: so many times the steps, from rest, where these do not settle.
         patient_tau: as `tau`, then.
@@ -44,6 +41,8 @@ class ForceBalanceSettings:
         cone: how much less shear weighs where something pushes.
         coarse_cone: the same on the coarsest grid, whose own error looks like friction under a contact.
         reach: radius of the surroundings that are asked whether a vertex is pushed.
+        renewal: share of a step's own weights of normal tractions in their geometric mean with those of the step before: so a
+            vertex that is pushed after one step and pulled after the next settles.
         floor: least weight of a compressive traction; without it a vertex under a contact has no place of its own.
         outlier: scale of the markers' loss, over their noise.
         pressure_noise: standard deviation of a measured pressure, over the reference traction (mostly the rest pressure); a
@@ -51,13 +50,14 @@ class ForceBalanceSettings:
         longest_step: largest step of a vertex.
         largest_stretch: by how much of its length an edge of the grid changes in a step at most.
         damping: share of a step's matrix' diagonal that is added to it as tau ends; it falls with tau's square.
+        settling_damping: the same of the steps that settle: the last of a schedule, and the `settling_steps`.
         coarsest: fewest lines of a coarser grid.
-        coarsest_warm: fewest lines of a coarser grid that is given the solution of the frame before, but of that of the dents.
         largest_relative_step: rms of the last step of a converged solution.
         largest_volume_error: volume error of a converged solution, over the rest volume.
         largest_misfit: rms of the markers' angles off their rays where a surface of this sensor explains them, over their
             noise and the model's error; on grids of fewer than `force_balance.RESOLVED` lines more.
         largest_objective: what is minimised, over the markers seen, where a surface of this sensor explains them; as before.
+        objective_of_press: so much more for a surface that has moved by its size (rms): the grid's error grows with the press.
         likely_objective: the same, of a solution that is not solved again.
         worse_objective: what is minimised, over that of a first solution that has converged, of a second that is not taken.
         largest_outlying: share of the markers that may be more than twice `outlier` off before a second try is made.
@@ -71,11 +71,8 @@ class ForceBalanceSettings:
     coarse_steps: int = 4
     fine_steps: int = 4
     finer_steps: int = 4
-    warm_steps: int = 4
-    conjugate_steps: int = 2
     tau: tuple[float, float] = (4.0, 0.4)
     fine_tau: tuple[float, float] = (0.8, 0.4)
-    warm_tau: tuple[float, float] = (0.8, 0.4)
     sharp_tau: tuple[float, float] = (1.0, 0.4)
     patience: int = 3
     patient_tau: tuple[float, float] = (16.0, 0.4)
@@ -97,24 +94,26 @@ class ForceBalanceSettings:
     cone: float = 23.0
     coarse_cone: float = 5.0
     reach: float = 0.04
+    renewal: float = 0.5
     floor: float = 1e-3
     outlier: float = 5.0
     pressure_noise: float = 0.01
     longest_step: float = 0.04
     largest_stretch: float = 0.3
     damping: float = 3e-7
+    settling_damping: float = 1e-4
     coarsest: int = 6
-    coarsest_warm: int = 13
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3
     largest_misfit: float = 1.35
-    largest_objective: float = 20.0
-    likely_objective: float = 5.0
+    largest_objective: float = 2.5
+    objective_of_press: float = 20.0
+    likely_objective: float = 2.5
     worse_objective: float = 1.02
     largest_outlying: float = 0.01
 
     def __post_init__(self) -> None:
-        for name in ("steps", "coarse_steps", "fine_steps", "finer_steps", "warm_steps"):
+        for name in ("steps", "coarse_steps", "fine_steps", "finer_steps"):
             if getattr(self, name) < 2:
                 raise MembraneError(f"ForceBalanceSettings: {name} = {getattr(self, name)}; expected at least 2")
         if not self.pressure_noise > 0:

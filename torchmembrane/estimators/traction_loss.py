@@ -30,6 +30,9 @@ BEYOND = 1e6  # over p0: no push comes near it
 NEGLIGIBLE = 1e-6  # weight of a vertex far away, over that of the one in the middle
 TINY = 1e-12  # keeps roots and quotients of what vanishes finite
 
+Memory = tuple[Tensor, Tensor | float]
+"""The weights `w_n [B, N]` of the step before, and the share of a step's own in their geometric mean."""
+
 
 class TractionLoss(nn.Module):
     """The loss, and the weights of its reweighted least squares.
@@ -120,17 +123,33 @@ class TractionLoss(nn.Module):
             cone: how much less shear weighs where something pushes; default, that of this loss.
             curvature: the curvature of a push's loss instead of its weight, zero where it bends down.
         """
+        return self.reweighted(normal, force, noise_level, tau, cone, curvature)[0]
+
+    def reweighted(
+        self,
+        normal: Tensor,
+        force: Tensor,
+        noise_level: Tensor,
+        tau: float | Tensor,
+        cone: float | Tensor | None = None,
+        curvature: bool = False,
+        memory: Memory | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """`W` as `weights` gives it, and its `w_n [B, N]`: with a `memory` a geometric mean with those of the step before."""
         q_n, shear2, push2 = self.parts(force / self.area, normal)
         rho2 = self.scale2(push2, noise_level, tau)
         shear2, push2 = shear2 / rho2, push2 / rho2
         compressive = GemanMcClure(tau)
         pushed = compressive.curvature(push2) if curvature else compressive.weight(push2)
         w_n = self.settings.floor + torch.where(q_n < 0, pushed, 1.0)
+        if memory is not None:
+            before, renewal = memory
+            w_n = before * (w_n / before) ** renewal
         w_t = self.shear_weight(push2, cone) * self.shear.weight(shear2)
         scale = self.settings.sparsity / (self.reference * self.size) ** 2 / self.area / rho2
         one = torch.eye(3, dtype=force.dtype, device=force.device)[..., None]
         along = (scale * (w_n - w_t))[:, None] * normal
-        return along[:, :, None] * normal[..., None, :, :] + (scale * w_t)[:, None, None] * one
+        return along[:, :, None] * normal[..., None, :, :] + (scale * w_t)[:, None, None] * one, w_n
 
     def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> Tensor:
         """The loss `[B]` of tractions `[B, 3, N]` at the last scale `tau`, each push judged by itself."""

@@ -1,6 +1,7 @@
 """How much of a membrane the markers that are found still see."""
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..surface.membrane import Membrane
@@ -9,6 +10,16 @@ NEAREST = 4
 """Markers that a vertex is asked of."""
 REACH = 1.5
 """How far a marker sees, over the markers' spacing."""
+LEAST_COVERAGE = 0.85
+"""Of what the markers see at rest: where they see less, a part of the membrane is hidden."""
+TURNED_AWAY = 0.5
+"""Of how a marker faces the camera at rest: one that faces it less is lost to the press, and hidden by nothing."""
+
+
+def facings(points: Tensor, normals: Tensor, origins: Tensor) -> Tensor:
+    """How surfaces at `points [..., D, 3]` with the outward `normals [..., D, 3]`, of any length, face the rays from `origins
+    [B, D, 3]` that see them from within: the cosines of the angles between, `[B, D]`."""
+    return F.cosine_similarity(points - origins, normals.expand_as(points), dim=-1)
 
 
 class Coverage(nn.Module):

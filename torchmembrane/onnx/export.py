@@ -166,7 +166,7 @@ def export(
     Args:
         reconstructor: the sensor's.
         path: the model's file.
-        tracking: start from the results of the frames before (force balance).
+        tracking: follow the dots of the frames before; their results are one more start of what is solved again.
         progress: is told what comes next: the pieces' names, some thirty, and at last the check.
 
     Returns:

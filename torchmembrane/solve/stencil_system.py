@@ -120,16 +120,6 @@ class StencilSystem(nn.Module):
         x = block_pentadiagonal.substitute(found, self.in_blocks(scale * loads))
         return scale * self.from_blocks(x)
 
-    def by_frame(self, factor: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """The factor with the batch as the first axis of every tensor, as it is of what goes from piece to piece."""
-        middle = len(factor) // 3
-        return (*(f if k in (middle, len(factor) - 1) else f.unflatten(0, (-1, 2)) for k, f in enumerate(factor)),)
-
-    def in_pairs(self, factor: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """`by_frame` undone."""
-        middle = len(factor) // 3
-        return (*(f if k in (middle, len(factor) - 1) else f.flatten(0, 1) for k, f in enumerate(factor)),)
-
     def in_blocks(self, vector: Tensor) -> Tensor:
         """Vectors `[B, C, 3 N]` as blocks `[B, rows, C, s]` in the order of their elimination."""
         m, n = self.inner_grid
