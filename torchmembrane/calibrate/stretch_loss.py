@@ -48,6 +48,7 @@ def _better(own: Explained, neighbour: Explained, observation: Observation) -> E
     (estimator, found), (other, near) = own, neighbour
     measured = estimator.equations.bearings.measured(observation)
     start = State(near.vertices, near.pressure * (estimator.rest_pressure / other.rest_pressure), near.moved)
+    state: State
     with torch.no_grad():
         state, before = estimator.descent(start, measured, estimator.schedule()[-1:] * STEPS)
         tried = estimator.equilibrium(*state, before, measured)
