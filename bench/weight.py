@@ -1,13 +1,14 @@
 """Forces after one known weight: of sensors whose modulus and prestretch nobody knows, one press is known, others compared.
 
-python bench/weight.py [--sensors dome_24 bubble_60 ...] [--each]
+python bench/weight.py [--sensors dome_24 bubble_60 ... | --others]
 
 Twenty sensors: domes, caps, bubbles of gas, fingertips and half cylinders of 12 to 80 mm across, liquid, gas and open,
 prestretched 1.05 to 1.7. Each is pressed by balls in five ways by the simulator, 0.03 to 0.12 of its size deep, and rendered
 with 40 dB of noise (seed: the sensor's place in the list), as its rest image is. The sensor file says prestretch 1.2 and no
 modulus. Each row: which press was the weight, what was found of the material, how surely the scale is said to be known, and all
 five forces found over true ones, in brackets where the reading says itself that it is known worse than that; or why the weight
-was refused. The last line counts those without brackets.
+was refused. The last line counts those without brackets. `--others`: ten more sensors of the same kinds, on which nothing was
+chosen.
 """
 
 import argparse
@@ -79,10 +80,28 @@ SENSORS = {
     ),
 }
 
+OTHERS = {
+    "dome_30": Drawn("dome", {"radius": 15.0}, 20.0, "fisheye", 110.0, "liquid", 1.18),
+    "cap_24_gas": Drawn("cap", {"radius": 12.0, "height": 6.0}, 20.0, "pinhole", 85.0, "gas", 1.35),
+    "cap_60": Drawn("cap", {"radius": 30.0, "height": 14.0}, 48.0, "pinhole", 85.0, "liquid", 1.25),
+    "cap_44": Drawn("cap", {"radius": 22.0, "height": 18.0}, 36.0, "pinhole", 90.0, "liquid", 1.12),
+    "bubble_50": Drawn("bubble", {"radius": 25.0, "height": 12.0}, 55.0, "pinhole", 70.0, "gas", 1.22),
+    "bubble_34": Drawn("bubble", {"radius": 17.0, "height": 9.0}, 38.0, "pinhole", 70.0, "gas", 1.42),
+    "bubble_70": Drawn("bubble", {"radius": 35.0, "height": 24.0}, 65.0, "pinhole", 80.0, "gas", 1.16),
+    "fingertip_26": Drawn("fingertip", {"semi_axes": [13.0, 10.0, 12.0]}, 18.0, "fisheye", 115.0, "liquid", 1.38),
+    "cylinder_30": Drawn(
+        "half_cylinder", {"radius": 15.0, "length": 50.0, "half_angle": 65.0}, 30.0, "fisheye", 115.0, "liquid", 1.2
+    ),
+    "cylinder_16_gas": Drawn(
+        "half_cylinder", {"radius": 8.0, "length": 26.0, "half_angle": 65.0}, 18.0, "fisheye", 110.0, "gas", 1.45
+    ),
+}
+ALL = SENSORS | OTHERS
+
 
 def sensor_of(name: str) -> tm.Sensor:
     """The sensor with its rest image, rendered with noise."""
-    drawn, size = SENSORS[name], (IMAGE[0] / 2 - 0.5, IMAGE[1] / 2 - 0.5)
+    drawn, size = ALL[name], (IMAGE[0] / 2 - 0.5, IMAGE[1] / 2 - 0.5)
     surface = drafted_surface(drawn.shape, drawn.lengths, drawn.distance)
     camera = Camera(drawn.lens, IMAGE, (focal_of_view(drawn.lens, IMAGE[0], drawn.view),) * 2, size)
     markers = Markers("dots", "dark", *drafted_dots(surface, None))
@@ -95,7 +114,7 @@ def sensor_of(name: str) -> tm.Sensor:
 
 
 def _seed(name: str) -> int:
-    return list(SENSORS).index(name)
+    return list(ALL).index(name)
 
 
 def presses(sensor: tm.Sensor) -> tuple[torch.Tensor, np.ndarray]:
@@ -144,7 +163,8 @@ def report(name: str) -> list[float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sensors", nargs="+", default=list(SENSORS), choices=list(SENSORS), metavar="NAME")
+    parser.add_argument("--sensors", nargs="+", default=list(SENSORS), choices=list(ALL), metavar="NAME")
+    parser.add_argument("--others", dest="sensors", action="store_const", const=list(OTHERS))
     args = parser.parse_args()
     torch.set_num_threads(1)
     errors = [error for name in args.sensors for error in report(name)]

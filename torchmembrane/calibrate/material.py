@@ -10,13 +10,13 @@ from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..estimators.base import Equilibrium
 from ..estimators.force_balance import ForceBalance
 from ..io.status import Status
 from ..reconstruct import Reconstructor
 from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor
 from .gauge import UNSURE, FoundPressures, GaugeModulus, modulus_from_pressures
+from .stretch_loss import Explained, continued, loss_beside_pushes
 
 GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
 PRESSURE_GRID = (33, 33)  # on coarser ones pressure changes are off by up to a tenth
@@ -26,6 +26,7 @@ PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the loss's, 
 WRONG = 0.02  # probability that an image is explained wrongly altogether and carries no information
 FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known force (docs/calibration.md)
 GAS_ROUNDS = 4
+GAS_SETTLED = 0.1  # change of a gas' modulus, relative, that changes the prestretch by less than its deviation
 FINE = 4001  # prestretches over which the probability is summed
 
 
@@ -112,13 +113,13 @@ def material_from_pixels(
     """Prestretch from presses, and the modulus where their forces, or the pressures in the cavity, are known.
 
     Force balance is solved at many prestretches l. What it minimises, in standard deviations of the markers and of tractions in
-    units of the rest pressure, is taken for the negative logarithm of a probability:
+    units of the rest pressure, less the loss of pushes (`stretch_loss`), is taken for the negative logarithm of a probability:
 
         p(log l) ~ product over images of [e + (1 - e) exp(-min over x, p of loss(x, p; l)) / mean over l of the same]
 
     with e = `WRONG`, for an image that is explained wrongly altogether. Mean and deviation are reported, the latter enlarged
     where the images contradict one another, and by an error that all images share. A membrane with the wrong l needs forces
-    where nothing touches it. Forces are proportional to the modulus, so that each press gives the modulus as force measured /
+    that no touch exerts. Forces are proportional to the modulus, so that each press gives the modulus as force measured /
     force found at modulus 1; their mean is reported. Pressures likewise (`gauge.modulus_from_pressures`).
 
     Args:
@@ -153,6 +154,7 @@ def _material(
     confidence: Tensor,
     forces: np.ndarray | None,
     pressures: KnownPressures | None,
+    rounds: int = GAS_ROUNDS,
 ) -> MaterialFit:
     if forces is not None and pressures is not None:
         raise MembraneError("calibrate material: forces and pressures; expected one of them, either gives the modulus")
@@ -180,10 +182,17 @@ def _material(
     alone = np.exp(each[:, :1]) * np.stack([np.ones(len(each)), np.sqrt(variances)], -1)
     covariance = np.array(effects) @ np.array(effects).T
     made = replace(sensor, material=material)
-    if made.force_unit != "relative" and sensor.cavity.filling == "gas" and sensor.force_unit == "relative":
-        # without a modulus the gas acted as a liquid
-        return _material(made, _reconstructor(made), displacement, confidence, forces, pressures)
+    if rounds and not _is_settled(sensor, made):
+        return _material(made, _reconstructor(made), displacement, confidence, forces, pressures, rounds - 1)
     return MaterialFit(made, np.array(values), covariance, profile, alone, magnitudes, gauged)
+
+
+def _is_settled(sensor: Sensor, made: Sensor) -> bool:
+    """Whether the presses were explained with about the modulus found; without one a gas acts as a liquid, whose shape does not
+    depend on it."""
+    if made.cavity.filling != "gas" or made.force_unit == "relative":
+        return True
+    return sensor.force_unit != "relative" and abs(made.material.modulus / sensor.material.modulus - 1) < GAS_SETTLED
 
 
 def _reconstructor(sensor: Sensor) -> Reconstructor:
@@ -218,9 +227,7 @@ class Presses:
         self.reconstructor = reconstructor
         self.observation = reconstructor.observation(displacement, confidence)
 
-    def explained(
-        self, stretch: float, modulus: float, grid: tuple[int, int] | None = None
-    ) -> tuple[ForceBalance, Equilibrium]:
+    def explained(self, stretch: float, modulus: float, grid: tuple[int, int] | None = None) -> Explained:
         """The estimator with this material, on this grid, default the reconstructor's, and what it finds."""
         r, known = self.reconstructor, self.reconstructor.estimator
         assert isinstance(known, ForceBalance)  # as `_reconstructor` chooses
@@ -236,17 +243,18 @@ class Presses:
 
     def profile(self) -> LossProfile:
         """The presses' losses at `STRETCHES`, and closer together around the lowest."""
-        losses = {stretch: self._losses(stretch) for stretch in STRETCHES}
-        k = min(max(int(np.argmin([values.sum() for values in losses.values()])), 1), len(STRETCHES) - 2)
-        losses |= {
-            stretch: self._losses(stretch) for stretch in np.geomspace(STRETCHES[k - 1], STRETCHES[k + 1], BETWEEN + 2)[1:-1]
-        }
-        stretches = np.array(sorted(losses))
-        return LossProfile(stretches, np.array([losses[stretch] for stretch in stretches]))
+        modulus = self.reconstructor.sensor.material.modulus
+        solutions = {stretch: self.explained(stretch, modulus) for stretch in STRETCHES}
+        total = self._profile(solutions).losses.sum(1)
+        k = min(max(int(np.argmin(total)), 1), len(STRETCHES) - 2)
+        between = np.geomspace(STRETCHES[k - 1], STRETCHES[k + 1], BETWEEN + 2)[1:-1]
+        return self._profile(solutions | {stretch: self.explained(stretch, modulus) for stretch in between})
 
-    def _losses(self, stretch: float) -> np.ndarray:
-        estimator, found = self.explained(stretch, self.reconstructor.sensor.material.modulus)
-        return estimator.objective(found, self.observation).numpy()
+    def _profile(self, solutions: dict[float, Explained]) -> LossProfile:
+        stretches = sorted(solutions)
+        best = continued([solutions[stretch] for stretch in stretches], self.observation)
+        losses = np.array([loss_beside_pushes(*explained, self.observation).numpy() for explained in best])
+        return LossProfile(np.array(stretches), losses)
 
     def gauge_modulus(
         self, log_stretch: float, deviation: float, pressures: KnownPressures
