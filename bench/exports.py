@@ -6,7 +6,8 @@ Sensors as of random_sensors.py, but of prestretch 1.002 to 2, 20 to 400 dots (o
 every second one exported to track; number 0 is a gas-filled dome of radius 20, wall 1.5, prestretch 1.006, with 81 dots and
 1280 x 720 pixels. The file is run on the rest image and two random presses, alone and together. Same: the vertices of frames
 with status ok within 1e-3 of the largest displacement or of a length unit, and all statuses equal. Beside it how far torch in
-float32 is from torch in float64 (rounding), and the seconds of processor time that the export took.
+float32 is from torch in float64, or from itself on images one rounding away (rounding), and the seconds of processor time that
+the export took.
 """
 
 import argparse
