@@ -6,7 +6,10 @@ lose it to rounding: in float32 from conditions of some 1e5 on, as a contact on 
 A matrix is split into 2 x 2 blocks down to `LEAF` rows, so that most of the work is matrix products; a leaf's root is by its
 Cholesky factor. Where a runtime has none (ONNX) it is split down to `ITERATED_LEAF` rows, whose roots are iterated by products
 as well, `T = (3 I - Z Y) / 2, Y <- Y T, Z <- T Z` from `Y = A, Z = I` to `Z = A^-1/2` (Higham 2008, Functions of matrices, eq.
-6.35), with `Z Y` scaled in between so that its eigenvalues, which go to 1, do so evenly.
+6.35), with `Z Y` scaled in between so that its eigenvalues, which go to 1, do so evenly. Rounding may have left an eigenvalue
+below zero, from which that diverges: so it is the root of `A` with a ridge, and its last steps, `R <- (3 I - R A R^T) R / 2`,
+with `A` itself take that back, but where there is little else. They are as near to a root as Cholesky factors are, and do not
+diverge from a `R` near one.
 """
 
 import math
@@ -21,8 +24,11 @@ from ..pieces import at_hand, named
 
 LEAF = 140  # rows: halves of a smaller one take no less time
 ITERATED_LEAF = 48
-LARGEST_CONDITION = 1e6  # of a leaf
-RIDGE = 1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor
+RIDGE = (
+    1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor, or is iterated: in float32, its rounding's share
+)
+NEAR_ONE = 0.1  # eigenvalues of R A R^T are 1 but for this before the last steps, each of which squares it
+LAST_STEPS = 3
 LARGEST_SCALE = 2.8  # of eigenvalues up to 1; near 3 an iteration would make all of them small
 
 
@@ -52,19 +58,24 @@ def by_cholesky(matrix: Tensor) -> Tensor:
 
 @named
 def by_products(matrix: Tensor) -> Tensor:
-    """Too small in the directions of a leaf's smallest eigenvalues where its condition exceeds `LARGEST_CONDITION`."""
+    """Too small in the directions of a leaf's eigenvalues far below its `RIDGE`."""
     if matrix.shape[-1] > ITERATED_LEAF:
         return _by_halves(matrix, by_products)
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     largest = matrix.abs().sum(-1).amax(-1)[..., None, None]
-    iteration = Iteration.to(LARGEST_CONDITION, torch.finfo(matrix.dtype).eps)
-    Y = (iteration.first / largest) * matrix
+    ridge = RIDGE * torch.finfo(matrix.dtype).eps / torch.finfo(torch.float32).eps
+    iteration = Iteration.to(1 / ridge, NEAR_ONE)
+    A = matrix / largest
+    Y = iteration.first * (A + ridge * one)
     T = Z = iteration.shifts[0] * one - Y
     for shift in iteration.shifts[1:]:
         Y = Y @ T
         T = shift * one - Z @ Y
         Z = T @ Z
-    return (iteration.last * largest.rsqrt()) * Z
+    R = iteration.last * Z
+    for _ in range(LAST_STEPS):
+        R = (1.5 * one - (0.5 * R) @ A @ R.mT) @ R
+    return largest.rsqrt() * R
 
 
 def _by_halves(matrix: Tensor, inverse_root: Callable[[Tensor], Tensor]) -> Tensor:
