@@ -189,8 +189,7 @@ class Reconstructor(nn.Module):
         pressure: Tensor | float | None = None,
     ) -> Reconstruction:
         """As `forward`, from grey images `[B, 1, height, width]` in 0..1 of this module's precision; nothing is checked."""
-        flow = self.observer(grey, None if previous is None else previous.pixels, rest_pixels)
-        return unrecorded(self._solve, flow, previous, pressure)
+        return unrecorded(self._seen, grey, previous, rest_pixels, pressure)
 
     def from_pixels(
         self,
@@ -216,6 +215,9 @@ class Reconstructor(nn.Module):
         with full_precision(self.rest_pixels.device.type):
             flow = self.observer.from_pixels(pixels, confidence, rest_pixels)
             return unrecorded(self._solve, flow, self._checked(previous, len(flow.status)), pressure)
+
+    def _seen(self, grey: Tensor, previous: Reconstruction | None, rest: Tensor | None, *gauge: Any) -> Reconstruction:
+        return self._solve(self.observer(grey, None if previous is None else previous.pixels, rest), previous, *gauge)
 
     def _solve(self, flow: MarkerFlow, previous: Reconstruction | None, pressure: Tensor | float | None) -> Reconstruction:
         usable, confidence, covariance, status = self.observer.judge(*flow)
