@@ -149,6 +149,18 @@ def test_what_is_left_of_an_ill_conditioned_system_stays_positive_in_float32(mon
     assert (single - exact).norm() < 0.1 * exact.norm()
 
 
+def test_an_eigenvalue_that_rounding_left_below_zero_breaks_no_iterated_root():
+    generator = torch.Generator().manual_seed(0)
+    q, _ = torch.linalg.qr(torch.randn(40, 40, dtype=torch.float64, generator=generator))
+    eigenvalues = torch.logspace(-3, 0, 40, dtype=torch.float64)
+    eigenvalues[0] = -2e-6
+    matrix = (q * eigenvalues) @ q.T
+    root = by_products(matrix.float()).double()
+    assert root.norm() < 1e4
+    others = torch.linalg.eigvalsh(root @ matrix @ root.T)[1:]
+    torch.testing.assert_close(others, torch.ones_like(others), rtol=0, atol=1e-3)
+
+
 def test_steps_with_their_numbers_folded_are_the_scaled_steps():
     """Of one eigenvalue: `T = (3 - s z y) sqrt(s) / 2, y <- y T, z <- T z`, to `z = y^-1/2`."""
     folded, scales, eigenvalue = Iteration.to(1e4, 1e-12), iteration_scales(1e4, 1e-12), 3e-3
