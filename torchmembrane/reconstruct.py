@@ -21,7 +21,7 @@ from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
 from .io.status import Status
-from .markers.coverage import LEAST_COVERAGE, TURNED_AWAY, Coverage, facings
+from .markers.coverage import LEAST_COVERAGE, Coverage, turned_away
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
 from .markers.placement import imaged_vertices, place_markers
 from .pieces import piece, unrecorded
@@ -259,11 +259,9 @@ class Reconstructor(nn.Module):
         modelled = self.camera.point_to_pixel(markers) + shift_of(found.moved, pixels, self.image_size)
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))
         normals, broken = membrane.normals(x), ~x.flatten(1).isfinite().all(1)
-        facing, at_rest = (
-            facings(point, self.marker_shares @ normal, observation.origins)
-            for point, normal in ((markers, normals), (self.rest_markers, membrane.rest_normals))
-        )
-        in_view = self.coverage(torch.where(facing < TURNED_AWAY * at_rest, 1.0, confidence))
+        surfaces = (markers, normals), (self.rest_markers, membrane.rest_normals)
+        turned = turned_away(self.marker_shares, *surfaces, observation.origins)
+        in_view = self.coverage(torch.where(turned, 1.0, confidence))
         gone, status = (status != Status.OK.value) | broken, self._judged(status, found, in_view, broken)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
         deviations = self.estimator.deviations(found, observation, contacts)

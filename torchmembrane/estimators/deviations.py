@@ -12,8 +12,8 @@ missing was fitted to presses of random sensors (`bench/intervals.py`), as stand
 
     of the force    FORCE x spread,  FORCE_SHARE of the force along itself,  AT_RIM of it where a contact reaches the rim,
                     where no contact is found UNSEEN of what a patch as pushed as the noise pushes would bear
-    of the depth    DEPTH x spread,  DIP spacing^2 / size, or DIP_UNSEEN where no contact is found,  DIP_SHARE depth spacing /
-                    size,  DIP_AT_RIM depth where a contact reaches the rim
+    of the depth    DEPTH x spread,  DIP spacing^2 / size,  DIP_SHARE depth spacing / size,  DIP_AT_RIM depth where a contact
+                    reaches the rim
 """
 
 import torch
@@ -30,8 +30,8 @@ from .descent import State
 from .normal_equations import BalanceEquations, NormalEquations
 from .settings import ForceBalanceSettings
 
-FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 1.4, 0.03, 0.4, 0.004
-DEPTH, DIP, DIP_UNSEEN, DIP_SHARE, DIP_AT_RIM = 2.4, 0.04, 0.24, 0.7, 0.075
+FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 0.8, 0.026, 0.11, 0.0017
+DEPTH, DIP, DIP_SHARE, DIP_AT_RIM = 2.5, 0.085, 0.52, 0.13
 FINE = 25
 """Lines of the grids that it was fitted on, at least; on coarser ones the spreads count for more, as the square of the step."""
 
@@ -61,11 +61,10 @@ def of_presses(
     none = (~contacts.points[..., 0].isfinite().any(1)).to(depth.dtype)
     at_rim = (contacts.at_rim == 1).any(1).to(depth.dtype)
     around = (AT_RIM * at_rim).square() * force.square().sum(-1) + (UNSEEN * unseen * none).square()
-    dip = (DIP + none * (DIP_UNSEEN - DIP)) * spacing**2 / size
     share = (DIP_SHARE * spacing / size) ** 2 + (DIP_AT_RIM * at_rim).square()
     return Deviations(
         (FORCE**2 * of_force + FORCE_SHARE**2 * force.square() + around[:, None]).sqrt(),
-        (DEPTH**2 * of_depth + dip.square() + share * depth.square()).sqrt(),
+        (DEPTH**2 * of_depth + (DIP * spacing**2 / size) ** 2 + share * depth.square()).sqrt(),
     )
 
 

@@ -22,6 +22,19 @@ def facings(points: Tensor, normals: Tensor, origins: Tensor) -> Tensor:
     return F.cosine_similarity(points - origins, normals.expand_as(points), dim=-1)
 
 
+def turned_away(shares: Tensor, now: tuple[Tensor, Tensor], rest: tuple[Tensor, Tensor], origins: Tensor) -> Tensor:
+    """`[B, D]` bool: markers that hardly face their rays, of what they do at rest.
+
+    Args:
+        shares: of the vertices in each marker, `[D, V]`.
+        now: the markers `[B, D, 3]` and the vertices' normals `[B, V, 3]`.
+        rest: the same at rest, `[D, 3]` and `[V, 3]`.
+        origins: of the rays, `[B, D, 3]`.
+    """
+    facing, at_rest = (facings(points, shares @ normals, origins) for points, normals in (now, rest))
+    return facing < TURNED_AWAY * at_rest
+
+
 class Coverage(nn.Module):
     """The share of a membrane's area near markers that are found, of what is near those seen at rest.
 
