@@ -244,6 +244,20 @@ def test_a_moved_camera_is_a_drift_and_one_that_is_found_is_named(stream, at_res
     assert named == ([] if shift < 1 else [pytest.approx(shift, abs=0.15)])
 
 
+def test_a_moved_camera_is_told_from_a_touch_and_from_noise(stream):
+    r, rng = stream.reconstructor, torch.Generator().manual_seed(3)
+    pixels, seen = r.rest_pixels.double(), torch.ones(len(r.rest_pixels))
+    watch = DriftWatch(r.rest_pixels, 0.02**2 * torch.eye(2).expand(len(pixels), 2, 2), seen > 0, r.image_size)
+    noise = 0.02 * 2**0.5 * torch.randn(pixels.shape, generator=rng, dtype=torch.float64)
+    off = pixels - pixels.mean(0)
+    turned = 1e-3 * torch.stack([-off[:, 1], off[:, 0]], -1)
+    for moved in (torch.tensor([0.2, 0.0]).expand_as(pixels), turned, 1e-3 * off):
+        assert watch.is_rigid(moved + noise, seen)
+    touch = 0.2 * torch.exp(-off.square().sum(-1) / 2 / 60**2)[:, None] * torch.tensor([1.0, 0.5])
+    for moved in (0 * pixels, touch, 0.2 * off.abs() / off.abs().max()):
+        assert not watch.is_rigid(moved + noise, seen)
+
+
 def test_presses_in_between_are_no_drift(stream, at_rest):
     tracker, pressed = tm.Tracker(stream.reconstructor), stream.images(stream.pressed * 5, seed=3)
     images = [image for k in range(5) for image in (*at_rest[4 * k : 4 * k + 4], *pressed[6 * k : 6 * k + 6])]

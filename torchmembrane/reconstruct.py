@@ -259,8 +259,7 @@ class Reconstructor(nn.Module):
         modelled = self.camera.point_to_pixel(markers) + shift_of(found.moved, pixels, self.image_size)
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))
         normals, broken = membrane.normals(x), ~x.flatten(1).isfinite().all(1)
-        surfaces = (markers, normals), (self.rest_markers, membrane.rest_normals)
-        turned = turned_away(self.marker_shares, *surfaces, observation.origins)
+        turned = turned_away(self.marker_shares, (markers, normals), (self.rest_markers, membrane.rest_normals))
         in_view = self.coverage(torch.where(turned, 1.0, confidence))
         gone, status = (status != Status.OK.value) | broken, self._judged(status, found, in_view, broken)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]

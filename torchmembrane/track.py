@@ -126,7 +126,7 @@ class Tracker:
 
     def _look_for_drift(self, result: Reconstruction) -> None:
         moved = result.pixels[0] - self.reconstructor.rest_pixels, result.confidence[0]
-        touched = bool(result.contact_points.isfinite().any())
+        touched = bool(result.contact_points.isfinite().any()) and not self._watch.is_rigid(*moved)
         if not touched or self._watch.is_near(*moved):
             self._watch.add(*moved)
             self._steady.forget()

@@ -16,22 +16,21 @@ TURNED_AWAY = 0.5
 """Of how a marker faces the camera at rest: one that faces it less is lost to the press, and hidden by nothing."""
 
 
-def facings(points: Tensor, normals: Tensor, origins: Tensor) -> Tensor:
-    """How surfaces at `points [..., D, 3]` with the outward `normals [..., D, 3]`, of any length, face the rays from `origins
-    [B, D, 3]` that see them from within: the cosines of the angles between, `[B, D]`."""
-    return F.cosine_similarity(points - origins, normals.expand_as(points), dim=-1)
+def facings(points: Tensor, normals: Tensor) -> Tensor:
+    """How surfaces at `points [..., D, 3]` with outward `normals [..., D, 3]` of any length face the camera that sees them
+    from within: the cosines of the angles between normals and lines of sight, refraction apart, `[..., D]`."""
+    return F.cosine_similarity(points, normals, dim=-1)
 
 
-def turned_away(shares: Tensor, now: tuple[Tensor, Tensor], rest: tuple[Tensor, Tensor], origins: Tensor) -> Tensor:
-    """`[B, D]` bool: markers that hardly face their rays, of what they do at rest.
+def turned_away(shares: Tensor, now: tuple[Tensor, Tensor], rest: tuple[Tensor, Tensor]) -> Tensor:
+    """`[B, D]` bool: markers that hardly face the camera, of what they do at rest.
 
     Args:
         shares: of the vertices in each marker, `[D, V]`.
         now: the markers `[B, D, 3]` and the vertices' normals `[B, V, 3]`.
         rest: the same at rest, `[D, 3]` and `[V, 3]`.
-        origins: of the rays, `[B, D, 3]`.
     """
-    facing, at_rest = (facings(points, shares @ normals, origins) for points, normals in (now, rest))
+    facing, at_rest = (facings(points, shares @ normals) for points, normals in (now, rest))
     return facing < TURNED_AWAY * at_rest
 
 

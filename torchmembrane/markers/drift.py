@@ -77,8 +77,10 @@ class DriftWatch:
     def __init__(self, rest_pixels: Tensor, rest_covariance: Tensor, seen: Tensor, image_size: tuple[int, int]):
         self.seen = seen.cpu()
         root = torch.linalg.cholesky(rest_covariance.cpu().double()[self.seen])
-        terms = _polynomials(rest_pixels.cpu().double()[self.seen], image_size)
+        pixels = rest_pixels.cpu().double()[self.seen]
+        terms = _polynomials(pixels, image_size)
         self.whitening = torch.linalg.inv(root)
+        self.rigid: Tensor = torch.linalg.qr((self.whitening @ _rigid_motions(pixels)).flatten(0, 1)).Q  # [2 D, 4]
         whitened = (self.whitening[..., None] * terms[:, None, None]).flatten(-2).flatten(0, 1)
         self.smooth: Tensor = torch.linalg.qr(whitened).Q  # [2 D, k]
         self.fields = root @ self.smooth.unflatten(0, (len(root), 2))  # [D, 2, k], px
@@ -105,6 +107,15 @@ class DriftWatch:
         if self.frames < ENOUGH:
             return False
         return self._size(self._coefficients(self._moved(displacement, confidence) - self.mean)) < NEAR
+
+    def is_rigid(self, displacement: Tensor, confidence: Tensor) -> bool:
+        """Whether one frame's markers have moved as a moved camera makes them, beyond noise, and no press; arguments as of
+        `add`. The frame is taken to be as noisy as what is taken for rest."""
+        whitened = self._whitened(self._moved(displacement, confidence)) / 2**0.5
+        S = float((whitened @ self.rigid).square().sum())
+        terms = self.rigid.shape[1]
+        rough = max(0.0, float(whitened.square().sum()) - S - (len(whitened) - terms))
+        return (S - terms) / (2 * terms) ** 0.5 > CERTAIN and rough < LARGEST_ROUGHNESS * (rough + S - terms)
 
     def drift(self) -> Drift:
         """What the frames so far show."""
@@ -137,6 +148,13 @@ class DriftWatch:
 
     def _coefficients(self, displacement: Tensor) -> Tensor:
         return self._whitened(displacement) @ self.smooth
+
+
+def _rigid_motions(pixels: Tensor) -> Tensor:
+    """Displacements of `pixels [D, 2]` by shifts, a rotation and a growth of the image, `[D, 2, 4]`."""
+    u, v = (pixels - pixels.mean(0)).unbind(-1)
+    one, none = torch.ones_like(u), torch.zeros_like(u)
+    return torch.stack([torch.stack([one, none, -v, u], -1), torch.stack([none, one, u, v], -1)], 1)
 
 
 def _polynomials(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
