@@ -30,8 +30,8 @@ from .descent import State
 from .normal_equations import BalanceEquations, NormalEquations
 from .settings import ForceBalanceSettings
 
-FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 0.8, 0.026, 0.11, 0.0017
-DEPTH, DIP, DIP_SHARE, DIP_AT_RIM = 2.5, 0.085, 0.52, 0.13
+FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 0.9, 0.028, 0.11, 0.002
+DEPTH, DIP, DIP_SHARE, DIP_AT_RIM = 2.3, 0.12, 0.45, 0.12
 FINE = 25
 """Lines of the grids that it was fitted on, at least; on coarser ones the spreads count for more, as the square of the step."""
 
