@@ -101,6 +101,32 @@ def test_a_second_try_settles_on_the_grids_that_are_finer_than_its_dents():
         assert second[len(second) - settling :] == [second[-1]] * settling
 
 
+def test_normal_weights_are_the_geometric_mean_with_those_of_the_step_before(dented):
+    one = estimator()
+    loss, measured = one.equations.loss, one.equations.bearings.measured(dented)
+    at = one.equations.forces.linearised(one.membrane.rest[None] * 1.01, one.rest_pressure[None])
+    _, own = loss.reweighted(at.normal, at.force, measured.noise_level[:1], 0.4)
+    before = torch.linspace(1e-3, 1.0, own.shape[1]).double()[None]
+    for renewal, expected in ((1.0, own), (0.5, (own * before).sqrt()), (0.0, before)):
+        W, w_n = loss.reweighted(at.normal, at.force, measured.noise_level[:1], 0.4, memory=(before, renewal))
+        torch.testing.assert_close(w_n, expected)
+        scale = SETTINGS.sparsity / (one.reference * one.size) ** 2 / loss.area
+        along = (at.normal[:, :, None] * W * at.normal[:, None]).sum((1, 2))
+        rho2 = loss.scale2(loss.parts(at.force / loss.area, at.normal)[2], measured.noise_level[:1], 0.4)
+        torch.testing.assert_close(along, scale * expected / rho2)
+
+
+def test_weights_are_remembered_while_the_losses_stay_and_the_last_steps_are_damped():
+    """With `tau` declining all are new; a step alone is neither."""
+    descent = estimator().descent
+    taus = [4.0, 1.6, 0.4, 0.4, 0.4]
+    steps = [descent._numbers(taus[: k + 1], settles=k >= 3) for k in range(5)]
+    assert [renewal for renewal, _ in steps] == [1.0, 1.0, 1.0, SETTINGS.renewal, SETTINGS.renewal]
+    least = [SETTINGS.damping * (tau / 0.4) ** 2 for tau in taus[:3]]
+    assert [damping for _, damping in steps] == pytest.approx([*least, *2 * [SETTINGS.settling_damping]])
+    assert descent._numbers([0.4], settles=True) == (1.0, SETTINGS.damping)
+
+
 def test_only_rows_that_are_not_done_are_worked_out_again():
     asked = []
 

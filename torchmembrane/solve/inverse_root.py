@@ -24,9 +24,7 @@ from ..pieces import at_hand, named
 
 LEAF = 140  # rows: halves of a smaller one take no less time
 ITERATED_LEAF = 48
-RIDGE = (
-    1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor, or is iterated: in float32, its rounding's share
-)
+RIDGE = 1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor or is iterated (float32: rounding's share)
 NEAR_ONE = 0.1  # eigenvalues of R A R^T are 1 but for this before the last steps, each of which squares it
 LAST_STEPS = 3
 LARGEST_SCALE = 2.8  # of eigenvalues up to 1; near 3 an iteration would make all of them small
