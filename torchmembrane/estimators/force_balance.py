@@ -49,6 +49,9 @@ from .traction_loss import TractionLoss
 RESOLVED = 17
 """Lines of a grid whose own error is small beside the markers'; a coarser one's grows as the square of its step."""
 
+ALONE = 3
+"""Last steps that are damped to settle, on a grid that none precedes and none follows."""
+
 
 class ForceBalance(nn.Module):
     """Surface, contact tractions and pressure from marker rays.
@@ -106,6 +109,7 @@ class ForceBalance(nn.Module):
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
         self.descent = Descent(self.equations, self.cavity, settings)
         self.dent = Dent(self.descent) if self.coarse is not None and self.coarse.coarse is None else None
+        self.settling = 1 if is_coarse or self.coarse is not None else ALONE
         self.spacing = self.size / len(bearings.positions) ** 0.5
         self.patches = ContactPatches(membrane, self.spacing)
         first = settings.coarse_steps if is_coarse else settings.steps
@@ -207,7 +211,7 @@ class ForceBalance(nn.Module):
         last = schedule[-1:] * len(schedule)
         found: tuple[State, Tensor]
         if self.dent is None:
-            settling = self.settings.settling_steps if patient and self.coarse is not None else 1
+            settling = self.settings.settling_steps if patient and self.coarse is not None else self.settling
             found = self.descent(self._begun(measured, patient, start), measured, schedule, settling=settling)
         elif patient:
             quick, slow = (self._undented(measured, patient) for patient in (False, True))
