@@ -167,13 +167,14 @@ def test_coverage_is_the_share_of_area_near_found_markers():
     flat = spherical_cap(12, 0.5, 3, (33, 33))
     positions[:, 2] = 3
     seen = torch.ones(len(positions), dtype=torch.bool)
-    coverage = Coverage(flat, positions, seen)
+    facing = torch.ones(len(positions), dtype=torch.float64)
+    coverage = Coverage(flat, positions, seen, facing)
     found = torch.ones(3, len(positions), dtype=torch.float64)
     found[1, positions[:, 0] > 0] = 0
     found[2, 66] = 0
     everything, half, lone = coverage(found).tolist()
     assert everything == pytest.approx(1) and lone == pytest.approx(1) and half == pytest.approx(0.57, abs=0.04)
-    assert Coverage(flat, positions, positions[:, 0] < 0)(found)[1] == pytest.approx(1)
+    assert Coverage(flat, positions, positions[:, 0] < 0, facing)(found)[1] == pytest.approx(1)
 
 
 @pytest.fixture(scope="module")

@@ -340,7 +340,7 @@ def weights(estimator, force, tau=0.5):
     _, normal = at_rest(estimator)
     loss = estimator.equations.loss
     loss.settings = replace(SETTINGS, least_scale=1.0)  # tractions over p0
-    W = loss.weights(normal.mT, force.mT, ONE, tau)[0].movedim(-1, 0)
+    W = loss.weights(normal.mT, force.mT, ONE, tau)[0][0].movedim(-1, 0)
     along = torch.nn.functional.normalize(along_y(normal), dim=-1)
     scale = SETTINGS.sparsity / (estimator.reference * estimator.size) ** 2 / loss.area
     return tuple((d[:, None] @ W @ d[..., None]).ravel() / scale for d in (normal, along))
@@ -525,7 +525,7 @@ def test_the_loss_of_normal_tractions_has_the_derivative_that_the_weights_say():
     traction = (level * normal).requires_grad_()
     (gradient,) = torch.autograd.grad(loss(traction, normal, ONE).sum(), traction)
     force = traction.detach() * loss.area
-    expected = loss.area * (loss.weights(normal, force, ONE, SETTINGS.tau[1]) * force[:, None]).sum(2)
+    expected = loss.area * (loss.weights(normal, force, ONE, SETTINGS.tau[1])[0] * force[:, None]).sum(2)
     torch.testing.assert_close((gradient * normal).sum(1), (expected * normal).sum(1), rtol=1e-6, atol=1e-9)
 
 

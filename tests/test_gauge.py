@@ -236,7 +236,7 @@ def test_a_reading_takes_the_grids_error_out_of_the_force():
             found = [reader(image, pressure=pressure).force[0].numpy() for pressure in (None, reading)]
         errors.append([np.linalg.norm(force - truth) / np.linalg.norm(truth) for force in found])
     alone, gauged = np.mean(errors, 0)
-    assert gauged < 0.9 * alone and gauged < 0.02
+    assert gauged < 0.8 * alone and gauged < 0.02
 
 
 @pytest.fixture(scope="module")

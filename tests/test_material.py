@@ -89,7 +89,7 @@ def test_a_gas_of_unknown_modulus_is_found_as_one_whose_file_says_it(presses):
     found = [material_from_pixels(replace(sensor(m), cavity=cavity), pixels, forces).values for m in (untold, told)]
     assert found[0] == pytest.approx(found[1], rel=0.1)
     liquid = material_from_pixels(sensor(told), pixels, forces).values
-    assert abs(liquid[0] / found[1][0] - 1) > 0.05
+    assert abs(liquid[0] / found[1][0] - 1) > 0.08
 
 
 def test_rest_tells_no_prestretch():

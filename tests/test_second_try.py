@@ -7,7 +7,7 @@ import torch
 
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.descent import Scales, State
-from torchmembrane.estimators.force_balance import ForceBalance
+from torchmembrane.estimators.force_balance import ALONE, ForceBalance
 from torchmembrane.estimators.settings import ForceBalanceSettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.pieces import mended
@@ -105,10 +105,10 @@ def test_normal_weights_are_the_geometric_mean_with_those_of_the_step_before(den
     one = estimator()
     loss, measured = one.equations.loss, one.equations.bearings.measured(dented)
     at = one.equations.forces.linearised(one.membrane.rest[None] * 1.01, one.rest_pressure[None])
-    _, own = loss.reweighted(at.normal, at.force, measured.noise_level[:1], 0.4)
+    _, own = loss.weights(at.normal, at.force, measured.noise_level[:1], 0.4)
     before = torch.linspace(1e-3, 1.0, own.shape[1]).double()[None]
     for renewal, expected in ((1.0, own), (0.5, (own * before).sqrt()), (0.0, before)):
-        W, w_n = loss.reweighted(at.normal, at.force, measured.noise_level[:1], 0.4, memory=(before, renewal))
+        W, w_n = loss.weights(at.normal, at.force, measured.noise_level[:1], 0.4, memory=(before, renewal))
         torch.testing.assert_close(w_n, expected)
         scale = SETTINGS.sparsity / (one.reference * one.size) ** 2 / loss.area
         along = (at.normal[:, :, None] * W * at.normal[:, None]).sum((1, 2))
@@ -125,6 +125,8 @@ def test_weights_are_remembered_while_the_losses_stay_and_the_last_steps_are_dam
     least = [SETTINGS.damping * (tau / 0.4) ** 2 for tau in taus[:3]]
     assert [damping for _, damping in steps] == pytest.approx([*least, *2 * [SETTINGS.settling_damping]])
     assert descent._numbers([0.4], settles=True) == (1.0, SETTINGS.damping)
+    several, alone = estimator(spherical_cap(12, 9, 3, (17, 17))), estimator(spherical_cap(12, 9, 3, (9, 9)))
+    assert (several.settling, several.coarse.settling, alone.settling) == (1, 1, ALONE)
 
 
 def test_only_rows_that_are_not_done_are_worked_out_again():

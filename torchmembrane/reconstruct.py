@@ -21,7 +21,7 @@ from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
 from .io.status import Status
-from .markers.coverage import LEAST_COVERAGE, Coverage, turned_away
+from .markers.coverage import LEAST_COVERAGE, Coverage, facings
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
 from .markers.placement import imaged_vertices, place_markers
 from .pieces import piece, unrecorded
@@ -108,11 +108,11 @@ class Reconstructor(nn.Module):
             rest_covariance=2 * self.observer.rest_covariance.double() + LEAST_ERROR**2 * torch.eye(2),
         )
         self.estimator = estimator_of(problem, estimator, settings)
-        self.coverage = Coverage(membrane, positions, self.observer.seen_at_rest)
         self.register_buffer("vertex_pixels", vertex_pixels)
         self.register_buffer("rest_markers", positions)
-        shares = bicubic_shares(markers.points, membrane.grid, membrane.fixed)
-        self.register_buffer("marker_shares", torch.from_numpy(shares))
+        self.register_buffer("marker_shares", torch.from_numpy(bicubic_shares(markers.points, membrane.grid, membrane.fixed)))
+        facing = facings(positions, self.marker_shares @ membrane.rest_normals)
+        self.coverage = Coverage(membrane, positions, self.observer.seen_at_rest, facing)
         self.to(dtype)
         keep_small(self)
 
@@ -259,8 +259,7 @@ class Reconstructor(nn.Module):
         modelled = self.camera.point_to_pixel(markers) + shift_of(found.moved, pixels, self.image_size)
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))
         normals, broken = membrane.normals(x), ~x.flatten(1).isfinite().all(1)
-        turned = turned_away(self.marker_shares, (markers, normals), (self.rest_markers, membrane.rest_normals))
-        in_view = self.coverage(torch.where(turned, 1.0, confidence))
+        in_view = self.coverage.in_view(confidence, facings(markers, self.marker_shares @ normals))
         gone, status = (status != Status.OK.value) | broken, self._judged(status, found, in_view, broken)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
         deviations = self.estimator.deviations(found, observation, contacts)

@@ -13,7 +13,6 @@ from torch import Tensor
 from ..estimators.base import Equilibrium, Observation
 from ..estimators.descent import State
 from ..estimators.force_balance import ForceBalance
-from ..estimators.robust import GemanMcClure
 from ..surface.stencil import inner
 
 STEPS = 4  # from a neighbour's solution
@@ -23,12 +22,10 @@ Explained = tuple[ForceBalance, Equilibrium]
 
 def loss_beside_pushes(estimator: ForceBalance, found: Equilibrium, observation: Observation) -> Tensor:
     """`[B]`: what `estimator` minimises, at what it has found, less the loss of the pushes."""
-    loss, membrane = estimator.equations.loss, estimator.membrane
-    level, tau = estimator.equations.bearings.measured(observation).noise_level, loss.settings.tau[-1]
-    normal, _, around = loss.parts(*(inner(a, membrane.grid).mT for a in (found.traction, membrane.normals(found.vertices))))
-    pushes2 = normal.clamp_max(0).square() / loss.scale2(around, level, tau)
-    of_pushes = loss.settings.sparsity / loss.size**2 * GemanMcClure(tau).loss(pushes2) @ loss.area
-    return estimator.objective(found, observation) - of_pushes
+    grid, level = estimator.membrane.grid, estimator.equations.bearings.measured(observation).noise_level
+    traction, normal = (inner(a, grid).mT for a in (found.traction, estimator.membrane.normals(found.vertices)))
+    pushes, _ = estimator.equations.loss.losses(traction, normal, level)
+    return estimator.objective(found, observation) - pushes
 
 
 def continued(solutions: list[Explained], observation: Observation) -> list[Explained]:

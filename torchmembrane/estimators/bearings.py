@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..camera.model import Camera
+from ..camera.motion import motion_of_pixels
 from ..pieces import piece
 from ..solve.stencil_system import NEAR
 from ..surface.bicubic import bicubic_shares
@@ -15,7 +16,6 @@ from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner
 from ..surface.tangent import tangent_frame
 from .base import Observation
-from .camera_motion import motion_of_pixels
 
 
 class Bearings(NamedTuple):

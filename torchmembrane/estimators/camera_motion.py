@@ -16,6 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..camera.motion import motion_of_pixels
 from ..solve.elimination import solve_positive
 
 RARE = 100.0
@@ -64,15 +65,6 @@ class CameraMotion(NamedTuple):
         """`T^-1 B y`, `[B, L, 4]`, of fields `y [B, L, 3 N]`."""
         turned: Tensor = _solve(self.own, self.coupling @ y.mT).mT
         return turned
-
-
-def motion_of_pixels(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
-    """Derivatives `[..., 2, 4]` of `pixels [..., 2]` in du, dv, rotation and growth, the latter two in px at half the image's
-    diagonal from its centre."""
-    size = pixels.new_tensor(image_size) - 1
-    u, v = ((2 * pixels - size) / torch.linalg.vector_norm(size)).unbind(-1)
-    one, none = torch.ones_like(u), torch.zeros_like(u)
-    return torch.stack([torch.stack([one, none, -v, u], -1), torch.stack([none, one, u, v], -1)], -2)
 
 
 def shift_of(moved: Tensor, pixels: Tensor, image_size: tuple[int, int]) -> Tensor:

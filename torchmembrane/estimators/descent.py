@@ -33,7 +33,7 @@ class State(NamedTuple):
 
 class Scales(NamedTuple):
     """Numbers of a step, `[]` each: the scales `tau` of the compressive traction's loss and `outlier` of the markers'; `cone`
-    and `renewal` as for `TractionLoss.reweighted`, and `damping`, the share of the matrix' diagonal that is added to it."""
+    as for `TractionLoss.weights`, `renewal` as of its memory; `damping`, the share of the matrix' diagonal that is added."""
 
     tau: Tensor
     outlier: Tensor

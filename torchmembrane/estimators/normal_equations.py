@@ -55,9 +55,9 @@ class BalanceEquations(nn.Module):
         memory: Memory | None = None,
     ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor], CameraMotion, Tensor]:
         """The forces, the normal equations, their loads, the camera's motion and the weights `w_n [B, N]` at a surface; `cone`,
-        `curvature` and `memory` as for `TractionLoss.reweighted`."""
+        `curvature` and `memory` as for `TractionLoss.weights`."""
         at = self.forces.linearised(x, pressure)
-        W, w_n = self.loss.reweighted(at.normal, at.force, measured.noise_level, tau, cone, curvature, memory)
+        W, w_n = self.loss.weights(at.normal, at.force, measured.noise_level, tau, cone, curvature, memory)
         angle, jacobian = self.bearings.angles(x, measured, moved)
         weight = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
         normal = self.normal_equations(at, W, jacobian, weight)

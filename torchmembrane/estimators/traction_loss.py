@@ -112,8 +112,10 @@ class TractionLoss(nn.Module):
         tau: float | Tensor,
         cone: float | Tensor | None = None,
         curvature: bool = False,
-    ) -> Tensor:
-        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, 3, 3, N]`: the parabolas that touch the loss of a force.
+        memory: Memory | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """`W_k = (w_n n n^T + w_t (I - n n^T)) / a_k`, `[B, 3, 3, N]`: the parabolas that touch the loss of a force; and the
+        `w_n [B, N]` in it.
 
         Args:
             normal: `[B, 3, N]` of the inner vertices.
@@ -122,20 +124,8 @@ class TractionLoss(nn.Module):
             tau: scale of the compressive traction's loss.
             cone: how much less shear weighs where something pushes; default, that of this loss.
             curvature: the curvature of a push's loss instead of its weight, zero where it bends down.
+            memory: of the step before; `w_n` is then a geometric mean with it.
         """
-        return self.reweighted(normal, force, noise_level, tau, cone, curvature)[0]
-
-    def reweighted(
-        self,
-        normal: Tensor,
-        force: Tensor,
-        noise_level: Tensor,
-        tau: float | Tensor,
-        cone: float | Tensor | None = None,
-        curvature: bool = False,
-        memory: Memory | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """`W` as `weights` gives it, and its `w_n [B, N]`: with a `memory` a geometric mean with those of the step before."""
         q_n, shear2, push2 = self.parts(force / self.area, normal)
         rho2 = self.scale2(push2, noise_level, tau)
         shear2, push2 = shear2 / rho2, push2 / rho2
@@ -153,13 +143,18 @@ class TractionLoss(nn.Module):
 
     def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> Tensor:
         """The loss `[B]` of tractions `[B, 3, N]` at the last scale `tau`, each push judged by itself."""
+        pushes, others = self.losses(traction, normal, noise_level)
+        return pushes + others
+
+    def losses(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> tuple[Tensor, Tensor]:
+        """The loss in two parts, `[B]` each: of the pushes, and of pulls and shear."""
         q_n, shear2, push2_around = self.parts(traction, normal)
         rho2 = self.scale2(push2_around, noise_level, self.settings.tau[-1])
         q_n, shear2, push2_around = q_n / rho2.sqrt(), shear2 / rho2, push2_around / rho2
-        push2 = (-q_n).clamp_min(0) ** 2
-        loss = GemanMcClure(self.settings.tau[-1]).loss(push2) + q_n.clamp_min(0) ** 2 / 2
-        loss = loss + self.shear_weight(push2_around) * self.shear.loss(shear2)
-        return self.settings.sparsity / self.size**2 * loss @ self.area
+        pushes = GemanMcClure(self.settings.tau[-1]).loss((-q_n).clamp_min(0) ** 2)
+        others = q_n.clamp_min(0) ** 2 / 2 + self.shear_weight(push2_around) * self.shear.loss(shear2)
+        unit = self.settings.sparsity / self.size**2 * self.area
+        return pushes @ unit, others @ unit
 
 
 def _gaussian_mean(membrane: Membrane, reach: float) -> Tensor:

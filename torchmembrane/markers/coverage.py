@@ -22,18 +22,6 @@ def facings(points: Tensor, normals: Tensor) -> Tensor:
     return F.cosine_similarity(points, normals, dim=-1)
 
 
-def turned_away(shares: Tensor, now: tuple[Tensor, Tensor], rest: tuple[Tensor, Tensor]) -> Tensor:
-    """`[B, D]` bool: markers that hardly face the camera, of what they do at rest.
-
-    Args:
-        shares: of the vertices in each marker, `[D, V]`.
-        now: the markers `[B, D, 3]` and the vertices' normals `[B, V, 3]`.
-        rest: the same at rest, `[D, 3]` and `[V, 3]`.
-    """
-    facing, at_rest = (facings(points, shares @ normals) for points, normals in (now, rest))
-    return facing < TURNED_AWAY * at_rest
-
-
 class Coverage(nn.Module):
     """The share of a membrane's area near markers that are found, of what is near those seen at rest.
 
@@ -41,18 +29,21 @@ class Coverage(nn.Module):
         membrane: the rest surface on the solver's grid.
         positions: of the markers, `[D, 3]`.
         seen: `[D]` bool, which of them are seen at rest.
+        facing: `[D]`, how they face the camera at rest, as of `facings`.
     """
 
+    facing: Tensor
     nearest: Tensor
     near: Tensor
     share: Tensor
 
-    def __init__(self, membrane: Membrane, positions: Tensor, seen: Tensor):
+    def __init__(self, membrane: Membrane, positions: Tensor, seen: Tensor, facing: Tensor):
         super().__init__()
         reach = REACH * membrane.size / len(positions) ** 0.5
         distance = torch.where(seen, torch.cdist(membrane.rest, positions.to(membrane.rest)), torch.inf)
         distance, nearest = distance.topk(min(NEAREST, len(positions)), largest=False)
         area = membrane.rest_area * (distance[:, 0] < reach)
+        self.register_buffer("facing", facing)
         self.register_buffer("nearest", nearest)
         self.register_buffer("near", (distance < reach).double())
         self.register_buffer("share", area / area.sum())
@@ -62,3 +53,9 @@ class Coverage(nn.Module):
         found = (confidence > 0).to(self.near.dtype)
         seen: Tensor = (found[:, self.nearest] * self.near).amax(-1) @ self.share
         return seen
+
+    def in_view(self, confidence: Tensor, facing: Tensor) -> Tensor:
+        """The same, those counted too that the press has turned away: by how the markers on the surface found face the camera,
+        `facing [B, D]`."""
+        counted: Tensor = self(torch.where(facing < TURNED_AWAY * self.facing, 1.0, confidence))
+        return counted

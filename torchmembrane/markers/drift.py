@@ -16,6 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..camera.motion import motion_of_pixels
+
 ORDER = 4
 """Of the polynomials; lower where there are fewer than `PER_TERM` markers for each of their terms."""
 PER_TERM = 3
@@ -80,7 +82,8 @@ class DriftWatch:
         pixels = rest_pixels.cpu().double()[self.seen]
         terms = _polynomials(pixels, image_size)
         self.whitening = torch.linalg.inv(root)
-        self.rigid: Tensor = torch.linalg.qr((self.whitening @ _rigid_motions(pixels)).flatten(0, 1)).Q  # [2 D, 4]
+        moved_camera = self.whitening @ motion_of_pixels(pixels, image_size)
+        self.rigid: Tensor = torch.linalg.qr(moved_camera.flatten(0, 1)).Q  # [2 D, 4]
         whitened = (self.whitening[..., None] * terms[:, None, None]).flatten(-2).flatten(0, 1)
         self.smooth: Tensor = torch.linalg.qr(whitened).Q  # [2 D, k]
         self.fields = root @ self.smooth.unflatten(0, (len(root), 2))  # [D, 2, k], px
@@ -148,13 +151,6 @@ class DriftWatch:
 
     def _coefficients(self, displacement: Tensor) -> Tensor:
         return self._whitened(displacement) @ self.smooth
-
-
-def _rigid_motions(pixels: Tensor) -> Tensor:
-    """Displacements of `pixels [D, 2]` by shifts, a rotation and a growth of the image, `[D, 2, 4]`."""
-    u, v = (pixels - pixels.mean(0)).unbind(-1)
-    one, none = torch.ones_like(u), torch.zeros_like(u)
-    return torch.stack([torch.stack([one, none, -v, u], -1), torch.stack([none, one, u, v], -1)], 1)
 
 
 def _polynomials(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
