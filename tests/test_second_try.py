@@ -5,10 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.base import Equilibrium, Observation
 from torchmembrane.estimators.descent import Scales, State
 from torchmembrane.estimators.force_balance import ALONE, ForceBalance
 from torchmembrane.estimators.settings import ForceBalanceSettings
+from torchmembrane.estimators.traction_loss import BEYOND
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.pieces import mended
 from torchmembrane.surface.membrane import Membrane
@@ -61,7 +62,7 @@ def test_a_step_changes_no_edge_by_more_than_its_share(dented, tau):
 
 def test_frames_that_settle_keep_their_first_solution_others_are_solved_patiently_from_rest(dented):
     anything = dict(settled_step=1e9, largest_misfit=1e9, largest_relative_step=1e9, largest_volume_error=1e9)
-    anything |= dict(largest_outlying=1.0, largest_objective=1e9, likely_objective=1e9)
+    anything |= dict(largest_outlying=1.0, largest_objective=1e9, likely_objective=(1e9, 1e9))
     kept, again = estimator(**anything), estimator(settled_step=0.0, largest_relative_step=0.0)
     measured = kept.equations.bearings.measured(dented)
     torch.testing.assert_close(kept(dented).vertices, kept._solved(measured).vertices)
@@ -188,7 +189,8 @@ def test_unlikely_solutions_are_tried_again_and_very_unlikely_ones_explain_nothi
         found = one(dented)
         moved = (found.vertices[1] - one.membrane.rest).square().sum(-1).mean().sqrt() / one.size
         largest = (SETTINGS.largest_objective + SETTINGS.objective_of_press * moved) * error
-        likely = SETTINGS.likely_objective * error
+        least, most = SETTINGS.likely_objective
+        likely = min(least + SETTINGS.likely_of_press * moved, most) * error
         first = type(found)(*(value[1:].repeat(3, *[1] * (value.ndim - 1)) for value in found))
         objective = torch.tensor([0.9 * likely, likely + 0.9 * (largest - likely), 1.1 * largest]).double()
         first = first._replace(objective=objective, misfit=0 * objective, relative_step=0 * objective)
@@ -197,6 +199,38 @@ def test_unlikely_solutions_are_tried_again_and_very_unlikely_ones_explain_nothi
         measured = one.equations.bearings.measured(rows)
         assert one.is_explained(first).tolist() == [True, True, False]
         assert one.is_done(first, measured).tolist() == [True, False, False]
+
+
+def test_what_is_likely_grows_with_the_press_up_to_a_limit(dented):
+    one = estimator()
+    found = one(dented)._replace(misfit=torch.zeros(2).double(), relative_step=torch.zeros(2).double())
+    found, measured = found._replace(objective=torch.tensor([1.0, 1.0]).double()), one.equations.bearings.measured(dented)
+    moved = (found.vertices - one.membrane.rest).square().sum(-1).mean(-1).sqrt() / one.size
+    assert moved[0] < 1e-4 < 0.015 < moved[1]
+    assert one.is_done(found, measured).tolist() == [False, True]
+    least, most = SETTINGS.likely_objective
+    steep = estimator(likely_of_press=(most - least) / moved[1].item() / 2)
+    for objective, expected in ((0.49 * (least + most), True), (0.51 * (least + most), False)):
+        assert steep.is_done(found._replace(objective=0 * moved + objective), measured)[1] == expected
+    assert not estimator(likely_of_press=1e9).is_done(found._replace(objective=0 * moved + 1.01 * most), measured)[1]
+
+
+@pytest.mark.parametrize("lines", [17, 33])
+def test_contacts_that_push_around_their_middle_only_are_tried_again(dented, lines):
+    """Pushes in a disc, in a ring, in a ring that noise explains, and in two discs that are far apart."""
+    one = estimator(spherical_cap(12, 9, 3, (lines, lines)))
+    rest, normals, zero = one.membrane.rest, one.membrane.rest_normals, torch.zeros(4, dtype=torch.float64)
+    off = torch.stack([(rest - rest[one.membrane.grid[1] * (lines // 2) + k]).norm(dim=-1) for k in (lines // 2, lines // 8)])
+    disc, ring = (torch.exp(-(((off[0] - r) / (0.05 * one.size)) ** 2)) for r in (0.0, 0.2 * one.size))
+    pushes = torch.stack([disc, ring, ring, disc + torch.exp(-((off[1] / (0.05 * one.size)) ** 2))])
+    reference = one.reference * torch.tensor([1.0, 1.0, BEYOND, 1.0])[:, None].expand(4, len(rest))
+    traction = -one.reference * pushes[..., None] * normals
+    x = rest.expand(4, -1, -1)
+    volume, moved = one.membrane.volume(x), torch.zeros(4, 4, dtype=torch.float64)
+    found = Equilibrium(x, one.rest_pressure.expand(4), volume, traction, zero, reference, zero, moved, zero)
+    assert one.dents.is_hollow(found, one.membrane).tolist() == [False, True, False, False]
+    measured = one.equations.bearings.measured(Observation(*(value[:1].expand(4, *value.shape[1:]) for value in dented[:3])))
+    assert one.is_done(found, measured).tolist() == [True, False, True, True]
 
 
 def test_the_objective_of_a_solution_is_over_the_markers_seen(dented):

@@ -177,7 +177,17 @@ def standard_deviations(
     observation: Observation,
     marker_noise: float | Tensor,
 ) -> StandardDeviations:
-    """At a solution; `marker_noise` as of `ForceBalance.standard_deviations`."""
+    """At a solution, of the rays it was found from.
+
+    Args:
+        equations: of the estimator.
+        cavity: its law.
+        settings: its settings.
+        state: the solution.
+        observation: the rays.
+        marker_noise: standard deviation of every marker's angles, radians; or `[B, D, 2, 3]`, how noise in each of two
+            independent directions turns the rays.
+    """
     measured = equations.bearings.measured(observation)
     noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * tangent_frame(observation.directions)
     scales = settings.tau[1], settings.outlier

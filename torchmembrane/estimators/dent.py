@@ -9,15 +9,20 @@ import torch
 from torch import Tensor, nn
 
 from ..pieces import piece, rowwise
+from ..surface.membrane import Membrane
 from ..surface.stencil import pad_border
+from .base import Equilibrium
 from .bearings import Bearings
 from .descent import Descent, State
+from .traction_loss import BEYOND
 
 DEPTH = 0.05  # over the surface's size
 WIDTH = 0.1  # standard deviation, over the size
 DEEP, WIDE = (0.16, 0.08), (0.25, 0.15)  # depth and width of those for a press that the first does not find
 REACH = 0.25  # of the surroundings whose pushes have one middle, over the size
 FAINT = 1.0  # of the push that the markers' noise makes: less hardly dents
+MIDDLE = 0.04  # radius of the middle of a contact, over the size
+HOLLOW = 0.1  # push there over the largest, of which less is hardly any
 LOWER = 0.9  # objective over another's of which it is taken
 TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle of none finite
 
@@ -71,6 +76,21 @@ class Dent(nn.Module):
         share = (push2.amax(-1) / (push2.amax(-1) + faint2))[:, None]
         inwards = depth * membrane.size * share * torch.exp(-off2 / (2 * width**2)) * self.free
         return State(x - inwards[..., None] * membrane.normals(x), pressure, moved)
+
+    def is_hollow(self, found: Equilibrium, membrane: Membrane) -> Tensor:
+        """`[B]` bool: hardly anything pushes in the middle of what pushes, as where a mound ringed by pushes stands for a pit,
+        or two contacts are close; `membrane`: of the finer grid it is found on."""
+        p0 = self.descent.equations.loss.reference
+        pushes = (-(found.traction * membrane.normals(found.vertices)).sum(-1) / p0).clamp_min(0)
+        pushes = torch.where(found.reference < BEYOND / 2 * p0, pushes, 0.0)  # where noise does not explain them
+        lines = (membrane.grid[0] - 1) // (self.membrane.grid[0] - 1)
+        pushes = pushes.unflatten(1, membrane.grid)[:, ::lines, ::lines].flatten(1) + TINY
+        rest, size = self.membrane.rest, self.membrane.size
+        around = pushes * self.area * self.around[pushes.argmax(-1)]
+        middle = around @ rest / around.sum(-1, keepdim=True)
+        off2 = (rest - middle[:, None]).square().sum(-1) / size**2
+        near = torch.exp(-off2 / (2 * MIDDLE**2)) * self.area
+        return torch.lt((near * pushes).sum(-1) / near.sum(-1), HOLLOW * pushes.amax(-1))
 
     def sought(
         self, quick: State, slow: State, rest: State, start: State | None, measured: Bearings, schedule: Schedule

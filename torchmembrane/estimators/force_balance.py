@@ -144,6 +144,11 @@ class ForceBalance(nn.Module):
         return self.equations.forces.membrane
 
     @property
+    def dents(self) -> Dent | None:
+        """Those of this grid or of a coarser one."""
+        return self.coarse.dents if self.dent is None and self.coarse is not None else self.dent
+
+    @property
     def elasticity(self) -> ElasticEnergy:
         """What the membrane stores."""
         return self.equations.forces.elasticity
@@ -291,19 +296,24 @@ class ForceBalance(nn.Module):
 
     @piece
     def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
-        """`[B]` bool: settled and likely, and hardly a marker is far outside, as beside a contact that the steps went past."""
-        far = 2 * self.settings.outlier * self.coarseness
+        """`[B]` bool: settled, likely, no mound for a pit, hardly a marker outside, as beside a contact steps went past."""
+        settings, far = self.settings, 2 * self.settings.outlier * self.coarseness
         outlying = self.equations.bearings.outlying(found.vertices, measured, found.moved, far)
-        likely = found.objective <= self.settings.likely_objective * self.coarseness**2
-        done: Tensor = self.is_settled(found) & likely & (outlying <= self.settings.largest_outlying)
-        return done
+        least, most = settings.likely_objective
+        likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most) * self.coarseness**2
+        done: Tensor = self.is_settled(found) & (found.objective <= likely) & (outlying <= settings.largest_outlying)
+        return done if self.dents is None else done & ~self.dents.is_hollow(found, self.membrane)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the markers are off their rays by their noise and the model's error alone, by likely tractions."""
         off = found.misfit > self.settings.largest_misfit * self.coarseness
-        moved = (found.vertices - self.membrane.rest).square().sum(-1).mean(-1).sqrt() / self.size
-        largest = self.settings.largest_objective + self.settings.objective_of_press * moved
+        largest = self.settings.largest_objective + self.settings.objective_of_press * self._press(found)
         return torch.logical_not(off | (found.objective > largest * self.coarseness**2))
+
+    def _press(self, found: Equilibrium) -> Tensor:
+        """Rms displacement over the size, `[B]`."""
+        moved: Tensor = (found.vertices - self.membrane.rest).square().sum(-1).mean(-1).sqrt() / self.size
+        return moved
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes."""
@@ -330,15 +340,7 @@ class ForceBalance(nn.Module):
     def standard_deviations(
         self, x: Tensor, pressure: Tensor, moved: Tensor, observation: Observation, marker_noise: float | Tensor
     ) -> StandardDeviations:
-        """Of the surface, total force and pressure found from these rays, as the noise of the markers spreads to first order.
-
-        Args:
-            x: vertices `[B, V, 3]` of the solution.
-            pressure: `[B]`, its pressure.
-            moved: `[B, 4]`, of the camera.
-            observation: the rays it was found from.
-            marker_noise: standard deviation of every marker's angles, radians; or `[B, D, 2, 3]`, how noise in each of two
-                independent directions turns the rays.
+        """Of a solution's surface, total force and pressure, as the noise of the markers spreads to first order.
 
         Limitations:
             Noise must not change which vertices are pushed, as it does in the shallowest presses and where two answers

@@ -58,7 +58,8 @@ class ForceBalanceSettings:
             noise and the model's error; on grids of fewer than `force_balance.RESOLVED` lines more.
         largest_objective: what is minimised, over the markers seen, where a surface of this sensor explains them; as before.
         objective_of_press: so much more for a surface that has moved by its size (rms): the grid's error grows with the press.
-        likely_objective: the same, of a solution that is not solved again.
+        likely_objective: the same, of a solution that is not solved again: where nothing moves, and of any.
+        likely_of_press: so much more, up to the latter, for a surface that has moved by its size (rms).
         worse_objective: what is minimised, over that of a first solution that has converged, of a second that is not taken.
         largest_outlying: share of the markers that may be more than twice `outlier` off before a second try is made.
 
@@ -108,7 +109,8 @@ class ForceBalanceSettings:
     largest_misfit: float = 1.35
     largest_objective: float = 2.5
     objective_of_press: float = 20.0
-    likely_objective: float = 2.5
+    likely_objective: tuple[float, float] = (0.6, 2.5)
+    likely_of_press: float = 60.0
     worse_objective: float = 1.02
     largest_outlying: float = 0.01
 
