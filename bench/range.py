@@ -47,7 +47,7 @@ def quantities(result: tm.Reconstruction, truth: dict) -> dict:
 def patch_quantities(result: tm.Reconstruction, truth: dict, membrane: tm.Membrane) -> dict:
     """Errors of the moment over the force (length unit) and, of one contact, of force, slip ratio and a sphere's curvature."""
     x, traction = (torch.from_numpy(truth[key]).double() for key in ("vertices_deformed", "traction"))
-    load, normals = traction * membrane.rest_area[:, None], membrane.normals(x)
+    load, normals = traction * membrane.vertex_area(x)[:, None], membrane.normals(x)
     inward = -(load * normals).sum(-1)
     force, shear = load.sum(0), (load + inward[:, None] * normals).sum(0)
     moment = torch.linalg.cross(x, load).sum(0)

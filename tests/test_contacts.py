@@ -198,8 +198,9 @@ def pressed(fingertip):
 
 def test_wrench_and_patch_against_the_simulator(fingertip, pressed):
     simulator, (state, _, got) = fingertip[0], pressed
-    load = state.traction * simulator.membrane.rest_area[:, None]
+    load = state.traction * simulator.membrane.vertex_area(state.vertices)[:, None]
     force, moment = load.sum(0), torch.linalg.cross(state.vertices, load).sum(0)
+    torch.testing.assert_close(force, state.force, rtol=1e-6, atol=1e-9)
     assert (got.wrench[0, :3] - force).norm() < 0.1 * force.norm()
     assert (got.wrench[0, 3:] - moment).norm() < 0.5 * force.norm()  # mm
     assert got.contact_points[0, 1:].isnan().all() and (got.contact_force[0, 0] - force).norm() < 0.1 * force.norm()
