@@ -12,7 +12,7 @@ missing was fitted to presses of random sensors (`bench/intervals.py`), as stand
 
     of the force    FORCE x spread,  FORCE_SHARE of the force along itself,  AT_RIM of it where a contact reaches the rim,
                     where no contact is found UNSEEN of what a patch as pushed as the noise pushes would bear
-    of the depth    DEPTH x spread,  DIP spacing^2 / size,  DIP_SHARE depth spacing / size,  DIP_AT_RIM depth where a contact
+    of the depth    DEPTH x spread,  DIP spacing,  DIP_SHARE depth spacing / size,  DIP_AT_RIM depth where a contact
                     reaches the rim
 """
 
@@ -31,7 +31,7 @@ from .normal_equations import BalanceEquations, NormalEquations
 from .settings import ForceBalanceSettings
 
 FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 0.9, 0.028, 0.11, 0.002
-DEPTH, DIP, DIP_SHARE, DIP_AT_RIM = 2.3, 0.12, 0.45, 0.12
+DEPTH, DIP, DIP_SHARE, DIP_AT_RIM = 1.4, 0.024, 0.42, 0.05
 FINE = 25
 """Lines of the grids that it was fitted on, at least; on coarser ones the spreads count for more, as the square of the step."""
 
@@ -64,7 +64,7 @@ def of_presses(
     share = (DIP_SHARE * spacing / size) ** 2 + (DIP_AT_RIM * at_rim).square()
     return Deviations(
         (FORCE**2 * of_force + FORCE_SHARE**2 * force.square() + around[:, None]).sqrt(),
-        (DEPTH**2 * of_depth + (DIP * spacing**2 / size) ** 2 + share * depth.square()).sqrt(),
+        (DEPTH**2 * of_depth + (DIP * spacing) ** 2 + share * depth.square()).sqrt(),
     )
 
 
