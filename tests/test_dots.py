@@ -177,6 +177,21 @@ def test_measures_dots_predicted_up_to_half_a_pitch_off(offset):
     np.testing.assert_allclose(radius, 1, atol=0.1)
 
 
+@pytest.mark.parametrize("columns", [58, 74])
+def test_sizes_are_those_of_the_dots_in_view(columns):
+    """Most dots are beyond the view's border or cut by it; the nearest in view have another size."""
+    s = scene()
+    begin = int(CENTRE[0] + RADIUS) - columns
+    image = render(s.pixels, s.shapes)[:, begin:]
+    seen = (s.pixels[:, 0] - begin > 8) & (s.pixels[:, 0] < SIZE[0] - 8)
+    assert 0.1 * len(s.pixels) < seen.sum() < 0.4 * len(s.pixels)
+    unit = s.shapes / np.where(s.sizes, 4.4, 2.7)[:, None, None]
+    got = measure_dots(image, s.pixels - [begin, 0], unit, s.sizes, "dark")
+    radius = np.sqrt(np.linalg.det(got.shapes) / np.linalg.det(s.shapes))
+    np.testing.assert_allclose(radius, 1, atol=0.1)
+    assert np.linalg.norm(got.pixels + [begin, 0] - s.pixels, axis=1)[seen].max() < 0.25
+
+
 @pytest.mark.parametrize("arrangement, two_sizes", PATTERNS)
 @pytest.mark.parametrize("field", [slide, dent])
 def test_follows_a_smooth_flow_of_one_and_a_half_pitches(arrangement, two_sizes, field):

@@ -11,7 +11,7 @@ import torch
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators import descent
 from torchmembrane.estimators.base import Observation
-from torchmembrane.estimators.bearings import Bearings
+from torchmembrane.estimators.bearings import Bearings, MarkerBearings
 from torchmembrane.estimators.contact_patches import contact_indicator, contact_points
 from torchmembrane.estimators.descent import State
 from torchmembrane.estimators.force_balance import ForceBalance
@@ -254,6 +254,23 @@ def test_angles_vanish_on_the_rays_and_grow_with_the_distance_across():
     basis = measured.across.movedim(-1, 1) * bearings.noise
     identity = basis @ basis.mT
     torch.testing.assert_close(identity, torch.eye(2, dtype=torch.float64).expand_as(identity))
+
+
+def test_the_noise_of_a_frame_is_over_that_of_its_own_markers_at_rest():
+    """Four frames: twice as noisy; and without the marker that the rest image shows badly; without any; one marker blurred."""
+    estimator = make(7)
+    y = estimator.equations.bearings.positions
+    directions = torch.nn.functional.normalize(y, dim=-1)[None]
+    sure = 1e3 * torch.ones(len(y), 1, 1, dtype=torch.float64)
+    sure[3] /= 1e3  # badly seen at rest: its turns are hardly any of its standard deviations
+    at_rest = seen(torch.zeros_like(directions), directions)._replace(across=tangent_frame(directions) * sure)
+    bearings = MarkerBearings(estimator.membrane, estimator.membrane.closest_points(y.numpy()), y, 1e-3, at_rest)
+    frames = Observation(*(None if value is None else value.repeat(4, *[1] * (value.ndim - 1)) for value in at_rest))
+    across, confidence = frames.across / 2, frames.confidence.clone()
+    confidence[1, 3], confidence[2], across[3, 5] = 0.0, 0.0, across[3, 5] / 100
+    blurred = 2 * 100 ** (1 / len(y))
+    level = bearings.measured(frames._replace(across=across, confidence=confidence)).noise_level
+    torch.testing.assert_close(level, torch.tensor([2.0, 2.0, 1.0, blurred], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("n", [9, 17])

@@ -24,7 +24,7 @@ class Bearings(NamedTuple):
     origins      `[B, 3, D]`
     across       `[B, 2, 3, D]`, two vectors across each ray, along which its turns are measured in standard deviations
     weight       `[B, D]`, the markers' confidence
-    noise_level  `[B]`, the markers' standard deviations over those at rest
+    noise_level  `[B]`, the markers' standard deviations over their own at rest, their geometric mean
     motion       `[B, 2, 4, D]`, derivatives of the angles in the camera's motion: du, dv, rotation, growth (px)
     gauge        `[B, 2]`, as of `Observation`, or None
     """
@@ -113,7 +113,7 @@ class MarkerBearings(nn.Module):
         smooth = torch.from_numpy(bicubic_shares(markers, membrane.grid, membrane.fixed)) * ~membrane.fixed
         self.register_buffer("smooth_shares", inner(smooth.mT, membrane.grid).mT.contiguous())
         across = None if rest is None else rest.across
-        spread = torch.tensor(noise**2, dtype=torch.float64) if across is None else _spread(across).mean()
+        spread = torch.full_like(self.positions[:, 0], noise**2) if across is None else _spread(across)[0]
         self.register_buffer("rest_spread", spread)
 
     @piece
@@ -125,8 +125,8 @@ class MarkerBearings(nn.Module):
         if motion is None:
             motion = torch.zeros_like(across[..., :1]).expand(-1, -1, -1, 4)
         found = (confidence > 0).to(confidence.dtype)
-        spread = (torch.where(found > 0, _spread(across), 0.0)).sum(-1) / found.sum(-1).clamp_min(1)
-        noise_level = (spread / self.rest_spread).sqrt()
+        excess = torch.where(found > 0, _spread(across) / self.rest_spread, 1.0).log()
+        noise_level = (excess.sum(-1) / found.sum(-1).clamp_min(1) / 2).exp()
         return Bearings(origins.mT, across.movedim(1, -1), confidence, noise_level, motion.movedim(1, -1), gauge)
 
     def markers(self, x: Tensor) -> Tensor:
