@@ -142,7 +142,8 @@ def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, size
     found, outlines = found[keep], outlines[keep]
     unit, log_radius = log_radii(shapes), log_radii(outlines)
     nearest = cKDTree(found).query(pixels)[1]
-    own = cKDTree(pixels).query(found)[1][nearest] == np.arange(len(pixels))  # not of dots out of view, or cut by its border
+    back = np.asarray(cKDTree(pixels).query(found)[1])
+    own = back[nearest] == np.arange(len(pixels))  # not of dots out of view, or cut by its border
     own |= ~np.isin(sizes, sizes[own])
     radius = {size: np.median((log_radius[nearest] - unit)[own & (sizes == size)]) for size in np.unique(sizes)}
     expected = unit + np.array([radius[size] for size in sizes])
