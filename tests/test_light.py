@@ -11,6 +11,7 @@ from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.bearings import marker_rays
 from torchmembrane.estimators.descent import Scales
+from torchmembrane.estimators.traction_loss import BEYOND
 from torchmembrane.markers.noise import pixel_noise
 from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
@@ -96,6 +97,9 @@ def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
     push = (inner(traction, estimator.membrane.grid) * normal).sum(-1) / estimator.reference / small
     expected = (push.square().sum(0) @ loss.surroundings).sqrt()
     torch.testing.assert_close(loss.push_noise, expected, rtol=0.01, atol=0)
+    before, after = (bearings.angles(y, measured, m)[0] for y, m in ((estimator.membrane.rest[None], 0 * moved), (x, moved)))
+    gained = (before * (before - after)).sum() / 2 / small**2 / D  # of a quadratic: half of what the residuals lose
+    torch.testing.assert_close(loss.noise_gain, gained, rtol=0.01, atol=0)
 
 
 def test_a_push_is_a_contact_where_it_stands_out_of_the_noise():
@@ -107,9 +111,28 @@ def test_a_push_is_a_contact_where_it_stands_out_of_the_noise():
     middle[len(patch) // 2] = True
     for times, is_contact in ((1.5, False), (6.0, True)):
         traction = times * loss.push_noise[middle] * force / loss.area
-        scale = loss.contact_scale(traction, normal.mT, ONE)[0, middle]
+        scale = loss.contact_scale(traction, normal.mT, ONE, 1e3 * ONE)[0, middle]
         pushed = -(traction[0] * normal.mT).sum(0)[middle] / estimator.reference
         assert (pushed > scale / 2).item() is is_contact
+
+
+def test_pushes_are_no_contact_where_the_surface_at_rest_explains_the_markers_as_well():
+    """One and the same surface with a push: of markers as they are seen on it, and of markers at rest."""
+    estimator = make(17)
+    membrane, bearings, loss = estimator.membrane, estimator.equations.bearings, estimator.equations.loss
+    off2 = (bearings.positions - bearings.positions[len(bearings.positions) // 4]).square().sum(-1)
+    moved = bearings.positions + 0.5 * torch.exp(-off2 / 8)[:, None] * torch.tensor([0.0, 1.0, -1.0]).double()
+    directions = torch.nn.functional.normalize(torch.stack([moved, bearings.positions]), dim=-1)
+    markers = seen(torch.zeros_like(directions), directions)
+    x, pressure = (value[:1].expand(2, *value.shape[1:]) for value in estimator(markers)[:2])
+    measured = bearings.measured(markers)
+    found = estimator.equilibrium(x, pressure, torch.zeros(2, 4).double(), x, measured)
+    gain = estimator.descent.at_rest(measured) / measured.weight.sum(-1) - found.objective
+    assert gain[0] > SETTINGS.evidence * loss.noise_gain > gain[1]
+    is_contact = (found.reference < BEYOND / 2 * estimator.reference) & ~membrane.fixed
+    assert is_contact[0].any() and not is_contact[1].any()
+    at_rest_found = estimator.equilibrium(*estimator.at_rest(measured.weight), x, measured)
+    torch.testing.assert_close(estimator.descent.at_rest(measured), at_rest_found.objective * measured.weight.sum(-1))
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)

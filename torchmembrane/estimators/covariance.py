@@ -108,8 +108,9 @@ def linearise(
 
 
 @torch.no_grad()
-def push_noise(equations: BalanceEquations, cavity: CavityLaw, rest: Observation, play: float) -> Tensor:
-    """The push `S [N]` that the markers' noise makes at rest, one standard deviation, while all losses are quadratic.
+def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observation, play: float) -> tuple[Tensor, Tensor]:
+    """What the markers' noise makes at rest, one standard deviation, while all losses are quadratic: the push `S [N]`, and by
+    how much the objective falls in the mean as the surface follows it, over the markers `[]`.
 
     Args:
         equations: of the force balance.
@@ -122,10 +123,12 @@ def push_noise(equations: BalanceEquations, cavity: CavityLaw, rest: Observation
     state = State(membrane.rest[None], cavity.rest_pressure[None], torch.zeros_like(membrane.rest[:1, :1]).expand(1, 4))
     at, normal, solution = linearise(equations, cavity, state, measured, (torch.inf, torch.inf), play)
     alone = torch.eye(2).to(measured.weight).expand(1, measured.weight.shape[1], 2, 2)
-    dx, dp = changes(solution, noise_loads(equations, normal, measured, solution.motion, alone))
+    loads = noise_loads(equations, normal, measured, solution.motion, alone)
+    dx, dp = changes(solution, loads)
     dq = equations.forces.change(at.stiffness, dx.unflatten(-1, (3, -1))) - dp[..., None, None] * at.volume[:, None]
     push = (dq * at.normal[:, None]).sum(2) / (loss.area * loss.reference)
-    return (push.square().sum(1) @ loss.surroundings).sqrt()[0]
+    gain = 0.5 * (loads * dx).sum().abs() / measured.weight.sum()
+    return (push.square().sum(1) @ loss.surroundings).sqrt()[0], gain
 
 
 def noise_loads(

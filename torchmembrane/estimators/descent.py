@@ -99,11 +99,18 @@ class Descent(nn.Module):
 
     def objective(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
-        equations, (x, pressure, moved) = self.equations, state
-        misfit = measured.weight * equations.bearings.angles(x, measured, moved)[0].square().sum(1)
+        of_tractions: Tensor = self.equations.loss(traction, normal, measured.noise_level)
+        return self._misfit(*state, measured) + of_tractions
+
+    def at_rest(self, measured: Bearings) -> Tensor:
+        """The same of the surface at rest and a camera that has not moved; there are no tractions."""
+        rest, none = self.membrane.rest[None], torch.zeros_like(measured.noise_level)
+        return self._misfit(rest, none + self.cavity.rest_pressure, none[:, None].expand(-1, 4), measured)
+
+    def _misfit(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> Tensor:
+        misfit = measured.weight * self.equations.bearings.angles(x, measured, moved)[0].square().sum(1)
         of_markers: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1)
-        of_tractions: Tensor = equations.loss(traction, normal, measured.noise_level)
-        return of_markers + of_tractions + gauge_loss(measured.gauge, pressure - self.cavity.rest_pressure)
+        return of_markers + gauge_loss(measured.gauge, pressure - self.cavity.rest_pressure)
 
     def tractions(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
         """The contact tractions of the inner vertices and their outward normals, `[B, 3, N]` each."""

@@ -37,7 +37,7 @@ from .base import Contacts, Deviations, Equilibrium, Observation, Problem
 from .bearings import Bearings, MarkerBearings, marker_rays, seen_from_origin
 from .contact_force import ContactForce
 from .contact_patches import ContactPatches
-from .covariance import StandardDeviations, push_noise, standard_deviations
+from .covariance import StandardDeviations, noise_effects, standard_deviations
 from .dent import Dent
 from .descent import Descent, State
 from .deviations import depths, of_presses, spreads
@@ -115,7 +115,7 @@ class ForceBalance(nn.Module):
         first = settings.coarse_steps if is_coarse else settings.steps
         self.steps = first if self.coarse is None else settings.finer_steps if self.dent is None else settings.fine_steps
         rest = seen_from_origin(bearings.positions) if rest is None else rest
-        loss.push_noise = push_noise(self.equations, self.cavity, rest, settings.camera_motion)
+        loss.push_noise, loss.noise_gain = noise_effects(self.equations, self.cavity, rest, settings.camera_motion)
 
     @classmethod
     def of(cls, problem: Problem, settings: ForceBalanceSettings | None = None) -> "ForceBalance":
@@ -277,9 +277,10 @@ class ForceBalance(nn.Module):
         step = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
         traction = self.equations.forces(x, pressure) / membrane.rest_area[:, None]
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
-        scale = 1 + pad_border(loss.contact_scale(*within, measured.noise_level)[..., None] - 1, membrane.grid)[..., 0]
-        misfit = self.equations.bearings.misfit(x, measured, moved, self.settings.outlier)
-        objective = self.descent.objective(State(x, pressure, moved), *within, measured) / measured.weight.sum(-1).clamp_min(1)
+        misfit, seen = self.equations.bearings.misfit(x, measured, moved, self.settings.outlier), measured.weight.sum(-1)
+        objective = self.descent.objective(State(x, pressure, moved), *within, measured) / seen.clamp_min(1)
+        gain = self.descent.at_rest(measured) / seen.clamp_min(1) - objective
+        scale = 1 + pad_border(loss.contact_scale(*within, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
         return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, misfit, moved, objective)
 
     @piece
@@ -291,8 +292,7 @@ class ForceBalance(nn.Module):
     @piece
     def is_settled(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: neither unfinished nor unexplained, so that more steps would change little."""
-        settled = found.relative_step < self.settings.settled_step
-        return settled & self.is_converged(found) & self.is_explained(found)
+        return (found.relative_step < self.settings.settled_step) & self.is_converged(found) & self.is_explained(found)
 
     @piece
     def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:

@@ -34,6 +34,8 @@ class ForceBalanceSettings:
         far_share: the same of the largest push of the whole surface.
         noise_share: the same of the push that the markers' noise alone makes, while all losses are quadratic.
         contact_noise: pushes of so many times the noise's are contacts, if they are large beside those around.
+        evidence: by how much what is found is likelier than the surface at rest, over what the markers' noise alone gains in
+            the mean, if anything of it is a contact.
         least_scale: least of what tractions are measured against, over p0.
         decrease: how fast that may fall as tau does.
         friction: weight of the shear traction's loss over that of the compressive one.
@@ -88,6 +90,7 @@ class ForceBalanceSettings:
     far_share: float = 0.1
     noise_share: float = 0.6
     contact_noise: float = 2.7
+    evidence: float = 0.35
     least_scale: float = 0.02
     decrease: float = 2.0
     friction: float = 3.75

@@ -48,6 +48,7 @@ class TractionLoss(nn.Module):
     surroundings: Tensor
     wider: Tensor
     push_noise: Tensor
+    noise_gain: Tensor
 
     def __init__(self, membrane: Membrane, reference: float, cone: float, settings: ForceBalanceSettings):
         super().__init__()
@@ -63,6 +64,7 @@ class TractionLoss(nn.Module):
         wider = within(within(_gaussian_mean(membrane, settings.scale_reach * self.size)).mT).mT
         self.register_buffer("wider", wider / wider.sum(0))
         self.register_buffer("push_noise", torch.zeros_like(self.area))
+        self.register_buffer("noise_gain", self.area.new_zeros(()))
 
     def parts(self, traction: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Normal part over `p0`, squared shear over `p0^2`, and the mean squared push `S^2` around, each `[B, N]`, of tractions
@@ -91,17 +93,20 @@ class TractionLoss(nn.Module):
         least = (settings.decrease * (torch.as_tensor(tau) / last - 1) + settings.least_scale).clamp_max(1.0)
         return (expected / last**2).maximum(least.to(push2) ** 2).clamp_max(1.0)
 
-    def contact_scale(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> Tensor:
-        """What a push that is a contact is measured against, over `p0`, `[B, N]`: `rho`, or where noise explains it `BEYOND`.
+    def contact_scale(self, traction: Tensor, normal: Tensor, noise_level: Tensor, gain: Tensor) -> Tensor:
+        """What a push that is a contact is measured against, over `p0`, `[B, N]`: `rho`, or where noise explains it, or
+        all that is found, `BEYOND`.
 
         Args:
             traction: `[B, 3, N]`, at a solution.
             normal: `[B, 3, N]`.
             noise_level: `[B]`, of the frames over that at rest.
+            gain: `[B]`, by how much the objective is below that of the surface at rest, over the markers seen.
         """
         push2 = self.parts(traction, normal)[2]
         rho = self.scale2(push2, noise_level, self.settings.tau[-1]).sqrt()
         above = push2 > (self.settings.contact_noise * noise_level[:, None] * self.push_noise).square()
+        above = above & (gain > self.settings.evidence * self.noise_gain)[:, None]
         return torch.where(above, rho, BEYOND)
 
     def weights(
