@@ -207,6 +207,8 @@ def test_what_is_likely_grows_with_the_press_up_to_a_limit(dented):
     found, measured = found._replace(objective=torch.tensor([1.0, 1.0]).double()), one.equations.bearings.measured(dented)
     moved = (found.vertices - one.membrane.rest).square().sum(-1).mean(-1).sqrt() / one.size
     assert moved[0] < 1e-4 < 0.015 < moved[1]
+    assert one.is_done(found, measured).tolist() == [True, True]  # without a contact in the first
+    found = found._replace(reference=one.reference * torch.ones_like(found.reference))
     assert one.is_done(found, measured).tolist() == [False, True]
     least, most = SETTINGS.likely_objective
     steep = estimator(likely_of_press=(most - least) / moved[1].item() / 2)

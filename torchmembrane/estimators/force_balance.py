@@ -16,8 +16,7 @@ neighbourhood of radius `reach` (contacts are patches), and the weights of the s
 
 Iteratively reweighted least squares (IRLS) by Gauss-Newton steps, while `tau` declines from where everything is quadratic
 (graduated non-convexity, GNC): no start but the rest surface is needed. A fine grid starts from the solution on every second of
-its lines, and so on: few vertices find the basin, and a `Dent` where something pushes. What has not settled is solved again, by
-more steps from several starts, the previous frame's solution among them: a stream's answers are those of its frames alone.
+its lines, and a `Dent` where something pushes. What has not settled is solved again, by more steps from several starts.
 """
 
 from typing import Any, ClassVar
@@ -44,7 +43,7 @@ from .deviations import depths, of_presses, spreads
 from .normal_equations import BalanceEquations
 from .pressure_gauge import gauge_reading, refuse_open
 from .settings import ForceBalanceSettings
-from .traction_loss import TractionLoss
+from .traction_loss import BEYOND, TractionLoss
 
 RESOLVED = 17
 """Lines of a grid whose own error is small beside the markers'; a coarser one's grows as the square of its step."""
@@ -297,10 +296,12 @@ class ForceBalance(nn.Module):
     @piece
     def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
         """`[B]` bool: settled, likely, no mound for a pit, hardly a marker outside, as beside a contact steps went past."""
-        settings, far = self.settings, 2 * self.settings.outlier * self.coarseness
-        outlying = self.equations.bearings.outlying(found.vertices, measured, found.moved, far)
-        least, most = settings.likely_objective
-        likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most) * self.coarseness**2
+        settings, (least, most) = self.settings, self.settings.likely_objective
+        at = found.vertices, measured, found.moved
+        outlying = self.equations.bearings.outlying(*at, 2 * settings.outlier * self.coarseness)
+        likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most)
+        pushed = ((found.reference < BEYOND / 2 * self.reference) & ~self.membrane.fixed).any(-1)
+        likely = torch.where(pushed, likely, most) * self.coarseness**2
         done: Tensor = self.is_settled(found) & (found.objective <= likely) & (outlying <= settings.largest_outlying)
         return done if self.dents is None else done & ~self.dents.is_hollow(found, self.membrane)
 
@@ -312,8 +313,7 @@ class ForceBalance(nn.Module):
 
     def _press(self, found: Equilibrium) -> Tensor:
         """Rms displacement over the size, `[B]`."""
-        moved: Tensor = (found.vertices - self.membrane.rest).square().sum(-1).mean(-1).sqrt() / self.size
-        return moved
+        return torch.sqrt((found.vertices - self.membrane.rest).square().sum(-1).mean(-1) / self.size**2)
 
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where something pushes."""

@@ -60,7 +60,7 @@ class ForceBalanceSettings:
             noise and the model's error; on grids of fewer than `force_balance.RESOLVED` lines more.
         largest_objective: what is minimised, over the markers seen, where a surface of this sensor explains them; as before.
         objective_of_press: so much more for a surface that has moved by its size (rms): the grid's error grows with the press.
-        likely_objective: the same, of a solution that is not solved again: where nothing moves, and of any.
+        likely_objective: the same, of a solution that is not solved again: of a contact where nothing moves, and of any.
         likely_of_press: so much more, up to the latter, for a surface that has moved by its size (rms).
         worse_objective: what is minimised, over that of a first solution that has converged, of a second that is not taken.
         largest_outlying: share of the markers that may be more than twice `outlier` off before a second try is made.
