@@ -11,7 +11,7 @@ from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.bearings import marker_rays
 from torchmembrane.estimators.descent import Scales
-from torchmembrane.estimators.traction_loss import BEYOND
+from torchmembrane.estimators.traction_loss import stands_out
 from torchmembrane.markers.noise import pixel_noise
 from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
@@ -127,12 +127,12 @@ def test_pushes_are_no_contact_where_the_surface_at_rest_explains_the_markers_as
     x, pressure = (value[:1].expand(2, *value.shape[1:]) for value in estimator(markers)[:2])
     measured = bearings.measured(markers)
     found = estimator.equilibrium(x, pressure, torch.zeros(2, 4).double(), x, measured)
-    gain = estimator.descent.at_rest(measured) / measured.weight.sum(-1) - found.objective
+    gain = estimator.descent.objective_at_rest(measured) / measured.weight.sum(-1) - found.objective
     assert gain[0] > SETTINGS.evidence * loss.noise_gain > gain[1]
-    is_contact = (found.reference < BEYOND / 2 * estimator.reference) & ~membrane.fixed
+    is_contact = stands_out(found.reference / estimator.reference) & ~membrane.fixed
     assert is_contact[0].any() and not is_contact[1].any()
     at_rest_found = estimator.equilibrium(*estimator.at_rest(measured.weight), x, measured)
-    torch.testing.assert_close(estimator.descent.at_rest(measured), at_rest_found.objective * measured.weight.sum(-1))
+    torch.testing.assert_close(estimator.descent.objective_at_rest(measured), at_rest_found.objective * measured.weight.sum(-1))
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)

@@ -127,7 +127,7 @@ def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observat
     dx, dp = changes(solution, loads)
     dq = equations.forces.change(at.stiffness, dx.unflatten(-1, (3, -1))) - dp[..., None, None] * at.volume[:, None]
     push = (dq * at.normal[:, None]).sum(2) / (loss.area * loss.reference)
-    gain = 0.5 * (loads * dx).sum().abs() / measured.weight.sum()
+    gain = 0.5 * (loads * dx).sum() / measured.weight.sum()
     return (push.square().sum(1) @ loss.surroundings).sqrt()[0], gain
 
 

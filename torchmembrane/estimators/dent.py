@@ -14,7 +14,7 @@ from ..surface.stencil import pad_border
 from .base import Equilibrium
 from .bearings import Bearings
 from .descent import Descent, State
-from .traction_loss import BEYOND
+from .traction_loss import stands_out
 
 DEPTH = 0.05  # over the surface's size
 WIDTH = 0.1  # standard deviation, over the size
@@ -82,7 +82,7 @@ class Dent(nn.Module):
         or two contacts are close; `membrane`: of the finer grid it is found on."""
         p0 = self.descent.equations.loss.reference
         pushes = (-(found.traction * membrane.normals(found.vertices)).sum(-1) / p0).clamp_min(0)
-        pushes = torch.where(found.reference < BEYOND / 2 * p0, pushes, 0.0)  # where noise does not explain them
+        pushes = torch.where(stands_out(found.reference / p0), pushes, 0.0)
         lines = (membrane.grid[0] - 1) // (self.membrane.grid[0] - 1)
         pushes = pushes.unflatten(1, membrane.grid)[:, ::lines, ::lines].flatten(1) + TINY
         rest, size = self.membrane.rest, self.membrane.size

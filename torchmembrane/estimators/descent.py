@@ -102,7 +102,7 @@ class Descent(nn.Module):
         of_tractions: Tensor = self.equations.loss(traction, normal, measured.noise_level)
         return self._misfit(*state, measured) + of_tractions
 
-    def at_rest(self, measured: Bearings) -> Tensor:
+    def objective_at_rest(self, measured: Bearings) -> Tensor:
         """The same of the surface at rest and a camera that has not moved; there are no tractions."""
         rest, none = self.membrane.rest[None], torch.zeros_like(measured.noise_level)
         return self._misfit(rest, none + self.cavity.rest_pressure, none[:, None].expand(-1, 4), measured)

@@ -43,7 +43,7 @@ from .deviations import depths, of_presses, spreads
 from .normal_equations import BalanceEquations
 from .pressure_gauge import gauge_reading, refuse_open
 from .settings import ForceBalanceSettings
-from .traction_loss import BEYOND, TractionLoss
+from .traction_loss import TractionLoss, stands_out
 
 RESOLVED = 17
 """Lines of a grid whose own error is small beside the markers'; a coarser one's grows as the square of its step."""
@@ -278,7 +278,7 @@ class ForceBalance(nn.Module):
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
         misfit, seen = self.equations.bearings.misfit(x, measured, moved, self.settings.outlier), measured.weight.sum(-1)
         objective = self.descent.objective(State(x, pressure, moved), *within, measured) / seen.clamp_min(1)
-        gain = self.descent.at_rest(measured) / seen.clamp_min(1) - objective
+        gain = self.descent.objective_at_rest(measured) / seen.clamp_min(1) - objective
         scale = 1 + pad_border(loss.contact_scale(*within, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
         return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, misfit, moved, objective)
 
@@ -300,7 +300,7 @@ class ForceBalance(nn.Module):
         at = found.vertices, measured, found.moved
         outlying = self.equations.bearings.outlying(*at, 2 * settings.outlier * self.coarseness)
         likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most)
-        pushed = ((found.reference < BEYOND / 2 * self.reference) & ~self.membrane.fixed).any(-1)
+        pushed = (stands_out(found.reference / self.reference) & ~self.membrane.fixed).any(-1)
         likely = torch.where(pushed, likely, most) * self.coarseness**2
         done: Tensor = self.is_settled(found) & (found.objective <= likely) & (outlying <= settings.largest_outlying)
         return done if self.dents is None else done & ~self.dents.is_hollow(found, self.membrane)

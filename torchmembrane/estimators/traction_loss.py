@@ -162,6 +162,11 @@ class TractionLoss(nn.Module):
         return pushes @ unit, others @ unit
 
 
+def stands_out(scale: Tensor) -> Tensor:
+    """Bool, of the shape of a `contact_scale`: where noise does not explain a push."""
+    return scale < BEYOND / 2
+
+
 def _gaussian_mean(membrane: Membrane, reach: float) -> Tensor:
     """Weights `[V, V]` of a Gaussian mean over the rest surface; column k is that around vertex k."""
     weight = torch.exp(-(torch.cdist(membrane.rest, membrane.rest) ** 2) / (2 * reach**2))
