@@ -201,6 +201,20 @@ def test_unlikely_solutions_are_tried_again_and_very_unlikely_ones_explain_nothi
         assert one.is_done(first, measured).tolist() == [True, False, False]
 
 
+def test_a_press_may_be_further_off_its_markers_than_a_sensor_at_rest(dented):
+    """Just below and just above what a press may be off, and the former of a surface at rest; the model of a grid of half the
+    lines errs four times as much."""
+    for one, error in ((estimator(), 1.0), (estimator(spherical_cap(12, 9, 3, (9, 9))), 4.0)):
+        found = one(dented)
+        moved = (found.vertices[1] - one.membrane.rest).square().sum(-1).mean().sqrt() / one.size
+        largest = (SETTINGS.largest_misfit + SETTINGS.misfit_of_press * moved) * error
+        first = type(found)(*(value[1:].repeat(3, *[1] * (value.ndim - 1)) for value in found))
+        vertices = torch.cat([first.vertices[:2], one.membrane.rest[None].to(first.vertices)])
+        first = first._replace(vertices=vertices, misfit=largest * torch.tensor([0.999, 1.001, 0.999]).double())
+        first = first._replace(objective=0 * first.objective)
+        assert one.is_explained(first).tolist() == [True, False, False]
+
+
 def test_what_is_likely_grows_with_the_press_up_to_a_limit(dented):
     one = estimator()
     found = one(dented)._replace(misfit=torch.zeros(2).double(), relative_step=torch.zeros(2).double())

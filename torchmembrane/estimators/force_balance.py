@@ -233,8 +233,7 @@ class ForceBalance(nn.Module):
 
     def _undented(self, measured: Bearings, patient: bool = False) -> State:
         """The state after a first step, whose pushes say where to dent it."""
-        begun, schedule = self._begun(measured, patient), self.schedule(patient)
-        return State(*self.descent(begun, measured, schedule[:1])[0])
+        return State(*self.descent(self._begun(measured, patient), measured, self.schedule(patient)[:1])[0])
 
     def schedule(self, patient: bool = False) -> list[tuple[float, float]]:
         """`tau` and `R` of every step on this grid; `patient`: a second time."""
@@ -307,9 +306,10 @@ class ForceBalance(nn.Module):
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the markers are off their rays by their noise and the model's error alone, by likely tractions."""
-        off = found.misfit > self.settings.largest_misfit * self.coarseness
-        largest = self.settings.largest_objective + self.settings.objective_of_press * self._press(found)
-        return torch.logical_not(off | (found.objective > largest * self.coarseness**2))
+        settings, press = self.settings, self._press(found)
+        misfit = (settings.largest_misfit + settings.misfit_of_press * press) * self.coarseness
+        objective = (settings.largest_objective + settings.objective_of_press * press) * self.coarseness**2
+        return torch.logical_not((found.misfit > misfit) | (found.objective > objective))
 
     def _press(self, found: Equilibrium) -> Tensor:
         """Rms displacement over the size, `[B]`."""

@@ -58,8 +58,9 @@ class ForceBalanceSettings:
         largest_volume_error: volume error of a converged solution, over the rest volume.
         largest_misfit: rms of the markers' angles off their rays where a surface of this sensor explains them, over their
             noise and the model's error; on grids of fewer than `force_balance.RESOLVED` lines more.
+        misfit_of_press: so much more for a surface that has moved by its size (rms): the grid's error grows with the press.
         largest_objective: what is minimised, over the markers seen, where a surface of this sensor explains them; as before.
-        objective_of_press: so much more for a surface that has moved by its size (rms): the grid's error grows with the press.
+        objective_of_press: so much more for a surface that has moved by its size (rms), as of the misfit.
         likely_objective: the same, of a solution that is not solved again: of a contact where nothing moves, and of any.
         likely_of_press: so much more, up to the latter, for a surface that has moved by its size (rms).
         worse_objective: what is minimised, over that of a first solution that has converged, of a second that is not taken.
@@ -77,10 +78,10 @@ class ForceBalanceSettings:
     tau: tuple[float, float] = (4.0, 0.4)
     fine_tau: tuple[float, float] = (0.8, 0.4)
     sharp_tau: tuple[float, float] = (1.0, 0.4)
-    patience: int = 3
+    patience: int = 4
     patient_tau: tuple[float, float] = (16.0, 0.4)
     patient_fine_tau: tuple[float, float] = (2.0, 0.4)
-    settling_steps: int = 8
+    settling_steps: int = 16
     settled_step: float = 1e-3
     camera_motion: float = 0.005
     decline: float = 0.6
@@ -98,7 +99,7 @@ class ForceBalanceSettings:
     cone: float = 23.0
     coarse_cone: float = 5.0
     reach: float = 0.04
-    renewal: float = 0.5
+    renewal: float = 0.25
     floor: float = 1e-3
     outlier: float = 5.0
     pressure_noise: float = 0.01
@@ -110,6 +111,7 @@ class ForceBalanceSettings:
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3
     largest_misfit: float = 1.35
+    misfit_of_press: float = 2.0
     largest_objective: float = 2.5
     objective_of_press: float = 20.0
     likely_objective: tuple[float, float] = (0.6, 2.5)
