@@ -118,14 +118,16 @@ def test_normal_weights_are_the_geometric_mean_with_those_of_the_step_before(den
 
 
 def test_weights_are_remembered_while_the_losses_stay_and_the_last_steps_are_damped():
-    """With `tau` declining all are new; a step alone is neither."""
+    """With `tau` declining all are new; a step alone is neither; a second try remembers more."""
     descent = estimator().descent
     taus = [4.0, 1.6, 0.4, 0.4, 0.4]
-    steps = [descent._numbers(taus[: k + 1], settles=k >= 3) for k in range(5)]
-    assert [renewal for renewal, _ in steps] == [1.0, 1.0, 1.0, SETTINGS.renewal, SETTINGS.renewal]
-    least = [SETTINGS.damping * (tau / 0.4) ** 2 for tau in taus[:3]]
-    assert [damping for _, damping in steps] == pytest.approx([*least, *2 * [SETTINGS.settling_damping]])
-    assert descent._numbers([0.4], settles=True) == (1.0, SETTINGS.damping)
+    first, second = ([descent._numbers(taus[: k + 1], k >= 3, patient) for k in range(5)] for patient in (False, True))
+    for steps, kept in zip((first, second), SETTINGS.renewal, strict=True):
+        assert [renewal for renewal, _ in steps] == [1.0, 1.0, 1.0, kept, kept]
+        least = [SETTINGS.damping * (tau / 0.4) ** 2 for tau in taus[:3]]
+        assert [damping for _, damping in steps] == pytest.approx([*least, *2 * [SETTINGS.settling_damping]])
+    assert SETTINGS.renewal[1] < SETTINGS.renewal[0]
+    assert descent._numbers([0.4], True, False) == (1.0, SETTINGS.damping)
     several, alone = estimator(spherical_cap(12, 9, 3, (17, 17))), estimator(spherical_cap(12, 9, 3, (9, 9)))
     assert (several.settling, several.coarse.settling, alone.settling) == (1, 1, ALONE)
 

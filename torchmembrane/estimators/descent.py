@@ -64,18 +64,19 @@ class Descent(nn.Module):
         schedule: list[tuple[float, float]],
         cone: float | None = None,
         settling: int = 1,
+        patient: bool = False,
     ) -> tuple[State, Tensor]:
         """The state after the steps of a schedule, and the surface before the last; `cone`: as for `TractionLoss.weights`;
-        `settling`: so many steps, the last ones, are damped to settle."""
+        `settling`: so many steps, the last ones, are damped to settle; `patient`: of a second try."""
         frames = max(1, VERTICES // self.membrane.rest.shape[0])
         cone = self.equations.loss.cone if cone is None else cone
         taus, size = [tau for tau, _ in schedule], len(schedule)
-        numbers = [self._numbers(taus[: k + 1], size - k <= settling) for k in range(size)]
+        numbers = [self._numbers(taus[: k + 1], size - k <= settling, patient) for k in range(size)]
         rows = [(*scales, cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
         x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows)
         return State(x, pressure, moved), before
 
-    def _numbers(self, taus: list[float], settles: bool) -> tuple[float, float]:
+    def _numbers(self, taus: list[float], settles: bool, patient: bool) -> tuple[float, float]:
         """The renewal and the damping of a step, from the scales `tau` up to its own: while these decline all weights are new,
         or they would lag behind."""
         settings, (first, last) = self.settings, self.settings.tau
@@ -83,7 +84,7 @@ class Descent(nn.Module):
         damping = settings.damping * (min(tau, first) / last) ** 2
         if settles and before:
             damping = max(damping, settings.settling_damping)
-        return settings.renewal if before[-1:] == [tau] else 1.0, damping
+        return settings.renewal[patient] if before[-1:] == [tau] else 1.0, damping
 
     def _stepped(self, x: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The state after the steps, and the surface before the last; `given`: what is measured, the steps' scales."""

@@ -216,7 +216,7 @@ class ForceBalance(nn.Module):
         found: tuple[State, Tensor]
         if self.dent is None:
             settling = self.settings.settling_steps if patient and self.coarse is not None else self.settling
-            found = self.descent(self._begun(measured, patient, start), measured, schedule, settling=settling)
+            found = self.descent(self._begun(measured, patient, start), measured, schedule, settling=settling, patient=patient)
         elif patient:
             quick, slow = (self._undented(measured, patient) for patient in (False, True))
             found = self.dent.sought(quick, slow, self.at_rest(measured.weight), start, measured, last)

@@ -43,8 +43,8 @@ class ForceBalanceSettings:
         cone: how much less shear weighs where something pushes.
         coarse_cone: the same on the coarsest grid, whose own error looks like friction under a contact.
         reach: radius of the surroundings that are asked whether a vertex is pushed.
-        renewal: share of a step's own weights of normal tractions in their geometric mean with those of the step before: so a
-            vertex that is pushed after one step and pulled after the next settles.
+        renewal: share of a step's own weights of normal tractions in their geometric mean with those of the step before, in a
+            first and in a second try: so a vertex that is pushed after one step and pulled after the next settles.
         floor: least weight of a compressive traction; without it a vertex under a contact has no place of its own.
         outlier: scale of the markers' loss, over their noise.
         pressure_noise: standard deviation of a measured pressure, over the reference traction (mostly the rest pressure); a
@@ -99,7 +99,7 @@ class ForceBalanceSettings:
     cone: float = 23.0
     coarse_cone: float = 5.0
     reach: float = 0.04
-    renewal: float = 0.25
+    renewal: tuple[float, float] = (0.5, 0.25)
     floor: float = 1e-3
     outlier: float = 5.0
     pressure_noise: float = 0.01
