@@ -78,7 +78,7 @@ class ForceBalanceSettings:
     tau: tuple[float, float] = (4.0, 0.4)
     fine_tau: tuple[float, float] = (0.8, 0.4)
     sharp_tau: tuple[float, float] = (1.0, 0.4)
-    patience: int = 4
+    patience: int = 3
     patient_tau: tuple[float, float] = (16.0, 0.4)
     patient_fine_tau: tuple[float, float] = (2.0, 0.4)
     settling_steps: int = 16
