@@ -57,7 +57,7 @@ class BalanceTwin:
         forces, bearings, loss = e.equations.forces, e.equations.bearings, e.equations.loss
         force, normals = forces(x, pressure), e.membrane.normals(x)
         within = (inner(field, e.membrane.grid).mT for field in (normals, force))
-        memory = None if self.weights is None else (self.weights, e.settings.renewal[0])
+        memory = None if self.weights is None else (self.weights, e.settings.renewal)
         inner_weights, self.weights = loss.weights(*within, measured.noise_level, tau, memory=memory)
         weights = pad_border(inner_weights.flatten(1, 2).mT, e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
         blocks = e.elasticity.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)

@@ -550,18 +550,13 @@ def test_the_objective_is_the_misfit_of_the_markers_and_the_loss_of_the_traction
     (origins, directions), *_ = pressed
     estimator = make()
     observation = seen(origins, directions)
-    found = estimator(observation)
-    none = found._replace(traction=torch.zeros_like(found.traction))
-    bearings = estimator.equations.bearings
-    misfit = bearings.angles(found.vertices, bearings.measured(observation), found.moved)[0].square().sum(1)
+    found, rest = estimator(observation), estimator.at_rest(observation.confidence)
+    bearings, descent = estimator.equations.bearings, estimator.descent
+    measured = bearings.measured(observation)
+    misfit = bearings.angles(found.vertices, measured, found.moved)[0].square().sum(1)
     expected = Cauchy(SETTINGS.outlier).loss(misfit).sum(1)
-    torch.testing.assert_close(estimator.objective(none, observation), expected)
-    assert (estimator.objective(found, observation) > expected).all()
-    assert estimator.objective(found, observation) < estimator.objective(equilibrium_at_rest(estimator), observation)
-
-
-def equilibrium_at_rest(estimator):
-    x, pressure, moved = estimator.at_rest(torch.ones(1, 1))
-    rays = estimator.equations.bearings.positions
-    measured = estimator.equations.bearings.measured(seen(torch.zeros_like(rays), torch.nn.functional.normalize(rays, dim=-1)))
-    return estimator.equilibrium(x, pressure, moved, x, measured)
+    state = State(found.vertices, found.pressure, found.moved)
+    traction, normal = descent.tractions(*state[:2])
+    torch.testing.assert_close(descent.objective(state, 0 * traction, normal, measured), expected)
+    assert (descent.objective(state, traction, normal, measured) > expected).all()
+    assert (found.objective < estimator.equilibrium(*rest, rest.x, measured).objective).all()

@@ -9,6 +9,7 @@ from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.cli.main import main
+from torchmembrane.estimators.descent import State
 from torchmembrane.estimators.pressure_gauge import gauge_loss, pulled
 from torchmembrane.mechanics.cavity import FILLINGS
 from torchmembrane.presets import preset
@@ -109,7 +110,10 @@ def test_the_objective_holds_half_the_squared_reading_over_its_noise(strokes):
     reading = reconstructor.rest_pressure + torch.tensor([1.3 * rise[0], NAN, rise[2]])
     with torch.no_grad():
         found = estimator(observation)
-        more = estimator.objective(found, estimator.gauged(observation, reading)) - estimator.objective(found, observation)
+        state, bearings = State(found.vertices, found.pressure, found.moved), estimator.equations.bearings
+        with_it, without = (bearings.measured(each) for each in (estimator.gauged(observation, reading), observation))
+        tractions = estimator.descent.tractions(*state[:2])
+        more = estimator.descent.objective(state, *tractions, with_it) - estimator.descent.objective(state, *tractions, without)
     expected = ((found.pressure - reading) / (0.02 * estimator.reference)).square() / 2
     torch.testing.assert_close(more, expected.nan_to_num())
 

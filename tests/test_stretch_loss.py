@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from torchmembrane.calibrate.material import Presses
-from torchmembrane.calibrate.stretch_loss import continued, loss_beside_pushes
+from torchmembrane.calibrate.stretch_loss import continued
 from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.descent import State
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
@@ -48,19 +49,22 @@ def off(losses):
 
 
 def test_without_its_pushes_a_light_press_tells_the_prestretch_better(light):
-    observation, _, best = light
-    beside = off([loss_beside_pushes(*explained, observation) for explained in best])
-    whole = off([estimator.objective(found, observation) for estimator, found in best])
+    best = light[2]
+    beside, whole = off([found.unexplained for _, found in best]), off([found.objective for _, found in best])
     assert beside < 0.04 and beside < 0.75 * whole
 
 
 def test_pushes_cost_nothing_and_pulls_what_they_cost(light):
     observation, solutions, _ = light
     estimator, found = solutions[4]
-    beside = loss_beside_pushes(estimator, found, observation)
-    assert (beside > 0).all() and (beside < estimator.objective(found, observation)).all()
-    pulled = loss_beside_pushes(estimator, found._replace(traction=-found.traction), observation)
-    assert (pulled > 10 * beside).all()
+    measured, seen = estimator.equations.bearings.measured(observation), observation.confidence.sum(-1)
+    state = State(found.vertices, found.pressure, found.moved)
+    traction, normal = estimator.descent.tractions(*state[:2])
+    beside, pushes = estimator.descent.losses(state, traction, normal, measured)
+    torch.testing.assert_close((found.unexplained, found.objective), (beside / seen, (beside + pushes) / seen))
+    assert (beside > 0).all() and (pushes > 0).all()
+    pulled, nothing = estimator.descent.losses(state, -traction, normal, measured)
+    assert (pulled > 10 * beside).all() and (nothing < 0.1 * pushes).all()
 
 
 def test_a_solve_that_ended_elsewhere_is_led_to_what_its_neighbours_found(light):

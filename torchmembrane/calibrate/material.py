@@ -16,7 +16,7 @@ from ..reconstruct import Reconstructor
 from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor
 from .gauge import UNSURE, FoundPressures, GaugeModulus, modulus_from_pressures
-from .stretch_loss import Explained, continued, loss_beside_pushes
+from .stretch_loss import Explained, continued
 
 GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
 PRESSURE_GRID = (33, 33)  # on coarser ones pressure changes are off by up to a tenth
@@ -253,8 +253,8 @@ class Presses:
     def _profile(self, solutions: dict[float, Explained]) -> LossProfile:
         stretches = sorted(solutions)
         best = continued([solutions[stretch] for stretch in stretches], self.observation)
-        losses = np.array([loss_beside_pushes(*explained, self.observation).numpy() for explained in best])
-        return LossProfile(np.array(stretches), losses)
+        seen = self.observation.confidence.sum(-1)
+        return LossProfile(np.array(stretches), np.array([(seen * found.unexplained).numpy() for _, found in best]))
 
     def gauge_modulus(
         self, log_stretch: float, deviation: float, pressures: KnownPressures

@@ -8,24 +8,14 @@ prestretch and not at the next; so the least at each is looked for from those at
 """
 
 import torch
-from torch import Tensor
 
 from ..estimators.base import Equilibrium, Observation
 from ..estimators.descent import State
 from ..estimators.force_balance import ForceBalance
-from ..surface.stencil import inner
 
 STEPS = 4  # from a neighbour's solution
 
 Explained = tuple[ForceBalance, Equilibrium]
-
-
-def loss_beside_pushes(estimator: ForceBalance, found: Equilibrium, observation: Observation) -> Tensor:
-    """`[B]`: what `estimator` minimises, at what it has found, less the loss of the pushes."""
-    grid, level = estimator.membrane.grid, estimator.equations.bearings.measured(observation).noise_level
-    traction, normal = (inner(a, grid).mT for a in (found.traction, estimator.membrane.normals(found.vertices)))
-    pushes, _ = estimator.equations.loss.losses(traction, normal, level)
-    return estimator.objective(found, observation) - pushes
 
 
 def continued(solutions: list[Explained], observation: Observation) -> list[Explained]:

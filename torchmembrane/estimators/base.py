@@ -65,8 +65,9 @@ class Equilibrium(NamedTuple):
     """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`
     (zero for minimum energy), `relative_step [...]`: the last step over the surface's size, `reference [..., V]`: the traction
     against which pushes are measured (zero where no tractions are found), `misfit [...]`: rms of the markers' angles off their
-    rays, in standard deviations (zero where the surface is on every ray), `moved [..., 4]`: the camera, against the rim, and
-    `objective [...]`: how unlikely markers and tractions are, over the markers seen (zero where no tractions are found)."""
+    rays, in standard deviations (zero where the surface is on every ray), `moved [..., 4]`: the camera, against the rim,
+    `objective [...]`: how unlikely markers and tractions are, over the markers seen, and `unexplained [...]`: as much of it
+    as no push is the reason of: misfit, pulls and shear (both zero where no tractions are found)."""
 
     vertices: Tensor
     pressure: Tensor
@@ -77,6 +78,7 @@ class Equilibrium(NamedTuple):
     misfit: Tensor
     moved: Tensor
     objective: Tensor
+    unexplained: Tensor
 
 
 class Contacts(NamedTuple):

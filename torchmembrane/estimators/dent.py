@@ -106,11 +106,11 @@ class Dent(nn.Module):
             self.deep(*slow, measured),
             self.wide(*slow, measured),
             self.deep(*quick, measured),
-            self.descent(rest, measured, settings.gnc_schedule(steps, settings.sharp_tau), patient=True)[0],
-            self.descent(rest, measured, settings.gnc_schedule(steps, settings.tau), cone=0.0, patient=True)[0],
+            self.descent(rest, measured, settings.gnc_schedule(steps, settings.sharp_tau))[0],
+            self.descent(rest, measured, settings.gnc_schedule(steps, settings.tau), cone=0.0)[0],
         ]
         starts += [] if start is None else [start]
-        found: list[Found] = [self.descent(start, measured, schedule, patient=True) for start in starts]
+        found: list[Found] = [self.descent(start, measured, schedule) for start in starts]
         best: Stepped = (*found[0][0], found[0][1])
         for state, before in found[1:]:
             best = self.lower(best, (*state, before), measured)

@@ -64,19 +64,18 @@ class Descent(nn.Module):
         schedule: list[tuple[float, float]],
         cone: float | None = None,
         settling: int = 1,
-        patient: bool = False,
     ) -> tuple[State, Tensor]:
         """The state after the steps of a schedule, and the surface before the last; `cone`: as for `TractionLoss.weights`;
-        `settling`: so many steps, the last ones, are damped to settle; `patient`: of a second try."""
+        `settling`: so many steps, the last ones, are damped to settle."""
         frames = max(1, VERTICES // self.membrane.rest.shape[0])
         cone = self.equations.loss.cone if cone is None else cone
         taus, size = [tau for tau, _ in schedule], len(schedule)
-        numbers = [self._numbers(taus[: k + 1], size - k <= settling, patient) for k in range(size)]
+        numbers = [self._numbers(taus[: k + 1], size - k <= settling) for k in range(size)]
         rows = [(*scales, cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
         x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows)
         return State(x, pressure, moved), before
 
-    def _numbers(self, taus: list[float], settles: bool, patient: bool) -> tuple[float, float]:
+    def _numbers(self, taus: list[float], settles: bool) -> tuple[float, float]:
         """The renewal and the damping of a step, from the scales `tau` up to its own: while these decline all weights are new,
         or they would lag behind."""
         settings, (first, last) = self.settings, self.settings.tau
@@ -84,7 +83,7 @@ class Descent(nn.Module):
         damping = settings.damping * (min(tau, first) / last) ** 2
         if settles and before:
             damping = max(damping, settings.settling_damping)
-        return settings.renewal[patient] if before[-1:] == [tau] else 1.0, damping
+        return settings.renewal if before[-1:] == [tau] else 1.0, damping
 
     def _stepped(self, x: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The state after the steps, and the surface before the last; `given`: what is measured, the steps' scales."""
@@ -100,8 +99,13 @@ class Descent(nn.Module):
 
     def objective(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
-        of_tractions: Tensor = self.equations.loss(traction, normal, measured.noise_level)
-        return self._misfit(*state, measured) + of_tractions
+        unexplained, pushes = self.losses(state, traction, normal, measured)
+        return unexplained + pushes
+
+    def losses(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> tuple[Tensor, Tensor]:
+        """The same in two parts, `[B]` each: what no push is the reason of, misfit, pulls and shear; and the pushes' loss."""
+        pushes, others = self.equations.loss.losses(traction, normal, measured.noise_level)
+        return self._misfit(*state, measured) + others, pushes
 
     def objective_at_rest(self, measured: Bearings) -> Tensor:
         """The same of the surface at rest and a camera that has not moved; there are no tractions."""

@@ -216,7 +216,7 @@ class ForceBalance(nn.Module):
         found: tuple[State, Tensor]
         if self.dent is None:
             settling = self.settings.settling_steps if patient and self.coarse is not None else self.settling
-            found = self.descent(self._begun(measured, patient, start), measured, schedule, settling=settling, patient=patient)
+            found = self.descent(self._begun(measured, patient, start), measured, schedule, settling=settling)
         elif patient:
             quick, slow = (self._undented(measured, patient) for patient in (False, True))
             found = self.dent.sought(quick, slow, self.at_rest(measured.weight), start, measured, last)
@@ -275,11 +275,13 @@ class ForceBalance(nn.Module):
         step = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
         traction = self.equations.forces(x, pressure) / membrane.rest_area[:, None]
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
-        misfit, seen = self.equations.bearings.misfit(x, measured, moved, self.settings.outlier), measured.weight.sum(-1)
-        objective = self.descent.objective(State(x, pressure, moved), *within, measured) / seen.clamp_min(1)
-        gain = self.descent.objective_at_rest(measured) / seen.clamp_min(1) - objective
+        misfit = self.equations.bearings.misfit(x, measured, moved, self.settings.outlier)
+        seen, parts = measured.weight.sum(-1).clamp_min(1), self.descent.losses(State(x, pressure, moved), *within, measured)
+        objective, unexplained = sum(parts) / seen, parts[0] / seen
+        gain = self.descent.objective_at_rest(measured) / seen - objective
         scale = 1 + pad_border(loss.contact_scale(*within, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
-        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, misfit, moved, objective)
+        against = self.reference * scale
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, against, misfit, moved, objective, unexplained)
 
     @piece
     def is_converged(self, found: Equilibrium) -> Tensor:
@@ -305,11 +307,12 @@ class ForceBalance(nn.Module):
         return done if self.dents is None else done & ~self.dents.is_hollow(found, self.membrane)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: the markers are off their rays by their noise and the model's error alone, by likely tractions."""
+        """`[B]` bool: the markers are off their rays by their noise and the model's error alone, with hardly a pull or shear
+        that no push comes with. How much pushes is no reason to doubt: a contact may be large, and its markers few."""
         settings, press = self.settings, self._press(found)
         misfit = (settings.largest_misfit + settings.misfit_of_press * press) * self.coarseness
-        objective = (settings.largest_objective + settings.objective_of_press * press) * self.coarseness**2
-        return torch.logical_not((found.misfit > misfit) | (found.objective > objective))
+        unexplained = (settings.largest_unexplained + settings.unexplained_of_press * press) * self.coarseness**2
+        return torch.logical_not((found.misfit > misfit) | (found.unexplained > unexplained))
 
     def _press(self, found: Equilibrium) -> Tensor:
         """Rms displacement over the size, `[B]`."""
@@ -329,13 +332,6 @@ class ForceBalance(nn.Module):
         force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, found.vertices)
         unseen = self.equations.loss.push_noise.mean() * self.reference * self.size**2
         return of_presses(spread, force, depth.amax(-1), contacts, self.membrane, self.spacing, unseen)
-
-    def objective(self, found: Equilibrium, observation: Observation) -> Tensor:
-        """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
-        state, measured = State(found.vertices, found.pressure, found.moved), self.equations.bearings.measured(observation)
-        normals = self.membrane.normals(found.vertices)
-        traction, normal = (inner(field, self.membrane.grid).mT for field in (found.traction, normals))
-        return self.descent.objective(state, traction, normal, measured)
 
     def standard_deviations(
         self, x: Tensor, pressure: Tensor, moved: Tensor, observation: Observation, marker_noise: float | Tensor

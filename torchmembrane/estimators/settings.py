@@ -43,8 +43,8 @@ class ForceBalanceSettings:
         cone: how much less shear weighs where something pushes.
         coarse_cone: the same on the coarsest grid, whose own error looks like friction under a contact.
         reach: radius of the surroundings that are asked whether a vertex is pushed.
-        renewal: share of a step's own weights of normal tractions in their geometric mean with those of the step before, in a
-            first and in a second try: so a vertex that is pushed after one step and pulled after the next settles.
+        renewal: share of a step's own weights of normal tractions in their geometric mean with those of the step before: so a
+            vertex that is pushed after one step and pulled after the next settles.
         floor: least weight of a compressive traction; without it a vertex under a contact has no place of its own.
         outlier: scale of the markers' loss, over their noise.
         pressure_noise: standard deviation of a measured pressure, over the reference traction (mostly the rest pressure); a
@@ -59,9 +59,11 @@ class ForceBalanceSettings:
         largest_misfit: rms of the markers' angles off their rays where a surface of this sensor explains them, over their
             noise and the model's error; on grids of fewer than `force_balance.RESOLVED` lines more.
         misfit_of_press: so much more for a surface that has moved by its size (rms): the grid's error grows with the press.
-        largest_objective: what is minimised, over the markers seen, where a surface of this sensor explains them; as before.
-        objective_of_press: so much more for a surface that has moved by its size (rms), as of the misfit.
-        likely_objective: the same, of a solution that is not solved again: of a contact where nothing moves, and of any.
+        largest_unexplained: what is minimised but for the loss of pushes, over the markers seen, where a surface of this
+            sensor explains them; as before.
+        unexplained_of_press: so much more for a surface that has moved by its size (rms), as of the misfit.
+        likely_objective: what is minimised, over the markers seen, of a solution that is not solved again: of a contact where
+            nothing moves, and of any; as before.
         likely_of_press: so much more, up to the latter, for a surface that has moved by its size (rms).
         worse_objective: what is minimised, over that of a first solution that has converged, of a second that is not taken.
         largest_outlying: share of the markers that may be more than twice `outlier` off before a second try is made.
@@ -78,14 +80,14 @@ class ForceBalanceSettings:
     tau: tuple[float, float] = (4.0, 0.4)
     fine_tau: tuple[float, float] = (0.8, 0.4)
     sharp_tau: tuple[float, float] = (1.0, 0.4)
-    patience: int = 3
+    patience: int = 4
     patient_tau: tuple[float, float] = (16.0, 0.4)
     patient_fine_tau: tuple[float, float] = (2.0, 0.4)
     settling_steps: int = 16
     settled_step: float = 1e-3
     camera_motion: float = 0.005
     decline: float = 0.6
-    sparsity: float = 6400.0
+    sparsity: float = 9000.0
     scale_reach: float = 0.08
     scale_share: float = 0.3
     far_share: float = 0.1
@@ -99,7 +101,7 @@ class ForceBalanceSettings:
     cone: float = 23.0
     coarse_cone: float = 5.0
     reach: float = 0.04
-    renewal: tuple[float, float] = (0.5, 0.25)
+    renewal: float = 0.25
     floor: float = 1e-3
     outlier: float = 5.0
     pressure_noise: float = 0.01
@@ -112,10 +114,10 @@ class ForceBalanceSettings:
     largest_volume_error: float = 1e-3
     largest_misfit: float = 1.35
     misfit_of_press: float = 2.0
-    largest_objective: float = 2.5
-    objective_of_press: float = 20.0
-    likely_objective: tuple[float, float] = (0.6, 2.5)
-    likely_of_press: float = 60.0
+    largest_unexplained: float = 2.5
+    unexplained_of_press: float = 10.0
+    likely_objective: tuple[float, float] = (0.8, 3.2)
+    likely_of_press: float = 80.0
     worse_objective: float = 1.02
     largest_outlying: float = 0.01
 
