@@ -225,7 +225,8 @@ def test_where_a_gauge_tells_nothing_is_said(strokes):
 
 
 def test_a_reading_takes_the_grids_error_out_of_the_force():
-    """Presses through rendered images, readings good to 0.1 % of the rest pressure, told to be good to 1 %."""
+    """Presses through rendered images, readings good to 0.1 % of the rest pressure, told to be good to 1 %; of these the deep
+    one of a narrow ball is what 17 lines resolve least."""
     sensor = sensor_of()
     simulator = Simulator(sensor, grid=(31, 31), appearance=Appearance(noise=35.0))
     reader = tm.Reconstructor(replace(sensor, markers=replace(sensor.markers, rest_image=simulator.rest_image())))
@@ -239,8 +240,8 @@ def test_a_reading_takes_the_grids_error_out_of_the_force():
         with torch.no_grad():
             found = [reader(image, pressure=pressure).force[0].numpy() for pressure in (None, reading)]
         errors.append([np.linalg.norm(force - truth) / np.linalg.norm(truth) for force in found])
-    alone, gauged = np.mean(errors, 0)
-    assert gauged < 0.8 * alone and gauged < 0.02
+    (alone, gauged), (narrow, narrow_gauged) = np.mean(errors, 0), errors[0]
+    assert narrow_gauged < 0.6 * narrow and gauged < alone and gauged < 0.016
 
 
 @pytest.fixture(scope="module")

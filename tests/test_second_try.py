@@ -213,24 +213,26 @@ def test_a_press_may_be_further_off_its_markers_than_a_sensor_at_rest(dented):
         first = type(found)(*(value[1:].repeat(3, *[1] * (value.ndim - 1)) for value in found))
         vertices = torch.cat([first.vertices[:2], one.membrane.rest[None].to(first.vertices)])
         first = first._replace(vertices=vertices, misfit=largest * torch.tensor([0.999, 1.001, 0.999]).double())
-        first = first._replace(objective=0 * first.objective)
+        first = first._replace(objective=0 * first.objective, unexplained=0 * first.objective)
         assert one.is_explained(first).tolist() == [True, False, False]
 
 
 def test_what_is_likely_grows_with_the_press_up_to_a_limit(dented):
-    one = estimator()
-    found = one(dented)._replace(misfit=torch.zeros(2).double(), relative_step=torch.zeros(2).double())
-    found, measured = found._replace(objective=torch.tensor([1.0, 1.0]).double()), one.equations.bearings.measured(dented)
+    one, zero = estimator(largest_outlying=1.0), torch.zeros(2, dtype=torch.float64)
+    found = one(dented)._replace(misfit=zero, relative_step=zero, unexplained=zero, objective=zero + 1)
+    measured = one.equations.bearings.measured(dented)
     moved = (found.vertices - one.membrane.rest).square().sum(-1).mean(-1).sqrt() / one.size
     assert moved[0] < 1e-4 < 0.015 < moved[1]
     assert one.is_done(found, measured).tolist() == [True, True]  # without a contact in the first
     found = found._replace(reference=one.reference * torch.ones_like(found.reference))
     assert one.is_done(found, measured).tolist() == [False, True]
     least, most = SETTINGS.likely_objective
-    steep = estimator(likely_of_press=(most - least) / moved[1].item() / 2)
+    steep = estimator(likely_of_press=(most - least) / moved[1].item() / 2, largest_outlying=1.0)
     for objective, expected in ((0.49 * (least + most), True), (0.51 * (least + most), False)):
         assert steep.is_done(found._replace(objective=0 * moved + objective), measured)[1] == expected
-    assert not estimator(likely_of_press=1e9).is_done(found._replace(objective=0 * moved + 1.01 * most), measured)[1]
+    assert not estimator(likely_of_press=1e9, largest_outlying=1.0).is_done(
+        found._replace(objective=0 * moved + 1.01 * most), measured
+    )[1]
 
 
 @pytest.mark.parametrize("lines", [17, 33])

@@ -51,7 +51,7 @@ def off(losses):
 def test_without_its_pushes_a_light_press_tells_the_prestretch_better(light):
     best = light[2]
     beside, whole = off([found.unexplained for _, found in best]), off([found.objective for _, found in best])
-    assert beside < 0.04 and beside < 0.75 * whole
+    assert beside < 0.02 and beside < 0.95 * whole
 
 
 def test_pushes_cost_nothing_and_pulls_what_they_cost(light):
@@ -63,8 +63,8 @@ def test_pushes_cost_nothing_and_pulls_what_they_cost(light):
     beside, pushes = estimator.descent.losses(state, traction, normal, measured)
     torch.testing.assert_close((found.unexplained, found.objective), (beside / seen, (beside + pushes) / seen))
     assert (beside > 0).all() and (pushes > 0).all()
-    pulled, nothing = estimator.descent.losses(state, -traction, normal, measured)
-    assert (pulled > 10 * beside).all() and (nothing < 0.1 * pushes).all()
+    pulled, _ = estimator.descent.losses(state, -traction, normal, measured)
+    assert (pulled > 10 * beside).all()
 
 
 def test_a_solve_that_ended_elsewhere_is_led_to_what_its_neighbours_found(light):

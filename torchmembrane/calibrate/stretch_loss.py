@@ -2,9 +2,9 @@
 
 The force balance minimises the misfit of the markers and the loss of the tractions, over `p0`. A press with the wrong
 prestretch needs shear and pulls where only pushes can be, and leaves the markers off. Its push is no sign of anything: it is
-what a press is. But its loss, too, changes with the prestretch, up or down with the force, its area and `p0`: counted, it puts
-the prestretch off by some per cent, of light presses above all. A solve from rest may also end beside the least loss at one
-prestretch and not at the next; so the least at each is looked for from those at its neighbours, too.
+what a press is. But its loss, too, changes with the prestretch, up or down with the force, its area and `p0`: it is not
+counted. A solve from rest may also end beside the least loss at one prestretch and not at the next; so the least at each is
+looked for from those at its neighbours, too.
 """
 
 import torch
