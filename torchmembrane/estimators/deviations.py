@@ -30,8 +30,8 @@ from .descent import State
 from .normal_equations import BalanceEquations, NormalEquations
 from .settings import ForceBalanceSettings
 
-FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 0.9, 0.028, 0.11, 0.002
-DEPTH, DIP, DIP_SHARE, DIP_AT_RIM = 1.4, 0.024, 0.42, 0.05
+FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 0.85, 0.026, 0.12, 0.002
+DEPTH, DIP, DIP_SHARE, DIP_AT_RIM = 1.6, 0.016, 0.7, 0.03
 FINE = 25
 """Lines of the grids that it was fitted on, at least; on coarser ones the spreads count for more, as the square of the step."""
 
