@@ -104,7 +104,7 @@ class Descent(nn.Module):
 
     def losses(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> tuple[Tensor, Tensor]:
         """The same in two parts, `[B]` each: what no push is the reason of, misfit, pulls and shear; and the pushes' loss."""
-        pushes, others = self.equations.loss.losses(traction, normal, measured.noise_level)
+        pushes, others = self.equations.loss(traction, normal, measured.noise_level)
         return self._misfit(*state, measured) + others, pushes
 
     def objective_at_rest(self, measured: Bearings) -> Tensor:

@@ -276,8 +276,9 @@ class ForceBalance(nn.Module):
         traction = self.equations.forces(x, pressure) / membrane.rest_area[:, None]
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
         misfit = self.equations.bearings.misfit(x, measured, moved, self.settings.outlier)
-        seen, parts = measured.weight.sum(-1).clamp_min(1), self.descent.losses(State(x, pressure, moved), *within, measured)
-        objective, unexplained = sum(parts) / seen, parts[0] / seen
+        losses, seen = self.descent.losses(State(x, pressure, moved), *within, measured), measured.weight.sum(-1).clamp_min(1)
+        unexplained, pushes = (each / seen for each in losses)
+        objective = unexplained + pushes
         gain = self.descent.objective_at_rest(measured) / seen - objective
         scale = 1 + pad_border(loss.contact_scale(*within, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
         against = self.reference * scale

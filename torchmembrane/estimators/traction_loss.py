@@ -146,13 +146,9 @@ class TractionLoss(nn.Module):
         along = (scale * (w_n - w_t))[:, None] * normal
         return along[:, :, None] * normal[..., None, :, :] + (scale * w_t)[:, None, None] * one, w_n
 
-    def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> Tensor:
-        """The loss `[B]` of tractions `[B, 3, N]` at the last scale `tau`, each push judged by itself."""
-        pushes, others = self.losses(traction, normal, noise_level)
-        return pushes + others
-
-    def losses(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> tuple[Tensor, Tensor]:
-        """The loss in two parts, `[B]` each: of the pushes, and of pulls and shear."""
+    def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> tuple[Tensor, Tensor]:
+        """The loss of tractions `[B, 3, N]` at the last scale `tau`, each push judged by itself, in two parts, `[B]` each: of
+        the pushes, and of pulls and shear."""
         q_n, shear2, push2_around = self.parts(traction, normal)
         rho2 = self.scale2(push2_around, noise_level, self.settings.tau[-1])
         q_n, shear2, push2_around = q_n / rho2.sqrt(), shear2 / rho2, push2_around / rho2
