@@ -1,6 +1,6 @@
 """How often intervals of one standard deviation hold the truth, and how wide they are.
 
-python bench/intervals.py DATA [--first 0] [--sensors 10000] [--grid N] [--json FILE]
+python bench/intervals.py DATA... [--first 0] [--sensors 10000] [--grid N] [--json FILE]
 
 DATA from random_sensors.py, its light strokes and presses. Of frames with status ok, by the true force over the sensor's
 largest, and apart where a contact reaches the rim: how many intervals of `force_deviation` (each component) and
@@ -36,7 +36,7 @@ def row_of(r: tm.Reconstructor, path: Path) -> dict:
     deepest = -((truth["vertices_deformed"] - truth["vertices_nominal"]) * normals).sum(-1).min()
     F = truth["force"].astype(float)
     return dict(
-        sensor=path.parent.name,
+        sensor=str(path.parent),
         file=path.stem,
         status=int(got["status"]),
         force=float(np.linalg.norm(F)),
@@ -78,7 +78,7 @@ def report(rows: list[dict]) -> None:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
+    parser.add_argument("data", type=Path, nargs="+")
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--sensors", type=int, default=10000)
     parser.add_argument("--grid", type=int)
@@ -86,7 +86,7 @@ def main():
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     rows = []
-    for folder in sorted(args.data.glob("s[0-9]*")):
+    for folder in sorted(folder for data in args.data for folder in data.glob("s[0-9]*")):
         if not args.first <= int(folder.name[1:]) < args.first + args.sensors:
             continue
         files = [path for kind in ("press", "light") for path in sorted(folder.glob(f"{kind}_*.npz"))]
@@ -96,7 +96,7 @@ def main():
                 sensor = replace(sensor, membrane=sensor.surface.membrane((args.grid, args.grid)))
             r = tm.Reconstructor(sensor)
         except tm.MembraneError as error:
-            print(f"{folder.name}: {error}")
+            print(f"{folder}: {error}")
             continue
         rows += [row_of(r, path) for path in files]
     report(rows)

@@ -16,6 +16,14 @@ from torchmembrane.simulate.simulator import Simulator
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 torch.set_num_threads(1)
+LONG = ["test_export_sensors", "test_material", "test_drift", "test_export", "test_compile", "test_deviations", "test_fuzz",
+        "test_tutorial", "test_gauge_modulus", "test_jobs", "test_learning_stack", "test_learning", "test_weight"]  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    """The longest files first, so that no process has one left to do when the others are through."""
+    place = {name: k for k, name in enumerate(LONG)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))
 
 
 @pytest.fixture(autouse=True)

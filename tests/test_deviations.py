@@ -15,13 +15,13 @@ from torchmembrane.estimators.deviations import (
     AT_RIM,
     DEPTH,
     DIP,
-    DIP_AT_RIM,
-    DIP_SHARE,
     FORCE,
     FORCE_SHARE,
     UNSEEN,
     depths,
+    gap_around,
     of_presses,
+    shares_of_deepest,
     spreads,
 )
 from torchmembrane.estimators.force_balance import ForceBalance
@@ -211,27 +211,46 @@ def test_spreads_by_the_transposed_equations_are_those_of_every_noise_by_itself(
 
 def test_deviations_of_an_answer_are_its_spreads_and_what_the_model_leaves_out():
     """Each part by itself, and turned with the force."""
-    spread, spacing = (torch.tensor([[3.0, 4.0, 0.0]]), torch.tensor([2.0])), 2.0
+    spread, gap = (torch.tensor([[3.0, 4.0, 0.0]]), torch.tensor([2.0])), 3.0
 
-    def of(spread, force=(0.0, 0.0, 0.0), depth=0.0, at_rim=torch.nan, unseen=0.0, lines=25):
+    def of(spread, force=(0.0, 0.0, 0.0), depth=0.0, at_rim=torch.nan, unseen=0.0, lines=25, gap=gap):
         rows = {name: torch.full((1, 4), torch.nan) for name in Contacts._fields}
         contacts = Contacts(**rows | {"points": torch.full((1, 4, 3), torch.nan)})
         if at_rim == at_rim:
             contacts.points[0, 0], contacts.at_rim[0, 0] = 0.0, at_rim
-        force, depth = torch.tensor([force]), torch.tensor([depth])
+        force, depth, gap = torch.tensor([force]), torch.tensor([depth]), torch.tensor([gap])
         membrane = SimpleNamespace(size=10.0, grid=(33, lines))
-        return of_presses(spread, force, depth, contacts, membrane, spacing, torch.tensor(unseen))
+        return of_presses(spread, force, depth, gap, contacts, membrane, torch.tensor(unseen))
 
     nothing = tuple(torch.zeros_like(s) for s in spread)
     close = torch.testing.assert_close
     close(of(spread, at_rim=0).force, FORCE * spread[0])
     close(of(spread, at_rim=0, lines=33).force, FORCE * spread[0])
     close(of(spread, at_rim=0, lines=13).force, 4 * FORCE * spread[0])
-    close(of(spread, at_rim=0).depth, torch.tensor([((DEPTH * 2) ** 2 + (DIP * 2) ** 2) ** 0.5]))
+    close(of(spread, gap=0.0).depth, spread[1])
+    close(of(spread, depth=4.0).depth, (4 + DEPTH**2 * 6 + (DIP * 3.3) ** 2) ** 0.5 * torch.ones(1))
+    close(of(spread, depth=4.0, lines=13).depth, (64 + DEPTH**2 * 24 + (DIP * 3.3) ** 2) ** 0.5 * torch.ones(1))
     close(of(nothing, (0.0, -5.0, 0.0), at_rim=0).force, torch.tensor([[0.0, 5 * FORCE_SHARE, 0.0]]))
     rim = of(nothing, (3.0, 0.0, 4.0), 2.0, at_rim=1)
     own = FORCE_SHARE * torch.tensor([[3.0, 0.0, 4.0]])
     close(rim.force, (own**2 + (5 * AT_RIM) ** 2).sqrt())
-    close(rim.depth, torch.tensor([((DIP * 2) ** 2 + (DIP_SHARE * 0.4) ** 2 + (DIP_AT_RIM * 2) ** 2) ** 0.5]))
     close(of(nothing, unseen=7.0).force, torch.full((1, 3), 7 * UNSEEN))
-    close(of(nothing).depth, torch.tensor([DIP * 2]))
+    close(of(nothing).depth, torch.tensor([DIP * 0.9]))
+
+
+def test_the_gap_is_the_mean_distance_to_the_nearest_markers_that_are_seen():
+    """Of the deepest vertex; lost markers leave a gap, and where hardly any are seen it is the surface's size."""
+    dome = spherical_cap(12.0, 9.0, 3.0, grid=(9, 9))
+    depth = torch.zeros(2, 81, dtype=torch.float64)
+    depth[0, 40], depth[1, 30] = 1.0, 2.0
+    deepest = shares_of_deepest(depth)
+    assert deepest.sum(1).tolist() == [1, 1] and deepest[0, 40] == deepest[1, 30] == 1
+    positions = dome.rest[40] + torch.tensor([[1.0, 0, 0], [0, 2, 0], [0, 0, 3], [-4, 0, 0], [0, -5, 0]], dtype=torch.float64)
+    seen = torch.tensor([[1.0, 1, 1, 1, 1], [1, 1, 1, 1, 1]])
+    offsets = torch.linalg.vector_norm(positions - dome.rest[30], dim=-1).sort().values
+    torch.testing.assert_close(
+        gap_around(deepest, positions, seen, dome), torch.stack([torch.tensor(2.5).double(), offsets[:4].mean()])
+    )
+    seen[0, 0] = 0
+    assert float(gap_around(deepest, positions, seen, dome)[0]) == pytest.approx(3.5)
+    assert float(gap_around(deepest, positions, 0 * seen, dome)[0]) == pytest.approx(dome.size)

@@ -12,8 +12,10 @@ missing was fitted to presses of random sensors (`bench/intervals.py`), as stand
 
     of the force    FORCE x spread,  FORCE_SHARE of the force along itself,  AT_RIM of it where a contact reaches the rim,
                     where no contact is found UNSEEN of what a patch as pushed as the noise pushes would bear
-    of the depth    DEPTH x spread,  DIP spacing,  DIP_SHARE depth spacing / size,  DIP_AT_RIM depth where a contact
-                    reaches the rim
+    of the depth    spread,  DEPTH sqrt(spread gap),  DIP gap (gap + 2 depth) / size
+
+with `gap` the distance to the markers around the deepest point. What lies between them is not seen: it may dip as much further as
+the surface's curvature and the dent's make of `gap`, and the less of a touch they see, the less its depth hangs on their noise.
 """
 
 import torch
@@ -31,7 +33,9 @@ from .normal_equations import BalanceEquations, NormalEquations
 from .settings import ForceBalanceSettings
 
 FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 0.85, 0.026, 0.12, 0.002
-DEPTH, DIP, DIP_SHARE, DIP_AT_RIM = 1.6, 0.016, 0.7, 0.03
+DEPTH, DIP = 0.43, 0.23
+AROUND = 4
+"""Markers around a point."""
 FINE = 25
 """Lines of the grids that it was fitted on, at least; on coarser ones the spreads count for more, as the square of the step."""
 
@@ -40,9 +44,9 @@ def of_presses(
     noise: tuple[Tensor, Tensor],
     force: Tensor,
     depth: Tensor,
+    gap: Tensor,
     contacts: Contacts,
     membrane: Membrane,
-    spacing: float,
     unseen: Tensor,
 ) -> Deviations:
     """With the model's error.
@@ -51,20 +55,20 @@ def of_presses(
         noise: of force and depth, as `spreads` gives it.
         force: `[B, 3]`, as found.
         depth: `[B]`, as found.
+        gap: `[B]`, to the markers around the deepest point.
         contacts: as found.
         membrane: the rest surface on the solver's grid.
-        spacing: of the markers.
         unseen: the force `[]` that noise alone makes, over the whole surface.
     """
-    size, coarse = membrane.size, max(1.0, (FINE - 1) / (min(membrane.grid) - 1)) ** 2
-    of_force, of_depth = ((coarse * spread).square() for spread in noise)
+    coarse = max(1.0, (FINE - 1) / (min(membrane.grid) - 1)) ** 2
+    of_force, of_depth = (coarse * spread for spread in noise)
     none = (~contacts.points[..., 0].isfinite().any(1)).to(depth.dtype)
     at_rim = (contacts.at_rim == 1).any(1).to(depth.dtype)
     around = (AT_RIM * at_rim).square() * force.square().sum(-1) + (UNSEEN * unseen * none).square()
-    share = (DIP_SHARE * spacing / size) ** 2 + (DIP_AT_RIM * at_rim).square()
+    dip = DIP * gap * (gap + 2 * depth) / membrane.size
     return Deviations(
-        (FORCE**2 * of_force + FORCE_SHARE**2 * force.square() + around[:, None]).sqrt(),
-        (DEPTH**2 * of_depth + (DIP * spacing) ** 2 + share * depth.square()).sqrt(),
+        ((FORCE * of_force).square() + FORCE_SHARE**2 * force.square() + around[:, None]).sqrt(),
+        (of_depth.square() + DEPTH**2 * of_depth * gap + dip.square()).sqrt(),
     )
 
 
@@ -72,6 +76,28 @@ def depths(membrane: Membrane, x: Tensor) -> Tensor:
     """Displacements along the inward rest normals `[B, V]`, of a surface `x [B, V, 3]`."""
     depth: Tensor = ((membrane.rest - x) * membrane.rest_normals).sum(-1)
     return depth
+
+
+def gap_around(deepest: Tensor, positions: Tensor, confidence: Tensor, membrane: Membrane) -> Tensor:
+    """How far off the markers around a point of the surface are, `[B]`, at rest: `AROUND` of those that are seen, in the mean.
+
+    Args:
+        deepest: `[B, V]`, the vertices' shares in the point.
+        positions: `[D, 3]`, of the markers.
+        confidence: `[B, D]`, 0 for those not seen.
+        membrane: the rest surface on this grid.
+    """
+    distance = torch.linalg.vector_norm(positions - (deepest @ membrane.rest)[:, None], dim=-1)
+    distance = torch.where(confidence > 0, distance, membrane.size)
+    gap: Tensor = distance.topk(min(AROUND, len(positions)), largest=False).values.mean(-1)
+    return gap
+
+
+def shares_of_deepest(depth: Tensor) -> Tensor:
+    """Of the vertices in the deepest point, by their `depth [B, V]`: where several are, all alike."""
+    deepest = (depth == depth.amax(-1, keepdim=True)).to(depth.dtype)
+    shares: Tensor = deepest / deepest.sum(-1, keepdim=True)
+    return shares
 
 
 def spreads(
@@ -82,9 +108,8 @@ def spreads(
     scales, play = (settings.tau[1], settings.outlier), settings.camera_motion
     _, normal, solution = linearise(equations, cavity, state, measured, scales, play, curvature=True)
     depth = inner(depths(membrane, state.x)[..., None], membrane.grid)[..., 0]
-    deepest = (depth == depth.amax(-1, keepdim=True)).to(depth.dtype)
     inwards = -inner(membrane.rest_normals, membrane.grid).mT
-    of_depth = (deepest / deepest.sum(-1, keepdim=True))[:, None] * inwards
+    of_depth = shares_of_deepest(depth)[:, None] * inwards
     wanted = torch.cat([solution.force.expand(of_depth.shape[0], -1, -1), of_depth.flatten(1)[:, None]], 1)
     by_pressure = torch.cat([-solution.of_pressure, torch.zeros_like(state.pressure)[:, None]], 1)
     both = spreads_of(equations, normal, solution, measured, wanted, by_pressure)

@@ -39,7 +39,7 @@ from .contact_patches import ContactPatches
 from .covariance import StandardDeviations, noise_effects, standard_deviations
 from .dent import Dent
 from .descent import Descent, State
-from .deviations import depths, of_presses, spreads
+from .deviations import depths, gap_around, of_presses, shares_of_deepest, spreads
 from .normal_equations import BalanceEquations
 from .pressure_gauge import gauge_reading, refuse_open
 from .settings import ForceBalanceSettings
@@ -328,11 +328,13 @@ class ForceBalance(nn.Module):
         net, state = self, State(found.vertices, found.pressure, found.moved)
         if self.coarse is not None:
             net, state = self.coarse, self.coarsened(*state)
+        force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, found.vertices)
         with torch.no_grad():
             spread = spreads(net.equations, net.cavity, self.settings, state, observation)
-        force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, found.vertices)
+            positions = self.equations.bearings.positions
+            gap = gap_around(shares_of_deepest(depth), positions, observation.confidence, self.membrane)
         unseen = self.equations.loss.push_noise.mean() * self.reference * self.size**2
-        return of_presses(spread, force, depth.amax(-1), contacts, self.membrane, self.spacing, unseen)
+        return of_presses(spread, force, depth.amax(-1), gap, contacts, self.membrane, unseen)
 
     def standard_deviations(
         self, x: Tensor, pressure: Tensor, moved: Tensor, observation: Observation, marker_noise: float | Tensor
