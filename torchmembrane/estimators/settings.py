@@ -112,10 +112,10 @@ class ForceBalanceSettings:
     coarsest: int = 6
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3
-    largest_misfit: float = 1.35
+    largest_misfit: float = 1.8
     misfit_of_press: float = 2.0
-    largest_unexplained: float = 2.5
-    unexplained_of_press: float = 10.0
+    largest_unexplained: float = 3.75
+    unexplained_of_press: float = 15.0
     likely_objective: tuple[float, float] = (0.8, 3.2)
     likely_of_press: float = 80.0
     worse_objective: float = 1.02
