@@ -112,7 +112,7 @@ class ForceBalanceSettings:
     coarsest: int = 6
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3
-    largest_misfit: float = 1.8
+    largest_misfit: float = 1.5
     misfit_of_press: float = 2.0
     largest_unexplained: float = 3.75
     unexplained_of_press: float = 15.0
