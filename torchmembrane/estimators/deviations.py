@@ -14,8 +14,8 @@ missing was fitted to presses of random sensors (`bench/intervals.py`), as stand
                     where no contact is found UNSEEN of what a patch as pushed as the noise pushes would bear
     of the depth    spread,  DEPTH sqrt(spread gap),  DIP gap (gap + 2 depth) / size
 
-with `gap` the distance to the markers around the deepest point. What lies between them is not seen: it may dip as much further as
-the surface's curvature and the dent's make of `gap`, and the less of a touch they see, the less its depth hangs on their noise.
+with `gap` the distance to the markers around the deepest point. What lies between them is not seen: it may dip as much further
+as the surface's curvature and the dent's make of `gap`, and its depth hangs less on their noise.
 """
 
 import torch
