@@ -5,7 +5,8 @@ python bench/intervals.py DATA... [--first 0] [--sensors 10000] [--grid N] [--js
 DATA from random_sensors.py, its light strokes and presses. Of frames with status ok, by the true force over the sensor's
 largest, and apart where a contact reaches the rim: how many intervals of `force_deviation` (each component) and
 `depth_deviation` hold the truth (68 % would of normal errors), the deviations' median over the rms error, both over the force
-or depth itself, and the rank correlation of deviations and errors.
+or depth itself, the rank correlation of deviations and errors, and by how much of themselves depths are found too shallow, in
+the median.
 """
 
 import argparse
@@ -53,9 +54,13 @@ def line(name: str, rows: list[dict], of: str) -> None:
     error, deviation = (np.array([row[f"{of}_{what}"] for row in rows]) for what in ("error", "deviation"))
     held = (abs(error) < deviation).mean()
     size = np.array([row[of] for row in rows])
+    signed = error[:, 0]
     error, deviation = (np.linalg.norm(a, axis=1) for a in (error, deviation))
     wide = np.median(deviation / size) / np.sqrt(np.mean((error / size) ** 2))
-    print(f"{name:28s} {len(rows):4d}: held {held:.2f}, wide {wide:.2f}, ranks {spearmanr(error, deviation).statistic:.2f}")
+    print(
+        f"{name:28s} {len(rows):4d}: held {held:.2f}, wide {wide:.2f}, ranks {spearmanr(error, deviation).statistic:.2f}"
+        + (f", too shallow by {np.median(-signed / size):.2f}" if of == "depth" else "")
+    )
 
 
 def report(rows: list[dict]) -> None:

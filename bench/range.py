@@ -5,9 +5,9 @@ python bench/range.py DATA [--first 0] [--sensors 10000] [--only press,light,res
 DATA from random_sensors.py. A press is right where the markers' surface is within a quarter of their displacement and the force
 within a quarter of the true one, or said to be a lower bound, by `contact_at_rim`. Printed: shares right and wrong with status
 ok, and the rest by status, of presses whose contact is no narrower than the dots' spacing, by filling, prestretch, dots, view
-and depth, and of the narrower ones; how often `contact_at_rim` is said of contacts clear of the rim; errors of moment (length
-unit), patch force, slip ratio and curvature, median / 90 %; then what light strokes give, by the share of their largest force;
-then images at rest.
+and depth, and of the narrower ones; how many that are right have a status; how often `contact_at_rim` is said of contacts clear
+of the rim; errors of moment (length unit), patch force, slip ratio and curvature, median / 90 %; then what light strokes give,
+by the share of their largest force; then images at rest.
 """
 
 import argparse
@@ -143,11 +143,15 @@ def reconstructed(r: tm.Reconstructor, path: Path) -> list[dict]:
     return [row | patch_quantities(result, truth, sensor.surface.membrane((n, n))) if n * n == len(X) else row]
 
 
+def is_right(row: dict) -> bool:
+    """Whether the answer is, whatever its status."""
+    return row["surface"] < CLOSE and (row["force"] < CLOSE or row["at_rim"])
+
+
 def verdict(row: dict) -> str:
     """ "right", "wrong" (with status ok), or the status."""
-    right = row["surface"] < CLOSE and (row["force"] < CLOSE or row["at_rim"])
     if row["status"] == 0:
-        return "right" if right else "wrong"
+        return "right" if is_right(row) else "wrong"
     return f"status {row['status']}"
 
 
@@ -167,6 +171,8 @@ def report(rows: list[dict]) -> None:
     wide = [row for row in presses if row["width"] >= 1]
     if wide:
         line("all", wide)
+        right = [row for row in wide if is_right(row)]
+        print(f"with a status though right: {sum(row['status'] != 0 for row in right)} of {len(right)}")
         for key in ("filling", "shape", "markers", "lens", "body"):
             for value in sorted({row[key] for row in wide}):
                 line(f"{key} {value}", [row for row in wide if row[key] == value])

@@ -234,6 +234,7 @@ def test_deviations_of_an_answer_are_its_spreads_and_what_the_model_leaves_out()
     rim = of(nothing, (3.0, 0.0, 4.0), 2.0, at_rim=1)
     own = FORCE_SHARE * torch.tensor([[3.0, 0.0, 4.0]])
     close(rim.force, (own**2 + (5 * AT_RIM) ** 2).sqrt())
+    close(rim.depth, torch.tensor([DIP * 2.1]))
     close(of(nothing, unseen=7.0).force, torch.full((1, 3), 7 * UNSEEN))
     close(of(nothing).depth, torch.tensor([DIP * 0.9]))
 

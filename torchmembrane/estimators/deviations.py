@@ -15,7 +15,7 @@ missing was fitted to presses of random sensors (`bench/intervals.py`), as stand
     of the depth    spread,  DEPTH sqrt(spread gap),  DIP gap (gap + 2 depth) / size
 
 with `gap` the distance to the markers around the deepest point. What lies between them is not seen: it may dip as much further
-as the surface's curvature and the dent's make of `gap`, and its depth hangs less on their noise.
+as the surface's curvature and the dent's make of `gap`. The mean of spread and gap has no such reason: it is what fits.
 """
 
 import torch
@@ -55,7 +55,7 @@ def of_presses(
         noise: of force and depth, as `spreads` gives it.
         force: `[B, 3]`, as found.
         depth: `[B]`, as found.
-        gap: `[B]`, to the markers around the deepest point.
+        gap: `[B]`, to the markers around the deepest point, as of `gap_around`.
         contacts: as found.
         membrane: the rest surface on the solver's grid.
         unseen: the force `[]` that noise alone makes, over the whole surface.
@@ -79,11 +79,11 @@ def depths(membrane: Membrane, x: Tensor) -> Tensor:
 
 
 def gap_around(deepest: Tensor, positions: Tensor, confidence: Tensor, membrane: Membrane) -> Tensor:
-    """How far off the markers around a point of the surface are, `[B]`, at rest: `AROUND` of those that are seen, in the mean.
+    """How far off the markers around a point are, `[B]`, length unit, at rest: the `AROUND` nearest that are seen, in the mean.
 
     Args:
         deepest: `[B, V]`, the vertices' shares in the point.
-        positions: `[D, 3]`, of the markers.
+        positions: `[D, 3]`, of the markers at rest.
         confidence: `[B, D]`, 0 for those not seen.
         membrane: the rest surface on this grid.
     """
