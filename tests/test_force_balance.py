@@ -24,6 +24,8 @@ from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.solve import block_pentadiagonal
 from torchmembrane.solve.inverse_root import by_cholesky, by_products
+from torchmembrane.solve.stencil_layouts import WIDTH
+from torchmembrane.solve.stencil_system import Matrix
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import spherical_cap
 from torchmembrane.surface.stencil import inner
@@ -81,16 +83,22 @@ def bent(membrane, batch=1, size=0.05):
 
 def dense(system, matrix):
     """The dense matrix `[3 N, 3 N]` of one frame's scaled blocks."""
-    values, scale = system.dense(matrix[0]), matrix[1][0]
-    rows, s = system.rows, values.shape[-1]
+    blocks, scale = system.row_blocks, matrix.scale[0]
+    values = blocks.dense(matrix.entries.index_select(1, blocks.sources).unflatten(1, (-1, WIDTH)))
+    rows, s = blocks.rows, values.shape[-1]
     full = values.new_zeros(rows, s, rows, s)
     for (i, j), block in zip(chain(*block_pentadiagonal.places(rows)), values, strict=True):
         if i >= 0:
             full[i, :, j], full[j, :, i] = block, block.mT
     columns = (
-        system.in_blocks(torch.eye(scale.shape[1], dtype=scale.dtype)[None])[0][system.place_of_row].movedim(0, 1).flatten(1)
+        blocks.in_blocks(torch.eye(scale.shape[1], dtype=scale.dtype)[None])[0][blocks.place_of_row].movedim(0, 1).flatten(1)
     )
     return columns @ full.flatten(2).flatten(0, 1) @ columns.T / (scale * scale.T)
+
+
+def solved_by(way, matrix, loads):
+    """Solutions for the loads by a way of elimination."""
+    return matrix.scale * way.substitute(way.factor(matrix.entries), matrix.scale * loads)
 
 
 def by_component(values):
@@ -176,9 +184,10 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     torch.testing.assert_close(of_fluid[0, unknowns], -A.T @ W @ v)
     torch.testing.assert_close(torch.stack([fWv, vWv], -1)[0], torch.stack([f @ W @ v, v @ W @ v]))
     torch.testing.assert_close(volume[0, unknowns], v[moving])
-    solved = equations.system.substitute(equations.system.factor(matrix), loads)[0].T
-    torch.testing.assert_close(solved[unknowns], torch.linalg.solve(M, loads[0].T[unknowns]))
-    assert (solved.count_nonzero(0) == len(unknowns)).all()
+    for way in (equations.system.band, equations.system.row_blocks):
+        solved = solved_by(way, matrix, loads)[0].T
+        torch.testing.assert_close(solved[unknowns], torch.linalg.solve(M, loads[0].T[unknowns]))
+        assert (solved.count_nonzero(0) == len(unknowns)).all()
     steps = torch.zeros_like(loads)
     steps[..., unknowns] = torch.rand(3, len(unknowns), generator=generator, dtype=torch.float64)
     product = equations.product(normal, steps)[0].T
@@ -451,15 +460,17 @@ def test_elimination_by_products_rounds_a_contacts_system_as_cholesky_does(monke
 
     def solved(root, matrix, loads):
         monkeypatch.setattr(block_pentadiagonal, "inverse_root", root)
-        return equations.system.substitute(equations.system.factor(matrix), loads)
+        return solved_by(equations.system.row_blocks, matrix, loads)
 
     exact = solved(by_cholesky, matrix, loads)
 
     def error(x):
         return (x - exact).norm(dim=2) / exact.norm(dim=2)
 
-    single = tuple(part.float() for part in matrix), loads.float()
-    assert (error(solved(by_products, *single)) < 10 * error(solved(by_cholesky, *single))).all()
+    single = Matrix(*(part.float() for part in matrix)), loads.float()
+    of_cholesky = error(solved(by_cholesky, *single))
+    assert (error(solved(by_products, *single)) < 10 * of_cholesky).all()
+    assert (error(solved_by(equations.system.band, *single)) < 2 * of_cholesky).all()
 
 
 def test_batch_equals_singles_and_lost_markers_have_zero_weight(pressed):

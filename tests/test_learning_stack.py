@@ -97,10 +97,12 @@ def test_a_functional_call_gives_the_derivative_of_a_camera_parameter(reconstruc
         assert torch.equal(functional_call(module, {name: focal}, (pixels,)), module(pixels))
 
 
-def test_torch_export_takes_the_reconstruction_and_agrees(reconstructor, images):
+def test_torch_export_takes_the_reconstruction_and_agrees(sensor, images):
+    """In double precision, in which the exported elimination and LAPACK's hardly differ by rounding."""
+    reconstructor, images = tm.Reconstructor(sensor).double(), images.double()
     with torch.no_grad():
         program = torch.export.export(reconstructor, (images,), strict=False)
-        assert_same(program.module()(images), reconstructor(images), rtol=1e-3, atol=1e-3)
+        assert_same(program.module()(images), reconstructor(images), rtol=1e-4, atol=1e-4)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from ..camera.model import Camera
 from ..camera.motion import motion_of_pixels
 from ..pieces import piece
-from ..solve.stencil_system import NEAR
+from ..solve.stencil_layouts import NEAR
 from ..surface.bicubic import bicubic_shares
 from ..surface.membrane import Membrane
 from ..surface.projection import SurfacePoints

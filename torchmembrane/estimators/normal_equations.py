@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..solve.stencil_system import NEAR, StencilSystem
+from ..solve.stencil_layouts import NEAR
+from ..solve.stencil_system import Matrix, StencilSystem
 from .bearings import Bearings, MarkerBearings
 from .camera_motion import CameraMotion
 from .contact_force import ContactForce, Linearised
@@ -86,7 +87,7 @@ class BalanceEquations(nn.Module):
         own, slope = weighted @ K.movedim(2, 1).flatten(2).mT, (weighted @ angle.flatten(1)[..., None])[..., 0]
         return CameraMotion(coupling.flatten(2), own, slope)
 
-    def matrix(self, normal: NormalEquations, damping: float | Tensor = 1e-6) -> tuple[Tensor, Tensor]:
+    def matrix(self, normal: NormalEquations, damping: float | Tensor = 1e-6) -> Matrix:
         """`M` as `system.factor` takes it, with a share of its diagonal added."""
         near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1))
         return self.system.matrix(normal.stiffness, normal.weights, near, damping)

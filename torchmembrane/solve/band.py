@@ -1,0 +1,95 @@
+"""Symmetric positive definite band matrices on a processor, by LAPACK: one call for what block elimination does in hundreds.
+
+LAPACK takes one matrix at a time. Operators of torch, so that a compiled graph may hold them; gradients take what is solved, not
+how, see `implicit.differentiable`.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.linalg.lapack import get_lapack_funcs
+from torch import Tensor
+
+RIDGES = (0.0, 1e-6, 1e-5, 1e-4)
+"""Added, one instead of the other, to a diagonal about 1 of a matrix that rounding has left without a factor."""
+
+
+def takes(matrix: Tensor) -> bool:
+    """Whether these operators can be used: on a processor, without gradients, and not in an exported model."""
+    recorded = torch.is_grad_enabled() and matrix.requires_grad
+    return matrix.device.type == "cpu" and not recorded and not torch.compiler.is_exporting()
+
+
+@torch.library.custom_op("torchmembrane::band_factor", mutates_args=())
+def factor(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
+    """Cholesky factors of matrices, NaN of one that is not positive.
+
+    Args:
+        runs: of neighbouring diagonals, `[B, n, K]` each: row by row the entries on the diagonal and to the right of it. All
+            others are zero.
+        starts: how far the first diagonal of each is to the right, the first 0.
+
+    Returns:
+        `[B, n, k + 1]`: with `L L^T` the matrix, row by row the columns of `L` from the diagonal on.
+
+    Example:
+        >>> factor([torch.tensor([[[4.0, 2.0], [5.0, 0.0]]])], [0])
+        tensor([[[2., 1.],
+                 [2., 0.]]])
+    """
+    pbtrf = _lapack("pbtrf", runs[0])
+    matrices = [run.numpy() for run in runs]
+    factors = runs[0].new_empty(*runs[0].shape[:2], starts[-1] + runs[-1].shape[-1])
+    for frame, kept in enumerate(factors.numpy()):
+        for ridge in RIDGES:
+            kept[:] = 0
+            for matrix, start in zip(matrices, starts, strict=True):
+                kept[:, start : start + matrix.shape[-1]] = matrix[frame]
+            kept[:, 0] += ridge
+            if pbtrf(kept.T, lower=1, overwrite_ab=1)[1] == 0:
+                break
+        else:
+            kept[:] = np.nan
+    return factors
+
+
+@factor.register_fake
+def _(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
+    return runs[0].new_empty(*runs[0].shape[:2], starts[-1] + runs[-1].shape[-1])
+
+
+@torch.library.custom_op("torchmembrane::band_solve", mutates_args=())
+def solve(factors: Tensor, b: Tensor) -> Tensor:
+    """Solutions for the rows of `b [B, C, n]`, from what `factor` gives.
+
+    Example:
+        >>> solve(factor([torch.tensor([[[4.0, 2.0], [5.0, 0.0]]])], [0]), torch.tensor([[[6.0, 7.0]]]))
+        tensor([[[1., 1.]]])
+    """
+    pbtrs = _lapack("pbtrs", b)
+    solved = b.clone(memory_format=torch.contiguous_format)
+    for kept, x in zip(factors.numpy(), solved.numpy(), strict=True):
+        pbtrs(kept.T, x.T, lower=1, overwrite_b=1)
+    return solved
+
+
+@solve.register_fake
+def _(factors: Tensor, b: Tensor) -> Tensor:
+    return torch.empty_like(b, memory_format=torch.contiguous_format)
+
+
+@solve.register_vmap
+def _(info: Any, dims: tuple[int | None, int | None], factors: Tensor, b: Tensor) -> tuple[Tensor, int]:
+    each = [
+        part.expand(info.batch_size, *part.shape) if dim is None else part.movedim(dim, 0)
+        for part, dim in zip((factors, b), dims, strict=True)
+    ]
+    return solve(*(part.flatten(0, 1) for part in each)).unflatten(0, (info.batch_size, -1)), 0
+
+
+def _lapack(name: str, of: Tensor) -> Any:
+    """LAPACK's function for the precision of a tensor."""
+    (function,) = get_lapack_funcs((name,), dtype=of.new_empty(0).numpy().dtype)
+    return function

@@ -1,0 +1,164 @@
+"""The matrix of a `StencilSystem` as solvers take it: blocks of grid rows, or a band; made of the vertices' blocks."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from . import band, block_pentadiagonal
+from .block_tridiagonal import inwards
+
+NEAR = ((0, 0), (0, 1), (1, 0), (1, 1))  # from a vertex to itself and to its neighbours further on
+OFFSETS = (*NEAR, (0, 2), (1, -1), (1, 2), (2, 0), (2, 1), (2, 2))
+"""Between two vertices of a stencil, none beside its opposite."""
+REACH = 2  # lines, between two vertices of a stencil
+WIDTH = 3 * (2 * REACH + 1) + 2
+"""Entries of a row of the matrix between two grid rows, each a place further to the left in the three rows of a vertex."""
+LEFT = 3 * REACH + 2
+"""Entries of a vertex's first row before the diagonal."""
+
+
+class RowBlocks(nn.Module):
+    """One block per grid row; the matrix is block pentadiagonal.
+
+    Args:
+        grid: `(m, n)`.
+        free: `[N]` bool, which inner vertices are free.
+    """
+
+    order: Tensor
+    place_of_row: Tensor
+    sources: Tensor
+
+    def __init__(self, grid: tuple[int, int], free: Tensor):
+        super().__init__()
+        m, n = self.inner_grid = grid[0] - 2, grid[1] - 2
+        self.rows = max(3, m + (m + 1) % 2)  # an odd number
+        self.columns = enough_columns(n)
+        places = block_pentadiagonal.places(self.rows)
+        self.parts = [3 * self.columns * len(part) for part in places]
+        sources = _sources(self.inner_grid, free.cpu().numpy(), np.concatenate(places), self.columns)
+        for name, index in (
+            ("order", np.array(inwards(self.rows))),
+            ("place_of_row", np.argsort(inwards(self.rows))),
+            ("sources", sources.ravel()),
+        ):
+            self.register_buffer(name, torch.from_numpy(index.astype(np.int32)))
+
+    def factor(self, entries: Tensor) -> tuple[Tensor, ...]:
+        """What `substitute` needs, from the vertices' blocks, scaled, a zero and a one, `[B, 90 N + 2]`."""
+        matrix = entries.index_select(1, self.sources).unflatten(1, (-1, WIDTH))
+        roots, near, far = block_pentadiagonal.factor(matrix.split(self.parts, 1), self.dense)
+        return *roots, *near, *far
+
+    def dense(self, rows: Tensor) -> Tensor:
+        """Blocks `[B K, s, s]` from their rows `[B, K s, 17]`, between a vertex and those at most `REACH` columns off.
+
+        Behind as many zeros as make a row of the matrix and one more, each lies where it belongs, but for a shift.
+        """
+        size = 3 * self.columns
+        whole = F.pad(rows, (0, size + 1 - WIDTH)).reshape(-1, size * (size + 1))
+        return whole[:, LEFT : LEFT - size].unflatten(1, (size, size))
+
+    def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
+        """Solutions `[B, C, 3 N]` for `loads` of that shape."""
+        turns = len(factor) // 3
+        found = block_pentadiagonal.Factor(*map(list, (factor[: turns + 1], factor[turns + 1 : -turns], factor[-turns:])))
+        return self.from_blocks(block_pentadiagonal.substitute(found, self.in_blocks(loads)))
+
+    def in_blocks(self, vector: Tensor) -> Tensor:
+        """Vectors `[B, C, 3 N]` as blocks `[B, rows, C, s]` in the order of their elimination."""
+        m, n = self.inner_grid
+        field = F.pad(vector.unflatten(-1, (3, m, n)), (0, self.columns - n, 0, self.rows - m))
+        return field.permute(0, 3, 1, 4, 2).flatten(3).index_select(1, self.order)
+
+    def from_blocks(self, blocks: Tensor) -> Tensor:
+        """`in_blocks` undone."""
+        m, n = self.inner_grid
+        field = blocks.index_select(1, self.place_of_row).unflatten(-1, (-1, 3)).permute(0, 2, 4, 1, 3)
+        return field[..., :m, :n].flatten(-3)
+
+
+class Band(nn.Module):
+    """The unknowns in turn, vertex by vertex and grid row by grid row.
+
+    Args:
+        grid: `(m, n)`.
+        free: `[N]` bool, which inner vertices are free.
+    """
+
+    sources: Tensor
+
+    def __init__(self, grid: tuple[int, int], free: Tensor):
+        super().__init__()
+        m, n = self.inner_grid = grid[0] - 2, grid[1] - 2
+        self.columns = enough_columns(n)
+        places = [(i, i + further) for i in range(m) for further in range(REACH + 1)]
+        sources = _sources(self.inner_grid, free.cpu().numpy(), places, self.columns).reshape(m, REACH + 1, -1, WIDTH)
+        sources = sources.swapaxes(1, 2).reshape(3 * m * self.columns, -1)[:, LEFT:]
+        self.register_buffer("sources", torch.from_numpy(sources.astype(np.int32)).flatten())
+        self.starts = [0, 3 * self.columns - LEFT, 6 * self.columns - LEFT]
+        self.widths = [WIDTH - LEFT, WIDTH, WIDTH]
+
+    def factor(self, entries: Tensor) -> tuple[Tensor]:
+        """As of `RowBlocks`."""
+        rows = entries.index_select(1, self.sources).unflatten(1, (-1, sum(self.widths)))
+        return (band.factor(rows.split(self.widths, 2), self.starts),)
+
+    def substitute(self, factor: tuple[Tensor], loads: Tensor) -> Tensor:
+        """As of `RowBlocks`."""
+        m, n = self.inner_grid
+        field = F.pad(loads.unflatten(-1, (3, m, n)), (0, self.columns - n))
+        solved = band.solve(factor[0], field.movedim(2, -1).flatten(2))
+        return solved.unflatten(-1, (m, self.columns, 3))[:, :, :, :n].movedim(-1, 2).flatten(2)
+
+
+def enough_columns(n: int) -> int:
+    """No fewer than a row of the matrix reaches."""
+    return max(n, 2 * REACH + 2)
+
+
+class Inner(NamedTuple):
+    """Rows and columns `[N]` of the inner vertices, and the number of a vertex at given ones, -1 outside."""
+
+    row: np.ndarray
+    column: np.ndarray
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, size: tuple[int, int]) -> "Inner":
+        row, column = np.indices(size)
+        return cls(row.ravel(), column.ravel(), size)
+
+    def at(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        inside = (row >= 0) & (row < self.size[0]) & (column >= 0) & (column < self.size[1])
+        return np.where(inside, row * self.size[1] + column, -1)
+
+
+def _sources(
+    inner_grid: tuple[int, int], free: np.ndarray, places: np.ndarray | Sequence[tuple[int, int]], columns: int
+) -> np.ndarray:
+    """Where the entries between two grid rows of every of the `places` are, between the numbers of a vertex and those of the
+    ones at most `REACH` columns from it, `[places, columns, 3, WIDTH]`: among the vertices' blocks `[3, 3, 10, N]`, a zero and
+    a one. Places of which a row is not there are zero."""
+    inner, N, K = Inner.of(inner_grid), len(free), len(OFFSETS)
+    number = np.full((2 * REACH + 1,) * 2, -1)
+    for k, offset in enumerate(OFFSETS):
+        number[offset] = k  # negative indices wrap: the opposite offset has its own place
+    i, other = (at[:, None, None, None, None] for at in np.asarray(places).T)
+    j, a, b = np.arange(columns)[:, None, None, None], np.arange(3)[:, None, None], np.arange(3)
+    di, dj = other - i, np.arange(-REACH, REACH + 1)[:, None]
+    p, q = inner.at(i, j), inner.at(i + di, j + dj)
+    close = (p >= 0) & free[p] & (q >= 0) & free[q] & (abs(di) <= REACH)
+    di, dj_close = np.where(close, di, 0), np.where(close, dj, 0)
+    upper, lower = number[di, dj_close], number[-di, -dj_close]
+    entry = np.where(upper >= 0, ((3 * a + b) * K + upper) * N + p, ((3 * b + a) * K + lower) * N + q)
+    zero, is_own = 9 * K * N, (i >= 0) & (other == i) & (dj == 0) & (a == b)
+    entry = np.where(is_own, zero + 1, np.where(close & ((upper >= 0) | (lower >= 0)), entry, zero))
+    sources = np.full((*entry.shape[:3], WIDTH), zero)
+    for row in range(3):
+        sources[:, :, row, 2 - row : WIDTH - row] = entry[:, :, row].reshape(*entry.shape[:2], -1)
+    return sources
