@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..camera.motion import motion_of_pixels
-from ..solve.elimination import solve_positive
+from ..solve.elimination import solve_dense
 
 RARE = 100.0
 """How much less likely a camera moves than that it stays, a power: a tenfold motion has a likelihood `10^-RARE` times."""
@@ -40,7 +40,7 @@ class CameraMotion(NamedTuple):
 
     def eased(self, solved: Tensor, of_motion: Tensor) -> Tensor:
         """`(M - B' T^-1 B)^-1` of loads whose `M^-1` is `solved [B, L, 3 N]`; `of_motion [B, 4, 3 N]`: that of the coupling."""
-        share = _solve(self.own - self.coupling @ of_motion.mT, self.coupling @ solved.mT)
+        share = solve_dense(self.own - self.coupling @ of_motion.mT, self.coupling @ solved.mT)
         eased: Tensor = solved + share.mT @ of_motion
         return eased
 
@@ -53,17 +53,17 @@ class CameraMotion(NamedTuple):
         """
         loads, coupling = products[:, :, :3], products[:, :, 3:]
         pulled = loads[:, 3:] - F.pad(self.slope[..., None], (1, 1))
-        following = _solve(self.own - coupling[:, 3:], pulled)
+        following = solve_dense(self.own - coupling[:, 3:], pulled)
         return loads[:, :3] + coupling[:, :3] @ following, following
 
     def without(self, loads: Tensor, slopes: Tensor) -> Tensor:
         """Loads `[B, L, 3 N]` on the surface alone, of those that pull the camera by `slopes [B, L, 4]` as well."""
-        kept: Tensor = loads - _solve(self.own, slopes.mT).mT @ self.coupling
+        kept: Tensor = loads - solve_dense(self.own, slopes.mT).mT @ self.coupling
         return kept
 
     def turning(self, y: Tensor) -> Tensor:
         """`T^-1 B y`, `[B, L, 4]`, of fields `y [B, L, 3 N]`."""
-        turned: Tensor = _solve(self.own, self.coupling @ y.mT).mT
+        turned: Tensor = solve_dense(self.own, self.coupling @ y.mT).mT
         return turned
 
 
@@ -89,8 +89,3 @@ def in_pixels(motion: Tensor, image_size: tuple[int, int]) -> Tensor:
 
 def _half_diagonal(image_size: tuple[int, int]) -> float:
     return math.hypot(image_size[0] - 1, image_size[1] - 1) / 2
-
-
-def _solve(matrix: Tensor, loads: Tensor) -> Tensor:
-    """`matrix^-1 loads [B, n, k]` of positive matrices `[B, n, n]`."""
-    return solve_positive(torch.cat([matrix, loads], -1).movedim(0, -1)).movedim(-1, 0)

@@ -5,10 +5,12 @@ pushes, show them alike. From a smooth surface, found on a grid too coarse for t
 whose tractions cost several times those of the pit. From a dent they find the pit; where there is none it fills.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
-from ..pieces import piece, rowwise
+from ..pieces import piece, rowwise, side_by_side
 from ..surface.membrane import Membrane
 from ..surface.stencil import pad_border
 from .base import Equilibrium
@@ -28,7 +30,7 @@ TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle
 
 Schedule = list[tuple[float, float]]
 Found = tuple[State, Tensor]
-Stepped = tuple[Tensor, Tensor, Tensor, Tensor]
+Stepped = Sequence[Tensor]
 """A `State`, and the surface a step before."""
 
 
@@ -110,10 +112,14 @@ class Dent(nn.Module):
             self.descent(rest, measured, settings.gnc_schedule(steps, settings.tau), cone=0.0)[0],
         ]
         starts += [] if start is None else [start]
-        found: list[Found] = [self.descent(start, measured, schedule) for start in starts]
-        best: Stepped = (*found[0][0], found[0][1])
-        for state, before in found[1:]:
-            best = self.lower(best, (*state, before), measured)
+
+        def stepped(start: Sequence[Tensor], measured: Bearings) -> Sequence[Tensor]:
+            state, before = self.descent(State(*start), measured, schedule)
+            return *state, before
+
+        best, *others = side_by_side(stepped, starts, measured)
+        for other in others:
+            best = self.lower(best, other, measured)
         return State(*best[:3]), best[3]
 
     @piece

@@ -1,7 +1,7 @@
 """Symmetric positive definite band matrices on a processor, by LAPACK: one call for what block elimination does in hundreds.
 
-LAPACK takes one matrix at a time. Operators of torch, so that a compiled graph may hold them; gradients take what is solved, not
-how, see `implicit.differentiable`.
+LAPACK takes one matrix at a time. Operators of torch, so that a compiled graph may hold them; gradients take what is solved,
+not how, see `implicit.differentiable`.
 """
 
 from collections.abc import Sequence
