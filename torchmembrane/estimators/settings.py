@@ -76,7 +76,7 @@ class ForceBalanceSettings:
     steps: int = 8
     coarse_steps: int = 4
     fine_steps: int = 4
-    finer_steps: int = 4
+    finer_steps: int = 3
     tau: tuple[float, float] = (4.0, 0.4)
     fine_tau: tuple[float, float] = (0.8, 0.4)
     sharp_tau: tuple[float, float] = (1.0, 0.4)
@@ -116,7 +116,7 @@ class ForceBalanceSettings:
     misfit_of_press: float = 2.0
     largest_unexplained: float = 3.75
     unexplained_of_press: float = 15.0
-    likely_objective: tuple[float, float] = (0.8, 3.2)
+    likely_objective: tuple[float, float] = (0.6, 2.4)
     likely_of_press: float = 80.0
     worse_objective: float = 1.02
     largest_outlying: float = 0.01

@@ -91,5 +91,4 @@ def _(info: Any, dims: tuple[int | None, int | None], factors: Tensor, b: Tensor
 
 def _lapack(name: str, of: Tensor) -> Any:
     """LAPACK's function for the precision of a tensor."""
-    (function,) = get_lapack_funcs((name,), dtype=of.new_empty(0).numpy().dtype)
-    return function
+    return get_lapack_funcs(name, dtype=of.new_empty(0).numpy().dtype)

@@ -103,12 +103,12 @@ class Band(nn.Module):
         self.starts = [0, 3 * self.columns - LEFT, 6 * self.columns - LEFT]
         self.widths = [WIDTH - LEFT, WIDTH, WIDTH]
 
-    def factor(self, entries: Tensor) -> tuple[Tensor]:
+    def factor(self, entries: Tensor) -> tuple[Tensor, ...]:
         """As of `RowBlocks`."""
         rows = entries.index_select(1, self.sources).unflatten(1, (-1, sum(self.widths)))
         return (band.factor(rows.split(self.widths, 2), self.starts),)
 
-    def substitute(self, factor: tuple[Tensor], loads: Tensor) -> Tensor:
+    def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
         """As of `RowBlocks`."""
         m, n = self.inner_grid
         field = F.pad(loads.unflatten(-1, (3, m, n)), (0, self.columns - n))
