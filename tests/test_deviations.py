@@ -35,7 +35,7 @@ from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical
 from torchmembrane.surface.stencil import inner
 from torchmembrane.surface.tangent import tangent_frame
 
-NOISE, DRAWS = 0.05, 96  # px
+NOISE, DRAWS = 0.05, 192  # px
 CAP, FINGER, CYLINDER = (
     lambda n: spherical_cap(12, 9, 3, (n, n)),
     lambda n: ellipsoid_cap((10, 8, 12), 3, (n, n)),

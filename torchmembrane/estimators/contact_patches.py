@@ -23,11 +23,11 @@ PUSHED = 0.5
 """Indicator above which a vertex is in contact."""
 RIM = 0.1
 """Over the surface's size: a push within it, or within the markers' spacing, of the rim may go on beyond the rim."""
-RIM_SHARE = 0.03
+RIM_SHARE = 0.05
 """Share of a patch's push there, above which the patch may reach the rim."""
 BESIDE = 0.06
 """Over the surface's size: so near the rim a body that reaches it has moved the surface."""
-MOVED = 0.2
+MOVED = 0.225
 """Displacement there over the largest of all, above which the patch may reach the rim: it does if both say so."""
 LEAST_STEPS = 2.0
 """Grid steps that a patch spans at least where curvatures are told."""
