@@ -45,7 +45,8 @@ PAGE = """# What a frame costs
 Processor time of one thread of a shared core against the lines of the grid, the dots, the size of the image and the frames
 in a batch; of a dome of radius 20 pressed by a ball, 33 x 33 vertices, some 150 dots and 640 x 480 pixels but for what is
 varied, every frame from rest. **Markers** is from the image to the markers' displacements, **solve** from these to the
-result; it takes several times as long where a frame is [solved a second time](mathematics.md), as that of 21 dots. Figure and tables are made anew by
+result; it takes several times as long where a frame is [solved a second time](mathematics.md), as that of 21 dots. Figure and
+tables are made anew by
 
     python bench/scaling.py --page docs/scaling.md
 

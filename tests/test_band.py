@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from torchmembrane.solve import band
 
@@ -70,6 +71,21 @@ def test_solutions_vmapped_are_those_one_by_one(dims):
     for k, x in enumerate(found):
         each = (one if dim is None else one.select(dim, k) for one, dim in zip((factors, b), dims, strict=True))
         torch.testing.assert_close(x, band.solve(*each))
+
+
+def test_others_keep_their_threads():
+    def threads():
+        return {pool["filepath"]: pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    with threadpool_limits(2, user_api="blas"):
+        before, within, pbtrf = threads(), [], band._lapack
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                band, "_lapack", lambda *of: lambda *given, **how: within.append(threads()) or pbtrf(*of)(*given, **how)
+            )
+            band.factor(runs(), STARTS)
+        assert within and set(within[0].values()) == {1} and set(before.values()) == {2}
+        assert threads() == before
 
 
 def test_operators_are_what_torch_expects_of_them():

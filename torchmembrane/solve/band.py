@@ -1,15 +1,19 @@
 """Symmetric positive definite band matrices on a processor, by LAPACK: one call for what block elimination does in hundreds.
 
-LAPACK takes one matrix at a time. Operators of torch, so that a compiled graph may hold them; gradients take what is solved,
-not how, see `implicit.differentiable`.
+LAPACK takes one matrix at a time, by one thread: of matrices as small as these others would only wait. Operators of torch, so
+that a compiled graph may hold them; gradients take what is solved, not how, see `implicit.differentiable`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from threading import Lock
 from typing import Any
 
 import numpy as np
 import torch
 from scipy.linalg.lapack import get_lapack_funcs
+from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 RIDGES = (0.0, 1e-6, 1e-5, 1e-4)
@@ -42,16 +46,17 @@ def factor(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
     pbtrf = _lapack("pbtrf", runs[0])
     matrices = [run.numpy() for run in runs]
     factors = runs[0].new_empty(*runs[0].shape[:2], starts[-1] + runs[-1].shape[-1])
-    for frame, kept in enumerate(factors.numpy()):
-        for ridge in RIDGES:
-            kept[:] = 0
-            for matrix, start in zip(matrices, starts, strict=True):
-                kept[:, start : start + matrix.shape[-1]] = matrix[frame]
-            kept[:, 0] += ridge
-            if pbtrf(kept.T, lower=1, overwrite_ab=1)[1] == 0:
-                break
-        else:
-            kept[:] = np.nan
+    with _one_thread():
+        for frame, kept in enumerate(factors.numpy()):
+            for ridge in RIDGES:
+                kept[:] = 0
+                for matrix, start in zip(matrices, starts, strict=True):
+                    kept[:, start : start + matrix.shape[-1]] = matrix[frame]
+                kept[:, 0] += ridge
+                if pbtrf(kept.T, lower=1, overwrite_ab=1)[1] == 0:
+                    break
+            else:
+                kept[:] = np.nan
     return factors
 
 
@@ -70,8 +75,9 @@ def solve(factors: Tensor, b: Tensor) -> Tensor:
     """
     pbtrs = _lapack("pbtrs", b)
     solved = b.clone(memory_format=torch.contiguous_format)
-    for kept, x in zip(factors.numpy(), solved.numpy(), strict=True):
-        pbtrs(kept.T, x.T, lower=1, overwrite_b=1)
+    with _one_thread():
+        for kept, x in zip(factors.numpy(), solved.numpy(), strict=True):
+            pbtrs(kept.T, x.T, lower=1, overwrite_b=1)
     return solved
 
 
@@ -87,6 +93,17 @@ def _(info: Any, dims: tuple[int | None, int | None], factors: Tensor, b: Tensor
         for part, dim in zip((factors, b), dims, strict=True)
     ]
     return solve(*(part.flatten(0, 1) for part in each)).unflatten(0, (info.batch_size, -1)), 0
+
+
+_alone = Lock()
+"""Held while there is one thread: of two that set it at once the later would take 1 for what was."""
+_libraries = cache(lambda: ThreadpoolController().select(user_api="blas"))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    with _alone, _libraries().limit(limits=1):
+        yield
 
 
 def _lapack(name: str, of: Tensor) -> Any:
