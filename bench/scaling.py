@@ -114,7 +114,7 @@ def exponent(rows: list[dict], sweep: str, part: str) -> float:
 
 def page(table: dict[str, list[dict]]) -> str:
     """The page of the documents."""
-    exponents = [[NAMES[sweep], *(f"{exponent(rows, sweep, part):.1f}" for part in PARTS)] for sweep, rows in table.items()]
+    exponents = [[NAMES[sweep], *(f"{exponent(rows, sweep, part):z.1f}" for part in PARTS)] for sweep, rows in table.items()]
     costs = [
         [NAMES[sweep] if k == 0 else "", str(row[sweep]), *(f"{row[part]:.3g}" for part in PARTS)]
         for sweep, rows in table.items()
@@ -140,7 +140,7 @@ def draw(table: dict[str, list[dict]], path: Path) -> None:
     figure, axes = plt.subplots(1, len(table), figsize=(11, 3.2), sharey=True, layout="constrained")
     for ax, (sweep, rows) in zip(axes, table.items(), strict=True):
         for part, mark in zip(PARTS, "os", strict=True):
-            label = f"{part}: power {exponent(rows, sweep, part):.1f}"
+            label = f"{part}: power {exponent(rows, sweep, part):z.1f}"
             ax.loglog([row[sweep] for row in rows], [row[part] for row in rows], marker=mark, markersize=4, label=label)
         values = [row[sweep] for row in rows]
         shown = values if len(values) < 5 else values[::2]

@@ -43,7 +43,7 @@ def factor(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
         tensor([[[2., 1.],
                  [2., 0.]]])
     """
-    pbtrf = _lapack("pbtrf", runs[0])
+    pbtrf = _lapack("pbtrf", runs[0].dtype)
     matrices = [run.numpy() for run in runs]
     factors = runs[0].new_empty(*runs[0].shape[:2], starts[-1] + runs[-1].shape[-1])
     with _one_thread():
@@ -73,7 +73,7 @@ def solve(factors: Tensor, b: Tensor) -> Tensor:
         >>> solve(factor([torch.tensor([[[4.0, 2.0], [5.0, 0.0]]])], [0]), torch.tensor([[[6.0, 7.0]]]))
         tensor([[[1., 1.]]])
     """
-    pbtrs = _lapack("pbtrs", b)
+    pbtrs = _lapack("pbtrs", b.dtype)
     solved = b.clone(memory_format=torch.contiguous_format)
     with _one_thread():
         for kept, x in zip(factors.numpy(), solved.numpy(), strict=True):
@@ -106,6 +106,7 @@ def _one_thread() -> Iterator[None]:
         yield
 
 
-def _lapack(name: str, of: Tensor) -> Any:
-    """LAPACK's function for the precision of a tensor."""
-    return get_lapack_funcs(name, dtype=of.new_empty(0).numpy().dtype)
+@cache
+def _lapack(name: str, dtype: torch.dtype) -> Any:
+    """LAPACK's function for a precision."""
+    return get_lapack_funcs(name, dtype=torch.empty(0, dtype=dtype).numpy().dtype)

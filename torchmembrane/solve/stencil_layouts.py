@@ -1,6 +1,5 @@
 """The matrix of a `StencilSystem` as solvers take it: blocks of grid rows, or a band; made of the vertices' blocks."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -48,11 +47,10 @@ class RowBlocks(nn.Module):
         ):
             self.register_buffer(name, torch.from_numpy(index.astype(np.int32)))
 
-    def factor(self, entries: Tensor) -> tuple[Tensor, ...]:
+    def factor(self, entries: Tensor) -> block_pentadiagonal.Factor:
         """What `substitute` needs, from the vertices' blocks, scaled, a zero and a one, `[B, 90 N + 2]`."""
         matrix = entries.index_select(1, self.sources).unflatten(1, (-1, WIDTH))
-        roots, near, far = block_pentadiagonal.factor(matrix.split(self.parts, 1), self.dense)
-        return *roots, *near, *far
+        return block_pentadiagonal.factor(matrix.split(self.parts, 1), self.dense)
 
     def dense(self, rows: Tensor) -> Tensor:
         """Blocks `[B K, s, s]` from their rows `[B, K s, 17]`, between a vertex and those at most `REACH` columns off.
@@ -63,11 +61,9 @@ class RowBlocks(nn.Module):
         whole = F.pad(rows, (0, size + 1 - WIDTH)).reshape(-1, size * (size + 1))
         return whole[:, LEFT : LEFT - size].unflatten(1, (size, size))
 
-    def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
+    def substitute(self, factor: block_pentadiagonal.Factor, loads: Tensor) -> Tensor:
         """Solutions `[B, C, 3 N]` for `loads` of that shape."""
-        turns = len(factor) // 3
-        found = block_pentadiagonal.Factor(*map(list, (factor[: turns + 1], factor[turns + 1 : -turns], factor[-turns:])))
-        return self.from_blocks(block_pentadiagonal.substitute(found, self.in_blocks(loads)))
+        return self.from_blocks(block_pentadiagonal.substitute(factor, self.in_blocks(loads)))
 
     def in_blocks(self, vector: Tensor) -> Tensor:
         """Vectors `[B, C, 3 N]` as blocks `[B, rows, C, s]` in the order of their elimination."""
@@ -96,23 +92,23 @@ class Band(nn.Module):
         super().__init__()
         m, n = self.inner_grid = grid[0] - 2, grid[1] - 2
         self.columns = enough_columns(n)
-        places = [(i, i + further) for i in range(m) for further in range(REACH + 1)]
+        places = np.array([(i, i + further) for i in range(m) for further in range(REACH + 1)])
         sources = _sources(self.inner_grid, free.cpu().numpy(), places, self.columns).reshape(m, REACH + 1, -1, WIDTH)
         sources = sources.swapaxes(1, 2).reshape(3 * m * self.columns, -1)[:, LEFT:]
         self.register_buffer("sources", torch.from_numpy(sources.astype(np.int32)).flatten())
         self.starts = [0, 3 * self.columns - LEFT, 6 * self.columns - LEFT]
         self.widths = [WIDTH - LEFT, WIDTH, WIDTH]
 
-    def factor(self, entries: Tensor) -> tuple[Tensor, ...]:
+    def factor(self, entries: Tensor) -> Tensor:
         """As of `RowBlocks`."""
         rows = entries.index_select(1, self.sources).unflatten(1, (-1, sum(self.widths)))
-        return (band.factor(rows.split(self.widths, 2), self.starts),)
+        return band.factor(rows.split(self.widths, 2), self.starts)
 
-    def substitute(self, factor: tuple[Tensor, ...], loads: Tensor) -> Tensor:
+    def substitute(self, factor: Tensor, loads: Tensor) -> Tensor:
         """As of `RowBlocks`."""
         m, n = self.inner_grid
         field = F.pad(loads.unflatten(-1, (3, m, n)), (0, self.columns - n))
-        solved = band.solve(factor[0], field.movedim(2, -1).flatten(2))
+        solved = band.solve(factor, field.movedim(2, -1).flatten(2))
         return solved.unflatten(-1, (m, self.columns, 3))[:, :, :, :n].movedim(-1, 2).flatten(2)
 
 
@@ -138,17 +134,15 @@ class Inner(NamedTuple):
         return np.where(inside, row * self.size[1] + column, -1)
 
 
-def _sources(
-    inner_grid: tuple[int, int], free: np.ndarray, places: np.ndarray | Sequence[tuple[int, int]], columns: int
-) -> np.ndarray:
-    """Where the entries between two grid rows of every of the `places` are, between the numbers of a vertex and those of the
-    ones at most `REACH` columns from it, `[places, columns, 3, WIDTH]`: among the vertices' blocks `[3, 3, 10, N]`, a zero and
-    a one. Places of which a row is not there are zero."""
+def _sources(inner_grid: tuple[int, int], free: np.ndarray, places: np.ndarray, columns: int) -> np.ndarray:
+    """Where the entries between the two grid rows of each of the `places [places, 2]` are, between the numbers of a vertex and
+    those of the ones at most `REACH` columns from it, `[places, columns, 3, WIDTH]`: among the vertices' blocks
+    `[3, 3, 10, N]`, a zero and a one. Places of which a row is not there are zero."""
     inner, N, K = Inner.of(inner_grid), len(free), len(OFFSETS)
     number = np.full((2 * REACH + 1,) * 2, -1)
     for k, offset in enumerate(OFFSETS):
         number[offset] = k  # negative indices wrap: the opposite offset has its own place
-    i, other = (at[:, None, None, None, None] for at in np.asarray(places).T)
+    i, other = (at[:, None, None, None, None] for at in places.T)
     j, a, b = np.arange(columns)[:, None, None, None], np.arange(3)[:, None, None], np.arange(3)
     di, dj = other - i, np.arange(-REACH, REACH + 1)[:, None]
     p, q = inner.at(i, j), inner.at(i + di, j + dj)

@@ -1,6 +1,6 @@
 """Symmetric systems on a grid from products of seven-point stencils."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,10 +24,10 @@ class Matrix(NamedTuple):
 
 
 class Factor(NamedTuple):
-    """How a matrix was eliminated, what of it is kept, and its scale."""
+    """The way a matrix was factored, what that keeps for its `substitute`, and the matrix' scale."""
 
     way: Band | RowBlocks
-    kept: tuple[Tensor, ...]
+    kept: Any
     scale: Tensor
 
 
