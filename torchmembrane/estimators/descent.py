@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..mechanics.cavity import CavityLaw
-from ..pieces import in_parts, piece, repeated
+from ..pieces import in_parts, piece, repeated, rowwise
 from ..solve.implicit import differentiable
 from ..solve.kkt import border_unknowns
 from ..surface.stencil import inner
@@ -72,7 +72,8 @@ class Descent(nn.Module):
         taus, size = [tau for tau, _ in schedule], len(schedule)
         numbers = [self._numbers(taus[: k + 1], size - k <= settling) for k in range(size)]
         rows = [(*scales, cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
-        x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows)
+        kept = settling if settling > 1 else 0
+        x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows, kept)
         return State(x, pressure, moved), before
 
     def _numbers(self, taus: list[float], settles: bool) -> tuple[float, float]:
@@ -87,10 +88,29 @@ class Descent(nn.Module):
 
     def _stepped(self, x: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The state after the steps, and the surface before the last; `given`: what is measured, the steps' scales."""
-        *of_markers, rows = given
+        *of_markers, rows, kept = given
+        measured, first = Bearings(*of_markers), max(len(rows) - kept, 0)
         state = x, pressure, moved, x, self._unweighted(x)
-        x, pressure, moved, before, _ = repeated(self._next, rows, state, Bearings(*of_markers))
+        state = repeated(self._next, rows[:first], state, measured)
+        if kept:
+            *found, weights = state
+            state = repeated(self._lower, rows[first:], (*found, weights, *found, self._unlikely(pressure)), measured)[5:]
+        x, pressure, moved, before = state[:4]
         return x, pressure, moved, before
+
+    @piece
+    def _unlikely(self, pressure: Tensor) -> Tensor:
+        return torch.full_like(pressure, torch.inf)
+
+    @piece
+    def _lower(self, x: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, weights: Tensor, *given: Any) -> Any:
+        """A step, and the state of the lowest objective after any."""
+        *kept, lowest, measured = given[:6]
+        state, weights = self._traced_once(State(x, pressure, moved), weights, measured, given[6:])
+        objective = self.objective(state, *self.tractions(*state[:2]), measured)
+        is_higher = torch.logical_not(objective < lowest)
+        kept = rowwise(is_higher, kept, (*state, x))
+        return *state, x, weights, *kept, torch.where(is_higher, lowest, objective)
 
     @piece
     def _unweighted(self, x: Tensor) -> Tensor:
