@@ -130,6 +130,39 @@ def test_weights_are_remembered_while_the_losses_stay_and_the_last_steps_are_dam
     assert (several.settling, several.coarse.settling, alone.settling) == (1, 1, ALONE)
 
 
+def test_of_the_steps_that_settle_the_likeliest_state_is_kept(dented, monkeypatch):
+    """Two frames; of the last four of nine steps, one of which breaks down. Where one settles, the last: none is judged."""
+    one, judged = estimator(), []
+    likely = iter(torch.tensor([[3.0, 1.0], [2.0, 2.0], [torch.nan, 3.0], [4.0, 4.0]]).double())
+    monkeypatch.setattr(one.descent, "objective", lambda state, *_: judged.append(state) or next(likely))
+    measured, schedule = one.equations.bearings.measured(dented), 9 * [(0.4, 5.0)]
+    state, before = one.descent(one.at_rest(measured.weight), measured, schedule, settling=4)
+    assert len(judged) == 4
+    for kept, at in zip(state, zip(*judged, strict=True), strict=True):
+        torch.testing.assert_close(kept, torch.stack([at[1][0], at[0][1]]), rtol=0, atol=0)
+    torch.testing.assert_close(before[0], judged[0].x[0], rtol=0, atol=0)
+    assert 0 < (before[1] - judged[0].x[1]).abs().max() < 0.1 * one.size
+    one.descent(one.at_rest(measured.weight), measured, schedule)
+    assert len(judged) == 4
+
+
+def test_where_contacts_push_nearly_everywhere_nothing_is_explained(dented):
+    """A half of the surface pushed, the other pulled; all pulled; just below and just above what may be pushed."""
+    one = estimator()
+    loss, within, outward = one.equations.loss, ~one.membrane.fixed, one.reference * one.membrane.rest_normals
+    normal, area = one.membrane.rest_normals[within].mT[None], one.membrane.rest_area[within]
+    west = one.membrane.rest[:, 0] < one.membrane.rest[:, 0].median()
+    for pushed in (west, ~west):
+        traction = torch.where(pushed[:, None], -outward, outward)[within].mT[None]
+        assert loss.pushed(traction, normal).item() == pytest.approx(
+            (area @ pushed[within].double() / area.sum()).item(), abs=0.1
+        )
+    assert loss.pushed(outward[within].mT[None], normal).item() == 0
+    zero, limit = torch.zeros(2, dtype=torch.float64), SETTINGS.largest_pushed
+    found = one(dented)._replace(misfit=zero, unexplained=zero, pushed=limit + torch.tensor([-0.01, 0.01]).double())
+    assert one.is_explained(found).tolist() == [True, False]
+
+
 def test_only_rows_that_are_not_done_are_worked_out_again():
     asked = []
 
@@ -247,7 +280,7 @@ def test_contacts_that_push_around_their_middle_only_are_tried_again(dented, lin
     traction = -one.reference * pushes[..., None] * normals
     x = rest.expand(4, -1, -1)
     volume, moved = one.membrane.volume(x), torch.zeros(4, 4, dtype=torch.float64)
-    found = Equilibrium(x, one.rest_pressure.expand(4), volume, traction, zero, reference, zero, moved, zero, zero)
+    found = Equilibrium(x, one.rest_pressure.expand(4), volume, traction, zero, reference, zero, moved, zero, zero, zero)
     assert one.dents.is_hollow(found, one.membrane).tolist() == [False, True, False, False]
     measured = one.equations.bearings.measured(Observation(*(value[:1].expand(4, *value.shape[1:]) for value in dented[:3])))
     assert one.is_done(found, measured).tolist() == [True, False, True, True]

@@ -67,7 +67,8 @@ class Equilibrium(NamedTuple):
     against which pushes are measured (zero where no tractions are found), `misfit [...]`: rms of the markers' angles off their
     rays, in standard deviations (zero where the surface is on every ray), `moved [..., 4]`: the camera, against the rim,
     `objective [...]`: how unlikely markers and tractions are, over the markers seen, and `unexplained [...]`: as much of it
-    as no push is the reason of: misfit, pulls and shear (both zero where no tractions are found)."""
+    as no push is the reason of: misfit, pulls and shear, `pushed [...]`: share of the surface that something pushes (all three
+    zero where no tractions are found)."""
 
     vertices: Tensor
     pressure: Tensor
@@ -79,6 +80,7 @@ class Equilibrium(NamedTuple):
     moved: Tensor
     objective: Tensor
     unexplained: Tensor
+    pushed: Tensor
 
 
 class Contacts(NamedTuple):

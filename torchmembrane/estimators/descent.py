@@ -72,8 +72,7 @@ class Descent(nn.Module):
         taus, size = [tau for tau, _ in schedule], len(schedule)
         numbers = [self._numbers(taus[: k + 1], size - k <= settling) for k in range(size)]
         rows = [(*scales, cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
-        kept = settling if settling > 1 else 0
-        x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows, kept)
+        x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows, settling)
         return State(x, pressure, moved), before
 
     def _numbers(self, taus: list[float], settles: bool) -> tuple[float, float]:
@@ -87,35 +86,26 @@ class Descent(nn.Module):
         return settings.renewal if before[-1:] == [tau] else 1.0, damping
 
     def _stepped(self, x: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The state after the steps, and the surface before the last; `given`: what is measured, the steps' scales."""
-        *of_markers, rows, kept = given
-        measured, first = Bearings(*of_markers), max(len(rows) - kept, 0)
-        state = x, pressure, moved, x, self._unweighted(x)
-        state = repeated(self._next, rows[:first], state, measured)
-        if kept:
-            *found, weights = state
-            state = repeated(self._lower, rows[first:], (*found, weights, *found, self._unlikely(pressure)), measured)[5:]
+        """The state after the steps, and the surface before the last; `given`: what is measured, the steps' scales, how many of
+        them settle."""
+        *of_markers, rows, settling = given
+        measured, last = Bearings(*of_markers), rows[-settling:] if settling > 1 else []
+        state: Sequence[Any] = (x, pressure, moved, x, self._unweighted(x))
+        state = repeated(self._next, rows[: len(rows) - len(last)], state, measured)
+        if last:
+            state = repeated(self._settle, last, (*state, *state[:4], self._none_found(pressure)), measured)[5:]
         x, pressure, moved, before = state[:4]
         return x, pressure, moved, before
-
-    @piece
-    def _unlikely(self, pressure: Tensor) -> Tensor:
-        return torch.full_like(pressure, torch.inf)
-
-    @piece
-    def _lower(self, x: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, weights: Tensor, *given: Any) -> Any:
-        """A step, and the state of the lowest objective after any."""
-        *kept, lowest, measured = given[:6]
-        state, weights = self._traced_once(State(x, pressure, moved), weights, measured, given[6:])
-        objective = self.objective(state, *self.tractions(*state[:2]), measured)
-        is_higher = torch.logical_not(objective < lowest)
-        kept = rowwise(is_higher, kept, (*state, x))
-        return *state, x, weights, *kept, torch.where(is_higher, lowest, objective)
 
     @piece
     def _unweighted(self, x: Tensor) -> Tensor:
         """What the first step has for the weights of a step before, `[B, N]`, and does not ask."""
         return torch.ones_like(x[:, : self.equations.loss.area.shape[0], 0])
+
+    @piece
+    def _none_found(self, pressure: Tensor) -> Tensor:
+        """The objective of no state, `[B]`."""
+        return torch.full_like(pressure, torch.inf)
 
     def objective(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
@@ -156,6 +146,20 @@ class Descent(nn.Module):
         """The state, the surface before, and the weights of normal tractions."""
         state, weights = self._traced_once(State(x, pressure, moved), weights, measured, scales)
         return *state, x, weights
+
+    @piece
+    def _settle(self, x: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, weights: Tensor, *given: Any) -> list[Tensor]:
+        """As `_next`, and of the states so far that of the lowest objective, the surface before it, and the objective: a vertex
+        that is pushed in one step and pulled in the next is no answer in every step.
+
+        Args:
+            given: the latter, what is measured, the numbers of the step.
+        """
+        *kept, lowest, measured = given[:6]
+        state, weights = self._traced_once(State(x, pressure, moved), weights, measured, given[6:])
+        objective = self.objective(state, *self.tractions(*state[:2]), measured)
+        is_lower = objective < lowest
+        return [*state, x, weights, *rowwise(is_lower, (*state, x, objective), (*kept, lowest))]
 
     def _traced_once(self, state: State, weights: Tensor, measured: Bearings, scales: Sequence[float]) -> tuple[State, Tensor]:
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.

@@ -281,8 +281,8 @@ class ForceBalance(nn.Module):
         objective = unexplained + pushes
         gain = self.descent.objective_at_rest(measured) / seen - objective
         scale = 1 + pad_border(loss.contact_scale(*within, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
-        against = self.reference * scale
-        return Equilibrium(x, pressure, membrane.volume(x), traction, step, against, misfit, moved, objective, unexplained)
+        of_solution = misfit, moved, objective, unexplained, loss.pushed(*within)
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *of_solution)
 
     @piece
     def is_converged(self, found: Equilibrium) -> Tensor:
@@ -309,11 +309,13 @@ class ForceBalance(nn.Module):
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the markers are off their rays by their noise and the model's error alone, with hardly a pull or shear
-        that no push comes with. How much pushes is no reason to doubt: a contact may be large, and its markers few."""
+        that no push comes with, and some surface is left that only the fluid pushes. How hard contacts push is no reason to
+        doubt: one may be large, and its markers few."""
         settings, press = self.settings, self._press(found)
         misfit = (settings.largest_misfit + settings.misfit_of_press * press) * self.coarseness
         unexplained = (settings.largest_unexplained + settings.unexplained_of_press * press) * self.coarseness**2
-        return torch.logical_not((found.misfit > misfit) | (found.unexplained > unexplained))
+        doubtful = (found.misfit > misfit) | (found.unexplained > unexplained) | (found.pushed > settings.largest_pushed)
+        return torch.logical_not(doubtful)
 
     def _press(self, found: Equilibrium) -> Tensor:
         """Rms displacement over the size, `[B]`."""

@@ -169,7 +169,7 @@ class MinimumEnergy(VertexRays):
         move, pressure = self._move(t, origins, directions, relaxed, *linear)
         error = move.abs().amax(-1) / self.membrane.size
         none, volume = torch.zeros_like(x), self.membrane.volume(x)
-        unasked = none[..., 0, 0], none[..., :4, 0], none[..., 0, 0], none[..., 0, 0]
+        unasked = none[..., 0, 0], none[..., :4, 0], *[none[..., 0, 0]] * 3
         return Equilibrium(x, pressure, volume, none, error, none[..., 0], *unasked)
 
     def _move(

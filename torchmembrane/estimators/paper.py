@@ -127,7 +127,7 @@ class PaperEstimator(VertexRays):
         t = self.rest_range + pad_border(psi[..., None], self.membrane.grid).squeeze(-1)
         x = rays[0] + t[..., None] * rays[1]
         none, step, volume = torch.zeros_like(x), torch.zeros_like(pressure), self.membrane.volume(x)
-        unasked = none[..., 0, 0], none[..., :4, 0], none[..., 0, 0], none[..., 0, 0]
+        unasked = none[..., 0, 0], none[..., :4, 0], *[none[..., 0, 0]] * 3
         return Equilibrium(x, pressure, volume, none, step, none[..., 0], *unasked)
 
     def programme(self, observation: Observation, relaxed: Tensor) -> tuple[QuadraticProgramme, tuple[Tensor, Tensor]]:

@@ -62,6 +62,8 @@ class ForceBalanceSettings:
         largest_unexplained: what is minimised but for the loss of pushes, over the markers seen, where a surface of this
             sensor explains them; as before.
         unexplained_of_press: so much more for a surface that has moved by its size (rms), as of the misfit.
+        largest_pushed: share of the surface that contacts push, of a surface that explains the markers: where all is pushed,
+            nothing tells the fluid's pressure from a contact's.
         likely_objective: what is minimised, over the markers seen, of a solution that is not solved again: of a contact where
             nothing moves, and of any; as before.
         likely_of_press: so much more, up to the latter, for a surface that has moved by its size (rms).
@@ -116,6 +118,7 @@ class ForceBalanceSettings:
     misfit_of_press: float = 2.0
     largest_unexplained: float = 3.75
     unexplained_of_press: float = 15.0
+    largest_pushed: float = 0.85
     likely_objective: tuple[float, float] = (0.6, 2.4)
     likely_of_press: float = 80.0
     worse_objective: float = 1.02

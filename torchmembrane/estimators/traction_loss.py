@@ -75,6 +75,11 @@ class TractionLoss(nn.Module):
         push2 = (-q_n / p0).clamp_min(0) ** 2 @ self.surroundings
         return q_n / p0, q_t.square().sum(1) / p0**2, push2
 
+    def pushed(self, traction: Tensor, normal: Tensor) -> Tensor:
+        """Share `[B]` of the surface around which tractions `[B, 3, N]` push more than the last scale `tau`."""
+        is_pushed = (self.parts(traction, normal)[2] > self.settings.tau[-1] ** 2).to(self.area.dtype)
+        return is_pushed @ self.area / self.area.sum()
+
     def shear_weight(self, push2: Tensor, cone: float | Tensor | None = None) -> Tensor:
         """`kappa [B, N]`; `cone`: default, that of this loss."""
         settings, cone = self.settings, self.cone if cone is None else cone

@@ -194,7 +194,7 @@ class MongeMinimumEnergy(nn.Module):
         psi, pressure, step = self.heights(origins, directions)
         x = self.material(psi, self._cells(psi, origins, directions), origins, directions)
         volume, none = self.membrane.volume(self.surface(psi)), torch.zeros_like(x)
-        unasked = none[..., 0, 0], none[..., :4, 0], none[..., 0, 0], none[..., 0, 0]
+        unasked = none[..., 0, 0], none[..., :4, 0], *[none[..., 0, 0]] * 3
         return Equilibrium(x, pressure, volume, none, step, none[..., 0], *unasked)
 
     def heights(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
