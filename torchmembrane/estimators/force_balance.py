@@ -300,7 +300,7 @@ class ForceBalance(nn.Module):
         """`[B]` bool: settled, likely, no mound for a pit, hardly a marker outside, as beside a contact steps went past."""
         settings, (least, most) = self.settings, self.settings.likely_objective
         at = found.vertices, measured, found.moved
-        outlying = self.equations.bearings.outlying(*at, 2 * settings.outlier * self.coarseness)
+        outlying = self.equations.bearings.outlying(*at, 4 * settings.outlier * self.coarseness)
         likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most)
         pushed = (stands_out(found.reference / self.reference) & ~self.membrane.fixed).any(-1)
         likely = torch.where(pushed, likely, most) * self.coarseness**2

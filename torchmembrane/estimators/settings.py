@@ -105,7 +105,7 @@ class ForceBalanceSettings:
     reach: float = 0.04
     renewal: float = 0.25
     floor: float = 1e-3
-    outlier: float = 5.0
+    outlier: float = 2.5
     pressure_noise: float = 0.01
     longest_step: float = 0.04
     largest_stretch: float = 0.3
