@@ -7,6 +7,8 @@ from ..errors import MembraneError
 ELEMENTS = ("triangle", "quadrilateral")
 VOLUMES = ("exact", "linear")
 FLOWS = ("smooth", "bilinear")
+NARROWING = 1.3
+"""Power of tau's decline with which that of the markers' scale goes: where tau begins it is twenty times the last."""
 
 
 @dataclass(frozen=True)
@@ -68,11 +70,11 @@ class ForceBalanceSettings:
             nothing moves, and of any; as before.
         likely_of_press: so much more, up to the latter, for a surface that has moved by its size (rms).
         worse_objective: what is minimised, over that of a first solution that has converged, of a second that is not taken.
-        largest_outlying: share of the markers that may be more than twice `outlier` off before a second try is made.
+        largest_outlying: share of the markers that may be more than four times `outlier` off before a second try is made.
 
     Example:
-        >>> ForceBalanceSettings(steps=12).gnc_schedule(2, (4.0, 0.4))
-        [(4.0, 50.0), (0.4, 5.0)]
+        >>> [(tau, round(outlier, 1)) for tau, outlier in ForceBalanceSettings().gnc_schedule(2, (4.0, 0.4))]
+        [(4.0, 49.9), (0.4, 2.5)]
     """
 
     steps: int = 8
@@ -119,7 +121,7 @@ class ForceBalanceSettings:
     largest_unexplained: float = 3.75
     unexplained_of_press: float = 15.0
     largest_pushed: float = 0.85
-    likely_objective: tuple[float, float] = (0.6, 2.4)
+    likely_objective: tuple[float, float] = (0.45, 1.8)
     likely_of_press: float = 80.0
     worse_objective: float = 1.02
     largest_outlying: float = 0.01
@@ -135,7 +137,7 @@ class ForceBalanceSettings:
         """Scales of the losses in every step, graduated non-convexity: of compressive tractions (tau), of markers."""
         first, last = tau
         taus = [first * (last / first) ** min(1.0, k / (self.decline * (steps - 1))) for k in range(steps)]
-        return [(tau, self.outlier * tau / last) for tau in taus]
+        return [(tau, self.outlier * (tau / last) ** NARROWING) for tau in taus]
 
 
 @dataclass(frozen=True)
