@@ -19,6 +19,7 @@ Iteratively reweighted least squares (IRLS) by Gauss-Newton steps, while `tau` d
 its lines, and a `Dent` where something pushes. What has not settled is solved again, by more steps from several starts.
 """
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -47,6 +48,9 @@ from .traction_loss import TractionLoss, stands_out
 
 RESOLVED = 17
 """Lines of a grid whose own error is small beside the markers'; a coarser one's grows as the square of its step."""
+
+WIDER = 2
+"""Scale of the markers' loss on coarser grids, over that of the finest: what they cannot follow must not draw them away."""
 
 ALONE = 3
 """Last steps that are damped to settle, on a grid that none precedes and none follows."""
@@ -102,7 +106,7 @@ class ForceBalance(nn.Module):
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
         bearings = MarkerBearings(membrane, markers, positions, noise, rest)
-        self.coarse = self._coarser(membrane, elasticity, bearings, rest, filling=filling, gas=gas)
+        self.coarse = self._coarser(membrane, elasticity, bearings, is_coarse, rest=rest, filling=filling, gas=gas)
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
@@ -127,7 +131,7 @@ class ForceBalance(nn.Module):
         return cls(*surface, noise, problem.filling, problem.gas, settings, rest)
 
     def _coarser(
-        self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerBearings, rest: Observation | None, **cavity: Any
+        self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerBearings, is_coarse: bool, **others: Any
     ) -> "ForceBalance | None":
         grid, positions = membrane.grid, bearings.positions
         if any(count % 2 == 0 or count < 2 * self.settings.coarsest - 1 for count in grid):
@@ -135,7 +139,8 @@ class ForceBalance(nn.Module):
         every_second = Membrane(*(a.unflatten(0, grid)[::2, ::2].numpy() for a in (membrane.rest, membrane.fixed)))
         markers, material = every_second.closest_points(positions.numpy()), elasticity.on(every_second)
         given = every_second, material, markers, positions, bearings.noise
-        return ForceBalance(*given, settings=self.settings, rest=rest, is_coarse=True, **cavity)
+        settings = self.settings if is_coarse else replace(self.settings, outlier=WIDER * self.settings.outlier)
+        return ForceBalance(*given, settings=settings, is_coarse=True, **others)
 
     @property
     def membrane(self) -> Membrane:
