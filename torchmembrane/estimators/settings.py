@@ -69,7 +69,7 @@ class ForceBalanceSettings:
         likely_objective: what is minimised, over the markers seen, of a solution that is not solved again: of a contact where
             nothing moves, and of any; as before.
         likely_of_press: so much more, up to the latter, for a surface that has moved by its size (rms).
-        worse_objective: what is minimised, over that of a first solution that has converged, of a second that is not taken.
+        worse_objective: what is minimised, over that of a first solution that has converged, above which a second is not taken.
         largest_outlying: share of the markers that may be more than four times `outlier` off before a second try is made.
 
     Example:
@@ -88,7 +88,7 @@ class ForceBalanceSettings:
     patient_tau: tuple[float, float] = (16.0, 0.4)
     patient_fine_tau: tuple[float, float] = (2.0, 0.4)
     settling_steps: int = 16
-    settled_step: float = 1e-3
+    settled_step: float = 4e-4
     camera_motion: float = 0.005
     decline: float = 0.6
     sparsity: float = 9000.0
@@ -121,9 +121,9 @@ class ForceBalanceSettings:
     largest_unexplained: float = 3.75
     unexplained_of_press: float = 15.0
     largest_pushed: float = 0.85
-    likely_objective: tuple[float, float] = (0.45, 1.8)
+    likely_objective: tuple[float, float] = (0.45, 0.9)
     likely_of_press: float = 80.0
-    worse_objective: float = 1.02
+    worse_objective: float = 0.9
     largest_outlying: float = 0.01
 
     def __post_init__(self) -> None:
