@@ -127,16 +127,19 @@ def test_a_tracked_frame_does_not_hang_on_the_mound_of_the_frame_before(bubble):
 
 
 def test_a_deep_press_is_found_from_a_deep_dent():
-    """A quarter of the size deep; from shallow dents alone the second try ends in a mound as the first does."""
+    """A quarter of the size deep; where markers' residuals weigh more, the second try from shallow dents alone is off by as
+    much."""
     sensor, truth = pressed_bubble(0.27)
-    reconstructor = tm.Reconstructor(sensor, check_rest=False)
+    surface, force = errors(solved(tm.Reconstructor(sensor, check_rest=False), truth), truth)
+    assert surface < 0.1 and force < 0.1
+    reconstructor = tm.Reconstructor(sensor, check_rest=False, settings=tm.ForceBalanceSettings(outlier=5.0))
     found = solved(reconstructor, truth)
     surface, force = errors(found, truth)
     assert found.status[0] == 0 and surface < 0.1 and force < 0.1
     dent = reconstructor.estimator.dent
     dent.deep = dent.wide = dent.forward
     without, _ = errors(solved(reconstructor, truth), truth)
-    assert without > 0.5
+    assert without > 0.25
     followed, _ = errors(solved(reconstructor, truth, found), truth)  # the frame before is one more start of the second try
     assert followed < 0.1
 

@@ -20,7 +20,7 @@ its lines, and a `Dent` where something pushes. What has not settled is solved a
 """
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 import torch.nn.functional as F
@@ -48,9 +48,6 @@ from .traction_loss import TractionLoss, stands_out
 
 RESOLVED = 17
 """Lines of a grid whose own error is small beside the markers'; a coarser one's grows as the square of its step."""
-
-WIDER = 2
-"""Scale of the markers' loss on coarser grids, over that of the finest: what they cannot follow must not draw them away."""
 
 ALONE = 3
 """Last steps that are damped to settle, on a grid that none precedes and none follows."""
@@ -106,7 +103,7 @@ class ForceBalance(nn.Module):
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
         bearings = MarkerBearings(membrane, markers, positions, noise, rest)
-        self.coarse = self._coarser(membrane, elasticity, bearings, is_coarse, rest=rest, filling=filling, gas=gas)
+        self.coarse = self._coarser(membrane, elasticity, bearings, rest=rest, filling=filling, gas=gas)
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
@@ -130,17 +127,15 @@ class ForceBalance(nn.Module):
         surface = problem.membrane, problem.elasticity, problem.markers, problem.positions
         return cls(*surface, noise, problem.filling, problem.gas, settings, rest)
 
-    def _coarser(
-        self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerBearings, is_coarse: bool, **others: Any
-    ) -> "ForceBalance | None":
+    def _coarser(self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerBearings, **others: Any) -> Self | None:
         grid, positions = membrane.grid, bearings.positions
         if any(count % 2 == 0 or count < 2 * self.settings.coarsest - 1 for count in grid):
             return None
         every_second = Membrane(*(a.unflatten(0, grid)[::2, ::2].numpy() for a in (membrane.rest, membrane.fixed)))
         markers, material = every_second.closest_points(positions.numpy()), elasticity.on(every_second)
         given = every_second, material, markers, positions, bearings.noise
-        settings = self.settings if is_coarse else replace(self.settings, outlier=WIDER * self.settings.outlier)
-        return ForceBalance(*given, settings=settings, is_coarse=True, **others)
+        settings = replace(self.settings, outlier=self.settings.coarse_outlier)
+        return type(self)(*given, settings=settings, is_coarse=True, **others)
 
     @property
     def membrane(self) -> Membrane:
@@ -303,23 +298,22 @@ class ForceBalance(nn.Module):
     @piece
     def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
         """`[B]` bool: settled, likely, no mound for a pit, hardly a marker outside, as beside a contact steps went past."""
-        settings, (least, most) = self.settings, self.settings.likely_objective
+        settings, (least, most, untouched) = self.settings, self.settings.likely_objective
         at = found.vertices, measured, found.moved
         outlying = self.equations.bearings.outlying(*at, 4 * settings.outlier * self.coarseness)
         likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most)
         pushed = (stands_out(found.reference / self.reference) & ~self.membrane.fixed).any(-1)
-        likely = torch.where(pushed, likely, most) * self.coarseness**2
+        likely = torch.where(pushed, likely, untouched) * self.coarseness**2
         done: Tensor = self.is_settled(found) & (found.objective <= likely) & (outlying <= settings.largest_outlying)
         return done if self.dents is None else done & ~self.dents.is_hollow(found, self.membrane)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: the markers are off their rays by their noise and the model's error alone, with hardly a pull or shear
-        that no push comes with, and some surface is left that only the fluid pushes. How hard contacts push is no reason to
-        doubt: one may be large, and its markers few."""
+        """`[B]` bool: the markers are off their rays by noise and the model's error alone, with hardly a pull or shear that no
+        push comes with, on a surface not pushed everywhere. How hard is no reason to doubt: a contact may have few markers."""
         settings, press = self.settings, self._press(found)
         misfit = (settings.largest_misfit + settings.misfit_of_press * press) * self.coarseness
         unexplained = (settings.largest_unexplained + settings.unexplained_of_press * press) * self.coarseness**2
-        doubtful = (found.misfit > misfit) | (found.unexplained > unexplained) | (found.pushed > settings.largest_pushed)
+        doubtful = (found.pushed > settings.largest_pushed) | (found.unexplained > unexplained) | (found.misfit > misfit)
         return torch.logical_not(doubtful)
 
     def _press(self, found: Equilibrium) -> Tensor:

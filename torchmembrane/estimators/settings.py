@@ -49,6 +49,7 @@ class ForceBalanceSettings:
             vertex that is pushed after one step and pulled after the next settles.
         floor: least weight of a compressive traction; without it a vertex under a contact has no place of its own.
         outlier: scale of the markers' loss, over their noise.
+        coarse_outlier: the same on grids that a finer one follows: what these cannot follow must not lose them markers.
         pressure_noise: standard deviation of a measured pressure, over the reference traction (mostly the rest pressure); a
             better gauge is best told to be as good as this.
         longest_step: largest step of a vertex.
@@ -67,8 +68,8 @@ class ForceBalanceSettings:
         largest_pushed: share of the surface that contacts push, of a surface that explains the markers: where all is pushed,
             nothing tells the fluid's pressure from a contact's.
         likely_objective: what is minimised, over the markers seen, of a solution that is not solved again: of a contact where
-            nothing moves, and of any; as before.
-        likely_of_press: so much more, up to the latter, for a surface that has moved by its size (rms).
+            nothing moves, of any contact, and of none; as before.
+        likely_of_press: so much more, up to the second, for a surface that has moved by its size (rms).
         worse_objective: what is minimised, over that of a first solution that has converged, above which a second is not taken.
         largest_outlying: share of the markers that may be more than four times `outlier` off before a second try is made.
 
@@ -108,6 +109,7 @@ class ForceBalanceSettings:
     renewal: float = 0.25
     floor: float = 1e-3
     outlier: float = 2.5
+    coarse_outlier: float = 5.0
     pressure_noise: float = 0.01
     longest_step: float = 0.04
     largest_stretch: float = 0.3
@@ -121,7 +123,7 @@ class ForceBalanceSettings:
     largest_unexplained: float = 3.75
     unexplained_of_press: float = 15.0
     largest_pushed: float = 0.85
-    likely_objective: tuple[float, float] = (0.45, 0.9)
+    likely_objective: tuple[float, float, float] = (0.45, 0.9, 1.8)
     likely_of_press: float = 80.0
     worse_objective: float = 0.9
     largest_outlying: float = 0.01
