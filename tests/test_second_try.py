@@ -102,6 +102,19 @@ def test_a_second_try_settles_on_the_grids_that_are_finer_than_its_dents():
         assert second[len(second) - settling :] == [second[-1]] * settling
 
 
+def test_coarser_grids_lose_fewer_markers():
+    """Of three grids; the markers' scale begins at twenty times its last, as tau begins at ten times."""
+    fine = estimator(spherical_cap(12, 9, 3, (33, 33)))
+    for one, last in (
+        (fine, SETTINGS.outlier),
+        (fine.coarse, SETTINGS.coarse_outlier),
+        (fine.coarse.coarse, SETTINGS.coarse_outlier),
+    ):
+        assert one.descent.settings.outlier == last < 2.1 * SETTINGS.outlier
+        assert [one.schedule(patient)[-1] for patient in (False, True)] == 2 * [(0.4, last)]
+    assert fine.coarse.coarse.schedule()[0] == (4.0, pytest.approx(20 * SETTINGS.coarse_outlier, rel=0.01))
+
+
 def test_normal_weights_are_the_geometric_mean_with_those_of_the_step_before(dented):
     one = estimator()
     loss, measured = one.equations.loss, one.equations.bearings.measured(dented)
