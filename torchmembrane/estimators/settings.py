@@ -123,7 +123,7 @@ class ForceBalanceSettings:
     largest_unexplained: float = 3.75
     unexplained_of_press: float = 15.0
     largest_pushed: float = 0.85
-    likely_objective: tuple[float, float, float] = (0.45, 0.9, 1.8)
+    likely_objective: tuple[float, float, float] = (0.45, 0.95, 1.8)
     likely_of_press: float = 80.0
     worse_objective: float = 0.9
     largest_outlying: float = 0.01
