@@ -127,9 +127,9 @@ def test_a_tracked_frame_does_not_hang_on_the_mound_of_the_frame_before(bubble):
 
 
 def test_a_deep_press_is_found_from_a_deep_dent():
-    """A quarter of the size deep; where markers' residuals weigh more, the second try from shallow dents alone is off by as
-    much."""
-    sensor, truth = pressed_bubble(0.27)
+    """Nearly a third of the size deep; where far markers weigh more, the second try from shallow dents alone ends in a mound
+    as the first does."""
+    sensor, truth = pressed_bubble(0.31)
     surface, force = errors(solved(tm.Reconstructor(sensor, check_rest=False), truth), truth)
     assert surface < 0.1 and force < 0.1
     reconstructor = tm.Reconstructor(sensor, check_rest=False, settings=tm.ForceBalanceSettings(outlier=5.0))
@@ -139,7 +139,7 @@ def test_a_deep_press_is_found_from_a_deep_dent():
     dent = reconstructor.estimator.dent
     dent.deep = dent.wide = dent.forward
     without, _ = errors(solved(reconstructor, truth), truth)
-    assert without > 0.25
+    assert without > 0.5
     followed, _ = errors(solved(reconstructor, truth, found), truth)  # the frame before is one more start of the second try
     assert followed < 0.1
 

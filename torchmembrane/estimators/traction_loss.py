@@ -75,10 +75,9 @@ class TractionLoss(nn.Module):
         push2 = (-q_n / p0).clamp_min(0) ** 2 @ self.surroundings
         return q_n / p0, q_t.square().sum(1) / p0**2, push2
 
-    def pushed(self, traction: Tensor, normal: Tensor) -> Tensor:
-        """Share `[B]` of the surface around which tractions `[B, 3, N]` push more than the last scale `tau`."""
-        is_pushed = (self.parts(traction, normal)[2] > self.settings.tau[-1] ** 2).to(self.area.dtype)
-        return is_pushed @ self.area / self.area.sum()
+    def pushed(self, push2: Tensor) -> Tensor:
+        """Share `[B]` of the surface that is pushed more than the last scale `tau`, from `S^2 [B, N]`."""
+        return (push2 > self.settings.tau[-1] ** 2).to(self.area.dtype) @ self.area / self.area.sum()
 
     def shear_weight(self, push2: Tensor, cone: float | Tensor | None = None) -> Tensor:
         """`kappa [B, N]`; `cone`: default, that of this loss."""
@@ -98,17 +97,15 @@ class TractionLoss(nn.Module):
         least = (settings.decrease * (torch.as_tensor(tau) / last - 1) + settings.least_scale).clamp_max(1.0)
         return (expected / last**2).maximum(least.to(push2) ** 2).clamp_max(1.0)
 
-    def contact_scale(self, traction: Tensor, normal: Tensor, noise_level: Tensor, gain: Tensor) -> Tensor:
+    def contact_scale(self, push2: Tensor, noise_level: Tensor, gain: Tensor) -> Tensor:
         """What a push that is a contact is measured against, over `p0`, `[B, N]`: `rho`, or where noise explains it, or
         all that is found, `BEYOND`.
 
         Args:
-            traction: `[B, 3, N]`, at a solution.
-            normal: `[B, 3, N]`.
+            push2: `S^2 [B, N]`, at a solution.
             noise_level: `[B]`, of the frames over that at rest.
             gain: `[B]`, by how much the objective is below that of the surface at rest, over the markers seen.
         """
-        push2 = self.parts(traction, normal)[2]
         rho = self.scale2(push2, noise_level, self.settings.tau[-1]).sqrt()
         above = push2 > (self.settings.contact_noise * noise_level[:, None] * self.push_noise).square()
         above = above & (gain > self.settings.evidence * self.noise_gain)[:, None]
