@@ -9,6 +9,7 @@ from ..spacing import FADED, faded, neighbours, safe_length, spacing, square_dis
 NEIGHBOURS = 6
 SEAM = 2.0  # width of the neighbourhood in which a seam is looked for, pitches
 TEAR = 0.045  # root of the share of dots lost and blobs left over, times the relative error of steps
+STRAY = 0.07  # share of the neighbours lost, times the relative error of the steps to the others
 CLAIM = 0.35  # a blob so near to a dot is the dot's, pitches
 RIVAL = 0.05  # a blob left over is as near to the prediction as the dot's own, pitches
 
@@ -18,8 +19,9 @@ class Coherence(nn.Module):
 
     A region matched one pitch off ends in a seam, where dots are lost, blobs of their size are left over, and the step
     from a dot to its neighbour is not what the deformation measured at both makes of it at rest. Lost dots or blobs left
-    over alone, or a field that varies fast, are no seam. A blob left over as near to the prediction as the dot's own is
-    its rival: then neither is believed.
+    over alone, or a field that varies fast, are no seam. A single dot on another's blob is a seam of its own: its neighbour is
+    lost, and the steps to the others are wrong. A blob left over as near to the prediction as the dot's own is its rival: then
+    neither is believed.
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest, px.
@@ -91,17 +93,19 @@ class Coherence(nn.Module):
         alone = 1 - (left[..., None] * torch.sigmoid(margin * self.decision)).amax(1)
         left = (left[:, None] @ torch.exp((square * self.narrowness).clamp_min(-FADED))).squeeze(1) / self.total
         lost = (1 - sure) @ self.share
-        error = self._error_of_steps(pixels, sure, gradient)
-        tear = torch.minimum(lost, left).clamp_min(1e-12).sqrt() * error
-        return alone * torch.sigmoid(8 * (1 - tear / TEAR))
+        error, around, beside = self._error_of_steps(pixels, sure, gradient)
+        tear = torch.minimum(lost, left).clamp_min(1e-12).sqrt() * around / TEAR
+        stray = beside * error / STRAY
+        return alone * torch.sigmoid(8 * (1 - tear)) * torch.sigmoid(8 * (1 - stray))
 
-    def _error_of_steps(self, pixels: Tensor, sure: Tensor, gradient: Tensor) -> Tensor:
-        """Relative error `[B, D]`, averaged around every dot, of the steps to its neighbours against the gradient."""
+    def _error_of_steps(self, pixels: Tensor, sure: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Relative error of the steps from every dot to its neighbours against the gradient, the same averaged around, and the
+        share of the neighbours that is lost, `[B, D]` each."""
         here = torch.cat([gradient.flatten(2), pixels, sure[..., None]], -1)
         there = here.index_select(1, self.near.flatten()).mT.unflatten(-1, self.near.shape)  # [B, 7, neighbours, D]
         here = here.mT[:, :, None]
         ends = (there[:, :4] + here[:, :4]).unflatten(1, (2, 2))
         change = there[:, 4:6] - here[:, 4:6] - self.step - (ends * self.half_step).sum(2)
         pair = there[:, 6] * here[:, 6]
-        error = (pair * safe_length(change, 1) / self.length).sum(1) @ self.share
-        return error / (pair.sum(1) @ self.share + 1e-3)
+        error, pairs = (pair * safe_length(change, 1) / self.length).sum(1), pair.sum(1)
+        return error / (pairs + 1e-3), (error @ self.share) / (pairs @ self.share + 1e-3), 1 - there[:, 6].mean(1)
