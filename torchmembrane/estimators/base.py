@@ -67,8 +67,9 @@ class Equilibrium(NamedTuple):
     against which pushes are measured (zero where no tractions are found), `misfit [...]`: rms of the markers' angles off their
     rays, in standard deviations (zero where the surface is on every ray), `moved [..., 4]`: the camera, against the rim,
     `objective [...]`: how unlikely markers and tractions are, over the markers seen, and `unexplained [...]`: as much of it
-    as no push is the reason of: misfit, pulls and shear, `pushed [...]`: share of the surface that something pushes (all three
-    zero where no tractions are found)."""
+    as no push is the reason of: misfit, pulls and shear, `pushed [...]`: share of the surface that something pushes, and
+    `shared_misfit [...]`: as much of the misfit as neighbouring markers have in common (all four zero where no tractions are
+    found)."""
 
     vertices: Tensor
     pressure: Tensor
@@ -81,6 +82,14 @@ class Equilibrium(NamedTuple):
     objective: Tensor
     unexplained: Tensor
     pushed: Tensor
+    shared_misfit: Tensor
+
+    @classmethod
+    def without_tractions(cls, x: Tensor, pressure: Tensor, volume: Tensor, step: Tensor) -> "Equilibrium":
+        """A surface on every ray, all that tractions tell zero."""
+        none = torch.zeros_like(x)
+        zero, still = none[..., 0, 0], none[..., :4, 0]
+        return cls(x, pressure, volume, none, step, none[..., 0], zero, still, zero, zero, zero, zero)
 
 
 class Contacts(NamedTuple):

@@ -17,6 +17,9 @@ from ..surface.stencil import inner
 from ..surface.tangent import tangent_frame
 from .base import Observation
 
+NEIGHBOURS = 4
+"""Of a marker, that are asked whether they are off their rays alike."""
+
 
 class Bearings(NamedTuple):
     """Measured marker rays, and what a gauge reads.
@@ -101,11 +104,14 @@ class MarkerBearings(nn.Module):
     smooth_shares: Tensor
     vertex_shares: Tensor
     pair_shares: Tensor
+    nearest: Tensor
 
     def __init__(self, membrane: Membrane, markers: SurfacePoints, positions: Tensor, noise: float, rest: Observation | None):
         super().__init__()
         self.grid, self.noise = membrane.grid, noise
         self.register_buffer("positions", torch.as_tensor(positions, dtype=torch.float64))
+        apart = torch.cdist(self.positions, self.positions)
+        self.register_buffer("nearest", apart.argsort(dim=-1, stable=True)[:, 1 : 1 + NEIGHBOURS].contiguous())
         self.register_buffer("inner_rest", inner(membrane.rest, membrane.grid))
         vertex_shares, pair_shares = _shares(membrane, markers)
         self.register_buffer("vertex_shares", vertex_shares)
@@ -149,6 +155,16 @@ class MarkerBearings(nn.Module):
         """Rms of the markers' angles off their rays `[B]`, in standard deviations, each counted as `outlier` at most."""
         angles2 = self.angles(x, measured, moved)[0].square().mean(1).clamp_max(outlier**2)
         return ((measured.weight * angles2).sum(-1) / measured.weight.sum(-1).clamp_min(1)).sqrt()
+
+    def shared_misfit(self, x: Tensor, measured: Bearings, moved: Tensor, far: float) -> Tensor:
+        """Root of the mean product `[B]` of the angles of a marker and of its nearest neighbours off their rays, in standard
+        deviations, each counted as `far` at most; 0 where it is negative. Noise and wrong matches of one marker know nothing of
+        the next; what no surface of this sensor can follow does."""
+        angles = self.angles(x, measured, moved)[0]
+        length = angles.square().sum(1, keepdim=True).clamp_min(1e-12).sqrt()
+        here = angles * (far / length).clamp_max(1) * measured.weight[:, None]
+        beside, seen = (each[..., self.nearest].sum(-1) for each in (here, measured.weight))
+        return ((here * beside).sum((1, 2)) / (measured.weight * seen).sum(-1).clamp_min(1)).clamp_min(0).sqrt()
 
     def outlying(self, x: Tensor, measured: Bearings, moved: Tensor, limit: float) -> Tensor:
         """The share `[B]` of the markers that are seen and more than `limit` standard deviations off their rays."""

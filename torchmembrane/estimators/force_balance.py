@@ -281,8 +281,9 @@ class ForceBalance(nn.Module):
         objective = unexplained + pushes
         gain = self.descent.objective_at_rest(measured) / seen - objective
         scale = 1 + pad_border(loss.contact_scale(push2, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
-        of_solution = misfit, moved, objective, unexplained, loss.pushed(push2)
-        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *of_solution)
+        shared = self.equations.bearings.shared_misfit(x, measured, moved, self.settings.far * self.coarseness)
+        judged = misfit, moved, objective, unexplained, loss.pushed(push2), shared
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *judged)
 
     @piece
     def is_converged(self, found: Equilibrium) -> Tensor:
@@ -299,8 +300,7 @@ class ForceBalance(nn.Module):
     def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
         """`[B]` bool: settled, likely, no mound for a pit, hardly a marker outside, as beside a contact steps went past."""
         settings, (least, most, untouched) = self.settings, self.settings.likely_objective
-        at = found.vertices, measured, found.moved
-        outlying = self.equations.bearings.outlying(*at, 4 * settings.outlier * self.coarseness)
+        outlying = self.equations.bearings.outlying(found.vertices, measured, found.moved, settings.far * self.coarseness)
         likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most)
         pushed = (stands_out(found.reference / self.reference) & ~self.membrane.fixed).any(-1)
         likely = torch.where(pushed, likely, untouched) * self.coarseness**2
@@ -308,13 +308,13 @@ class ForceBalance(nn.Module):
         return done if self.dents is None else done & ~self.dents.is_hollow(found, self.membrane)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: the markers are off their rays by noise and the model's error alone, with hardly a pull or shear that no
-        push comes with, on a surface not pushed everywhere. How hard is no reason to doubt: a contact may have few markers."""
+        """`[B]` bool: markers off their rays by noise and the model's error alone, neighbours not alike, hardly a pull or shear
+        that no push comes with, not pushed everywhere. How hard is no reason to doubt: a contact may have few markers."""
         settings, press = self.settings, self._press(found)
         misfit = (settings.largest_misfit + settings.misfit_of_press * press) * self.coarseness
         unexplained = (settings.largest_unexplained + settings.unexplained_of_press * press) * self.coarseness**2
         doubtful = (found.pushed > settings.largest_pushed) | (found.unexplained > unexplained) | (found.misfit > misfit)
-        return torch.logical_not(doubtful)
+        return torch.logical_not(doubtful | (found.shared_misfit > settings.largest_shared_misfit * self.coarseness))
 
     def _press(self, found: Equilibrium) -> Tensor:
         """Rms displacement over the size, `[B]`."""

@@ -168,9 +168,7 @@ class MinimumEnergy(VertexRays):
         x = (origins + t[..., None, :] * directions).mT
         move, pressure = self._move(t, origins, directions, relaxed, *linear)
         error = move.abs().amax(-1) / self.membrane.size
-        none, volume = torch.zeros_like(x), self.membrane.volume(x)
-        unasked = none[..., 0, 0], none[..., :4, 0], *[none[..., 0, 0]] * 3
-        return Equilibrium(x, pressure, volume, none, error, none[..., 0], *unasked)
+        return Equilibrium.without_tractions(x, pressure, self.membrane.volume(x), error)
 
     def _move(
         self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None, *linear: Tensor

@@ -126,9 +126,7 @@ class PaperEstimator(VertexRays):
             pressure = self.rest_pressure - multiplier
         t = self.rest_range + pad_border(psi[..., None], self.membrane.grid).squeeze(-1)
         x = rays[0] + t[..., None] * rays[1]
-        none, step, volume = torch.zeros_like(x), torch.zeros_like(pressure), self.membrane.volume(x)
-        unasked = none[..., 0, 0], none[..., :4, 0], *[none[..., 0, 0]] * 3
-        return Equilibrium(x, pressure, volume, none, step, none[..., 0], *unasked)
+        return Equilibrium.without_tractions(x, pressure, self.membrane.volume(x), torch.zeros_like(pressure))
 
     def programme(self, observation: Observation, relaxed: Tensor) -> tuple[QuadraticProgramme, tuple[Tensor, Tensor]]:
         """Eq. 22 of these rays, and the rays on which the rim stays: direction 0."""

@@ -65,13 +65,15 @@ class ForceBalanceSettings:
         largest_unexplained: what is minimised but for the loss of pushes, over the markers seen, where a surface of this
             sensor explains them; as before.
         unexplained_of_press: so much more for a surface that has moved by its size (rms), as of the misfit.
+        largest_shared_misfit: as much of the misfit as neighbouring markers have in common, of a surface that explains them, in
+            standard deviations: a torn or sheared image moves neighbours alike, as no surface follows.
         largest_pushed: share of the surface that contacts push, of a surface that explains the markers: where all is pushed,
             nothing tells the fluid's pressure from a contact's.
         likely_objective: what is minimised, over the markers seen, of a solution that is not solved again: of a contact where
             nothing moves, of any contact, and of none; as before.
         likely_of_press: so much more, up to the second, for a surface that has moved by its size (rms).
         worse_objective: what is minimised, over that of a first solution that has converged, above which a second is not taken.
-        largest_outlying: share of the markers that may be more than four times `outlier` off before a second try is made.
+        largest_outlying: share of the markers that may be `far` off before a second try is made.
 
     Example:
         >>> [(tau, round(outlier, 1)) for tau, outlier in ForceBalanceSettings().gnc_schedule(2, (4.0, 0.4))]
@@ -120,8 +122,9 @@ class ForceBalanceSettings:
     largest_volume_error: float = 1e-3
     largest_misfit: float = 1.5
     misfit_of_press: float = 2.0
-    largest_unexplained: float = 3.75
-    unexplained_of_press: float = 15.0
+    largest_unexplained: float = 2.25
+    unexplained_of_press: float = 30.0
+    largest_shared_misfit: float = 1.35
     largest_pushed: float = 0.85
     likely_objective: tuple[float, float, float] = (0.45, 0.95, 1.8)
     likely_of_press: float = 80.0
@@ -134,6 +137,11 @@ class ForceBalanceSettings:
                 raise MembraneError(f"ForceBalanceSettings: {name} = {getattr(self, name)}; expected at least 2")
         if not self.pressure_noise > 0:
             raise MembraneError(f"ForceBalanceSettings: pressure_noise = {self.pressure_noise}; expected more than 0")
+
+    @property
+    def far(self) -> float:
+        """Of a marker off its ray, over its noise: what no more can be said of than that it is far off."""
+        return 4 * self.outlier
 
     def gnc_schedule(self, steps: int, tau: tuple[float, float]) -> list[tuple[float, float]]:
         """Scales of the losses in every step, graduated non-convexity: of compressive tractions (tau), of markers."""

@@ -193,9 +193,7 @@ class MongeMinimumEnergy(nn.Module):
         """
         psi, pressure, step = self.heights(origins, directions)
         x = self.material(psi, self._cells(psi, origins, directions), origins, directions)
-        volume, none = self.membrane.volume(self.surface(psi)), torch.zeros_like(x)
-        unasked = none[..., 0, 0], none[..., :4, 0], *[none[..., 0, 0]] * 3
-        return Equilibrium(x, pressure, volume, none, step, none[..., 0], *unasked)
+        return Equilibrium.without_tractions(x, pressure, self.membrane.volume(self.surface(psi)), step)
 
     def heights(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """`psi` at the free points, the pressure, and the last step over the surface's size (eqs. 22, 27 with `v.psi = 0`)."""
