@@ -398,6 +398,22 @@ def test_a_dot_is_not_believed_beside_a_blob_nearer_to_the_prediction(rival, bel
     assert (trust[0, 12] > 0.9) == believed and np.delete(trust[0].numpy(), 12).min() > 0.9
 
 
+@pytest.mark.parametrize("off, lost, believed", [(0.7, True, False), (0.7, False, True), (0.0, True, True)])
+def test_a_dot_on_the_blob_of_a_lost_neighbour_is_not_believed(off, lost, believed):
+    """Out of line with those around; the same where all are found; in line beside a lost one."""
+    rest = PITCH * np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), -1).reshape(-1, 2)
+    coherence = Coherence(rest, np.ones(25), 0.45)
+    predicted = torch.tensor(rest)[None]
+    pixels = predicted.clone()
+    pixels[0, 12, 0] += off * PITCH
+    confidence, flat = torch.full((1, 25), 0.95, dtype=torch.float64), torch.zeros(1, 25, 2, 2, dtype=torch.float64)
+    confidence[0, 13] = 0.0 if lost else 0.95
+    ones = torch.ones(1, 25, dtype=torch.float64)
+    trust = coherence(pixels, confidence, flat, pixels, pixels, ones, (confidence > 0).double())
+    assert (trust[0, 12] > 0.9) == believed and (believed or trust[0, 12] < 0.1)
+    assert np.delete(trust[0].numpy(), 12).min() > 0.9
+
+
 @pytest.mark.parametrize("arrangement, two_sizes", PATTERNS)
 def test_what_cannot_be_followed_is_lost_and_not_wrong(arrangement, two_sizes):
     s = scene(arrangement, two_sizes)

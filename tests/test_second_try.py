@@ -62,7 +62,7 @@ def test_a_step_changes_no_edge_by_more_than_its_share(dented, tau):
 
 def test_frames_that_settle_keep_their_first_solution_others_are_solved_patiently_from_rest(dented):
     anything = dict(settled_step=1e9, largest_misfit=1e9, largest_relative_step=1e9, largest_volume_error=1e9)
-    anything |= dict(largest_outlying=1.0, largest_unexplained=1e9, likely_objective=(1e9, 1e9, 1e9))
+    anything |= dict(largest_outlying=1.0, largest_unexplained=1e9, likely_objective=(1e9, 1e9, 1e9), largest_shared_misfit=1e9)
     kept, again = estimator(**anything), estimator(settled_step=0.0, largest_relative_step=0.0)
     measured = kept.equations.bearings.measured(dented)
     torch.testing.assert_close(kept(dented).vertices, kept._solved(measured).vertices)
@@ -74,7 +74,8 @@ def test_what_broke_down_or_is_unexplained_has_not_settled(dented):
     one = estimator()
     found = one(dented)._replace(relative_step=torch.tensor([0.0, 0.0], dtype=torch.float64), misfit=torch.zeros(2).double())
     found = found._replace(volume=one.cavity.rest_volume.expand(2), pressure=one.rest_pressure.expand(2))
-    found = found._replace(objective=torch.zeros(2).double(), unexplained=torch.zeros(2).double())
+    none = torch.zeros(2).double()
+    found = found._replace(objective=none, unexplained=none, shared_misfit=none)
     assert one.is_settled(found).tolist() == [True, True]
     assert one.is_settled(found._replace(misfit=torch.tensor([0.0, 9.0]))).tolist() == [True, False]
     assert one.is_settled(found._replace(relative_step=torch.tensor([torch.nan, 1.5e-3]))).tolist() == [False, False]
@@ -175,6 +176,37 @@ def test_where_contacts_push_nearly_everywhere_nothing_is_explained(dented):
     assert one.is_explained(found).tolist() == [True, False]
 
 
+def test_what_neighbouring_markers_have_in_common_is_a_reason_to_doubt_what_each_has_alone_is_none():
+    """Off by 1.2 and 1.5 deviations, all alike; by 50 alike, of which 10 count; every second the other way; each its own way;
+    a quarter alike, the others at rest; that quarter not trusted."""
+    one = estimator()
+    rest, noise = one.equations.bearings.positions, one.equations.bearings.noise
+    ray = torch.nn.functional.normalize(rest, dim=-1)
+    up = torch.tensor([0.0, 1.0, 0.0]).to(ray).expand_as(ray)
+    across = torch.nn.functional.normalize(torch.linalg.cross(ray, up), dim=-1)
+    along = torch.linalg.cross(ray, across)
+    row, column = torch.arange(121) // 11, torch.arange(121) % 11
+    even, part = 1.0 - 2 * ((row + column) % 2), ((row < 5) & (column < 6)).double()
+    own = torch.randn(2, 121, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    alike = torch.stack(
+        [torch.full((121,), 1.2), torch.full((121,), 1.5), torch.full((121,), 50.0), 3 * even, 3 * own[0], 9 * part, 9 * part]
+    )
+    other = torch.zeros(7, 121).double()
+    other[4] = 3 * own[1]
+    depth = noise * rest.norm(dim=-1, keepdim=True)
+    observation = seen(rest + depth * (alike[..., None] * across + other[..., None] * along))
+    observation.confidence[6, part > 0] = 0
+    measured = one.equations.bearings.measured(observation)
+    state = one.at_rest(measured.weight)
+    found = one.equilibrium(*state, state.x, measured)
+    expected = torch.tensor([1.2, 1.5, SETTINGS.far, 0.0]).double()
+    torch.testing.assert_close(found.shared_misfit[:4], expected, rtol=0.06, atol=0)
+    assert found.shared_misfit[4] < 1.0 < found.misfit[4]
+    assert 9 * 0.8 * (30 / 121) ** 0.5 < found.shared_misfit[5] < 9 * (30 / 121) ** 0.5 and found.shared_misfit[6] < 1e-9
+    found = found._replace(misfit=0 * found.misfit, unexplained=0 * found.misfit)
+    assert one.is_explained(found).tolist() == [True, False, False, True, True, False, True]
+
+
 def test_only_rows_that_are_not_done_are_worked_out_again():
     asked = []
 
@@ -242,7 +274,7 @@ def test_unlikely_solutions_are_tried_again_and_what_no_push_is_the_reason_of_ex
         objective = torch.tensor([0.9 * likely, 1.1 * likely, 0.9 * likely, 100 * largest]).double()
         unexplained = torch.tensor([0.0, 0.9 * largest, 1.1 * largest, 0.0]).double()
         first = first._replace(objective=objective, unexplained=unexplained, misfit=0 * objective, relative_step=0 * objective)
-        first = first._replace(volume=one.membrane.volume(first.vertices))
+        first = first._replace(volume=one.membrane.volume(first.vertices), shared_misfit=0 * objective)
         rows = type(dented)(*(None if value is None else value[1:].expand(4, *value.shape[1:]) for value in dented))
         measured = one.equations.bearings.measured(rows)
         assert one.is_explained(first).tolist() == [True, True, False, True]
@@ -259,13 +291,14 @@ def test_a_press_may_be_further_off_its_markers_than_a_sensor_at_rest(dented):
         first = type(found)(*(value[1:].repeat(3, *[1] * (value.ndim - 1)) for value in found))
         vertices = torch.cat([first.vertices[:2], one.membrane.rest[None].to(first.vertices)])
         first = first._replace(vertices=vertices, misfit=largest * torch.tensor([0.999, 1.001, 0.999]).double())
-        first = first._replace(objective=0 * first.objective, unexplained=0 * first.objective)
+        none = 0 * first.objective
+        first = first._replace(objective=none, unexplained=none, shared_misfit=none)
         assert one.is_explained(first).tolist() == [True, False, False]
 
 
 def test_what_is_likely_grows_with_the_press_up_to_a_limit(dented):
     one, zero = estimator(largest_outlying=1.0), torch.zeros(2, dtype=torch.float64)
-    found = one(dented)._replace(misfit=zero, relative_step=zero, unexplained=zero, objective=zero + 0.8)
+    found = one(dented)._replace(misfit=zero, relative_step=zero, unexplained=zero, shared_misfit=zero, objective=zero + 0.8)
     measured = one.equations.bearings.measured(dented)
     moved = (found.vertices - one.membrane.rest).square().sum(-1).mean(-1).sqrt() / one.size
     assert moved[0] < 1e-4 < 0.015 < moved[1]
@@ -295,7 +328,7 @@ def test_contacts_that_push_around_their_middle_only_are_tried_again(dented, lin
     traction = -one.reference * pushes[..., None] * normals
     x = rest.expand(4, -1, -1)
     volume, moved = one.membrane.volume(x), torch.zeros(4, 4, dtype=torch.float64)
-    found = Equilibrium(x, one.rest_pressure.expand(4), volume, traction, zero, reference, zero, moved, zero, zero, zero)
+    found = Equilibrium(x, one.rest_pressure.expand(4), volume, traction, zero, reference, zero, moved, zero, zero, zero, zero)
     assert one.dents.is_hollow(found, one.membrane).tolist() == [False, True, False, False]
     measured = one.equations.bearings.measured(Observation(*(value[:1].expand(4, *value.shape[1:]) for value in dented[:3])))
     assert one.is_done(found, measured).tolist() == [True, False, True, True]
