@@ -236,7 +236,9 @@ def test_markers_that_the_press_turns_away_are_not_hidden(fingertip):
     seen = torch.ones(1, len(reconstructor.rest_markers))
     observation = reconstructor.observation(torch.zeros(1, seen.shape[1], 2), seen)
     found = net.equilibrium(x, pressure, moved, x, net.equations.bearings.measured(observation))
-    found = found._replace(volume=net.membrane.rest_volume[None], misfit=0 * pressure, unexplained=0 * pressure)
+    found = found._replace(
+        volume=net.membrane.rest_volume[None], misfit=0 * pressure, unexplained=0 * pressure, shared_misfit=0 * pressure
+    )
     markers = reconstructor.rest_markers + reconstructor.marker_shares @ (x - rest)
     facing = facings(markers, reconstructor.marker_shares @ net.membrane.normals(x))
     walls, number = facing < 0.4, int((facing < 0.4).sum())

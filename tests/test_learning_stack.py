@@ -245,7 +245,9 @@ def test_frames_without_a_surface_pass_no_gradient_to_what_they_share(sensor, do
 
 
 def test_a_frame_that_has_not_converged_passes_finite_gradients(sensor, pixels):
-    few = tm.ForceBalanceSettings(patience=3, settling_steps=8, renewal=0.5)
+    few = tm.ForceBalanceSettings(
+        patience=3, settling_steps=8, renewal=0.5, largest_shared_misfit=100.0, largest_unexplained=100.0
+    )
     reconstructor = tm.Reconstructor(sensor, settings=few, dtype=torch.float64)
     rest = reconstructor.rest_pixels
     leaf = (rest + 40 * (pixels[:1] - rest)).requires_grad_()
