@@ -11,8 +11,10 @@ from ...pieces import piece, repeated, unless
 from ..spacing import spacing, thin_out
 from .deformation import FAR, LocalDeformation
 from .flow import SUPPORT, FlowAverages
+from .steps import NeighbourSteps, trust
 
 SETTLING = 6  # steps after the growth has reached every dot
+DOUBTS, RESETTLING = 2, 3  # how often the dots that strayed are let go, and the steps in which all settle after it
 FOLLOWING = 1  # steps after dots are followed from where they were
 KEPT = 0.3  # certainty of a dot that could be followed
 WIDTH = 1.1  # of the local average, pitches
@@ -37,7 +39,7 @@ class DotMatcher(nn.Module):
     one cannot be, searched for from the anchors on: each of a fixed number of steps predicts every dot from the sure nodes
     around it and the local deformation, takes the blob nearest to the prediction and of its size, and keeps it where the
     choice is mutual. Without anchors each part of the pattern in turn is assumed to have moved least, and the start that
-    matches most is kept.
+    matches most is kept. In the end those that took another's blob are let go, and may find their own.
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest, px.
@@ -66,6 +68,7 @@ class DotMatcher(nn.Module):
         nodes = np.concatenate([pixels, anchors])
         self.deformation = LocalDeformation(pixels)
         self.averages = FlowAverages(pixels, nodes, WIDTH)
+        self.neighbour_steps = NeighbourSteps(pixels)
         self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
         self.register_buffer("pixels", torch.as_tensor(pixels - pixels.mean(0)))
         self.register_buffer("square", self.pixels.square().sum(-1))
@@ -141,10 +144,12 @@ class DotMatcher(nn.Module):
 
     def search(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> State:
         """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""
-        known, base = self.scene(self.deformation(blobs, valid), blobs, log_radius, valid)
-        known, base, *start = self.begin(known, base)
+        scene = self.scene(self.deformation(blobs, valid), blobs, log_radius, valid)
+        known, base, *start = self.begin(*scene)
         grown = repeated(self.grow, self.steps, start, known, base)
-        return self.best(*repeated(self.settle, SETTLING, grown, known, base))
+        found = self.best(*repeated(self.settle, SETTLING, grown, known, base))
+        weight, flow, strain = repeated(self.doubt, DOUBTS, found, *scene)
+        return weight, flow, strain
 
     @piece
     def follow(
@@ -201,6 +206,14 @@ class DotMatcher(nn.Module):
         """One step along the strain measured and what the neighbours' flow says of it."""
         gradient = self.averages.gradient(weight, flow, strain)
         return self.choose(*self.averages.along(weight, flow, gradient), known, base)
+
+    @piece
+    def doubt(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
+        """Some steps more after those that took another's blob have been let go."""
+        state = weight * trust(*self.neighbour_steps(self.pixels.mT + flow, weight, strain)), flow, strain
+        for _ in range(RESETTLING):
+            state = self.settle(*state, known, base)
+        return state
 
     @piece
     def best(self, weight: Tensor, flow: Tensor, strain: Tensor) -> State:
