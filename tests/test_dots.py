@@ -398,6 +398,15 @@ def test_a_dot_is_not_believed_beside_a_blob_nearer_to_the_prediction(rival, bel
     assert (trust[0, 12] > 0.9) == believed and np.delete(trust[0].numpy(), 12).min() > 0.9
 
 
+def test_dots_that_took_anothers_blob_are_let_go_and_find_their_own():
+    """Of a twist by which the growth from the rim comes inwards askew, all dots are found, whatever the noise."""
+    s = scene("hexagonal", two_sizes=True)
+    truth, shapes = deform(s, twist, 0.36)
+    images = batch(*(render(truth, shapes, seed=seed) for seed in range(4)))
+    pixels, confidence, _ = DotLocator(measured(s), SIZE, "dark", s.rim)(images)
+    assert confidence.min() > 0.5 and np.linalg.norm(pixels.numpy() - truth, axis=-1).max() < 0.5
+
+
 @pytest.mark.parametrize("off, lost, believed", [(0.7, True, False), (0.7, False, True), (0.0, True, True)])
 def test_a_dot_on_the_blob_of_a_lost_neighbour_is_not_believed(off, lost, believed):
     """Out of line with those around; the same where all are found; in line beside a lost one."""
