@@ -177,8 +177,8 @@ def test_where_contacts_push_nearly_everywhere_nothing_is_explained(dented):
 
 
 def test_what_neighbouring_markers_have_in_common_is_a_reason_to_doubt_what_each_has_alone_is_none():
-    """Off by 1.2 and 1.5 deviations, all alike, but that what is across a ray turns with it; by 50 alike, of which 10 count; every
-    second the other way; each its own way; a quarter alike, the others at rest; that quarter not trusted."""
+    """Off by 1.2 and 1.5 deviations, all alike, but that what is across a ray turns with it; by 50 alike, of which 10 count;
+    every second the other way; each its own way; a quarter alike, the others at rest; that quarter not trusted."""
     one = estimator()
     rest, noise = one.equations.bearings.positions, one.equations.bearings.noise
     ray = torch.nn.functional.normalize(rest, dim=-1)
