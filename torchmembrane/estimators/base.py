@@ -86,7 +86,8 @@ class Equilibrium(NamedTuple):
 
     @classmethod
     def without_tractions(cls, x: Tensor, pressure: Tensor, volume: Tensor, step: Tensor) -> "Equilibrium":
-        """A surface on every ray, all that tractions tell zero."""
+        """A surface `x [..., V, 3]` on every ray, with its `pressure`, `volume` and last `step` over the size, `[...]` each;
+        all that tractions tell is zero."""
         none = torch.zeros_like(x)
         zero, still = none[..., 0, 0], none[..., :4, 0]
         return cls(x, pressure, volume, none, step, none[..., 0], zero, still, zero, zero, zero, zero)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from ..camera.model import Camera
 from ..camera.motion import motion_of_pixels
+from ..markers.spacing import neighbours
 from ..pieces import piece
 from ..solve.stencil_layouts import NEAR
 from ..surface.bicubic import bicubic_shares
@@ -110,8 +111,7 @@ class MarkerBearings(nn.Module):
         super().__init__()
         self.grid, self.noise = membrane.grid, noise
         self.register_buffer("positions", torch.as_tensor(positions, dtype=torch.float64))
-        apart = torch.cdist(self.positions, self.positions)
-        self.register_buffer("nearest", apart.argsort(dim=-1, stable=True)[:, 1 : 1 + NEIGHBOURS].contiguous())
+        self.register_buffer("nearest", torch.from_numpy(neighbours(self.positions.numpy(), NEIGHBOURS).copy()))
         self.register_buffer("inner_rest", inner(membrane.rest, membrane.grid))
         vertex_shares, pair_shares = _shares(membrane, markers)
         self.register_buffer("vertex_shares", vertex_shares)
@@ -151,20 +151,27 @@ class MarkerBearings(nn.Module):
         angle = angle.squeeze(2)
         return angle + (measured.motion * moved[:, None, :, None]).sum(2), jacobian
 
-    def misfit(self, x: Tensor, measured: Bearings, moved: Tensor, outlier: float) -> Tensor:
-        """Rms of the markers' angles off their rays `[B]`, in standard deviations, each counted as `outlier` at most."""
-        angles2 = self.angles(x, measured, moved)[0].square().mean(1).clamp_max(outlier**2)
-        return ((measured.weight * angles2).sum(-1) / measured.weight.sum(-1).clamp_min(1)).sqrt()
+    def misfits(self, x: Tensor, measured: Bearings, moved: Tensor, outlier: float, far: float) -> tuple[Tensor, Tensor]:
+        """How far the markers are off their rays, in standard deviations, and as much of it as neighbours have in common.
 
-    def shared_misfit(self, x: Tensor, measured: Bearings, moved: Tensor, far: float) -> Tensor:
-        """Root of the mean product `[B]` of the angles of a marker and of its nearest neighbours off their rays, in standard
-        deviations, each counted as `far` at most; 0 where it is negative. Noise and wrong matches of one marker know nothing of
-        the next; what no surface of this sensor can follow does."""
-        angles = self.angles(x, measured, moved)[0]
+        Args:
+            x: the surface, `[B, V, 3]`.
+            measured: the markers' rays.
+            moved: the camera, `[B, 4]`.
+            outlier: as what each marker counts at most, in the first.
+            far: the same in the second.
+
+        Returns:
+            Rms of the angles `[B]`; the root of the mean product `[B]` of a marker's angles with its nearest neighbours', 0
+            where it is negative. Noise and a marker's wrong match know nothing of the next; what no surface can follow does.
+        """
+        angles, weight = self.angles(x, measured, moved)[0], measured.weight
+        counted = angles.square().mean(1).clamp_max(outlier**2)
         length = angles.square().sum(1, keepdim=True).clamp_min(1e-12).sqrt()
-        here = angles * (far / length).clamp_max(1) * measured.weight[:, None]
-        beside, seen = (each[..., self.nearest].sum(-1) for each in (here, measured.weight))
-        return ((here * beside).sum((1, 2)) / (measured.weight * seen).sum(-1).clamp_min(1)).clamp_min(0).sqrt()
+        here = angles * (far / length).clamp_max(1) * weight[:, None]
+        beside, seen = (each[..., self.nearest].sum(-1) for each in (here, weight))
+        shared = (here * beside).sum((1, 2)) / (weight * seen).sum(-1).clamp_min(1)
+        return ((weight * counted).sum(-1) / weight.sum(-1).clamp_min(1)).sqrt(), shared.clamp_min(0).sqrt()
 
     def outlying(self, x: Tensor, measured: Bearings, moved: Tensor, limit: float) -> Tensor:
         """The share `[B]` of the markers that are seen and more than `limit` standard deviations off their rays."""

@@ -275,13 +275,13 @@ class ForceBalance(nn.Module):
         step = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
         traction = self.equations.forces(x, pressure) / membrane.rest_area[:, None]
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
-        misfit, push2 = self.equations.bearings.misfit(x, measured, moved, self.settings.outlier), loss.parts(*within)[2]
+        limits, push2 = (self.settings.outlier, self.settings.far * self.coarseness), loss.parts(*within)[2]
         losses, seen = self.descent.losses(State(x, pressure, moved), *within, measured), measured.weight.sum(-1).clamp_min(1)
         unexplained, pushes = (each / seen for each in losses)
         objective = unexplained + pushes
         gain = self.descent.objective_at_rest(measured) / seen - objective
         scale = 1 + pad_border(loss.contact_scale(push2, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
-        shared = self.equations.bearings.shared_misfit(x, measured, moved, self.settings.far * self.coarseness)
+        misfit, shared = self.equations.bearings.misfits(x, measured, moved, *limits)
         judged = misfit, moved, objective, unexplained, loss.pushed(push2), shared
         return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *judged)
 

@@ -40,7 +40,7 @@ def neighbours(points: np.ndarray, count: int) -> np.ndarray:
     """The points nearest to each of `points`, itself left out.
 
     Args:
-        points: `[N, 2]`.
+        points: `[N, 2]` or `[N, 3]`.
         count: how many neighbours are wanted; fewer where there are no more points.
 
     Returns:

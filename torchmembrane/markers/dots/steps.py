@@ -43,8 +43,9 @@ class NeighbourSteps(nn.Module):
             The sum of the relative errors of the steps to sure neighbours, the sure neighbours, and the share of the neighbours
             that is lost, `[B, D]` each.
         """
-        here = torch.cat([gradient.flatten(1, 2), pixels, sure[:, None]], 1)[:, :, None]
-        there = here.squeeze(2).index_select(2, self.near.flatten()).unflatten(-1, self.near.shape)  # [B, 7, neighbours, D]
+        here = torch.cat([gradient.flatten(1, 2), pixels, sure[:, None]], 1)
+        there = here.index_select(2, self.near.flatten()).unflatten(-1, self.near.shape)  # [B, 7, neighbours, D]
+        here = here[:, :, None]
         ends = (there[:, :4] + here[:, :4]).unflatten(1, (2, 2))
         change = there[:, 4:6] - here[:, 4:6] - self.step - (ends * self.half_step).sum(2)
         pair = there[:, 6] * here[:, 6]
