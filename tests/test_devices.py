@@ -40,7 +40,7 @@ def test_frames_are_tracked_gauged_and_taken_from_markers(sensor):
     images = torch.empty(2, 1, 480, 640, device="meta")
     first = reconstructor(images)
     followed = reconstructor(images, first, pressure=torch.empty(2, device="meta"))
-    located = reconstructor.from_pixels(first.pixels, first.confidence, previous=first)
+    located = reconstructor.from_pixels(first.pixels, first.confidence)
     assert followed.force.shape == located.force.shape == (2, 3)
 
 

@@ -100,14 +100,13 @@ def test_the_model_agrees_with_torch(run, reconstructor, images):
     agree(run(images[:1]), Reconstruction(*(field[:1] for field in together)))
 
 
-def test_a_tracking_model_starts_from_the_frames_before(model_files, reconstructor, images):
+def test_a_tracking_model_follows_dots_from_the_frames_before(model_files, reconstructor, images):
     images, session = reconstructor.read(*images), opened(str(model_files[True]))
     with torch.no_grad():
         before = reconstructor(images[[0, 1, 1]])
-        before.vertices[2], before.pressure[2] = torch.nan, torch.nan
+        before.pixels[2] = torch.nan
         expected = reconstructor(images, before)
-    feed = {"image": images.numpy()}
-    feed |= {name: getattr(before, name.removeprefix("previous_")).numpy() for name in export.previous_of(reconstructor)}
+    feed = {"image": images.numpy(), "previous_pixels": before.pixels.numpy()}
     agree(Reconstruction(*session.run(list(Reconstruction._fields), feed)), expected)
 
 
@@ -130,12 +129,6 @@ def test_what_runs_unless_a_condition_holds_runs_only_then():
     session = opened(tracer.assembly.model([x], [result], {}).SerializeToString())
     for x in (np.ones((3, 3), np.float32), -np.ones((1, 3), np.float32)):
         np.testing.assert_array_equal(session.run(None, {"x": x})[0], 2 * x if (x > 0).all() else 2 * x - 1)
-
-
-def test_minimum_energy_does_not_track(small_sensor, tmp_path):
-    reconstructor = Reconstructor.from_file(small_sensor / "sensor.toml", estimator="minimum-energy")
-    with pytest.raises(MembraneError, match="starts from rest always"):
-        export.export(reconstructor, tmp_path / "no.onnx", tracking=True)
 
 
 def test_damaged_images_get_the_same_status(run, reconstructor, images):

@@ -1,9 +1,7 @@
 """What the command's choices are put together of, exported and run; models that cannot be written, or are not the same."""
 
 from contextlib import nullcontext
-from inspect import signature
 from itertools import product
-from types import SimpleNamespace
 
 import numpy as np
 import onnx
@@ -231,10 +229,16 @@ def test_a_failure_is_said_in_one_line_and_nothing_is_written(part, small_sensor
 
 
 @pytest.mark.parametrize("follows", [True, False])
-def test_a_tracking_model_is_given_what_a_solve_starts_from(follows):
-    made = SimpleNamespace(observer=SimpleNamespace(locator=SimpleNamespace(follows=follows)))
-    starts = {f"previous_{name}" for name in signature(Reconstructor.start).parameters if name != "self"}
-    assert set(export.previous_of(made)) == starts | ({"previous_pixels"} if follows else set())
+def test_a_tracking_model_is_given_where_dots_were(follows, small_sensor, tmp_path, monkeypatch):
+    """Of any estimator; a texture, which is not followed, makes the same model as without tracking."""
+    made = Reconstructor.from_file(small_sensor / "sensor.toml", estimator="minimum-energy")
+    made.observer.locator.follows = follows
+    names = []
+    monkeypatch.setattr(Reconstructor, "reconstruct_grey", lambda _, *given: names.extend(value.name for value in given))
+    monkeypatch.setattr(export, "_finished", lambda *_: onnx.ModelProto())
+    monkeypatch.setattr(export, "checked", lambda *_: None)
+    export.export(made, tmp_path / "model.onnx", tracking=True)
+    assert names == (["image", "previous_pixels"] if follows else ["image"])
 
 
 def test_single_precision_only(sensor, tmp_path):

@@ -162,15 +162,14 @@ def test_the_gradient_of_an_image_takes_its_noise_for_given(reconstructor, image
     torch.testing.assert_close(slope(), expected)
 
 
-@pytest.mark.parametrize("from_a_start", [False, True])
-def test_gradients_of_markers_are_the_finite_differences(sensor, images, from_a_start):
+def test_gradients_of_markers_are_the_finite_differences(sensor, images):
     double = tm.Reconstructor(sensor, dtype=torch.float64)
     with torch.no_grad():
         first = double(images)
-    previous, direction = first if from_a_start else None, torch.randn(first.pixels.shape, generator=torch.manual_seed(0))
+    direction = torch.randn(first.pixels.shape, generator=torch.manual_seed(0))
 
     def found(pixels):
-        result = double.from_pixels(pixels, previous=previous)
+        result = double.from_pixels(pixels)
         return result.force.square().sum() + result.displacement.square().sum()
 
     pixels = first.pixels.clone().requires_grad_()
@@ -219,19 +218,15 @@ def too_far(rest, times):
     return (rest.mean(0) + times * (rest - rest.mean(0)))[None]
 
 
-@pytest.mark.parametrize("from_a_start", [False, True])
-def test_frames_without_a_surface_pass_no_gradient_to_what_they_share(sensor, double, pixels, from_a_start):
+def test_frames_without_a_surface_pass_no_gradient_to_what_they_share(sensor, double, pixels):
     """Nor do they change that of others: of a shift of all pixels, and of the prestretch."""
     rest, other = double.rest_pixels, tm.Reconstructor(sensor, dtype=torch.float64)
     bad = [torch.full_like(rest[None], torch.nan), too_far(rest, 1e3), too_far(rest, 3.0)]
-    with torch.no_grad():
-        previous = double.from_pixels(pixels[:1]) if from_a_start else None
 
     def slopes(frames):
         shift, stretch = (torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in ([0.0, 0.0], 1.2))
         other.estimator.set_prestretch(stretch)
-        before = previous and tm.Reconstruction(*(each.expand(len(frames), *each.shape[1:]) for each in previous))
-        result = other.from_pixels(frames + shift, previous=before)
+        result = other.from_pixels(frames + shift)
         of_what_is_found(result).backward()
         return result, shift.grad, stretch.grad
 

@@ -59,10 +59,3 @@ def test_after_a_frame_without_a_surface_a_frame_is_solved_as_from_rest(reconstr
     assert (result.vertices[0] - cold.vertices[0]).abs().max() < 1e-3  # mm; from rest in a tracker's few steps: 0.08
     torch.testing.assert_close(result.force[0], cold.force[0], rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(result.vertices[1], of_second.vertices[0], rtol=0, atol=1e-3)
-
-
-def test_markers_after_a_frame_without_a_surface_are_solved_as_from_rest(reconstructor, cold, after_black):
-    with torch.no_grad():
-        plain = reconstructor.from_pixels(cold.pixels, cold.confidence)
-        result = reconstructor.from_pixels(cold.pixels, cold.confidence, previous=after_black)
-    torch.testing.assert_close(result.vertices[0], plain.vertices[0], rtol=0, atol=1e-3)

@@ -94,13 +94,18 @@ def test_a_second_try_that_broke_down_is_not_taken(dented):
     torch.testing.assert_close(taken.vertices, torch.cat([first.vertices[:1], second.vertices[1:3], first.vertices[3:]]))
 
 
-def test_a_second_try_settles_on_the_grids_that_are_finer_than_its_dents():
+def test_a_second_try_settles_on_the_grids_that_are_finer_than_its_dents_damped_more(dented, monkeypatch):
     """Of three grids, with 9, 17 and 33 lines."""
-    fine = estimator(spherical_cap(12, 9, 3, (33, 33)))
+    fine, damped = estimator(spherical_cap(12, 9, 3, (33, 33))), []
     for one, settling in ((fine, SETTINGS.settling_steps), (fine.coarse, 0), (fine.coarse.coarse, 0)):
         first, second = one.schedule(), one.schedule(patient=True)
         assert len(second) == SETTINGS.patience * len(first) + settling
         assert second[len(second) - settling :] == [second[-1]] * settling
+    steps = fine.descent.forward
+    monkeypatch.setattr(fine.descent, "forward", lambda *given, damping, **_: damped.append(damping) or steps(*given))
+    for patient in (False, True):
+        fine._stepped(fine.equations.bearings.measured(dented), patient)
+    assert damped == [SETTINGS.settling_damping, SETTINGS.patient_damping] and damped[1] > damped[0]
 
 
 def test_coarser_grids_lose_fewer_markers():
@@ -135,11 +140,11 @@ def test_weights_are_remembered_while_the_losses_stay_and_the_last_steps_are_dam
     """With `tau` declining all are new; a step alone is neither."""
     descent, kept = estimator().descent, SETTINGS.renewal
     taus = [4.0, 1.6, 0.4, 0.4, 0.4]
-    steps = [descent._numbers(taus[: k + 1], k >= 3) for k in range(5)]
+    steps = [descent._numbers(taus[: k + 1], (k >= 3) * SETTINGS.settling_damping) for k in range(5)]
     assert [renewal for renewal, _ in steps] == [1.0, 1.0, 1.0, kept, kept]
     least = [SETTINGS.damping * (tau / 0.4) ** 2 for tau in taus[:3]]
     assert [damping for _, damping in steps] == pytest.approx([*least, *2 * [SETTINGS.settling_damping]])
-    assert kept < 1 and descent._numbers([0.4], True) == (1.0, SETTINGS.damping)
+    assert kept < 1 and descent._numbers([0.4], 1.0) == (1.0, SETTINGS.damping)
     several, alone = estimator(spherical_cap(12, 9, 3, (17, 17))), estimator(spherical_cap(12, 9, 3, (9, 9)))
     assert (several.settling, several.coarse.settling, alone.settling) == (1, 1, ALONE)
 

@@ -10,13 +10,13 @@ from torch import Tensor, nn
 
 from .errors import MembraneError
 from .estimators.base import Contacts, Equilibrium, Observation, Problem
+from .estimators.breakdown import broken_down
 from .estimators.camera_motion import in_pixels, in_words, shift_of
 from .estimators.choice import ESTIMATORS, Settings, estimator_of
 from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
 from .estimators.kept_state import keep_small
 from .estimators.precision import PRECISIONS, check_precision, full_precision
-from .estimators.start import broken_down, checked_previous
 from .io.images import read_image
 from .io.intake import CHANNELS, Channels, grey_batch
 from .io.results import Reconstruction
@@ -159,8 +159,7 @@ class Reconstructor(nn.Module):
         Args:
             images: torch or numpy, uint8, uint16 or float in 0..1: `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or
                 `[B, H, W, 1 | 3]`. Grey is 0.299 R + 0.587 G + 0.114 B.
-            previous: results of the frames before (force balance): where markers are looked for, and one more start of
-                what has to be solved again.
+            previous: results of the frames before, where dots are looked for first; a texture is looked for as from rest.
             rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: in the sensor's rest image.
             pressure: `[B]` or a number, difference across the membrane that a gauge reads, unit as of the result's, NaN where
                 none is (force balance; `pressure_noise` in its settings). Of a change since rest, add `rest_pressure`.
@@ -175,7 +174,7 @@ class Reconstructor(nn.Module):
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
             grey = self.grey(images)
-            return self.reconstruct_grey(grey, self._checked(previous, len(grey)), rest_pixels, pressure)
+            return self.reconstruct_grey(grey, self._before(previous, len(grey)), rest_pixels, pressure)
 
     def grey(self, images: Tensor | np.ndarray) -> Tensor:
         """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
@@ -184,19 +183,19 @@ class Reconstructor(nn.Module):
     def reconstruct_grey(
         self,
         grey: Tensor,
-        previous: Reconstruction | None = None,
+        before: Tensor | None = None,
         rest_pixels: Tensor | None = None,
         pressure: Tensor | float | None = None,
     ) -> Reconstruction:
-        """As `forward`, from grey images `[B, 1, height, width]` in 0..1 of this module's precision; nothing is checked."""
-        return unrecorded(self._seen, grey, previous, rest_pixels, pressure)
+        """As `forward`, from grey images `[B, 1, height, width]` in 0..1 of this module's precision and `pixels [B, D, 2]`
+        of the frames before; nothing is checked."""
+        return unrecorded(self._seen, grey, before, rest_pixels, pressure)
 
     def from_pixels(
         self,
         pixels: Tensor,
         confidence: Tensor | None = None,
         rest_pixels: Tensor | None = None,
-        previous: Reconstruction | None = None,
         pressure: Tensor | float | None = None,
     ) -> Reconstruction:
         """Reconstruct from marker centres located elsewhere; those that belong with no neighbour get confidence 0.
@@ -205,7 +204,6 @@ class Reconstructor(nn.Module):
             pixels: `[B, D, 2]` or `[D, 2]` in the sensor file's order, NaN where lost.
             confidence: `[B, D]` or `[D]` in 0..1; default: 1 where finite.
             rest_pixels: `[D, 2]`, the same markers located in the rest image; default: the model's rest pixels.
-            previous: as for images.
             pressure: as for images.
 
         Raises:
@@ -214,27 +212,18 @@ class Reconstructor(nn.Module):
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
             flow = self.observer.from_pixels(pixels, confidence, rest_pixels)
-            return unrecorded(self._solve, flow, self._checked(previous, len(flow.status)), pressure)
+            return unrecorded(self._solve, flow, pressure)
 
-    def _seen(self, grey: Tensor, previous: Reconstruction | None, rest: Tensor | None, *gauge: Any) -> Reconstruction:
-        return self._solve(self.observer(grey, None if previous is None else previous.pixels, rest), previous, *gauge)
+    def _seen(self, grey: Tensor, before: Tensor | None, rest: Tensor | None, *gauge: Any) -> Reconstruction:
+        return self._solve(self.observer(grey, before, rest), *gauge)
 
-    def _solve(self, flow: MarkerFlow, previous: Reconstruction | None, pressure: Tensor | float | None) -> Reconstruction:
+    def _solve(self, flow: MarkerFlow, pressure: Tensor | float | None) -> Reconstruction:
         usable, confidence, covariance, status = self.observer.judge(*flow)
-        start = None if previous is None else self.start(previous.vertices, previous.pressure, previous.camera_motion)
         observation = self._gauged(self.observation(usable, confidence, covariance), pressure)
-        found = self.estimator(observation, start)
+        found = self.estimator(observation)
         if (broken := broken_down(status, found.vertices)) is not None:
-            return self._solve(flow._replace(status=broken), previous, pressure)
+            return self._solve(flow._replace(status=broken), pressure)
         return self.result(found, observation, flow.displacement, confidence, status)
-
-    @piece
-    def start(self, vertices: Tensor, pressure: Tensor, camera_motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Vertices `[B, V, 3]`, pressure `[B]` and the camera's motion `[B, 4]` of the frames before, those of rest where there
-        are none (NaN)."""
-        vertices = torch.where(vertices.isfinite(), vertices, self.estimator.membrane.rest)
-        pressure = torch.where(pressure.isfinite(), pressure, self.estimator.rest_pressure)
-        return vertices, pressure, in_pixels(camera_motion, self.image_size).nan_to_num()
 
     @piece
     def observation(self, displacement: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
@@ -335,14 +324,19 @@ class Reconstructor(nn.Module):
         turn = (after.origin - before.origin) / distance + after.direction - before.direction
         noise = torch.linalg.cholesky(2 * self.observer.rest_covariance).mT @ turn
         observation = self._gauged(self.observation(pixels - self.rest_pixels, result.confidence), pressure)
-        state = result.vertices, result.pressure, result.camera_motion
-        found = self.estimator.standard_deviations(*self.start(*state), observation, noise)
+        vertices = torch.where(result.vertices.isfinite(), result.vertices, self.estimator.membrane.rest)
+        pressure = torch.where(result.pressure.isfinite(), result.pressure, self.estimator.rest_pressure)
+        moved = in_pixels(result.camera_motion, self.image_size).nan_to_num()
+        found = self.estimator.standard_deviations(vertices, pressure, moved, observation, noise)
         return found.known(result.vertices.flatten(1).isfinite().all(1))
 
-    def _checked(self, previous: Reconstruction | None, frames: int) -> Reconstruction | None:
-        """A previous result, refused where it cannot be one of these frames'."""
+    def _before(self, previous: Reconstruction | None, frames: int) -> Tensor | None:
+        """Pixels `[B, D, 2]` of a previous result, refused where it cannot be one of these frames'."""
         if previous is None:
             return None
-        if not self.estimator.takes_start:
-            raise MembraneError(f"Reconstructor: {self.estimator_name} starts from rest always; leave previous out")
-        return checked_previous(previous, frames, self.estimator.membrane, self.rest_pixels, self.sensor.length_unit)
+        given, expected = list(previous.pixels.shape), [frames, *self.rest_pixels.shape]
+        if given != expected:
+            raise MembraneError(
+                f"Reconstructor: previous has pixels {given}; expected {expected}: an earlier result for each image"
+            )
+        return previous.pixels.to(self.rest_pixels)

@@ -1,4 +1,4 @@
-"""One stream of images: every frame is followed from the one before, and a rest state that has aged is noticed."""
+"""One stream of images: dots are followed from frame to frame, and a rest state that has aged is noticed."""
 
 import warnings
 
@@ -22,9 +22,9 @@ LARGEST_STEADY = 0.3
 class Tracker:
     """Reconstructs the frames of one camera one after another.
 
-    Markers are looked for where the frame before had them, and where a frame has to be solved again, the solution of the frame
-    before is one more start. All else is as for a frame alone, and so are its answers: they do not hang on where a stream
-    began. After a frame without a surface the next one is alone; so is every frame of an estimator that takes no start.
+    Dots are looked for where the frame before had them, a texture as in a frame alone. All else is as for a frame alone, and so
+    are its answers, to the last digit where the same dots are found: they do not hang on where a stream began. After a frame
+    without a surface the next one is alone.
 
     Frames without contact tell whether the markers still rest where the rest image has them. When they do not, beyond chance,
     for temperature, creep, swelling, another pressure or a moved camera, the tracker warns once, with the remedy, `rezero`. A
@@ -85,8 +85,7 @@ class Tracker:
         with torch.no_grad():
             result: Reconstruction = self.reconstructor(images, self._before, self._rest_pixels, pressure)
         self._latest = images
-        follows = self.reconstructor.estimator.takes_start and Status(int(result.status[0])).has_surface
-        self._before = result if follows else None
+        self._before = result if Status(int(result.status[0])).has_surface else None
         if int(result.status[0]) in (Status.OK, Status.UNEXPLAINED):  # a camera that moved may leave it unexplained
             self._look_for_drift(result)
         return result

@@ -23,7 +23,7 @@ class Session:
     `providers`, onnxruntime's, in order of preference.
 
     Attributes: `name` of the sensor, `length_unit`, `force_unit`, `status_texts` (code to text), `mesh` (what `mesh.npz`
-    holds: rest_vertices, triangles, fixed ...), `image_size` (width, height), `tracks`: whether a frame starts from another.
+    holds: rest_vertices, triangles, fixed ...), `image_size` (width, height), `tracks`: whether it follows dots.
     """
 
     def __init__(self, model: str | Path, threads: int = 1, providers: Sequence[str] = ("CPUExecutionProvider",)):
@@ -53,8 +53,7 @@ class Session:
 
         `images`: `[height, width]` or `[B, height, width]` grey, or `[B, height, width, 3]` RGB; uint8, uint16 or float in
         0..1. A frame that cannot be reconstructed has a status and NaN.
-        `previous`, for a model that tracks: the results of the frames before. Without them, or where a frame had no surface,
-        it starts from rest.
+        `previous`, for a model that tracks: the results of the frames before, where its dots are looked for first.
         """
         images = grey(images)
         width, height = self.image_size
@@ -66,15 +65,17 @@ class Session:
         if not self.tracks:
             return dict(zip(self._outputs, self._session.run(None, feed), strict=True))
         state = self._rest(len(images)) if previous is None else previous
-        if len(state["pressure"]) != len(images):
-            raise EdgeError(f"{len(images)} images after results of {len(state['pressure'])}; expected as many")
+        if (count := len(state[self._state[0]])) != len(images):
+            raise EdgeError(f"{len(images)} images after results of {count}; expected as many")
         feed |= {f"previous_{key}": state[key] for key in self._state}
         return dict(zip(self._outputs, self._session.run(None, feed), strict=True))
 
     def track(self, images):
-        """Results of a video's images, one after another, each from that before (a generator)."""
+        """Results of a video's images, one after another, dots followed from each to the next (a generator)."""
         if not self.tracks:
-            raise EdgeError(f"the model of {self.name!r} does not track; expected one from `torchmembrane export --tracking`")
+            raise EdgeError(
+                f"the model of {self.name!r} does not track; expected one of dots from `torchmembrane export --tracking`"
+            )
         previous = None
         for image in images:
             previous = self.run(np.asarray(image)[None], previous)

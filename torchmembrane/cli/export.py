@@ -15,8 +15,8 @@ examples:
   torchmembrane export sensor.toml -o video.onnx --tracking
 
 The model takes `image` [batch, 1, height, width], grey in 0..1, and gives the arrays of a NAME.npz, one row per frame;
---tracking, also previous_vertices, previous_pressure and (dots) previous_pixels: those of the frames before, NaN to start from
-rest. To run it without torch: the package torchmembrane-edge (folder export/). Needs: pip install "torchmembrane[export]"
+--tracking, of dots, also previous_pixels: those of the frames before, NaN to look for them from rest.
+To run it without torch: the package torchmembrane-edge (folder export/). Needs: pip install "torchmembrane[export]"
 
 exit code: 0 written, 2 wrong usage or sensor file"""
 
@@ -27,7 +27,7 @@ def add_parser(commands: Any) -> None:
     add_sensor(add)
     add("-o", "--out", metavar="MODEL.onnx", type=Path, required=True, help="the model's file")
     add_estimator(add, "as for reconstruct (default: triangle)")
-    add("--tracking", action="store_true", help="follow the dots of the frame before, given with the image (force balance)")
+    add("--tracking", action="store_true", help="follow the dots of the frame before, given with the image")
 
 
 def run(arguments: Namespace) -> int:

@@ -132,12 +132,11 @@ class Deviations(NamedTuple):
 class Estimator(Protocol):
     """From what the markers show to the surface: an `nn.Module` of one sensor, batched and differentiable.
 
-    `finds_tractions`: tractions and standard deviations are found; `takes_start`: `forward` accepts the solution of
-    the frames before. `element`, `volume`, `flow_kind` and `smoothing_weight` are stored beside the results.
+    `finds_tractions`: tractions and standard deviations are found. `element`, `volume`, `flow_kind` and `smoothing_weight` are
+    stored beside the results.
     """
 
     finds_tractions: ClassVar[bool]
-    takes_start: ClassVar[bool]
     membrane: Membrane
     cavity: CavityLaw
 
@@ -146,8 +145,8 @@ class Estimator(Protocol):
         [B, D, 2, 2]` of the pixels, px^2."""
         ...
 
-    def __call__(self, observation: Observation, start: tuple[Tensor, ...] | None = None) -> Equilibrium:
-        """The surface; `start`: of a solution near it, such as the previous frame's, as the estimator says."""
+    def __call__(self, observation: Observation) -> Equilibrium:
+        """The surface."""
         ...
 
     def is_converged(self, found: Equilibrium) -> Tensor:

@@ -94,13 +94,10 @@ class Dent(nn.Module):
         near = torch.exp(-off2 / (2 * MIDDLE**2)) * self.area
         return torch.lt((near * pushes).sum(-1) / near.sum(-1), HOLLOW * pushes.amax(-1))
 
-    def sought(
-        self, quick: State, slow: State, rest: State, start: State | None, measured: Bearings, schedule: Schedule
-    ) -> Found:
-        """The best of what the steps of a schedule make of several dents in two states, of two states found from `rest` on this
-        grid, and of a `start`, and the surface a step before; the first of those that are about as good, for answers must not
-        jump between them. The two from rest: by a sharp loss from the start, and without a cone, where shear is dear even under
-        a push."""
+    def sought(self, quick: State, slow: State, rest: State, measured: Bearings, schedule: Schedule) -> Found:
+        """The best of what the steps of a schedule make of several dents in two states and of two states found from `rest` on
+        this grid, and the surface a step before; the first of those that are about as good, for answers must not jump between
+        them. The two from rest: by a sharp loss from the start, and without a cone, where shear is dear even under a push."""
         settings = self.descent.settings
         steps = 2 * settings.steps
         starts = [
@@ -111,7 +108,6 @@ class Dent(nn.Module):
             self.descent(rest, measured, settings.gnc_schedule(steps, settings.sharp_tau))[0],
             self.descent(rest, measured, settings.gnc_schedule(steps, settings.tau), cone=0.0)[0],
         ]
-        starts += [] if start is None else [start]
 
         def stepped(start: Sequence[Tensor], measured: Bearings) -> Sequence[Tensor]:
             state, before = self.descent(State(*start), measured, schedule)

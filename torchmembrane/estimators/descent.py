@@ -64,25 +64,27 @@ class Descent(nn.Module):
         schedule: list[tuple[float, float]],
         cone: float | None = None,
         settling: int = 1,
+        damping: float | None = None,
     ) -> tuple[State, Tensor]:
         """The state after the steps of a schedule, and the surface before the last; `cone`: as for `TractionLoss.weights`;
-        `settling`: so many steps, the last ones, are damped to settle."""
+        `settling`: so many steps, the last ones, have at least a `damping` (default, `settling_damping`) to settle."""
         frames = max(1, VERTICES // self.membrane.rest.shape[0])
         cone = self.equations.loss.cone if cone is None else cone
+        damping = self.settings.settling_damping if damping is None else damping
         taus, size = [tau for tau, _ in schedule], len(schedule)
-        numbers = [self._numbers(taus[: k + 1], size - k <= settling) for k in range(size)]
+        numbers = [self._numbers(taus[: k + 1], damping if size - k <= settling else 0.0) for k in range(size)]
         rows = [(*scales, cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
         x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows, settling)
         return State(x, pressure, moved), before
 
-    def _numbers(self, taus: list[float], settles: bool) -> tuple[float, float]:
+    def _numbers(self, taus: list[float], least: float) -> tuple[float, float]:
         """The renewal and the damping of a step, from the scales `tau` up to its own: while these decline all weights are new,
-        or they would lag behind."""
+        or they would lag behind; `least`: damping, but for a first step."""
         settings, (first, last) = self.settings, self.settings.tau
         *before, tau = taus
         damping = settings.damping * (min(tau, first) / last) ** 2
-        if settles and before:
-            damping = max(damping, settings.settling_damping)
+        if before:
+            damping = max(damping, least)
         return settings.renewal if before[-1:] == [tau] else 1.0, damping
 
     def _stepped(self, x: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:

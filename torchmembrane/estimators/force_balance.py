@@ -81,7 +81,6 @@ class ForceBalance(nn.Module):
     flow_kind: ClassVar[str] = "smooth"
     smoothing_weight: ClassVar[float] = 0.0
     Settings: ClassVar[type[ForceBalanceSettings]] = ForceBalanceSettings
-    takes_start: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -184,18 +183,15 @@ class ForceBalance(nn.Module):
         deviation = self.settings.pressure_noise * self.reference
         return observation._replace(gauge=gauge_reading(pressure, self.rest_pressure, deviation, observation.confidence))
 
-    def forward(self, observation: Observation, start: tuple[Tensor, ...] | None = None) -> Equilibrium:
-        """The surface that the markers' rays show; `start`: vertices, pressure and the camera's motion near it, such as the
-        previous frame's, for what has to be solved again."""
+    def forward(self, observation: Observation) -> Equilibrium:
+        """The surface that the markers' rays show."""
         measured = self.equations.bearings.measured(observation)
-        found, given = self._solved(measured), (*(start or ()), *measured)
-        return Equilibrium(*mended(self.is_done(found, measured), found, self._patiently, given, self.chosen))
+        found = self._solved(measured)
+        return Equilibrium(*mended(self.is_done(found, measured), found, self._patiently, measured, self.chosen))
 
-    def _patiently(self, *given: Any) -> Equilibrium:
-        """From rest in many small steps: deep presses need them; `given`: a start, where there is one, and what is measured."""
-        measured = Bearings(*given[-len(Bearings._fields) :])
-        start = given[: -len(Bearings._fields)]
-        return self._solved(measured, patient=True, start=State(*start) if start else None)
+    def _patiently(self, *measured: Any) -> Equilibrium:
+        """In many small steps: deep presses need them."""
+        return self._solved(Bearings(*measured), patient=True)
 
     @piece
     def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
@@ -205,31 +201,32 @@ class ForceBalance(nn.Module):
         stands = self.is_converged(first) & self.is_explained(first) & is_worse
         return Equilibrium(*rowwise(done | stands | second.objective.isnan(), first, second))
 
-    def _solved(self, measured: Bearings, patient: bool = False, start: State | None = None) -> Equilibrium:
-        state, before = self._stepped(measured, patient, start)
+    def _solved(self, measured: Bearings, patient: bool = False) -> Equilibrium:
+        state, before = self._stepped(measured, patient)
         return self.equilibrium(*state, before, measured)
 
-    def _stepped(self, measured: Bearings, patient: bool, start: State | None = None) -> tuple[State, Tensor]:
+    def _stepped(self, measured: Bearings, patient: bool) -> tuple[State, Tensor]:
         """The state after all steps, on coarser grids too, and the surface before the last."""
         schedule = self.schedule(patient)
         last = schedule[-1:] * len(schedule)
         found: tuple[State, Tensor]
         if self.dent is None:
-            settling = self.settings.settling_steps if patient and self.coarse is not None else self.settling
-            found = self.descent(self._begun(measured, patient, start), measured, schedule, settling=settling)
+            settling, damping = self.settling, self.settings.settling_damping
+            if patient and self.coarse is not None:
+                settling, damping = self.settings.settling_steps, self.settings.patient_damping
+            found = self.descent(self._begun(measured, patient), measured, schedule, settling=settling, damping=damping)
         elif patient:
             quick, slow = (self._undented(measured, patient) for patient in (False, True))
-            found = self.dent.sought(quick, slow, self.at_rest(measured.weight), start, measured, last)
+            found = self.dent.sought(quick, slow, self.at_rest(measured.weight), measured, last)
         else:
             found = self.descent(self.dent(*self._undented(measured), measured), measured, last)
         return found
 
-    def _begun(self, measured: Bearings, patient: bool, start: State | None = None) -> State:
+    def _begun(self, measured: Bearings, patient: bool) -> State:
         """At what is found on the coarser grid, without one at rest."""
         if self.coarse is None:
             return self.at_rest(measured.weight)
-        begun = None if start is None else self.coarsened(*start)
-        return State(*self.refined(*self.coarse._stepped(measured, patient, begun)[0]))
+        return State(*self.refined(*self.coarse._stepped(measured, patient)[0]))
 
     def _undented(self, measured: Bearings, patient: bool = False) -> State:
         """The state after a first step, whose pushes say where to dent it."""

@@ -11,7 +11,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..camera.model import Rays
-from ..errors import MembraneError
 from ..mechanics.affine_quadrilateral import AffineQuadrilaterals
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..pieces import piece
@@ -108,15 +107,12 @@ class MinimumEnergy(VertexRays):
     def _smoother(self, psi: Tensor) -> Tensor:
         return grid_laplacian(psi, self.membrane.grid)
 
-    def forward(self, observation: Observation, start: tuple[Tensor, ...] | None = None) -> Equilibrium:
+    def forward(self, observation: Observation) -> Equilibrium:
         """The surface on the rays of the grid's vertices.
 
         Args:
             observation: the ray of every vertex now, `[..., V, 3]`.
-            start: none: the solve starts from rest always.
         """
-        if start is not None:
-            raise MembraneError("MinimumEnergy: starts from rest always; leave the start out")
         return self.solve(observation)
 
     def solve(self, observation: Observation, relaxed: Tensor | None = None) -> Equilibrium:

@@ -18,7 +18,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..camera.model import Rays
-from ..errors import MembraneError
 from ..mechanics.affine_quadrilateral import AffineQuadrilaterals
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..pieces import piece
@@ -96,15 +95,12 @@ class PaperEstimator(VertexRays):
         """The weight of the smoother of eq. 28."""
         return self.settings.smoothing
 
-    def forward(self, observation: Observation, start: tuple[Tensor, ...] | None = None) -> Equilibrium:
+    def forward(self, observation: Observation) -> Equilibrium:
         """The surface on the rays of the grid's vertices.
 
         Args:
             observation: the ray of every vertex now, `[B, V, 3]`.
-            start: none: the solve is direct.
         """
-        if start is not None:
-            raise MembraneError("PaperEstimator: starts from rest always; leave the start out")
         found = reconstruct_and_segment(self, self.segmentation, observation, self.settings.rounds)
         return found.surface._replace(relative_step=found.moved)
 

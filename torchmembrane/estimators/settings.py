@@ -55,7 +55,8 @@ class ForceBalanceSettings:
         longest_step: largest step of a vertex.
         largest_stretch: by how much of its length an edge of the grid changes in a step at most.
         damping: share of a step's matrix' diagonal that is added to it as tau ends; it falls with tau's square.
-        settling_damping: the same of the steps that settle: the last of a schedule, and the `settling_steps`.
+        settling_damping: the same of the last steps of a schedule, which settle.
+        patient_damping: the same of the `settling_steps`.
         coarsest: fewest lines of a coarser grid.
         largest_relative_step: rms of the last step of a converged solution.
         largest_volume_error: volume error of a converged solution, over the rest volume.
@@ -117,6 +118,7 @@ class ForceBalanceSettings:
     largest_stretch: float = 0.3
     damping: float = 3e-7
     settling_damping: float = 1e-4
+    patient_damping: float = 1e-3
     coarsest: int = 6
     largest_relative_step: float = 2e-3
     largest_volume_error: float = 1e-3

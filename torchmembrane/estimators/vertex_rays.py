@@ -30,7 +30,6 @@ class VertexRays(nn.Module):
     """
 
     finds_tractions: ClassVar[bool] = False
-    takes_start: ClassVar[bool] = False
     Settings: ClassVar[Any]
     settings: Any
     rest_range: Tensor

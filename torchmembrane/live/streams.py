@@ -57,7 +57,7 @@ class TrackedStream:
 
 
 class ModelStream:
-    """By a model of `torchmembrane export`, run by onnxruntime; one that tracks starts each frame from the one before.
+    """By a model of `torchmembrane export`, run by onnxruntime; one that tracks follows dots from frame to frame.
 
     Args:
         path: of the model.

@@ -79,22 +79,19 @@ def compare(model: bytes, reconstructor: Reconstructor, images: Tensor) -> Agree
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # its warnings are of its own optimiser
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    fields = [given.name.removeprefix("previous_") for given in session.get_inputs()][1:]
+    tracks = "previous_pixels" in [given.name for given in session.get_inputs()]
     status: list[int] = []
     expected_status: list[int] = []
-    distances, previous = [0.0], None
-    if fields:
+    distances = [0.0]
+    before = images.new_full((len(images), *reconstructor.rest_pixels.shape), torch.nan) if tracks else None
+    for _ in range(2 if tracks else 1):
         with torch.no_grad():
-            cold = reconstructor.reconstruct_grey(images)
-        previous = cold._replace(**{name: torch.full_like(getattr(cold, name), torch.nan) for name in fields})
-    for _ in range(2 if fields else 1):
-        with torch.no_grad():
-            expected = reconstructor.reconstruct_grey(images, previous)
-        feed = {"image": images.numpy(), **{f"previous_{name}": getattr(previous, name).numpy() for name in fields}}
+            expected = reconstructor.reconstruct_grey(images, before)
+        feed = {"image": images.numpy()} | ({} if before is None else {"previous_pixels": before.numpy()})
         for frames in (len(images), 1):
             vertices, statuses = session.run(["vertices", "status"], {name: value[:frames] for name, value in feed.items()})
             apart = np.linalg.norm(vertices - expected.vertices[:frames].numpy(), axis=-1).max(-1)
             distances += [float(apart[k]) for k, value in enumerate(statuses) if value == 0 == expected.status[k]]
             status, expected_status = status + statuses.tolist(), expected_status + expected.status[:frames].tolist()
-        previous = expected
+        before = expected.pixels
     return Agreement(float(np.max(distances)), status, expected_status)

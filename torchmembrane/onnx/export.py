@@ -19,7 +19,6 @@ from torch.utils._pytree import tree_flatten, tree_leaves, tree_map, tree_unflat
 
 from ..errors import MembraneError
 from ..io.atomic import whole_file
-from ..io.results import Reconstruction
 from ..io.status import Status
 from ..io.store import FORMATS, Mesh, Settings
 from ..pieces import FUNCTIONS, Value
@@ -166,54 +165,33 @@ def export(
     Args:
         reconstructor: the sensor's.
         path: the model's file.
-        tracking: follow the dots of the frames before; their results are one more start of what is solved again.
+        tracking: follow the dots of the frames before; of a texture, which is not followed, the model is the same.
         progress: is told what comes next: the pieces' names, some thirty, and at last the check.
 
     Returns:
-        The model. Input `image [batch, 1, height, width]`, grey in 0..1; with `tracking` also `previous_vertices
-        [batch, V, 3]`, `previous_pressure [batch]`, `previous_camera_motion [batch, 4]` and, of dots, `previous_pixels
-        [batch, D, 2]`, NaN to start from rest.
-        Outputs as `Reconstruction`.
+        The model. Input `image [batch, 1, height, width]`, grey in 0..1; with `tracking`, of dots, also `previous_pixels
+        [batch, D, 2]`, NaN to start from rest. Outputs as `Reconstruction`.
 
     Raises:
-        MembraneError: tracking with an estimator that starts from rest always, a reconstructor of another precision than
-            float32, or one that cannot be written, or is not the same when it is.
+        MembraneError: a reconstructor of another precision than float32, or one that cannot be written, or is not the same
+            when it is.
     """
-    if tracking and not reconstructor.estimator.takes_start:
-        raise MembraneError(
-            f"export: {reconstructor.estimator_name} starts from rest always; expected force-balance for tracking"
-        )
     if reconstructor.rest_pixels.dtype != torch.float32:
         raise MembraneError(f"export: the reconstructor is {reconstructor.rest_pixels.dtype}; expected torch.float32")
     width, height = reconstructor.image_size
     image = torch.rand(EXAMPLES, 1, height, width, generator=torch.Generator().manual_seed(0)).to(reconstructor.rest_pixels)
     tracer = Tracer(progress)
-    before: dict[str, Any] = dict.fromkeys(Reconstruction._fields)
     inputs = [tracer.given("image", image)]
-    if tracking:
-        membrane = reconstructor.estimator.membrane
-        rest = {
-            "vertices": membrane.rest.repeat(EXAMPLES, 1, 1),
-            "pressure": reconstructor.estimator.rest_pressure.repeat(EXAMPLES),
-            "camera_motion": image.new_tensor([0.0, 0.0, 0.0, 1.0]).repeat(EXAMPLES, 1),
-            "pixels": reconstructor.rest_pixels.repeat(EXAMPLES, 1, 1),
-        }
-        inputs += [tracer.given(name, rest[name.removeprefix("previous_")]) for name in previous_of(reconstructor)]
-        before |= {value.name.removeprefix("previous_"): value for value in inputs[1:]}
-    grey: Any = inputs[0]  # stands for a tensor
-    result: Any = reconstructor.reconstruct_grey(grey, Reconstruction(**before) if tracking else None)
+    if tracking and reconstructor.observer.locator.follows:
+        inputs.append(tracer.given("previous_pixels", reconstructor.rest_pixels.repeat(EXAMPLES, 1, 1)))
+    values: Any = inputs  # stand for tensors
+    result: Any = reconstructor.reconstruct_grey(*values)
     model = _finished(tracer, inputs, result, reconstructor)
     progress("check against torch")
     checked(model.SerializeToString(), reconstructor)
     with whole_file(path) as partial:
         onnx.save(model, partial)
     return model
-
-
-def previous_of(reconstructor: Reconstructor) -> tuple[str, ...]:
-    """A tracking model's further inputs: `previous_` and the field of `Reconstruction` that they continue."""
-    names = ("previous_vertices", "previous_pressure", "previous_camera_motion", "previous_pixels")
-    return names[: 4 if reconstructor.observer.locator.follows else 3]
 
 
 def _finished(tracer: Tracer, inputs: list[Known], result: Any, reconstructor: Reconstructor) -> onnx.ModelProto:

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...pieces import piece, repeated, unless
+from ...pieces import piece, repeated, rowwise, unless
 from ..spacing import spacing, thin_out
 from .deformation import FAR, LocalDeformation
 from .flow import SUPPORT, FlowAverages
@@ -39,7 +39,8 @@ class DotMatcher(nn.Module):
     one cannot be, searched for from the anchors on: each of a fixed number of steps predicts every dot from the sure nodes
     around it and the local deformation, takes the blob nearest to the prediction and of its size, and keeps it where the
     choice is mutual. Without anchors each part of the pattern in turn is assumed to have moved least, and the start that
-    matches most is kept. In the end those that took another's blob are let go, and may find their own.
+    matches most is kept. Where some are lost, those that took another's blob are let go, and may find their own. What is
+    returned follows from which blob is which dot's alone, not from how that was found.
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest, px.
@@ -140,16 +141,21 @@ class DotMatcher(nn.Module):
         def searched() -> Sequence[Tensor]:
             return self.either(kept, *followed, *self.search(blobs, log_radius, valid))
 
-        return self.end(*unless(kept, followed, searched))
+        weight, flow, strain = unless(kept, followed, searched)
+        weight, flow, strain, complete = self.sure(weight, flow, strain, blobs, log_radius, valid)
+
+        def doubted() -> Sequence[Tensor]:
+            known, base = self.scene(self.deformation(blobs, valid), blobs, log_radius, valid)
+            begun = self.from_sure(weight, flow, strain, known, base)
+            return self.either(complete, weight, flow, strain, *repeated(self.doubt, DOUBTS, begun, known, base))
+
+        return self.end(*unless(complete, (weight, flow, strain), doubted))
 
     def search(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> State:
         """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""
-        scene = self.scene(self.deformation(blobs, valid), blobs, log_radius, valid)
-        known, base, *start = self.begin(*scene)
+        known, base, *start = self.begin(*self.scene(self.deformation(blobs, valid), blobs, log_radius, valid))
         grown = repeated(self.grow, self.steps, start, known, base)
-        found = self.best(*repeated(self.settle, SETTLING, grown, known, base))
-        weight, flow, strain = repeated(self.doubt, DOUBTS, found, *scene)
-        return weight, flow, strain
+        return self.best(*repeated(self.settle, SETTLING, grown, known, base))
 
     @piece
     def follow(
@@ -162,20 +168,39 @@ class DotMatcher(nn.Module):
             enough = finite.to(blobs.dtype).mean(-1, keepdim=True) > 0.5
             flow = torch.where((finite & enough)[..., None], previous - self.pixels - self.origin, flow)
             found = finite | ~enough
-        weight, flow, eye = found.to(blobs.dtype), flow.mT, torch.eye(2, dtype=blobs.dtype, device=blobs.device)
-        known, base = self.scene(eye[..., None].expand(*valid.shape[:1], 2, 2, valid.shape[1]), blobs, log_radius, valid)
-        state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), known, base)
+        weight, flow, scene = found.to(blobs.dtype), flow.mT, self.unstrained(blobs, log_radius, valid)
+        state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), *scene)
         for _ in range(FOLLOWING):
-            state = self.settle(*state, known, base)
+            state = self.settle(*state, *scene)
         weight, flow, strain = state
-        followed = ~(found & ~(weight >= KEPT)).any(-1)
-        return weight, flow, self.averages.gradient(weight, flow, strain), followed
+        return weight, flow, strain, ~(found & ~(weight >= KEPT)).any(-1)
 
     @piece
-    def either(self, kept: Tensor, weight: Tensor, flow: Tensor, strain: Tensor, *searched: Tensor) -> tuple[Tensor, ...]:
-        """The dots followed in the frames `kept [B]`, those searched in the others."""
-        followed = (weight, flow, strain)
-        return tuple(torch.where(kept.reshape(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in zip(followed, searched, strict=True))
+    def sure(
+        self, weight: Tensor, flow: Tensor, strain: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What the dots that are found say, however they were: the same to the last digit whether followed or searched for; and
+        in which frames `[B]` all are found, so that none can be on another's blob."""
+        complete = (weight >= KEPT).all(-1)
+        weight, flow, strain = self.from_sure(weight, flow, strain, *self.unstrained(blobs, log_radius, valid))
+        return weight, flow, self.averages.gradient(weight, flow, strain), complete
+
+    @piece
+    def from_sure(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
+        """A step from the dots that are found alone: which they are and where, not how surely."""
+        found = (weight >= KEPT).to(flow.dtype)
+        return self.settle(found, found[:, None] * flow, torch.zeros_like(strain), known, base)
+
+    def unstrained(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """The `scene` of blobs whose arrangement says nothing."""
+        eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)
+        return self.scene(eye[..., None].expand(*valid.shape[:1], 2, 2, valid.shape[1]), blobs, log_radius, valid)
+
+    @piece
+    def either(self, kept: Tensor, weight: Tensor, flow: Tensor, strain: Tensor, *others: Tensor) -> State:
+        """These dots in the frames `kept [B]`, the others in the others."""
+        weight, flow, strain = rowwise(kept, (weight, flow, strain), others)
+        return weight, flow, strain
 
     @piece
     def scene(self, deformation: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
