@@ -42,26 +42,27 @@ class BalanceTwin:
         e, single = self.estimator, Observation(*(None if part is None else part[None] for part in observation))
         measured = e.equations.bearings.measured(single)
         if self.coarse is None:
-            x, pressure, _ = e.at_rest(single.confidence)
+            u, pressure, _ = e.at_rest(single.confidence)
         else:
-            surface, pressure = self.coarse(observation)
+            displacement, pressure = self.coarse(observation)
             still = torch.zeros(1, 4).double()
-            x, pressure, _ = e.refined(torch.from_numpy(surface)[None], torch.tensor([pressure]).double(), still)
+            u, pressure, _ = e.refined(torch.from_numpy(displacement)[None], torch.tensor([pressure]).double(), still)
         self.weights = None
         for tau, outlier in e.schedule():
-            x, pressure = self.step(x, pressure, measured, tau, outlier)
-        return x[0].numpy(), float(pressure)
+            u, pressure = self.step(u, pressure, measured, tau, outlier)
+        return u[0].numpy(), float(pressure)
 
-    def step(self, x: torch.Tensor, pressure, measured: Bearings, tau: float, outlier: float):
+    def step(self, u: torch.Tensor, pressure, measured: Bearings, tau: float, outlier: float):
         e, free, count = self.estimator, self.free, self.count
+        x = e.membrane.rest + u
         forces, bearings, loss = e.equations.forces, e.equations.bearings, e.equations.loss
-        force, normals = forces(x, pressure), e.membrane.normals(x)
+        force, normals = forces(u, pressure), e.membrane.normals(x)
         within = (inner(field, e.membrane.grid).mT for field in (normals, force))
         memory = None if self.weights is None else (self.weights, e.settings.renewal)
         inner_weights, self.weights = loss.weights(*within, measured.noise_level, tau, memory=memory)
         weights = pad_border(inner_weights.flatten(1, 2).mT, e.membrane.grid)[0].unflatten(-1, (3, 3)).numpy()
         blocks = e.elasticity.hessian_blocks(x) - pressure * e.membrane.volume_hessian_blocks(x)
-        angle, jacobian = bearings.angles(x, measured, torch.zeros(1, 4).double())
+        angle, jacobian = bearings.angles(u, measured, torch.zeros(1, 4).double())
         jacobian = jacobian.movedim(-1, 1).numpy()[..., None, :] * self.marker_weights[:, None, :, None]
         certainty = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
         certainty = np.repeat(certainty[0].numpy(), 2)
@@ -89,4 +90,4 @@ class BalanceTwin:
         for axis in (0, 1):
             edge, turn = (np.linalg.norm(np.diff(a, axis=axis), axis=-1) for a in (surface, change))
             share = min(share, e.settings.largest_stretch / (turn / edge).max().clip(1e-12))
-        return x + share * torch.from_numpy(move), pressure + share * rise
+        return u + share * torch.from_numpy(move), pressure + share * rise

@@ -150,7 +150,8 @@ def force_balance(args):
     frame = reconstructor.observation(displacement, confidence, covariance)
     frame = frame._replace(motion=torch.zeros_like(frame.motion))  # the twin's camera stays
     twin, single = BalanceTwin(exact), Observation(*(None if part is None else part[0].double() for part in frame))
-    gap = np.abs(twin(single)[0] - estimator(frame).vertices[0].numpy()).max()
+    displacement = estimator(frame).vertices[0] - estimator.membrane.rest
+    gap = np.abs(twin(single)[0] - displacement.numpy()).max()
     functions, batches = {"scipy twin, cold": partial(twin, single)}, {}
     for batch in args.batches:
         frames = Observation(*(None if part is None else part.expand(batch, *part.shape[1:]).contiguous() for part in frame))

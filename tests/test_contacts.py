@@ -232,15 +232,15 @@ def test_markers_that_the_press_turns_away_are_not_hidden(fingertip):
     net, rest = reconstructor.estimator, reconstructor.estimator.membrane.rest
     off2 = (rest - rest[rest[:, 2].argmax()]).square().sum(-1) / net.size**2
     dent = 1.4 * net.size * torch.exp(-off2 / 0.08)[:, None] * net.membrane.rest_normals * ~net.membrane.fixed[:, None]
-    x, (_, pressure, moved) = (rest - dent)[None], net.at_rest(torch.ones(1, len(reconstructor.rest_markers)))
+    u, (_, pressure, moved) = -dent[None], net.at_rest(torch.ones(1, len(reconstructor.rest_markers)))
     seen = torch.ones(1, len(reconstructor.rest_markers))
     observation = reconstructor.observation(torch.zeros(1, seen.shape[1], 2), seen)
-    found = net.equilibrium(x, pressure, moved, x, net.equations.bearings.measured(observation))
+    found = net.equilibrium(u, pressure, moved, u, net.equations.bearings.measured(observation))
     found = found._replace(
         volume=net.membrane.rest_volume[None], misfit=0 * pressure, unexplained=0 * pressure, shared_misfit=0 * pressure
     )
-    markers = reconstructor.rest_markers + reconstructor.marker_shares @ (x - rest)
-    facing = facings(markers, reconstructor.marker_shares @ net.membrane.normals(x))
+    markers = reconstructor.rest_markers + reconstructor.marker_shares @ u
+    facing = facings(markers, reconstructor.marker_shares @ net.membrane.normals(rest + u))
     walls, number = facing < 0.4, int((facing < 0.4).sum())
     others = torch.zeros_like(walls)
     others[0, facing[0].argsort(descending=True)[:number]] = True

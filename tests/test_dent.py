@@ -37,9 +37,9 @@ def dented(estimator: ForceBalance, middles: list[int], push: float = 1.0) -> to
     rays = torch.nn.functional.normalize(estimator.equations.bearings.positions, dim=-1)[None]
     measured = estimator.equations.bearings.measured(Observation(torch.zeros_like(rays), rays, torch.ones_like(rays[..., 0])))
     held = estimator.descent.tractions
-    estimator.descent.tractions = lambda x, pressure: tractions
+    estimator.descent.tractions = lambda u, pressure: tractions
     try:
-        return estimator.dent(*estimator.at_rest(measured.weight), measured).x[0] - rest
+        return estimator.dent(*estimator.at_rest(measured.weight), measured).u[0]
     finally:
         estimator.descent.tractions = held
 
@@ -134,11 +134,11 @@ def test_a_deep_press_is_found_from_a_deep_dent():
 def test_a_dent_is_kept_only_where_its_objective_is_lower(estimator):
     """Row by row; a step that broke down is never taken."""
     blown = estimator.membrane.rest_normals * estimator.equations.forces.free
-    x = torch.stack([estimator.membrane.rest + depth * blown for depth in (0.0, 0.1, 0.2, 0.1)])
+    u = torch.stack([depth * blown for depth in (0.0, 0.1, 0.2, 0.1)])
     pressure, moved = torch.full((4,), float(estimator.rest_pressure)), torch.zeros(4, 4)
     rays = torch.nn.functional.normalize(estimator.equations.bearings.positions, dim=-1)[None].repeat(4, 1, 1)
     measured = estimator.equations.bearings.measured(Observation(torch.zeros_like(rays), rays, torch.ones_like(rays[..., 0])))
-    other = x[[1, 0, 0, 0]].clone()
+    other = u[[1, 0, 0, 0]].clone()
     other[3] = torch.nan
-    taken, *_ = estimator.dent.lower((x, pressure, moved, x), (other, pressure, moved, other), measured)
-    torch.testing.assert_close(taken, torch.stack([x[0], other[1], other[2], x[3]]))
+    taken, *_ = estimator.dent.lower((u, pressure, moved, u), (other, pressure, moved, other), measured)
+    torch.testing.assert_close(taken, torch.stack([u[0], other[1], other[2], u[3]]))

@@ -70,12 +70,12 @@ def estimate(estimator, camera, pixels):
 
 
 def force_of(estimator, result):
-    return estimator.equations.forces(result.vertices, result.pressure).sum(1)
+    return estimator.equations.forces(result.vertices - estimator.membrane.rest, result.pressure).sum(1)
 
 
 def turns(estimator, camera, pixels, vertices):
     """How the rays to the markers turn by one standard deviation of the pixels, by the camera's inverse: `[B, D, 2, 3]`."""
-    place = estimator.equations.bearings.markers(vertices)
+    place = estimator.equations.bearings.markers(vertices - estimator.membrane.rest)
     origins, directions = camera.pixel_to_ray(pixels)
     basis = tangent_frame(directions.mT, dim=1).movedim(-1, 1)
     step = 1e-5
@@ -188,7 +188,7 @@ def test_spreads_by_the_transposed_equations_are_those_of_every_noise_by_itself(
     if gauge:
         observation = estimator.gauged(observation, 1.1 * estimator.rest_pressure)
     found = estimator(observation)
-    net, state = estimator.coarse, estimator.coarsened(found.vertices, found.pressure, found.moved)
+    net, state = estimator.coarse, estimator.coarsened(found.vertices - estimator.membrane.rest, found.pressure, found.moved)
     settings, equations = estimator.settings, net.equations
     of_force, of_depth = spreads(equations, net.cavity, settings, state, observation)
     measured = equations.bearings.measured(observation)
@@ -199,7 +199,7 @@ def test_spreads_by_the_transposed_equations_are_those_of_every_noise_by_itself(
     dF = dx @ solution.force.mT - dp[..., None] * solution.of_pressure[:, None]
     torch.testing.assert_close(of_force, dF.square().sum(1).sqrt())
     inner_normals = inner(net.membrane.rest_normals, net.membrane.grid)
-    depth = inner(depths(net.membrane, state.x)[..., None], net.membrane.grid)[0, :, 0]
+    depth = inner(depths(net.membrane, state.u)[..., None], net.membrane.grid)[0, :, 0]
     deepest = int(depth.argmax())
     of_deepest = dx.unflatten(-1, (3, -1))[0, :, :, deepest] @ inner_normals[deepest]
     torch.testing.assert_close(of_depth[0], of_deepest.square().sum().sqrt())

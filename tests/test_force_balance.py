@@ -106,15 +106,15 @@ def by_component(values):
     return values.unflatten(-1, (-1, 3)).mT.flatten(-2)
 
 
-def jacobian_at_inner_vertices(function, x, estimator):
-    """Derivative of `function(x)` in the inner vertices' coordinates, a row for each of its numbers."""
-    jacobian = torch.autograd.functional.jacobian(function, x)
+def jacobian_at_inner_vertices(function, u, estimator):
+    """Derivative of `function(u)` in the inner vertices' coordinates, a row for each of its numbers."""
+    jacobian = torch.autograd.functional.jacobian(function, u)
     return inner(jacobian.flatten(0, -4).squeeze(1), estimator.membrane.grid).flatten(1)
 
 
-def linear_angles(bearings, x, y, measured, moved):
-    """The angles at `y` where the markers' step from `x` is linear in their triangles, as the equations have it."""
-    at, step = bearings.markers(x), inner(y - x, bearings.grid)
+def linear_angles(bearings, u, y, measured, moved):
+    """The angles at `y` where the markers' step from `u` is linear in their triangles, as the equations have it."""
+    at, step = bearings.markers(u), inner(y - u, bearings.grid)
     bearings.markers = lambda _: at + bearings.vertex_shares @ step
     try:
         return bearings.angles(y, measured, moved)[0]
@@ -126,15 +126,16 @@ def test_linearised_force_and_volume_are_those_and_their_derivatives():
     estimator = make(9)
     membrane, forces = estimator.membrane, estimator.equations.forces
     x, p = bent(membrane), torch.tensor([0.3], dtype=torch.float64)
-    at = forces.linearised(x, p)
+    u = x - membrane.rest
+    at = forces.linearised(u, p)
 
     def within(field):
         return inner(field, membrane.grid)
 
-    torch.testing.assert_close(at.force.mT, within(forces(x, p)))
+    torch.testing.assert_close(at.force.mT, within(forces(u, p)))
     torch.testing.assert_close(at.volume.mT, within(membrane.volume_gradient(x)))
     torch.testing.assert_close(at.normal.mT, within(membrane.normals(x)))
-    exact = by_component(jacobian_at_inner_vertices(lambda y: within(forces(y, p)).mT, x, estimator))
+    exact = by_component(jacobian_at_inner_vertices(lambda y: within(forces(y, p)).mT, u, estimator))
     single_moves = torch.eye(len(exact), dtype=torch.float64).unflatten(-1, (3, -1))[None]
     stiffness = forces.change(at.stiffness, single_moves).flatten(2)[0].T
     torch.testing.assert_close(stiffness, exact)
@@ -152,7 +153,7 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     estimator = ForceBalance(
         dome, ElasticEnergy(dome, prestretch=1.3), dome.closest_points(positions.numpy()), positions, 0.1 / 168
     )
-    x, p = bent(dome), torch.tensor([0.3], dtype=torch.float64)
+    u, p = bent(dome) - dome.rest, torch.tensor([0.3], dtype=torch.float64)
     directions = torch.nn.functional.normalize(positions + 0.3, dim=-1)[None]
     motion = torch.rand(1, 2, 4, directions.shape[1], generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     measured = Bearings(
@@ -160,8 +161,8 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     )
     moved = torch.tensor([[0.3, -0.2, 0.1, 0.5]], dtype=torch.float64)
     equations = estimator.equations
-    at = equations.forces.linearised(x, p)
-    angle, jacobian = equations.bearings.angles(x, measured, moved)
+    at = equations.forces.linearised(u, p)
+    angle, jacobian = equations.bearings.angles(u, measured, moved)
     generator = torch.Generator().manual_seed(3)
     weight = torch.rand(1, len(positions), generator=generator, dtype=torch.float64)
     root = torch.rand(1, at.force.shape[-1], 3, 3, generator=generator, dtype=torch.float64)
@@ -172,8 +173,8 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
 
     moving = equations.forces.inner_free.repeat(3) > 0
     unknowns = torch.nonzero(moving).ravel()
-    A = jacobian_at_inner_vertices(lambda y: inner(equations.forces(y, p), dome.grid).mT, x, estimator)
-    J = jacobian_at_inner_vertices(lambda y: linear_angles(equations.bearings, x, y, measured, moved), x, estimator)
+    A = jacobian_at_inner_vertices(lambda y: inner(equations.forces(y, p), dome.grid).mT, u, estimator)
+    J = jacobian_at_inner_vertices(lambda y: linear_angles(equations.bearings, u, y, measured, moved), u, estimator)
     A, J = (by_component(rows)[:, unknowns] for rows in (A, J))
     W = torch.diag_embed(W[0]).movedim(2, 1).flatten(2).flatten(0, 1)
     w = torch.diag(weight[0].repeat(2))
@@ -214,9 +215,9 @@ def test_the_bearing_jacobian_is_the_derivative_of_the_angles():
         0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, directions.shape[1]).double(), ONE, motion
     )
     moved = torch.tensor([[0.3, -0.2, 0.1, 0.5]], dtype=torch.float64)
-    x = bent(estimator.membrane)
-    _, jacobian = bearings.angles(x, measured, moved)
-    exact = torch.autograd.functional.jacobian(lambda y: bearings.angles(y, measured, moved)[0], x)[0, :, :, 0]
+    u = bent(estimator.membrane) - estimator.membrane.rest
+    _, jacobian = bearings.angles(u, measured, moved)
+    exact = torch.autograd.functional.jacobian(lambda y: bearings.angles(y, measured, moved)[0], u)[0, :, :, 0]
     expected = torch.einsum("acd,dn->adnc", jacobian[0], bearings.smooth_shares)
     torch.testing.assert_close(inner(exact, estimator.membrane.grid), expected)
 
@@ -230,7 +231,7 @@ def test_steps_take_the_cone_they_are_given(pressed):
     for one, cone in ((steep, None), (usual, 0.0), (usual, None)):
         measured = one.equations.bearings.measured(seen(origins, directions))
         schedule = SETTINGS.gnc_schedule(4, SETTINGS.tau)
-        found.append(one.descent(one.at_rest(measured.weight), measured, schedule, cone=cone)[0].x)
+        found.append(one.descent(one.at_rest(measured.weight), measured, schedule, cone=cone)[0].u)
     torch.testing.assert_close(found[1], found[0], rtol=0, atol=0)
     assert (found[2] - found[0]).abs().max() > 0.01
 
@@ -248,10 +249,10 @@ def test_markers_follow_a_curved_displacement_between_the_grids_lines(n, share):
 
     assert (abs(normals.distance) < 0.05).all()  # of the same surface
     free = estimator.equations.forces.free
-    x = (membrane.rest + dent(membrane.rest) * free)[None]
+    u = (dent(membrane.rest) * free)[None]
     exact = bearings.positions + dent(bearings.positions)
-    smooth = (bearings.markers(x)[0] - exact).norm(dim=-1)
-    linear = bearings.positions + bearings.vertex_shares @ inner(x - membrane.rest, membrane.grid)[0]
+    smooth = (bearings.markers(u)[0] - exact).norm(dim=-1)
+    linear = bearings.positions + bearings.vertex_shares @ inner(u, membrane.grid)[0]
     chord = (linear - exact).norm(dim=-1)
     assert smooth.square().mean().sqrt() < share * chord.square().mean().sqrt()
 
@@ -261,7 +262,7 @@ def test_angles_vanish_on_the_rays_and_grow_with_the_distance_across():
     bearings, y = estimator.equations.bearings, estimator.equations.bearings.positions
     directions = torch.nn.functional.normalize(y, dim=-1)[None]
     measured = bearings.measured(seen(torch.zeros_like(directions), directions))
-    angle, _ = bearings.angles(estimator.membrane.rest[None], measured, torch.zeros(1, 4).double())
+    angle, _ = bearings.angles(torch.zeros_like(estimator.membrane.rest[None]), measured, torch.zeros(1, 4).double())
     assert angle.abs().max() < 1e-12
     basis = measured.across.movedim(-1, 1) * bearings.noise
     identity = basis @ basis.mT
@@ -317,7 +318,7 @@ def test_the_rim_stays_exactly_where_it_is(pressed, n):
 
 
 def relative(estimator, result, positions, moved):
-    got = estimator.equations.bearings.markers(result.vertices)[0]
+    got = estimator.equations.bearings.markers(result.vertices - estimator.membrane.rest)[0]
     return float((got - moved).norm() / (moved - positions).norm())
 
 
@@ -426,28 +427,12 @@ def test_a_fine_grid_begins_with_the_coarse_ones_solution(pressed):
     fine = make(33)
     assert fine.coarse.membrane.grid == (17, 17) and fine.coarse.coarse.membrane.grid == (9, 9)
     assert fine.coarse.coarse.coarse is None and make(16).coarse is None
-    surface = State(bent(fine.coarse.membrane), torch.ones(1), torch.ones(1, 4))
+    surface = State(bent(fine.coarse.membrane) - fine.coarse.membrane.rest, torch.ones(1), torch.ones(1, 4))
     torch.testing.assert_close(fine.coarsened(*fine.refined(*surface)), surface)
     result = fine(seen(origins, directions))
     assert relative(fine, result, positions, moved) < 0.1
     force = (result.traction * fine.membrane.rest_area[:, None]).sum(1)[0]
     assert (force - truth.force).norm() < 0.07 * truth.force.norm()
-
-
-def test_a_frame_that_settles_is_what_it_is_without_a_start(pressed):
-    """Whatever the start; one that does not settle takes it for what it is solved again from."""
-    (origins, directions), *_ = pressed
-    estimator, observation = make(17), seen(origins, directions)
-    alone = estimator(observation)
-    blown = alone.vertices + 0.2 * estimator.membrane.rest_normals * ~estimator.membrane.fixed[:, None]
-    followed = estimator(observation, (blown, 2 * alone.pressure, alone.moved))
-    torch.testing.assert_close(followed.vertices, alone.vertices, rtol=0, atol=0)
-    estimator.settings = replace(SETTINGS, settled_step=0.0)
-    given = []
-    sought = estimator.dent.sought
-    estimator.dent.sought = lambda *states: given.append(states[3]) or sought(*states)
-    estimator(observation, (blown, 2 * alone.pressure, alone.moved))
-    torch.testing.assert_close(given[0].x, blown, rtol=0, atol=0)
 
 
 def test_elimination_by_products_rounds_a_contacts_system_as_cholesky_does(monkeypatch, pressed):
@@ -458,7 +443,9 @@ def test_elimination_by_products_rounds_a_contacts_system_as_cholesky_does(monke
     measured = equations.bearings.measured(seen(origins, directions))
     found = estimator(seen(origins, directions))
     scales = SETTINGS.tau[1], SETTINGS.outlier
-    _, normal, loads, *_ = equations.linearised(found.vertices, found.pressure, found.moved, measured, *scales)
+    _, normal, loads, *_ = equations.linearised(
+        found.vertices - estimator.membrane.rest, found.pressure, found.moved, measured, *scales
+    )
     matrix = equations.matrix(normal)
 
     def solved(root, matrix, loads):
@@ -560,6 +547,20 @@ def test_the_loss_of_normal_tractions_has_the_derivative_that_the_weights_say():
     torch.testing.assert_close((gradient * normal).sum(1), (expected * normal).sum(1), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("far", [3, 300])
+def test_a_slack_sheet_at_rest_is_explained_in_single_precision(far):
+    """Near the camera and far from it; markers a hundredth of their noise off."""
+    dome = spherical_cap(12, 9, far, (33, 33))
+    elasticity, positions = ElasticEnergy(dome, "neo_hookean", 1.004), dots(spherical_cap(12, 9, far, (65, 65)))
+    noise = 0.1 / 168
+    estimator = ForceBalance(dome, elasticity, dome.closest_points(positions.numpy()), positions, noise).float()
+    off = 0.01 * noise * torch.randn(positions.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rays = torch.nn.functional.normalize(torch.nn.functional.normalize(positions, dim=-1) + off, dim=-1)[None].float()
+    with torch.no_grad():
+        found = estimator(seen(torch.zeros_like(rays), rays))
+    assert estimator.is_explained(found).item() and found.objective.item() < 0.1
+
+
 def test_the_objective_is_the_misfit_of_the_markers_and_the_loss_of_the_tractions(pressed):
     (origins, directions), *_ = pressed
     estimator = make()
@@ -567,10 +568,10 @@ def test_the_objective_is_the_misfit_of_the_markers_and_the_loss_of_the_traction
     found, rest = estimator(observation), estimator.at_rest(observation.confidence)
     bearings, descent = estimator.equations.bearings, estimator.descent
     measured = bearings.measured(observation)
-    misfit = bearings.angles(found.vertices, measured, found.moved)[0].square().sum(1)
+    misfit = bearings.angles(found.vertices - estimator.membrane.rest, measured, found.moved)[0].square().sum(1)
     expected = Cauchy(SETTINGS.outlier).loss(misfit).sum(1)
-    state = State(found.vertices, found.pressure, found.moved)
+    state = State(found.vertices - estimator.membrane.rest, found.pressure, found.moved)
     traction, normal = descent.tractions(*state[:2])
     torch.testing.assert_close(descent.objective(state, 0 * traction, normal, measured), expected)
     assert (descent.objective(state, traction, normal, measured) > expected).all()
-    assert (found.objective < estimator.equilibrium(*rest, rest.x, measured).objective).all()
+    assert (found.objective < estimator.equilibrium(*rest, rest.u, measured).objective).all()

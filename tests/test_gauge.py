@@ -81,7 +81,9 @@ def test_the_gauge_pulls_as_the_forces_resist(strokes):
             found = estimator(gauged)
             measured = estimator.equations.bearings.measured(gauged)
             scales = estimator.settings.tau[1], estimator.settings.outlier
-            corner = estimator.equations.linearised(found.vertices, found.pressure, found.moved, measured, *scales)[3]
+            corner = estimator.equations.linearised(
+                found.vertices - estimator.membrane.rest, found.pressure, found.moved, measured, *scales
+            )[3]
         pulls.append(corner[0])
     sigma = 0.01 * estimator.reference
     expected = (found.pressure - reading) / sigma**2
@@ -109,7 +111,10 @@ def test_the_objective_holds_half_the_squared_reading_over_its_noise(strokes):
     reading = reconstructor.rest_pressure + torch.tensor([1.3 * rise[0], NAN, rise[2]])
     with torch.no_grad():
         found = estimator(observation)
-        state, bearings = State(found.vertices, found.pressure, found.moved), estimator.equations.bearings
+        state, bearings = (
+            State(found.vertices - estimator.membrane.rest, found.pressure, found.moved),
+            estimator.equations.bearings,
+        )
         with_it, without = (bearings.measured(each) for each in (estimator.gauged(observation, reading), observation))
         tractions = estimator.descent.tractions(*state[:2])
         more = estimator.descent.objective(state, *tractions, with_it) - estimator.descent.objective(state, *tractions, without)

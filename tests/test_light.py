@@ -91,13 +91,13 @@ def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
     state = estimator.at_rest(torch.ones(2 * D, 1, dtype=torch.float64))
     scales = Scales(*torch.tensor((torch.inf, torch.inf, SETTINGS.cone, 1.0, 0.0), dtype=torch.float64))
     unweighted = torch.ones(1, len(estimator.equations.loss.area), dtype=torch.float64)
-    (x, pressure, moved), *_ = estimator.descent.step(state, unweighted, measured, scales)
-    traction = estimator.equilibrium(x, pressure, moved, x, measured).traction
+    (u, pressure, moved), *_ = estimator.descent.step(state, unweighted, measured, scales)
+    traction = estimator.equilibrium(u, pressure, moved, u, measured).traction
     _, normal = at_rest(estimator)
     push = (inner(traction, estimator.membrane.grid) * normal).sum(-1) / estimator.reference / small
     expected = (push.square().sum(0) @ loss.surroundings).sqrt()
     torch.testing.assert_close(loss.push_noise, expected, rtol=0.01, atol=0)
-    before, after = (bearings.angles(y, measured, m)[0] for y, m in ((estimator.membrane.rest[None], 0 * moved), (x, moved)))
+    before, after = (bearings.angles(y, measured, m)[0] for y, m in ((0 * u[:1], 0 * moved), (u, moved)))
     gained = (before * (before - after)).sum() / 2 / small**2 / D  # of a quadratic: half of what the residuals lose
     torch.testing.assert_close(loss.noise_gain, gained, rtol=0.01, atol=0)
 
@@ -125,13 +125,13 @@ def test_pushes_are_no_contact_where_the_surface_at_rest_explains_the_markers_as
     directions = torch.nn.functional.normalize(torch.stack([moved, bearings.positions]), dim=-1)
     markers = seen(torch.zeros_like(directions), directions)
     x, pressure = (value[:1].expand(2, *value.shape[1:]) for value in estimator(markers)[:2])
-    measured = bearings.measured(markers)
-    found = estimator.equilibrium(x, pressure, torch.zeros(2, 4).double(), x, measured)
+    measured, u = bearings.measured(markers), x - membrane.rest
+    found = estimator.equilibrium(u, pressure, torch.zeros(2, 4).double(), u, measured)
     gain = estimator.descent.objective_at_rest(measured) / measured.weight.sum(-1) - found.objective
     assert gain[0] > SETTINGS.evidence * loss.noise_gain > gain[1]
     is_contact = stands_out(found.reference / estimator.reference) & ~membrane.fixed
     assert is_contact[0].any() and not is_contact[1].any()
-    at_rest_found = estimator.equilibrium(*estimator.at_rest(measured.weight), x, measured)
+    at_rest_found = estimator.equilibrium(*estimator.at_rest(measured.weight), u, measured)
     torch.testing.assert_close(estimator.descent.objective_at_rest(measured), at_rest_found.objective * measured.weight.sum(-1))
 
 

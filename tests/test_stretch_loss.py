@@ -58,7 +58,7 @@ def test_pushes_cost_nothing_and_pulls_what_they_cost(light):
     observation, solutions, _ = light
     estimator, found = solutions[4]
     measured, seen = estimator.equations.bearings.measured(observation), observation.confidence.sum(-1)
-    state = State(found.vertices, found.pressure, found.moved)
+    state = State(found.vertices - estimator.membrane.rest, found.pressure, found.moved)
     traction, normal = estimator.descent.tractions(*state[:2])
     beside, pushes = estimator.descent.losses(state, traction, normal, measured)
     torch.testing.assert_close((found.unexplained, found.objective), (beside / seen, (beside + pushes) / seen))
@@ -72,7 +72,7 @@ def test_a_solve_that_ended_elsewhere_is_led_to_what_its_neighbours_found(light)
     estimator, found = best[4]
     measured = estimator.equations.bearings.measured(observation)
     at_rest = estimator.at_rest(observation.confidence)
-    stuck = estimator.equilibrium(*at_rest, at_rest.x, measured)
+    stuck = estimator.equilibrium(*at_rest, at_rest.u, measured)
     assert (stuck.objective > 2 * found.objective).all()
     led = continued([best[3], (estimator, stuck), best[5]], observation)[1][1]
     assert led.objective.numpy() == pytest.approx(found.objective.numpy(), rel=0.1)

@@ -34,7 +34,9 @@ def _better(own: Explained, neighbour: Explained, observation: Observation) -> E
     """Of each press `own`, or what some steps from the `neighbour`'s solution end at, if that has converged to less."""
     (estimator, found), (other, near) = own, neighbour
     measured = estimator.equations.bearings.measured(observation)
-    start = State(near.vertices, near.pressure * (estimator.rest_pressure / other.rest_pressure), near.moved)
+    start = State(
+        near.vertices - estimator.membrane.rest, near.pressure * (estimator.rest_pressure / other.rest_pressure), near.moved
+    )
     state: State
     with torch.no_grad():
         state, before = estimator.descent(start, measured, estimator.schedule()[-1:] * STEPS)

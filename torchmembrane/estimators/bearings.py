@@ -101,7 +101,6 @@ class MarkerBearings(nn.Module):
 
     positions: Tensor
     rest_spread: Tensor
-    inner_rest: Tensor
     smooth_shares: Tensor
     vertex_shares: Tensor
     pair_shares: Tensor
@@ -112,7 +111,6 @@ class MarkerBearings(nn.Module):
         self.grid, self.noise = membrane.grid, noise
         self.register_buffer("positions", torch.as_tensor(positions, dtype=torch.float64))
         self.register_buffer("nearest", torch.from_numpy(neighbours(self.positions.numpy(), NEIGHBOURS).copy()))
-        self.register_buffer("inner_rest", inner(membrane.rest, membrane.grid))
         vertex_shares, pair_shares = _shares(membrane, markers)
         self.register_buffer("vertex_shares", vertex_shares)
         self.register_buffer("pair_shares", pair_shares)
@@ -135,15 +133,16 @@ class MarkerBearings(nn.Module):
         noise_level = (excess.sum(-1) / found.sum(-1).clamp_min(1) / 2).exp()
         return Bearings(origins.mT, across.movedim(1, -1), confidence, noise_level, motion.movedim(1, -1), gauge)
 
-    def markers(self, x: Tensor) -> Tensor:
-        """The markers' positions on the surface `x [B, V, 3]`, `[B, D, 3]`: their displacement is bicubic between the grid's
-        lines. In the equations it is linear, for their sparsity: steps are short, and smooth as the chords' errors are not."""
-        return self.positions + self.smooth_shares @ (inner(x, self.grid) - self.inner_rest)
+    def markers(self, u: Tensor) -> Tensor:
+        """The markers' positions on the surface displaced by `u [B, V, 3]`, `[B, D, 3]`: their displacement is bicubic between
+        the grid's lines. In the equations it is linear, for their sparsity: steps are short, and smooth as the chords' errors
+        are not."""
+        return self.positions + self.smooth_shares @ inner(u, self.grid)
 
-    def angles(self, x: Tensor, measured: Bearings, moved: Tensor) -> tuple[Tensor, Tensor]:
+    def angles(self, u: Tensor, measured: Bearings, moved: Tensor) -> tuple[Tensor, Tensor]:
         """Angles across the measured rays `[B, 2, D]`, and the bearing Jacobian: their derivatives in the markers' positions,
         `[B, 2, 3, D]`; `moved [B, 4]`: of the camera."""
-        to_marker = self.markers(x).mT - measured.origins
+        to_marker = self.markers(u).mT - measured.origins
         distance = torch.linalg.vector_norm(to_marker, dim=1, keepdim=True)
         along = (to_marker / distance)[:, None]
         angle = (measured.across * along).sum(2, keepdim=True)
@@ -151,11 +150,11 @@ class MarkerBearings(nn.Module):
         angle = angle.squeeze(2)
         return angle + (measured.motion * moved[:, None, :, None]).sum(2), jacobian
 
-    def misfits(self, x: Tensor, measured: Bearings, moved: Tensor, outlier: float, far: float) -> tuple[Tensor, Tensor]:
+    def misfits(self, u: Tensor, measured: Bearings, moved: Tensor, outlier: float, far: float) -> tuple[Tensor, Tensor]:
         """How far the markers are off their rays, in standard deviations, and as much of it as neighbours have in common.
 
         Args:
-            x: the surface, `[B, V, 3]`.
+            u: the surface's displacement, `[B, V, 3]`.
             measured: the markers' rays.
             moved: the camera, `[B, 4]`.
             outlier: as what each marker counts at most, in the first.
@@ -165,7 +164,7 @@ class MarkerBearings(nn.Module):
             Rms of the angles `[B]`; the root of the mean product `[B]` of a marker's angles with its nearest neighbours', 0
             where it is negative. Noise and a marker's wrong match know nothing of the next; what no surface can follow does.
         """
-        angles, weight = self.angles(x, measured, moved)[0], measured.weight
+        angles, weight = self.angles(u, measured, moved)[0], measured.weight
         counted = angles.square().mean(1).clamp_max(outlier**2)
         length = angles.square().sum(1, keepdim=True).clamp_min(1e-12).sqrt()
         here = angles * (far / length).clamp_max(1) * weight[:, None]
@@ -173,9 +172,9 @@ class MarkerBearings(nn.Module):
         shared = (here * beside).sum((1, 2)) / (weight * seen).sum(-1).clamp_min(1)
         return ((weight * counted).sum(-1) / weight.sum(-1).clamp_min(1)).sqrt(), shared.clamp_min(0).sqrt()
 
-    def outlying(self, x: Tensor, measured: Bearings, moved: Tensor, limit: float) -> Tensor:
+    def outlying(self, u: Tensor, measured: Bearings, moved: Tensor, limit: float) -> Tensor:
         """The share `[B]` of the markers that are seen and more than `limit` standard deviations off their rays."""
-        far = self.angles(x, measured, moved)[0].square().sum(1) > limit**2
+        far = self.angles(u, measured, moved)[0].square().sum(1) > limit**2
         return (measured.weight * far).mean(-1)
 
 

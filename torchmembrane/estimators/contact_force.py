@@ -40,6 +40,7 @@ class ContactForce(nn.Module):
     inner_free: Tensor
     free_neighbours: Tensor
     edges: Tensor
+    rest_edges: Tensor
     kernels: Tensor
 
     def __init__(self, membrane: Membrane, elasticity: ElasticEnergy):
@@ -49,26 +50,27 @@ class ContactForce(nn.Module):
         self.register_buffer("free", (~membrane.fixed).double()[:, None])
         self.register_buffer("inner_free", inner(self.free, membrane.grid).squeeze(-1))
         self.register_buffer("edges", one_ring_edges())
+        self.register_buffer("rest_edges", apply_stencil(membrane.rest, self.edges, membrane.grid, border=False))
         self.register_buffer("kernels", stencil_kernels())
         free_neighbours = apply_stencil(self.free, stencil_kernels()[1:], membrane.grid, border=False)
         self.register_buffer("free_neighbours", free_neighbours.reshape(6, -1))
 
-    def forward(self, x: Tensor, pressure: Tensor) -> Tensor:
-        """The force on every free vertex, `[B, V, 3]`, of a surface `x [B, V, 3]` under a pressure `[B]`."""
-        of_fluid = pressure[:, None, None] * self.membrane.volume_gradient(x)
-        return (self.elasticity.gradient(x) - self.rest_load - of_fluid) * self.free
+    def forward(self, u: Tensor, pressure: Tensor) -> Tensor:
+        """The force on every free vertex, `[B, V, 3]`, of the surface displaced by `u [B, V, 3]`, under a pressure `[B]`."""
+        of_fluid = pressure[:, None, None] * self.membrane.volume_gradient(self.membrane.rest + u)
+        return (self.elasticity.gradient_of_displaced(u) - self.rest_load - of_fluid) * self.free
 
-    def linearised(self, x: Tensor, pressure: Tensor) -> Linearised:
+    def linearised(self, u: Tensor, pressure: Tensor) -> Linearised:
         """The force and what it and the volume do when vertices move, at the inner vertices."""
         grid, p = self.membrane.grid, pressure[:, None, None]
-        edges, chords = apply_stencil(x, self.edges, grid, border=False).chunk(2, -1)
+        edges, chords = (self.rest_edges + apply_stencil(u, self.edges, grid, border=False)).chunk(2, -1)
         edges, volume_ring = edges.unflatten(-1, (6, -1))[:, None], self.membrane.volume_one_ring(chords)
         gradient = 0.5 * (volume_ring * edges).sum((2, 3))
-        stress, elastic_ring = self.elasticity.one_ring(x)
+        stress, elastic_ring = self.elasticity.one_ring(u)
         force = (stress[:, None] * edges[:, 0]).sum(2) - inner(self.rest_load, grid).mT - p * gradient
         beside = self.free_neighbours * torch.addcmul(elastic_ring, volume_ring, p[..., None, None], value=-1)
         stiffness = torch.cat([-elastic_ring.sum(3, keepdim=True), beside], 3) * self.inner_free
-        normal = gradient * gradient.square().sum(1, keepdim=True).clamp_min(torch.finfo(x.dtype).tiny).rsqrt()
+        normal = gradient * gradient.square().sum(1, keepdim=True).clamp_min(torch.finfo(u.dtype).tiny).rsqrt()
         return Linearised(force * self.inner_free, stiffness, gradient * self.inner_free, normal)
 
     def change(self, stiffness: Tensor, step: Tensor) -> Tensor:

@@ -89,11 +89,11 @@ def linearise(
     at, normal, loads, corner, motion, _ = equations.linearised(*state, measured, *scales, curvature=curvature)
     vWv = pulled(corner, measured.gauge, state.pressure - cavity.rest_pressure)[1]
     factor, membrane = equations.system.factor(equations.matrix(normal)), equations.forces.membrane
-    compliance = cavity.condition(membrane.volume(state.x) - membrane.rest_volume, state.pressure)[1]
+    compliance = cavity.condition(membrane.volume(membrane.rest + state.u) - membrane.rest_volume, state.pressure)[1]
     motion = motion.held(state.moved, play)
     of_motion = equations.system.substitute(factor, motion.coupling)
     closed = cavity.filling != "open"
-    one = torch.eye(3).to(state.x)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
+    one = torch.eye(3).to(state.u)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
     of_force = equations.forces.change(at.stiffness, one).flatten(2)
     solution = LinearisedSolution(
         lambda loads: motion.eased(equations.system.substitute(factor, loads), of_motion),
@@ -120,7 +120,9 @@ def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observat
     """
     membrane, loss = equations.forces.membrane, equations.loss
     measured = equations.bearings.measured(rest)
-    state = State(membrane.rest[None], cavity.rest_pressure[None], torch.zeros_like(membrane.rest[:1, :1]).expand(1, 4))
+    state = State(
+        torch.zeros_like(membrane.rest[None]), cavity.rest_pressure[None], torch.zeros_like(membrane.rest[:1, :1]).expand(1, 4)
+    )
     at, normal, solution = linearise(equations, cavity, state, measured, (torch.inf, torch.inf), play)
     alone = torch.eye(2).to(measured.weight).expand(1, measured.weight.shape[1], 2, 2)
     loads = noise_loads(equations, normal, measured, solution.motion, alone)

@@ -54,30 +54,30 @@ class Dent(nn.Module):
         self.register_buffer("free", (~self.membrane.fixed).double())
 
     @piece
-    def forward(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
+    def forward(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
         """The state, its surface dented where the middle of the pushes around, weighted by their squares, is near."""
-        return self._dented(x, pressure, moved, measured, DEPTH, WIDTH)
+        return self._dented(u, pressure, moved, measured, DEPTH, WIDTH)
 
     @piece
-    def deep(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
+    def deep(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
         """The state, dented deeper."""
-        return self._dented(x, pressure, moved, measured, *DEEP)
+        return self._dented(u, pressure, moved, measured, *DEEP)
 
     @piece
-    def wide(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
+    def wide(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
         """The state, dented deeper and wider."""
-        return self._dented(x, pressure, moved, measured, *WIDE)
+        return self._dented(u, pressure, moved, measured, *WIDE)
 
-    def _dented(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings, depth: float, width: float) -> State:
+    def _dented(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings, depth: float, width: float) -> State:
         membrane, loss = self.membrane, self.descent.equations.loss
-        push2 = loss.parts(*self.descent.tractions(x, pressure))[2]
+        push2 = loss.parts(*self.descent.tractions(u, pressure))[2]
         weight = (pad_border(push2[..., None], membrane.grid)[..., 0] + TINY) * self.area
         middle = (weight[..., None] * membrane.rest).mT @ self.around / (weight @ self.around)[:, None]
         off2 = (middle.mT - membrane.rest).square().sum(-1) / membrane.size**2
         faint2 = (FAINT * measured.noise_level[:, None] * loss.push_noise).square().mean(-1) + TINY
         share = (push2.amax(-1) / (push2.amax(-1) + faint2))[:, None]
         inwards = depth * membrane.size * share * torch.exp(-off2 / (2 * width**2)) * self.free
-        return State(x - inwards[..., None] * membrane.normals(x), pressure, moved)
+        return State(u - inwards[..., None] * membrane.normals(membrane.rest + u), pressure, moved)
 
     def is_hollow(self, found: Equilibrium, membrane: Membrane) -> Tensor:
         """`[B]` bool: hardly anything pushes in the middle of what pushes, as where a mound ringed by pushes stands for a pit,
@@ -125,5 +125,5 @@ class Dent(nn.Module):
             self.descent.objective(State(*each[:3]), *self.descent.tractions(*each[:2]), measured) for each in (kept, other)
         )
         is_lower = of_other < torch.where(of_kept.isnan(), torch.inf, LOWER * of_kept)
-        x, pressure, moved, before = rowwise(is_lower, other, kept)
-        return x, pressure, moved, before
+        u, pressure, moved, before = rowwise(is_lower, other, kept)
+        return u, pressure, moved, before

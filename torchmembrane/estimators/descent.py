@@ -24,9 +24,10 @@ VERTICES = 9000
 
 
 class State(NamedTuple):
-    """What the steps change: the surface `x [B, V, 3]`, the `pressure [B]`, and by how much the camera has `moved [B, 4]`."""
+    """What the steps change: the surface's displacement `u [B, V, 3]` from rest (positions in float32 would round the strain
+    of a slack sheet), the `pressure [B]`, and by how much the camera has `moved [B, 4]`."""
 
-    x: Tensor
+    u: Tensor
     pressure: Tensor
     moved: Tensor
 
@@ -66,7 +67,7 @@ class Descent(nn.Module):
         settling: int = 1,
         damping: float | None = None,
     ) -> tuple[State, Tensor]:
-        """The state after the steps of a schedule, and the surface before the last; `cone`: as for `TractionLoss.weights`;
+        """The state after the steps of a schedule, and the displacement before the last; `cone`: as for `TractionLoss.weights`;
         `settling`: so many steps, the last ones, have at least a `damping` (default, `settling_damping`) to settle."""
         frames = max(1, VERTICES // self.membrane.rest.shape[0])
         cone = self.equations.loss.cone if cone is None else cone
@@ -74,8 +75,8 @@ class Descent(nn.Module):
         taus, size = [tau for tau, _ in schedule], len(schedule)
         numbers = [self._numbers(taus[: k + 1], damping if size - k <= settling else 0.0) for k in range(size)]
         rows = [(*scales, cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
-        x, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows, settling)
-        return State(x, pressure, moved), before
+        u, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows, settling)
+        return State(u, pressure, moved), before
 
     def _numbers(self, taus: list[float], least: float) -> tuple[float, float]:
         """The renewal and the damping of a step, from the scales `tau` up to its own: while these decline all weights are new,
@@ -87,22 +88,22 @@ class Descent(nn.Module):
             damping = max(damping, least)
         return settings.renewal if before[-1:] == [tau] else 1.0, damping
 
-    def _stepped(self, x: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The state after the steps, and the surface before the last; `given`: what is measured, the steps' scales, how many of
-        them settle."""
+    def _stepped(self, u: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The state after the steps, and the displacement before the last; `given`: what is measured, the steps' scales, how
+        many of them settle."""
         *of_markers, rows, settling = given
         measured, last = Bearings(*of_markers), rows[-settling:] if settling > 1 else []
-        state: Sequence[Any] = (x, pressure, moved, x, self._unweighted(x))
+        state: Sequence[Any] = (u, pressure, moved, u, self._unweighted(u))
         state = repeated(self._next, rows[: len(rows) - len(last)], state, measured)
         if last:
             state = repeated(self._settle, last, (*state, *state[:4], self._none_found(pressure)), measured)[5:]
-        x, pressure, moved, before = state[:4]
-        return x, pressure, moved, before
+        u, pressure, moved, before = state[:4]
+        return u, pressure, moved, before
 
     @piece
-    def _unweighted(self, x: Tensor) -> Tensor:
+    def _unweighted(self, u: Tensor) -> Tensor:
         """What the first step has for the weights of a step before, `[B, N]`, and does not ask."""
-        return torch.ones_like(x[:, : self.equations.loss.area.shape[0], 0])
+        return torch.ones_like(u[:, : self.equations.loss.area.shape[0], 0])
 
     @piece
     def _none_found(self, pressure: Tensor) -> Tensor:
@@ -121,23 +122,24 @@ class Descent(nn.Module):
 
     def objective_at_rest(self, measured: Bearings) -> Tensor:
         """The same of the surface at rest and a camera that has not moved; there are no tractions."""
-        rest, none = self.membrane.rest[None], torch.zeros_like(measured.noise_level)
-        return self._misfit(rest, none + self.cavity.rest_pressure, none[:, None].expand(-1, 4), measured)
+        still, none = torch.zeros_like(self.membrane.rest[None]), torch.zeros_like(measured.noise_level)
+        return self._misfit(still, none + self.cavity.rest_pressure, none[:, None].expand(-1, 4), measured)
 
-    def _misfit(self, x: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> Tensor:
-        misfit = measured.weight * self.equations.bearings.angles(x, measured, moved)[0].square().sum(1)
+    def _misfit(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> Tensor:
+        misfit = measured.weight * self.equations.bearings.angles(u, measured, moved)[0].square().sum(1)
         of_markers: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1)
         return of_markers + gauge_loss(measured.gauge, pressure - self.cavity.rest_pressure)
 
-    def tractions(self, x: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
+    def tractions(self, u: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
         """The contact tractions of the inner vertices and their outward normals, `[B, 3, N]` each."""
-        traction = self.equations.forces(x, pressure) / self.membrane.rest_area[:, None]
-        return inner(traction, self.membrane.grid).mT, inner(self.membrane.normals(x), self.membrane.grid).mT
+        traction = self.equations.forces(u, pressure) / self.membrane.rest_area[:, None]
+        normals = self.membrane.normals(self.membrane.rest + u)
+        return inner(traction, self.membrane.grid).mT, inner(normals, self.membrane.grid).mT
 
     @piece
     def _next(
         self,
-        x: Tensor,
+        u: Tensor,
         pressure: Tensor,
         moved: Tensor,
         before: Tensor,
@@ -145,29 +147,29 @@ class Descent(nn.Module):
         measured: Bearings,
         *scales: float,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The state, the surface before, and the weights of normal tractions."""
-        state, weights = self._traced_once(State(x, pressure, moved), weights, measured, scales)
-        return *state, x, weights
+        """The state, the displacement before, and the weights of normal tractions."""
+        state, weights = self._traced_once(State(u, pressure, moved), weights, measured, scales)
+        return *state, u, weights
 
     @piece
-    def _settle(self, x: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, weights: Tensor, *given: Any) -> list[Tensor]:
-        """As `_next`, and of the states so far that of the lowest objective, the surface before it, and the objective: a vertex
-        that is pushed in one step and pulled in the next is no answer in every step.
+    def _settle(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, weights: Tensor, *given: Any) -> list[Tensor]:
+        """As `_next`, and of the states so far that of the lowest objective, the displacement before it, and the objective: a
+        vertex that is pushed in one step and pulled in the next is no answer in every step.
 
         Args:
             given: the latter, what is measured, the numbers of the step.
         """
         *kept, lowest, measured = given[:6]
-        state, weights = self._traced_once(State(x, pressure, moved), weights, measured, given[6:])
+        state, weights = self._traced_once(State(u, pressure, moved), weights, measured, given[6:])
         objective = self.objective(state, *self.tractions(*state[:2]), measured)
         is_lower = objective < lowest
-        return [*state, x, weights, *rowwise(is_lower, (*state, x, objective), (*kept, lowest))]
+        return [*state, u, weights, *rowwise(is_lower, (*state, u, objective), (*kept, lowest))]
 
     def _traced_once(self, state: State, weights: Tensor, measured: Bearings, scales: Sequence[float]) -> tuple[State, Tensor]:
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.
 
         With gradients every step is: those of a nested region come with strides that torch 2.13 does not follow."""
-        numbers = Scales(*(torch.as_tensor(scale, dtype=state.x.dtype, device=state.x.device) for scale in scales))
+        numbers = Scales(*(torch.as_tensor(scale, dtype=state.u.dtype, device=state.u.device) for scale in scales))
         unrolled = torch.compiler.is_exporting() or torch.is_grad_enabled()
         step = self.step if unrolled else self._compiled_once
         taken: tuple[State, Tensor] = step(state, weights, measured, numbers)
@@ -190,7 +192,7 @@ class Descent(nn.Module):
             The state and the weights after it.
         """
         tau, outlier, cone, renewal, damping = scales
-        equations, (x, pressure, moved) = self.equations, state
+        equations, (u, pressure, moved) = self.equations, state
         _, normal, loads, corner, motion, weights = equations.linearised(
             *state, measured, tau, outlier, cone, memory=(weights, renewal)
         )
@@ -201,12 +203,12 @@ class Descent(nn.Module):
         motion = motion.held(moved, self.settings.camera_motion * blunt)
         products, following = motion.eliminated(loads @ solved.mT)
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
-        shares = self._shares(x, pressure, products, corner)
+        shares = self._shares(u, pressure, products, corner)
         turn = (following @ shares[..., None])[..., 0]
         move = F.pad(-(torch.cat([shares, turn], 1)[:, None] @ solved).unflatten(-1, (3, *self.inner_grid))[:, 0], (1, 1, 1, 1))
-        share = self._share(x, move)
-        x = x + share[:, None, None] * move.flatten(2).mT
-        return State(x, pressure + share * shares[:, 2], moved + share[:, None] * turn), weights
+        share = self._share(u, move)
+        u = u + share[:, None, None] * move.flatten(2).mT
+        return State(u, pressure + share * shares[:, 2], moved + share[:, None] * turn), weights
 
     def _solved(self, normal: NormalEquations, loads: Tensor, damping: Tensor) -> Tensor:
         """The solutions `[B, C, 3 N]` of the equations, damped; gradients take what was solved, not how."""
@@ -217,21 +219,22 @@ class Descent(nn.Module):
             substitute = partial(equations.system.substitute, equations.system.factor(equations.matrix(normal, damping)))
         return differentiable(substitute, partial(equations.product, normal, damping=damping), loads)
 
-    def _shares(self, x: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:
+    def _shares(self, u: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:
         """Shares `[B, 3]` in a step, but for its sign, of what solves the volume's row, the loads and the pressure's row: the
         second is 1, the third what the pressure rises by."""
         one = torch.ones_like(pressure)
         if self.cavity.filling == "open":
             return torch.stack([0 * one, one, 0 * one], 1)
         fWv, vWv = corner
-        target, compliance = self.cavity.condition(self.membrane.volume(x) - self.membrane.rest_volume, pressure)
+        change = self.membrane.volume(self.membrane.rest + u) - self.membrane.rest_volume
+        target, compliance = self.cavity.condition(change, pressure)
         multiplier, rise = border_unknowns(products, vWv, fWv, compliance, target)
         return torch.stack([multiplier, one, rise], 1)
 
-    def _share(self, x: Tensor, move: Tensor) -> Tensor:
+    def _share(self, u: Tensor, move: Tensor) -> Tensor:
         """Of a step `move [B, 3, m, n]`, so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
-        settings, tiny = self.settings, torch.finfo(x.dtype).tiny
-        both = torch.stack([move, x.transpose(1, 2).unflatten(-1, self.membrane.grid)], 1)  # mT of an input would be aliased
+        settings, tiny = self.settings, torch.finfo(u.dtype).tiny
+        both = torch.stack([move, (self.membrane.rest + u).mT.unflatten(-1, self.membrane.grid)], 1)
         far2 = move.square().sum(1).flatten(1).amax(-1) / (settings.longest_step * self.membrane.size) ** 2
         for axis in (-2, -1):
             change2, edge2 = both.diff(dim=axis).square().sum(2).unbind(1)

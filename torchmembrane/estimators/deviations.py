@@ -72,9 +72,9 @@ def of_presses(
     )
 
 
-def depths(membrane: Membrane, x: Tensor) -> Tensor:
-    """Displacements along the inward rest normals `[B, V]`, of a surface `x [B, V, 3]`."""
-    depth: Tensor = ((membrane.rest - x) * membrane.rest_normals).sum(-1)
+def depths(membrane: Membrane, u: Tensor) -> Tensor:
+    """Displacements `u [B, V, 3]` along the inward rest normals, `[B, V]`."""
+    depth: Tensor = -(u * membrane.rest_normals).sum(-1)
     return depth
 
 
@@ -107,7 +107,7 @@ def spreads(
     membrane, measured = equations.forces.membrane, equations.bearings.measured(observation)
     scales, play = (settings.tau[1], settings.outlier), settings.camera_motion
     _, normal, solution = linearise(equations, cavity, state, measured, scales, play, curvature=True)
-    depth = inner(depths(membrane, state.x)[..., None], membrane.grid)[..., 0]
+    depth = inner(depths(membrane, state.u)[..., None], membrane.grid)[..., 0]
     inwards = -inner(membrane.rest_normals, membrane.grid).mT
     of_depth = shares_of_deepest(depth)[:, None] * inwards
     wanted = torch.cat([solution.force.expand(of_depth.shape[0], -1, -1), of_depth.flatten(1)[:, None]], 1)

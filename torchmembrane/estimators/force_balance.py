@@ -245,20 +245,22 @@ class ForceBalance(nn.Module):
     def at_rest(self, confidence: Tensor) -> State:
         """The rest surface and pressure and a camera that has not moved, for every row of `confidence [B, D]`."""
         frames, pressure = confidence.shape[0], self.rest_pressure
-        return State(self.membrane.rest.repeat(frames, 1, 1), pressure.repeat(frames), (0 * pressure).repeat(frames, 4))
+        return State(
+            torch.zeros_like(self.membrane.rest).repeat(frames, 1, 1), pressure.repeat(frames), (0 * pressure).repeat(frames, 4)
+        )
 
     @piece
-    def coarsened(self, x: Tensor, pressure: Tensor, moved: Tensor) -> State:
-        """Vertices `[B, V, 3]` of every second line, for `coarse`; pressure `[B]`, as far from rest; camera `[B, 4]`."""
-        return State(x.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure - self._above_coarse(), moved)
+    def coarsened(self, u: Tensor, pressure: Tensor, moved: Tensor) -> State:
+        """Displacements `[B, V, 3]` of every second line, for `coarse`; pressure `[B]`, as far from rest; camera `[B, 4]`."""
+        return State(u.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure - self._above_coarse(), moved)
 
     @piece
-    def refined(self, x: Tensor, pressure: Tensor, moved: Tensor) -> State:
+    def refined(self, u: Tensor, pressure: Tensor, moved: Tensor) -> State:
         """What `coarse` found on this grid: the displacement is bicubic between its lines, so that it has no folds there."""
         assert self.coarse is not None  # only called with what it has found
-        u = (x - self.coarse.membrane.rest).unflatten(1, self.coarse.membrane.grid).permute(0, 3, 1, 2)
+        u = u.unflatten(1, self.coarse.membrane.grid).permute(0, 3, 1, 2)
         u = F.interpolate(u, self.membrane.grid, mode="bicubic", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
-        return State(self.membrane.rest + u * self.equations.forces.free, pressure + self._above_coarse(), moved)
+        return State(u * self.equations.forces.free, pressure + self._above_coarse(), moved)
 
     def _above_coarse(self) -> Tensor:
         """By how much the rest pressure is above that of `coarse`, `[]`: every grid has its own."""
@@ -266,19 +268,19 @@ class ForceBalance(nn.Module):
         return self.rest_pressure - self.coarse.rest_pressure
 
     @piece
-    def equilibrium(self, x: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
-        """What this state amounts to; `before`: the surface a step earlier."""
-        membrane, loss = self.membrane, self.equations.loss
-        step = (x - before).square().sum(-1).mean(-1).sqrt() / self.size
-        traction = self.equations.forces(x, pressure) / membrane.rest_area[:, None]
+    def equilibrium(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
+        """What this state amounts to; `before`: the displacement a step earlier."""
+        membrane, loss, x = self.membrane, self.equations.loss, self.membrane.rest + u
+        step = (u - before).square().sum(-1).mean(-1).sqrt() / self.size
+        traction = self.equations.forces(u, pressure) / membrane.rest_area[:, None]
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
         limits, push2 = (self.settings.outlier, self.settings.far * self.coarseness), loss.parts(*within)[2]
-        losses, seen = self.descent.losses(State(x, pressure, moved), *within, measured), measured.weight.sum(-1).clamp_min(1)
+        losses, seen = self.descent.losses(State(u, pressure, moved), *within, measured), measured.weight.sum(-1).clamp_min(1)
         unexplained, pushes = (each / seen for each in losses)
         objective = unexplained + pushes
         gain = self.descent.objective_at_rest(measured) / seen - objective
         scale = 1 + pad_border(loss.contact_scale(push2, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
-        misfit, shared = self.equations.bearings.misfits(x, measured, moved, *limits)
+        misfit, shared = self.equations.bearings.misfits(u, measured, moved, *limits)
         judged = misfit, moved, objective, unexplained, loss.pushed(push2), shared
         return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *judged)
 
@@ -297,7 +299,9 @@ class ForceBalance(nn.Module):
     def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
         """`[B]` bool: settled, likely, no mound for a pit, hardly a marker outside, as beside a contact steps went past."""
         settings, (least, most, untouched) = self.settings, self.settings.likely_objective
-        outlying = self.equations.bearings.outlying(found.vertices, measured, found.moved, settings.far * self.coarseness)
+        outlying = self.equations.bearings.outlying(
+            found.vertices - self.membrane.rest, measured, found.moved, settings.far * self.coarseness
+        )
         likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most)
         pushed = (stands_out(found.reference / self.reference) & ~self.membrane.fixed).any(-1)
         likely = torch.where(pushed, likely, untouched) * self.coarseness**2
@@ -323,10 +327,9 @@ class ForceBalance(nn.Module):
 
     def deviations(self, found: Equilibrium, observation: Observation, contacts: Contacts) -> Deviations:
         """How far off force and depth may be; spread on the grid of `coarse`, which costs little and knows as much."""
-        net, state = self, State(found.vertices, found.pressure, found.moved)
-        if self.coarse is not None:
-            net, state = self.coarse, self.coarsened(*state)
-        force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, found.vertices)
+        u, whole = found.vertices - self.membrane.rest, (found.pressure, found.moved)
+        net, state = (self, State(u, *whole)) if self.coarse is None else (self.coarse, self.coarsened(u, *whole))
+        force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, u)
         with torch.no_grad():
             spread = spreads(net.equations, net.cavity, self.settings, state, observation)
             positions = self.equations.bearings.positions
@@ -343,5 +346,5 @@ class ForceBalance(nn.Module):
             Noise must not change which vertices are pushed, as it does in the shallowest presses and where two answers
             compete; the grid's and the material's errors are not in it.
         """
-        state = State(x, pressure, moved)
+        state = State(x - self.membrane.rest, pressure, moved)
         return standard_deviations(self.equations, self.cavity, self.settings, state, observation, marker_noise)

@@ -45,7 +45,7 @@ class BalanceEquations(nn.Module):
 
     def linearised(
         self,
-        x: Tensor,
+        u: Tensor,
         pressure: Tensor,
         moved: Tensor,
         measured: Bearings,
@@ -57,9 +57,9 @@ class BalanceEquations(nn.Module):
     ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor], CameraMotion, Tensor]:
         """The forces, the normal equations, their loads, the camera's motion and the weights `w_n [B, N]` at a surface; `cone`,
         `curvature` and `memory` as for `TractionLoss.weights`."""
-        at = self.forces.linearised(x, pressure)
+        at = self.forces.linearised(u, pressure)
         W, w_n = self.loss.weights(at.normal, at.force, measured.noise_level, tau, cone, curvature, memory)
-        angle, jacobian = self.bearings.angles(x, measured, moved)
+        angle, jacobian = self.bearings.angles(u, measured, moved)
         weight = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
         normal = self.normal_equations(at, W, jacobian, weight)
         return at, normal, *self.loads(normal, at, angle), self.motion(normal, measured, angle), w_n

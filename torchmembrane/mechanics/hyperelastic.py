@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError
 from ..surface.membrane import Membrane
-from ..surface.stencil import ONE_RING, apply_stencil, convolved, stencil_kernels
+from ..surface.stencil import apply_stencil, convolved, stencil_kernels
 from ..surface.topology import corners, triangles_of
 from .cell_forces import cell_edges, cell_metric, forces_of_stress
-from .metric import adjugate, determinant, edge_vectors, metric, metric_constants, tensile_part
+from .metric import adjugate, determinant, edge_vectors, metric, metric_constants, one_ring_constants, products, tensile_part
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 _FIRST = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -93,6 +93,9 @@ class ElasticEnergy(nn.Module):
     cell_det: Tensor
     cell_first: Tensor
     cell_second: Tensor
+    rest_edges: Tensor
+    rest_sides: Tensor
+    rest_cell_edges: Tensor
 
     def __init__(
         self,
@@ -109,12 +112,13 @@ class ElasticEnergy(nn.Module):
         c2 = modulus / 2 * c2_ratio / (1 + c2_ratio) if model == "mooney_rivlin" else 0.0
         for name, value in (("prestretch", prestretch), ("c1", modulus / 2 - c2), ("c2", c2)):
             self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
-        g = metric(edge_vectors(membrane.rest, self.grid))
+        self.register_buffer("rest_edges", edge_vectors(membrane.rest, self.grid))
+        g = metric(self.rest_edges)
         det = determinant(g)
         self.register_buffer("inverse_metric", adjugate(g) / det)
         self.register_buffer("det", det)
         self.register_buffer("area", det.sqrt() / 2)
-        for name, constant in {**metric_constants(), **_one_ring_constants()}.items():
+        for name, constant in {**metric_constants(), **one_ring_constants()}.items():
             self.register_buffer(name, constant)
         self._register_one_ring(membrane)
         self._register_cells(membrane)
@@ -128,6 +132,7 @@ class ElasticEnergy(nn.Module):
             apply_stencil(x, self.sides, self.grid).unflatten(-1, (3, -1))
             for x in (torch.ones_like(membrane.rest), membrane.rest)
         )
+        self.register_buffer("rest_sides", rest.flatten(-2))
         missing = (beyond != 0).any(0).any(0)
         e1, e2, _ = rest.unbind(-2)
         g11, g12, g22 = (e1 * e1).sum(0), (e1 * e2).sum(0), (e2 * e2).sum(0)
@@ -142,7 +147,8 @@ class ElasticEnergy(nn.Module):
         self.register_buffer("total", torch.ones(1, 3, dtype=torch.float64))
 
     def _register_cells(self, membrane: Membrane) -> None:
-        g11, g12, g22 = cell_metric(cell_edges(membrane.rest, self.grid)).unbind(-4)
+        self.register_buffer("rest_cell_edges", cell_edges(membrane.rest, self.grid))
+        g11, g12, g22 = cell_metric(self.rest_cell_edges).unbind(-4)
         det = g11 * g22 - g12 * g12
         inverse = torch.stack([g22, -g12, g11]) / det
         self.register_buffer("cell_inverse", inverse * torch.tensor([1, 2, 1])[:, None, None, None])
@@ -157,7 +163,9 @@ class ElasticEnergy(nn.Module):
 
     def strain(self, x: Tensor) -> Strain:
         """The strain of `x [..., V, 3]`: of all triangles, `T = 2 (m-1) (n-1)`."""
-        edges = edge_vectors(x, self.grid)
+        return self._strain(edge_vectors(x, self.grid))
+
+    def _strain(self, edges: Tensor) -> Strain:
         g = metric(edges)
         first = (self.twice_12 * self.inverse_metric * g).sum(-2, keepdim=True)
         return Strain(edges, adjugate(g), first, determinant(g) / self.det)
@@ -226,7 +234,19 @@ class ElasticEnergy(nn.Module):
         """`dU/dx`, `[..., V, 3]`: the membrane's forces with opposite sign."""
         if torch.compiler.is_exporting():
             return self.gradient_by_rings(x)
-        edges = cell_edges(x, self.grid)
+        return self._gradient(cell_edges(x, self.grid))
+
+    def gradient_of_displaced(self, u: Tensor) -> Tensor:
+        """`gradient` of the surface that is displaced from rest by `u [..., V, 3]`.
+
+        Its edges are those at rest and the differences of `u`: a float32 that holds positions rounds the strain of a short edge
+        far from the origin more than a slack sheet's tension strains it.
+        """
+        if torch.compiler.is_exporting():
+            return self._gradient_by_rings(self.rest_sides + apply_stencil(u, self.sides, self.grid))
+        return self._gradient(self.rest_cell_edges + cell_edges(u, self.grid))
+
+    def _gradient(self, edges: Tensor) -> Tensor:
         if self.model == "harmonic":
             return forces_of_stress(edges, self.c1 * self.prestretch**2 * self.cell_first)
         g = cell_metric(edges)
@@ -242,8 +262,10 @@ class ElasticEnergy(nn.Module):
 
         `I` is linear in the squared lengths `l` of a triangle's three sides and `D` quadratic (Heron).
         """
-        batch, V = x.shape[:-2], x.shape[-2]
-        e = apply_stencil(x, self.sides, self.grid)
+        return self._gradient_by_rings(apply_stencil(x, self.sides, self.grid))
+
+    def _gradient_by_rings(self, e: Tensor) -> Tensor:
+        batch, V = e.shape[:-2], e.shape[-1] // len(self.sides)
         squared = (self.total @ (e * e)).reshape(*batch, 3, 6 * V)
         dD = self.heron @ squared  # det dD/dl
         D = self.total @ (squared * dD) * self.half_over_det + self.missing
@@ -273,16 +295,16 @@ class ElasticEnergy(nn.Module):
         rows = [[-(ab + ac), ab, ac], [ab.mT, -(ab.mT + bc), bc], [ac.mT, bc.mT, -(ac.mT + bc.mT)]]
         return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
-    def one_ring(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def one_ring(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Inner vertices' forces and tangent stiffness, by their six neighbours: `s [..., 6, N]`, `H [..., 3, 3, 6, N]`.
 
         The force (as `gradient`) is `sum_i s_i (x_i - x_k)` over the six neighbours; its derivative in neighbour `i` is `H_i`,
         in the vertex itself minus the sum of the six.
 
         Args:
-            x: `[..., V, 3]`.
+            u: displacement from rest, `[..., V, 3]`, as for `gradient_of_displaced`.
         """
-        (m, n), pairs = self.grid, self._pairs(self.strain(x))
+        (m, n), pairs = self.grid, self._pairs(self._strain(self.rest_edges + edge_vectors(u, self.grid)))
         planes = pairs.reshape(-1, 6, *_cells(self.grid))
         found = convolved(planes, self.around).reshape(*pairs.shape[:-2], 2, 6, (m - 2) * (n - 2))
         direct, transposed = found.unbind(-3)
@@ -299,10 +321,10 @@ class ElasticEnergy(nn.Module):
         e, adjugate, I, D = strain  # noqa: E741
         w, q = self.derivatives(I, D), self.twice_12 / self.det * adjugate
         stress = 2 * self.area * self.inverse_metric * w.I + 2 * self.area / self.det * w.D * adjugate
-        Q = _outer(q, self.area * w.DD * q) + self.area / self.det * (w.convex_D if positive else w.D) * self.bend
+        Q = products(q, self.area * w.DD * q) + self.area / self.det * (w.convex_D if positive else w.D) * self.bend
         if self.model == "mooney_rivlin":
             p = self.area * w.ID * self.twice_12 * self.inverse_metric
-            Q = Q + _outer(p, q) + _outer(q, p)
+            Q = Q + products(p, q) + products(q, p)
         S = (self.stress_to_pairs @ (tensile_part(stress) if positive else stress))[..., None, :, :]
         T1, T2 = (self.metric_to_pairs @ Q).unflatten(-2, (1, 3, 2, 2)).unbind(-2)
         e1, e2 = e[..., :, None, None, :, :].unbind(-2)
@@ -323,25 +345,5 @@ class ElasticEnergy(nn.Module):
         return 2 * (w.I + w.D)
 
 
-def _outer(a: Tensor, b: Tensor) -> Tensor:
-    """Products of the entries of `[..., 3, T]`, `[..., 9, T]`."""
-    return (a[..., :, None, :] * b[..., None, :, :]).flatten(-3, -2)
-
-
 def _cells(grid: tuple[int, int]) -> tuple[int, int]:
     return grid[0] - 1, grid[1] - 1
-
-
-def _one_ring_constants() -> dict[str, Tensor]:
-    """`around [12, 6, 2, 2]`: of the three pairs in the first and in the second triangles of the quadrilaterals about a vertex
-    those that join it with `ONE_RING`, then those that do so the other way round, whose blocks count `transposed [10]`; `one
-    [9, 1, 1]`, the entries of the unit matrix."""
-    joins = ((0, 0, 0, 1, 1), (1, 1, 0, 1, 1), (1, 0, 1, 1, 1), (2, 2, 0, 0, 1), (2, 1, 1, 1, 1), (3, 2, 1, 0, 0))
-    back = ((0, 2, 1, 1, 0), (3, 0, 0, 0, 1), (4, 1, 0, 0, 0), (4, 0, 1, 0, 0), (5, 2, 0, 0, 0), (5, 1, 1, 1, 0))
-    around = torch.zeros(2, len(ONE_RING), 3, 2, 2, 2, dtype=torch.float64)
-    for way, found in enumerate((joins, back)):
-        for neighbour, pair, triangle, i, j in found:
-            around[way, neighbour, pair, triangle, i, j] = 1.0
-    order = torch.arange(9).unflatten(0, (3, 3)).T.flatten()
-    one = torch.eye(3, dtype=torch.float64).reshape(9, 1, 1)
-    return dict(around=around.flatten(0, 1).flatten(1, 2), transposed=torch.cat([order, torch.tensor([9])]), one=one)

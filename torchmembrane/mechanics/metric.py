@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from ..linalg import symmetric_determinant
+from ..surface.stencil import ONE_RING
 
 
 def edge_vectors(x: Tensor, grid: tuple[int, int]) -> Tensor:
@@ -59,3 +60,25 @@ def tensile_part(stress: Tensor) -> Tensor:
     high, low = (mean + radius).clamp_min(0), (mean - radius).clamp_min(0)
     centre, ratio = (high + low) / 2, (high - low) / (2 * radius)
     return torch.cat([centre + ratio * half, ratio * s12, centre - ratio * half], -2)
+
+
+def one_ring_constants() -> dict[str, Tensor]:
+    """What is constant in sums over the triangles around a vertex.
+
+    `around [12, 6, 2, 2]`: of the three pairs in the first and in the second triangles of the quadrilaterals about a vertex
+    those that join it with `ONE_RING`, then those that do so the other way round, whose blocks count `transposed [10]`; `one
+    [9, 1, 1]`, the entries of the unit matrix."""
+    joins = ((0, 0, 0, 1, 1), (1, 1, 0, 1, 1), (1, 0, 1, 1, 1), (2, 2, 0, 0, 1), (2, 1, 1, 1, 1), (3, 2, 1, 0, 0))
+    back = ((0, 2, 1, 1, 0), (3, 0, 0, 0, 1), (4, 1, 0, 0, 0), (4, 0, 1, 0, 0), (5, 2, 0, 0, 0), (5, 1, 1, 1, 0))
+    around = torch.zeros(2, len(ONE_RING), 3, 2, 2, 2, dtype=torch.float64)
+    for way, found in enumerate((joins, back)):
+        for neighbour, pair, triangle, i, j in found:
+            around[way, neighbour, pair, triangle, i, j] = 1.0
+    order = torch.arange(9).unflatten(0, (3, 3)).T.flatten()
+    one = torch.eye(3, dtype=torch.float64).reshape(9, 1, 1)
+    return dict(around=around.flatten(0, 1).flatten(1, 2), transposed=torch.cat([order, torch.tensor([9])]), one=one)
+
+
+def products(a: Tensor, b: Tensor) -> Tensor:
+    """Of the entries of `[..., 3, T]`, each with each: `[..., 9, T]`."""
+    return (a[..., :, None, :] * b[..., None, :, :]).flatten(-3, -2)
