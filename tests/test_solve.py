@@ -161,6 +161,23 @@ def test_an_eigenvalue_that_rounding_left_below_zero_breaks_no_iterated_root():
     torch.testing.assert_close(others, torch.ones_like(others), rtol=0, atol=1e-3)
 
 
+@pytest.mark.parametrize("below", [1.1, 2.0, 50.0])
+def test_a_leaf_that_rounding_left_far_from_positive_gets_the_root_of_a_diagonal_above_it(below):
+    """Beside one that is positive, which keeps its own."""
+    generator = torch.Generator().manual_seed(0)
+    Q = torch.linalg.qr(torch.randn(46, 46, generator=generator, dtype=torch.float64)).Q
+    eigenvalues = torch.logspace(-3, 0, 46, dtype=torch.float64)
+    positive = Q @ torch.diag(eigenvalues) @ Q.T
+    eigenvalues[0] = -below * RIDGE * positive.abs().sum(-1).max()
+    matrix = torch.stack([positive, Q @ torch.diag(eigenvalues) @ Q.T])
+    alone, (kept, found) = by_products(positive.float()), by_products(matrix.float()).double()
+    torch.testing.assert_close(kept, alone.double())
+    assert found.isfinite().all()
+    bound = torch.linalg.inv(found.T @ found)
+    if below >= 2:  # a little below, the ridge may do
+        assert torch.linalg.eigvalsh(bound - matrix[1]).min() > -1e-6
+
+
 def test_steps_with_their_numbers_folded_are_the_scaled_steps():
     """Of one eigenvalue: `T = (3 - s z y) sqrt(s) / 2, y <- y T, z <- T z`, to `z = y^-1/2`."""
     folded, scales, eigenvalue = Iteration.to(1e4, 1e-12), iteration_scales(1e4, 1e-12), 3e-3

@@ -9,7 +9,8 @@ as well, `T = (3 I - Z Y) / 2, Y <- Y T, Z <- T Z` from `Y = A, Z = I` to `Z = A
 6.35), with `Z Y` scaled in between so that its eigenvalues, which go to 1, do so evenly. Rounding may have left an eigenvalue
 below zero, from which that diverges: so it is the root of `A` with a ridge, and its last steps, `R <- (3 I - R A R^T) R / 2`,
 with `A` itself take that back, but where there is little else. They are as near to a root as Cholesky factors are, and do not
-diverge from a `R` near one.
+diverge from a `R` near one. An eigenvalue further below zero than the ridge makes them diverge: then the root is that of a
+diagonal above `A` (Gershgorin), as if something had been added to this leaf; what is solved stays a direction of descent.
 """
 
 import math
@@ -27,6 +28,7 @@ ITERATED_LEAF = 48
 RIDGE = 1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor or is iterated (float32: rounding's share)
 NEAR_ONE = 0.1  # eigenvalues of R A R^T are 1 but for this before the last steps, each of which squares it
 LAST_STEPS = 3
+LARGEST_ENTRY = 10.0  # of R, over that of the root of a ridge alone: more is divergence
 LARGEST_SCALE = 2.8  # of eigenvalues up to 1; near 3 an iteration would make all of them small
 
 
@@ -60,7 +62,8 @@ def by_products(matrix: Tensor) -> Tensor:
     if matrix.shape[-1] > ITERATED_LEAF:
         return _by_halves(matrix, by_products)
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    largest = matrix.abs().sum(-1).amax(-1)[..., None, None]
+    rows = matrix.abs().sum(-1, keepdim=True)
+    largest = rows.amax(-2, keepdim=True)
     ridge = RIDGE * torch.finfo(matrix.dtype).eps / torch.finfo(torch.float32).eps
     iteration = Iteration.to(1 / ridge, NEAR_ONE)
     A = matrix / largest
@@ -73,7 +76,8 @@ def by_products(matrix: Tensor) -> Tensor:
     R = iteration.last * Z
     for _ in range(LAST_STEPS):
         R = (1.5 * one - (0.5 * R) @ A @ R.mT) @ R
-    return largest.rsqrt() * R
+    is_root = R.abs().amax((-2, -1), keepdim=True) < LARGEST_ENTRY / ridge**0.5
+    return torch.where(is_root, largest.rsqrt() * R, rows.rsqrt() * one)
 
 
 def _by_halves(matrix: Tensor, inverse_root: Callable[[Tensor], Tensor]) -> Tensor:
