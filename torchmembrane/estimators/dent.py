@@ -31,7 +31,7 @@ TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle
 Schedule = list[tuple[float, float]]
 Found = tuple[State, Tensor]
 Stepped = Sequence[Tensor]
-"""A `State`, and the surface a step before."""
+"""A `State`, and the displacement a step before."""
 
 
 class Dent(nn.Module):
@@ -96,8 +96,9 @@ class Dent(nn.Module):
 
     def sought(self, quick: State, slow: State, rest: State, measured: Bearings, schedule: Schedule) -> Found:
         """The best of what the steps of a schedule make of several dents in two states and of two states found from `rest` on
-        this grid, and the surface a step before; the first of those that are about as good, for answers must not jump between
-        them. The two from rest: by a sharp loss from the start, and without a cone, where shear is dear even under a push."""
+        this grid, and the displacement a step before; the first of those that are about as good, for answers must not jump
+        between them. The two from rest: by a sharp loss from the start, and without a cone, where shear is dear even under a
+        push."""
         settings = self.descent.settings
         steps = 2 * settings.steps
         starts = [
