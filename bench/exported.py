@@ -91,8 +91,8 @@ def seconds(call, scale: float, repeats: int = 20) -> dict[str, float]:
 
 
 def given(reconstructor, images, tracking: bool) -> tuple[dict[str, np.ndarray], tm.Reconstruction | None]:
-    """A model's inputs, and the result whose dots it follows."""
-    if not tracking:
+    """A model's inputs, and the result whose dots it follows; a texture is not followed."""
+    if not (tracking and reconstructor.observer.locator.follows):
         return {"image": images.numpy()}, None
     with torch.no_grad():
         before = reconstructor(images)

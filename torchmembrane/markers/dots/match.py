@@ -179,8 +179,8 @@ class DotMatcher(nn.Module):
     def sure(
         self, weight: Tensor, flow: Tensor, strain: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What the dots that are found say, however they were: the same to the last digit whether followed or searched for; and
-        in which frames `[B]` all are found, so that none can be on another's blob."""
+        """What the dots that are found say, the same to the last digit whether they were followed or searched for; and in which
+        frames `[B]` all are found, so that none can be on another's blob."""
         complete = (weight >= KEPT).all(-1)
         weight, flow, strain = self.from_sure(weight, flow, strain, *self.unstrained(blobs, log_radius, valid))
         return weight, flow, self.averages.gradient(weight, flow, strain), complete
