@@ -14,6 +14,7 @@ from ..solve.implicit import differentiable
 from ..solve.kkt import border_unknowns
 from ..surface.stencil import inner
 from .bearings import Bearings
+from .native import NativeSteps, takes
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
 from .robust import Cauchy
@@ -57,6 +58,7 @@ class Descent(nn.Module):
         self.equations, self.cavity, self.settings = equations, cavity, settings
         self.membrane = equations.forces.membrane
         self.inner_grid = self.membrane.grid[0] - 2, self.membrane.grid[1] - 2
+        self.native = NativeSteps()
 
     def forward(
         self,
@@ -169,6 +171,9 @@ class Descent(nn.Module):
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.
 
         With gradients every step is: those of a nested region come with strides that torch 2.13 does not follow."""
+        if takes(*state, weights, *measured, self.equations.forces.elasticity.prestretch):
+            *taken, weights = self.native.take(self.equations, self.cavity, self.settings, state, weights, measured, scales)
+            return State(*taken), weights
         numbers = Scales(*(torch.as_tensor(scale, dtype=state.u.dtype, device=state.u.device) for scale in scales))
         unrolled = torch.compiler.is_exporting() or torch.is_grad_enabled()
         step = self.step if unrolled else self._compiled_once
