@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..mechanics.cavity import CavityLaw
-from ..mechanics.native_membrane import surface_of
+from ..mechanics.native_membrane import Surface, linearise, surface_of
 from .bearings import Bearings
 from .native_step import Constants, Numbers, Workspace, steps, workspace
 from .normal_equations import BalanceEquations
@@ -86,6 +86,7 @@ def takes(*values: Any) -> bool:
 def _constants(equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings) -> Constants:
     forces, loss, bearings = equations.forces, equations.loss, equations.bearings
     absolute, gas = cavity.gas.tolist()
+    surface = surface_of(forces.membrane, forces.elasticity, forces.rest_load)
     numbers = Numbers(
         reference=loss.reference,
         size=loss.size,
@@ -104,6 +105,7 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, settings: ForceBa
         longest_step=settings.longest_step,
         largest_stretch=settings.largest_stretch,
         rest_pressure=float(cavity.rest_pressure),
+        rest_volume=_volume(surface),
         is_open=cavity.filling == "open",
         is_gas=cavity.filling == "gas",
         absolute=absolute,
@@ -111,7 +113,7 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, settings: ForceBa
     )
     surroundings, wider = loss.surroundings.contiguous().numpy(), loss.wider.contiguous().numpy()
     return Constants(
-        surface_of(forces.membrane, forces.elasticity, forces.rest_load),
+        surface,
         loss.area.numpy(),
         surroundings,
         _within(surroundings),
@@ -123,6 +125,14 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, settings: ForceBa
         _sparse(bearings.vertex_shares.numpy(), 3),
         numbers,
     )
+
+
+def _volume(surface: Surface) -> float:
+    """At rest, rounded as in steps."""
+    still = np.zeros_like(surface.rest)
+    fields = np.zeros_like(still), np.zeros((3, 21, *still.shape[:2]), still.dtype), np.zeros_like(still)
+    volume: float = linearise(surface, still, still[0, 0, :1], *fields)
+    return volume
 
 
 def _within(rows: np.ndarray) -> np.ndarray:

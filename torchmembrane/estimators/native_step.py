@@ -10,15 +10,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..mechanics.native_membrane import STENCIL, Surface, linearise
-from ..solve.native_band import LANES, RANK, backward, compiled, factor, forward, storage
+from ..solve.native_band import LANES, RANK, backward, compiled, factor, storage
+from ..solve.stencil_layouts import OFFSETS
 from .camera_motion import RARE
 from .traction_loss import POWER, TINY
 
 RIDGES = (0.0, 1e-6, 1e-5, 1e-4)
 """Added, one instead of the other, to a diagonal about 1 of a matrix that rounding has left without a factor."""
+BETWEEN = tuple(tuple(OFFSETS.index((b[0] - a[0], b[1] - a[1])) if b >= a else -1 for b in STENCIL) for a in STENCIL)
+"""Of two vertices of a stencil, the offset from one to a later one."""
 LOADS = 7
-NOTHING = 1e-22
-"""Of what is summed, beside `TINY`."""
+NOTHING = 1e-12
+"""Of the share of a vertex in a mean that does not count below `(far_share / scale_share)^(2 POWER)`, some 1e-4."""
 
 
 class Constants(NamedTuple):
@@ -64,6 +67,7 @@ class Numbers(NamedTuple):
     longest_step: float
     largest_stretch: float
     rest_pressure: float
+    rest_volume: float
     is_open: bool
     is_gas: bool
     absolute: float
@@ -77,12 +81,16 @@ class Workspace(NamedTuple):
     """`[m, n, 3]`; as `volume`, the volume's gradient."""
     volume: Any
     A: Any
-    """`[m, n, 3, 21]`, the tangent stiffness; its rows once weighted: `weighted [3, 24]`."""
+    """`[3, 21, m, n]`, the tangent stiffness; weighted: `weighted [3, 21, V]`."""
     weighted: Any
+    W: Any
+    """`[3, 3, V]`"""
+    of_loads: Any
+    """`[3, 2, V]`, forces and the fluid's, weighted."""
+    sums: Any
+    """`[90, V]`, blocks of the matrix."""
     normal: Any
     """`[N, 3]`"""
-    W: Any
-    """`[N, 3, 3]`"""
     fields: Any
     """`[4, N]`"""
     blocks: Any
@@ -94,6 +102,8 @@ class Workspace(NamedTuple):
     scale: Any
     loads: Any
     """`[7, 3 N]`: of the volume, the forces, the fluid, the camera's four motions."""
+    y: Any
+    """`[8 x 3 N]`, loads and then solutions as `native_band` takes them, one zero."""
     width: int
     """Diagonals of the matrix above the main one."""
 
@@ -103,10 +113,12 @@ def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
     m, n = grid
     N, width = (m - 2) * (n - 2), 3 * (2 * (n - 2) + 2) + 2  # to two lines, two vertices and two components further
     unknowns, rows, ld = storage(3 * N, width)
-    shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(m, n, 3, 21), weighted=(3, 24), normal=(N, 3), W=(N, 3, 3))
+    shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, m, n), weighted=(3, 21, m * n), W=(3, 3, m * n))
+    shapes |= dict(of_loads=(3, 2, m * n), sums=(90, m * n), normal=(N, 3))
     shapes |= dict(fields=(4, N), blocks=(markers, 3, 3), inverse=(unknowns,), panel=(RANK * ld,), scale=(unknowns,))
     arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
-    return Workspace(U=_aligned(rows * ld, dtype), loads=np.zeros((LOADS, unknowns), dtype), width=width, **arrays)
+    y = _aligned(RANK * unknowns, dtype)
+    return Workspace(U=_aligned(rows * ld, dtype), y=y, loads=np.zeros((LOADS, unknowns), dtype), width=width, **arrays)
 
 
 def _aligned(size: int, dtype: Any) -> Any:
@@ -125,23 +137,25 @@ def step(c, work, u, pressure, moved, before, origins, across, weight, noise_lev
     tau, outlier, cone, renewal, damping = scales
     k, (m, n) = c.numbers, c.surface.free.shape
     width, ld, unknowns = work.width, len(work.panel) // RANK, len(work.inverse)
-    rise = linearise(c.surface, u, pressure[0], work.force, work.A, work.volume)
+    rise = -c.numbers.rest_volume + linearise(c.surface, u, pressure, work.force, work.A, work.volume)
     _weigh(c, work, before, noise_level, tau, cone, renewal)
-    own, slope, products = np.zeros((4, 4)), np.zeros(4), np.zeros((LOADS, LOADS))
+    y, own, slope, products = work.y, np.zeros((4, 4)), np.zeros(4), np.zeros((LOADS, LOADS))
     fWv, vWv = _load_forces(c, work)
     _load_markers(c, work, u, moved, origins, across, weight, motion, outlier, own, slope)
+    _sum_blocks(c, work)
     for ridge in RIDGES:
-        _assemble(c, work, ld, damping, ridge)
-        if factor(work.U, ld, width, unknowns, work.inverse, work.panel):
+        _fill(c, work, ld, damping, ridge)
+        for a in range(LOADS):
+            for i in range(unknowns):
+                y[a * unknowns + i] = work.loads[a, i] * work.scale[i]
+        if factor(work.U, ld, width, unknowns, work.inverse, work.panel, y):
             break
     else:
-        work.loads[:] = np.nan
-    loads = work.loads
-    loads *= work.scale
-    forward(work.U, ld, width, unknowns, work.inverse, loads)
+        y[:] = np.nan
     for a in range(LOADS):
         for b in range(a + 1):
-            products[a, b] = products[b, a] = _dot(loads[a], loads[b])
+            of_b = y[b * unknowns : (b + 1) * unknowns]
+            products[a, b] = products[b, a] = _dot(y[a * unknowns : (a + 1) * unknowns], of_b)
     play = k.camera_motion * (min(tau, k.first_tau) / k.last_tau) ** 2
     stiffness = RARE / (play**2 + _dot(moved, moved))
     for a in range(4):
@@ -149,14 +163,13 @@ def step(c, work, u, pressure, moved, before, origins, across, weight, noise_lev
         slope[a] += stiffness * moved[a]
     following = _camera_eliminated(products, own, slope)
     multiplier, one, change = _shares(k, products, rise, pressure[0], fWv, vWv, gauge)
-    solved = loads[0]
+    solved, turn = y[:unknowns], np.empty_like(moved)
     for i in range(unknowns):
-        solved[i] = multiplier * loads[0, i] + one * loads[1, i] + change * loads[2, i]
-    turn = np.empty_like(moved)
+        solved[i] = multiplier * y[i] + one * y[unknowns + i] + change * y[2 * unknowns + i]
     for a in range(4):
         turn[a] = multiplier * following[a, 0] + one * following[a, 1] + change * following[a, 2]
         for i in range(unknowns):
-            solved[i] += turn[a] * loads[3 + a, i]
+            solved[i] += turn[a] * y[(3 + a) * unknowns + i]
     backward(work.U, ld, width, unknowns, work.inverse, solved)
     solved *= -work.scale
     move = solved[: 3 * (m - 2) * (n - 2)].reshape((m - 2, n - 2, 3))
@@ -181,15 +194,14 @@ def _weigh(c, work, before, noise_level, tau, cone, renewal):
     q_n, shear2, push2, around = work.fields
     for i in range(N):
         p, q = i // (n - 2) + 1, i % (n - 2) + 1
-        v, f = work.volume[p, q], work.force[p, q]
-        length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+        square, along, across2 = 0.0, 0.0, 0.0
         for a in range(3):
-            work.normal[i, a] = v[a] / length if length > 0 else v[a]
-        normal = work.normal[i]
-        along = f[0] * normal[0] + f[1] * normal[1] + f[2] * normal[2]
-        across2 = 0.0
+            square += work.volume[p, q, a] ** 2
         for a in range(3):
-            across2 += (f[a] - along * normal[a]) ** 2
+            work.normal[i, a] = work.volume[p, q, a] / np.sqrt(square)
+            along += work.force[p, q, a] * work.normal[i, a]
+        for a in range(3):
+            across2 += (work.force[p, q, a] - along * work.normal[i, a]) ** 2
         unit = c.area[i] * k.reference
         q_n[i], shear2[i] = along / unit, across2 / unit**2
     push2[:] = 0
@@ -208,6 +220,7 @@ def _weigh(c, work, before, noise_level, tau, cone, renewal):
     for i in range(N):
         expected = top * max(around[i], TINY) ** (1 / POWER) * k.scale_share**2
         expected = max(expected, top * k.far_share**2, (k.noise_share * noise_level * c.push_noise[i]) ** 2)
+        at = (i // (n - 2) + 1) * n + i % (n - 2) + 1
         rho2 = min(max(expected / k.last_tau**2, least), 1.0)
         pushed = push2[i] / rho2
         w_n = k.floor + ((1 + pushed / tau**2) ** -2 if q_n[i] < 0 else 1.0)
@@ -216,8 +229,8 @@ def _weigh(c, work, before, noise_level, tau, cone, renewal):
         scale = k.sparsity / (k.reference * k.size) ** 2 / c.area[i] / rho2
         for a in range(3):
             for b in range(3):
-                work.W[i, a, b] = scale * (w_n - w_t) * work.normal[i, a] * work.normal[i, b]
-            work.W[i, a, a] += scale * w_t
+                work.W[a, b, at] = scale * (w_n - w_t) * work.normal[i, a] * work.normal[i, b]
+            work.W[a, a, at] += scale * w_t
         before[i] = w_n
 
 
@@ -233,29 +246,41 @@ def _add(total, row, share, within):
 def _load_forces(c, work):
     """`BalanceEquations.loads` of the forces; `f W v` and `v W v`."""
     m, n = c.surface.free.shape
-    loads, of_f, of_v, fWv, vWv = work.loads, np.zeros(3), np.zeros(3), 0.0, 0.0
-    loads[:] = 0
+    V, loads, of_loads, fWv, vWv = m * n, work.loads, work.of_loads, 0.0, 0.0
+    loads[:], of_loads[:] = 0, 0
     for i in range(1, m - 1):
         for j in range(1, n - 1):
-            if not c.surface.free[i, j]:
-                continue
-            k = (i - 1) * (n - 2) + j - 1
-            f, v, W, A = work.force[i, j], work.volume[i, j], work.W[k], work.A[i, j]
-            for a in range(3):
-                of_f[a] = W[a, 0] * f[0] + W[a, 1] * f[1] + W[a, 2] * f[2]
-                of_v[a] = W[a, 0] * v[0] + W[a, 1] * v[1] + W[a, 2] * v[2]
-                fWv += of_f[a] * v[a]
-                vWv += of_v[a] * v[a]
-                loads[0, 3 * k + a] = v[a]
+            if c.surface.free[i, j]:
+                k, at = (i - 1) * (n - 2) + j - 1, i * n + j
+                for a in range(3):
+                    for b in range(3):
+                        of_loads[a, 0, at] += work.W[a, b, at] * work.force[i, j, b]
+                        of_loads[a, 1, at] -= work.W[a, b, at] * work.volume[i, j, b]
+                    fWv += of_loads[a, 0, at] * work.volume[i, j, a]
+                    vWv -= of_loads[a, 1, at] * work.volume[i, j, a]
+                    loads[0, 3 * k + a] = work.volume[i, j, a]
+    A, first, count, sums = work.A.reshape((3, 21, V)), n + 1, V - 2 * n - 2, work.sums
+    for load in range(2):
+        for d in range(3):
+            sums[d] = 0
             for s in range(7):
-                p, q = i + STENCIL[s][0], j + STENCIL[s][1]
-                if 0 < p < m - 1 and 0 < q < n - 1:
-                    at = 3 * ((p - 1) * (n - 2) + q - 1)
-                    for d in range(3):
-                        x, y, z = A[0, 3 * s + d], A[1, 3 * s + d], A[2, 3 * s + d]
-                        loads[1, at + d] += x * of_f[0] + y * of_f[1] + z * of_f[2]
-                        loads[2, at + d] -= x * of_v[0] + y * of_v[1] + z * of_v[2]
+                at = first - STENCIL[s][0] * n - STENCIL[s][1]
+                _add_products(sums[d], first, count, A, 3 * s + d, of_loads, load, at)
+        for k in range((m - 2) * (n - 2)):
+            at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
+            for d in range(3):
+                loads[1 + load, 3 * k + d] = sums[d, at]
     return fWv, vWv
+
+
+@compiled
+def _add_products(total, first, count, a, of_a, b, of_b, at):
+    """`total[first + k] += sum_c a[c, of_a, at + k] b[c, of_b, at + k]`, of `count` vertices."""
+    out = total[first : first + count]
+    a0, a1, a2 = a[0, of_a, at : at + count], a[1, of_a, at : at + count], a[2, of_a, at : at + count]
+    b0, b1, b2 = b[0, of_b, at : at + count], b[1, of_b, at : at + count], b[2, of_b, at : at + count]
+    for k in range(count):
+        out[k] += a0[k] * b0[k] + a1[k] * b1[k] + a2[k] * b2[k]
 
 
 @compiled
@@ -301,59 +326,56 @@ def _load_markers(c, work, u, moved, origins, across, weight, motion, outlier, o
 
 
 @compiled
-def _assemble(c, work, ld, damping, ridge):
-    """`A^T W A` and the markers' blocks in `U`, scaled from both sides by `scale` to a diagonal of 1, the ridge added to it."""
-    (m, n), U, (corners, pulls) = c.surface.free.shape, work.U, c.corners
-    N, scale, WA = (m - 2) * (n - 2), work.scale, work.weighted
-    places = np.empty(7, np.int64)
-    U[:] = 0
-    for i in range(1, m - 1):
-        for j in range(1, n - 1):
-            if not c.surface.free[i, j]:
-                continue
-            W, A = work.W[(i - 1) * (n - 2) + j - 1], work.A[i, j]
+def _sum_blocks(c, work):
+    """`A^T W A` and the markers' blocks in `sums [10 3 3, V]`: between the vertices and those at `OFFSETS`."""
+    (m, n), (corners, pulls) = c.surface.free.shape, c.corners
+    V, sums, WA = m * n, work.sums, work.weighted
+    A, W, first, count = work.A.reshape((3, 21, V)), work.W, n + 1, V - 2 * n - 2
+    WA[:], sums[:] = 0, 0
+    for a in range(3):
+        for t in range(21):
+            _add_products(WA[a, t], 0, V, W, a, A, t, 0)
+    for s in range(7):
+        at = first - STENCIL[s][0] * n - STENCIL[s][1]
+        for other in range(s, 7):
+            block = 9 * BETWEEN[s][other]
             for a in range(3):
-                for t in range(21):
-                    WA[a, t] = W[a, 0] * A[0, t] + W[a, 1] * A[1, t] + W[a, 2] * A[2, t]
-            for s in range(7):
-                p, q = i + STENCIL[s][0], j + STENCIL[s][1]
-                places[s] = 3 * ((p - 1) * (n - 2) + q - 1) if 0 < p < m - 1 and 0 < q < n - 1 else -1
-            for s in range(7):
-                if places[s] < 0:
-                    continue
-                for a in range(3):
-                    r = places[s] + a
-                    at = r * ld - r // LANES * LANES
-                    x, y, z = A[0, 3 * s + a], A[1, 3 * s + a], A[2, 3 * s + a]
-                    for other in range(s, 7):
-                        if places[other] >= 0:
-                            for b in range(a if other == s else 0, 3):
-                                t = 3 * other + b
-                                U[at + places[other] + b] += x * WA[0, t] + y * WA[1, t] + z * WA[2, t]
+                for b in range(3):
+                    _add_products(sums[block + 3 * a + b], first, count, A, 3 * s + a, WA, 3 * other + b, at)
     for d in range(len(work.blocks)):
         for s in range(3):
             for other in range(3):
-                share = pulls[d, s] * pulls[d, other]
-                if share != 0 and corners[d, other] >= corners[d, s]:
+                share, k, further = pulls[d, s] * pulls[d, other], corners[d, s], corners[d, other] - corners[d, s]
+                if share != 0 and further >= 0:
+                    block = 9 * (further if further < 2 else further - (n - 2) + 2)
+                    at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
                     for a in range(3):
-                        r = 3 * corners[d, s] + a
-                        at = r * ld - r // LANES * LANES
-                        for b in range(a if other == s else 0, 3):
-                            U[at + 3 * corners[d, other] + b] += share * work.blocks[d, a, b]
-    for r in range(len(scale)):
-        diagonal = U[r * ld + r % LANES]
-        scale[r] = 1 / np.sqrt(diagonal * (1 + damping)) if diagonal > 0 else 1.0
-    for k in range(N):
-        i, j = k // (n - 2), k % (n - 2)
-        for further in range(3):
-            if i + further >= m - 2:
-                break
-            first, last = max(j - 1, 0) if further == 1 else j, min(j + 2, n - 3)
-            first, last = 3 * ((i + further) * (n - 2) + first), 3 * ((i + further) * (n - 2) + last) + 3
-            for r in range(3 * k, 3 * k + 3):
-                at = r * ld - r // LANES * LANES
-                for column in range(max(first, r + 1), last):
-                    U[at + column] *= scale[r] * scale[column]
+                        for b in range(3):
+                            sums[block + 3 * a + b, at] += share * work.blocks[d, a, b]
+
+
+@compiled
+def _fill(c, work, ld, damping, ridge):
+    """The matrix of the blocks in `U`, scaled from both sides by `scale` to a diagonal of 1, the ridge added to it."""
+    (m, n), U, sums, scale = c.surface.free.shape, work.U, work.sums, work.scale
+    scale[:], U[:] = 1, 0
+    for k in range((m - 2) * (n - 2)):
+        at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
+        for a in range(3):
+            if sums[4 * a, at] > 0:
+                scale[3 * k + a] = 1 / np.sqrt(sums[4 * a, at] * (1 + damping))
+    for i in range(m - 2):
+        for j in range(n - 2):
+            k, at = i * (n - 2) + j, (i + 1) * n + j + 1
+            for block in range(10):
+                p, q = i + OFFSETS[block][0], j + OFFSETS[block][1]
+                if p < m - 2 and 0 <= q < n - 2:
+                    column = 3 * (p * (n - 2) + q)
+                    for a in range(3):
+                        r = 3 * k + a
+                        start = r * ld - r // LANES * LANES + column
+                        for b in range(a if block == 0 else 0, 3):
+                            U[start + b] = sums[9 * block + 3 * a + b, at] * scale[r] * scale[column + b]
     for r in range(len(scale)):
         U[r * ld + r % LANES] = 1 + ridge
 

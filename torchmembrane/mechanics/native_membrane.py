@@ -13,14 +13,12 @@ from ..surface.membrane import Membrane
 from .hyperelastic import ElasticEnergy
 
 STENCIL = ((-1, -1), (-1, 0), (0, -1), (0, 0), (0, 1), (1, 0), (1, 1))
-"""A vertex and its six neighbours, in the order of the vertices: blocks of `A`."""
-OWN = 3
-TRIANGLES = (((0, 0), (1, 0), (1, 1)), ((0, 0), (1, 1), (0, 1)))
-"""Of a quadrilateral, by the places of their vertices."""
-PLACES = tuple(
-    tuple(tuple(STENCIL.index((q[0] - p[0], q[1] - p[1])) for q in triangle) for p in triangle) for triangle in TRIANGLES
-)
-"""Of the third index' vertex in the stencil of the second's, of either triangle."""
+"""A vertex and its six neighbours, in the order of the vertices: the blocks of `A`. Opposite ones add up to `LAST`."""
+OWN, LAST = 3, 6
+TRIANGLES = (((1, 0), (1, 1)), ((1, 1), (0, 1)))
+"""Of a quadrilateral: where their second and third vertices are from the first."""
+PAIRS = ((5, 6, 4), (6, 4, 5))
+"""Of their vertices 1 and 2, 1 and 3, 2 and 3 (in the second 3 and 2): the later one in the stencil of the other."""
 
 
 class Surface(NamedTuple):
@@ -40,16 +38,15 @@ class Surface(NamedTuple):
     """`[2, m-1, n-1]`"""
     area: Any
     """`[2, m-1, n-1]`"""
-    law: tuple[float, float, float, float]
-    """`c1 l^2, c1 / l^4, c2 / l^2, c2 l^4`, the second zero where the energy is harmonic."""
-    outward: float
+    law: Any
+    """`[5]`: `c1 l^2, c1 / l^4, c2 / l^2, c2 l^4`, the second zero where the energy is harmonic; a sixth, the outward sign."""
 
 
 def surface_of(membrane: Membrane, elasticity: ElasticEnergy, load: Any) -> Surface:
     """Of a membrane and its material; `load`: the rest load `[V, 3]`."""
     m, n = membrane.grid
     l2, c1, c2 = (float(value) for value in (elasticity.prestretch**2, elasticity.c1, elasticity.c2))
-    law = c1 * l2, 0.0 if elasticity.model == "harmonic" else c1 / l2**2, c2 / l2, c2 * l2**2
+    law = [c1 * l2, 0.0 if elasticity.model == "harmonic" else c1 / l2**2, c2 / l2, c2 * l2**2, membrane.outward / 6]
     vertices = (m, n, 3)
     cells = (2, m - 1, n - 1)
     return Surface(
@@ -60,132 +57,147 @@ def surface_of(membrane: Membrane, elasticity: ElasticEnergy, load: Any) -> Surf
         elasticity.inverse_metric.numpy().reshape(3, *cells),
         elasticity.det.numpy().reshape(cells),
         elasticity.area.numpy().reshape(cells),
-        law,
-        float(membrane.outward),
+        np.array(law, membrane.rest.numpy().dtype),
     )
 
 
 @compiled
 def linearise(surface, u, pressure, force, A, volume):
-    """The contact force, its tangent stiffness and the gradient of the volume, at the inner vertices; by how much the volume is
-    above that at rest.
+    """The contact force, its tangent stiffness and the gradient of the volume, at the inner vertices; the volume.
 
-    `u [m, n, 3]` the displacement; `force [m, n, 3]`, `A [m, n, 3, 21]` (of a component, in the components of the stencil's
-    vertices) and `volume [m, n, 3]` are filled, at the border with what is half a sum. `A` is zero in vertices that are not free.
+    `u [m, n, 3]` the displacement, `pressure [1]`; `force [m, n, 3]`, `A [3, 21, m, n]` (of a component, in the components of the
+    stencil's vertices) and `volume [m, n, 3]` are filled, at the border with what is half a sum. `A` is zero at and in
+    vertices that are not free.
     """
     m, n = surface.free.shape
-    sixth = surface.outward / 6
-    e, of_I, of_D, spin = np.empty((2, 3), u.dtype), np.empty((2, 3), u.dtype), np.empty((2, 3), u.dtype), np.empty(3, u.dtype)
-    H, around = np.empty((3, 3, 3, 3), u.dtype), np.empty((3, 3), u.dtype)
+    e, spin, by_edge = np.empty((2, 3), u.dtype), np.empty(3, u.dtype), np.empty((4, 3), u.dtype)
     force[:] = -surface.load
     A[:], volume[:] = 0, 0
-    rise = 0.0
+    sixth, enclosed = surface.law[4], 0.0
     for i in range(m - 1):
         for j in range(n - 1):
             for t in range(2):
-                corners, places = TRIANGLES[t], PLACES[t]
-                i1, j1, i2, j2 = i + corners[1][0], j + corners[1][1], i + corners[2][0], j + corners[2][1]
-                now, rest = 0.0, 0.0
+                (i1, j1), (i2, j2) = TRIANGLES[t]
+                i1, j1, i2, j2 = i + i1, j + j1, i + i2, j + j2
                 for c in range(3):
                     e[0, c] = surface.edges[c, 0, t, i, j] + (u[i1, j1, c] - u[i, j, c])
                     e[1, c] = surface.edges[c, 1, t, i, j] + (u[i2, j2, c] - u[i, j, c])
                 for c in range(3):
                     p, q = (c + 1) % 3, (c + 2) % 3
                     spin[c] = sixth * (e[0, p] * e[1, q] - e[0, q] * e[1, p])
-                    x, y = surface.edges[p, 0, t, i, j], surface.edges[q, 1, t, i, j]
-                    z, w = surface.edges[q, 0, t, i, j], surface.edges[p, 1, t, i, j]
-                    rest += surface.rest[i, j, c] * sixth * (x * y - z * w)
-                    now += (surface.rest[i, j, c] + u[i, j, c]) * spin[c]
-                rise += now - rest
-                s11, s12, s22 = _second_derivatives(surface, t, i, j, e, of_I, of_D, H)
-                _less_fluid(H, e, sixth * pressure)
+                    enclosed += (surface.rest[i, j, c] + u[i, j, c]) * spin[c]
+                i_later, j_later = (i1, j1) if t == 0 else (i2, j2)
+                s11, s12, s22 = _stiffness(surface, t, i, j, i_later, j_later, e, sixth * pressure[0], by_edge, A)
                 for c in range(3):
                     first = s11 * e[0, c] + s12 * e[1, c]
                     other = s12 * e[0, c] + s22 * e[1, c]
-                    of_fluid = pressure * spin[c]
+                    of_fluid = pressure[0] * spin[c]
                     force[i, j, c] -= first + other + of_fluid
                     force[i1, j1, c] += first - of_fluid
                     force[i2, j2, c] += other - of_fluid
                     volume[i, j, c] += spin[c]
                     volume[i1, j1, c] += spin[c]
                     volume[i2, j2, c] += spin[c]
-                for a in range(3):
-                    row = A[i + corners[a][0], j + corners[a][1]]
-                    for b in range(3):
-                        at = 3 * places[a][b]
-                        for c in range(3):
-                            for d in range(3):
-                                row[c, at + d] += H[a, b, c, d]
-    for i in range(m):
-        for j in range(n):
-            for s in range(7):
-                p, q = i + STENCIL[s][0], j + STENCIL[s][1]
-                if not (surface.free[i, j] and 0 <= p < m and 0 <= q < n and surface.free[p, q]):
-                    A[i, j, :, 3 * s : 3 * s + 3] = 0
-            if not surface.free[i, j]:
-                force[i, j] = 0
-    return rise
+    _complete(surface.free, force, A)
+    return enclosed
 
 
 @compiled
-def _second_derivatives(surface, t, i, j, e, of_I, of_D, H):
-    """Those of a triangle's energy in its vertices, `H[a, b]`; the stress `S`, force on edge a is `sum_b S_ab e_b`."""
+def _stiffness(surface, t, i, j, i_later, j_later, e, share, by_edge, A):
+    """The stress `S` of a triangle: force on edge a is `sum_b S_ab e_b`. Added to the rows of `A` of its vertices, in later ones:
+    its energy's second derivatives, less `share` times those of the volume, which are cross products with edges whose sums about
+    a vertex, in itself, vanish."""
     area, det = surface.area[t, i, j], surface.det[t, i, j]
     i11, i12, i22 = surface.inverse[0, t, i, j], surface.inverse[1, t, i, j], surface.inverse[2, t, i, j]
     g11 = e[0, 0] * e[0, 0] + e[0, 1] * e[0, 1] + e[0, 2] * e[0, 2]
     g12 = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
     g22 = e[1, 0] * e[1, 0] + e[1, 1] * e[1, 1] + e[1, 2] * e[1, 2]
-    I, D = i11 * g11 + 2 * i12 * g12 + i22 * g22, (g11 * g22 - g12 * g12) / det  # noqa: E741
-    linear, thickness, mixed, quadratic = surface.law
-    w_I = linear + mixed / D
-    w_D = -thickness / (D * D) - mixed * I / (D * D) + quadratic
-    w_ID, w_DD = -mixed / (D * D), 2 * (thickness + mixed * I) / (D * D * D)
-    by_I, by_D = 2 * area * w_I, 2 * area / det * w_D
+    I, D = i11 * g11 + i12 * g12 + i22 * g22, (g11 * g22 - g12 * g12) / det  # noqa: E741
+    linear, thickness, mixed, quadratic = surface.law[0], surface.law[1], surface.law[2], surface.law[3]
+    I += i12 * g12  # noqa: E741
+    inverse = 1 / D
+    w_I = linear + mixed * inverse
+    w_ID = -mixed * inverse * inverse
+    w_D = quadratic + (w_ID * I - thickness * inverse * inverse)
+    w_DD = (thickness + mixed * I) * inverse * inverse * inverse
+    w_DD += w_DD
+    area += area
+    by_I, by_D = area * w_I, area / det * w_D
     s11, s12, s22 = by_I * i11 + by_D * g22, by_I * i12 - by_D * g12, by_I * i22 + by_D * g11
+    scale = area + area
+    det_inverse = 1 / det
+    for c in range(3):  # halves of what I and D change by in the edges
+        by_edge[0, c], by_edge[1, c] = i11 * e[0, c] + i12 * e[1, c], i12 * e[0, c] + i22 * e[1, c]
+        by_edge[2, c] = det_inverse * (g22 * e[0, c] - g12 * e[1, c])
+        by_edge[3, c] = det_inverse * (g11 * e[1, c] - g12 * e[0, c])
+    at_12, at_13, at_23 = 3 * PAIRS[t][0], 3 * PAIRS[t][1], 3 * PAIRS[t][2]
     for c in range(3):
-        of_I[0, c], of_I[1, c] = 2 * (i11 * e[0, c] + i12 * e[1, c]), 2 * (i12 * e[0, c] + i22 * e[1, c])
-        of_D[0, c], of_D[1, c] = 2 / det * (g22 * e[0, c] - g12 * e[1, c]), 2 / det * (g11 * e[1, c] - g12 * e[0, c])
-    for c in range(3):
+        I1, I2 = scale * w_ID * by_edge[0, c], scale * w_ID * by_edge[1, c]
+        D1, D2 = scale * w_DD * by_edge[2, c], scale * w_DD * by_edge[3, c]
+        D1_I, D2_I = scale * w_ID * by_edge[2, c], scale * w_ID * by_edge[3, c]
         for d in range(3):
-            one = 1.0 if c == d else 0.0
-            x = of_D[0, d] * w_DD + of_I[0, d] * w_ID
-            y = of_D[1, d] * w_DD + of_I[1, d] * w_ID
-            h11 = area * (of_D[0, c] * x + w_ID * of_I[0, c] * of_D[0, d]) - by_D * e[1, c] * e[1, d] + s11 * one
-            h22 = area * (of_D[1, c] * y + w_ID * of_I[1, c] * of_D[1, d]) - by_D * e[0, c] * e[0, d] + s22 * one
-            h12 = area * (of_D[0, c] * y + w_ID * of_I[0, c] * of_D[1, d]) + s12 * one
-            H[1, 1, c, d], H[2, 2, c, d] = h11, h22
-            H[1, 2, c, d] = h12 + by_D * (2 * e[0, c] * e[1, d] - e[1, c] * e[0, d])
+            h11 = I1 * by_edge[2, d] + D1_I * by_edge[0, d] + D1 * by_edge[2, d] - by_D * e[1, c] * e[1, d]
+            h22 = I2 * by_edge[3, d] + D2_I * by_edge[1, d] + D2 * by_edge[3, d] - by_D * e[0, c] * e[0, d]
+            mixed_12 = I1 * by_edge[3, d] + D1_I * by_edge[1, d] + D1 * by_edge[3, d]
+            mixed_21 = I2 * by_edge[2, d] + D2_I * by_edge[0, d] + D2 * by_edge[2, d]
+            first_second, second_first = by_D * e[0, c] * e[1, d], by_D * e[1, c] * e[0, d]
+            h12 = mixed_12 + (first_second + first_second - second_first)
+            h21 = mixed_21 + (second_first + second_first - first_second)
+            if c == d:
+                h11 += s11
+                h12 += s12
+                h21 += s12
+                h22 += s22
+            A[c, at_12 + d, i, j] -= h11 + h21
+            A[c, at_13 + d, i, j] -= h12 + h22
+            A[c, at_23 + d, i_later, j_later] += h12 if t == 0 else h21
     for c in range(3):
-        for d in range(3):
-            H[2, 1, c, d] = H[1, 2, d, c]
-    for c in range(3):
-        for d in range(3):
-            H[1, 0, c, d] = H[0, 1, d, c] = -(H[1, 1, c, d] + H[1, 2, c, d])
-            H[2, 0, c, d] = H[0, 2, d, c] = -(H[2, 1, c, d] + H[2, 2, c, d])
-    for c in range(3):
-        for d in range(3):
-            H[0, 0, c, d] = -(H[0, 1, c, d] + H[0, 2, c, d])
+        p, q = (c + 1) % 3, (c + 2) % 3
+        x, y = share * e[0, c], share * e[1, c]
+        z = x if t == 0 else -y
+        A[q, at_12 + p, i, j] += y
+        A[p, at_12 + q, i, j] -= y
+        A[q, at_13 + p, i, j] -= x
+        A[p, at_13 + q, i, j] += x
+        A[q, at_23 + p, i_later, j_later] -= z
+        A[p, at_23 + q, i_later, j_later] += z
     return s11, s12, s22
 
 
 @compiled
-def _less_fluid(H, e, share):
-    """Without the second derivatives of the volume: in vertices a and b `share` times the cross product with an edge, whose sums
-    about a vertex, in itself, vanish."""
+def _complete(free, force, A):
+    """`A` in earlier vertices, transposed, and in the vertices themselves: minus the sum of the others. Then zero what is not
+    free."""
+    m, n = free.shape
+    V = m * n
+    planes, first, last = A.reshape((3, 21, V)), n + 1, V - n - 1
+    for s in range(OWN):
+        shift, there = STENCIL[s][0] * n + STENCIL[s][1], 3 * (LAST - s)
+        for c in range(3):
+            for d in range(3):
+                planes[c, 3 * s + d, first:last] = planes[d, there + c, first + shift : last + shift]
     for c in range(3):
-        p, q = (c + 1) % 3, (c + 2) % 3
-        x, y = share * e[0, c], share * e[1, c]
-        z = y - x
-        # of the products [x]: at row q, column p is x, at row p, column q is -x
-        H[0, 1, q, p] += y
-        H[0, 1, p, q] -= y
-        H[0, 2, q, p] -= x
-        H[0, 2, p, q] += x
-        H[1, 2, q, p] -= x
-        H[1, 2, p, q] += x
-        H[1, 0, q, p] -= z
-        H[1, 0, p, q] += z
-        H[2, 0, q, p] -= z
-        H[2, 0, p, q] += z
-        H[2, 1, q, p] += y
-        H[2, 1, p, q] -= y
+        for d in range(3):
+            own = planes[c, 3 * OWN + d]
+            own[:] = 0
+            for s in range(LAST + 1):
+                if s != OWN:
+                    own -= planes[c, 3 * s + d]
+    for i in range(m):
+        for j in range(n):
+            if not (0 < i < m - 1 and 0 < j < n - 1 and free[i, j]):
+                A[:, :, i, j] = 0
+                force[i, j] = 0
+            elif not _surrounded(free, i, j):
+                for s in range(LAST + 1):
+                    if not free[i + STENCIL[s][0], j + STENCIL[s][1]]:
+                        A[:, 3 * s : 3 * s + 3, i, j] = 0
+
+
+@compiled
+def _surrounded(free, i, j):
+    """Whether all vertices around are free."""
+    for s in range(LAST + 1):
+        if not free[i + STENCIL[s][0], j + STENCIL[s][1]]:
+            return False
+    return True

@@ -15,7 +15,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-LANES, RANK, ROWS = 16, 8, 2
+LANES, RANK, ROWS, LOADS = 16, 8, 2, 8
 
 compiled = numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 """Loops without Python: NaN and infinity as they are, sums in any order."""
@@ -24,97 +24,109 @@ compiled = numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "re
 def storage(unknowns: int, width: int) -> tuple[int, int, int]:
     """Of a matrix with so many unknowns and `width` diagonals above the main one: how many unknowns to solve for, the last of
     them with a 1 on the diagonal, rows of `U`, and `ld`."""
-    whole = -(-unknowns // RANK) * RANK
+    whole = -(-unknowns // LANES) * LANES
     return whole, whole + ROWS, -(-(width + RANK + LANES) // LANES) * LANES
 
 
 @intrinsic
-def _subtract_products(typing: Any, U: Any, W: Any, row: Any, first: Any, own: Any, stride: Any, ld: Any, chunks: Any) -> Any:
-    """Of the `ROWS` rows that begin at `U[row]`, `U[row + k ld + c] -= sum_p W[p stride + own + k] W[p stride + first + c]`, for
-    `c` in `LANES x chunks` columns."""
-    signature = types.void(U, W, *[types.intp] * 6)
+def _subtract(typing: Any, A: Any, row: Any, step: Any, S: Any, own: Any, turn: Any, W: Any, first: Any, ld: Any, chunks: Any) -> Any:
+    """Of the `ROWS` rows that begin at `A[row + k step]`, `A[row + k step + c] -= sum_p S[own + k + p turn] W[first + p ld + c]`,
+    for `c` in `LANES x chunks` columns."""
+    signature = types.void(A, types.intp, types.intp, S, types.intp, types.intp, W, *[types.intp] * 3)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        (matrix, panel), (row, first, own, stride, ld, chunks) = args[:2], args[2:]
-        of_U, of_W = (context.make_array(kind)(context, builder, given).data for kind, given in zip(signature.args, args[:2]))
-        scalar = context.get_data_type(signature.args[0].dtype)
-        vector, lanes = ir.VectorType(scalar, LANES), ir.VectorType(ir.IntType(32), LANES)
-        fused = ("contract",)
+        row, step, own, turn, first, ld, chunks = (args[k] for k in (1, 2, 4, 5, 7, 8, 9))
+        of_A, of_S, of_W = (context.make_array(signature.args[k])(context, builder, args[k]) for k in (0, 3, 6))
+        kind = signature.args[0].dtype
+        vector, lanes = ir.VectorType(context.get_data_type(kind), LANES), ir.VectorType(ir.IntType(32), LANES)
 
-        def at(pointer: Any, *steps: tuple[Any, int]) -> Any:
-            for size, times in steps:
+        def at(pointer: Any, *places: tuple[Any, int]) -> Any:
+            for size, times in places:
                 pointer = builder.gep(pointer, [builder.mul(size, ir.Constant(size.type, times))])
             return pointer
 
-        def loaded(pointer: Any) -> Any:
-            value = builder.load(builder.bitcast(pointer, vector.as_pointer()))
-            value.align = signature.args[0].dtype.bitwidth // 8
-            return value
-
-        def spread(value: Any) -> Any:
+        def spread(pointer: Any) -> Any:
             empty = ir.Constant(vector, ir.Undefined)
-            one = builder.insert_element(empty, builder.fneg(value), ir.Constant(ir.IntType(32), 0))
+            minus = builder.fneg(builder.load(pointer))
+            one = builder.insert_element(empty, minus, ir.Constant(ir.IntType(32), 0))
             return builder.shuffle_vector(one, empty, ir.Constant(lanes, [0] * LANES))
 
+        def vector_at(pointer: Any, *places: tuple[Any, int]) -> Any:
+            return builder.bitcast(at(pointer, *places), vector.as_pointer())
+
         one = ir.Constant(row.type, 1)
-        rows = [at(of_U, (row, 1), (ld, k)) for k in range(ROWS)]
-        behind = [at(of_W, (first, 1), (stride, p)) for p in range(RANK)]
-        shares = [[spread(builder.load(at(of_W, (own, 1), (one, k), (stride, p)))) for p in range(RANK)] for k in range(ROWS)]
+        shares = [[spread(at(of_S.data, (own, 1), (one, k), (turn, p))) for p in range(RANK)] for k in range(ROWS)]
         with cgutils.for_range(builder, chunks) as loop:
-            products = [loaded(at(pointer, (loop.index, LANES))) for pointer in behind]
-            for pointer, share in zip(rows, shares):
-                place = at(pointer, (loop.index, LANES))
-                total = loaded(place)
-                for p in range(RANK):
-                    total = builder.fadd(builder.fmul(share[p], products[p], flags=fused), total, flags=fused)
-                stored = builder.store(total, builder.bitcast(place, vector.as_pointer()))
-                stored.align = signature.args[0].dtype.bitwidth // 8
+            behind = [builder.load(vector_at(of_W.data, (first, 1), (ld, p), (loop.index, LANES))) for p in range(RANK)]
+            places = [vector_at(of_A.data, (row, 1), (step, k), (loop.index, LANES)) for k in range(ROWS)]
+            totals = [builder.load(place) for place in places]
+            for value in (*behind, *totals):
+                value.align = kind.bitwidth // 8
+            for place, total, of_row in zip(places, totals, shares, strict=True):
+                for share, values in zip(of_row, behind, strict=True):
+                    product = builder.fmul(share, values, flags=("contract",))
+                    total = builder.fadd(product, total, flags=("contract",))
+                builder.store(total, place).align = kind.bitwidth // 8
         return context.get_dummy_value()
 
     return signature, codegen
 
 
 @compiled
-def factor(U, ld, width, n, inverse, W):
-    """The matrix in `U` becomes its factor; `inverse [n]`: of the factor's diagonal; `W [RANK ld]`: to work in. False where a
-    pivot is not positive."""
-    stride = len(W) // RANK
+def factor(U, ld, width, n, inverse, W, b):
+    """The matrix in `U` becomes its factor and the loads `b [LOADS n]` the `y` with `U^T y = b`; `inverse [n]`: of the factor's
+    diagonal; `W [RANK ld]`: to work in. False where a pivot is not positive."""
+    y, shares = np.empty(RANK * LOADS, U.dtype), np.empty(RANK * ROWS, U.dtype)
     for first in range(0, n, RANK):
         base = first - first % LANES
+        if not _panel(U, ld, first, inverse, W, shares):
+            return False
         for p in range(RANK):
-            k = first + p
-            row = U[k * ld + k - base : k * ld + k - base + width + 1]
-            if not row[0] > 0:
-                return False
-            inverse[k] = 1 / np.sqrt(row[0])
-            row *= inverse[k]
-            for q in range(p + 1, RANK):
-                below = U[(first + q) * ld + first + q - base : (first + q) * ld + k - base + width + 1]
-                share, beside = row[q - p], row[q - p :]
-                for t in range(len(below)):
-                    below[t] -= share * beside[t]
-            end = k - base + width + 1
-            W[p * stride : p * stride + end] = U[k * ld : k * ld + end]
-            W[p * stride + end : (p + 1) * stride] = 0
-        end = min(first - base + RANK + width, n - base)
-        for i in range(first - base + RANK, end, ROWS):
-            start = i - i % LANES
-            _subtract_products(U, W, (base + i) * ld, start, i, stride, ld, (end - start + LANES - 1) // LANES)
+            for q in range(LOADS):
+                y[p * LOADS + q] = b[q * n + first + p]
+            for other in range(p):
+                share = W[other * ld + first - base + p]
+                for q in range(LOADS):
+                    y[p * LOADS + q] -= share * y[other * LOADS + q]
+            for q in range(LOADS):
+                y[p * LOADS + q] *= inverse[first + p]
+        start, end = first - base + RANK, min(first - base + RANK + width, n - base)
+        for i in range(start, end, ROWS):
+            lane = i - i % LANES
+            _subtract(U, (base + i) * ld, ld, W, i, ld, W, lane, ld, (end - lane + LANES - 1) // LANES)
+        lane = start - start % LANES
+        for q in range(0, LOADS, ROWS):
+            _subtract(b, q * n + base + lane, n, y, q, LOADS, W, lane, ld, (end - lane + LANES - 1) // LANES)
+        for p in range(RANK):
+            for q in range(LOADS):
+                b[q * n + first + p] = y[p * LOADS + q]
     return True
 
 
 @compiled
-def forward(U, ld, width, n, inverse, b):
-    """`b [C, n]` becomes `y` with `U^T y = b`."""
-    for k in range(n):
-        reach = min(width, n - 1 - k)
-        row = U[k * ld + k % LANES + 1 : k * ld + k % LANES + 1 + reach]
-        for q in range(len(b)):
-            y = b[q, k] * inverse[k]
-            b[q, k] = y
-            behind = b[q, k + 1 : k + 1 + reach]
-            for t in range(reach):
-                behind[t] -= y * row[t]
+def _panel(U, ld, first, inverse, W, shares):
+    """The `RANK` rows of the factor from `first` on, in `U`, and in `W` with columns from those of their lane on."""
+    lane = first % LANES
+    W[:] = U[first * ld : (first + RANK) * ld]
+    for p in range(0, RANK, ROWS):
+        if p > 0:
+            shares[:] = 0
+            for q in range(p):
+                shares[ROWS * q], shares[ROWS * q + 1] = W[q * ld + lane + p], W[q * ld + lane + p + 1]
+            _subtract(W, p * ld, ld, shares, 0, ROWS, W, 0, ld, ld // LANES)
+        row, below = W[p * ld : (p + 1) * ld], W[(p + 1) * ld : (p + 2) * ld]
+        pivot, share = row[lane + p], row[lane + p + 1]
+        following = below[lane + p + 1] - share / pivot * share
+        if not (pivot > 0 and following > 0):
+            return False
+        inverse[first + p], inverse[first + p + 1] = 1 / np.sqrt(pivot), 1 / np.sqrt(following)
+        share *= inverse[first + p]
+        for t in range(ld):
+            row[t] *= inverse[first + p]
+        for t in range(ld):
+            below[t] = (below[t] - share * row[t]) * inverse[first + p + 1]
+    U[first * ld : (first + RANK) * ld] = W
+    return True
 
 
 @compiled
