@@ -172,8 +172,8 @@ class Descent(nn.Module):
 
         With gradients every step is: those of a nested region come with strides that torch 2.13 does not follow."""
         if takes(*state, weights, *measured, self.equations.forces.elasticity.prestretch):
-            *taken, weights = self.native.take(self.equations, self.cavity, self.settings, state, weights, measured, scales)
-            return State(*taken), weights
+            *after, weights = self.native.take(self.equations, self.cavity, self.settings, state, weights, measured, scales)
+            return State(*after), weights
         numbers = Scales(*(torch.as_tensor(scale, dtype=state.u.dtype, device=state.u.device) for scale in scales))
         unrolled = torch.compiler.is_exporting() or torch.is_grad_enabled()
         step = self.step if unrolled else self._compiled_once

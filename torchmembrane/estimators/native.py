@@ -1,6 +1,7 @@
-"""When steps of force balance are taken by machine code made here, and what that is given."""
+"""When steps of force balance are taken by machine code, and what that is given."""
 
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,9 +9,10 @@ import torch
 from torch import Tensor
 
 from ..mechanics.cavity import CavityLaw
-from ..mechanics.native_membrane import Surface, linearise, surface_of
+from ..mechanics.native_membrane import Surface, surface_of
 from .bearings import Bearings
-from .native_step import Constants, Numbers, Workspace, steps, workspace
+from .native_equations import Constants, Numbers, Workspace, workspace
+from .native_step import steps
 from .normal_equations import BalanceEquations
 from .settings import ForceBalanceSettings
 
@@ -39,7 +41,7 @@ class NativeSteps:
         state: tuple[Tensor, Tensor, Tensor],
         weights: Tensor,
         measured: Bearings,
-        scales: tuple[float, ...],
+        scales: Sequence[float],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Displacement, pressure, camera and weights after a step; arguments as of `Descent.step`."""
         grid = equations.forces.membrane.grid
@@ -54,7 +56,7 @@ class NativeSteps:
         return u, pressure, moved, weights
 
     def _work(self, grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
-        kept = self._own.__dict__
+        kept: dict[Any, Workspace] = self._own.__dict__
         if dtype not in kept:
             kept[dtype] = workspace(grid, markers, dtype)
         return kept[dtype]
@@ -128,11 +130,10 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, settings: ForceBa
 
 
 def _volume(surface: Surface) -> float:
-    """At rest, rounded as in steps."""
-    still = np.zeros_like(surface.rest)
-    fields = np.zeros_like(still), np.zeros((3, 21, *still.shape[:2]), still.dtype), np.zeros_like(still)
-    volume: float = linearise(surface, still, still[0, 0, :1], *fields)
-    return volume
+    """At rest, eq. 19, by triangles as steps sum it up."""
+    spins = np.cross(*surface.edges.astype(float).swapaxes(0, 1), axis=0).sum(1)
+    inner: np.ndarray = surface.rest[:-1, :-1].astype(float)
+    return float(surface.law[4] * (inner * np.moveaxis(spins, 0, -1)).sum())
 
 
 def _within(rows: np.ndarray) -> np.ndarray:

@@ -1,182 +1,66 @@
-"""A step of force balance by machine code made here: what `Descent.step` does, frame by frame, without gradients.
+"""A step of force balance by machine code: what `Descent.step` does, frame by frame, without gradients.
 
 On a processor the tensor operations of a step, some six hundred, take longer to begin than to work: on 33 x 33 vertices three
-times, on 9 x 9 thirty times as long as this. The formulas are those of `contact_force`, `traction_loss`, `bearings`,
-`normal_equations`, `camera_motion` and `descent`, which say what they mean; tests hold both to the same numbers.
+times, on 9 x 9 ten times as long as this. The formulas are those of `descent`, `camera_motion`, `cavity` and `kkt`.
 """
-
-from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..mechanics.native_membrane import STENCIL, Surface, linearise
-from ..solve.native_band import LANES, RANK, backward, compiled, factor, storage
-from ..solve.stencil_layouts import OFFSETS
+from ..machine_code import compiled, fingerprint, kept
+from ..mechanics import native_membrane
+from ..mechanics.native_membrane import linearise
+from ..solve import native_band
+from ..solve.band import RIDGES
+from ..solve.native_band import RANK, backward, factor
+from . import native_equations
 from .camera_motion import RARE
-from .traction_loss import POWER, TINY
-
-RIDGES = (0.0, 1e-6, 1e-5, 1e-4)
-"""Added, one instead of the other, to a diagonal about 1 of a matrix that rounding has left without a factor."""
-BETWEEN = tuple(tuple(OFFSETS.index((b[0] - a[0], b[1] - a[1])) if b >= a else -1 for b in STENCIL) for a in STENCIL)
-"""Of two vertices of a stencil, the offset from one to a later one."""
-LOADS = 7
-NOTHING = 1e-12
-"""Of the share of a vertex in a mean that does not count below `(far_share / scale_share)^(2 POWER)`, some 1e-4."""
-
-
-class Constants(NamedTuple):
-    """What is constant of an estimator on one grid."""
-
-    surface: Surface
-    area: Any
-    """`[N]`, of the inner vertices."""
-    surroundings: Any
-    """`[N, N]`, column k the mean around vertex k; as `wider`."""
-    surroundings_within: Any
-    """`[N, 2]`: where row i begins and ends to be more than zero."""
-    wider: Any
-    wider_within: Any
-    push_noise: Any
-    """`[N]`"""
-    positions: Any
-    """`[D, 3]`, of the markers at rest."""
-    smooth: tuple[Any, Any]
-    """Numbers of inner vertices and their shares in the markers' displacement, `[D, K]` each."""
-    corners: tuple[Any, Any]
-    """The same in what markers pull, `[D, 3]`."""
-    numbers: "Numbers"
-
-
-class Numbers(NamedTuple):
-    """Settings, and other numbers of an estimator."""
-
-    reference: float
-    size: float
-    friction: float
-    slip: float
-    sparsity: float
-    floor: float
-    last_tau: float
-    first_tau: float
-    scale_share: float
-    far_share: float
-    noise_share: float
-    decrease: float
-    least_scale: float
-    camera_motion: float
-    longest_step: float
-    largest_stretch: float
-    rest_pressure: float
-    rest_volume: float
-    is_open: bool
-    is_gas: bool
-    absolute: float
-    gas_volume: float
-
-
-class Workspace(NamedTuple):
-    """Arrays of a step, made once: to make them would take longer than what is done in them."""
-
-    force: Any
-    """`[m, n, 3]`; as `volume`, the volume's gradient."""
-    volume: Any
-    A: Any
-    """`[3, 21, m, n]`, the tangent stiffness; weighted: `weighted [3, 21, V]`."""
-    weighted: Any
-    W: Any
-    """`[3, 3, V]`"""
-    of_loads: Any
-    """`[3, 2, V]`, forces and the fluid's, weighted."""
-    sums: Any
-    """`[90, V]`, blocks of the matrix."""
-    normal: Any
-    """`[N, 3]`"""
-    fields: Any
-    """`[4, N]`"""
-    blocks: Any
-    """`[D, 3, 3]`, of the markers."""
-    U: Any
-    """The matrix, and `inverse [3 N]`, `panel` and its `scale [3 N]`, as `native_band` stores them."""
-    inverse: Any
-    panel: Any
-    scale: Any
-    loads: Any
-    """`[7, 3 N]`: of the volume, the forces, the fluid, the camera's four motions."""
-    y: Any
-    """`[8 x 3 N]`, loads and then solutions as `native_band` takes them, one zero."""
-    width: int
-    """Diagonals of the matrix above the main one."""
-
-
-def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
-    """Arrays for a grid and so many markers."""
-    m, n = grid
-    N, width = (m - 2) * (n - 2), 3 * (2 * (n - 2) + 2) + 2  # to two lines, two vertices and two components further
-    unknowns, rows, ld = storage(3 * N, width)
-    shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, m, n), weighted=(3, 21, m * n), W=(3, 3, m * n))
-    shapes |= dict(of_loads=(3, 2, m * n), sums=(90, m * n), normal=(N, 3))
-    shapes |= dict(fields=(4, N), blocks=(markers, 3, 3), inverse=(unknowns,), panel=(RANK * ld,), scale=(unknowns,))
-    arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
-    y = _aligned(RANK * unknowns, dtype)
-    return Workspace(U=_aligned(rows * ld, dtype), y=y, loads=np.zeros((LOADS, unknowns), dtype), width=width, **arrays)
-
-
-def _aligned(size: int, dtype: Any) -> Any:
-    whole = np.zeros(size + 64, dtype)
-    first = -whole.ctypes.data % 64 // whole.itemsize
-    return whole[first : first + size]
+from .native_equations import USED, fill, load_forces, load_markers, sum_blocks, weigh
 
 
 @compiled
-def step(c, work, u, pressure, moved, before, origins, across, weight, noise_level, motion, gauge, scales):
-    """From a state to the next: `u [m, n, 3]`, `pressure [1]`, `moved [4]`, `before [N]` (weights of normal tractions) change.
-
-    `origins [3, D]`, `across [2, 3, D]`, `weight [D]`, `noise_level`, `motion [2, 4, D]`, `gauge [2]`: what is measured;
-    `scales`: tau, outlier, cone, renewal, damping.
-    """
+def _step(c, work, u, pressure, moved, before, seen, noise_level, gauge, scales):
+    """From a state to the next: `u [m, n, 3]`, `pressure [1]`, `moved [4]` and `before [N]`, the weights of normal tractions,
+    change."""
     tau, outlier, cone, renewal, damping = scales
-    k, (m, n) = c.numbers, c.surface.free.shape
-    width, ld, unknowns = work.width, len(work.panel) // RANK, len(work.inverse)
-    rise = -c.numbers.rest_volume + linearise(c.surface, u, pressure, work.force, work.A, work.volume)
-    _weigh(c, work, before, noise_level, tau, cone, renewal)
-    y, own, slope, products = work.y, np.zeros((4, 4)), np.zeros(4), np.zeros((LOADS, LOADS))
-    fWv, vWv = _load_forces(c, work)
-    _load_markers(c, work, u, moved, origins, across, weight, motion, outlier, own, slope)
-    _sum_blocks(c, work)
+    m, n = c.surface.free.shape
+    rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
+    own, slope = np.zeros((4, 4)), np.zeros(4)
+    weigh(c, work, before, noise_level, tau, cone, renewal)
+    fWv, vWv = load_forces(c, work)
+    load_markers(c, work, u, moved, seen, outlier, own, slope)
+    sum_blocks(c, work)
+    width, size, y = work.width, len(work.inverse), work.y
     for ridge in RIDGES:
-        _fill(c, work, ld, damping, ridge)
-        for a in range(LOADS):
-            for i in range(unknowns):
-                y[a * unknowns + i] = work.loads[a, i] * work.scale[i]
-        if factor(work.U, ld, width, unknowns, work.inverse, work.panel, y):
+        fill(c, work, damping, ridge)
+        if factor(work.U, len(work.panel) // RANK, width, size, work.inverse, work.panel, y):
             break
     else:
         y[:] = np.nan
-    for a in range(LOADS):
+    products = np.empty((USED, USED))
+    for a in range(USED):
         for b in range(a + 1):
-            of_b = y[b * unknowns : (b + 1) * unknowns]
-            products[a, b] = products[b, a] = _dot(y[a * unknowns : (a + 1) * unknowns], of_b)
-    play = k.camera_motion * (min(tau, k.first_tau) / k.last_tau) ** 2
-    stiffness = RARE / (play**2 + _dot(moved, moved))
-    for a in range(4):
-        own[a, a] += stiffness
-        slope[a] += stiffness * moved[a]
-    following = _camera_eliminated(products, own, slope)
-    multiplier, one, change = _shares(k, products, rise, pressure[0], fWv, vWv, gauge)
-    solved, turn = y[:unknowns], np.empty_like(moved)
-    for i in range(unknowns):
-        solved[i] = multiplier * y[i] + one * y[unknowns + i] + change * y[2 * unknowns + i]
+            products[a, b] = products[b, a] = _dot(y[a * size : (a + 1) * size], y[b * size : (b + 1) * size])
+    following = _camera_eliminated(c.numbers, products, own, slope, moved, tau)
+    multiplier, one, change = _shares(c.numbers, products, rise, pressure[0], fWv, vWv, gauge)
+    solved, turn = y[:size], np.empty_like(moved)
+    for i in range(size):
+        solved[i] = multiplier * y[i] + one * y[size + i] + change * y[2 * size + i]
     for a in range(4):
         turn[a] = multiplier * following[a, 0] + one * following[a, 1] + change * following[a, 2]
-        for i in range(unknowns):
-            solved[i] += turn[a] * y[(3 + a) * unknowns + i]
-    backward(work.U, ld, width, unknowns, work.inverse, solved)
-    solved *= -work.scale
+        for i in range(size):
+            solved[i] += turn[a] * y[(3 + a) * size + i]
+    backward(work.U, len(work.panel) // RANK, width, size, work.inverse, solved)
+    for i in range(size):
+        solved[i] *= -work.scale[i]
     move = solved[: 3 * (m - 2) * (n - 2)].reshape((m - 2, n - 2, 3))
     share = _share(c, u, move)
-    u[1:-1, 1:-1] += share * move
+    for i in range(m - 2):
+        for j in range(n - 2):
+            for a in range(3):
+                u[i + 1, j + 1, a] += share * move[i, j, a]
     pressure[0] += share * change
-    moved += share * turn
+    for a in range(4):
+        moved[a] += share * turn[a]
 
 
 @compiled
@@ -188,210 +72,25 @@ def _dot(a, b):
 
 
 @compiled
-def _weigh(c, work, before, noise_level, tau, cone, renewal):
-    """`TractionLoss.weights`: `W`, and `before` becomes the weights of the normal tractions."""
-    k, N, (m, n) = c.numbers, len(c.area), c.surface.free.shape
-    q_n, shear2, push2, around = work.fields
-    for i in range(N):
-        p, q = i // (n - 2) + 1, i % (n - 2) + 1
-        square, along, across2 = 0.0, 0.0, 0.0
-        for a in range(3):
-            square += work.volume[p, q, a] ** 2
-        for a in range(3):
-            work.normal[i, a] = work.volume[p, q, a] / np.sqrt(square)
-            along += work.force[p, q, a] * work.normal[i, a]
-        for a in range(3):
-            across2 += (work.force[p, q, a] - along * work.normal[i, a]) ** 2
-        unit = c.area[i] * k.reference
-        q_n[i], shear2[i] = along / unit, across2 / unit**2
-    push2[:] = 0
-    for i in range(N):
-        if not q_n[i] >= 0:
-            _add(push2, c.surroundings[i], q_n[i] ** 2, c.surroundings_within[i])
-    top = TINY
-    for i in range(N):
-        top = max(top, push2[i])
-    around[:] = 0
-    for i in range(N):
-        share = (push2[i] / top) ** POWER
-        if not share < NOTHING:
-            _add(around, c.wider[i], share, c.wider_within[i])
-    least = min(k.decrease * (tau / k.last_tau - 1) + k.least_scale, 1.0) ** 2
-    for i in range(N):
-        expected = top * max(around[i], TINY) ** (1 / POWER) * k.scale_share**2
-        expected = max(expected, top * k.far_share**2, (k.noise_share * noise_level * c.push_noise[i]) ** 2)
-        at = (i // (n - 2) + 1) * n + i % (n - 2) + 1
-        rho2 = min(max(expected / k.last_tau**2, least), 1.0)
-        pushed = push2[i] / rho2
-        w_n = k.floor + ((1 + pushed / tau**2) ** -2 if q_n[i] < 0 else 1.0)
-        w_n = before[i] * (w_n / before[i]) ** renewal
-        w_t = k.friction / (1 + cone * np.sqrt(pushed + k.slip**4)) / np.sqrt(shear2[i] / rho2 + k.slip**2)
-        scale = k.sparsity / (k.reference * k.size) ** 2 / c.area[i] / rho2
-        for a in range(3):
-            for b in range(3):
-                work.W[a, b, at] = scale * (w_n - w_t) * work.normal[i, a] * work.normal[i, b]
-            work.W[a, a, at] += scale * w_t
-        before[i] = w_n
-
-
-@compiled
-def _add(total, row, share, within):
-    """`total += share row`, of which only the places `within` are not zero."""
-    part, of_row = total[within[0] : within[1]], row[within[0] : within[1]]
-    for i in range(len(part)):
-        part[i] += share * of_row[i]
-
-
-@compiled
-def _load_forces(c, work):
-    """`BalanceEquations.loads` of the forces; `f W v` and `v W v`."""
-    m, n = c.surface.free.shape
-    V, loads, of_loads, fWv, vWv = m * n, work.loads, work.of_loads, 0.0, 0.0
-    loads[:], of_loads[:] = 0, 0
-    for i in range(1, m - 1):
-        for j in range(1, n - 1):
-            if c.surface.free[i, j]:
-                k, at = (i - 1) * (n - 2) + j - 1, i * n + j
-                for a in range(3):
-                    for b in range(3):
-                        of_loads[a, 0, at] += work.W[a, b, at] * work.force[i, j, b]
-                        of_loads[a, 1, at] -= work.W[a, b, at] * work.volume[i, j, b]
-                    fWv += of_loads[a, 0, at] * work.volume[i, j, a]
-                    vWv -= of_loads[a, 1, at] * work.volume[i, j, a]
-                    loads[0, 3 * k + a] = work.volume[i, j, a]
-    A, first, count, sums = work.A.reshape((3, 21, V)), n + 1, V - 2 * n - 2, work.sums
-    for load in range(2):
-        for d in range(3):
-            sums[d] = 0
-            for s in range(7):
-                at = first - STENCIL[s][0] * n - STENCIL[s][1]
-                _add_products(sums[d], first, count, A, 3 * s + d, of_loads, load, at)
-        for k in range((m - 2) * (n - 2)):
-            at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
-            for d in range(3):
-                loads[1 + load, 3 * k + d] = sums[d, at]
-    return fWv, vWv
-
-
-@compiled
-def _add_products(total, first, count, a, of_a, b, of_b, at):
-    """`total[first + k] += sum_c a[c, of_a, at + k] b[c, of_b, at + k]`, of `count` vertices."""
-    out = total[first : first + count]
-    a0, a1, a2 = a[0, of_a, at : at + count], a[1, of_a, at : at + count], a[2, of_a, at : at + count]
-    b0, b1, b2 = b[0, of_b, at : at + count], b[1, of_b, at : at + count], b[2, of_b, at : at + count]
-    for k in range(count):
-        out[k] += a0[k] * b0[k] + a1[k] * b1[k] + a2[k] * b2[k]
-
-
-@compiled
-def _load_markers(c, work, u, moved, origins, across, weight, motion, outlier, own, slope):
-    """`MarkerBearings.angles` and what they add to blocks, loads and the camera's equations."""
-    n, (numbers, shares), (corners, pulls) = c.surface.free.shape[1], c.smooth, c.corners
-    to_marker, jacobian, angle = np.zeros(3), np.zeros((2, 3)), np.zeros(2)
-    for d in range(len(weight)):
-        for a in range(3):
-            to_marker[a] = c.positions[d, a] - origins[a, d]
-        for s in range(numbers.shape[1]):
-            i = numbers[d, s]
-            at = u[i // (n - 2) + 1, i % (n - 2) + 1]
-            for a in range(3):
-                to_marker[a] += shares[d, s] * at[a]
-        distance = np.sqrt(_dot(to_marker, to_marker))
-        square = 0.0
-        for r in range(2):
-            turned = 0.0
-            for a in range(3):
-                turned += across[r, a, d] * to_marker[a] / distance
-            for a in range(3):
-                jacobian[r, a] = (across[r, a, d] - turned * to_marker[a] / distance) / distance
-            for a in range(4):
-                turned += motion[r, a, d] * moved[a]
-            angle[r] = turned
-            square += turned * turned
-        w = weight[d] / (1 + weight[d] * square / outlier**2)
-        for a in range(3):
-            pull = w * (jacobian[0, a] * angle[0] + jacobian[1, a] * angle[1])
-            for b in range(3):
-                work.blocks[d, a, b] = w * (jacobian[0, a] * jacobian[0, b] + jacobian[1, a] * jacobian[1, b])
-            for s in range(3):
-                at, share = 3 * corners[d, s] + a, pulls[d, s]
-                work.loads[1, at] += share * pull
-                for e in range(4):
-                    by_motion = motion[0, e, d] * jacobian[0, a] + motion[1, e, d] * jacobian[1, a]
-                    work.loads[3 + e, at] += share * w * by_motion
-        for a in range(4):
-            slope[a] += w * (motion[0, a, d] * angle[0] + motion[1, a, d] * angle[1])
-            for b in range(4):
-                own[a, b] += w * (motion[0, a, d] * motion[0, b, d] + motion[1, a, d] * motion[1, b, d])
-
-
-@compiled
-def _sum_blocks(c, work):
-    """`A^T W A` and the markers' blocks in `sums [10 3 3, V]`: between the vertices and those at `OFFSETS`."""
-    (m, n), (corners, pulls) = c.surface.free.shape, c.corners
-    V, sums, WA = m * n, work.sums, work.weighted
-    A, W, first, count = work.A.reshape((3, 21, V)), work.W, n + 1, V - 2 * n - 2
-    WA[:], sums[:] = 0, 0
-    for a in range(3):
-        for t in range(21):
-            _add_products(WA[a, t], 0, V, W, a, A, t, 0)
-    for s in range(7):
-        at = first - STENCIL[s][0] * n - STENCIL[s][1]
-        for other in range(s, 7):
-            block = 9 * BETWEEN[s][other]
-            for a in range(3):
-                for b in range(3):
-                    _add_products(sums[block + 3 * a + b], first, count, A, 3 * s + a, WA, 3 * other + b, at)
-    for d in range(len(work.blocks)):
-        for s in range(3):
-            for other in range(3):
-                share, k, further = pulls[d, s] * pulls[d, other], corners[d, s], corners[d, other] - corners[d, s]
-                if share != 0 and further >= 0:
-                    block = 9 * (further if further < 2 else further - (n - 2) + 2)
-                    at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
-                    for a in range(3):
-                        for b in range(3):
-                            sums[block + 3 * a + b, at] += share * work.blocks[d, a, b]
-
-
-@compiled
-def _fill(c, work, ld, damping, ridge):
-    """The matrix of the blocks in `U`, scaled from both sides by `scale` to a diagonal of 1, the ridge added to it."""
-    (m, n), U, sums, scale = c.surface.free.shape, work.U, work.sums, work.scale
-    scale[:], U[:] = 1, 0
-    for k in range((m - 2) * (n - 2)):
-        at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
-        for a in range(3):
-            if sums[4 * a, at] > 0:
-                scale[3 * k + a] = 1 / np.sqrt(sums[4 * a, at] * (1 + damping))
-    for i in range(m - 2):
-        for j in range(n - 2):
-            k, at = i * (n - 2) + j, (i + 1) * n + j + 1
-            for block in range(10):
-                p, q = i + OFFSETS[block][0], j + OFFSETS[block][1]
-                if p < m - 2 and 0 <= q < n - 2:
-                    column = 3 * (p * (n - 2) + q)
-                    for a in range(3):
-                        r = 3 * k + a
-                        start = r * ld - r // LANES * LANES + column
-                        for b in range(a if block == 0 else 0, 3):
-                            U[start + b] = sums[9 * block + 3 * a + b, at] * scale[r] * scale[column + b]
-    for r in range(len(scale)):
-        U[r * ld + r % LANES] = 1 + ridge
-
-
-@compiled
-def _camera_eliminated(products, own, slope):
-    """`CameraMotion.eliminated`: how the camera follows each load, `[4, 3]`; the loads' own products become those with it."""
+def _camera_eliminated(k, products, own, slope, moved, tau):
+    """`CameraMotion.held` and `eliminated`: how the camera follows each load, `[4, 3]`; the loads' products become those with
+    it."""
+    play = k.camera_motion * (min(tau, k.first_tau) / k.last_tau) ** 2
+    stiffness = RARE / (play**2 + _dot(moved, moved))
     system = np.empty((4, 7))
-    system[:, :4], system[:, 4:] = own - products[3:, 3:], products[3:, :3]
     for a in range(4):
-        system[a, 5] -= slope[a]
+        for b in range(7):
+            system[a, b] = own[a, b] - products[3 + a, 3 + b] if b < 4 else products[3 + a, b - 4]
+        system[a, a] += stiffness
+        system[a, 5] -= slope[a] + stiffness * moved[a]
     for a in range(4):
-        system[a] /= system[a, a]
+        pivot = system[a, a]
+        for e in range(7):
+            system[a, e] /= pivot
         for b in range(4):
-            if b != a:
-                system[b] -= system[b, a] * system[a]
+            share = system[b, a] if b != a else 0.0
+            for e in range(7):
+                system[b, e] -= share * system[a, e]
     for a in range(3):
         for b in range(3):
             for e in range(4):
@@ -422,14 +121,12 @@ def _share(c, u, move):
     """`Descent._share`: so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
     (m, n), rest, k, tiny = c.surface.free.shape, c.surface.rest, c.numbers, 1e-30
     far2, stretch2 = 0.0, 0.0
-    here, there = np.zeros(3), np.zeros(3)
+    here = np.zeros(3)
     for i in range(m):
         for j in range(n):
             inside = 0 < i < m - 1 and 0 < j < n - 1
-            if inside:
-                here[:] = move[i - 1, j - 1]
-            else:
-                here[:] = 0
+            for a in range(3):
+                here[a] = move[i - 1, j - 1, a] if inside else 0.0
             far2 = max(far2, here[0] ** 2 + here[1] ** 2 + here[2] ** 2)
             for axis in range(2):
                 p, q = i + 1 - axis, j + axis
@@ -446,10 +143,18 @@ def _share(c, u, move):
     return 1 / np.sqrt(far2)
 
 
-@compiled
-def steps(c, work, u, pressure, moved, before, origins, across, weight, noise_level, motion, gauge, scales):
-    """`step` of every frame."""
-    for b in range(len(u)):
-        at = b if len(weight) > 1 else 0
-        now = u[b], pressure[b : b + 1], moved[b], before[b]
-        step(c, work, *now, origins[at], across[at], weight[at], noise_level[at], motion[at], gauge[at], scales)
+def _entry(sources):
+    @kept
+    def steps(c, work, u, pressure, moved, before, origins, across, weight, noise_level, motion, gauge, scales):
+        """A step of every frame: states `u [B, m, n, 3]`, `pressure [B]`, `moved [B, 4]` and `before [B, N]` become the next.
+
+        c: `Constants`, work: a `Workspace`, origins to gauge: `Bearings`, scales: tau, outlier, cone, renewal, damping.
+        """
+        for b in range(len(u) if sources else 0):
+            seen = origins[b], across[b], weight[b], motion[b]
+            _step(c, work, u[b], pressure[b : b + 1], moved[b], before[b], seen, noise_level[b], gauge[b], scales)
+
+    return steps
+
+
+steps = _entry(fingerprint(__file__, *(module.__file__ for module in (native_band, native_equations, native_membrane))))

@@ -1,4 +1,4 @@
-"""The forces of a membrane and its fluid, and their tangent stiffness, triangle by triangle: machine code made here.
+"""The forces of a membrane and its fluid, and their tangent stiffness, triangle by triangle, by machine code.
 
 The formulas of `hyperelastic` and of `Membrane.volume` once more, for one surface without gradients: there each is a few tensor
 operations over all triangles, of which a grid has too few to make them worth their calls.
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..solve.native_band import compiled
+from ..machine_code import compiled
 from ..surface.membrane import Membrane
 from .hyperelastic import ElasticEnergy
 
@@ -65,57 +65,56 @@ def surface_of(membrane: Membrane, elasticity: ElasticEnergy, load: Any) -> Surf
 def linearise(surface, u, pressure, force, A, volume):
     """The contact force, its tangent stiffness and the gradient of the volume, at the inner vertices; the volume.
 
-    `u [m, n, 3]` the displacement, `pressure [1]`; `force [m, n, 3]`, `A [3, 21, m, n]` (of a component, in the components of the
-    stencil's vertices) and `volume [m, n, 3]` are filled, at the border with what is half a sum. `A` is zero at and in
-    vertices that are not free.
+    `u [m, n, 3]` the displacement, `pressure [1]`; `force [m, n, 3]`, `A [3, 21, m, n]` (of a component, in the components of
+    the stencil's vertices) and `volume [m, n, 3]` are filled, the last at the border with half a sum. Force and `A` are zero
+    at, `A` also in, vertices that are not free.
     """
     m, n = surface.free.shape
     e, spin, by_edge = np.empty((2, 3), u.dtype), np.empty(3, u.dtype), np.empty((4, 3), u.dtype)
-    force[:] = -surface.load
     A[:], volume[:] = 0, 0
+    for i in range(m):
+        for j in range(n):
+            for c in range(3):
+                force[i, j, c] = -surface.load[i, j, c]
     sixth, enclosed = surface.law[4], 0.0
     for i in range(m - 1):
         for j in range(n - 1):
             for t in range(2):
                 (i1, j1), (i2, j2) = TRIANGLES[t]
-                i1, j1, i2, j2 = i + i1, j + j1, i + i2, j + j2
+                corners = (i, j), (i + i1, j + j1), (i + i2, j + j2)
                 for c in range(3):
-                    e[0, c] = surface.edges[c, 0, t, i, j] + (u[i1, j1, c] - u[i, j, c])
-                    e[1, c] = surface.edges[c, 1, t, i, j] + (u[i2, j2, c] - u[i, j, c])
+                    for edge in range(2):
+                        p, q = corners[1 + edge]
+                        e[edge, c] = surface.edges[c, edge, t, i, j] + (u[p, q, c] - u[i, j, c])
                 for c in range(3):
                     p, q = (c + 1) % 3, (c + 2) % 3
                     spin[c] = sixth * (e[0, p] * e[1, q] - e[0, q] * e[1, p])
                     enclosed += (surface.rest[i, j, c] + u[i, j, c]) * spin[c]
-                i_later, j_later = (i1, j1) if t == 0 else (i2, j2)
-                s11, s12, s22 = _stiffness(surface, t, i, j, i_later, j_later, e, sixth * pressure[0], by_edge, A)
+                s11, s12, s22 = _stiffness(surface, t, i, j, corners[1 + t], e, sixth * pressure[0], by_edge, A)
                 for c in range(3):
                     first = s11 * e[0, c] + s12 * e[1, c]
                     other = s12 * e[0, c] + s22 * e[1, c]
-                    of_fluid = pressure[0] * spin[c]
-                    force[i, j, c] -= first + other + of_fluid
-                    force[i1, j1, c] += first - of_fluid
-                    force[i2, j2, c] += other - of_fluid
-                    volume[i, j, c] += spin[c]
-                    volume[i1, j1, c] += spin[c]
-                    volume[i2, j2, c] += spin[c]
+                    of_energy = -(first + other), first, other
+                    for k in range(3):
+                        p, q = corners[k]
+                        force[p, q, c] += of_energy[k] - pressure[0] * spin[c]
+                        volume[p, q, c] += spin[c]
     _complete(surface.free, force, A)
     return enclosed
 
 
 @compiled
-def _stiffness(surface, t, i, j, i_later, j_later, e, share, by_edge, A):
-    """The stress `S` of a triangle: force on edge a is `sum_b S_ab e_b`. Added to the rows of `A` of its vertices, in later ones:
-    its energy's second derivatives, less `share` times those of the volume, which are cross products with edges whose sums about
-    a vertex, in itself, vanish."""
+def _stiffness(surface, t, i, j, later, e, share, by_edge, A):
+    """The stress `S` of a triangle: force on edge a is `sum_b S_ab e_b`. Added to `A`, in those of its vertices that come later
+    than one (`later` is the earlier of the second and the third): its energy's second derivatives, less `share` times those of
+    the volume, which are cross products with edges."""
     area, det = surface.area[t, i, j], surface.det[t, i, j]
     i11, i12, i22 = surface.inverse[0, t, i, j], surface.inverse[1, t, i, j], surface.inverse[2, t, i, j]
     g11 = e[0, 0] * e[0, 0] + e[0, 1] * e[0, 1] + e[0, 2] * e[0, 2]
     g12 = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
     g22 = e[1, 0] * e[1, 0] + e[1, 1] * e[1, 1] + e[1, 2] * e[1, 2]
-    I, D = i11 * g11 + i12 * g12 + i22 * g22, (g11 * g22 - g12 * g12) / det  # noqa: E741
+    I, inverse = i11 * g11 + (i12 * g12 + i12 * g12) + i22 * g22, det / (g11 * g22 - g12 * g12)  # noqa: E741
     linear, thickness, mixed, quadratic = surface.law[0], surface.law[1], surface.law[2], surface.law[3]
-    I += i12 * g12  # noqa: E741
-    inverse = 1 / D
     w_I = linear + mixed * inverse
     w_ID = -mixed * inverse * inverse
     w_D = quadratic + (w_ID * I - thickness * inverse * inverse)
@@ -125,11 +124,10 @@ def _stiffness(surface, t, i, j, i_later, j_later, e, share, by_edge, A):
     by_I, by_D = area * w_I, area / det * w_D
     s11, s12, s22 = by_I * i11 + by_D * g22, by_I * i12 - by_D * g12, by_I * i22 + by_D * g11
     scale = area + area
-    det_inverse = 1 / det
     for c in range(3):  # halves of what I and D change by in the edges
         by_edge[0, c], by_edge[1, c] = i11 * e[0, c] + i12 * e[1, c], i12 * e[0, c] + i22 * e[1, c]
-        by_edge[2, c] = det_inverse * (g22 * e[0, c] - g12 * e[1, c])
-        by_edge[3, c] = det_inverse * (g11 * e[1, c] - g12 * e[0, c])
+        by_edge[2, c] = (g22 * e[0, c] - g12 * e[1, c]) / det
+        by_edge[3, c] = (g11 * e[1, c] - g12 * e[0, c]) / det
     at_12, at_13, at_23 = 3 * PAIRS[t][0], 3 * PAIRS[t][1], 3 * PAIRS[t][2]
     for c in range(3):
         I1, I2 = scale * w_ID * by_edge[0, c], scale * w_ID * by_edge[1, c]
@@ -150,7 +148,7 @@ def _stiffness(surface, t, i, j, i_later, j_later, e, share, by_edge, A):
                 h22 += s22
             A[c, at_12 + d, i, j] -= h11 + h21
             A[c, at_13 + d, i, j] -= h12 + h22
-            A[c, at_23 + d, i_later, j_later] += h12 if t == 0 else h21
+            A[c, at_23 + d, later[0], later[1]] += h12 if t == 0 else h21
     for c in range(3):
         p, q = (c + 1) % 3, (c + 2) % 3
         x, y = share * e[0, c], share * e[1, c]
@@ -159,8 +157,8 @@ def _stiffness(surface, t, i, j, i_later, j_later, e, share, by_edge, A):
         A[p, at_12 + q, i, j] -= y
         A[q, at_13 + p, i, j] -= x
         A[p, at_13 + q, i, j] += x
-        A[q, at_23 + p, i_later, j_later] -= z
-        A[p, at_23 + q, i_later, j_later] += z
+        A[q, at_23 + p, later[0], later[1]] -= z
+        A[p, at_23 + q, later[0], later[1]] += z
     return s11, s12, s22
 
 
@@ -175,14 +173,17 @@ def _complete(free, force, A):
         shift, there = STENCIL[s][0] * n + STENCIL[s][1], 3 * (LAST - s)
         for c in range(3):
             for d in range(3):
-                planes[c, 3 * s + d, first:last] = planes[d, there + c, first + shift : last + shift]
+                for k in range(first, last):
+                    planes[c, 3 * s + d, k] = planes[d, there + c, k + shift]
     for c in range(3):
         for d in range(3):
             own = planes[c, 3 * OWN + d]
             own[:] = 0
             for s in range(LAST + 1):
                 if s != OWN:
-                    own -= planes[c, 3 * s + d]
+                    other = planes[c, 3 * s + d]
+                    for k in range(V):
+                        own[k] -= other[k]
     for i in range(m):
         for j in range(n):
             if not (0 < i < m - 1 and 0 < j < n - 1 and free[i, j]):

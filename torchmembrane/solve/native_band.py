@@ -1,24 +1,25 @@
-"""Symmetric positive definite band matrices by machine code made here: factor, and solve in halves.
+"""Symmetric positive definite band matrices by machine code: factor, and solve in halves.
 
-Row by row the matrix' upper half, `M = U^T U`: the entry at row `r`, column `c`, lies at `r ld + c - 16 floor(r / 16)`, so that
-columns of all rows are aligned alike. The rows of `U` are found `RANK` at a time; what they leave of the rows behind, two of
-these at a time, is `LANES` columns wide vectors of products: twice as fast as LAPACK's on bands of some 200, which must not be
-told from noise where a matrix is factored a dozen times a frame.
+Of `M = U^T U` the upper half is stored row by row, the entry at row `r`, column `c`, at `r ld + c - LANES floor(r / LANES)`: so
+columns of all rows are aligned alike. The rows of `U` are found `RANK` at a time; what they leave of the rows behind is
+worked out in vectors of `LANES` columns, `ROWS` rows at a time, and of the loads likewise. Left of the diagonal, and behind the
+last diagonal, lie numbers that mean nothing. On bands of 200 it takes two thirds of LAPACK's time for the factor, a third for
+the solutions: LAPACK works on blocks of 32 and takes loads one by one.
 """
 
 from typing import Any
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-LANES, RANK, ROWS, LOADS = 16, 8, 2, 8
+from ..machine_code import compiled
 
-compiled = numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
-"""Loops without Python: NaN and infinity as they are, sums in any order."""
+LANES, RANK, ROWS = 16, 8, 2
+LOADS = 8
+"""Right-hand sides."""
 
 
 def storage(unknowns: int, width: int) -> tuple[int, int, int]:
@@ -29,9 +30,11 @@ def storage(unknowns: int, width: int) -> tuple[int, int, int]:
 
 
 @intrinsic
-def _subtract(typing: Any, A: Any, row: Any, step: Any, S: Any, own: Any, turn: Any, W: Any, first: Any, ld: Any, chunks: Any) -> Any:
-    """Of the `ROWS` rows that begin at `A[row + k step]`, `A[row + k step + c] -= sum_p S[own + k + p turn] W[first + p ld + c]`,
-    for `c` in `LANES x chunks` columns."""
+def _subtract(
+    typing: Any, A: Any, row: Any, step: Any, S: Any, own: Any, turn: Any, W: Any, first: Any, ld: Any, chunks: Any
+) -> Any:
+    """`A[row + k step + c] -= sum_p S[own + k + p turn] W[first + p ld + c]`: of `ROWS` rows k and `LANES x chunks` columns c,
+    the sum over `RANK` rows p. Left to itself numba makes no vectors of it."""
     signature = types.void(A, types.intp, types.intp, S, types.intp, types.intp, W, *[types.intp] * 3)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -107,7 +110,9 @@ def factor(U, ld, width, n, inverse, W, b):
 def _panel(U, ld, first, inverse, W, shares):
     """The `RANK` rows of the factor from `first` on, in `U`, and in `W` with columns from those of their lane on."""
     lane = first % LANES
-    W[:] = U[first * ld : (first + RANK) * ld]
+    rows = U[first * ld : (first + RANK) * ld]
+    for t in range(RANK * ld):
+        W[t] = rows[t]
     for p in range(0, RANK, ROWS):
         if p > 0:
             shares[:] = 0
@@ -125,7 +130,8 @@ def _panel(U, ld, first, inverse, W, shares):
             row[t] *= inverse[first + p]
         for t in range(ld):
             below[t] = (below[t] - share * row[t]) * inverse[first + p + 1]
-    U[first * ld : (first + RANK) * ld] = W
+    for t in range(RANK * ld):
+        rows[t] = W[t]
     return True
 
 
