@@ -58,7 +58,7 @@ class Descent(nn.Module):
         self.equations, self.cavity, self.settings = equations, cavity, settings
         self.membrane = equations.forces.membrane
         self.inner_grid = self.membrane.grid[0] - 2, self.membrane.grid[1] - 2
-        self.native = NativeSteps()
+        self.native = NativeSteps(equations.is_slack)
 
     def forward(
         self,

@@ -26,12 +26,13 @@ class NativeSteps:
         settings: of the estimator.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, precise: bool = False) -> None:
+        self.precise = precise
         self._constants: tuple[Any, Constants] | None = None
         self._own = threading.local()
 
-    def __reduce__(self) -> tuple[Any, tuple[()]]:
-        return type(self), ()
+    def __reduce__(self) -> tuple[Any, tuple[bool]]:
+        return type(self), (self.precise,)
 
     def take(
         self,
@@ -44,16 +45,17 @@ class NativeSteps:
         scales: Sequence[float],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Displacement, pressure, camera and weights after a step; arguments as of `Descent.step`."""
-        grid = equations.forces.membrane.grid
-        u, pressure, moved, weights = (value.clone(memory_format=torch.contiguous_format) for value in (*state, weights))
-        gauge = torch.zeros_like(moved[:, :2]) if measured.gauge is None else measured.gauge
-        given = (*measured[:5], gauge)
-        arrays = [value.contiguous().numpy() for value in given]
-        constants = self._found(equations, cavity, settings, u.dtype)
-        work = self._work(grid, len(constants.positions), u.numpy().dtype)
-        numbers = tuple(float(scale) for scale in scales)
-        steps(constants, work, u.view(-1, *grid, 3).numpy(), pressure.numpy(), moved.numpy(), weights.numpy(), *arrays, numbers)
-        return u, pressure, moved, weights
+        grid, given = equations.forces.membrane.grid, state[0].dtype
+        dtype = torch.float64 if self.precise else given
+        changing = [value.to(dtype, copy=True, memory_format=torch.contiguous_format) for value in (*state, weights)]
+        gauge = torch.zeros_like(state[2][:, :2]) if measured.gauge is None else measured.gauge
+        fixed = [value.to(dtype).contiguous().numpy() for value in (*measured[:5], gauge)]
+        constants = self._found(equations, cavity, settings, changing[0].numpy().dtype)
+        work = self._work(grid, len(constants.positions), changing[0].numpy().dtype)
+        u, *others = (value.numpy() for value in changing)
+        steps(constants, work, u.reshape(-1, *grid, 3), *others, *fixed, tuple(float(scale) for scale in scales))
+        after, pressure, moved, weights = (value.to(given) for value in changing)
+        return after, pressure, moved, weights
 
     def _work(self, grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
         kept: dict[Any, Workspace] = self._own.__dict__
@@ -61,16 +63,14 @@ class NativeSteps:
             kept[dtype] = workspace(grid, markers, dtype)
         return kept[dtype]
 
-    def _found(
-        self, equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, dtype: torch.dtype
-    ) -> Constants:
+    def _found(self, equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, dtype: Any) -> Constants:
         forces, loss, bearings = equations.forces, equations.loss, equations.bearings
         elasticity, membrane = forces.elasticity, forces.membrane
         material = elasticity.prestretch, elasticity.c1, elasticity.c2, cavity.rest_pressure
         places = forces.rest_load, membrane.rest, loss.surroundings, bearings.positions
         key = dtype, *(float(value) for value in material), *(value.data_ptr() for value in places)
         if self._constants is None or self._constants[0] != key:
-            self._constants = key, _constants(equations, cavity, settings)
+            self._constants = key, _constants(equations, cavity, settings, dtype)
         return self._constants[1]
 
 
@@ -85,10 +85,10 @@ def takes(*values: Any) -> bool:
     )
 
 
-def _constants(equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings) -> Constants:
+def _constants(equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, dtype: Any) -> Constants:
     forces, loss, bearings = equations.forces, equations.loss, equations.bearings
     absolute, gas = cavity.gas.tolist()
-    surface = surface_of(forces.membrane, forces.elasticity, forces.rest_load)
+    surface = surface_of(forces.membrane, forces.elasticity, forces.rest_load, dtype)
     numbers = Numbers(
         reference=loss.reference,
         size=loss.size,
@@ -113,25 +113,30 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, settings: ForceBa
         absolute=absolute,
         gas_volume=gas,
     )
-    surroundings, wider = loss.surroundings.contiguous().numpy(), loss.wider.contiguous().numpy()
+
+    def array(values: Tensor) -> np.ndarray:
+        return np.ascontiguousarray(values.numpy(), dtype)
+
+    surroundings, wider = array(loss.surroundings), array(loss.wider)
     return Constants(
         surface,
-        loss.area.numpy(),
+        array(loss.area),
         surroundings,
         _within(surroundings),
         wider,
         _within(wider),
-        loss.push_noise.numpy(),
-        bearings.positions.numpy(),
-        _sparse(bearings.smooth_shares.numpy()),
-        _sparse(bearings.vertex_shares.numpy(), 3),
+        array(loss.push_noise),
+        array(bearings.positions),
+        _sparse(array(bearings.smooth_shares)),
+        _sparse(array(bearings.vertex_shares), 3),
         numbers,
     )
 
 
 def _volume(surface: Surface) -> float:
     """At rest, eq. 19, by triangles as steps sum it up."""
-    spins = np.cross(*surface.edges.astype(float).swapaxes(0, 1), axis=0).sum(1)
+    edges = surface.edges.astype(float)
+    spins = np.cross(edges[:, 0], edges[:, 1], axis=0).sum(1)
     inner: np.ndarray = surface.rest[:-1, :-1].astype(float)
     return float(surface.law[4] * (inner * np.moveaxis(spins, 0, -1)).sum())
 

@@ -18,8 +18,8 @@ BETWEEN = tuple(tuple(OFFSETS.index((b[0] - a[0], b[1] - a[1])) if b >= a else -
 """Of two vertices of a stencil, the offset from one to a later one."""
 USED = 7
 """Loads: of the volume, the forces, the fluid, the camera's four motions."""
-NOTHING = 1e-12
-"""Of the share of a vertex in a mean that does not count below `(far_share / scale_share)^(2 POWER)`, some 1e-4."""
+NOTHING = 1e-18
+"""Of a vertex in a mean that does not count below `(far_share / scale_share)^(2 POWER)`, some 1e-4."""
 
 
 class Constants(NamedTuple):

@@ -17,6 +17,10 @@ from .contact_force import ContactForce, Linearised
 from .robust import Cauchy
 from .traction_loss import Memory, TractionLoss
 
+SLACK = 0.5
+"""Rest tension over shear modulus x thickness, of a prestretch of 1.09, below which equations are solved in double precision:
+little holds a slack sheet between its markers, and float32 moves it by per cents of a press."""
+
 
 class NormalEquations(NamedTuple):
     """`M = A^T W A + J^T w J`: the forces' tangent stiffness `A [B, 3, 3, 7, N]` and weights `W [B, 3, 3, N]`; the weighted
@@ -42,6 +46,8 @@ class BalanceEquations(nn.Module):
         super().__init__()
         self.forces, self.bearings, self.loss = forces, bearings, loss
         self.system = StencilSystem(forces.membrane.grid, forces.inner_free > 0)
+        elasticity = forces.elasticity
+        self.is_slack = bool(elasticity.tension < SLACK * 2 * (elasticity.c1 + elasticity.c2))
 
     def linearised(
         self,

@@ -7,6 +7,7 @@ operations over all triangles, of which a grid has too few to make them worth th
 from typing import Any, NamedTuple
 
 import numpy as np
+from torch import Tensor
 
 from ..machine_code import compiled
 from ..surface.membrane import Membrane
@@ -42,22 +43,25 @@ class Surface(NamedTuple):
     """`[5]`: `c1 l^2, c1 / l^4, c2 / l^2, c2 l^4`, the second zero where the energy is harmonic; a sixth, the outward sign."""
 
 
-def surface_of(membrane: Membrane, elasticity: ElasticEnergy, load: Any) -> Surface:
-    """Of a membrane and its material; `load`: the rest load `[V, 3]`."""
+def surface_of(membrane: Membrane, elasticity: ElasticEnergy, load: Tensor, dtype: np.dtype) -> Surface:
+    """Of a membrane and its material, in a precision; `load`: the rest load `[V, 3]`."""
     m, n = membrane.grid
     l2, c1, c2 = (float(value) for value in (elasticity.prestretch**2, elasticity.c1, elasticity.c2))
     law = [c1 * l2, 0.0 if elasticity.model == "harmonic" else c1 / l2**2, c2 / l2, c2 * l2**2, membrane.outward / 6]
-    vertices = (m, n, 3)
-    cells = (2, m - 1, n - 1)
+
+    def array(values: Tensor, *shape: int) -> np.ndarray:
+        return np.asarray(values.numpy().reshape(shape), dtype)
+
+    cells = 2, m - 1, n - 1
     return Surface(
-        membrane.rest.numpy().reshape(vertices),
+        array(membrane.rest, m, n, 3),
         ~membrane.fixed.numpy().reshape(m, n),
-        load.numpy().reshape(vertices),
-        elasticity.rest_edges.numpy().reshape(3, 2, *cells),
-        elasticity.inverse_metric.numpy().reshape(3, *cells),
-        elasticity.det.numpy().reshape(cells),
-        elasticity.area.numpy().reshape(cells),
-        np.array(law, membrane.rest.numpy().dtype),
+        array(load, m, n, 3),
+        array(elasticity.rest_edges, 3, 2, *cells),
+        array(elasticity.inverse_metric, 3, *cells),
+        array(elasticity.det, *cells),
+        array(elasticity.area, *cells),
+        np.array(law, dtype),
     )
 
 

@@ -1,0 +1,293 @@
+"""Laws of the steps by machine code: the tensor operations' own numbers, frame by frame; whatever these cannot do is left to them."""
+
+import ast
+import copy
+import pickle
+import re
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchmembrane.camera.model import Camera
+from torchmembrane.estimators import native_step
+from torchmembrane.estimators.bearings import marker_rays
+from torchmembrane.estimators.descent import Scales, State
+from torchmembrane.estimators.force_balance import ForceBalance
+from torchmembrane.estimators.native import takes
+from torchmembrane.estimators.settings import ForceBalanceSettings
+from torchmembrane.machine_code import aligned
+from torchmembrane.mechanics.hyperelastic import ElasticEnergy
+from torchmembrane.solve import native_band
+from torchmembrane.surface.membrane import Membrane
+from torchmembrane.surface.shapes import spherical_cap
+
+CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
+PACKAGE = Path(native_step.__file__).parents[1]
+SCALES = (0.4, 2.5, 23.0, 0.25, 1e-4)  # tau, outlier, cone, renewal, damping
+
+
+def estimator(model="neo_hookean", prestretch=1.3, filling="liquid", grid=(11, 9), hole=False):
+    """Of a cap, its lines not alike in both directions, 25 dots; `hole`: some inner vertices are fixed."""
+    dome = spherical_cap(12, 9, 3, grid)
+    if hole:
+        fixed = dome.fixed.reshape(grid).numpy().copy()
+        fixed[3:5, 4] = True
+        dome = Membrane(dome.rest.reshape(*grid, 3).numpy(), fixed)
+    positions = spherical_cap(12, 9, 3, (7, 7)).rest.reshape(7, 7, 3)[1:-1, 1:-1].reshape(-1, 3)
+    pixels = CAMERA.point_to_pixel(positions)[None]
+    covariance = 0.01 * torch.tensor([[1.0, 0.3], [0.3, 2.0]], dtype=torch.float64).expand(1, len(positions), 2, 2)
+    rest = marker_rays(CAMERA, pixels, positions, torch.ones_like(pixels[..., 0]), covariance)
+    energy = ElasticEnergy(dome, model, prestretch, 0.7, 0.3 if model == "mooney_rivlin" else 0.0)
+    gas = (4.0, 5000.0) if filling == "gas" else None
+    return ForceBalance(dome, energy, dome.closest_points(positions.numpy()), positions, 1e-3, filling, gas, rest=rest)
+
+
+def problem(balance, frames=3, gauge=False, dtype=torch.float64):
+    """A state of a pressed surface, some way off, weights of a step before, and what is measured: some markers are lost."""
+    generator = torch.Generator().manual_seed(3)
+
+    def noise(*shape, size=1.0):
+        return size * torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    membrane, positions = balance.membrane, balance.equations.bearings.positions
+    free = (~membrane.fixed).double()[:, None]
+    towards = torch.tensor([0.3, 0.1, -1.0], dtype=torch.float64)
+    dent = torch.exp(-((membrane.rest - membrane.rest[len(free) // 2]).square().sum(-1)) / 8)[:, None] * towards
+    u = (dent + noise(frames, *membrane.rest.shape, size=0.05)) * free
+    pixels = CAMERA.point_to_pixel(positions) + noise(frames, len(positions), 2, size=2.0)
+    covariance = (0.02 + 0.01 * noise(frames, len(positions), 1, 1) ** 2) * torch.eye(2, dtype=torch.float64)
+    confidence = (torch.rand(frames, len(positions), generator=generator) > 0.2).double()
+    observation = marker_rays(CAMERA, pixels, positions, confidence, covariance)
+    if gauge:
+        observation = balance.gauged(observation, balance.rest_pressure + noise(frames, size=0.01))
+    state = State(u, balance.rest_pressure * (1 + noise(frames, size=0.1)), noise(frames, 4, size=0.01))
+    weights = 0.1 + noise(frames, len(balance.equations.loss.area)).abs()
+    measured = balance.equations.bearings.measured(observation)
+    cast = [State(*(value.to(dtype) for value in state)), weights.to(dtype)]
+    return *cast, type(measured)(*(None if value is None else value.to(dtype) for value in measured))
+
+
+def taken(balance, state, weights, measured, scales=SCALES):
+    descent = balance.descent
+    return descent.native.take(descent.equations, descent.cavity, descent.settings, state, weights, measured, scales)
+
+
+def expected(balance, state, weights, measured, scales=SCALES):
+    """By tensor operations."""
+    numbers = Scales(*(torch.tensor(scale, dtype=state.u.dtype) for scale in scales))
+    with torch.no_grad():
+        after, renewed = balance.descent.step(state, weights, measured, numbers)
+    return *after, renewed
+
+
+def assert_same(found, wanted, rtol=1e-9):
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=rtol, atol=rtol * float(other.abs().max()))
+
+
+@pytest.mark.parametrize("model", ["harmonic", "neo_hookean", "mooney_rivlin"])
+@pytest.mark.parametrize("filling", ["liquid", "gas", "open"])
+@pytest.mark.parametrize("hole", [False, True])
+def test_a_step_is_that_of_tensor_operations(model, filling, hole):
+    balance = estimator(model, filling=filling, hole=hole)
+    given = problem(balance, gauge=filling != "open")
+    assert_same(taken(balance, *given), expected(balance, *given))
+
+
+@pytest.mark.parametrize("scales", [(4.0, 50.0, 5.0, 1.0, 3e-5), (16.0, 200.0, 0.0, 1.0, 1e-7), (0.4, 2.5, 23.0, 0.25, 1e-3)])
+@pytest.mark.parametrize("grid", [(9, 9), (6, 13), (17, 17)])
+def test_so_it_is_with_all_scales_on_all_grids(scales, grid):
+    balance = estimator(grid=grid)
+    given = problem(balance)
+    assert_same(taken(balance, *given, scales), expected(balance, *given, scales))
+
+
+def test_every_setting_is_heard_of():
+    """Each changes a step, as it changes that of tensor operations."""
+    changed = dict(friction=2.0, slip=0.2, sparsity=900.0, floor=0.1, scale_share=0.9, far_share=0.8, noise_share=40.0)
+    changed |= dict(decrease=0.1, least_scale=0.3, camera_motion=0.5, longest_step=1e-4, largest_stretch=1e-3)
+    balance, scales = estimator(), (0.5, 2.5, 23.0, 0.5, 1e-4)
+    given = problem(balance)
+    usual = taken(balance, *given, scales)[0]
+    for name, value in changed.items():
+        other = estimator()
+        settings = replace(ForceBalanceSettings(), **{name: value})
+        other.descent.settings = other.equations.loss.settings = settings
+        other.equations.loss.shear = type(other.equations.loss.shear)(settings.slip)
+        found = taken(other, *given, scales)
+        assert_same(found, expected(other, *given, scales))
+        assert float((found[0] - usual).abs().max()) > 1e-6 * float(usual.abs().max()), name
+
+
+def test_a_frame_alone_is_that_of_a_batch_to_the_last_digit():
+    balance = estimator()
+    state, weights, measured = problem(balance)
+    together = taken(balance, state, weights, measured)
+    for k in range(3):
+        one = type(measured)(*(None if value is None else value[k : k + 1] for value in measured))
+        alone = taken(balance, State(*(value[k : k + 1] for value in state)), weights[k : k + 1], one)
+        assert_same(alone, [value[k : k + 1] for value in together], rtol=0)
+
+
+def test_nothing_that_was_given_changes():
+    balance = estimator()
+    state, weights, measured = problem(balance)
+    before = [value.clone() for value in (*state, weights, *measured[:5])]
+    taken(balance, state, weights, measured)
+    assert_same([*state, weights, *measured[:5]], before, rtol=0)
+
+
+def test_zero_flow_gives_zero_displacement():
+    balance = estimator()
+    _, weights, measured = problem(balance)
+    at_rest = balance.equations.bearings.angles(torch.zeros_like(balance.membrane.rest[None]), measured, torch.zeros(1, 4))
+    positions = balance.equations.bearings.positions.T.expand(3, -1, -1)
+    along = torch.nn.functional.normalize(positions - measured.origins, dim=1)
+    across = measured.across - (measured.across * along[:, None]).sum(2, keepdim=True) * along[:, None]
+    assert float(at_rest[0].abs().max()) > 1
+    after = taken(balance, balance.at_rest(measured.weight), torch.ones_like(weights), measured._replace(across=across))
+    assert float(after[0].abs().max()) < 1e-12 * balance.size
+
+
+@pytest.mark.parametrize("spoil", ["across", "origins"])
+def test_a_broken_frame_is_nan_and_the_others_are_not(spoil):
+    balance = estimator()
+    state, weights, measured = problem(balance)
+    broken = getattr(measured, spoil).clone()
+    broken[1, ..., 4] = torch.nan
+    found = taken(balance, state, weights, measured._replace(**{spoil: broken}))
+    assert found[0][1].isnan().any() and found[1][1].isnan()
+    fine = taken(balance, state, weights, measured)
+    assert_same([value[::2] for value in found], [value[::2] for value in fine], rtol=0)
+
+
+def test_another_prestretch_is_another_step():
+    balance = estimator()
+    given = problem(balance)
+    before = taken(balance, *given)
+    balance.set_prestretch(torch.tensor(1.5, dtype=torch.float64))
+    after = taken(balance, *given)
+    assert_same(after, expected(balance, *given))
+    assert float((after[0] - before[0]).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda balance: pickle.loads(pickle.dumps(balance))])
+def test_a_copy_has_its_own_constants(copied):
+    balance = estimator()
+    given = problem(balance)
+    before = taken(balance, *given)
+    other = copied(balance)
+    other.set_prestretch(torch.tensor(1.5, dtype=torch.float64))
+    assert_same(taken(other, *given), expected(other, *given))
+    assert_same(taken(balance, *given), before, rtol=0)
+
+
+def test_threads_do_not_disturb_each_other():
+    balance = estimator()
+    given = [problem(balance, frames=frames) for frames in (1, 2, 3, 4)]
+    alone, found = [taken(balance, *one) for one in given], {}
+
+    def work(k):
+        for _ in range(30):
+            found[k] = taken(balance, *given[k])
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for k, one in enumerate(alone):
+        assert_same(found[k], one, rtol=0)
+
+
+def test_slack_sheets_are_solved_in_double_precision():
+    """float32 moves the answer of a sheet of prestretch 1.004 by more than a hundredth of what a step in double precision of the
+    same rounded numbers does."""
+    for prestretch, is_slack in ((1.004, True), (1.3, False)):
+        balance = estimator(prestretch=prestretch, grid=(17, 17))
+        assert balance.descent.native.precise == is_slack
+        wanted = taken(balance, *problem(balance))
+        in_single = copy.deepcopy(balance).float()
+        given = problem(balance, dtype=torch.float32)
+        errors = []
+        for precise in (True, False):
+            in_single.descent.native.precise = precise
+            found = taken(in_single, *given)
+            assert found[0].dtype == torch.float32
+            errors.append(float((found[0].double() - wanted[0]).abs().max() / (wanted[0] - problem(balance)[0].u).abs().max()))
+        if is_slack:
+            assert errors[0] < 1e-3 and errors[1] > 10 * errors[0]
+
+
+def test_what_needs_tensor_operations_is_left_to_them():
+    x = torch.ones(3)
+    assert takes(x, None)
+    assert not takes(x, torch.ones(1, requires_grad=True))
+    with torch.no_grad():
+        assert takes(torch.ones(1, requires_grad=True))
+    assert not takes(torch.ones(3, device="meta"))
+    asked = []
+    torch.func.vmap(lambda one: asked.append(takes(one)) or one)(x)
+    torch.compile(lambda one: one + takes(one), backend="eager")(x)
+    assert asked == [False]
+    assert torch.compile(lambda one: one + takes(one), backend="eager")(x)[0] == 1
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("unknowns, width", [(5, 3), (16, 7), (50, 20), (147, 50), (675, 98)])
+def test_a_band_is_factored_and_solved_as_the_dense_matrix(unknowns, width, dtype):
+    matrix, U, sizes = band(unknowns, width, dtype)
+    size, ld = sizes
+    b = aligned(native_band.LOADS * size, np.dtype(dtype))
+    loads = np.random.default_rng(1).normal(size=(native_band.LOADS, unknowns))
+    b.reshape(-1, size)[:, :unknowns] = loads
+    inverse, panel = np.zeros(size, dtype), np.zeros(native_band.RANK * ld, dtype)
+    assert native_band.factor(U, ld, width, size, inverse, panel, b)
+    exact = np.linalg.solve(matrix, loads.T)
+    tolerance = 1e3 * np.finfo(dtype).eps
+    y = b.reshape(-1, size)[:, :unknowns].astype(float)
+    np.testing.assert_allclose(y @ y.T, loads @ exact, rtol=0, atol=tolerance * abs(loads @ exact).max())
+    first = b[:size]
+    native_band.backward(U, ld, width, size, inverse, first)
+    np.testing.assert_allclose(first[:unknowns], exact[:, 0], rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("row", [0, 1, 30, 49])
+@pytest.mark.parametrize("spoil", [-1.0, np.nan])
+def test_a_band_that_is_not_positive_has_no_factor(row, spoil):
+    _, U, (size, ld) = band(50, 20, np.float64)
+    U[row * ld + row % native_band.LANES] = spoil
+    b = aligned(native_band.LOADS * size, np.dtype(float))
+    assert not native_band.factor(U, ld, 20, size, np.zeros(size), np.zeros(native_band.RANK * ld), b)
+
+
+def band(unknowns, width, dtype):
+    """A random positive matrix, dense, and as `native_band` stores it."""
+    size, rows, ld = native_band.storage(unknowns, width)
+    generator = np.random.default_rng(0)
+    matrix, stored = np.zeros((unknowns, unknowns)), aligned(rows * ld, np.dtype(dtype))
+    for r in range(size):
+        values = generator.normal(size=min(width + 1, max(unknowns - r, 1))) / (4 * width)
+        values[0] = 1.0
+        at = r * ld + r % native_band.LANES
+        stored[at : at + len(values)] = values
+        if r < unknowns:
+            matrix[r, r : r + len(values)] = matrix[r : r + len(values), r] = values
+    return matrix, stored, (size, ld)
+
+
+def test_what_is_kept_on_disk_hangs_on_all_its_sources():
+    """Every file with a function that is compiled into the steps is in their fingerprint."""
+    files = [path for path in PACKAGE.rglob("*.py") if re.search(r"import .*\bcompiled\b", path.read_text())]
+    (call,) = [
+        node
+        for node in ast.walk(ast.parse(Path(native_step.__file__).read_text()))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "fingerprint"
+    ]
+    named = {node.id for node in ast.walk(call) if isinstance(node, ast.Name)}
+    compiled = {path.stem for path in files if path.stem != "native_step"}
+    assert compiled == named & {path.stem for path in PACKAGE.rglob("*.py")}
