@@ -58,7 +58,7 @@ class Descent(nn.Module):
         self.equations, self.cavity, self.settings = equations, cavity, settings
         self.membrane = equations.forces.membrane
         self.inner_grid = self.membrane.grid[0] - 2, self.membrane.grid[1] - 2
-        self.native = NativeSteps(equations.is_slack)
+        self.native, self._given = NativeSteps(equations.is_slack), (equations, cavity, settings)
 
     def forward(
         self,
@@ -96,11 +96,19 @@ class Descent(nn.Module):
         *of_markers, rows, settling = given
         measured, last = Bearings(*of_markers), rows[-settling:] if settling > 1 else []
         state: Sequence[Any] = (u, pressure, moved, u, self._unweighted(u))
-        state = repeated(self._next, rows[: len(rows) - len(last)], state, measured)
+        first = rows[: len(rows) - len(last)]
+        if self._by_machine_code(*state, *of_markers):
+            state = self.native.take(*self._given, State(u, pressure, moved), state[4], measured, first)
+        else:
+            state = repeated(self._next, first, state, measured)
         if last:
             state = repeated(self._settle, last, (*state, *state[:4], self._none_found(pressure)), measured)[5:]
         u, pressure, moved, before = state[:4]
         return u, pressure, moved, before
+
+    def _by_machine_code(self, *values: Any) -> bool:
+        """Whether steps of these tensors are taken so."""
+        return takes(*values, self.equations.forces.elasticity.prestretch)
 
     @piece
     def _unweighted(self, u: Tensor) -> Tensor:
@@ -171,8 +179,8 @@ class Descent(nn.Module):
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.
 
         With gradients every step is: those of a nested region come with strides that torch 2.13 does not follow."""
-        if takes(*state, weights, *measured, self.equations.forces.elasticity.prestretch):
-            *after, weights = self.native.take(self.equations, self.cavity, self.settings, state, weights, measured, scales)
+        if self._by_machine_code(*state, weights, *measured):
+            *after, _, weights = self.native.take(*self._given, state, weights, measured, [scales])
             return State(*after), weights
         numbers = Scales(*(torch.as_tensor(scale, dtype=state.u.dtype, device=state.u.device) for scale in scales))
         unrolled = torch.compiler.is_exporting() or torch.is_grad_enabled()

@@ -42,9 +42,10 @@ class NativeSteps:
         state: tuple[Tensor, Tensor, Tensor],
         weights: Tensor,
         measured: Bearings,
-        scales: Sequence[float],
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Displacement, pressure, camera and weights after a step; arguments as of `Descent.step`."""
+        rows: Sequence[Sequence[float]],
+    ) -> list[Tensor]:
+        """Displacement, pressure and camera after the steps, the displacement before the last, and the weights; arguments as of
+        `Descent.step`, `rows`: the numbers of every step."""
         grid, given = equations.forces.membrane.grid, state[0].dtype
         dtype = torch.float64 if self.precise else given
         changing = [value.to(dtype, copy=True, memory_format=torch.contiguous_format) for value in (*state, weights)]
@@ -52,10 +53,12 @@ class NativeSteps:
         fixed = [value.to(dtype).contiguous().numpy() for value in (*measured[:5], gauge)]
         constants = self._found(equations, cavity, settings, changing[0].numpy().dtype)
         work = self._work(grid, len(constants.positions), changing[0].numpy().dtype)
-        u, *others = (value.numpy() for value in changing)
-        steps(constants, work, u.reshape(-1, *grid, 3), *others, *fixed, tuple(float(scale) for scale in scales))
-        after, pressure, moved, weights = (value.to(given) for value in changing)
-        return after, pressure, moved, weights
+        changing.append(changing[0].clone())
+        u, pressure, moved, weighing, before = (value.numpy() for value in changing)
+        surfaces = u.reshape(-1, *grid, 3), pressure, moved, weighing, before.reshape(-1, *grid, 3)
+        steps(constants, work, *surfaces, *fixed, np.array(rows, float).reshape(-1, 5))
+        after, pressure_after, camera, weights, before_last = (value.to(given) for value in changing)
+        return [after, pressure_after, camera, before_last, weights]
 
     def _work(self, grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
         kept: dict[Any, Workspace] = self._own.__dict__

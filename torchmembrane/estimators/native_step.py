@@ -18,14 +18,14 @@ from .native_equations import USED, fill, load_forces, load_markers, sum_blocks,
 
 
 @compiled
-def _step(c, work, u, pressure, moved, before, seen, noise_level, gauge, scales):
-    """From a state to the next: `u [m, n, 3]`, `pressure [1]`, `moved [4]` and `before [N]`, the weights of normal tractions,
+def _step(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales):
+    """From a state to the next: `u [m, n, 3]`, `pressure [1]`, `moved [4]` and `weights [N]`, of the normal tractions,
     change."""
-    tau, outlier, cone, renewal, damping = scales
+    tau, outlier, cone, renewal, damping = scales[0], scales[1], scales[2], scales[3], scales[4]
     m, n = c.surface.free.shape
     rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
     own, slope = np.zeros((4, 4)), np.zeros(4)
-    weigh(c, work, before, noise_level, tau, cone, renewal)
+    weigh(c, work, weights, noise_level, tau, cone, renewal)
     fWv, vWv = load_forces(c, work)
     load_markers(c, work, u, moved, seen, outlier, own, slope)
     sum_blocks(c, work)
@@ -145,14 +145,20 @@ def _share(c, u, move):
 
 def _entry(sources):
     @kept
-    def steps(c, work, u, pressure, moved, before, origins, across, weight, noise_level, motion, gauge, scales):
-        """A step of every frame: states `u [B, m, n, 3]`, `pressure [B]`, `moved [B, 4]` and `before [B, N]` become the next.
+    def steps(c, work, u, pressure, moved, weights, before, origins, across, weight, noise_level, motion, gauge, rows):
+        """Steps of every frame: states `u [B, m, n, 3]`, `pressure [B]`, `moved [B, 4]` and `weights [B, N]`, of the normal
+        tractions, become those after them; `before [B, m, n, 3]` the displacement before the last.
 
-        c: `Constants`, work: a `Workspace`, origins to gauge: `Bearings`, scales: tau, outlier, cone, renewal, damping.
+        c: `Constants`, work: a `Workspace`, origins to gauge: `Bearings`, rows: of every step tau, outlier, cone, renewal and
+        damping, `[S, 5]`.
         """
         for b in range(len(u) if sources else 0):
             seen = origins[b], across[b], weight[b], motion[b]
-            _step(c, work, u[b], pressure[b : b + 1], moved[b], before[b], seen, noise_level[b], gauge[b], scales)
+            for k in range(len(rows)):
+                if k == len(rows) - 1:
+                    before[b] = u[b]
+                state = u[b], pressure[b : b + 1], moved[b], weights[b]
+                _step(c, work, *state, seen, noise_level[b], gauge[b], rows[k])
 
     return steps
 
