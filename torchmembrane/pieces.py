@@ -74,14 +74,18 @@ def piece(method: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
 
 def named(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[torch.Tensor], torch.Tensor]:
     """Make a function, to a tensor of the shape and type of its argument, one that a piece being traced holds as one node of
-    the domain `NAMED`, its type the function's name: its own nodes are traced once for every shape."""
+    the domain `NAMED`, its type the function's name: its own nodes are traced once for every shape and precision."""
 
     @wraps(function)
     def called(value: torch.Tensor) -> torch.Tensor:
         if not _writing.get():
             return function(value)
         kept: torch.Tensor = torch.onnx.ops.symbolic(
-            f"{NAMED}::{function.__name__}", (value,), {"sizes": [*value.shape[1:]]}, dtype=value.dtype, shape=value.shape
+            f"{NAMED}::{function.__name__}",
+            (value,),
+            {"sizes": [*value.shape[1:]], "bytes": value.element_size()},
+            dtype=value.dtype,
+            shape=value.shape,
         )
         return kept
 

@@ -14,6 +14,7 @@ from ..solve.implicit import differentiable
 from ..solve.kkt import border_unknowns
 from ..surface.stencil import inner
 from .bearings import Bearings
+from .camera_motion import CameraMotion
 from .native import NativeSteps, takes
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
@@ -210,6 +211,9 @@ class Descent(nn.Module):
             *state, measured, tau, outlier, cone, memory=(weights, renewal)
         )
         loads = torch.cat([loads, motion.coupling], 1)
+        if equations.is_slack:
+            normal, loads = NormalEquations(*(part.double() for part in normal)), loads.double()
+            motion, corner = CameraMotion(*(part.double() for part in motion)), (corner[0].double(), corner[1].double())
         first, last = self.settings.tau
         blunt = (tau.clamp_max(first) / last) ** 2  # 1 as tau ends
         solved = self._solved(normal, loads, damping)
@@ -218,7 +222,8 @@ class Descent(nn.Module):
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
         shares = self._shares(u, pressure, products, corner)
         turn = (following @ shares[..., None])[..., 0]
-        move = F.pad(-(torch.cat([shares, turn], 1)[:, None] @ solved).unflatten(-1, (3, *self.inner_grid))[:, 0], (1, 1, 1, 1))
+        inner_move = -(torch.cat([shares, turn], 1)[:, None] @ solved).to(u).unflatten(-1, (3, *self.inner_grid))[:, 0]
+        shares, turn, move = shares.to(u), turn.to(u), F.pad(inner_move, (1, 1, 1, 1))
         share = self._share(u, move)
         u = u + share[:, None, None] * move.flatten(2).mT
         return State(u, pressure + share * shares[:, 2], moved + share[:, None] * turn), weights
@@ -235,7 +240,7 @@ class Descent(nn.Module):
     def _shares(self, u: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:
         """Shares `[B, 3]` in a step, but for its sign, of what solves the volume's row, the loads and the pressure's row: the
         second is 1, the third what the pressure rises by."""
-        one = torch.ones_like(pressure)
+        one = torch.ones_like(products[:, 0, 0])
         if self.cavity.filling == "open":
             return torch.stack([0 * one, one, 0 * one], 1)
         fWv, vWv = corner

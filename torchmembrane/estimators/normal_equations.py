@@ -95,14 +95,14 @@ class BalanceEquations(nn.Module):
 
     def matrix(self, normal: NormalEquations, damping: float | Tensor = 1e-6) -> Matrix:
         """`M` as `system.factor` takes it, with a share of its diagonal added."""
-        near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1))
+        near = (normal.marker_blocks @ self.bearings.pair_shares.to(normal.marker_blocks)).unflatten(-1, (len(NEAR), -1))
         return self.system.matrix(normal.stiffness, normal.weights, near, damping)
 
     def product(self, normal: NormalEquations, u: Tensor, damping: float | Tensor | None = None) -> Tensor:
         """`M u` for `u [B, C, 3 N]`, without the matrix; with `damping` as of `matrix`."""
         if damping is not None:
             return self.product(normal, u) + damping * self._diagonal(normal).flatten(1)[:, None] * u
-        u, change, shares = u.unflatten(-1, (3, -1)), self.forces.change, self.bearings.vertex_shares
+        u, change, shares = u.unflatten(-1, (3, -1)), self.forces.change, self.bearings.vertex_shares.to(u)
         of_forces = change(normal.stiffness, _weighed(normal.weights[:, None], change(normal.stiffness, u)))
         of_markers = _weighed(normal.marker_blocks[:, None], u @ shares.transpose(0, 1)) @ shares
         return (of_forces + of_markers).flatten(2)
@@ -112,8 +112,12 @@ class BalanceEquations(nn.Module):
         A, (m, n) = normal.stiffness, self.forces.membrane.grid
         squares = (A * (normal.weights[:, :, :, None, None] * A[:, None]).sum(2)).sum(1)
         planes = squares.unflatten(-1, (m - 2, n - 2)).flatten(0, 1)
-        of_forces = F.conv_transpose2d(planes, self.forces.kernels[:, None], padding=1).reshape(-1, 3, squares.shape[-1])
-        of_markers = normal.marker_blocks.diagonal(dim1=1, dim2=2).mT @ self.bearings.pair_shares[:, : squares.shape[-1]]
+        of_forces = F.conv_transpose2d(planes, self.forces.kernels[:, None].to(planes), padding=1).reshape(
+            -1, 3, squares.shape[-1]
+        )
+        of_markers = normal.marker_blocks.diagonal(dim1=1, dim2=2).mT @ self.bearings.pair_shares[:, : squares.shape[-1]].to(
+            squares
+        )
         return of_forces + of_markers
 
 

@@ -131,13 +131,14 @@ class Tracer:
         return inlined(model, self._function)
 
     def _function(self, node: onnx.NodeProto) -> onnx.ModelProto:
-        """The model of a `named` function for the sizes that a node has, but for the batch."""
-        name, sizes = node.op_type, tuple(node.attribute[0].ints)
-        if (name, sizes) not in self.traced:
-            example = {"value": torch.zeros(EXAMPLES, *sizes)}
+        """The model of a `named` function for the sizes that a node has, but for the batch, and its precision."""
+        given = {attribute.name: attribute for attribute in node.attribute}
+        name, sizes, width = node.op_type, tuple(given["sizes"].ints), given["bytes"].i
+        if (name, sizes, width) not in self.traced:
+            example = {"value": torch.zeros(EXAMPLES, *sizes, dtype=torch.float32 if width == 4 else torch.float64)}
             piece = Piece(None, lambda _, value: FUNCTIONS[name](value))
-            self.traced[name, sizes] = self._whole(traced(piece, example, ["result"]))
-        return self.traced[name, sizes]
+            self.traced[name, sizes, width] = self._whole(traced(piece, example, ["result"]))
+        return self.traced[name, sizes, width]
 
     def _known(self, found: Any, names: dict[str, str]) -> Any:
         """The values of such names, arranged as the examples `found` are."""
@@ -158,9 +159,9 @@ def export(
 ) -> onnx.ModelProto:
     """Write the whole reconstruction, image to result, as one ONNX model, if it agrees with torch.
 
-    Standard operators only, float32, batch free. Run on the sensor at rest and pressed, both simulated, it must give torch's
-    statuses, and vertices within 3e-5 of the surface's size. The model's metadata hold `format`, `status_texts` and `mesh` (the
-    fields of `Mesh`) as JSON.
+    Standard operators only, batch free, float32, but for the equations of slack sheets, float64. Run on the sensor at rest and
+    pressed, both simulated, it must give torch's statuses, and vertices within 3e-5 of the surface's size. The model's metadata
+    hold `format`, `status_texts` and `mesh` (the fields of `Mesh`) as JSON.
 
     Args:
         reconstructor: the sensor's.

@@ -28,7 +28,7 @@ def inlined(model: onnx.ModelProto, function: Callable[[onnx.NodeProto], onnx.Mo
         inside, (result,) = function(node).graph, node.output
         known = {inside.input[0].name: node.input[0], inside.output[0].name: result}
         for tensor in inside.initializer:
-            known[tensor.name] = f"{node.op_type}/{list(node.attribute[0].ints)}/{tensor.name}"
+            known[tensor.name] = f"{node.op_type}/{[list(each.ints) or each.i for each in node.attribute]}/{tensor.name}"
             constants[known[tensor.name]] = tensor
         nodes.extend(renamed(inside.node, known, result))
     del graph.node[:]

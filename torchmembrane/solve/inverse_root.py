@@ -25,7 +25,8 @@ from ..pieces import at_hand, named
 
 LEAF = 140  # rows: halves of a smaller one take no less time
 ITERATED_LEAF = 48
-RIDGE = 1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor or is iterated (float32: rounding's share)
+RIDGE = 1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor or is iterated: float32's share of rounding
+SMALL_RIDGE = 1e-10  # the same in float64, where conditions are that large and no larger
 NEAR_ONE = 0.1  # eigenvalues of R A R^T are 1 but for this before the last steps, each of which squares it
 LAST_STEPS = 3
 LARGEST_ENTRY = 10.0  # of R, over that of the root of a ridge alone: more is divergence
@@ -64,7 +65,7 @@ def by_products(matrix: Tensor) -> Tensor:
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     rows = matrix.abs().sum(-1, keepdim=True)
     largest = rows.amax(-2, keepdim=True)
-    ridge = RIDGE * torch.finfo(matrix.dtype).eps / torch.finfo(torch.float32).eps
+    ridge = RIDGE if matrix.dtype == torch.float32 else SMALL_RIDGE
     iteration = Iteration.to(1 / ridge, NEAR_ONE)
     A = matrix / largest
     Y = iteration.first * (A + ridge * one)
