@@ -190,7 +190,7 @@ def test_spreads_by_the_transposed_equations_are_those_of_every_noise_by_itself(
     found = estimator(observation)
     net, state = estimator.coarse, estimator.coarsened(found.vertices - estimator.membrane.rest, found.pressure, found.moved)
     settings, equations = estimator.settings, net.equations
-    of_force, of_depth = spreads(equations, net.cavity, settings, state, observation)
+    of_force, of_depth = spreads(net.descent, settings, state, observation)
     measured = equations.bearings.measured(observation)
     scales = settings.tau[1], settings.outlier
     _, normal, solution = linearise(equations, net.cavity, state, measured, scales, settings.camera_motion, curvature=True)

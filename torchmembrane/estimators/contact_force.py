@@ -76,7 +76,7 @@ class ContactForce(nn.Module):
     def change(self, stiffness: Tensor, step: Tensor) -> Tensor:
         """How forces change, `A u [B, C, 3, N]`, for steps `u` of that shape of the inner vertices: `A^T u` as well."""
         m, n = self.membrane.grid
-        steps = apply_stencil(step.mT, self.kernels.to(step), (m - 2, n - 2))
+        steps = apply_stencil(step.mT, self.kernels, (m - 2, n - 2))
         steps = steps.unflatten(-1, (len(self.kernels), -1)).flatten(2, 3)
         changed: Tensor = (stiffness.flatten(2, 3)[:, None] * steps[:, :, None]).sum(3)
         return changed

@@ -14,7 +14,6 @@ from ..solve.implicit import differentiable
 from ..solve.kkt import border_unknowns
 from ..surface.stencil import inner
 from .bearings import Bearings
-from .camera_motion import CameraMotion
 from .native import NativeSteps, takes
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
@@ -45,6 +44,18 @@ class Scales(NamedTuple):
     damping: Tensor
 
 
+class Stepping(nn.Module):
+    """A descent that, called, makes a step."""
+
+    def __init__(self, descent: "Descent"):
+        super().__init__()
+        self.descent = descent
+
+    def forward(self, *given: Any) -> tuple[State, Tensor]:
+        """As `Descent.step`."""
+        return self.descent.step(*given)
+
+
 class Descent(nn.Module):
     """Reweighted Gauss-Newton steps by a schedule of the losses' scales.
 
@@ -59,7 +70,7 @@ class Descent(nn.Module):
         self.equations, self.cavity, self.settings = equations, cavity, settings
         self.membrane = equations.forces.membrane
         self.inner_grid = self.membrane.grid[0] - 2, self.membrane.grid[1] - 2
-        self.native, self._given = NativeSteps(equations.is_slack), (equations, cavity, settings)
+        self.native, self._given = NativeSteps(equations.is_slack), (equations, cavity)
 
     def forward(
         self,
@@ -98,7 +109,7 @@ class Descent(nn.Module):
         measured, last = Bearings(*of_markers), rows[-settling:] if settling > 1 else []
         state: Sequence[Any] = (u, pressure, moved, u, self._unweighted(u))
         first = rows[: len(rows) - len(last)]
-        if self._by_machine_code(*state, *of_markers):
+        if self.is_native(*state, *of_markers):
             state = self.native.take(*self._given, State(u, pressure, moved), state[4], measured, first)
         else:
             state = repeated(self._next, first, state, measured)
@@ -107,8 +118,8 @@ class Descent(nn.Module):
         u, pressure, moved, before = state[:4]
         return u, pressure, moved, before
 
-    def _by_machine_code(self, *values: Any) -> bool:
-        """Whether steps of these tensors are taken so."""
+    def is_native(self, *values: Any) -> bool:
+        """Whether steps of these tensors are taken by machine code."""
         return takes(*values, self.equations.forces.elasticity.prestretch)
 
     @piece
@@ -180,18 +191,28 @@ class Descent(nn.Module):
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.
 
         With gradients every step is: those of a nested region come with strides that torch 2.13 does not follow."""
-        if self._by_machine_code(*state, weights, *measured):
+        if self.is_native(*state, weights, *measured):
             *after, _, weights = self.native.take(*self._given, state, weights, measured, [scales])
             return State(*after), weights
         numbers = Scales(*(torch.as_tensor(scale, dtype=state.u.dtype, device=state.u.device) for scale in scales))
         unrolled = torch.compiler.is_exporting() or torch.is_grad_enabled()
-        step = self.step if unrolled else self._compiled_once
+        step = self._precise if self.equations.is_slack else self.step if unrolled else self._compiled_once
         taken: tuple[State, Tensor] = step(state, weights, measured, numbers)
         return taken
 
     @torch.compiler.nested_compile_region
     def _compiled_once(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
         return self.step(state, weights, measured, scales)
+
+    def _precise(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
+        """`step` in double precision, of and to the precision of the state."""
+        doubled = {f"descent.{name}": each.double() for name, each in self.named_buffers() if each.is_floating_point()}
+        of_state, of_markers, numbers = (
+            [None if x is None else x.double() for x in each] for each in (state, measured, scales)
+        )
+        given: Any = State(*of_state), weights.double(), Bearings(*of_markers), Scales(*numbers)  # type: ignore[arg-type]
+        taken, renewed = torch.func.functional_call(Stepping(self), doubled, given, tie_weights=False)
+        return State(*(value.to(state.u) for value in taken)), renewed.to(weights)
 
     def step(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
         """One reweighted Gauss-Newton step, the volume linearised, the longest vertex step capped.
@@ -211,9 +232,6 @@ class Descent(nn.Module):
             *state, measured, tau, outlier, cone, memory=(weights, renewal)
         )
         loads = torch.cat([loads, motion.coupling], 1)
-        if equations.is_slack:
-            normal, loads = NormalEquations(*(part.double() for part in normal)), loads.double()
-            motion, corner = CameraMotion(*(part.double() for part in motion)), (corner[0].double(), corner[1].double())
         first, last = self.settings.tau
         blunt = (tau.clamp_max(first) / last) ** 2  # 1 as tau ends
         solved = self._solved(normal, loads, damping)
@@ -222,8 +240,7 @@ class Descent(nn.Module):
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
         shares = self._shares(u, pressure, products, corner)
         turn = (following @ shares[..., None])[..., 0]
-        inner_move = -(torch.cat([shares, turn], 1)[:, None] @ solved).to(u).unflatten(-1, (3, *self.inner_grid))[:, 0]
-        shares, turn, move = shares.to(u), turn.to(u), F.pad(inner_move, (1, 1, 1, 1))
+        move = F.pad(-(torch.cat([shares, turn], 1)[:, None] @ solved).unflatten(-1, (3, *self.inner_grid))[:, 0], (1, 1, 1, 1))
         share = self._share(u, move)
         u = u + share[:, None, None] * move.flatten(2).mT
         return State(u, pressure + share * shares[:, 2], moved + share[:, None] * turn), weights
@@ -240,7 +257,7 @@ class Descent(nn.Module):
     def _shares(self, u: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:
         """Shares `[B, 3]` in a step, but for its sign, of what solves the volume's row, the loads and the pressure's row: the
         second is 1, the third what the pressure rises by."""
-        one = torch.ones_like(products[:, 0, 0])
+        one = torch.ones_like(pressure)
         if self.cavity.filling == "open":
             return torch.stack([0 * one, one, 0 * one], 1)
         fWv, vWv = corner

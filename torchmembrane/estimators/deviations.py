@@ -28,7 +28,7 @@ from ..surface.stencil import inner
 from .base import Contacts, Deviations, Observation
 from .bearings import Bearings
 from .covariance import LinearisedSolution, linearise
-from .descent import State
+from .descent import Descent, State
 from .normal_equations import BalanceEquations, NormalEquations
 from .settings import ForceBalanceSettings
 
@@ -100,11 +100,20 @@ def shares_of_deepest(depth: Tensor) -> Tensor:
     return shares
 
 
-def spreads(
-    equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, state: State, observation: Observation
-) -> tuple[Tensor, Tensor]:
+def spreads(descent: Descent, settings: ForceBalanceSettings, state: State, observation: Observation) -> tuple[Tensor, Tensor]:
     """Of the force `[B, 3]` and the depth `[B]` at a solution, by the noise that the solve takes the markers to have."""
-    membrane, measured = equations.forces.membrane, equations.bearings.measured(observation)
+    measured = descent.equations.bearings.measured(observation)
+    if descent.is_native(*state, *measured):
+        both = descent.native.spread(descent.equations, descent.cavity, state, measured, settings.outlier)
+        return both[:, :3], both[:, 3]
+    return spreads_by_tensors(descent.equations, descent.cavity, settings, state, measured)
+
+
+def spreads_by_tensors(
+    equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, state: State, measured: Bearings
+) -> tuple[Tensor, Tensor]:
+    """The same by tensor operations."""
+    membrane = equations.forces.membrane
     scales, play = (settings.tau[1], settings.outlier), settings.camera_motion
     _, normal, solution = linearise(equations, cavity, state, measured, scales, play, curvature=True)
     depth = inner(depths(membrane, state.u)[..., None], membrane.grid)[..., 0]

@@ -331,7 +331,7 @@ class ForceBalance(nn.Module):
         net, state = (self, State(u, *whole)) if self.coarse is None else (self.coarse, self.coarsened(u, *whole))
         force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, u)
         with torch.no_grad():
-            spread = spreads(net.equations, net.cavity, self.settings, state, observation)
+            spread = spreads(net.descent, self.settings, state, observation)
             positions = self.equations.bearings.positions
             gap = gap_around(shares_of_deepest(depth), positions, observation.confidence, self.membrane)
         unseen = self.equations.loss.push_noise.mean() * self.reference * self.size**2

@@ -10,20 +10,19 @@ from torch import Tensor
 
 from ..mechanics.cavity import CavityLaw
 from ..mechanics.native_membrane import Surface, surface_of
+from ..surface.stencil import inner
 from .bearings import Bearings
 from .native_equations import Constants, Numbers, Workspace, workspace
+from .native_spread import spreads
 from .native_step import steps
-from .normal_equations import BalanceEquations
-from .settings import ForceBalanceSettings
+from .normal_equations import DAMPING, BalanceEquations
 
 
 class NativeSteps:
-    """The steps of one grid. What is constant is looked up again where precision or material have changed.
+    """The steps of one grid. What is constant is looked up again where precision, settings or material have changed.
 
     Args:
-        equations: of the force balance.
-        cavity: its law.
-        settings: of the estimator.
+        precise: in double precision whatever comes.
     """
 
     def __init__(self, precise: bool = False) -> None:
@@ -38,7 +37,6 @@ class NativeSteps:
         self,
         equations: BalanceEquations,
         cavity: CavityLaw,
-        settings: ForceBalanceSettings,
         state: tuple[Tensor, Tensor, Tensor],
         weights: Tensor,
         measured: Bearings,
@@ -46,19 +44,50 @@ class NativeSteps:
     ) -> list[Tensor]:
         """Displacement, pressure and camera after the steps, the displacement before the last, and the weights; arguments as of
         `Descent.step`, `rows`: the numbers of every step."""
-        grid, given = equations.forces.membrane.grid, state[0].dtype
-        dtype = torch.float64 if self.precise else given
+        given, dtype = state[0].dtype, self._precision(state[0])
+        constants, work, fixed = self._prepared(equations, cavity, measured, dtype)
         changing = [value.to(dtype, copy=True, memory_format=torch.contiguous_format) for value in (*state, weights)]
-        gauge = torch.zeros_like(state[2][:, :2]) if measured.gauge is None else measured.gauge
-        fixed = [value.to(dtype).contiguous().numpy() for value in (*measured[:5], gauge)]
-        constants = self._found(equations, cavity, settings, changing[0].numpy().dtype)
-        work = self._work(grid, len(constants.positions), changing[0].numpy().dtype)
         changing.append(changing[0].clone())
         u, pressure, moved, weighing, before = (value.numpy() for value in changing)
-        surfaces = u.reshape(-1, *grid, 3), pressure, moved, weighing, before.reshape(-1, *grid, 3)
+        surface = -1, *equations.forces.membrane.grid, 3
+        surfaces = u.reshape(surface), pressure, moved, weighing, before.reshape(surface)
         steps(constants, work, *surfaces, *fixed, np.array(rows, float).reshape(-1, 5))
         after, pressure_after, camera, weights, before_last = (value.to(given) for value in changing)
         return [after, pressure_after, camera, before_last, weights]
+
+    def spread(
+        self,
+        equations: BalanceEquations,
+        cavity: CavityLaw,
+        state: tuple[Tensor, Tensor, Tensor],
+        measured: Bearings,
+        outlier: float,
+    ) -> Tensor:
+        """Standard deviations of force and depth, `[B, 4]`; arguments as of `deviations.spreads`."""
+        dtype = self._precision(state[0])
+        constants, work, fixed = self._prepared(equations, cavity, measured, dtype)
+        u, pressure, moved = (value.to(dtype).contiguous().numpy() for value in state)
+        weights, found = np.ones((len(u), len(constants.area)), u.dtype), np.empty((len(u), 4), u.dtype)
+        scales = np.array([equations.loss.settings.tau[1], outlier, equations.loss.cone, 1.0, DAMPING])
+        u = u.reshape(-1, *equations.forces.membrane.grid, 3)
+        spreads(constants, work, u, pressure, moved, weights, *fixed, scales, found)
+        return torch.from_numpy(found).to(state[0].dtype)
+
+    def _precision(self, u: Tensor) -> torch.dtype:
+        return torch.float64 if self.precise else u.dtype
+
+    def _prepared(
+        self,
+        equations: BalanceEquations,
+        cavity: CavityLaw,
+        measured: Bearings,
+        dtype: torch.dtype,
+    ) -> tuple[Constants, Workspace, list[np.ndarray]]:
+        """What is constant, where to work, and what is measured, as arrays of a precision."""
+        gauge = torch.zeros_like(measured.motion[:, 0, :2, 0]) if measured.gauge is None else measured.gauge
+        fixed = [value.to(dtype).contiguous().numpy() for value in (*measured[:5], gauge)]
+        constants = self._found(equations, cavity, fixed[0].dtype)
+        return constants, self._work(equations.forces.membrane.grid, len(constants.positions), fixed[0].dtype), fixed
 
     def _work(self, grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
         kept: dict[Any, Workspace] = self._own.__dict__
@@ -66,14 +95,14 @@ class NativeSteps:
             kept[dtype] = workspace(grid, markers, dtype)
         return kept[dtype]
 
-    def _found(self, equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, dtype: Any) -> Constants:
+    def _found(self, equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Constants:
         forces, loss, bearings = equations.forces, equations.loss, equations.bearings
         elasticity, membrane = forces.elasticity, forces.membrane
         material = elasticity.prestretch, elasticity.c1, elasticity.c2, cavity.rest_pressure
         places = forces.rest_load, membrane.rest, loss.surroundings, bearings.positions
-        key = dtype, *(float(value) for value in material), *(value.data_ptr() for value in places)
+        key = dtype, loss.settings, *(float(value) for value in material), *(value.data_ptr() for value in places)
         if self._constants is None or self._constants[0] != key:
-            self._constants = key, _constants(equations, cavity, settings, dtype)
+            self._constants = key, _constants(equations, cavity, dtype)
         return self._constants[1]
 
 
@@ -88,8 +117,8 @@ def takes(*values: Any) -> bool:
     )
 
 
-def _constants(equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, dtype: Any) -> Constants:
-    forces, loss, bearings = equations.forces, equations.loss, equations.bearings
+def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Constants:
+    forces, loss, bearings, settings = equations.forces, equations.loss, equations.bearings, equations.loss.settings
     absolute, gas = cavity.gas.tolist()
     surface = surface_of(forces.membrane, forces.elasticity, forces.rest_load, dtype)
     numbers = Numbers(
@@ -129,6 +158,7 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, settings: ForceBa
         wider,
         _within(wider),
         array(loss.push_noise),
+        -array(inner(forces.membrane.rest_normals, forces.membrane.grid)),
         array(bearings.positions),
         _sparse(array(bearings.smooth_shares)),
         _sparse(array(bearings.vertex_shares), 3),

@@ -10,14 +10,15 @@ import numpy as np
 
 from ..machine_code import aligned, compiled
 from ..mechanics.native_membrane import STENCIL, Surface
-from ..solve.native_band import LANES, LOADS, RANK, storage
+from ..solve.native_band import LANES, RANK, ROWS, storage
 from ..solve.stencil_layouts import OFFSETS
 from .traction_loss import POWER, TINY
 
 BETWEEN = tuple(tuple(OFFSETS.index((b[0] - a[0], b[1] - a[1])) if b >= a else -1 for b in STENCIL) for a in STENCIL)
 """Of two vertices of a stencil, the offset from one to a later one."""
-USED = 7
-"""Loads: of the volume, the forces, the fluid, the camera's four motions."""
+VOLUME, FORCES, FLUID, CAMERA, WANTED = 0, 1, 2, 3, 7
+"""Loads: of the volume, the forces, the fluid, the camera's four motions, and in `native_spread` of four wanted numbers."""
+LOADS = WANTED + 4
 NOTHING = 1e-18
 """Of a vertex in a mean that does not count below `(far_share / scale_share)^(2 POWER)`, some 1e-4."""
 
@@ -36,6 +37,8 @@ class Constants(NamedTuple):
     wider_within: Any
     push_noise: Any
     """`[N]`"""
+    inwards: Any
+    """`[N, 3]`, at rest."""
     positions: Any
     """`[D, 3]`, of the markers at rest."""
     smooth: tuple[Any, Any]
@@ -92,16 +95,18 @@ class Workspace(NamedTuple):
     fields: Any
     """`[4, N]`"""
     blocks: Any
-    """`[D, 3, 3]`, of the markers."""
+    """`[D, 3, 3]`, of the markers; their bearing Jacobians, weighted, `jacobians [D, 2, 3]`, and `marker_weights [D]`."""
+    jacobians: Any
+    marker_weights: Any
     U: Any
     """The matrix, and `inverse [3 N]`, `panel` and its `scale [3 N]`, as `native_band` stores them."""
     inverse: Any
     panel: Any
     scale: Any
     loads: Any
-    """`[7, 3 N]`: of the volume, the forces, the fluid, the camera's four motions."""
+    """`[11, 3 N]`"""
     y: Any
-    """`[8 x 3 N]`, loads and then solutions as `native_band` takes them, one zero."""
+    """`[12 x 3 N]`, loads, and then what `native_band` makes of them; the last zero."""
     width: int
     """Diagonals of the matrix above the main one."""
 
@@ -109,19 +114,20 @@ class Workspace(NamedTuple):
 def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
     """Arrays for a grid and so many markers."""
     m, n = grid
-    N, width = (m - 2) * (n - 2), 3 * (2 * (n - 2) + 2) + 2  # to two lines, two vertices and two components further
+    N, V, width = (m - 2) * (n - 2), m * n, 3 * (2 * (n - 2) + 2) + 2  # to two lines, vertices and components further
     unknowns, rows, ld = storage(3 * N, width)
-    shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, m, n), weighted=(3, 21, m * n), W=(3, 3, m * n))
-    shapes |= dict(of_loads=(3, 2, m * n), sums=(90, m * n), normal=(N, 3))
-    shapes |= dict(fields=(4, N), blocks=(markers, 3, 3), inverse=(unknowns,), panel=(RANK * ld,), scale=(unknowns,))
+    shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, m, n), weighted=(3, 21, V), W=(3, 3, V), of_loads=(3, 2, V))
+    shapes |= dict(sums=(90, V), normal=(N, 3), fields=(4, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
+    shapes |= dict(marker_weights=(markers,), inverse=(unknowns,), panel=(RANK * ld,), scale=(unknowns,))
     arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
-    y = aligned(LOADS * unknowns, dtype)
-    return Workspace(U=aligned(rows * ld, dtype), y=y, loads=np.zeros((USED, unknowns), dtype), width=width, **arrays)
+    y = aligned((LOADS + LOADS % ROWS) * unknowns, dtype)
+    return Workspace(U=aligned(rows * ld, dtype), y=y, loads=np.zeros((LOADS, unknowns), dtype), width=width, **arrays)
 
 
 @compiled
-def weigh(c, work, before, noise_level, tau, cone, renewal):
-    """`TractionLoss.weights`: `W`, and `before` becomes the weights of the normal tractions."""
+def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
+    """`TractionLoss.weights`: `W`, and `before` becomes the weights of the normal tractions; `curvature`: of a push's loss, in
+    place of its weight."""
     k, N, n = c.numbers, len(c.area), c.surface.free.shape[1]
     q_n, shear2, push2, around = work.fields
     for i in range(N):
@@ -155,7 +161,9 @@ def weigh(c, work, before, noise_level, tau, cone, renewal):
         at = (i // (n - 2) + 1) * n + i % (n - 2) + 1
         rho2 = min(max(expected / k.last_tau**2, least), 1.0)
         pushed = push2[i] / rho2
-        w_n = k.floor + ((1 + pushed / tau**2) ** -2 if q_n[i] < 0 else 1.0)
+        ratio = pushed / tau**2
+        of_push = max(1 - 3 * ratio, 0.0) / (1 + ratio) ** 3 if curvature else 1 / (1 + ratio) ** 2
+        w_n = k.floor + (of_push if q_n[i] < 0 else 1.0)
         w_n = before[i] * (w_n / before[i]) ** renewal
         w_t = k.friction / (1 + cone * np.sqrt(pushed + k.slip**4)) / np.sqrt(shear2[i] / rho2 + k.slip**2)
         scale = k.sparsity / (k.reference * k.size) ** 2 / c.area[i] / rho2
@@ -190,7 +198,7 @@ def load_forces(c, work):
                         of_loads[a, 1, at] -= work.W[a, b, at] * work.volume[i, j, b]
                     fWv += of_loads[a, 0, at] * work.volume[i, j, a]
                     vWv -= of_loads[a, 1, at] * work.volume[i, j, a]
-                    loads[0, 3 * k + a] = work.volume[i, j, a]
+                    loads[VOLUME, 3 * k + a] = work.volume[i, j, a]
     A, first, count, sums = work.A.reshape((3, 21, V)), n + 1, V - 2 * n - 2, work.sums
     for load in range(2):
         for d in range(3):
@@ -201,7 +209,7 @@ def load_forces(c, work):
         for k in range((m - 2) * (n - 2)):
             at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
             for d in range(3):
-                loads[1 + load, 3 * k + d] = sums[d, at]
+                loads[FORCES + load, 3 * k + d] = sums[d, at]
     return fWv, vWv
 
 
@@ -239,16 +247,18 @@ def load_markers(c, work, u, moved, seen, outlier, own, slope):
             angle[r] = turned
             square += turned * turned
         w = weight[d] / (1 + weight[d] * square / outlier**2)
+        work.marker_weights[d] = w
         for a in range(3):
+            work.jacobians[d, 0, a], work.jacobians[d, 1, a] = w * jacobian[0, a], w * jacobian[1, a]
             pull = w * (jacobian[0, a] * angle[0] + jacobian[1, a] * angle[1])
             for b in range(3):
                 work.blocks[d, a, b] = w * (jacobian[0, a] * jacobian[0, b] + jacobian[1, a] * jacobian[1, b])
             for s in range(3):
                 at, share = 3 * corners[d, s] + a, pulls[d, s]
-                work.loads[1, at] += share * pull
+                work.loads[FORCES, at] += share * pull
                 for e in range(4):
                     by_motion = motion[0, e, d] * jacobian[0, a] + motion[1, e, d] * jacobian[1, a]
-                    work.loads[3 + e, at] += share * w * by_motion
+                    work.loads[CAMERA + e, at] += share * w * by_motion
         for a in range(4):
             slope[a] += w * (motion[0, a, d] * angle[0] + motion[1, a, d] * angle[1])
             for b in range(4):
@@ -297,16 +307,10 @@ def sum_blocks(c, work):
 
 
 @compiled
-def fill(c, work, damping, ridge):
-    """The matrix of the blocks in `U` and the loads in `y`, scaled by `scale` to a diagonal of 1, the ridge added to it."""
-    (m, n), U, sums, scale, ld, size = (
-        c.surface.free.shape,
-        work.U,
-        work.sums,
-        work.scale,
-        len(work.panel) // RANK,
-        len(work.scale),
-    )
+def fill(c, work, damping, ridge, used):
+    """The matrix of the blocks in `U` and the first loads in `y`, by `scale` with a diagonal of 1, the ridge added to it."""
+    (m, n), U, sums, scale = c.surface.free.shape, work.U, work.sums, work.scale
+    ld, size = len(work.panel) // RANK, len(work.scale)
     scale[:], U[:] = 1, 0
     for k in range((m - 2) * (n - 2)):
         at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
@@ -327,6 +331,6 @@ def fill(c, work, damping, ridge):
                             U[start + b] = sums[9 * block + 3 * a + b, at] * scale[r] * scale[column + b]
     for r in range(size):
         U[r * ld + r % LANES] = 1 + ridge
-    for load in range(USED):
+    for load in range(used):
         for r in range(size):
             work.y[load * size + r] = work.loads[load, r] * scale[r]

@@ -11,10 +11,10 @@ from ..mechanics import native_membrane
 from ..mechanics.native_membrane import linearise
 from ..solve import native_band
 from ..solve.band import RIDGES
-from ..solve.native_band import RANK, backward, factor
+from ..solve.native_band import RANK, ROWS, backward, factor
 from . import native_equations
 from .camera_motion import RARE
-from .native_equations import USED, fill, load_forces, load_markers, sum_blocks, weigh
+from .native_equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, load_markers, sum_blocks, weigh
 
 
 @compiled
@@ -25,21 +25,12 @@ def _step(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales
     m, n = c.surface.free.shape
     rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
     own, slope = np.zeros((4, 4)), np.zeros(4)
-    weigh(c, work, weights, noise_level, tau, cone, renewal)
+    weigh(c, work, weights, noise_level, tau, cone, renewal, False)
     fWv, vWv = load_forces(c, work)
     load_markers(c, work, u, moved, seen, outlier, own, slope)
     sum_blocks(c, work)
-    width, size, y = work.width, len(work.inverse), work.y
-    for ridge in RIDGES:
-        fill(c, work, damping, ridge)
-        if factor(work.U, len(work.panel) // RANK, width, size, work.inverse, work.panel, y):
-            break
-    else:
-        y[:] = np.nan
-    products = np.empty((USED, USED))
-    for a in range(USED):
-        for b in range(a + 1):
-            products[a, b] = products[b, a] = _dot(y[a * size : (a + 1) * size], y[b * size : (b + 1) * size])
+    size, y = len(work.scale), work.y
+    products = factored(c, work, damping, WANTED)
     following = _camera_eliminated(c.numbers, products, own, slope, moved, tau)
     multiplier, one, change = _shares(c.numbers, products, rise, pressure[0], fWv, vWv, gauge)
     solved, turn = y[:size], np.empty_like(moved)
@@ -49,52 +40,83 @@ def _step(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales
         turn[a] = multiplier * following[a, 0] + one * following[a, 1] + change * following[a, 2]
         for i in range(size):
             solved[i] += turn[a] * y[(3 + a) * size + i]
-    backward(work.U, len(work.panel) // RANK, width, size, work.inverse, solved)
-    for i in range(size):
-        solved[i] *= -work.scale[i]
+    substituted(work, solved)
     move = solved[: 3 * (m - 2) * (n - 2)].reshape((m - 2, n - 2, 3))
     share = _share(c, u, move)
     for i in range(m - 2):
         for j in range(n - 2):
             for a in range(3):
-                u[i + 1, j + 1, a] += share * move[i, j, a]
+                u[i + 1, j + 1, a] -= share * move[i, j, a]
     pressure[0] += share * change
     for a in range(4):
         moved[a] += share * turn[a]
 
 
 @compiled
-def _dot(a, b):
-    total = 0.0
-    for i in range(len(a)):
-        total += a[i] * b[i]
-    return total
+def factored(c, work, damping, used):
+    """The matrix factored, of so many loads `b` the `U^-T b` in `y`; their products `b . M^-1 b'`, `[LOADS, LOADS]`."""
+    width, size, y = work.width, len(work.scale), work.y
+    for ridge in RIDGES:
+        fill(c, work, damping, ridge, used)
+        if factor(work.U, len(work.panel) // RANK, width, size, work.inverse, work.panel, y, used + used % ROWS):
+            break
+    else:
+        y[:] = np.nan
+    products = np.zeros((LOADS, LOADS))
+    for a in range(used):
+        for b in range(a + 1):
+            total = 0.0
+            for i in range(size):
+                total += y[a * size + i] * y[b * size + i]
+            products[a, b] = products[b, a] = total
+    return products
+
+
+@compiled
+def substituted(work, solved):
+    """A sum `[3 N]` of what `factored` left in `y` becomes the solution for that sum of loads."""
+    backward(work.U, len(work.panel) // RANK, work.width, len(work.scale), work.inverse, solved)
+    for i in range(len(work.scale)):
+        solved[i] *= work.scale[i]
+
+
+@compiled
+def camera_stiffness(k, moved, tau):
+    """Of `CameraMotion.held`."""
+    play = k.camera_motion * (min(tau, k.first_tau) / k.last_tau) ** 2
+    return RARE / (play**2 + moved[0] ** 2 + moved[1] ** 2 + moved[2] ** 2 + moved[3] ** 2)
+
+
+@compiled
+def eliminated(system):
+    """Solutions of `[A b] [4, 4 + n]`, in the columns of `b`."""
+    for a in range(4):
+        pivot = system[a, a]
+        for e in range(system.shape[1]):
+            system[a, e] /= pivot
+        for b in range(4):
+            share = system[b, a] if b != a else 0.0
+            for e in range(system.shape[1]):
+                system[b, e] -= share * system[a, e]
 
 
 @compiled
 def _camera_eliminated(k, products, own, slope, moved, tau):
     """`CameraMotion.held` and `eliminated`: how the camera follows each load, `[4, 3]`; the loads' products become those with
     it."""
-    play = k.camera_motion * (min(tau, k.first_tau) / k.last_tau) ** 2
-    stiffness = RARE / (play**2 + _dot(moved, moved))
-    system = np.empty((4, 7))
+    stiffness, system = camera_stiffness(k, moved, tau), np.empty((4, 7))
     for a in range(4):
-        for b in range(7):
-            system[a, b] = own[a, b] - products[3 + a, 3 + b] if b < 4 else products[3 + a, b - 4]
-        system[a, a] += stiffness
-        system[a, 5] -= slope[a] + stiffness * moved[a]
-    for a in range(4):
-        pivot = system[a, a]
-        for e in range(7):
-            system[a, e] /= pivot
         for b in range(4):
-            share = system[b, a] if b != a else 0.0
-            for e in range(7):
-                system[b, e] -= share * system[a, e]
+            system[a, b] = own[a, b] - products[CAMERA + a, CAMERA + b]
+        for b in range(3):
+            system[a, 4 + b] = products[CAMERA + a, b]
+        system[a, a] += stiffness
+        system[a, 4 + FORCES] -= slope[a] + stiffness * moved[a]
+    eliminated(system)
     for a in range(3):
         for b in range(3):
             for e in range(4):
-                products[a, b] += products[a, 3 + e] * system[e, 4 + b]
+                products[a, b] += products[a, CAMERA + e] * system[e, 4 + b]
     return system[:, 4:]
 
 
@@ -103,17 +125,29 @@ def _shares(k, products, rise, pressure, fWv, vWv, gauge):
     """`Descent._shares`: of the volume's multiplier, the forces and the pressure's change in a step."""
     if k.is_open:
         return 0.0, 1.0, 0.0
-    above = pressure - k.rest_pressure
-    fWv, vWv = fWv - gauge[1] * (above - gauge[0]), vWv + gauge[1]
-    target, compliance = -rise, 0.0
-    if k.is_gas:
-        ratio = k.gas_volume / (k.gas_volume + rise)
-        compliance = k.gas_volume / (k.absolute * ratio**2)
-        target = compliance * (k.absolute * (ratio - 1) - above)
-    a11, a12, a22 = vWv - products[2, 2], compliance - products[0, 2], -products[0, 0]
-    b1, b2 = fWv + products[2, 1], target + products[0, 1]
+    fWv, vWv = fWv - gauge[1] * (pressure - k.rest_pressure - gauge[0]), vWv + gauge[1]
+    target, compliance = cavity_condition(k, rise, pressure)
+    loads = fWv + products[FLUID, FORCES], target + products[VOLUME, FORCES]
+    multiplier, change = border_unknowns(products, vWv, compliance, *loads)
+    return multiplier, 1.0, change
+
+
+@compiled
+def cavity_condition(k, rise, pressure):
+    """`CavityLaw.condition`."""
+    if not k.is_gas:
+        return -rise, 0.0
+    ratio = k.gas_volume / (k.gas_volume + rise)
+    compliance = k.gas_volume / (k.absolute * ratio**2)
+    return compliance * (k.absolute * (ratio - 1) - (pressure - k.rest_pressure)), compliance
+
+
+@compiled
+def border_unknowns(products, vWv, compliance, of_fluid, of_volume):
+    """`kkt.border_unknowns`: the volume's multiplier and the pressure's change, from what is on the right of their rows."""
+    a11, a12, a22 = vWv - products[FLUID, FLUID], compliance - products[VOLUME, FLUID], -products[VOLUME, VOLUME]
     det = a11 * a22 - a12 * a12
-    return (a11 * b2 - a12 * b1) / det, 1.0, (b1 * a22 - a12 * b2) / det
+    return (a11 * of_volume - a12 * of_fluid) / det, (of_fluid * a22 - a12 * of_volume) / det
 
 
 @compiled

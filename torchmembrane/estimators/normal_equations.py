@@ -17,8 +17,10 @@ from .contact_force import ContactForce, Linearised
 from .robust import Cauchy
 from .traction_loss import Memory, TractionLoss
 
-SLACK = 0.5
-"""Rest tension over shear modulus x thickness, of a prestretch of 1.09, below which equations are solved in double precision:
+DAMPING = 1e-6
+"""Share of the matrix' diagonal that is added to it where nothing else is said."""
+SLACK = 0.75
+"""Rest tension over shear modulus x thickness, of a prestretch of 1.15, below which equations are solved in double precision:
 little holds a slack sheet between its markers, and float32 moves it by per cents of a press."""
 
 
@@ -93,16 +95,16 @@ class BalanceEquations(nn.Module):
         own, slope = weighted @ K.movedim(2, 1).flatten(2).mT, (weighted @ angle.flatten(1)[..., None])[..., 0]
         return CameraMotion(coupling.flatten(2), own, slope)
 
-    def matrix(self, normal: NormalEquations, damping: float | Tensor = 1e-6) -> Matrix:
+    def matrix(self, normal: NormalEquations, damping: float | Tensor = DAMPING) -> Matrix:
         """`M` as `system.factor` takes it, with a share of its diagonal added."""
-        near = (normal.marker_blocks @ self.bearings.pair_shares.to(normal.marker_blocks)).unflatten(-1, (len(NEAR), -1))
+        near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1))
         return self.system.matrix(normal.stiffness, normal.weights, near, damping)
 
     def product(self, normal: NormalEquations, u: Tensor, damping: float | Tensor | None = None) -> Tensor:
         """`M u` for `u [B, C, 3 N]`, without the matrix; with `damping` as of `matrix`."""
         if damping is not None:
             return self.product(normal, u) + damping * self._diagonal(normal).flatten(1)[:, None] * u
-        u, change, shares = u.unflatten(-1, (3, -1)), self.forces.change, self.bearings.vertex_shares.to(u)
+        u, change, shares = u.unflatten(-1, (3, -1)), self.forces.change, self.bearings.vertex_shares
         of_forces = change(normal.stiffness, _weighed(normal.weights[:, None], change(normal.stiffness, u)))
         of_markers = _weighed(normal.marker_blocks[:, None], u @ shares.transpose(0, 1)) @ shares
         return (of_forces + of_markers).flatten(2)

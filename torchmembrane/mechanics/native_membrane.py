@@ -112,31 +112,12 @@ def _stiffness(surface, t, i, j, later, e, share, by_edge, A):
     """The stress `S` of a triangle: force on edge a is `sum_b S_ab e_b`. Added to `A`, in those of its vertices that come later
     than one (`later` is the earlier of the second and the third): its energy's second derivatives, less `share` times those of
     the volume, which are cross products with edges."""
-    area, det = surface.area[t, i, j], surface.det[t, i, j]
-    i11, i12, i22 = surface.inverse[0, t, i, j], surface.inverse[1, t, i, j], surface.inverse[2, t, i, j]
-    g11 = e[0, 0] * e[0, 0] + e[0, 1] * e[0, 1] + e[0, 2] * e[0, 2]
-    g12 = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
-    g22 = e[1, 0] * e[1, 0] + e[1, 1] * e[1, 1] + e[1, 2] * e[1, 2]
-    I, inverse = i11 * g11 + (i12 * g12 + i12 * g12) + i22 * g22, det / (g11 * g22 - g12 * g12)  # noqa: E741
-    linear, thickness, mixed, quadratic = surface.law[0], surface.law[1], surface.law[2], surface.law[3]
-    w_I = linear + mixed * inverse
-    w_ID = -mixed * inverse * inverse
-    w_D = quadratic + (w_ID * I - thickness * inverse * inverse)
-    w_DD = (thickness + mixed * I) * inverse * inverse * inverse
-    w_DD += w_DD
-    area += area
-    by_I, by_D = area * w_I, area / det * w_D
-    s11, s12, s22 = by_I * i11 + by_D * g22, by_I * i12 - by_D * g12, by_I * i22 + by_D * g11
-    scale = area + area
-    for c in range(3):  # halves of what I and D change by in the edges
-        by_edge[0, c], by_edge[1, c] = i11 * e[0, c] + i12 * e[1, c], i12 * e[0, c] + i22 * e[1, c]
-        by_edge[2, c] = (g22 * e[0, c] - g12 * e[1, c]) / det
-        by_edge[3, c] = (g11 * e[1, c] - g12 * e[0, c]) / det
+    s11, s12, s22, by_D, w_ID, w_DD = _of_energy(surface, t, i, j, e, by_edge)
     at_12, at_13, at_23 = 3 * PAIRS[t][0], 3 * PAIRS[t][1], 3 * PAIRS[t][2]
     for c in range(3):
-        I1, I2 = scale * w_ID * by_edge[0, c], scale * w_ID * by_edge[1, c]
-        D1, D2 = scale * w_DD * by_edge[2, c], scale * w_DD * by_edge[3, c]
-        D1_I, D2_I = scale * w_ID * by_edge[2, c], scale * w_ID * by_edge[3, c]
+        I1, I2 = w_ID * by_edge[0, c], w_ID * by_edge[1, c]
+        D1, D2 = w_DD * by_edge[2, c], w_DD * by_edge[3, c]
+        D1_I, D2_I = w_ID * by_edge[2, c], w_ID * by_edge[3, c]
         for d in range(3):
             h11 = I1 * by_edge[2, d] + D1_I * by_edge[0, d] + D1 * by_edge[2, d] - by_D * e[1, c] * e[1, d]
             h22 = I2 * by_edge[3, d] + D2_I * by_edge[1, d] + D2 * by_edge[3, d] - by_D * e[0, c] * e[0, d]
@@ -164,6 +145,30 @@ def _stiffness(surface, t, i, j, later, e, share, by_edge, A):
         A[q, at_23 + p, later[0], later[1]] -= z
         A[p, at_23 + q, later[0], later[1]] += z
     return s11, s12, s22
+
+
+@compiled
+def _of_energy(surface, t, i, j, e, by_edge):
+    """Of a triangle: the stress `S`; `2 area dW/dD / det`; 4 area times the second derivatives of `W(I, D)`; in `by_edge
+    [4, 3]` halves of the derivatives of `I` and of `D` in its two edges."""
+    area, det = surface.area[t, i, j], surface.det[t, i, j]
+    i11, i12, i22 = surface.inverse[0, t, i, j], surface.inverse[1, t, i, j], surface.inverse[2, t, i, j]
+    g11 = e[0, 0] * e[0, 0] + e[0, 1] * e[0, 1] + e[0, 2] * e[0, 2]
+    g12 = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
+    g22 = e[1, 0] * e[1, 0] + e[1, 1] * e[1, 1] + e[1, 2] * e[1, 2]
+    I, inverse = i11 * g11 + (i12 * g12 + i12 * g12) + i22 * g22, det / (g11 * g22 - g12 * g12)  # noqa: E741
+    linear, thickness, mixed, quadratic = surface.law[0], surface.law[1], surface.law[2], surface.law[3]
+    twice = area + area
+    w_ID = -mixed * inverse * inverse
+    w_D = quadratic + (w_ID * I - thickness * inverse * inverse)
+    half_w_DD = (thickness + mixed * I) * inverse * inverse * inverse
+    by_I, by_D, four = twice * (linear + mixed * inverse), twice / det * w_D, twice + twice
+    for c in range(3):
+        by_edge[0, c], by_edge[1, c] = i11 * e[0, c] + i12 * e[1, c], i12 * e[0, c] + i22 * e[1, c]
+        by_edge[2, c] = (g22 * e[0, c] - g12 * e[1, c]) / det
+        by_edge[3, c] = (g11 * e[1, c] - g12 * e[0, c]) / det
+    s11, s12, s22 = by_I * i11 + by_D * g22, by_I * i12 - by_D * g12, by_I * i22 + by_D * g11
+    return s11, s12, s22, by_D, four * w_ID, four * (half_w_DD + half_w_DD)
 
 
 @compiled

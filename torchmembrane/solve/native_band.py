@@ -18,8 +18,6 @@ from numba.extending import intrinsic
 from ..machine_code import compiled
 
 LANES, RANK, ROWS = 16, 8, 2
-LOADS = 8
-"""Right-hand sides."""
 
 
 def storage(unknowns: int, width: int) -> tuple[int, int, int]:
@@ -76,33 +74,33 @@ def _subtract(
 
 
 @compiled
-def factor(U, ld, width, n, inverse, W, b):
-    """The matrix in `U` becomes its factor and the loads `b [LOADS n]` the `y` with `U^T y = b`; `inverse [n]`: of the factor's
-    diagonal; `W [RANK ld]`: to work in. False where a pivot is not positive."""
-    y, shares = np.empty(RANK * LOADS, U.dtype), np.empty(RANK * ROWS, U.dtype)
+def factor(U, ld, width, n, inverse, W, b, count):
+    """The matrix in `U` becomes its factor, and loads `b [count n]`, an even number, the `y` with `U^T y = b`; `inverse [n]`:
+    of the factor's diagonal; `W [RANK ld]`: to work in. False where a pivot is not positive."""
+    y, shares = np.empty(RANK * count, U.dtype), np.empty(RANK * ROWS, U.dtype)
     for first in range(0, n, RANK):
         base = first - first % LANES
         if not _panel(U, ld, first, inverse, W, shares):
             return False
         for p in range(RANK):
-            for q in range(LOADS):
-                y[p * LOADS + q] = b[q * n + first + p]
+            for q in range(count):
+                y[p * count + q] = b[q * n + first + p]
             for other in range(p):
                 share = W[other * ld + first - base + p]
-                for q in range(LOADS):
-                    y[p * LOADS + q] -= share * y[other * LOADS + q]
-            for q in range(LOADS):
-                y[p * LOADS + q] *= inverse[first + p]
+                for q in range(count):
+                    y[p * count + q] -= share * y[other * count + q]
+            for q in range(count):
+                y[p * count + q] *= inverse[first + p]
         start, end = first - base + RANK, min(first - base + RANK + width, n - base)
         for i in range(start, end, ROWS):
             lane = i - i % LANES
             _subtract(U, (base + i) * ld, ld, W, i, ld, W, lane, ld, (end - lane + LANES - 1) // LANES)
         lane = start - start % LANES
-        for q in range(0, LOADS, ROWS):
-            _subtract(b, q * n + base + lane, n, y, q, LOADS, W, lane, ld, (end - lane + LANES - 1) // LANES)
+        for q in range(0, count, ROWS):
+            _subtract(b, q * n + base + lane, n, y, q, count, W, lane, ld, (end - lane + LANES - 1) // LANES)
         for p in range(RANK):
-            for q in range(LOADS):
-                b[q * n + first + p] = y[p * LOADS + q]
+            for q in range(count):
+                b[q * n + first + p] = y[p * count + q]
     return True
 
 

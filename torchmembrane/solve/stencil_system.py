@@ -66,7 +66,7 @@ class StencilSystem(nn.Module):
         """
         blocks = self._blocks(stencils, weights)
         blocks = torch.cat([blocks[:, :, :, : len(NEAR)] + near, blocks[:, :, :, len(NEAR) :]], 3)
-        scale = (blocks[:, :, :, 0].diagonal(dim1=1, dim2=2).mT * (1 + damping) + self.fixed.to(blocks)).rsqrt()
+        scale = (blocks[:, :, :, 0].diagonal(dim1=1, dim2=2).mT * (1 + damping) + self.fixed).rsqrt()
         there = scale.flatten(1).index_select(1, self.ends).reshape(-1, 1, 3, *blocks.shape[3:])
         scaled = (blocks * scale[:, :, None, None] * there).flatten(1)
         constants = torch.stack([torch.zeros_like(scaled[:, 0]), torch.ones_like(scaled[:, 0])], 1)
@@ -89,7 +89,7 @@ class StencilSystem(nn.Module):
             x1, x2, x3 = left.narrow(4, here, rows * n).narrow(3, k, 1)[:, :, :, None].unbind(1)
             y1, y2, y3 = right.narrow(4, here, rows * n).narrow(3, k, later)[:, :, None].unbind(1)
             products.append(torch.addcmul(torch.addcmul(x1 * y1, x2, y2), x3, y3))
-        inside = (self.offsets_of_pairs.to(left) @ torch.cat(products, 3)).unflatten(-1, (rows, n))
+        inside = (self.offsets_of_pairs @ torch.cat(products, 3)).unflatten(-1, (rows, n))
         return inside[..., 1:-1].flatten(-2)
 
     def factor(self, matrix: Matrix) -> Factor:

@@ -72,7 +72,8 @@ def apply_stencil(field: Tensor, kernels: Tensor, grid: tuple[int, int], border:
 
 def convolved(planes: Tensor, kernels: Tensor, padding: int = 0) -> Tensor:
     """`F.conv2d`; where no gradient is recorded, of a few small planes on a processor by the kernel that begins at once:
-    oneDNN's, which it would take, works for 40 microseconds before.
+    oneDNN's, which it would take, works for 40 microseconds before. In exported models, which have no convolution in double
+    precision, that is a product.
 
     Args:
         planes: `[P, C, m, n]`.
@@ -83,10 +84,20 @@ def convolved(planes: Tensor, kernels: Tensor, padding: int = 0) -> Tensor:
         >>> convolved(torch.ones(1, 1, 3, 3), torch.ones(1, 1, 2, 2)).tolist()
         [[[[4.0, 4.0], [4.0, 4.0]]]]
     """
+    if torch.compiler.is_exporting() and planes.dtype == torch.float64:
+        return _convolved_by_product(F.pad(planes, (padding,) * 4), kernels)
     if len(planes) > FEW or planes.device.type != "cpu" or torch.is_grad_enabled() or torch.compiler.is_compiling():
         return F.conv2d(planes, kernels, padding=padding)
     at_once: Tensor = torch.ops.aten.thnn_conv2d(planes, kernels, kernels.shape[2:], None, [1, 1], [padding] * 2)
     return at_once
+
+
+def _convolved_by_product(planes: Tensor, kernels: Tensor) -> Tensor:
+    (m, n), (h, w) = planes.shape[2:], kernels.shape[2:]
+    rows, columns = m - h + 1, n - w + 1
+    windows = torch.cat([planes[..., i : i + rows, j : j + columns] for i in range(h) for j in range(w)], 1)
+    product: Tensor = (kernels.permute(0, 2, 3, 1).flatten(1) @ windows.flatten(2)).unflatten(-1, (rows, columns))
+    return product
 
 
 def inner(field: Tensor, grid: tuple[int, int]) -> Tensor:
