@@ -10,7 +10,7 @@ from torchmembrane import MembraneError
 from torchmembrane.linalg import symmetric_adjugate_product, symmetric_determinant
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, half_cylinder, heightfield, spherical_cap
-from torchmembrane.surface.stencil import FEW, apply_stencil
+from torchmembrane.surface.stencil import FEW, apply_stencil, convolved_by_product
 from torchmembrane.surface.tangent import tangent_axes, tangent_frame
 from torchmembrane.surface.topology import (
     TRIANGLE_CORNERS,
@@ -294,6 +294,13 @@ def test_symmetric_closed_forms_solve_their_systems():
     matrix = np.stack([np.stack([a, b], -1), np.stack([b, c], -1)], -2)
     solved = np.stack(symmetric_adjugate_product(a, b, c, u, v), -1) / symmetric_determinant(a, b, c)[:, None]
     np.testing.assert_allclose((matrix @ solved[..., None])[..., 0], np.stack([u, v], -1), atol=1e-9)
+
+
+def test_a_convolution_by_product_is_one():
+    """As exported models have it in double precision."""
+    generator = torch.Generator().manual_seed(0)
+    planes, kernels = (torch.randn(*shape, generator=generator).double() for shape in ((2, 3, 7, 6), (4, 3, 3, 2)))
+    torch.testing.assert_close(convolved_by_product(planes, kernels), torch.nn.functional.conv2d(planes, kernels))
 
 
 @pytest.mark.parametrize("planes", [1, FEW, FEW + 1])

@@ -255,6 +255,20 @@ def test_slack_sheets_are_solved_in_double_precision():
             assert errors[0] < 1e-3 and errors[1] > 10 * errors[0]
 
 
+def test_tensor_operations_take_a_slack_sheet_s_step_in_double_precision_too():
+    """As exported models do; afterwards all constants are as they were."""
+    balance = estimator(prestretch=1.004, grid=(17, 17)).float()
+    state, weights, measured = problem(balance, dtype=torch.float32)
+    kept = {name: value.dtype for name, value in balance.named_buffers(remove_duplicate=False)}
+    with torch.no_grad():
+        numbers = Scales(*(torch.tensor(scale) for scale in SCALES))
+        after, renewed = balance.descent._precise(state, weights, measured, numbers)
+    assert {name: value.dtype for name, value in balance.named_buffers(remove_duplicate=False)} == kept
+    wanted, in_single = taken(balance, state, weights, measured), expected(balance, state, weights, measured)
+    assert_same([*after, renewed], wanted, rtol=1e-5)
+    assert float((in_single[0] - wanted[0]).abs().max()) > 10 * float((after.u - wanted[0]).abs().max())
+
+
 def test_what_needs_tensor_operations_is_left_to_them():
     x = torch.ones(3)
     assert takes(x, None)

@@ -195,8 +195,10 @@ class Descent(nn.Module):
             *after, _, weights = self.native.take(*self._given, state, weights, measured, [scales])
             return State(*after), weights
         numbers = Scales(*(torch.as_tensor(scale, dtype=state.u.dtype, device=state.u.device) for scale in scales))
-        unrolled = torch.compiler.is_exporting() or torch.is_grad_enabled()
-        step = self._precise if self.equations.is_slack else self.step if unrolled else self._compiled_once
+        exporting, recording = torch.compiler.is_exporting(), torch.is_grad_enabled()
+        step = self.step if exporting or recording else self._compiled_once
+        if self.native.precise and (exporting or not (recording or torch.compiler.is_compiling())):
+            step = self._precise
         taken: tuple[State, Tensor] = step(state, weights, measured, numbers)
         return taken
 
@@ -206,12 +208,10 @@ class Descent(nn.Module):
 
     def _precise(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
         """`step` in double precision, of and to the precision of the state."""
-        doubled = {f"descent.{name}": each.double() for name, each in self.named_buffers() if each.is_floating_point()}
-        of_state, of_markers, numbers = (
-            [None if x is None else x.double() for x in each] for each in (state, measured, scales)
-        )
-        given: Any = State(*of_state), weights.double(), Bearings(*of_markers), Scales(*numbers)  # type: ignore[arg-type]
-        taken, renewed = torch.func.functional_call(Stepping(self), doubled, given, tie_weights=False)
+        constants = {f"descent.{name}": each.double() for name, each in self.named_buffers() if each.is_floating_point()}
+        of_state, of_markers, numbers = (map(_doubled, each) for each in (state, measured, scales))
+        given: Any = State(*of_state), weights.double(), Bearings(*of_markers), Scales(*numbers)
+        taken, renewed = torch.func.functional_call(Stepping(self), constants, given, tie_weights=False)
         return State(*(value.to(state.u) for value in taken)), renewed.to(weights)
 
     def step(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
@@ -277,3 +277,7 @@ class Descent(nn.Module):
             far2 = torch.maximum(far2, stretch2 / settings.largest_stretch**2)
         share: Tensor = far2.clamp_min(1.0).rsqrt()
         return share
+
+
+def _doubled(value: Tensor | None) -> Any:
+    return None if value is None else value.double()

@@ -114,12 +114,8 @@ class BalanceEquations(nn.Module):
         A, (m, n) = normal.stiffness, self.forces.membrane.grid
         squares = (A * (normal.weights[:, :, :, None, None] * A[:, None]).sum(2)).sum(1)
         planes = squares.unflatten(-1, (m - 2, n - 2)).flatten(0, 1)
-        of_forces = F.conv_transpose2d(planes, self.forces.kernels[:, None].to(planes), padding=1).reshape(
-            -1, 3, squares.shape[-1]
-        )
-        of_markers = normal.marker_blocks.diagonal(dim1=1, dim2=2).mT @ self.bearings.pair_shares[:, : squares.shape[-1]].to(
-            squares
-        )
+        of_forces = F.conv_transpose2d(planes, self.forces.kernels[:, None], padding=1).reshape(-1, 3, squares.shape[-1])
+        of_markers = normal.marker_blocks.diagonal(dim1=1, dim2=2).mT @ self.bearings.pair_shares[:, : squares.shape[-1]]
         return of_forces + of_markers
 
 

@@ -85,14 +85,20 @@ def convolved(planes: Tensor, kernels: Tensor, padding: int = 0) -> Tensor:
         [[[[4.0, 4.0], [4.0, 4.0]]]]
     """
     if torch.compiler.is_exporting() and planes.dtype == torch.float64:
-        return _convolved_by_product(F.pad(planes, (padding,) * 4), kernels)
+        return convolved_by_product(F.pad(planes, (padding,) * 4), kernels)
     if len(planes) > FEW or planes.device.type != "cpu" or torch.is_grad_enabled() or torch.compiler.is_compiling():
         return F.conv2d(planes, kernels, padding=padding)
     at_once: Tensor = torch.ops.aten.thnn_conv2d(planes, kernels, kernels.shape[2:], None, [1, 1], [padding] * 2)
     return at_once
 
 
-def _convolved_by_product(planes: Tensor, kernels: Tensor) -> Tensor:
+def convolved_by_product(planes: Tensor, kernels: Tensor) -> Tensor:
+    """`F.conv2d`, without padding, by a product of matrices.
+
+    Args:
+        planes: `[P, C, m, n]`.
+        kernels: `[W, C, h, w]`.
+    """
     (m, n), (h, w) = planes.shape[2:], kernels.shape[2:]
     rows, columns = m - h + 1, n - w + 1
     windows = torch.cat([planes[..., i : i + rows, j : j + columns] for i in range(h) for j in range(w)], 1)
