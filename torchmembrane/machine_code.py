@@ -10,8 +10,10 @@ import numpy as np
 OPTIONS: dict[str, Any] = dict(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 """NaN and infinity are what they are, sums come in any order."""
 
-compiled = numba.njit(**OPTIONS)
-"""Of a function that others call."""
+INNER: dict[str, Any] = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+compiled = numba.njit(**OPTIONS, **INNER)
+"""Of a function that others call, not Python: its arguments would take as long to unpack as it takes to compile."""
 kept = numba.njit(cache=True, **OPTIONS)
 """Of a function that Python calls: kept on disk, beside its file or in the user's cache, until that file changes."""
 

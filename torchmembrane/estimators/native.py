@@ -13,8 +13,7 @@ from ..mechanics.native_membrane import Surface, surface_of
 from ..surface.stencil import inner
 from .bearings import Bearings
 from .native_equations import Constants, Numbers, Workspace, workspace
-from .native_spread import spreads
-from .native_step import steps
+from .native_frames import frames
 from .normal_equations import DAMPING, BalanceEquations
 
 
@@ -51,7 +50,7 @@ class NativeSteps:
         u, pressure, moved, weighing, before = (value.numpy() for value in changing)
         surface = -1, *equations.forces.membrane.grid, 3
         surfaces = u.reshape(surface), pressure, moved, weighing, before.reshape(surface)
-        steps(constants, work, *surfaces, *fixed, np.array(rows, float).reshape(-1, 5))
+        frames(constants, work, *surfaces, *fixed, np.array(rows, float).reshape(-1, 5), np.empty((0, 4), u.dtype))
         after, pressure_after, camera, weights, before_last = (value.to(given) for value in changing)
         return [after, pressure_after, camera, before_last, weights]
 
@@ -68,9 +67,9 @@ class NativeSteps:
         constants, work, fixed = self._prepared(equations, cavity, measured, dtype)
         u, pressure, moved = (value.to(dtype).contiguous().numpy() for value in state)
         weights, found = np.ones((len(u), len(constants.area)), u.dtype), np.empty((len(u), 4), u.dtype)
-        scales = np.array([equations.loss.settings.tau[1], outlier, equations.loss.cone, 1.0, DAMPING])
+        scales = np.array([[equations.loss.settings.tau[1], outlier, equations.loss.cone, 1.0, DAMPING]])
         u = u.reshape(-1, *equations.forces.membrane.grid, 3)
-        spreads(constants, work, u, pressure, moved, weights, *fixed, scales, found)
+        frames(constants, work, u, pressure, moved, weights, u, *fixed, scales, found)
         return torch.from_numpy(found).to(state[0].dtype)
 
     def _precision(self, u: Tensor) -> torch.dtype:

@@ -6,17 +6,14 @@ eliminated, are substituted back.
 
 import numpy as np
 
-from ..machine_code import compiled, fingerprint, kept
-from ..mechanics import native_membrane
+from ..machine_code import compiled
 from ..mechanics.native_membrane import linearise
-from ..solve import native_band
-from . import native_equations, native_step
 from .native_equations import CAMERA, FLUID, LOADS, VOLUME, WANTED, load_forces, load_markers, sum_blocks, weigh
 from .native_step import border_unknowns, camera_stiffness, cavity_condition, eliminated, factored, substituted
 
 
 @compiled
-def _spread(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales, spread):
+def spread_of(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales, found):
     """Standard deviations `[4]` at the state of a frame."""
     own, slope, size = np.zeros((4, 4)), np.zeros(4), len(work.scale)
     rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
@@ -42,7 +39,7 @@ def _spread(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scal
             for i in range(size):
                 solved[i] += share * work.y[(CAMERA + e) * size + i]
         substituted(work, solved)
-        spread[k - WANTED] = np.sqrt(_at_markers(c, work, solved, own, seen[3]) + change**2 * gauge[1])
+        found[k - WANTED] = np.sqrt(_at_markers(c, work, solved, own, seen[3]) + change**2 * gauge[1])
 
 
 @compiled
@@ -108,20 +105,3 @@ def _at_markers(c, work, solved, own, motion):
                 turned -= work.marker_weights[d] * motion[r, a, d] * system[a, 4]
             total += turned * turned
     return total
-
-
-def _entry(sources):
-    @kept
-    def spreads(c, work, u, pressure, moved, weights, origins, across, weight, noise_level, motion, gauge, scales, found):
-        """Standard deviations `found [B, 4]`, of force and depth, of every frame; arguments as of `steps`."""
-        for b in range(len(u) if sources else 0):
-            seen = origins[b], across[b], weight[b], motion[b]
-            state = u[b], pressure[b : b + 1], moved[b], weights[b]
-            _spread(c, work, *state, seen, noise_level[b], gauge[b], scales, found[b])
-
-    return spreads
-
-
-spreads = _entry(
-    fingerprint(__file__, *(each.__file__ for each in (native_band, native_equations, native_membrane, native_step)))
-)

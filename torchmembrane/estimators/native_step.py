@@ -6,19 +6,16 @@ times, on 9 x 9 ten times as long as this. The formulas are those of `descent`, 
 
 import numpy as np
 
-from ..machine_code import compiled, fingerprint, kept
-from ..mechanics import native_membrane
+from ..machine_code import compiled
 from ..mechanics.native_membrane import linearise
-from ..solve import native_band
 from ..solve.band import RIDGES
 from ..solve.native_band import RANK, ROWS, backward, factor
-from . import native_equations
 from .camera_motion import RARE
 from .native_equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, load_markers, sum_blocks, weigh
 
 
 @compiled
-def _step(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales):
+def step(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales):
     """From a state to the next: `u [m, n, 3]`, `pressure [1]`, `moved [4]` and `weights [N]`, of the normal tractions,
     change."""
     tau, outlier, cone, renewal, damping = scales[0], scales[1], scales[2], scales[3], scales[4]
@@ -175,26 +172,3 @@ def _share(c, u, move):
                     stretch2 = max(stretch2, change2 / max(edge2, tiny))
     far2 = max(far2 / (k.longest_step * k.size) ** 2, stretch2 / k.largest_stretch**2, 1.0)
     return 1 / np.sqrt(far2)
-
-
-def _entry(sources):
-    @kept
-    def steps(c, work, u, pressure, moved, weights, before, origins, across, weight, noise_level, motion, gauge, rows):
-        """Steps of every frame: states `u [B, m, n, 3]`, `pressure [B]`, `moved [B, 4]` and `weights [B, N]`, of the normal
-        tractions, become those after them; `before [B, m, n, 3]` the displacement before the last.
-
-        c: `Constants`, work: a `Workspace`, origins to gauge: `Bearings`, rows: of every step tau, outlier, cone, renewal and
-        damping, `[S, 5]`.
-        """
-        for b in range(len(u) if sources else 0):
-            seen = origins[b], across[b], weight[b], motion[b]
-            for k in range(len(rows)):
-                if k == len(rows) - 1:
-                    before[b] = u[b]
-                state = u[b], pressure[b : b + 1], moved[b], weights[b]
-                _step(c, work, *state, seen, noise_level[b], gauge[b], rows[k])
-
-    return steps
-
-
-steps = _entry(fingerprint(__file__, *(module.__file__ for module in (native_band, native_equations, native_membrane))))
