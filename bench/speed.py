@@ -1,6 +1,6 @@
 """Time a frame: markers, flow, solve, at several batch sizes, beside per-frame scipy twins of the solves.
 
-python bench/speed.py [--sensor examples/sensor.toml] [--image examples/two_contacts.png] [--device cpu] [--json FILE]
+python bench/speed.py [--sensor examples/sensor.toml] [--image examples/press_on_axis.png] [--device cpu] [--json FILE]
 
 The paper: its estimator with the soft locator, stage by stage, and `paper_twin` of its solve. Minimum energy: the twin of the
 harmonic problem (linear triangles, volume linearised once, eq. 22) is as one would write it for one frame, sparse assembly and
@@ -175,7 +175,7 @@ def force_balance(args):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sensor", default="examples/sensor.toml")
-    parser.add_argument("--image", default="examples/two_contacts.png")
+    parser.add_argument("--image", default="examples/press_on_axis.png")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--batches", type=int, nargs="*", default=[1, 16, 64])
