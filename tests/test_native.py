@@ -20,7 +20,7 @@ from torchmembrane.estimators.deviations import spreads_by_tensors
 from torchmembrane.estimators.force_balance import ForceBalance
 from torchmembrane.estimators.native import takes
 from torchmembrane.estimators.settings import ForceBalanceSettings
-from torchmembrane.machine_code import aligned
+from torchmembrane.machine_code import aligned, kept
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.solve import native_band
 from torchmembrane.surface.membrane import Membrane
@@ -326,6 +326,15 @@ def band(unknowns, width, dtype):
         if r < unknowns:
             matrix[r, r : r + len(values)] = matrix[r : r + len(values), r] = values
     return matrix, stored, (size, ld)
+
+
+def test_what_can_be_kept_nowhere_is_compiled_all_the_same():
+    """Numba refuses a function without a file, as one where nothing can be written."""
+    names: dict = {}
+    exec("def double(x):\n    return 2 * x", names)
+    with pytest.raises(RuntimeError, match="cannot cache"):
+        numba.njit(cache=True)(names["double"])
+    assert kept(names["double"])(3) == 6
 
 
 def test_what_is_kept_on_disk_hangs_on_all_its_sources():

@@ -1,6 +1,7 @@
 """Functions of arrays as machine code, made by numba at their first call: loops without Python, for one frame at a time."""
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,20 @@ INNER: dict[str, Any] = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 compiled = numba.njit(**OPTIONS, **INNER)
 """Of a function that others call, not Python: its arguments would take as long to unpack as it takes to compile."""
-kept = numba.njit(cache=True, **OPTIONS)
-"""Of a function that Python calls: kept on disk, beside its file or in the user's cache, until that file changes."""
+
+
+def kept(function: Callable[..., Any]) -> Any:
+    """A function that Python calls, compiled and kept on disk, beside its file or in the user's cache, until that file changes;
+    in this process alone where neither can be written.
+
+    Example:
+        >>> kept(lambda x: 2 * x)(3)
+        6
+    """
+    try:
+        return numba.njit(cache=True, **OPTIONS)(function)
+    except RuntimeError:  # numba's, of a place to write
+        return numba.njit(**OPTIONS)(function)
 
 
 def fingerprint(*files: str | None) -> str:
