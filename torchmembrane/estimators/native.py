@@ -123,26 +123,15 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Co
     numbers = Numbers(
         reference=loss.reference,
         size=loss.size,
-        friction=settings.friction,
-        slip=settings.slip,
-        sparsity=settings.sparsity,
-        floor=settings.floor,
         last_tau=settings.tau[1],
         first_tau=settings.tau[0],
-        scale_share=settings.scale_share,
-        far_share=settings.far_share,
-        noise_share=settings.noise_share,
-        decrease=settings.decrease,
-        least_scale=settings.least_scale,
-        camera_motion=settings.camera_motion,
-        longest_step=settings.longest_step,
-        largest_stretch=settings.largest_stretch,
         rest_pressure=float(cavity.rest_pressure),
         rest_volume=_volume(surface),
         is_open=cavity.filling == "open",
         is_gas=cavity.filling == "gas",
         absolute=absolute,
         gas_volume=gas,
+        **{name: getattr(settings, name) for name in Numbers._fields if hasattr(settings, name)},
     )
 
     def array(values: Tensor) -> np.ndarray:
