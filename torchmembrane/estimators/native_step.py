@@ -1,7 +1,7 @@
 """A step of force balance by machine code: what `Descent.step` does, frame by frame, without gradients.
 
-On a processor the tensor operations of a step, some six hundred, take longer to begin than to work: on 33 x 33 vertices three
-times, on 9 x 9 ten times as long as this. The formulas are those of `descent`, `camera_motion`, `cavity` and `kkt`.
+On a processor the tensor operations of a step, some six hundred, take longer to begin than to work.
+The formulas are those of `descent`, `camera_motion`, `cavity` and `kkt`.
 """
 
 import numpy as np

@@ -3,8 +3,8 @@
 Of `M = U^T U` the upper half is stored row by row, the entry at row `r`, column `c`, at `r ld + c - LANES floor(r / LANES)`: so
 columns of all rows are aligned alike. The rows of `U` are found `RANK` at a time; what they leave of the rows behind is
 worked out in vectors of `LANES` columns, `ROWS` rows at a time, and of the loads likewise. Left of the diagonal, and behind the
-last diagonal, lie numbers that mean nothing. On bands of 200 it takes two thirds of LAPACK's time for the factor, a third for
-the solutions: LAPACK works on blocks of 32 and takes loads one by one.
+last diagonal, lie numbers that mean nothing. LAPACK works on
+small blocks and takes loads one by one, which on bands of a few hundred is slower.
 """
 
 from typing import Any
