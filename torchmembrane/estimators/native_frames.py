@@ -1,7 +1,7 @@
 """Steps and deviations of frames by machine code: in one function, so that what both need is compiled once."""
 
 from ..machine_code import fingerprint, kept
-from ..mechanics import native_membrane
+from ..mechanics import cavity, native_membrane
 from ..solve import native_band
 from . import native_equations, native_spread, native_step
 from .native_spread import spread_of
@@ -36,6 +36,7 @@ def _entry(sources):
 
 frames = _entry(
     fingerprint(
-        __file__, *(each.__file__ for each in (native_band, native_equations, native_membrane, native_spread, native_step))
+        __file__,
+        *(each.__file__ for each in (cavity, native_band, native_equations, native_membrane, native_spread, native_step)),
     )
 )

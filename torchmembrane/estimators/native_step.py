@@ -7,11 +7,14 @@ The formulas are those of `descent`, `camera_motion`, `cavity` and `kkt`.
 import numpy as np
 
 from ..machine_code import compiled
+from ..mechanics.cavity import gas_law_step
 from ..mechanics.native_membrane import linearise
 from ..solve.band import RIDGES
 from ..solve.native_band import RANK, ROWS, backward, factor
 from .camera_motion import RARE
 from .native_equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, load_markers, sum_blocks, weigh
+
+gas_step = compiled(gas_law_step)
 
 
 @compiled
@@ -134,9 +137,7 @@ def cavity_condition(k, rise, pressure):
     """`CavityLaw.condition`."""
     if not k.is_gas:
         return -rise, 0.0
-    ratio = k.gas_volume / (k.gas_volume + rise)
-    compliance = k.gas_volume / (k.absolute * ratio**2)
-    return compliance * (k.absolute * (ratio - 1) - (pressure - k.rest_pressure)), compliance
+    return gas_step(rise, pressure, k.rest_pressure, k.absolute, k.gas_volume)
 
 
 @compiled
