@@ -84,7 +84,7 @@ class ForceBalanceSettings:
     steps: int = 8
     coarse_steps: int = 4
     fine_steps: int = 4
-    finer_steps: int = 4
+    finer_steps: int = 3
     tau: tuple[float, float] = (4.0, 0.4)
     fine_tau: tuple[float, float] = (0.8, 0.4)
     sharp_tau: tuple[float, float] = (1.0, 0.4)
