@@ -111,7 +111,7 @@ def test_a_push_is_a_contact_where_it_stands_out_of_the_noise():
     middle[len(patch) // 2] = True
     for times, is_contact in ((1.5, False), (6.0, True)):
         traction = times * loss.push_noise[middle] * force / loss.area
-        scale = loss.contact_scale(loss.parts(traction, normal.mT)[2], ONE, 1e3 * ONE)[0, middle]
+        scale = loss.contact_scale(loss(traction, normal.mT, ONE), ONE, 1e3 * ONE)[0, middle]
         pushed = -(traction[0] * normal.mT).sum(0)[middle] / estimator.reference
         assert (pushed > scale / 2).item() is is_contact
 

@@ -238,37 +238,16 @@ def test_threads_do_not_disturb_each_other():
         assert_same(found[k], one, rtol=0)
 
 
-def test_slack_sheets_are_solved_in_double_precision():
-    """Of a sheet of prestretch 1.004 a step in single precision is ten times as far off as one in double precision of the same
-    rounded numbers."""
+def test_single_precision_loses_a_slack_sheet():
+    """Of a sheet of prestretch 1.004 it changes a step by a thousandth, of one of 1.3 by less than a tenth of that."""
+    errors = []
     for prestretch, is_slack in ((1.004, True), (1.3, False)):
         balance = estimator(prestretch=prestretch, grid=(17, 17))
-        assert balance.descent.native.precise == is_slack
+        assert balance.equations.is_slack == is_slack
         wanted = taken(balance, *problem(balance))
-        in_single = copy.deepcopy(balance).float()
-        given = problem(balance, dtype=torch.float32)
-        errors = []
-        for precise in (True, False):
-            in_single.descent.native.precise = precise
-            found = taken(in_single, *given)
-            assert found[0].dtype == torch.float32
-            errors.append(float((found[0].double() - wanted[0]).abs().max() / (wanted[0] - problem(balance)[0].u).abs().max()))
-        if is_slack:
-            assert errors[0] < 1e-3 and errors[1] > 10 * errors[0]
-
-
-def test_tensor_operations_take_a_slack_sheet_s_step_in_double_precision_too():
-    """As exported models do; afterwards all constants are as they were."""
-    balance = estimator(prestretch=1.004, grid=(17, 17)).float()
-    state, weights, measured = problem(balance, dtype=torch.float32)
-    kept = {name: value.dtype for name, value in balance.named_buffers(remove_duplicate=False)}
-    with torch.no_grad():
-        numbers = Scales(*(torch.tensor(scale) for scale in SCALES))
-        after, renewed = balance.descent._precise(state, weights, measured, numbers)
-    assert {name: value.dtype for name, value in balance.named_buffers(remove_duplicate=False)} == kept
-    wanted, in_single = taken(balance, state, weights, measured), expected(balance, state, weights, measured)
-    assert_same([*after, renewed], wanted, rtol=1e-5)
-    assert float((in_single[0] - wanted[0]).abs().max()) > 10 * float((after.u - wanted[0]).abs().max())
+        found = taken(copy.deepcopy(balance).float(), *problem(balance, dtype=torch.float32))
+        errors.append(float((found[0].double() - wanted[0]).abs().max() / (wanted[0] - problem(balance)[0].u).abs().max()))
+    assert errors[0] > 5e-4 and errors[1] < 0.1 * errors[0]
 
 
 def test_what_needs_tensor_operations_is_left_to_them():

@@ -60,10 +60,13 @@ def test_pushes_cost_nothing_and_pulls_what_they_cost(light):
     measured, seen = estimator.equations.bearings.measured(observation), observation.confidence.sum(-1)
     state = State(found.vertices - estimator.membrane.rest, found.pressure, found.moved)
     traction, normal = estimator.descent.tractions(*state[:2])
-    beside, pushes = estimator.descent.losses(state, traction, normal, measured)
+    angles = estimator.equations.bearings.angles(state.u, measured, state.moved)[0]
+    misfit = estimator.descent.misfit(angles, state.pressure, measured)
+    _, _, pushes, others = estimator.equations.loss(traction, normal, measured.noise_level)
+    beside = misfit + others
     torch.testing.assert_close((found.unexplained, found.objective), (beside / seen, (beside + pushes) / seen))
     assert (beside > 0).all() and (pushes > 0).all()
-    pulled, _ = estimator.descent.losses(state, -traction, normal, measured)
+    pulled = misfit + estimator.equations.loss(-traction, normal, measured.noise_level).others
     assert (pulled > 10 * beside).all()
 
 

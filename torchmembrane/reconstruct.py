@@ -12,7 +12,7 @@ from .errors import MembraneError
 from .estimators.base import Contacts, Equilibrium, Observation, Problem
 from .estimators.breakdown import broken_down
 from .estimators.camera_motion import in_pixels, in_words, shift_of
-from .estimators.choice import ESTIMATORS, Settings, estimator_of
+from .estimators.choice import ESTIMATORS, AnyEstimator, Settings, estimator_of
 from .estimators.covariance import StandardDeviations
 from .estimators.force_balance import ForceBalance
 from .estimators.kept_state import keep_small
@@ -45,7 +45,7 @@ class Reconstructor(nn.Module):
         settings: of that estimator, `ForceBalanceSettings`, `MinimumEnergySettings` or `PaperSettings`.
         model: the elastic energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin".
         channels: order of the channels of colour images, "rgb" or "bgr".
-        dtype: torch.float32 or torch.float64.
+        dtype: of images and results, torch.float32 or torch.float64; slack sheets are solved in the latter whatever it is.
         locator: how markers are found in images: "fit", by least squares, or "soft", by soft-argmax of responses; default:
             "soft" for "paper", else "fit".
         check_rest: whether a rest image that disagrees with the model by more than calibration could explain is refused.
@@ -107,14 +107,22 @@ class Reconstructor(nn.Module):
             vertex_pixels=vertex_pixels,
             rest_covariance=2 * self.observer.rest_covariance.double() + LEAST_ERROR**2 * torch.eye(2),
         )
-        self.estimator = estimator_of(problem, estimator, settings)
         self.register_buffer("vertex_pixels", vertex_pixels)
         self.register_buffer("rest_markers", positions)
         self.register_buffer("marker_shares", torch.from_numpy(bicubic_shares(markers.points, membrane.grid, membrane.fixed)))
         facing = facings(positions, self.marker_shares @ membrane.rest_normals)
         self.coverage = Coverage(membrane, positions, self.observer.seen_at_rest, facing)
         self.to(dtype)
+        self._solve_by(estimator_of(problem, estimator, settings), dtype)
         keep_small(self)
+
+    def _solve_by(self, estimator: AnyEstimator, dtype: torch.dtype) -> None:
+        """Take an estimator, of a precision but for a slack sheet's: that is in double, and so is what it is given."""
+        self.estimator = estimator
+        if isinstance(estimator, ForceBalance) and estimator.equations.is_slack:
+            self.observer.locator.be_exact()
+        else:
+            estimator.to(dtype)
 
     @classmethod
     def from_file(cls, path: str | Path, estimator: str = "force-balance", **options: Any) -> "Reconstructor":
@@ -243,12 +251,12 @@ class Reconstructor(nn.Module):
         """The frames' results, NaN where there is no surface."""
         membrane, lost, x = self.estimator.membrane, confidence <= FOUND, found.vertices
         u = x - membrane.rest
-        markers = self.rest_markers + self.marker_shares @ u
+        markers = self.rest_markers + self.marker_shares @ u.to(self.marker_shares)
         pixels = self.rest_pixels + displacement
         modelled = self.camera.point_to_pixel(markers) + shift_of(found.moved, pixels, self.image_size)
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))
         normals, broken = membrane.normals(x), ~x.flatten(1).isfinite().all(1)
-        in_view = self.coverage.in_view(confidence, facings(markers, self.marker_shares @ normals))
+        in_view = self.coverage.in_view(confidence, facings(markers, self.marker_shares @ normals.to(markers)))
         gone, status = (status != Status.OK.value) | broken, self._judged(status, found, in_view, broken)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
         deviations = self.estimator.deviations(found, observation, contacts)
@@ -273,9 +281,10 @@ class Reconstructor(nn.Module):
             **{f"contact_{name}": getattr(contacts, name) for name in Contacts._fields[1:]},
         )
         kept = {
-            name: torch.where(gone.reshape(-1, *(1,) * (value.ndim - 1)), torch.nan, value) for name, value in values.items()
+            name: torch.where(gone.reshape(-1, *(1,) * (value.ndim - 1)), torch.nan, value).to(markers)
+            for name, value in values.items()
         }
-        measured = torch.where(lost[..., None], torch.nan, pixels)
+        measured = torch.where(lost[..., None], torch.nan, pixels).to(markers)
         return Reconstruction(pixels=measured, confidence=confidence, status=status.to(torch.int32), **kept)
 
     def _judged(self, status: Tensor, found: Equilibrium, coverage: Tensor, broken: Tensor) -> Tensor:

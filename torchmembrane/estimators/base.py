@@ -60,6 +60,10 @@ class Observation(NamedTuple):
     motion: Tensor | None = None
     gauge: Tensor | None = None
 
+    def to(self, dtype: torch.dtype) -> "Observation":
+        """The same in another precision."""
+        return self._replace(**{name: value.to(dtype) for name, value in self._asdict().items() if value is not None})
+
 
 class Equilibrium(NamedTuple):
     """What an estimator finds: `vertices [..., V, 3]`, pressure difference and volume `[...]`, contact `traction [..., V, 3]`

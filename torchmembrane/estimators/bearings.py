@@ -123,7 +123,7 @@ class MarkerBearings(nn.Module):
     @piece
     def measured(self, observation: Observation) -> Bearings:
         """The markers' rays as `angles` takes them."""
-        origins, directions, confidence, across, motion, gauge = observation
+        origins, directions, confidence, across, motion, gauge = observation.to(self.positions.dtype)
         if across is None:
             across = tangent_frame(directions) / self.noise
         if motion is None:
@@ -150,13 +150,12 @@ class MarkerBearings(nn.Module):
         angle = angle.squeeze(2)
         return angle + (measured.motion * moved[:, None, :, None]).sum(2), jacobian
 
-    def misfits(self, u: Tensor, measured: Bearings, moved: Tensor, outlier: float, far: float) -> tuple[Tensor, Tensor]:
+    def misfits(self, angles: Tensor, measured: Bearings, outlier: float, far: float) -> tuple[Tensor, Tensor]:
         """How far the markers are off their rays, in standard deviations, and as much of it as neighbours have in common.
 
         Args:
-            u: the surface's displacement, `[B, V, 3]`.
+            angles: of the markers, `[B, 2, D]`.
             measured: the markers' rays.
-            moved: the camera, `[B, 4]`.
             outlier: as what each marker counts at most, in the first.
             far: the same in the second.
 
@@ -164,7 +163,7 @@ class MarkerBearings(nn.Module):
             Rms of the angles `[B]`; the root of the mean product `[B]` of a marker's angles with its nearest neighbours', 0
             where it is negative. Noise and a marker's wrong match know nothing of the next; what no surface can follow does.
         """
-        angles, weight = self.angles(u, measured, moved)[0], measured.weight
+        weight = measured.weight
         counted = angles.square().mean(1).clamp_max(outlier**2)
         length = angles.square().sum(1, keepdim=True).clamp_min(1e-12).sqrt()
         here = angles * (far / length).clamp_max(1) * weight[:, None]

@@ -197,7 +197,7 @@ def standard_deviations(
     noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * tangent_frame(observation.directions)
     scales = settings.tau[1], settings.outlier
     _, normal, solution = linearise(equations, cavity, state, measured, scales, settings.camera_motion, curvature=True)
-    turned = torch.einsum("bdrj,bajd->bdra", noise, measured.across)
+    turned = torch.einsum("bdrj,bajd->bdra", noise.to(measured.across), measured.across)
     dx, dF, dp = spread(solution, noise_loads(equations, normal, measured, solution.motion, turned))
     return StandardDeviations(pad_border(dx.unflatten(-1, (3, -1)).mT, equations.forces.membrane.grid), dF, dp)
 

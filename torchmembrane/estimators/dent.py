@@ -16,6 +16,7 @@ from ..surface.stencil import pad_border
 from .base import Equilibrium
 from .bearings import Bearings
 from .descent import Descent, State
+from .precision import shortened
 from .traction_loss import stands_out
 
 DEPTH = 0.05  # over the surface's size
@@ -49,7 +50,7 @@ class Dent(nn.Module):
         super().__init__()
         self.descent, self.membrane = descent, descent.membrane
         rest, size = self.membrane.rest, self.membrane.size
-        self.register_buffer("around", torch.exp(-(torch.cdist(rest, rest) ** 2) / (2 * (REACH * size) ** 2)))
+        self.register_buffer("around", shortened(torch.exp(-(torch.cdist(rest, rest) ** 2) / (2 * (REACH * size) ** 2))))
         self.register_buffer("area", self.membrane.rest_area / size**2)
         self.register_buffer("free", (~self.membrane.fixed).double())
 

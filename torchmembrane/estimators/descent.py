@@ -19,6 +19,7 @@ from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
 from .robust import Cauchy
 from .settings import ForceBalanceSettings
+from .traction_loss import Judged
 
 VERTICES = 9000
 """Of a batch's surfaces that are worked on at a time: what a step makes of more does not stay in a processor's cache."""
@@ -44,18 +45,6 @@ class Scales(NamedTuple):
     damping: Tensor
 
 
-class Stepping(nn.Module):
-    """A descent that, called, makes a step."""
-
-    def __init__(self, descent: "Descent"):
-        super().__init__()
-        self.descent = descent
-
-    def forward(self, *given: Any) -> tuple[State, Tensor]:
-        """As `Descent.step`."""
-        return self.descent.step(*given)
-
-
 class Descent(nn.Module):
     """Reweighted Gauss-Newton steps by a schedule of the losses' scales.
 
@@ -70,7 +59,7 @@ class Descent(nn.Module):
         self.equations, self.cavity, self.settings = equations, cavity, settings
         self.membrane = equations.forces.membrane
         self.inner_grid = self.membrane.grid[0] - 2, self.membrane.grid[1] - 2
-        self.native, self._given = NativeSteps(equations.is_slack), (equations, cavity)
+        self.native, self._given = NativeSteps(), (equations, cavity)
 
     def forward(
         self,
@@ -134,21 +123,19 @@ class Descent(nn.Module):
 
     def objective(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
-        unexplained, pushes = self.losses(state, traction, normal, measured)
-        return unexplained + pushes
-
-    def losses(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> tuple[Tensor, Tensor]:
-        """The same in two parts, `[B]` each: what no push is the reason of, misfit, pulls and shear; and the pushes' loss."""
-        pushes, others = self.equations.loss(traction, normal, measured.noise_level)
-        return self._misfit(*state, measured) + others, pushes
+        judged: Judged = self.equations.loss(traction, normal, measured.noise_level)
+        angles = self.equations.bearings.angles(state.u, measured, state.moved)[0]
+        return self.misfit(angles, state.pressure, measured) + judged.others + judged.pushes
 
     def objective_at_rest(self, measured: Bearings) -> Tensor:
         """The same of the surface at rest and a camera that has not moved; there are no tractions."""
         still, none = torch.zeros_like(self.membrane.rest[None]), torch.zeros_like(measured.noise_level)
-        return self._misfit(still, none + self.cavity.rest_pressure, none[:, None].expand(-1, 4), measured)
+        angles = self.equations.bearings.angles(still, measured, none[:, None].expand(-1, 4))[0]
+        return self.misfit(angles, none + self.cavity.rest_pressure, measured)
 
-    def _misfit(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> Tensor:
-        misfit = measured.weight * self.equations.bearings.angles(u, measured, moved)[0].square().sum(1)
+    def misfit(self, angles: Tensor, pressure: Tensor, measured: Bearings) -> Tensor:
+        """The part `[B]` of markers, seen at `angles [B, 2, D]`, and of a gauge."""
+        misfit = measured.weight * angles.square().sum(1)
         of_markers: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1)
         return of_markers + gauge_loss(measured.gauge, pressure - self.cavity.rest_pressure)
 
@@ -195,24 +182,13 @@ class Descent(nn.Module):
             *after, _, weights = self.native.take(*self._given, state, weights, measured, [scales])
             return State(*after), weights
         numbers = Scales(*(torch.as_tensor(scale, dtype=state.u.dtype, device=state.u.device) for scale in scales))
-        exporting, recording = torch.compiler.is_exporting(), torch.is_grad_enabled()
-        step = self.step if exporting or recording else self._compiled_once
-        if self.native.precise and (exporting or not (recording or torch.compiler.is_compiling())):
-            step = self._precise
+        step = self.step if torch.compiler.is_exporting() or torch.is_grad_enabled() else self._compiled_once
         taken: tuple[State, Tensor] = step(state, weights, measured, numbers)
         return taken
 
     @torch.compiler.nested_compile_region
     def _compiled_once(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
         return self.step(state, weights, measured, scales)
-
-    def _precise(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
-        """`step` in double precision, of and to the precision of the state."""
-        constants = {f"descent.{name}": each.double() for name, each in self.named_buffers() if each.is_floating_point()}
-        of_state, of_markers, numbers = (map(_doubled, each) for each in (state, measured, scales))
-        given: Any = State(*of_state), weights.double(), Bearings(*of_markers), Scales(*numbers)
-        taken, renewed = torch.func.functional_call(Stepping(self), constants, given, tie_weights=False)
-        return State(*(value.to(state.u) for value in taken)), renewed.to(weights)
 
     def step(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
         """One reweighted Gauss-Newton step, the volume linearised, the longest vertex step capped.
@@ -277,7 +253,3 @@ class Descent(nn.Module):
             far2 = torch.maximum(far2, stretch2 / settings.largest_stretch**2)
         share: Tensor = far2.clamp_min(1.0).rsqrt()
         return share
-
-
-def _doubled(value: Tensor | None) -> Any:
-    return None if value is None else value.double()

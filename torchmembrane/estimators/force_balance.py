@@ -23,13 +23,13 @@ from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..camera.model import Camera
 from ..mechanics.cavity import CavityLaw, rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..pieces import mended, piece, rowwise
+from ..surface.bicubic import Refinement
 from ..surface.membrane import Membrane
 from ..surface.projection import SurfacePoints
 from ..surface.stencil import inner, pad_border
@@ -99,10 +99,12 @@ class ForceBalance(nn.Module):
         self.settings = settings = settings or ForceBalanceSettings()
         self.cavity = CavityLaw(membrane, rest_balance(membrane, elasticity)[0], filling, gas)
         self.size, self.coarseness = membrane.size, max(1.0, (RESOLVED - 1) / (min(membrane.grid) - 1)) ** 2
+        self._far = settings.far * self.coarseness
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
         bearings = MarkerBearings(membrane, markers, positions, noise, rest)
         self.coarse = self._coarser(membrane, elasticity, bearings, rest=rest, filling=filling, gas=gas)
+        self.refinement = None if self.coarse is None else Refinement(self.coarse.membrane.grid, membrane.grid)
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
@@ -257,10 +259,8 @@ class ForceBalance(nn.Module):
     @piece
     def refined(self, u: Tensor, pressure: Tensor, moved: Tensor) -> State:
         """What `coarse` found on this grid: the displacement is bicubic between its lines, so that it has no folds there."""
-        assert self.coarse is not None  # only called with what it has found
-        u = u.unflatten(1, self.coarse.membrane.grid).permute(0, 3, 1, 2)
-        u = F.interpolate(u, self.membrane.grid, mode="bicubic", align_corners=True).permute(0, 2, 3, 1).flatten(1, 2)
-        return State(u * self.equations.forces.free, pressure + self._above_coarse(), moved)
+        assert self.refinement is not None  # only called with what the coarser grid has found
+        return State(self.refinement(u) * self.equations.forces.free, pressure + self._above_coarse(), moved)
 
     def _above_coarse(self) -> Tensor:
         """By how much the rest pressure is above that of `coarse`, `[]`: every grid has its own."""
@@ -274,15 +274,15 @@ class ForceBalance(nn.Module):
         step = (u - before).square().sum(-1).mean(-1).sqrt() / self.size
         traction = self.equations.forces(u, pressure) / membrane.rest_area[:, None]
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
-        limits, push2 = (self.settings.outlier, self.settings.far * self.coarseness), loss.parts(*within)[2]
-        losses, seen = self.descent.losses(State(u, pressure, moved), *within, measured), measured.weight.sum(-1).clamp_min(1)
-        unexplained, pushes = (each / seen for each in losses)
-        objective = unexplained + pushes
+        judged, seen = loss(*within, measured.noise_level), measured.weight.sum(-1).clamp_min(1)
+        angles = self.equations.bearings.angles(u, measured, moved)[0]
+        unexplained = (self.descent.misfit(angles, pressure, measured) + judged.others) / seen
+        objective = unexplained + judged.pushes / seen
         gain = self.descent.objective_at_rest(measured) / seen - objective
-        scale = 1 + pad_border(loss.contact_scale(push2, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
-        misfit, shared = self.equations.bearings.misfits(u, measured, moved, *limits)
-        judged = misfit, moved, objective, unexplained, loss.pushed(push2), shared
-        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *judged)
+        scale = 1 + pad_border(loss.contact_scale(judged, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
+        misfit, shared = self.equations.bearings.misfits(angles, measured, self.settings.outlier, self._far)
+        reasons = misfit, moved, objective, unexplained, loss.pushed(judged.push2), shared
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *reasons)
 
     @piece
     def is_converged(self, found: Equilibrium) -> Tensor:
@@ -299,9 +299,7 @@ class ForceBalance(nn.Module):
     def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
         """`[B]` bool: settled, likely, no mound for a pit, hardly a marker outside, as beside a contact steps went past."""
         settings, (least, most, untouched) = self.settings, self.settings.likely_objective
-        outlying = self.equations.bearings.outlying(
-            found.vertices - self.membrane.rest, measured, found.moved, settings.far * self.coarseness
-        )
+        outlying = self.equations.bearings.outlying(found.vertices - self.membrane.rest, measured, found.moved, self._far)
         likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most)
         pushed = (stands_out(found.reference / self.reference) & ~self.membrane.fixed).any(-1)
         likely = torch.where(pushed, likely, untouched) * self.coarseness**2
@@ -346,5 +344,6 @@ class ForceBalance(nn.Module):
             Noise must not change which vertices are pushed, as it does in the shallowest presses and where two answers
             compete; the grid's and the material's errors are not in it.
         """
+        x, pressure, moved = (value.to(self.membrane.rest.dtype) for value in (x, pressure, moved))
         state = State(x - self.membrane.rest, pressure, moved)
         return standard_deviations(self.equations, self.cavity, self.settings, state, observation, marker_noise)

@@ -18,19 +18,14 @@ from .normal_equations import DAMPING, BalanceEquations
 
 
 class NativeSteps:
-    """The steps of one grid. What is constant is looked up again where precision, settings or material have changed.
+    """The steps of one grid. What is constant is looked up again where precision, settings or material have changed."""
 
-    Args:
-        precise: in double precision whatever comes.
-    """
-
-    def __init__(self, precise: bool = False) -> None:
-        self.precise = precise
+    def __init__(self) -> None:
         self._constants: tuple[Any, Constants] | None = None
         self._own = threading.local()
 
-    def __reduce__(self) -> tuple[Any, tuple[bool]]:
-        return type(self), (self.precise,)
+    def __reduce__(self) -> tuple[Any, tuple[()]]:
+        return type(self), ()
 
     def take(
         self,
@@ -43,15 +38,14 @@ class NativeSteps:
     ) -> list[Tensor]:
         """Displacement, pressure and camera after the steps, the displacement before the last, and the weights; arguments as of
         `Descent.step`, `rows`: the numbers of every step."""
-        given, dtype = state[0].dtype, self._precision(state[0])
-        constants, work, fixed = self._prepared(equations, cavity, measured, dtype)
-        changing = [value.to(dtype, copy=True, memory_format=torch.contiguous_format) for value in (*state, weights)]
+        constants, work, fixed = self._prepared(equations, cavity, measured)
+        changing = [value.clone(memory_format=torch.contiguous_format) for value in (*state, weights)]
         changing.append(changing[0].clone())
         u, pressure, moved, weighing, before = (value.numpy() for value in changing)
         surface = -1, *equations.forces.membrane.grid, 3
         surfaces = u.reshape(surface), pressure, moved, weighing, before.reshape(surface)
         frames(constants, work, *surfaces, *fixed, np.array(rows, float).reshape(-1, 5), np.empty((0, 4), u.dtype))
-        after, pressure_after, camera, weights, before_last = (value.to(given) for value in changing)
+        after, pressure_after, camera, weights, before_last = changing
         return [after, pressure_after, camera, before_last, weights]
 
     def spread(
@@ -63,28 +57,20 @@ class NativeSteps:
         outlier: float,
     ) -> Tensor:
         """Standard deviations of force and depth, `[B, 4]`; arguments as of `deviations.spreads`."""
-        dtype = self._precision(state[0])
-        constants, work, fixed = self._prepared(equations, cavity, measured, dtype)
-        u, pressure, moved = (value.to(dtype).contiguous().numpy() for value in state)
+        constants, work, fixed = self._prepared(equations, cavity, measured)
+        u, pressure, moved = (value.contiguous().numpy() for value in state)
         weights, found = np.ones((len(u), len(constants.area)), u.dtype), np.empty((len(u), 4), u.dtype)
         scales = np.array([[equations.loss.settings.tau[1], outlier, equations.loss.cone, 1.0, DAMPING]])
         u = u.reshape(-1, *equations.forces.membrane.grid, 3)
         frames(constants, work, u, pressure, moved, weights, u, *fixed, scales, found)
-        return torch.from_numpy(found).to(state[0].dtype)
-
-    def _precision(self, u: Tensor) -> torch.dtype:
-        return torch.float64 if self.precise else u.dtype
+        return torch.from_numpy(found)
 
     def _prepared(
-        self,
-        equations: BalanceEquations,
-        cavity: CavityLaw,
-        measured: Bearings,
-        dtype: torch.dtype,
+        self, equations: BalanceEquations, cavity: CavityLaw, measured: Bearings
     ) -> tuple[Constants, Workspace, list[np.ndarray]]:
-        """What is constant, where to work, and what is measured, as arrays of a precision."""
+        """What is constant, where to work, and what is measured, as arrays."""
         gauge = torch.zeros_like(measured.motion[:, 0, :2, 0]) if measured.gauge is None else measured.gauge
-        fixed = [value.to(dtype).contiguous().numpy() for value in (*measured[:5], gauge)]
+        fixed = [value.contiguous().numpy() for value in (*measured[:5], gauge)]
         constants = self._found(equations, cavity, fixed[0].dtype)
         return constants, self._work(equations.forces.membrane.grid, len(constants.positions), fixed[0].dtype), fixed
 

@@ -20,8 +20,8 @@ from .traction_loss import Memory, TractionLoss
 DAMPING = 1e-6
 """Share of the matrix' diagonal that is added to it where nothing else is said."""
 SLACK = 0.75
-"""Rest tension over shear modulus x thickness, of a prestretch of 1.15, below which equations are solved in double precision:
-little holds a slack sheet between its markers, and float32 moves it by per cents of a press."""
+"""Rest tension over shear modulus x thickness, of a prestretch of 1.15, below which a sheet is solved in double precision: so
+little holds it between its markers that float32 moves it by per cents of a press."""
 
 
 class NormalEquations(NamedTuple):

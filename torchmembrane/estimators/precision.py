@@ -3,6 +3,7 @@
 from contextlib import AbstractContextManager, nullcontext
 
 import torch
+from torch import Tensor
 
 from ..errors import MembraneError
 
@@ -21,3 +22,13 @@ def check_precision(dtype: torch.dtype) -> None:
             f"Reconstructor: in {dtype} the solve loses the answer; expected torch.float32 or torch.float64: call .float() "
             "(images may be of half precision)"
         )
+
+
+def shortened(matrix: Tensor) -> Tensor:
+    """A matrix of means as single precision holds it: its last digits mean nothing, and a model's file keeps half.
+
+    Example:
+        >>> shortened(torch.tensor(0.1, dtype=torch.float64)).item()
+        0.10000000149011612
+    """
+    return matrix.float().to(matrix)

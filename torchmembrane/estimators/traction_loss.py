@@ -17,11 +17,14 @@ makes there. The loss is that of `q / rho`: whatever its scale, a touch looks th
 like one. (As iterative reweighting for sparse recovery ties its epsilon to the largest entries: Daubechies et al. 2010.)
 """
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 
 from ..surface.membrane import Membrane
 from ..surface.stencil import inner
+from .precision import shortened
 from .robust import GemanMcClure, PseudoHuber
 from .settings import ForceBalanceSettings
 
@@ -32,6 +35,16 @@ TINY = 1e-12  # keeps roots and quotients of what vanishes finite
 
 Memory = tuple[Tensor, Tensor | float]
 """The weights `w_n [B, N]` of the step before, and the share of a step's own in their geometric mean."""
+
+
+class Judged(NamedTuple):
+    """Of tractions at the last scale: `push2` `S^2 [B, N]`, `scale2` `rho^2 [B, N]`, and the loss `[B]` in two parts, of the
+    `pushes`, and of the `others`, pulls and shear."""
+
+    push2: Tensor
+    scale2: Tensor
+    pushes: Tensor
+    others: Tensor
 
 
 class TractionLoss(nn.Module):
@@ -60,9 +73,9 @@ class TractionLoss(nn.Module):
 
         self.register_buffer("area", within(membrane.rest_area[:, None]).squeeze(-1))
         surroundings = _gaussian_mean(membrane, settings.reach * self.size)
-        self.register_buffer("surroundings", within(within(surroundings).mT).mT)
+        self.register_buffer("surroundings", shortened(within(within(surroundings).mT).mT))
         wider = within(within(_gaussian_mean(membrane, settings.scale_reach * self.size)).mT).mT
-        self.register_buffer("wider", wider / wider.sum(0))
+        self.register_buffer("wider", shortened(wider / wider.sum(0)))
         self.register_buffer("push_noise", torch.zeros_like(self.area))
         self.register_buffer("noise_gain", self.area.new_zeros(()))
 
@@ -94,22 +107,22 @@ class TractionLoss(nn.Module):
         around = top * (((push2 / top) ** POWER) @ self.wider).clamp_min(TINY) ** (1 / POWER)
         noise2 = (settings.noise_share * noise_level[:, None] * self.push_noise).square()
         expected = torch.maximum((settings.scale_share**2 * around).maximum(settings.far_share**2 * top), noise2)
-        least = (settings.decrease * (torch.as_tensor(tau) / last - 1) + settings.least_scale).clamp_max(1.0)
-        return (expected / last**2).maximum(least.to(push2) ** 2).clamp_max(1.0)
+        tau = torch.as_tensor(tau, dtype=push2.dtype, device=push2.device)
+        least = (settings.decrease * (tau / last - 1) + settings.least_scale).clamp_max(1.0)
+        return (expected / last**2).maximum(least**2).clamp_max(1.0)
 
-    def contact_scale(self, push2: Tensor, noise_level: Tensor, gain: Tensor) -> Tensor:
+    def contact_scale(self, judged: Judged, noise_level: Tensor, gain: Tensor) -> Tensor:
         """What a push that is a contact is measured against, over `p0`, `[B, N]`: `rho`, or where noise explains it, or
         all that is found, `BEYOND`.
 
         Args:
-            push2: `S^2 [B, N]`, at a solution.
+            judged: the tractions of a solution.
             noise_level: `[B]`, of the frames over that at rest.
             gain: `[B]`, by how much the objective is below that of the surface at rest, over the markers seen.
         """
-        rho = self.scale2(push2, noise_level, self.settings.tau[-1]).sqrt()
-        above = push2 > (self.settings.contact_noise * noise_level[:, None] * self.push_noise).square()
+        above = judged.push2 > (self.settings.contact_noise * noise_level[:, None] * self.push_noise).square()
         above = above & (gain > self.settings.evidence * self.noise_gain)[:, None]
-        return torch.where(above, rho, BEYOND)
+        return torch.where(above, judged.scale2.sqrt(), BEYOND)
 
     def weights(
         self,
@@ -148,16 +161,15 @@ class TractionLoss(nn.Module):
         along = (scale * (w_n - w_t))[:, None] * normal
         return along[:, :, None] * normal[..., None, :, :] + (scale * w_t)[:, None, None] * one, w_n
 
-    def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> tuple[Tensor, Tensor]:
-        """The loss of tractions `[B, 3, N]` at the last scale `tau`, each push judged by itself, in two parts, `[B]` each: of
-        the pushes, and of pulls and shear."""
-        q_n, shear2, push2_around = self.parts(traction, normal)
-        rho2 = self.scale2(push2_around, noise_level, self.settings.tau[-1])
-        q_n, shear2, push2_around = q_n / rho2.sqrt(), shear2 / rho2, push2_around / rho2
+    def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> Judged:
+        """The loss of tractions `[B, 3, N]` at the last scale `tau`, each push judged by itself."""
+        q_n, shear2, push2 = self.parts(traction, normal)
+        rho2 = self.scale2(push2, noise_level, self.settings.tau[-1])
+        q_n, shear2 = q_n / rho2.sqrt(), shear2 / rho2
         pushes = GemanMcClure(self.settings.tau[-1]).loss((-q_n).clamp_min(0) ** 2)
-        others = q_n.clamp_min(0) ** 2 / 2 + self.shear_weight(push2_around) * self.shear.loss(shear2)
+        others = q_n.clamp_min(0) ** 2 / 2 + self.shear_weight(push2 / rho2) * self.shear.loss(shear2)
         unit = self.settings.sparsity / self.size**2 * self.area
-        return pushes @ unit, others @ unit
+        return Judged(push2, rho2, pushes @ unit, others @ unit)
 
 
 def stands_out(scale: Tensor) -> Tensor:

@@ -51,3 +51,7 @@ class Locator(Protocol):
                 markers are searched for from rest.
         """
         ...
+
+    def be_exact(self) -> None:
+        """From now on, tell pixels in double precision, where that means anything: in other runtimes the same."""
+        ...

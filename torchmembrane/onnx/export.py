@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto
+from onnx import TensorProto, helper
 from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten, tree_leaves, tree_map, tree_unflatten
 
@@ -80,7 +80,8 @@ class Tracer:
     ) -> Any:
         """Values after a loop of a bound piece, as `pieces.repeated`."""
         assert isinstance(step, MethodType) and isinstance(step.__self__, nn.Module)
-        columns = [np.array(column, np.float32) for column in zip(*rows, strict=True)]
+        precise = state[0].example.dtype == torch.float64
+        columns = [np.array(column, np.float64 if precise else np.float32) for column in zip(*rows, strict=True)]
         row = [Known(self, "", torch.as_tensor(column[0])) for column in columns]
         model, names, found = self._trace(step.__self__, unwrap(step.__func__), [*state, *given, *row])
         tables = dict(zip(reversed(names), reversed(columns), strict=False))
@@ -91,7 +92,8 @@ class Tracer:
         """Values after a conditional, as `pieces.unless`."""
         condition = self.call(None, _everywhere, (done,))
         names = {k: value.name for k, value in enumerate(values)}
-        with self.assembly.unless(condition.name, names):
+        kinds = [_kind(value.example) for value in values]
+        with self.assembly.unless(condition.name, names, kinds):
             names |= {k: value.name for k, value in enumerate(otherwise())}
         return [Known(self, names[k], value.example) for k, value in enumerate(values)]
 
@@ -148,6 +150,11 @@ class Tracer:
 
 def _everywhere(_: None, done: Tensor) -> Tensor:
     return done.all()
+
+
+def _kind(example: Tensor) -> int:
+    """ONNX' number of a tensor's element type."""
+    return helper.np_dtype_to_tensor_dtype(example.numpy().dtype)
 
 
 def export(

@@ -14,6 +14,8 @@ from .trace import OPSET
 
 IR_VERSION = 8
 """onnxruntime reads it, and the operators' set, from 1.14 on."""
+FEW = 64
+"""Numbers of a constant: more, in double precision, are stored in single precision if that holds them."""
 SPARSE_SIZE, SPARSE_SHARE = 4096, 0.7
 """A constant of more numbers, of which less are not zero, is stored by these and the distances between their places."""
 
@@ -62,7 +64,7 @@ class Assembly:
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[tuple[Any, ...], TensorProto] = {}
-        self.scattered: dict[str, list[onnx.NodeProto]] = {}
+        self.made: dict[str, list[onnx.NodeProto]] = {}
         self.pieces, self.part = 0, ""
 
     def append(self, piece: onnx.ModelProto, names: dict[str, str]) -> dict[str, str]:
@@ -73,7 +75,9 @@ class Assembly:
 
     def constant(self, array: np.ndarray) -> str:
         """The name of a constant."""
-        nonzero = np.flatnonzero(array) if array.size > SPARSE_SIZE and array.dtype == np.float32 else None
+        if array.dtype == np.float64 and array.size > FEW and np.array_equal(single := array.astype(np.float32), array):
+            return self._widened(self.constant(single))
+        nonzero = np.flatnonzero(array) if array.size > SPARSE_SIZE and array.dtype.kind == "f" else None
         if nonzero is not None and len(nonzero) < SPARSE_SHARE * array.size:
             return self._scattered(array, nonzero)
         tensor = numpy_helper.from_array(array)
@@ -95,16 +99,23 @@ class Assembly:
         }
         names = {name: self.constant(part) for name, part in parts.items()}
         dense = f"{names['values']}/{names['distances']}/{names['shape']}"
-        if dense not in self.scattered:
+        if dense not in self.made:
             made = [f"{dense}/{step}" for step in ("distances", "places", "zero", "flat")]
-            self.scattered[dense] = [
+            zero = numpy_helper.from_array(np.zeros(1, array.dtype))
+            self.made[dense] = [
                 helper.make_node("Cast", [names["distances"]], [made[0]], to=TensorProto.INT64),
                 helper.make_node("CumSum", [made[0], names["axis"]], [made[1]]),
-                helper.make_node("ConstantOfShape", [names["length"]], [made[2]]),
+                helper.make_node("ConstantOfShape", [names["length"]], [made[2]], value=zero),
                 helper.make_node("ScatterND", [made[2], made[1], names["values"]], [made[3]]),
                 helper.make_node("Reshape", [made[3], names["shape"]], [dense]),
             ]
         return dense
+
+    def _widened(self, name: str) -> str:
+        """The name of a constant in double precision, made of one in single precision when the model is loaded."""
+        double = f"{name}/double"
+        self.made.setdefault(double, [helper.make_node("Cast", [name], [double], to=TensorProto.DOUBLE)])
+        return double
 
     def named(self, name: str, output: str) -> None:
         """Give a value the name of an output."""
@@ -137,19 +148,23 @@ class Assembly:
         return last
 
     @contextmanager
-    def unless(self, condition: str, names: dict[Any, str]) -> Iterator[None]:
+    def unless(self, condition: str, names: dict[Any, str], kinds: Sequence[int]) -> Iterator[None]:
         """Pieces appended inside run where `condition` (bool) is false only.
 
-        `names` of float values here; inside they are to be given the names of what replaces them. On leaving they become those
-        of the one or the other.
+        `names` of values here, of such element types; inside they are to be given the names of what replaces them. On leaving
+        they become those of the one or the other.
         """
         k, before, outside = f"{self.part}/{self.pieces}", dict(names), self.nodes
         self.nodes = []
         yield
         same = [helper.make_node("Identity", [name], [f"{k}/{i}/same"]) for i, name in enumerate(before.values())]
+
+        def described_each(given: Iterable[str]) -> list[onnx.ValueInfoProto]:
+            return [described(*each) for each in zip(given, kinds, strict=True)]
+
         branches = dict(
-            then_branch=helper.make_graph(same, "then", [], [described(node.output[0]) for node in same]),
-            else_branch=helper.make_graph(self.nodes, "else", [], [described(name) for name in names.values()]),
+            then_branch=helper.make_graph(same, "then", [], described_each([node.output[0] for node in same])),
+            else_branch=helper.make_graph(self.nodes, "else", [], described_each(names.values())),
         )
         names |= {name: f"{k}/{i}/either" for i, name in enumerate(names)}
         self.nodes = [*outside, helper.make_node("If", [condition], list(names.values()), **branches)]
@@ -158,7 +173,7 @@ class Assembly:
         self, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto], metadata: dict[str, str]
     ) -> onnx.ModelProto:
         """The whole as a checked model of such inputs and outputs, with metadata."""
-        nodes = [*chain.from_iterable(self.scattered.values()), *self.nodes]
+        nodes = [*chain.from_iterable(self.made.values()), *self.nodes]
         graph = helper.make_graph(nodes, "torchmembrane", inputs, outputs, list(self.constants.values()))
         _shorten(graph, {value.name: value.name for value in [*inputs, *outputs]} | {"": ""})
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="torchmembrane")

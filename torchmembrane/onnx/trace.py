@@ -12,8 +12,11 @@ import numpy as np
 import onnx
 import onnx_ir as ir
 import torch
+from onnx import TensorProto
 from onnx_ir import passes
 from onnx_ir.passes import common
+from onnxscript import opset18
+from onnxscript.function_libs.torch_lib.ops.core import aten_scalar_tensor
 from onnxscript.optimizer import fold_constants_ir
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
@@ -44,8 +47,24 @@ TIDY = passes.Sequential(
     common.NameFixPass(),
 )
 """What torch's exporter does too, but for its patterns, which take most of its time and change next to nothing here."""
-_registry = cache(ONNXRegistry.from_torchlib)
-"""Torch's exporter reads its operators anew for every model, a second each; nothing here changes them."""
+_from_torchlib = ONNXRegistry.from_torchlib
+
+
+@cache
+def _registry(**options: Any) -> ONNXRegistry:
+    """The operators of torch's exporter, which it reads anew for every model, a second each; numbers in double precision, which
+    it rounds to single, are as they are."""
+    registry = _from_torchlib(**options)
+    registry.register_op(torch.ops.aten.scalar_tensor.default, _number)
+    return registry
+
+
+def _number(s: float, dtype: int = TensorProto.FLOAT, layout: str = "", device: str = "", pin_memory: bool = False) -> Any:
+    """`torch.scalar_tensor` as ONNX."""
+    if dtype != TensorProto.DOUBLE or not isinstance(s, float):
+        return aten_scalar_tensor(s, dtype, layout, device, pin_memory)
+    number: Any = ir.tensor(s, dtype=ir.DataType.DOUBLE)
+    return opset18.Constant(value=number)
 
 
 def _promoted(interpreter: _TypePromotionInterpreter, node: torch.fx.Node) -> Any:

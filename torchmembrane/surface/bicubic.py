@@ -5,7 +5,9 @@ an eighth of its second difference.
 """
 
 import numpy as np
-from torch import Tensor
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
 
 from .projection import SurfacePoints
 
@@ -25,7 +27,6 @@ def bicubic_shares(points: SurfacePoints, grid: tuple[int, int], fixed: Tensor) 
         `[D, V]`, rows that sum to one; exact for cubics away from the border, for quadratics at it.
 
     Example:
-        >>> import torch
         >>> points = SurfacePoints(np.array([[0, 4, 5]]), np.array([[0.5, 0.25, 0.25]]), np.zeros(1))
         >>> row, column = np.divmod(np.arange(16.0), 4)
         >>> (bicubic_shares(points, (4, 4), torch.zeros(16, dtype=bool)) @ np.stack([row, row * column], 1)).tolist()
@@ -41,6 +42,34 @@ def bicubic_shares(points: SurfacePoints, grid: tuple[int, int], fixed: Tensor) 
     kinked = (abs(shares) @ inside.ravel()) > 0
     shares[kinked] = linear[kinked]
     return shares
+
+
+class Refinement(nn.Module):
+    """Fields of a grid's vertices on one with more lines, the border alike: cubic convolution.
+
+    Args:
+        grid: `m, n`.
+        finer: the same of the other grid.
+
+    Example:
+        >>> Refinement((3, 3), (5, 3))(torch.tensor([0.0, 0, 0, 1, 1, 1, 0, 0, 0])[None, :, None].double())[0, ::3, 0].tolist()
+        [0.0, 0.59375, 1.0, 0.59375, 0.0]
+    """
+
+    rows: Tensor
+    columns: Tensor
+
+    def __init__(self, grid: tuple[int, int], finer: tuple[int, int]):
+        super().__init__()
+        self.grid = grid
+        for name, lines, more in zip(("rows", "columns"), grid, finer, strict=True):
+            one = torch.eye(lines, dtype=torch.float64)[None, None]
+            self.register_buffer(name, F.interpolate(one, (more, lines), mode="bicubic", align_corners=True)[0, 0])
+
+    def forward(self, field: Tensor) -> Tensor:
+        """`[B, V', C]` from `field [B, V, C]`."""
+        finer: Tensor = self.rows @ field.unflatten(1, self.grid).permute(0, 3, 1, 2) @ self.columns.mT
+        return finer.permute(0, 2, 3, 1).flatten(1, 2)
 
 
 def _along(place: np.ndarray, count: int) -> np.ndarray:

@@ -125,7 +125,7 @@ class EllipseFit(nn.Module):
             index = first.index_select(1, self.get_buffer(f"dots{k}")) + self.get_buffer(f"step{k}")
             parts.append(levels[k].flatten(1).gather(1, index.flatten(1)).unflatten(1, index.shape[1:]))
         values = parts[0] if len(parts) == 1 else torch.cat(parts, 1)[:, self.dot_to_row]
-        return values, pixel * self.stride + self.corner
+        return values.to(centre), pixel * self.stride + self.corner
 
     def forward(self, levels: list[Tensor], centre: Tensor, shape: Tensor, noise: Tensor, steps: int) -> FittedDots:
         """Fit every dot of a batch of frames.
@@ -141,6 +141,7 @@ class EllipseFit(nn.Module):
             The dots; their quality comes from the share of the window's variance explained, the contrast `a / b_0`, and the
             size against that of `shape` or at rest.
         """
+        centre, shape, noise = (value.to(self.size) for value in (centre, shape, noise))
         values, middle = self.windows(levels, centre)
         mean = values.mean(-1, keepdim=True)
         window = values - mean

@@ -20,6 +20,10 @@ from .pattern import OUTLIER, DotPattern
 from .pyramid import mean_pyramid
 
 STEPS = 3  # of the fit
+DIGITS = 8.0  # float32 has 20 binary ones after the point beside it
+BLOB, SHARE, NOISE, CONFIDENCE = 1 / 8, 1 / 64, 2.0**-18, 1 / 256
+"""Steps of the blobs' centres, px, of shares of one, of the noise, in grey, and of the confidence: nothing finer is known of
+what the fit starts from, and without rounding, which is each runtime's own, it starts alike in all."""
 FEWEST = 0.2  # mean confidence of a frame that is half trusted
 
 
@@ -46,6 +50,26 @@ def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tu
             "camera's view: check the camera's pose, centre and focal length"
         )
     return torch.as_tensor(inside, dtype=torch.float64)[None, None]
+
+
+def short(image: Tensor) -> Tensor:
+    """An image in 0..1 with so few digits that float32 holds its means over 4 x 4 pixels: these are alike in whatever order.
+
+    Example:
+        >>> bool(short(torch.tensor(0.7)) == round(0.7 * 2**20) / 2**20)
+        True
+    """
+    return (image + DIGITS) - DIGITS
+
+
+def rounded(value: Tensor, step: float) -> Tensor:
+    """The nearest multiple of a step; gradients as if it were the value.
+
+    Example:
+        >>> rounded(torch.tensor([0.3, 7.0]), 0.125).tolist()
+        [0.25, 7.0]
+    """
+    return value + ((value.detach() / step).round() * step - value.detach())
 
 
 class DotLocator(nn.Module):
@@ -100,7 +124,7 @@ class DotLocator(nn.Module):
                 f"DotLocator: {len(pixels)} dots, {int(np.isnan(pixels).any(1).sum())} of them NaN, expected at least "
                 "6, all finite; leave out dots that are not visible in the rest image"
             )
-        self.polarity, self.image_size = polarity, tuple(image_size)
+        self.polarity, self.image_size, self.is_exact = polarity, tuple(image_size), False
         tolerance = size_tolerance(shapes, np.asarray(pattern.sizes))
         self.fit = EllipseFit(pixels, shapes, image_size, tolerance)
         inside = membrane_mask(pixels, anchors, image_size)
@@ -117,6 +141,11 @@ class DotLocator(nn.Module):
         self.register_buffer("shapes", torch.as_tensor(shapes))
         self.float()
 
+    def be_exact(self) -> None:
+        """As of `Locator`: the fit in double precision, from a start that is rounded."""
+        self.is_exact = True
+        self.fit.double()
+
     def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
         """Locate the dots in a batch of frames.
 
@@ -132,12 +161,15 @@ class DotLocator(nn.Module):
     @piece
     def begin(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """The levels of the pyramid, and the blobs: centres `[B, K, 2]`, log radius `[B, K]`, and how surely one is a dot."""
-        levels = mean_pyramid(1 - image if self.polarity == "light" else image)
+        image = 1 - image if self.polarity == "light" else image
+        levels = mean_pyramid(short(image) if self.is_exact else image)
         blobs, log_radius, strength = self.detect(levels)
         relative = strength / self.strength[self.match.nearest_dots(blobs)]
         level = relative[:, : self.rest.shape[0] // 2].mean(1, keepdim=True)
         valid = torch.sigmoid(20 * (relative / (level + 1e-3) - 0.4))
         level_0, level_1, level_2 = levels
+        if self.is_exact:
+            blobs, log_radius, valid = rounded(blobs, BLOB), rounded(log_radius, SHARE), rounded(valid, SHARE)
         return level_0, level_1, level_2, blobs, log_radius, valid
 
     @piece
@@ -154,14 +186,19 @@ class DotLocator(nn.Module):
         strain: Tensor,
     ) -> LocatedMarkers:
         """The dots, by the fit about where the matcher places the dots."""
-        levels, rest = [level_0, level_1, level_2], self.rest
-        gradient = self.match.gradient(certainty, place - rest, strain).movedim(-1, 1)
-        shape = self.shapes + gradient.clamp(-0.6, 0.6) @ self.shapes
-        pixels, covariance, _, quality = self.fit(levels, place, shape, pixel_noise(level_0.detach()), STEPS)
-        flow, _, _ = self.match.predict(certainty * quality, pixels - rest, strain)
+        levels, rest, shapes = [level_0, level_1, level_2], self.rest, self.shapes.to(self.fit.size)
+        gradient, noise = self.match.gradient(certainty, place - rest, strain).movedim(-1, 1), pixel_noise(level_0.detach())
+        if self.is_exact:
+            gradient, noise = rounded(gradient, SHARE), rounded(noise, NOISE)
+        shape = shapes + gradient.clamp(-0.6, 0.6).to(shapes) @ shapes
+        pixels, covariance, _, quality = self.fit(levels, place, shape, noise, STEPS)
+        seen, quality = pixels.to(rest), quality.to(rest)
+        flow, _, _ = self.match.predict(certainty * quality, seen - rest, strain)
         predicted = rest + flow
-        deviation = safe_length(pixels - predicted, -1) / self.match.nearest
+        deviation = safe_length(seen - predicted, -1) / self.match.nearest
         confidence = quality * torch.sigmoid(20 * (OUTLIER - deviation))
-        confidence = confidence * self.coherence(pixels, confidence, strain, predicted, blobs, log_radius, valid)
+        confidence = confidence * self.coherence(seen, confidence, strain, predicted, blobs, log_radius, valid)
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
+        if self.is_exact:
+            confidence = rounded(confidence, CONFIDENCE)
         return LocatedMarkers(torch.where(confidence[..., None] > 0.05, pixels, predicted), confidence, covariance)

@@ -114,6 +114,9 @@ class SoftLocator(nn.Module):
         self._calibrate(draw_dots(pixels, shapes, image_size))
         self.float()
 
+    def be_exact(self) -> None:
+        """As of `Locator`: nothing changes."""
+
     def _calibrate(self, drawn: Tensor) -> None:
         """Take the drawn pattern `[1, 1, H, W]` for what sure dots look like."""
         self.double()

@@ -63,6 +63,9 @@ class PatchLocator(nn.Module):
         """The pyramid of the rest image `[H, W]`, each level `[1, 1, H, W]` in double precision."""
         return low_pass_pyramid(torch.as_tensor(np.asarray(rest_image, float))[None, None])
 
+    def be_exact(self) -> None:
+        """As of `Locator`: nothing changes."""
+
     def check_size(self, image: Tensor) -> None:
         """Refuse an image that is not `[B, 1, H, W]` of the rest image's size."""
         height, width = self.size
