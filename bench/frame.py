@@ -67,8 +67,8 @@ def main() -> None:
             "one image": (1, lambda: reconstructor(images[:1])),
             "in batches of 16": (16, lambda: reconstructor(many)),
             "tracked, from the frame before": (1, lambda: tracker(images[0])),
-            "markers alone": (1, lambda: reconstructor.observer(images[:1])),
-            "markers alone, followed": (1, lambda: reconstructor.observer(images[:1], pixels)),
+            "markers alone": (1, torch.inference_mode()(lambda: reconstructor.observer(images[:1]))),
+            "markers alone, followed": (1, torch.inference_mode()(lambda: reconstructor.observer(images[:1], pixels))),
         } | {f"onnxruntime, {path.name}": (1, model(path, images, pixels)) for path in args.models}
         taken = measured({"unit": (1, unit())} | runs, args.rounds)
     print(f"{m} x {n} vertices, {len(reconstructor.rest_pixels)} markers, {images.shape[-1]} x {images.shape[-2]} px")

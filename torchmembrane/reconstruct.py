@@ -118,11 +118,10 @@ class Reconstructor(nn.Module):
 
     def _solve_by(self, estimator: AnyEstimator, dtype: torch.dtype) -> None:
         """Take an estimator, of a precision but for a slack sheet's: that is in double, and so is what it is given."""
-        self.estimator = estimator
-        if isinstance(estimator, ForceBalance) and estimator.equations.is_slack:
+        is_slack = isinstance(estimator, ForceBalance) and estimator.equations.is_slack
+        self.estimator = estimator if is_slack else estimator.to(dtype)
+        if is_slack:
             self.observer.locator.be_exact()
-        else:
-            estimator.to(dtype)
 
     @classmethod
     def from_file(cls, path: str | Path, estimator: str = "force-balance", **options: Any) -> "Reconstructor":

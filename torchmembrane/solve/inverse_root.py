@@ -25,9 +25,10 @@ from ..pieces import at_hand, named
 
 LEAF = 140  # rows: halves of a smaller one take no less time
 ITERATED_LEAF = 48
+LANES = 16  # numbers of a vector: products of 47 x 47 take onnxruntime half as long again as those of 48 x 48
 RIDGE = 1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor or is iterated: float32's share of rounding
 SMALL_RIDGE = 1e-10  # the same in float64, where conditions are that large and no larger
-NEAR_ONE = 0.1  # eigenvalues of R A R^T are 1 but for this before the last steps, each of which squares it
+NEAR_ONE = 0.2  # eigenvalues of R A R^T are 1 but for this before the last steps, each of which squares it
 LAST_STEPS = 3
 LARGEST_ENTRY = 10.0  # of R, over that of the root of a ridge alone: more is divergence
 LARGEST_SCALE = 2.8  # of eigenvalues up to 1; near 3 an iteration would make all of them small
@@ -48,7 +49,7 @@ def inverse_root(matrix: Tensor) -> Tensor:
 def by_cholesky(matrix: Tensor) -> Tensor:
     """The inverse of the Cholesky factor; where rounding has left a leaf without one, of that with a `RIDGE`."""
     if matrix.shape[-1] > LEAF:
-        return _by_halves(matrix, by_cholesky)
+        return _by_parts(matrix, by_cholesky, LEAF)
     factor, info = torch.linalg.cholesky_ex(matrix)
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     if at_hand(info) and any(info.flatten().tolist()):
@@ -61,7 +62,7 @@ def by_cholesky(matrix: Tensor) -> Tensor:
 def by_products(matrix: Tensor) -> Tensor:
     """Too small in the directions of a leaf's eigenvalues far below its `RIDGE`."""
     if matrix.shape[-1] > ITERATED_LEAF:
-        return _by_halves(matrix, by_products)
+        return _by_parts(matrix, by_products, ITERATED_LEAF)
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     rows = matrix.abs().sum(-1, keepdim=True)
     largest = rows.amax(-2, keepdim=True)
@@ -74,17 +75,22 @@ def by_products(matrix: Tensor) -> Tensor:
         Y = Y @ T
         T = shift * one - Z @ Y
         Z = T @ Z
-    R = iteration.last * Z
+    R, half = iteration.last * Z, 0.5 * A
     for _ in range(LAST_STEPS):
-        R = (1.5 * one - (0.5 * R) @ A @ R.mT) @ R
+        R = (1.5 * one - R @ half @ R.mT) @ R
     is_root = R.abs().amax((-2, -1), keepdim=True) < LARGEST_ENTRY / ridge**0.5
     return torch.where(is_root, largest.rsqrt() * R, rows.rsqrt() * one)
 
 
-def _by_halves(matrix: Tensor, inverse_root: Callable[[Tensor], Tensor]) -> Tensor:
-    """The inverse root from those of the first half of the rows and of what is left of the second."""
-    half = matrix.shape[-1] // 2
-    A, B, C = matrix[..., :half, :half], matrix[..., :half, half:], matrix[..., half:, half:]
+def _by_parts(matrix: Tensor, inverse_root: Callable[[Tensor], Tensor], leaf: int) -> Tensor:
+    """The inverse root from those of the first rows and of what is left of the others, about as many: as few leaves as can be,
+    their rows whole vectors where they can be."""
+    n = matrix.shape[-1]
+    leaves = -(-n // leaf)
+    cut = min(-(-(leaves // 2) * n // leaves // LANES) * LANES, leaves // 2 * leaf)
+    sizes = [cut, n - cut]
+    upper, lower = matrix.split(sizes, -2)
+    (A, B), (_, C) = upper.split(sizes, -1), lower.split(sizes, -1)
     root = inverse_root(A)
     coupling = root @ B
     further = inverse_root(C - coupling.mT @ coupling)

@@ -136,13 +136,14 @@ class DotMatcher(nn.Module):
         Returns:
             Positions `[B, D, 2]` px, certainty `[B, D]` in 0..1 and strain `[B, D, 2, 2]`.
         """
-        *followed, kept = self.follow(blobs, log_radius, valid, previous)
+        unstrained = self.unstrained(blobs, log_radius, valid)
+        *followed, kept = self.follow(*unstrained, previous)
 
         def searched() -> Sequence[Tensor]:
             return self.either(kept, *followed, *self.search(blobs, log_radius, valid))
 
         weight, flow, strain = unless(kept, followed, searched)
-        weight, flow, strain, complete = self.sure(weight, flow, strain, blobs, log_radius, valid)
+        weight, flow, strain, complete = self.sure(weight, flow, strain, *unstrained)
 
         def doubted() -> Sequence[Tensor]:
             known, base = self.scene(self.deformation(blobs, valid), blobs, log_radius, valid)
@@ -158,31 +159,30 @@ class DotMatcher(nn.Module):
         return self.best(*repeated(self.settle, SETTLING, grown, known, base))
 
     @piece
-    def follow(
-        self, blobs: Tensor, log_radius: Tensor, valid: Tensor, previous: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As `search`, from the frames before; and in which frames `[B]` all dots that were found could be followed."""
+    def follow(self, known: Tensor, base: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As `search`, from the frames before, in the scene that is `unstrained`; and in which frames `[B]` all dots that were
+        found could be followed."""
         found, flow = torch.ones_like(self.nearest[None]) > 0, torch.zeros_like(self.pixels[None])
         if previous is not None:
             finite = previous.isfinite().all(-1)
-            enough = finite.to(blobs.dtype).mean(-1, keepdim=True) > 0.5
+            enough = finite.to(base.dtype).mean(-1, keepdim=True) > 0.5
             flow = torch.where((finite & enough)[..., None], previous - self.pixels - self.origin, flow)
             found = finite | ~enough
-        weight, flow, scene = found.to(blobs.dtype), flow.mT, self.unstrained(blobs, log_radius, valid)
-        state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), *scene)
+        weight, flow = found.to(base.dtype), flow.mT
+        state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), known, base)
         for _ in range(FOLLOWING):
-            state = self.settle(*state, *scene)
+            state = self.settle(*state, known, base)
         weight, flow, strain = state
         return weight, flow, strain, ~(found & ~(weight >= KEPT)).any(-1)
 
     @piece
     def sure(
-        self, weight: Tensor, flow: Tensor, strain: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor
+        self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What the dots that are found say, the same to the last digit whether they were followed or searched for; and in which
         frames `[B]` all are found, so that none can be on another's blob."""
         complete = (weight >= KEPT).all(-1)
-        weight, flow, strain = self.from_sure(weight, flow, strain, *self.unstrained(blobs, log_radius, valid))
+        weight, flow, strain = self.from_sure(weight, flow, strain, known, base)
         return weight, flow, self.averages.gradient(weight, flow, strain), complete
 
     @piece
@@ -191,6 +191,7 @@ class DotMatcher(nn.Module):
         found = (weight >= KEPT).to(flow.dtype)
         return self.settle(found, found[:, None] * flow, torch.zeros_like(strain), known, base)
 
+    @piece
     def unstrained(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """The `scene` of blobs whose arrangement says nothing."""
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)
