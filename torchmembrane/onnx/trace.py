@@ -138,6 +138,7 @@ def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> 
     common.InlinePass()(program.model)
     fold_constants_ir(program.model, should_fold=_is_constant)
     _free(program.model.graph)
+    _leave_out_ones(program.model.graph)
     TIDY(program.model)
     for value, name in zip(program.model.graph.inputs, inputs, strict=True):  # one that is an output too has lost its name
         value.name = name
@@ -185,6 +186,17 @@ def _free(graph: ir.Graph) -> None:
         if value.shape is not None:
             lengths = [length if isinstance(length, int) else None for length in value.shape]
             value.shape = ir.Shape([None if length and length % MANY == 0 else length for length in lengths])
+
+
+def _leave_out_ones(graph: ir.Graph) -> None:
+    """Products with the number 1, which torch's exporter makes of `addcmul` and others, are what they are made of."""
+    for node in [node for node in graph if node.op_type == "Mul" and not node.outputs[0].is_graph_output()]:
+        for value, other in (node.inputs, node.inputs[::-1]):
+            constant = None if value is None else ir.convenience.get_const_tensor(value)
+            if other is not None and constant is not None and constant.numpy().ndim == 0 and constant.numpy() == 1:
+                ir.convenience.replace_all_uses_with(node.outputs[0], other)
+                graph.remove(node, safe=True)
+                break
 
 
 def _depends(numbers: np.ndarray) -> bool:
