@@ -131,7 +131,9 @@ class MarkerBearings(nn.Module):
         found = (confidence > 0).to(confidence.dtype)
         excess = torch.where(found > 0, _spread(across) / self.rest_spread, 1.0).log()
         noise_level = (excess.sum(-1) / found.sum(-1).clamp_min(1) / 2).exp()
-        return Bearings(origins.mT, across.movedim(1, -1), confidence, noise_level, motion.movedim(1, -1), gauge)
+        turned = (value.contiguous() for value in (origins.mT, across.movedim(1, -1), motion.movedim(1, -1)))
+        origins, across, motion = turned
+        return Bearings(origins, across, confidence, noise_level, motion, gauge)
 
     def markers(self, u: Tensor) -> Tensor:
         """The markers' positions on the surface displaced by `u [B, V, 3]`, `[B, D, 3]`: their displacement is bicubic between

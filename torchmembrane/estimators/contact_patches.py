@@ -8,7 +8,7 @@ up to the total force, also where the estimate smears a push over the contact's 
 import torch
 from torch import Tensor, nn
 
-from ..solve.elimination import solve_positive
+from ..solve.elimination import solve_dense
 from ..surface.membrane import Membrane
 from ..surface.stencil import inner, pad_border
 from ..surface.tangent import tangent_frame
@@ -180,9 +180,9 @@ class ContactPatches(nn.Module):
         spread = (share * (u * u + v * v)).sum(-1, keepdim=True).clamp_min((1e-6 * self.membrane.size) ** 2).sqrt()
         u, v = u / spread, v / spread
         terms = torch.stack([torch.ones_like(u), u, v, u * u / 2, u * v, v * v / 2, z / spread], 2)
-        gram = ((strong[:, :, None] * terms) @ terms.mT).movedim((-2, -1), (0, 1))
-        ridge = 1e-6 * torch.eye(6, 7, dtype=x.dtype, device=x.device)[..., None, None]
-        _, by_u, by_v, uu, uv, vv = solve_positive(gram[:6] + ridge)[:, 0].unbind(0)
+        gram = (strong[:, :, None] * terms[:, :, :6]) @ terms.mT
+        ridge = 1e-6 * torch.eye(6, dtype=x.dtype, device=x.device)
+        _, by_u, by_v, uu, uv, vv = solve_dense(gram[..., :6] + ridge, gram[..., 6:])[..., 0].unbind(-1)
         steep = 1 + by_u * by_u + by_v * by_v
         mean = ((1 + by_v * by_v) * uu - 2 * by_u * by_v * uv + (1 + by_u * by_u) * vv) / (2 * steep * steep.sqrt())
         gauss = (uu * vv - uv * uv) / (steep * steep)

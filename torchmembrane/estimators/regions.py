@@ -105,15 +105,16 @@ def _passes(basin: Tensor, height: Tensor, count: int) -> Tensor:
 
 def _standing_apart(top: Tensor, between: Tensor, count: int, margin: Tensor) -> tuple[Tensor, Tensor]:
     """Heights and indices `[B, count]`, highest first, of peaks `top [B, K]` that stand above the passes `between [B, K, K]`
-    to higher ones by `margin [B, K]` or `[B, 1]`; heights of `-inf` where there are no more."""
-    standing, heights, chosen = top, [], []
-    for _ in range(count):
-        highest, k = standing.max(1, keepdim=True)
-        heights.append(highest)
-        chosen.append(k)
-        to_it = between.gather(1, k[..., None].expand(-1, -1, top.shape[1])).squeeze(1)
-        standing = torch.where(standing - to_it >= margin, standing, -torch.inf)
-    return torch.cat(heights, 1), torch.cat(chosen, 1)
+    to higher ones by `margin [B, K]` or `[B, 1]`; heights of `-inf` where there are no more.
+
+    `top` goes down. It makes no difference whether the higher ones stand: where the pass to one is too high that does not, the
+    pass from there to a third is too high, and so is the one to the third.
+    """
+    number = torch.arange(top.shape[1], device=top.device)
+    too_high = (between > (top - margin)[..., None]) & (number < number[:, None])
+    highest, chosen = torch.where(too_high.any(-1), -torch.inf, top).topk(min(count, top.shape[1]))
+    short = count - highest.shape[1]
+    return F.pad(highest, (0, short), value=-torch.inf), F.pad(chosen, (0, short))
 
 
 def _dilated(height: Tensor) -> Tensor:
