@@ -9,7 +9,11 @@ import torch
 from onnx import TensorProto, numpy_helper
 from test_dots import SIZE, batch, deform, measured, render, scene, slide
 
+from torchmembrane.estimators.base import Observation
+from torchmembrane.markers.dots import locator as module
 from torchmembrane.markers.dots.locator import DotLocator, short
+from torchmembrane.markers.dots.pyramid import mean_pyramid
+from torchmembrane.markers.noise import pixel_noise
 from torchmembrane.onnx.graph import Assembly, described
 from torchmembrane.onnx.trace import traced
 from torchmembrane.reconstruct import Reconstructor
@@ -49,21 +53,38 @@ def test_gradients_reach_the_images(slack, small_images):
 
 
 def nudged(locator, by):
-    """What a locator makes of an image whose blobs, and the flow's gradient, another runtime rounds."""
-    detect, gradient = locator.detect.forward, locator.match.gradient
+    """What a locator makes of an image in another runtime, which rounds otherwise all that leads to the fit and comes after."""
+    parts = [
+        (locator.detect, "forward"),
+        (locator.match, "gradient"),
+        (locator.match, "predict"),
+        (locator.coherence, "forward"),
+    ]
+    s = scene()
+    image = batch(render(*deform(s, slide, 0.4)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(locator.detect, "forward", lambda *x: [value * (1 + by) for value in detect(*x)])
-        patch.setattr(locator.match, "gradient", lambda *x: gradient(*x) * (1 + by))
-        s = scene()
-        return locator(batch(render(*deform(s, slide, 0.4))))
+        for owner, name in parts if by else ():
+            patch.setattr(owner, name, rounded_otherwise(getattr(owner, name), by))
+        if by:
+            patch.setattr(module, "pixel_noise", rounded_otherwise(pixel_noise, by))
+            patch.setattr(module, "mean_pyramid", lambda image: [level.float() for level in mean_pyramid(image.double())])
+        return locator(image)
+
+
+def rounded_otherwise(function, by):
+    def called(*given):
+        found = function(*given)
+        return [value * (1 + by) for value in found] if isinstance(found, tuple) else found * (1 + by)
+
+    return called
 
 
 def test_an_exact_locator_tells_the_same_whatever_the_rounding_before_its_fit():
     s = scene()
     locator = DotLocator(measured(s), SIZE, "dark", s.rim)
-    found = [nudged(locator, by) for by in (0.0, 1e-6)]
+    found = [nudged(locator, by) for by in (0.0, 1e-7)]
     locator.be_exact()
-    exact = [nudged(locator, by) for by in (0.0, 1e-6)]
+    exact = [nudged(locator, by) for by in (0.0, 1e-7)]
     apart = [max(float((a - b).abs().max()) for a, b in zip(*pair, strict=True)) for pair in (found, exact)]
     assert apart[0] > 1e-7 and apart[1] < 1e-12
     assert exact[0].pixels.dtype == torch.float64 and float((exact[0].pixels - found[0].pixels).abs().max()) < 0.01
@@ -114,3 +135,16 @@ def test_constants_in_double_precision_take_half_where_single_holds_them(single,
     model = assembly.model([], [described("y", TensorProto.DOUBLE, array.shape)], {})
     (found,) = onnxruntime.InferenceSession(model.SerializeToString()).run(None, {})
     np.testing.assert_array_equal(found, array)
+
+
+def test_markers_from_elsewhere_come_in_single_precision(slack, small_images):
+    made = Reconstructor(slack)
+    result = made(made.read(small_images[-1]))
+    again = made.from_pixels(result.pixels, result.confidence)
+    assert (again.vertices - result.vertices).norm(dim=-1).max() < 0.01 * result.displacement.norm(dim=-1).max()
+    directions = torch.nn.functional.normalize(made.rest_markers, dim=-1)[None]
+    sure = torch.ones_like(directions[..., 0])
+    found = made.estimator(Observation(torch.zeros_like(directions), directions, sure))
+    assert found.vertices.dtype == torch.float64 and found.vertices.isfinite().all()
+    deviations = made.standard_deviations(result)
+    assert deviations.force.isfinite().all() and deviations.vertices.isfinite().all()
