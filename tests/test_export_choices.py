@@ -152,6 +152,23 @@ def test_a_graph_captured_at_once_is_what_torch_makes_of_it_in_two_steps(monkeyp
     assert at_once.SerializeToString(deterministic=True) == in_two_steps.SerializeToString(deterministic=True)
 
 
+class WithOnes(torch.nn.Module):
+    """Products with one: of an operator that torch's exporter writes so, of an output, of one that makes a longer shape."""
+
+    def forward(self, x, y):
+        return torch.addcmul(x, x, y), 1.0 * x, (x * torch.ones(1, 1, 1)).sum(0)
+
+
+def test_products_with_one_are_left_out():
+    inputs = {"x": torch.rand(2, 3), "y": torch.rand(2, 3)}
+    model = traced(WithOnes(), inputs, ["a", "b", "c"])
+    assert sorted(node.op_type for node in model.graph.node) == ["Add", "Mul", "Mul", "Mul", "ReduceSum"]
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    found = session.run(None, {name: value.numpy() for name, value in inputs.items()})
+    for value, expected in zip(found, WithOnes()(*inputs.values()), strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-6)
+
+
 def test_a_number_that_depends_on_the_batch_is_refused():
     with pytest.raises(ValueError, match="depends on the batch's length, as a number"):
         traced(Lengths(lambda x, batch: x + float(2 * batch)), {"x": torch.rand(2, 3)}, ["y"])

@@ -166,7 +166,7 @@ def export(
 ) -> onnx.ModelProto:
     """Write the whole reconstruction, image to result, as one ONNX model, if it agrees with torch.
 
-    Standard operators only, batch free, float32, but for the equations of slack sheets, float64. Run on the sensor at rest and
+    Standard operators only, batch free, float32, but for the solve of slack sheets, float64. Run on the sensor at rest and
     pressed, both simulated, it must give torch's statuses, and vertices within 3e-5 of the surface's size. The model's metadata
     hold `format`, `status_texts` and `mesh` (the fields of `Mesh`) as JSON.
 
