@@ -39,6 +39,16 @@ def test_a_slack_sheet_is_solved_in_double_precision(slack, small_sensor, small_
     assert (result.status == 0).all()
 
 
+def test_called_float_it_is_solved_in_single_precision(slack, small_images):
+    made = Reconstructor(slack)
+    expected = made(made.read(*small_images))
+    single = made.float()
+    assert precisions(single) == {torch.float32}
+    result = single(single.read(*small_images))
+    assert (result.status == 0).all() and result.vertices.dtype == torch.float32
+    assert (result.vertices - expected.vertices).norm(dim=-1).max() < 0.1 * expected.displacement.norm(dim=-1).max()
+
+
 def test_it_is_what_a_module_in_double_precision_finds(slack, small_images):
     single, double = Reconstructor(slack), Reconstructor(slack, dtype=torch.float64)
     found, expected = (made(made.read(*small_images)) for made in (single, double))
