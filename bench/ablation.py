@@ -72,6 +72,7 @@ VARIANTS = [
     *(Variant("energy", model.replace("_", "-"), model=model) for model in ("harmonic", "neo_hookean", "mooney_rivlin")),
     *(Variant("grid", f"{n} x {n}", grid=n) for n in (13, 25)),
     *each("steps", "coarse_steps", 3, 6),
+    *each("steps", "finer_steps", 2, 4),
     *(changed("steps", f"fine_steps = finer_steps = {n}", fine_steps=n, finer_steps=n) for n in (3, 6, 20)),
     *(changed("steps", f"17 x 17, fine_steps = {n}", grid=17, fine_steps=n) for n in (3, 4, 20)),
     *(changed("steps", f"17 x 17, coarsest = 17, steps = {n}", grid=17, coarsest=17, steps=n) for n in (6, 8)),

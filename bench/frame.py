@@ -6,7 +6,7 @@ python bench/frame.py [--sensor examples/sensor.toml] [--images examples/*.png] 
 One thread; processor time, as other programs may share the cores; the median of all rounds and, in brackets, the least. Every
 round also takes 0.45 GFLOP of products of 186 x 186 matrices, of which the medians are told as multiples: cores differ, and
 minutes do. Models as `torchmembrane export` writes them are run by onnxruntime, on one image; those that track from its own
-pixels.
+pixels. Markers alone are found in inference mode, as a frame's are.
 """
 
 import argparse

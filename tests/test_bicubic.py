@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchmembrane.surface.bicubic import bicubic_shares
+from torchmembrane.surface.bicubic import Refinement, bicubic_shares
 from torchmembrane.surface.projection import SurfacePoints
 from torchmembrane.surface.topology import corners, triangles_of
 
@@ -76,3 +76,18 @@ def test_beside_what_is_fixed_within_points_are_linear_in_their_triangle():
     np.testing.assert_array_equal(shares[near], linear[near])
     assert (abs(shares[far] - linear[far]).max(1) > 1e-3).all()
     np.testing.assert_allclose(shares.sum(1), 1, atol=1e-12)
+
+
+def test_a_refined_field_keeps_its_values_and_is_what_it_was_where_it_is_linear():
+    finer = tuple(2 * count - 1 for count in GRID)
+    refinement = Refinement(GRID, finer)
+    values = torch.randn(2, GRID[0] * GRID[1], 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    refined = refinement(values).unflatten(1, finer)
+    torch.testing.assert_close(refined[:, ::2, ::2].flatten(1, 2), values)
+    places = [
+        torch.stack(torch.meshgrid(*(torch.linspace(0, 1, n, dtype=torch.float64) for n in grid), indexing="ij"), -1)
+        for grid in (GRID, finer)
+    ]
+    linear, expected = (1 + place @ torch.tensor([[2.0], [-3.0]]).double() for place in places)
+    within = refinement(linear.flatten(0, 1)[None]).unflatten(1, finer)[0, 2:-2, 2:-2]
+    torch.testing.assert_close(within, expected[2:-2, 2:-2])

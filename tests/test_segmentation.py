@@ -12,7 +12,7 @@ from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.flow import FlowInterpolation
 from torchmembrane.estimators.minimum_energy import MinimumEnergy
 from torchmembrane.estimators.paper import PaperEstimator
-from torchmembrane.estimators.regions import PERSISTENCE, SHARE, persistent_regions
+from torchmembrane.estimators.regions import PERSISTENCE, SHARE, persistent_peaks, persistent_regions
 from torchmembrane.estimators.segmentation import PolarAngle, Segmentation, polar_angle, reconstruct_and_segment
 from torchmembrane.estimators.settings import MinimumEnergySettings, PaperSettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
@@ -181,6 +181,29 @@ def test_regions_are_those_of_flooding_and_of_the_best_paths(kind):
         assert persistent_regions(height[None], 4, 0.01)[0].tolist() == expected.tolist()
         several += expected.max() > 1
     assert several > len(shapes) / 2
+
+
+def peaks_by_hand(height, count, least, apart):
+    """Peaks that stand, highest first: one after the other, above the best paths to those that stand already."""
+    h, standing = height.ravel(), []
+    tops = [k for k in range(h.size) if h[k] > max(h[j] for j in neighbours(k, height.shape))]
+    for top in sorted(tops, key=lambda k: -h[k]):
+        passes = [best_paths(height, higher)[top] for higher in standing]
+        if h[top] >= least * h.max() and all(h[top] - each >= apart * h[top] for each in passes):
+            standing.append(top)
+    return standing[:count]
+
+
+@pytest.mark.parametrize("apart", [0.1, 0.3])
+def test_peaks_stand_by_a_share_of_themselves_above_the_passes_to_those_that_stand(apart):
+    several = 0
+    for seed in range(8):
+        height = smooth_hills(seed, (19, 23), 8) + 0.5
+        expected = peaks_by_hand(height.numpy(), 4, 0.1, apart)
+        top, place = persistent_peaks(height[None], 4, 0.1, apart)
+        assert place[0, top[0] > -torch.inf].tolist() == expected
+        several += len(expected) > 1
+    assert several > 4
 
 
 def test_all_of_one_long_winding_ridge_is_one_region():

@@ -131,9 +131,8 @@ class MarkerBearings(nn.Module):
         found = (confidence > 0).to(confidence.dtype)
         excess = torch.where(found > 0, _spread(across) / self.rest_spread, 1.0).log()
         noise_level = (excess.sum(-1) / found.sum(-1).clamp_min(1) / 2).exp()
-        turned = (value.contiguous() for value in (origins.mT, across.movedim(1, -1), motion.movedim(1, -1)))
-        origins, across, motion = turned
-        return Bearings(origins, across, confidence, noise_level, motion, gauge)
+        turned = across.movedim(1, -1).contiguous(), confidence, noise_level, motion.movedim(1, -1).contiguous()
+        return Bearings(origins.mT.contiguous(), *turned, gauge)
 
     def markers(self, u: Tensor) -> Tensor:
         """The markers' positions on the surface displaced by `u [B, V, 3]`, `[B, D, 3]`: their displacement is bicubic between

@@ -145,6 +145,7 @@ class DotLocator(nn.Module):
         """As of `Locator`: the fit in double precision, from a start that is rounded."""
         self.is_exact = True
         self.fit.double()
+        self.shapes = self.shapes.double()
 
     def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
         """Locate the dots in a batch of frames.
@@ -168,9 +169,8 @@ class DotLocator(nn.Module):
         level = relative[:, : self.rest.shape[0] // 2].mean(1, keepdim=True)
         valid = torch.sigmoid(20 * (relative / (level + 1e-3) - 0.4))
         level_0, level_1, level_2 = levels
-        if self.is_exact:
-            blobs, log_radius, valid = rounded(blobs, BLOB), rounded(log_radius, SHARE), rounded(valid, SHARE)
-        return level_0, level_1, level_2, blobs, log_radius, valid
+        start = self._alike(blobs, BLOB), self._alike(log_radius, SHARE), self._alike(valid, SHARE)
+        return level_0, level_1, level_2, *start
 
     @piece
     def end(
@@ -186,11 +186,10 @@ class DotLocator(nn.Module):
         strain: Tensor,
     ) -> LocatedMarkers:
         """The dots, by the fit about where the matcher places the dots."""
-        levels, rest, shapes = [level_0, level_1, level_2], self.rest, self.shapes.to(self.fit.size)
-        gradient, noise = self.match.gradient(certainty, place - rest, strain).movedim(-1, 1), pixel_noise(level_0.detach())
-        if self.is_exact:
-            gradient, noise = rounded(gradient, SHARE), rounded(noise, NOISE)
+        levels, rest, shapes = [level_0, level_1, level_2], self.rest, self.shapes
+        gradient = self._alike(self.match.gradient(certainty, place - rest, strain).movedim(-1, 1), SHARE)
         shape = shapes + gradient.clamp(-0.6, 0.6).to(shapes) @ shapes
+        noise = self._alike(pixel_noise(level_0.detach()), NOISE)
         pixels, covariance, _, quality = self.fit(levels, place, shape, noise, STEPS)
         seen, quality = pixels.to(rest), quality.to(rest)
         flow, _, _ = self.match.predict(certainty * quality, seen - rest, strain)
@@ -199,6 +198,9 @@ class DotLocator(nn.Module):
         confidence = quality * torch.sigmoid(20 * (OUTLIER - deviation))
         confidence = confidence * self.coherence(seen, confidence, strain, predicted, blobs, log_radius, valid)
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
-        if self.is_exact:
-            confidence = rounded(confidence, CONFIDENCE)
+        confidence = self._alike(confidence, CONFIDENCE)
         return LocatedMarkers(torch.where(confidence[..., None] > 0.05, pixels, predicted), confidence, covariance)
+
+    def _alike(self, value: Tensor, step: float) -> Tensor:
+        """The value, or where every runtime is to have the same, its nearest multiple of a step."""
+        return rounded(value, step) if self.is_exact else value
