@@ -16,7 +16,8 @@ from onnx import TensorProto
 from onnx_ir import passes
 from onnx_ir.passes import common
 from onnxscript import opset18
-from onnxscript.function_libs.torch_lib.ops.core import aten_scalar_tensor
+from onnxscript.function_libs.torch_lib.ops.core import aten_index_select, aten_scalar_tensor
+from onnxscript.function_libs.torch_lib.tensor_typing import IntType, TTensor
 from onnxscript.optimizer import fold_constants_ir
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
@@ -52,10 +53,11 @@ _from_torchlib = ONNXRegistry.from_torchlib
 
 @cache
 def _registry(**options: Any) -> ONNXRegistry:
-    """The operators of torch's exporter, which it reads anew for every model, a second each; numbers in double precision, which
-    it rounds to single, are as they are."""
+    """The operators of torch's exporter, which it reads anew for every model, a second each; but for numbers in double
+    precision, which it rounds to single, and for what is selected of rows."""
     registry = _from_torchlib(**options)
     registry.register_op(torch.ops.aten.scalar_tensor.default, _number)
+    registry.register_op(torch.ops.aten.index_select.default, _selected)
     return registry
 
 
@@ -65,6 +67,14 @@ def _number(s: float, dtype: int = TensorProto.FLOAT, layout: str = "", device: 
         return aten_scalar_tensor(s, dtype, layout, device, pin_memory)
     number: Any = ir.tensor(s, dtype=ir.DataType.DOUBLE)
     return opset18.Constant(value=number)
+
+
+def _selected(self: TTensor, dim: int, index: IntType) -> Any:
+    """`torch.index_select` as ONNX; along the last axis element by element, a quarter of the time that slices of one take."""
+    if dim % len(self.shape) + 1 < len(self.shape):
+        return aten_index_select(self, dim, index)
+    shape = ir.tensor([*self.shape[:-1], index.shape[0]], dtype=ir.DataType.INT64)
+    return opset18.GatherElements(self, opset18.Expand(index, opset18.Constant(value=shape)), axis=dim)
 
 
 def _promoted(interpreter: _TypePromotionInterpreter, node: torch.fx.Node) -> Any:
@@ -146,7 +156,9 @@ def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> 
 
 
 def _is_constant(node: ir.Node) -> bool | None:
-    """False of what is as long as the batch; None leaves it to the pass."""
+    """False of what is as long as the batch; None leaves it, and lengths put together, to the pass."""
+    if node.op_type == "Concat":
+        return None
     lengths = (None if value is None else ir.convenience.get_const_tensor(value) for value in node.inputs)
     made = any(each is not None and each.size <= LENGTHS and _depends(each.numpy()) for each in lengths)
     return False if made else None

@@ -4,19 +4,22 @@ What is left of a system after an elimination, `C - B^T A^-1 B = C - (R B)^T R B
 lose it to rounding: in float32 from conditions of some 1e5 on, as a contact on a nearly unstretched sheet has.
 
 A matrix is split into 2 x 2 blocks down to `LEAF` rows, so that most of the work is matrix products; a leaf's root is by its
-Cholesky factor. Where a runtime has none (ONNX) it is split down to `ITERATED_LEAF` rows, whose roots are iterated by products
-as well, `T = (3 I - Z Y) / 2, Y <- Y T, Z <- T Z` from `Y = A, Z = I` to `Z = A^-1/2` (Higham 2008, Functions of matrices, eq.
-6.35), with `Z Y` scaled in between so that its eigenvalues, which go to 1, do so evenly. Rounding may have left an eigenvalue
-below zero, from which that diverges: so it is the root of `A` with a ridge, and its last steps, `R <- (3 I - R A R^T) R / 2`,
-with `A` itself take that back, but where there is little else. They are as near to a root as Cholesky factors are, and do not
-diverge from a `R` near one. An eigenvalue further below zero than the ridge makes them diverge: then the root is that of a
-diagonal above `A` (Gershgorin), as if something had been added to this leaf; what is solved stays a direction of descent.
+Cholesky factor. Where a runtime has none (ONNX) it is split down to `ITERATED_LEAF` rows, whose roots are by products as well:
+`R <- (a + b M + c M^2) R` with `M = R A R^T`, from `R = I`. Every eigenvalue `x^2` of `M` goes to that of `p(x) = a x + b x^3 +
+c x^5`, which is as near to 1 as such a polynomial can be from the least `x` that a condition allows to the largest; of
+polynomials so composed none do better (Amsel, Persson, Musco and Gower 2025, The Polar Express). As each step begins from `A`
+itself, what rounding does to one is taken back by the next.
+
+Such a root is too small in the directions of eigenvalues far below the condition's. An eigenvalue that rounding has left below
+zero grows in its last steps, and may diverge where it is as large: then the root is that of a number above `A` (Gershgorin),
+as if something had been added to this leaf; what is solved stays a direction of descent.
 """
 
 import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -26,12 +29,11 @@ from ..pieces import at_hand, named
 LEAF = 140  # rows: halves of a smaller one take no less time
 ITERATED_LEAF = 48
 LANES = 16  # numbers of a vector: products of 47 x 47 take onnxruntime half as long again as those of 48 x 48
-RIDGE = 1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor or is iterated: float32's share of rounding
-SMALL_RIDGE = 1e-10  # the same in float64, where conditions are that large and no larger
-NEAR_ONE = 0.2  # eigenvalues of R A R^T are 1 but for this before the last steps, each of which squares it
-LAST_STEPS = 3
-LARGEST_ENTRY = 10.0  # of R, over that of the root of a ridge alone: more is divergence
-LARGEST_SCALE = 2.8  # of eigenvalues up to 1; near 3 an iteration would make all of them small
+RIDGE = 1e-5  # of a leaf's largest eigenvalue, where it has no Cholesky factor: float32's share of rounding
+LARGEST_CONDITION = {torch.float32: 1.2e5, torch.float64: 1e10}  # of a leaf
+LARGEST_NORM = 10.0  # of R, over the root of the largest condition: more is divergence
+EXCHANGES = 30  # of extrema, until a polynomial is found
+NARROW = 0.02  # interval about 1
 
 
 def inverse_root(matrix: Tensor) -> Tensor:
@@ -60,26 +62,21 @@ def by_cholesky(matrix: Tensor) -> Tensor:
 
 @named
 def by_products(matrix: Tensor) -> Tensor:
-    """Too small in the directions of a leaf's eigenvalues far below its `RIDGE`."""
+    """Too small in the directions of a leaf's eigenvalues below its largest over `LARGEST_CONDITION`."""
     if matrix.shape[-1] > ITERATED_LEAF:
         return _by_parts(matrix, by_products, ITERATED_LEAF)
+    condition = LARGEST_CONDITION[matrix.dtype]
+    steps = Steps.to(condition, 10 * torch.finfo(matrix.dtype).eps)
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    rows = matrix.abs().sum(-1, keepdim=True)
-    largest = rows.amax(-2, keepdim=True)
-    ridge = RIDGE if matrix.dtype == torch.float32 else SMALL_RIDGE
-    iteration = Iteration.to(1 / ridge, NEAR_ONE)
-    A = matrix / largest
-    Y = iteration.first * (A + ridge * one)
-    T = Z = iteration.shifts[0] * one - Y
-    for shift in iteration.shifts[1:]:
-        Y = Y @ T
-        T = shift * one - Z @ Y
-        Z = T @ Z
-    R, half = iteration.last * Z, 0.5 * A
-    for _ in range(LAST_STEPS):
-        R = (1.5 * one - R @ half @ R.mT) @ R
-    is_root = R.abs().amax((-2, -1), keepdim=True) < LARGEST_ENTRY / ridge**0.5
-    return torch.where(is_root, largest.rsqrt() * R, rows.rsqrt() * one)
+    largest = matrix.abs().sum(-1, keepdim=True).amax(-2, keepdim=True)
+    A = matrix * (steps.first / largest)
+    M = A - steps.shifts[0] * one
+    R = M @ M + steps.offsets[0] * one
+    for shift, offset in zip(steps.shifts[1:], steps.offsets[1:], strict=True):
+        M = R @ A @ R.mT - shift * one
+        R = (M @ M + offset * one) @ R
+    is_root = torch.linalg.vector_norm(R, dim=(-2, -1), keepdim=True) < LARGEST_NORM * condition**0.5
+    return torch.where(is_root, R, one / steps.last) * (steps.last * largest.rsqrt())
 
 
 def _by_parts(matrix: Tensor, inverse_root: Callable[[Tensor], Tensor], leaf: int) -> Tensor:
@@ -98,44 +95,48 @@ def _by_parts(matrix: Tensor, inverse_root: Callable[[Tensor], Tensor], leaf: in
     return torch.cat([first, torch.cat([-(further @ coupling.mT) @ root, further], -1)], -2)
 
 
-class Iteration(NamedTuple):
-    """Scaled steps `T = (3 I - s Z Y) sqrt(s) / 2` without a product by a number: `T = shift I - Z Y`, the rest in `Y` and `Z`.
+class Steps(NamedTuple):
+    """Steps `R <- T R` without a product by a number: `T = (R A R^T - shift)^2 + offset`, the rest in `A` and `R`.
 
-    With `z` in `Z`, `y` in `Y` and `c` in `T` of a step, `z y = c s^(3/2) / 2` and those of the next step are `c z` and `c y`.
+    With `c` in `M^2`, `r` in `R` of a step and `t` in its `T`, `c t r^4 = 1`, and the next step's `r` is that over `t`.
     """
 
-    shifts: list[float]
     first: float
+    shifts: list[float]
+    offsets: list[float]
     last: float
 
     @classmethod
-    def to(cls, condition: float, rounding: float) -> "Iteration":
-        """For matrices of a condition up to this, until eigenvalues are 1 but for rounding."""
-        scales = iteration_scales(condition, rounding)
-        c = [1.0]
-        for scale, following in zip(reversed(scales[:-1]), reversed(scales[1:]), strict=True):
-            c.insert(0, (c[0] * (following / scale) ** 1.5) ** (1 / 3))
-        shifts = [1.5 * each * scale**0.5 for each, scale in zip(c, scales, strict=True)]
-        return cls(shifts, c[0] * scales[0] ** 1.5 / 2, 1 / math.prod(c))
+    def to(cls, condition: float, rounding: float) -> "Steps":
+        """For matrices of a condition up to this, until the roots of eigenvalues are 1 but for rounding."""
+        steps = quintics(condition**-0.5, rounding)
+        t = [1.0]
+        for (_, _, c), (_, _, following) in zip(reversed(steps[:-1]), reversed(steps[1:]), strict=True):
+            t.insert(0, (t[0] * following / c) ** 0.2)
+        scales = [(c * each) ** 0.5 for (_, _, c), each in zip(steps, t, strict=True)]
+        shifts = [-b / (2 * c) * scale for (_, b, c), scale in zip(steps, scales, strict=True)]
+        offsets = [a * each - shift**2 for (a, _, _), each, shift in zip(steps, t, shifts, strict=True)]
+        return cls(scales[0], shifts, offsets, 1 / math.prod(t))
 
 
-def iteration_scales(condition: float, rounding: float) -> list[float]:
-    """By what to scale eigenvalues before every iteration, from between `1 / condition` and 1 at first."""
-    low, scales = 1 / condition, [1.0]
-    while 1 - low > rounding:
-        scales.append(_evening(low))
-        low = _iterated(scales[-1] * low)
-    return [*scales[1:], 1.0]
+def quintics(low: float, rounding: float) -> list[tuple[float, float, float]]:
+    """`a, b, c` of odd polynomials `a x + b x^3 + c x^5` that, composed, take all from `low` to 1 to 1 but for rounding."""
+    found, high, error = [], 1.0, 1.0
+    while error > rounding:
+        *quintic, error = _nearest_to_one(low, high)
+        found.append(tuple(quintic))
+        low, high = 1 - error, 1 + error
+    return found
 
 
-def _evening(low: float) -> float:
-    """The scale that sends the smallest and the largest eigenvalue to the same: iterated, both are least."""
-    scale, beyond = 1.0, 3.0
-    for _ in range(60):
-        middle = (scale + beyond) / 2
-        scale, beyond = (middle, beyond) if _iterated(middle) > _iterated(middle * low) else (scale, middle)
-    return min(scale, LARGEST_SCALE)
-
-
-def _iterated(eigenvalue: float) -> float:
-    return eigenvalue * (3 - eigenvalue) ** 2 / 4
+def _nearest_to_one(low: float, high: float) -> tuple[float, float, float, float]:
+    """`a, b, c` of the odd quintic nearest to 1 from `low` to `high`, and how far from it: as far at both ends and at the two
+    extrema between, from one side and the other in turn (Remez); of a short interval the one that is flat at 1."""
+    if high - low < NARROW:
+        return 15 / 8, -10 / 8, 3 / 8, 2.5 * (high - 1) ** 3
+    least, most = low + (high - low) / 4, high - (high - low) / 4
+    for _ in range(EXCHANGES):
+        x = np.array([low, least, most, high])
+        a, b, c, error = np.linalg.solve(np.stack([x, x**3, x**5, [1, -1, 1, -1]], 1), np.ones(4))
+        least, most = np.sqrt(np.sort(np.roots([5 * c, 3 * b, a])).clip(low**2, high**2))
+    return float(a), float(b), float(c), float(error)
