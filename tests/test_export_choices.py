@@ -169,6 +169,28 @@ def test_products_with_one_are_left_out():
         np.testing.assert_allclose(value, expected, rtol=1e-6)
 
 
+class Selected(torch.nn.Module):
+    """Entries of rows, whole rows, and rows from the back; in a shape that is put together of lengths."""
+
+    places, rows = torch.tensor([3, 0, 0, 2, 4], dtype=torch.int32), torch.tensor([1, 1, 0])
+
+    def forward(self, x):
+        entries = x.index_select(2, self.places)
+        return entries.unflatten(-1, (5, 1)).flatten(0, 1), x.index_select(-1, self.places), x.index_select(1, self.rows)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_entries_of_rows_are_selected_one_by_one_and_whole_rows_as_such(frames):
+    model = traced(Selected(), {"x": torch.rand(2, 2, 5)}, ["a", "b", "c"])
+    nodes = [node.op_type for node in model.graph.node]
+    assert nodes.count("GatherElements") == 1 and nodes.count("Gather") == 1  # of rows and from the back it is the same one
+    assert "Concat" not in nodes
+    x = torch.rand(frames, 2, 5)
+    found = onnxruntime.InferenceSession(model.SerializeToString()).run(None, {"x": x.numpy()})
+    for value, expected in zip(found, Selected()(x), strict=True):
+        np.testing.assert_array_equal(value, expected)
+
+
 def test_a_number_that_depends_on_the_batch_is_refused():
     with pytest.raises(ValueError, match="depends on the batch's length, as a number"):
         traced(Lengths(lambda x, batch: x + float(2 * batch)), {"x": torch.rand(2, 3)}, ["y"])

@@ -9,7 +9,7 @@ from torchmembrane.solve import block_tridiagonal
 from torchmembrane.solve.anderson import DEPTH, accelerated, first
 from torchmembrane.solve.conjugate_gradient import conjugate_gradient
 from torchmembrane.solve.implicit import differentiable
-from torchmembrane.solve.inverse_root import LEAF, RIDGE, Iteration, by_cholesky, by_products, iteration_scales
+from torchmembrane.solve.inverse_root import LARGEST_CONDITION, LEAF, RIDGE, Steps, by_cholesky, by_products, quintics
 from torchmembrane.solve.kkt import constrained_minimum
 
 
@@ -178,21 +178,41 @@ def test_a_leaf_that_rounding_left_far_from_positive_gets_the_root_of_a_diagonal
         assert torch.linalg.eigvalsh(bound - matrix[1]).min() > -1e-6
 
 
-def test_steps_with_their_numbers_folded_are_the_scaled_steps():
-    """Of one eigenvalue: `T = (3 - s z y) sqrt(s) / 2, y <- y T, z <- T z`, to `z = y^-1/2`."""
-    folded, scales, eigenvalue = Iteration.to(1e4, 1e-12), iteration_scales(1e4, 1e-12), 3e-3
-    y, z = eigenvalue, 1.0
-    for scale in scales:
-        T = (3 - scale * z * y) * scale**0.5 / 2
-        y, z = y * T, T * z
-    Y = folded.first * eigenvalue
-    Z = T = folded.shifts[0] - Y
-    for shift in folded.shifts[1:]:
-        Y *= T
-        T = shift - Z * Y
-        Z *= T
-    assert folded.last * Z == pytest.approx(z, rel=1e-12)
-    assert z == pytest.approx(eigenvalue**-0.5, rel=1e-9)
+@pytest.mark.parametrize("low", [0.3, 3e-3, 1e-5])
+def test_a_quintic_is_as_far_from_one_at_four_places_from_either_side_in_turn_and_nowhere_further(low):
+    """Which makes it the nearest to 1 of its kind (Chebyshev): two that alternate so cannot differ."""
+    x = np.concatenate([np.geomspace(low, 1, 20001), np.linspace(low, 1, 20001)])
+    x.sort()
+    a, b, c = quintics(low, 0.99999)[0]
+    off = 1 - (a * x + b * x**3 + c * x**5)
+    extrema = off[[0, *(np.flatnonzero(np.diff(np.sign(np.diff(off))) != 0) + 1), -1]]
+    alternating = [extrema[0], *(after for before, after in zip(extrema[:-1], extrema[1:], strict=True) if after * before < 0)]
+    assert len(alternating) == 4
+    np.testing.assert_allclose(np.abs(alternating), np.abs(off).max(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_composed_quintics_take_all_roots_of_eigenvalues_to_one(dtype):
+    low, rounding = LARGEST_CONDITION[dtype] ** -0.5, 10 * torch.finfo(dtype).eps
+    x = np.geomspace(low, 1, 10001)
+    steps = quintics(low, rounding)
+    for a, b, c in steps:
+        x = a * x + b * x**3 + c * x**5
+    assert np.abs(x - 1).max() < max(rounding, 1e-13)
+    assert len(steps) == {torch.float32: 6, torch.float64: 11}[dtype]
+
+
+def test_steps_without_products_by_numbers_are_the_composed_quintics():
+    """Of one eigenvalue `y`: `r` with `r^2 y = x^2`, `x` what the quintics make of `y^1/2`."""
+    folded, eigenvalue = Steps.to(1e4, 1e-6), 3e-3
+    x = eigenvalue**0.5
+    for a, b, c in quintics(1e-2, 1e-6):
+        x = a * x + b * x**3 + c * x**5
+    A, R = folded.first * eigenvalue, 1.0
+    for shift, offset in zip(folded.shifts, folded.offsets, strict=True):
+        R *= (R * A * R - shift) ** 2 + offset
+    assert (folded.last * R) ** 2 * eigenvalue == pytest.approx(x**2, rel=1e-12)
+    assert folded.last * R == pytest.approx(eigenvalue**-0.5, rel=1e-5)
 
 
 def test_a_matrix_split_into_halves_has_a_ridge_only_in_the_leaf_that_needs_one():

@@ -123,8 +123,8 @@ def quintics(low: float, rounding: float) -> list[tuple[float, float, float]]:
     """`a, b, c` of odd polynomials `a x + b x^3 + c x^5` that, composed, take all from `low` to 1 to 1 but for rounding."""
     found, high, error = [], 1.0, 1.0
     while error > rounding:
-        *quintic, error = _nearest_to_one(low, high)
-        found.append(tuple(quintic))
+        a, b, c, error = _nearest_to_one(low, high)
+        found.append((a, b, c))
         low, high = 1 - error, 1 + error
     return found
 
