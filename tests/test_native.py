@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from torchmembrane.camera.model import Camera
-from torchmembrane.estimators import native_frames
+from torchmembrane.estimators import native, native_frames
 from torchmembrane.estimators.bearings import marker_rays
 from torchmembrane.estimators.descent import Scales, State
 from torchmembrane.estimators.deviations import spreads_by_tensors
@@ -236,6 +236,26 @@ def test_threads_do_not_disturb_each_other():
         thread.join()
     for k, one in enumerate(alone):
         assert_same(found[k], one, rtol=0)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 8])
+def test_frames_of_a_batch_are_shared_out_among_threads(threads, monkeypatch):
+    """Of five, each by one of them, all at the same time; nothing of a result hangs on it."""
+    balance, used, entered = estimator(), set(), threading.Barrier(min(threads, 5))
+    given = problem(balance, frames=5)
+    descent = balance.descent
+    spread = descent.equations, descent.cavity, given[0], given[2], 2.5
+    alone = *taken(balance, *given), descent.native.spread(*spread)
+
+    def watched(*arguments):
+        used.add(threading.get_ident())
+        entered.wait(60)
+        native_frames.frames(*arguments)
+
+    monkeypatch.setattr(native, "frames", watched)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    assert_same((*taken(balance, *given), descent.native.spread(*spread)), alone, rtol=0)
+    assert len(used) >= min(threads, 5) and threading.get_ident() not in used
 
 
 def test_single_precision_loses_a_slack_sheet():

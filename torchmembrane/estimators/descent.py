@@ -22,7 +22,8 @@ from .settings import ForceBalanceSettings
 from .traction_loss import Judged
 
 VERTICES = 9000
-"""Of a batch's surfaces that are worked on at a time: what a step makes of more does not stay in a processor's cache."""
+"""Of a batch's surfaces that are worked on at a time, but for one a thread: what a step makes of more does not stay in a
+processor's cache."""
 
 
 class State(NamedTuple):
@@ -72,7 +73,7 @@ class Descent(nn.Module):
     ) -> tuple[State, Tensor]:
         """The state after the steps of a schedule, and the displacement before the last; `cone`: as for `TractionLoss.weights`;
         `settling`: so many steps, the last ones, have at least a `damping` (default, `settling_damping`) to settle."""
-        frames = max(1, VERTICES // self.membrane.rest.shape[0])
+        frames = max(torch.get_num_threads(), VERTICES // self.membrane.rest.shape[0])
         cone = self.equations.loss.cone if cone is None else cone
         damping = self.settings.settling_damping if damping is None else damping
         taus, size = [tau for tau, _ in schedule], len(schedule)

@@ -1,7 +1,8 @@
 """When steps of force balance are taken by machine code, and what that is given."""
 
-import threading
+from collections import defaultdict
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,12 @@ from .normal_equations import DAMPING, BalanceEquations
 
 
 class NativeSteps:
-    """The steps of one grid. What is constant is looked up again where precision, settings or material have changed."""
+    """The steps of one grid. What is constant is looked up again where precision, settings or material have changed. Frames of
+    a batch are shared out among as many threads as torch has."""
 
     def __init__(self) -> None:
         self._constants: tuple[Any, Constants] | None = None
-        self._own = threading.local()
+        self._idle: defaultdict[Any, list[Workspace]] = defaultdict(list)
 
     def __reduce__(self) -> tuple[Any, tuple[()]]:
         return type(self), ()
@@ -38,13 +40,15 @@ class NativeSteps:
     ) -> list[Tensor]:
         """Displacement, pressure and camera after the steps, the displacement before the last, and the weights; arguments as of
         `Descent.step`, `rows`: the numbers of every step."""
-        constants, work, fixed = self._prepared(equations, cavity, measured)
+        constants, fixed = self._prepared(equations, cavity, measured)
         changing = [value.clone(memory_format=torch.contiguous_format) for value in (*state, weights)]
         changing.append(changing[0].clone())
         u, pressure, moved, weighing, before = (value.numpy() for value in changing)
         surface = -1, *equations.forces.membrane.grid, 3
         surfaces = u.reshape(surface), pressure, moved, weighing, before.reshape(surface)
-        frames(constants, work, *surfaces, *fixed, np.array(rows, float).reshape(-1, 5), np.empty((0, 4), u.dtype))
+        self._shared_out(
+            equations, constants, [*surfaces, *fixed, np.empty((0, 4), u.dtype)], np.array(rows, float).reshape(-1, 5)
+        )
         after, pressure_after, camera, weights, before_last = changing
         return [after, pressure_after, camera, before_last, weights]
 
@@ -57,28 +61,39 @@ class NativeSteps:
         outlier: float,
     ) -> Tensor:
         """Standard deviations of force and depth, `[B, 4]`; arguments as of `deviations.spreads`."""
-        constants, work, fixed = self._prepared(equations, cavity, measured)
+        constants, fixed = self._prepared(equations, cavity, measured)
         u, pressure, moved = (value.contiguous().numpy() for value in state)
         weights, found = np.ones((len(u), len(constants.area)), u.dtype), np.empty((len(u), 4), u.dtype)
         scales = np.array([[equations.loss.settings.tau[1], outlier, equations.loss.cone, 1.0, DAMPING]])
         u = u.reshape(-1, *equations.forces.membrane.grid, 3)
-        frames(constants, work, u, pressure, moved, weights, u, *fixed, scales, found)
+        self._shared_out(equations, constants, [u, pressure, moved, weights, u, *fixed, found], scales)
         return torch.from_numpy(found)
 
     def _prepared(
         self, equations: BalanceEquations, cavity: CavityLaw, measured: Bearings
-    ) -> tuple[Constants, Workspace, list[np.ndarray]]:
-        """What is constant, where to work, and what is measured, as arrays."""
+    ) -> tuple[Constants, list[np.ndarray]]:
+        """What is constant, and what is measured, as arrays."""
         gauge = torch.zeros_like(measured.motion[:, 0, :2, 0]) if measured.gauge is None else measured.gauge
         fixed = [value.contiguous().numpy() for value in (*measured[:5], gauge)]
-        constants = self._found(equations, cavity, fixed[0].dtype)
-        return constants, self._work(equations.forces.membrane.grid, len(constants.positions), fixed[0].dtype), fixed
+        return self._found(equations, cavity, fixed[0].dtype), fixed
 
-    def _work(self, grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
-        kept: dict[Any, Workspace] = self._own.__dict__
-        if dtype not in kept:
-            kept[dtype] = workspace(grid, markers, dtype)
-        return kept[dtype]
+    def _shared_out(self, equations: BalanceEquations, constants: Constants, each: list[np.ndarray], rows: np.ndarray) -> None:
+        """Call `frames` with parts of what `each` frame has, of which the last is `found`, each part in a thread of its own."""
+        grid, dtype, threads = equations.forces.membrane.grid, each[0].dtype, min(torch.get_num_threads(), len(each[0]))
+
+        def take(part: Sequence[np.ndarray]) -> None:
+            try:
+                work = self._idle[dtype].pop()
+            except IndexError:
+                work = workspace(grid, len(constants.positions), dtype)
+            frames(constants, work, *part[:-1], rows, part[-1])
+            self._idle[dtype].append(work)
+
+        if threads <= 1:
+            take(each)
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(take, zip(*(np.array_split(values, threads) for values in each), strict=True)))
 
     def _found(self, equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Constants:
         forces, loss, bearings = equations.forces, equations.loss, equations.bearings

@@ -86,8 +86,8 @@ class StencilSystem(nn.Module):
         for k, slot in enumerate(SLOTS):
             i, j = STENCIL[slot]
             here, later = (2 - i) * n - j, len(SLOTS) - k
-            x1, x2, x3 = left.narrow(4, here, rows * n).narrow(3, k, 1)[:, :, :, None].unbind(1)
-            y1, y2, y3 = right.narrow(4, here, rows * n).narrow(3, k, later)[:, :, None].unbind(1)
+            x1, x2, x3 = left.narrow(3, k, 1).narrow(4, here, rows * n)[:, :, :, None].unbind(1)
+            y1, y2, y3 = right.narrow(3, k, later).narrow(4, here, rows * n)[:, :, None].unbind(1)
             products.append(torch.addcmul(torch.addcmul(x1 * y1, x2, y2), x3, y3))
         inside = (self.offsets_of_pairs @ torch.cat(products, 3)).unflatten(-1, (rows, n))
         return inside[..., 1:-1].flatten(-2)
