@@ -10,7 +10,7 @@ import numpy as np
 
 from ..machine_code import aligned, compiled
 from ..mechanics.native_membrane import STENCIL, Surface
-from ..solve.native_band import LANES, PAIR, RANK, storage
+from ..solve.native_band import LANES, RANK, ROWS, storage
 from ..solve.stencil_layouts import OFFSETS
 from .traction_loss import POWER, TINY
 
@@ -120,7 +120,7 @@ def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
     shapes |= dict(sums=(90, V), normal=(N, 3), fields=(4, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
     shapes |= dict(marker_weights=(markers,), inverse=(unknowns,), panel=(RANK * ld,), scale=(unknowns,))
     arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
-    y = aligned((LOADS + LOADS % PAIR) * unknowns, dtype)
+    y = aligned(-(-LOADS // ROWS) * ROWS * unknowns, dtype)
     return Workspace(U=aligned(rows * ld, dtype), y=y, loads=np.zeros((LOADS, unknowns), dtype), width=width, **arrays)
 
 

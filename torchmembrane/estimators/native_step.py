@@ -10,7 +10,7 @@ from ..machine_code import compiled
 from ..mechanics.cavity import gas_law_step
 from ..mechanics.native_membrane import linearise
 from ..solve.band import RIDGES
-from ..solve.native_band import PAIR, RANK, backward, factor
+from ..solve.native_band import RANK, ROWS, backward, factor
 from .camera_motion import RARE
 from .native_equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, load_markers, sum_blocks, weigh
 
@@ -58,7 +58,7 @@ def factored(c, work, damping, used):
     width, size, y = work.width, len(work.scale), work.y
     for ridge in RIDGES:
         fill(c, work, damping, ridge, used)
-        if factor(work.U, len(work.panel) // RANK, width, size, work.inverse, work.panel, y, used + used % PAIR):
+        if factor(work.U, len(work.panel) // RANK, width, size, work.inverse, work.panel, y, -(-used // ROWS) * ROWS):
             break
     else:
         y[:] = np.nan

@@ -2,9 +2,9 @@
 
 Of `M = U^T U` the upper half is stored row by row, the entry at row `r`, column `c`, at `r ld + c - LANES floor(r / LANES)`: so
 columns of all rows are aligned alike. The rows of `U` are found `RANK` at a time; what they leave of the rows behind is worked
-out in vectors of `LANES` columns, `ROWS` rows at a time, and of the loads likewise, a `PAIR` at a time. Left of the diagonal,
-and behind the last diagonal, lie numbers that mean nothing. LAPACK works on small blocks and takes loads one by one, which on
-bands of a few hundred is slower.
+out in vectors of `LANES` columns, `ROWS` rows at a time, and of the loads likewise. Left of the diagonal, and behind the last
+diagonal, lie numbers that mean nothing. LAPACK works on small blocks and takes loads one by one, which on bands of a few
+hundred is slower.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ from numba.extending import intrinsic
 
 from ..machine_code import compiled
 
-LANES, RANK, ROWS, PAIR = 16, 4, 4, 2
+LANES, RANK, ROWS = 16, 4, 4
 
 
 def storage(unknowns: int, width: int) -> tuple[int, int, int]:
@@ -27,67 +27,60 @@ def storage(unknowns: int, width: int) -> tuple[int, int, int]:
     return whole, whole + ROWS, -(-(width + RANK + LANES) // LANES) * LANES
 
 
-def _subtracting(rows: int) -> Any:
-    """A function that takes `A[row + k step + c] -= sum_p S[own + k + p turn] W[first + p ld + c]`, of so many rows k and
-    `LANES x chunks` columns c, the sum over `RANK` rows p. Left to itself numba makes no vectors of it."""
+@intrinsic
+def _subtract(
+    typing: Any, A: Any, row: Any, step: Any, S: Any, own: Any, turn: Any, W: Any, first: Any, ld: Any, chunks: Any
+) -> Any:
+    """`A[row + k step + c] -= sum_p S[own + k + p turn] W[first + p ld + c]`: of `ROWS` rows k and `LANES x chunks` columns c,
+    the sum over `RANK` rows p. Left to itself numba makes no vectors of it."""
+    signature = types.void(A, types.intp, types.intp, S, types.intp, types.intp, W, *[types.intp] * 3)
 
-    @intrinsic
-    def subtract(
-        typing: Any, A: Any, row: Any, step: Any, S: Any, own: Any, turn: Any, W: Any, first: Any, ld: Any, chunks: Any
-    ) -> Any:
-        signature = types.void(A, types.intp, types.intp, S, types.intp, types.intp, W, *[types.intp] * 3)
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        row, step, own, turn, first, ld, chunks = (args[k] for k in (1, 2, 4, 5, 7, 8, 9))
+        of_A, of_S, of_W = (context.make_array(signature.args[k])(context, builder, args[k]) for k in (0, 3, 6))
+        kind = signature.args[0].dtype
+        vector, lanes = ir.VectorType(context.get_data_type(kind), LANES), ir.VectorType(ir.IntType(32), LANES)
 
-        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            row, step, own, turn, first, ld, chunks = (args[k] for k in (1, 2, 4, 5, 7, 8, 9))
-            of_A, of_S, of_W = (context.make_array(signature.args[k])(context, builder, args[k]) for k in (0, 3, 6))
-            kind = signature.args[0].dtype
-            vector, lanes = ir.VectorType(context.get_data_type(kind), LANES), ir.VectorType(ir.IntType(32), LANES)
+        def at(pointer: Any, *places: tuple[Any, int]) -> Any:
+            for size, times in places:
+                pointer = builder.gep(pointer, [builder.mul(size, ir.Constant(size.type, times))])
+            return pointer
 
-            def at(pointer: Any, *places: tuple[Any, int]) -> Any:
-                for size, times in places:
-                    pointer = builder.gep(pointer, [builder.mul(size, ir.Constant(size.type, times))])
-                return pointer
+        def spread(pointer: Any) -> Any:
+            empty = ir.Constant(vector, ir.Undefined)
+            minus = builder.fneg(builder.load(pointer))
+            one = builder.insert_element(empty, minus, ir.Constant(ir.IntType(32), 0))
+            return builder.shuffle_vector(one, empty, ir.Constant(lanes, [0] * LANES))
 
-            def spread(pointer: Any) -> Any:
-                empty = ir.Constant(vector, ir.Undefined)
-                minus = builder.fneg(builder.load(pointer))
-                one = builder.insert_element(empty, minus, ir.Constant(ir.IntType(32), 0))
-                return builder.shuffle_vector(one, empty, ir.Constant(lanes, [0] * LANES))
+        def vector_at(pointer: Any, *places: tuple[Any, int]) -> Any:
+            return builder.bitcast(at(pointer, *places), vector.as_pointer())
 
-            def vector_at(pointer: Any, *places: tuple[Any, int]) -> Any:
-                return builder.bitcast(at(pointer, *places), vector.as_pointer())
+        one = ir.Constant(row.type, 1)
+        shares = [[spread(at(of_S.data, (own, 1), (one, k), (turn, p))) for p in range(RANK)] for k in range(ROWS)]
+        with cgutils.for_range(builder, chunks) as loop:
+            behind = [builder.load(vector_at(of_W.data, (first, 1), (ld, p), (loop.index, LANES))) for p in range(RANK)]
+            places = [vector_at(of_A.data, (row, 1), (step, k), (loop.index, LANES)) for k in range(ROWS)]
+            totals = [builder.load(place) for place in places]
+            for value in (*behind, *totals):
+                value.align = kind.bitwidth // 8
+            for place, total, of_row in zip(places, totals, shares, strict=True):
+                for share, values in zip(of_row, behind, strict=True):
+                    product = builder.fmul(share, values, flags=("contract",))
+                    total = builder.fadd(product, total, flags=("contract",))
+                builder.store(total, place).align = kind.bitwidth // 8
+        return context.get_dummy_value()
 
-            one = ir.Constant(row.type, 1)
-            shares = [[spread(at(of_S.data, (own, 1), (one, k), (turn, p))) for p in range(RANK)] for k in range(rows)]
-            with cgutils.for_range(builder, chunks) as loop:
-                behind = [builder.load(vector_at(of_W.data, (first, 1), (ld, p), (loop.index, LANES))) for p in range(RANK)]
-                places = [vector_at(of_A.data, (row, 1), (step, k), (loop.index, LANES)) for k in range(rows)]
-                totals = [builder.load(place) for place in places]
-                for value in (*behind, *totals):
-                    value.align = kind.bitwidth // 8
-                for place, total, of_row in zip(places, totals, shares, strict=True):
-                    for share, values in zip(of_row, behind, strict=True):
-                        product = builder.fmul(share, values, flags=("contract",))
-                        total = builder.fadd(product, total, flags=("contract",))
-                    builder.store(total, place).align = kind.bitwidth // 8
-            return context.get_dummy_value()
-
-        return signature, codegen
-
-    return subtract
-
-
-_subtract, _subtract_pair = _subtracting(ROWS), _subtracting(PAIR)
+    return signature, codegen
 
 
 @compiled
 def factor(U, ld, width, n, inverse, W, b, count):
-    """The matrix in `U` becomes its factor, and loads `b [count n]`, an even number, the `y` with `U^T y = b`; `inverse [n]`:
-    of the factor's diagonal; `W [RANK ld]`: to work in. False where a pivot is not positive."""
-    y, shares = np.empty(RANK * count, U.dtype), np.empty(RANK * PAIR, U.dtype)
+    """The matrix in `U` becomes its factor, and loads `b [count n]`, a multiple of `ROWS` of them, the `y` with `U^T y = b`;
+    `inverse [n]`: of the factor's diagonal; `W [RANK ld]`: to work in. False where a pivot is not positive."""
+    y = np.empty(RANK * count, U.dtype)
     for first in range(0, n, RANK):
         base = first - first % LANES
-        if not _panel(U, ld, first, inverse, W, shares):
+        if not _panel(U, ld, first, inverse, W):
             return False
         for p in range(RANK):
             for q in range(count):
@@ -103,8 +96,8 @@ def factor(U, ld, width, n, inverse, W, b, count):
             lane = i - i % LANES
             _subtract(U, (base + i) * ld, ld, W, i, ld, W, lane, ld, (end - lane + LANES - 1) // LANES)
         lane = start - start % LANES
-        for q in range(0, count, PAIR):
-            _subtract_pair(b, q * n + base + lane, n, y, q, count, W, lane, ld, (end - lane + LANES - 1) // LANES)
+        for q in range(0, count, ROWS):
+            _subtract(b, q * n + base + lane, n, y, q, count, W, lane, ld, (end - lane + LANES - 1) // LANES)
         for p in range(RANK):
             for q in range(count):
                 b[q * n + first + p] = y[p * count + q]
@@ -112,20 +105,20 @@ def factor(U, ld, width, n, inverse, W, b, count):
 
 
 @compiled
-def _panel(U, ld, first, inverse, W, shares):
+def _panel(U, ld, first, inverse, W):
     """The `RANK` rows of the factor from `first` on, in `U`, and in `W` with columns from those of their lane on, zero before
-    `first`."""
+    `first`. Two at a time."""
     lane = first % LANES
     rows = U[first * ld : (first + RANK) * ld]
     for t in range(RANK * ld):
         W[t] = rows[t]
-    for p in range(0, RANK, PAIR):
-        if p > 0:
-            shares[:] = 0
-            for q in range(p):
-                shares[PAIR * q], shares[PAIR * q + 1] = W[q * ld + lane + p], W[q * ld + lane + p + 1]
-            _subtract_pair(W, p * ld, ld, shares, 0, PAIR, W, 0, ld, ld // LANES)
+    for p in range(0, RANK, 2):
         row, below = W[p * ld : (p + 1) * ld], W[(p + 1) * ld : (p + 2) * ld]
+        for q in range(p):
+            above, of_row, of_below = W[q * ld : (q + 1) * ld], W[q * ld + lane + p], W[q * ld + lane + p + 1]
+            for t in range(ld):
+                row[t] -= of_row * above[t]
+                below[t] -= of_below * above[t]
         pivot, share = row[lane + p], row[lane + p + 1]
         following = below[lane + p + 1] - share / pivot * share
         if not (pivot > 0 and following > 0):
