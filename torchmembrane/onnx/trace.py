@@ -69,7 +69,7 @@ def _number(s: float, dtype: int = TensorProto.FLOAT, layout: str = "", device: 
 
 
 def _selected(self: Any, dim: int, index: Any) -> Any:
-    """`torch.index_select` as ONNX; along the last axis entry by entry, a quarter of the time that slices of one take."""
+    """`torch.index_select` as ONNX; along the last axis entry by entry: onnxruntime is slow at many slices of one."""
     *others, _ = self.shape
     if dim % len(self.shape) < len(others):
         return aten_index_select(self, dim, index)

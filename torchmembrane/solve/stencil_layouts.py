@@ -69,7 +69,7 @@ class RowBlocks(nn.Module):
         """Vectors `[B, C, 3 N]` as blocks `[B, rows, C, s]` in the order of their elimination."""
         m, n = self.inner_grid
         field = F.pad(vector.unflatten(-1, (3, m, n)), (0, self.columns - n, 0, self.rows - m))
-        by_vertex = field.flatten(3).transpose(2, 3)  # an axis at a time: together onnxruntime takes five times as long
+        by_vertex = field.flatten(3).transpose(2, 3)  # an axis at a time: onnxruntime is slow at several
         by_row = by_vertex.reshape(*by_vertex.shape[:2], self.rows, -1).transpose(1, 2)
         return by_row.index_select(1, self.order)
 
