@@ -22,7 +22,7 @@ from .settings import ForceBalanceSettings
 from .traction_loss import Judged
 
 VERTICES = 9000
-"""Of a batch's surfaces that are worked on at a time, but for one a thread: what a step makes of more does not stay in a
+"""Of a batch's surfaces that are worked on at a time, or more if threads are: what a step makes of more does not stay in a
 processor's cache."""
 
 
@@ -73,7 +73,9 @@ class Descent(nn.Module):
     ) -> tuple[State, Tensor]:
         """The state after the steps of a schedule, and the displacement before the last; `cone`: as for `TractionLoss.weights`;
         `settling`: so many steps, the last ones, have at least a `damping` (default, `settling_damping`) to settle."""
-        frames = max(torch.get_num_threads(), VERTICES // self.membrane.rest.shape[0])
+        frames = max(1, VERTICES // self.membrane.rest.shape[0])
+        if self.is_native(*state, *measured):
+            frames = max(frames, torch.get_num_threads())
         cone = self.equations.loss.cone if cone is None else cone
         damping = self.settings.settling_damping if damping is None else damping
         taus, size = [tau for tau, _ in schedule], len(schedule)
