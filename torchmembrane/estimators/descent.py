@@ -22,8 +22,8 @@ from .settings import ForceBalanceSettings
 from .traction_loss import Judged
 
 VERTICES = 9000
-"""Of a batch's surfaces that are worked on at a time, or more if threads are: what a step makes of more does not stay in a
-processor's cache."""
+"""Of a batch's surfaces that are worked on at a time, but for a frame for every thread that takes steps by machine code: what a
+step makes of more does not stay in a processor's cache."""
 
 
 class State(NamedTuple):

@@ -66,7 +66,8 @@ class StencilSystem(nn.Module):
         """
         blocks = self._blocks(stencils, weights)
         blocks = torch.cat([blocks[:, :, :, : len(NEAR)] + near, blocks[:, :, :, len(NEAR) :]], 3)
-        scale = (blocks[:, :, :, 0].flatten(1, 2)[:, ::4] * (1 + damping) + self.fixed).rsqrt()
+        diagonal = blocks[:, :, :, 0].flatten(1, 2)[:, ::4]
+        scale = (diagonal * (1 + damping) + self.fixed).rsqrt()
         there = scale.flatten(1).index_select(1, self.ends).reshape(-1, 1, 3, *blocks.shape[3:])
         scaled = (blocks * scale[:, :, None, None] * there).flatten(1)
         constants = torch.stack([torch.zeros_like(scaled[:, 0]), torch.ones_like(scaled[:, 0])], 1)
