@@ -9,10 +9,10 @@ import torch
 from scipy.sparse.linalg import splu
 
 from torchmembrane.estimators.base import Observation
-from torchmembrane.estimators.bearings import Bearings
-from torchmembrane.estimators.force_balance import ForceBalance
-from torchmembrane.estimators.robust import Cauchy
-from torchmembrane.surface.stencil import inner, pad_border
+from torchmembrane.estimators.force_balance.estimator import ForceBalance
+from torchmembrane.estimators.force_balance.marker_residuals import Bearings
+from torchmembrane.estimators.force_balance.robust import Cauchy
+from torchmembrane.solve.stencil import inner, pad_border
 from torchmembrane.surface.topology import corners, triangles_of
 
 DAMPING = 1e-6

@@ -36,9 +36,9 @@ from torchmembrane.calibrate import (
     rest_from_image,
     rest_from_views,
 )
+from torchmembrane.calibrate.report import Report
 from torchmembrane.calibrate.surface import fine_surface, surface_projection
-from torchmembrane.io.images import to_grey
-from torchmembrane.io.report import Report
+from torchmembrane.files.images import to_grey
 from torchmembrane.markers.dots.pattern import find_dots
 from torchmembrane.plot.calibration import fit_figure, layout_figure, surface_figure
 from torchmembrane.plot.drawing import save

@@ -25,7 +25,7 @@ from random_sensors import INCREMENT
 
 from torchmembrane.camera.model import Camera
 from torchmembrane.errors import MembraneError
-from torchmembrane.io.images import to_grey
+from torchmembrane.files.images import to_grey
 from torchmembrane.presets.design import cylinder_dots, dome_dots
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor

@@ -5,7 +5,7 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import splu
 
-from torchmembrane.estimators.minimum_energy import MinimumEnergy
+from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergy
 from torchmembrane.solve.anderson import DEPTH
 
 

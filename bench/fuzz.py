@@ -34,9 +34,7 @@ from PIL import Image
 from record import write
 
 import torchmembrane as tm
-from torchmembrane.io.claim import WHOLE
-from torchmembrane.io.read import read_frame
-from torchmembrane.io.store import Mesh, Settings
+from torchmembrane.files.folder_lock import WHOLE
 from torchmembrane.jobs.decode import decoded, sources
 from torchmembrane.jobs.inputs import find_inputs
 from torchmembrane.jobs.local import reconstruct_files
@@ -44,6 +42,8 @@ from torchmembrane.jobs.pressure import read_pressures
 from torchmembrane.jobs.result_folder import ResultFolder
 from torchmembrane.plot.film import write_film
 from torchmembrane.presets.dot_list import read_drafted_dots
+from torchmembrane.results.read import read_frame
+from torchmembrane.results.store import Mesh, Settings
 
 KEPT = Path("out/fuzz")
 COUNTS = dict(sensors=1000, images=700, npz=300, parquet=300, readings=300, dots=300, videos=100)

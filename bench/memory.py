@@ -20,7 +20,7 @@ from record import write
 from scaling import NOISE, dome
 
 import torchmembrane as tm
-from torchmembrane.io.images import to_grey
+from torchmembrane.files.images import to_grey
 from torchmembrane.jobs.workers import frame_bytes
 from torchmembrane.sensor.parts import Markers
 from torchmembrane.simulate.appearance import noisy

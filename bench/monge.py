@@ -19,7 +19,7 @@ from record import write
 
 import torchmembrane as tm
 from torchmembrane.estimators.base import Equilibrium, Observation
-from torchmembrane.paper.monge import MongeMinimumEnergy
+from torchmembrane.estimators.paper.studies.monge import MongeMinimumEnergy
 
 
 def forms(reconstructor: tm.Reconstructor) -> dict[str, Callable[[Observation], Equilibrium]]:

@@ -3,7 +3,8 @@
 python bench/one_dimension.py [--json FILE]
 
 Radius 15 mm, prestretch 1.2, 31 markers seen from the centre with 0.2 mrad noise (0.05 px at 240 px/rad); data from the
-closed form (paper/pressed_strip.py), the estimators' polygons have 60 edges. Printed: rms error at the markers over their
+closed form (estimators/paper/studies/pressed_strip.py), the estimators' polygons have 60 edges. Printed: rms error at the
+markers over their
 displacement, largest depth found and true, the discs' total force and the pressure against the truth. Medians over
 eight draws of the noise.
 """
@@ -14,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from record import write
 
-from torchmembrane.paper.pressed_strip import Disc, PressedStrip
-from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile, StripProfile
-from torchmembrane.paper.strip import Strip
+from torchmembrane.estimators.paper.studies.pressed_strip import Disc, PressedStrip
+from torchmembrane.estimators.paper.studies.profile import ForceBalanceProfile, MinimumEnergyProfile, StripProfile
+from torchmembrane.estimators.paper.studies.strip import Strip
 
 RADIUS, NODES, MARKERS, NOISE, DRAWS = 15.0, 61, 31, 2e-4, 8
 STRIPS = {"neo-Hookean": Strip("neo_hookean", 1.2), "harmonic": Strip("harmonic", 1.2)}

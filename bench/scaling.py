@@ -20,7 +20,7 @@ from record import write
 
 import torchmembrane as tm
 from torchmembrane.camera.model import Camera
-from torchmembrane.io.images import to_grey
+from torchmembrane.files.images import to_grey
 from torchmembrane.presets.design import dome_dots
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor

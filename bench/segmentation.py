@@ -22,7 +22,7 @@ from accuracy import cases_in
 from record import write
 
 import torchmembrane as tm
-from torchmembrane.estimators.segmentation import Segmented, reconstruct_and_segment
+from torchmembrane.estimators.minimum_energy.segmentation import Segmented, reconstruct_and_segment
 
 NOISE, NONE_FOUND, ROUNDS = 0.05, 10.0, 8
 PAPER, FREE, MATERIAL, BALANCE = "loop, paper", "loop, paper, free part only", "loop, material", "force balance"

@@ -46,11 +46,11 @@ from pressed import (
 from slip import slip_figure
 
 from torchmembrane import Reconstruction
-from torchmembrane.estimators.segmentation import PolarAngle
+from torchmembrane.estimators.minimum_energy.segmentation import PolarAngle
+from torchmembrane.estimators.paper.studies.pressed_strip import Disc, PressedStrip
+from torchmembrane.estimators.paper.studies.profile import ForceBalanceProfile, MinimumEnergyProfile
+from torchmembrane.estimators.paper.studies.strip import Strip
 from torchmembrane.markers.observer import FOUND
-from torchmembrane.paper.pressed_strip import Disc, PressedStrip
-from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile
-from torchmembrane.paper.strip import Strip
 from torchmembrane.plot.drawing import BLUE, GREY, VERMILION
 
 MISMATCHED = 0.05

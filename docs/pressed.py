@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from torchmembrane import Reconstruction, Reconstructor, Status
-from torchmembrane.estimators.segmentation import Segmented, reconstruct_and_segment
+from torchmembrane.estimators.minimum_energy.segmentation import Segmented, reconstruct_and_segment
 from torchmembrane.presets import preset_file
 from torchmembrane.simulate import Appearance, Cylinder, Simulator, Sphere, press
 

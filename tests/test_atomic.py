@@ -5,8 +5,8 @@ import sys
 import pytest
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.io import optional
-from torchmembrane.io.atomic import whole_file
+from torchmembrane.files import optional
+from torchmembrane.files.atomic import whole_file
 
 
 def test_a_failing_block_leaves_the_old_file_and_nothing_else(tmp_path):

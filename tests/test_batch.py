@@ -15,14 +15,15 @@ import torch
 from PIL import Image
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.io import frame_table, frames, results
-from torchmembrane.io.images import read_image
-from torchmembrane.io.read import read_results
-from torchmembrane.io.status import Status
-from torchmembrane.io.store import Mesh, Settings
-from torchmembrane.io.summary import UNREADABLE
+from torchmembrane.files.images import read_image
 from torchmembrane.jobs.inputs import find_inputs
 from torchmembrane.jobs.local import reconstruct_files
+from torchmembrane.results import frame_table, frames
+from torchmembrane.results import reconstruction as results
+from torchmembrane.results.read import read_results
+from torchmembrane.results.status import Status
+from torchmembrane.results.store import Mesh, Settings
+from torchmembrane.results.summary import UNREADABLE
 from torchmembrane.surface.shapes import spherical_cap
 
 WIDTH, HEIGHT = 16, 12

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.io.bounded import lies_within, read_array, read_arrays, read_bytes, read_text
+from torchmembrane.files.safe_read import lies_within, read_array, read_arrays, read_bytes, read_text
 
 NAMES = ("vertices", "fixed")
 
@@ -162,12 +162,12 @@ def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path):
 READERS = {"open", "read_text", "read_bytes", "read_table", "read_metadata", "ParquetFile", "fromfile"}
 LOADERS = {"np", "json", "tomllib", "pickle", "trimesh"}
 OTHERS_FILES = {
-    "io/bounded.py": "the one place",
-    "io/images.py": "Image.open, of bytes",
-    "io/parquet.py": "PyArrow reads itself, of what was looked at before",
-    "io/frame_table.py": "JSON of a table's metadata, through io.parquet",
-    "io/summary.py": "line by line, as long as it likes, of a regular file",
-    "io/origin.py": "hashed piece by piece, of a regular file",
+    "files/safe_read.py": "the one place",
+    "files/images.py": "Image.open, of bytes",
+    "files/parquet.py": "PyArrow reads itself, of what was looked at before",
+    "results/frame_table.py": "JSON of a table's metadata, through io.parquet",
+    "results/summary.py": "line by line, as long as it likes, of a regular file",
+    "files/provenance.py": "hashed piece by piece, of a regular file",
     "sensor/table.py": "tomllib, of text",
     "cli/calibrate/files.py": "np.loadtxt, of text",
     "simulate/frames.py": "JSON, of text, and of a table's metadata",
@@ -213,7 +213,7 @@ def test_the_bounds_hold_where_memory_is_short(tmp_path):
     code = f"""if True:
         import resource
         from pathlib import Path
-        from torchmembrane.io.bounded import read_arrays
+        from torchmembrane.files.safe_read import read_arrays
         taken = int(Path("/proc/self/statm").read_text().split()[0]) * 4096
         resource.setrlimit(resource.RLIMIT_AS, (taken + 2**23,) * 2)
         read_arrays(Path({str(path)!r}), {NAMES!r})

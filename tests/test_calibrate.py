@@ -25,15 +25,15 @@ from torchmembrane.calibrate.layout import layout_for_pixels, pixel_lattice
 from torchmembrane.calibrate.rest import rest_from_image
 from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
+from torchmembrane.camera.targets import Checkerboard, DotBoard
 from torchmembrane.cli import main as cli
-from torchmembrane.io.images import read_image, to_grey
+from torchmembrane.files.images import read_image, to_grey
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.simulator import Simulator
 from torchmembrane.simulate.target_renderer import TargetRenderer
-from torchmembrane.targets import Checkerboard, DotBoard
 
 SIZE, NOISE = (320, 240), 40.0
 LENSES = {

@@ -9,8 +9,9 @@ from scipy import ndimage
 from test_light import CAMERAS
 
 from torchmembrane import Reconstructor, Status, Tracker
-from torchmembrane.estimators.bearings import marker_rays
-from torchmembrane.estimators.camera_motion import RARE, CameraMotion, in_pixels, in_words, shift_of
+from torchmembrane.camera.motion import in_pixels, in_words, shift_of
+from torchmembrane.estimators.force_balance.camera_motion import RARE, CameraMotion
+from torchmembrane.estimators.force_balance.marker_residuals import marker_rays
 from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
 from torchmembrane.simulate.appearance import Appearance

@@ -19,12 +19,13 @@ from torchmembrane.cli import arguments as types
 from torchmembrane.cli import choices
 from torchmembrane.cli import main as cli
 from torchmembrane.errors import MembraneError
-from torchmembrane.estimators import settings
-from torchmembrane.io import store
+from torchmembrane.estimators.minimum_energy.estimator import ELEMENTS, VOLUMES
+from torchmembrane.estimators.minimum_energy.flow import FLOWS
 from torchmembrane.markers import placement
 from torchmembrane.mechanics import hyperelastic
 from torchmembrane.presets import draft
 from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.results import store
 from torchmembrane.sensor import parts
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate import appearance, dataset, frames, simulator
@@ -257,7 +258,7 @@ def test_help_loads_nothing_heavy(arguments):
 
 def test_the_options_choices_are_what_the_package_has():
     assert choices.ESTIMATORS == tuple(reconstruct.ESTIMATORS) and choices.ENERGIES == hyperelastic.MODELS
-    assert (choices.ELEMENTS, choices.VOLUMES, choices.FLOWS) == (settings.ELEMENTS, settings.VOLUMES, settings.FLOWS)
+    assert (choices.ELEMENTS, choices.VOLUMES, choices.FLOWS) == (ELEMENTS, VOLUMES, FLOWS)
     assert choices.RESULT_FORMATS == store.FORMATS
     assert choices.LOCATORS == placement.LOCATORS
     assert choices.DRAFTS == tuple(draft.SHAPES) and choices.LENGTH_UNITS == tuple(parts.METRE)

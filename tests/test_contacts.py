@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from torchmembrane import Reconstructor, Status
-from torchmembrane.estimators.contact_patches import ContactPatches
-from torchmembrane.estimators.settings import ForceBalanceSettings
-from torchmembrane.estimators.traction_loss import TractionLoss
-from torchmembrane.io.results import ADDED, Reconstruction, completed
+from torchmembrane.estimators.contacts import ContactPatches
+from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
+from torchmembrane.estimators.force_balance.traction_loss import TractionLoss
 from torchmembrane.markers.coverage import Coverage, facings
 from torchmembrane.presets import preset
+from torchmembrane.results.npz import ADDED, completed
+from torchmembrane.results.reconstruction import Reconstruction
 from torchmembrane.simulate import Simulator, Sphere, Stroke
 from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.surface.shapes import spherical_cap

@@ -8,13 +8,13 @@ import torch
 
 import torchmembrane as tm
 from torchmembrane.estimators.base import Observation
-from torchmembrane.estimators.dent import DEPTH, REACH, WIDTH
-from torchmembrane.estimators.force_balance import ForceBalance
+from torchmembrane.estimators.force_balance.estimator import ForceBalance
+from torchmembrane.estimators.force_balance.starts import DEPTH, REACH, WIDTH
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate import Simulator, Sphere
 from torchmembrane.simulate.dataset import stroke_to
+from torchmembrane.solve.stencil import inner
 from torchmembrane.surface.shapes import spherical_cap
-from torchmembrane.surface.stencil import inner
 
 DOME = spherical_cap(12, 9, 30, (17, 17))
 SLACK = 1.1

@@ -10,29 +10,31 @@ import torch
 from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.base import Contacts, Observation
-from torchmembrane.estimators.covariance import changes, linearise, noise_loads
-from torchmembrane.estimators.deviations import (
+from torchmembrane.estimators.force_balance.estimator import ForceBalance
+from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
+from torchmembrane.estimators.force_balance.uncertainty import (
     AT_RIM,
     DEPTH,
     DIP,
     FORCE,
     FORCE_SHARE,
     UNSEEN,
+    changes,
     depths,
     gap_around,
+    linearise,
+    noise_loads,
     of_presses,
     shares_of_deepest,
     spreads,
 )
-from torchmembrane.estimators.force_balance import ForceBalance
-from torchmembrane.estimators.settings import ForceBalanceSettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Stroke
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.quasi_static import carried, press
+from torchmembrane.solve.stencil import inner
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
-from torchmembrane.surface.stencil import inner
 from torchmembrane.surface.tangent import tangent_frame
 
 NOISE, DRAWS = 0.05, 192  # px

@@ -10,9 +10,6 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 CHANGELOG = (ROOT / "CHANGELOG.md").read_text()
 GLOSSARY = (ROOT / "docs" / "glossary.md").read_text()
 MATHEMATICS = (ROOT / "docs" / "mathematics.md").read_text()
-ROWS = [[cell.strip() for cell in line.split("|")[1:-1]] for line in CHANGELOG.splitlines() if line.startswith("| `")]
-MOVED = {before.strip("`"): re.findall(r"`([^`]+)`", now) for before, now in ROWS if before.startswith("`torchmembrane.")}
-RENAMED = {before: now for before, now in ROWS if before.strip("`") not in MOVED}
 
 
 def read_yaml(text: str):
@@ -86,22 +83,6 @@ def test_a_broken_citation_is_not_read():
 
 def test_changelog_begins_with_this_version():
     assert re.search(r"^## \[(.+?)\]", CHANGELOG, re.M)[1] == PROJECT["project"]["version"]
-
-
-@pytest.mark.parametrize("new", sorted({new for modules in MOVED.values() for new in modules}))
-def test_moved_modules_are_where_the_changelog_says(new):
-    path = ROOT.joinpath(*new.split("."))
-    assert path.with_suffix(".py").exists() or (path / "__init__.py").exists()
-
-
-def test_changelog_lists_no_module_and_no_name_twice():
-    assert len(MOVED) > 40 and len(RENAMED) > 40 and len(ROWS) == len(MOVED) + len(RENAMED)
-
-
-@pytest.mark.parametrize("now", RENAMED.values(), ids=RENAMED)
-def test_new_names_are_where_the_changelog_says(now):
-    for name in quoted(now):
-        meant_by(name)
 
 
 def test_drawn_layers_are_the_checked_ones():

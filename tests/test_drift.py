@@ -11,7 +11,7 @@ from scipy import ndimage
 
 import torchmembrane as tm
 from torchmembrane import track
-from torchmembrane.io.images import to_grey
+from torchmembrane.files.images import to_grey
 from torchmembrane.markers import drift
 from torchmembrane.markers.drift import ENOUGH, LARGEST_ROUGHNESS, MEMORY, NEAR, DriftWatch
 from torchmembrane.mechanics.cavity import rest_balance

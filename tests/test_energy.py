@@ -8,9 +8,9 @@ from torchmembrane import MembraneError
 from torchmembrane.mechanics.affine_quadrilateral import AffineQuadrilaterals
 from torchmembrane.mechanics.hyperelastic import MODELS, ElasticEnergy
 from torchmembrane.mechanics.metric import metric
+from torchmembrane.solve.stencil import apply_stencil, inner, one_ring_edges
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import ellipsoid_cap, half_cylinder, spherical_cap
-from torchmembrane.surface.stencil import apply_stencil, inner, one_ring_edges
 from torchmembrane.surface.topology import corners, corners_to_vertices, triangles_of
 
 ELASTIC = dict(prestretch=1.2, modulus=0.7, c2_ratio=0.15)

@@ -14,18 +14,19 @@ import torch
 from torch import nn
 
 from torchmembrane import MembraneError
-from torchmembrane.estimators.settings import ForceBalanceSettings
-from torchmembrane.io.images import to_grey
-from torchmembrane.io.results import Reconstruction, load_frame
-from torchmembrane.io.status import Status
-from torchmembrane.io.store import Mesh
+from torchmembrane.control_flow import piece, unless
+from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
+from torchmembrane.files.images import to_grey
 from torchmembrane.live.streams import ModelStream
 from torchmembrane.onnx import export
 from torchmembrane.onnx.export import Piece
 from torchmembrane.onnx.graph import Assembly
 from torchmembrane.onnx.trace import traced
-from torchmembrane.pieces import piece, unless
 from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.results.npz import load_frame
+from torchmembrane.results.reconstruction import Reconstruction
+from torchmembrane.results.status import Status
+from torchmembrane.results.store import Mesh
 
 ROOT = Path(__file__).parents[1]
 

@@ -12,7 +12,8 @@ import torch
 from torchmembrane import MembraneError
 from torchmembrane.cli import main as cli
 from torchmembrane.estimators.base import Observation
-from torchmembrane.estimators.settings import ELEMENTS, FLOWS, VOLUMES
+from torchmembrane.estimators.minimum_energy.estimator import ELEMENTS, VOLUMES
+from torchmembrane.estimators.minimum_energy.flow import FLOWS
 from torchmembrane.onnx import check, export, trace
 from torchmembrane.onnx.check import Agreement, check_images, checked
 from torchmembrane.onnx.graph import Assembly

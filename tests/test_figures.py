@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from torchmembrane.estimators.base import Equilibrium, Problem
-from torchmembrane.estimators.force_balance import ForceBalance
-from torchmembrane.estimators.minimum_energy import MinimumEnergy
-from torchmembrane.estimators.paper import PaperEstimator
+from torchmembrane.estimators.force_balance.estimator import ForceBalance
+from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergy
+from torchmembrane.estimators.paper.estimator import PaperEstimator
 from torchmembrane.markers.locator import isotropic
 from torchmembrane.mechanics.cavity import rest_balance
 from torchmembrane.presets import preset

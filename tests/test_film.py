@@ -10,8 +10,8 @@ from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.cli.main import main
+from torchmembrane.files.images import read_image
 from torchmembrane.integrations.rerun import LONGER, LONGEST_FORCE, RerunLog
-from torchmembrane.io.images import read_image
 from torchmembrane.live.loop import Seen
 from torchmembrane.live.recording import Recording
 from torchmembrane.live.streams import TrackedStream

@@ -8,8 +8,7 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.estimators.affine_maps import LocalAffineMaps, affine_fit, weighted_affine_fit
-from torchmembrane.estimators.bilinear import bilinear_matrix
-from torchmembrane.estimators.flow import FlowInterpolation, roughness, weights
+from torchmembrane.estimators.minimum_energy.flow import FlowInterpolation, bilinear_matrix, roughness, weights
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.projection import SurfacePoints
 from torchmembrane.surface.shapes import heightfield, spherical_cap

@@ -9,26 +9,26 @@ import pytest
 import torch
 
 from torchmembrane.camera.model import Camera
-from torchmembrane.estimators import descent
 from torchmembrane.estimators.base import Observation
-from torchmembrane.estimators.bearings import Bearings, MarkerBearings
-from torchmembrane.estimators.contact_patches import contact_indicator, contact_points
-from torchmembrane.estimators.descent import State
-from torchmembrane.estimators.force_balance import ForceBalance
-from torchmembrane.estimators.robust import Cauchy
-from torchmembrane.estimators.settings import ForceBalanceSettings
-from torchmembrane.estimators.traction_loss import TractionLoss
+from torchmembrane.estimators.contacts import contact_indicator, contact_points
+from torchmembrane.estimators.force_balance import gauss_newton as descent
+from torchmembrane.estimators.force_balance.estimator import ForceBalance
+from torchmembrane.estimators.force_balance.gauss_newton import State
+from torchmembrane.estimators.force_balance.marker_residuals import Bearings, MarkerBearings
+from torchmembrane.estimators.force_balance.robust import Cauchy
+from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
+from torchmembrane.estimators.force_balance.traction_loss import TractionLoss
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.quasi_static import carried, press
 from torchmembrane.solve import block_pentadiagonal
 from torchmembrane.solve.inverse_root import by_cholesky, by_products
+from torchmembrane.solve.stencil import inner
 from torchmembrane.solve.stencil_layouts import WIDTH
 from torchmembrane.solve.stencil_system import Matrix
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import spherical_cap
-from torchmembrane.surface.stencil import inner
 from torchmembrane.surface.tangent import tangent_frame
 
 SETTINGS = ForceBalanceSettings()

@@ -9,8 +9,8 @@ from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.cli.main import main
-from torchmembrane.estimators.descent import State
-from torchmembrane.estimators.pressure_gauge import gauge_loss, pulled
+from torchmembrane.estimators.force_balance.gauss_newton import State
+from torchmembrane.estimators.force_balance.pressure_gauge import gauge_loss, pulled
 from torchmembrane.mechanics.cavity import FILLINGS
 from torchmembrane.presets import preset
 from torchmembrane.sensor.parts import Cavity

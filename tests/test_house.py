@@ -18,7 +18,12 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "torchmembrane"
 FILES = sorted(PACKAGE.rglob("*.py"))
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-LONGEST_FILE, LONGEST_FUNCTION = 350, 50
+LONG_FILE, LONGEST_FILE, LONGEST_FUNCTION = 350, 450, 50
+ONE_THING: dict[str, str] = {
+    "estimators/force_balance/estimator.py": "the estimator's story from its equations to its statuses",
+    "mechanics/hyperelastic.py": "one energy with its gradient and Hessian",
+}
+"""Files of more than `LONG_FILE` lines, and why each is one thing."""
 HEAVY = ("torch", "kornia", "scipy", "matplotlib", "tqdm")
 
 CONSTANT = r"`((?:[a-z_]+\.)*(?:[A-Z][A-Z0-9_]+|(?:[A-Z]\w+Settings)?\.[a-z]\w*))`"
@@ -44,8 +49,10 @@ def length(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 
 
 @every_file
-def test_a_file_is_short(path):
-    assert len(path.read_text().splitlines()) <= LONGEST_FILE
+def test_a_file_is_short_or_says_why_not(path):
+    lines, is_one_thing = len(path.read_text().splitlines()), str(path.relative_to(PACKAGE)) in ONE_THING
+    assert lines <= LONGEST_FILE
+    assert (lines > LONG_FILE) == is_one_thing
 
 
 @every_file
@@ -67,7 +74,7 @@ def test_every_module_has_its_layer():
     layered = {name for layer in layers for name in re.findall(r"[\w.]+", layer)}
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in FILES}
     layerless = {name for name in modules if not any(f"{name}.".startswith(f"{layer}.") for layer in layered)}
-    assert layerless == {"torchmembrane", "torchmembrane.__main__", "torchmembrane.io"}
+    assert layerless == {"torchmembrane", "torchmembrane.__main__"}
 
 
 def loaded(*arguments: str) -> set[str]:

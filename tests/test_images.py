@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.io.images import read_image, to_grey, write_image
+from torchmembrane.files.images import read_image, to_grey, write_image
 
 RGB = np.random.default_rng(0).integers(0, 256, (7, 9, 3), dtype=np.uint8)
 GREY_OF_RGB = (RGB.astype(np.float64) @ [0.299, 0.587, 0.114]) / 255

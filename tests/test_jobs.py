@@ -18,14 +18,15 @@ from PIL import Image
 from test_batch import CONTRACT, NPZ, PARQUET, Denting, grey_image, reconstruct, summary_of
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.io import frame_table
-from torchmembrane.io.claim import WHOLE, Claim, Shard
-from torchmembrane.io.origin import Origin
-from torchmembrane.io.read import read_results
-from torchmembrane.io.results import Reconstruction, save_frame
+from torchmembrane.files.folder_lock import WHOLE, Claim, Shard
+from torchmembrane.files.provenance import Origin
 from torchmembrane.jobs import workers
 from torchmembrane.jobs.inputs import find_inputs
 from torchmembrane.jobs.workers import LARGEST_BATCH, MEMORY_SHARE, batch_for, frame_bytes
+from torchmembrane.results import frame_table
+from torchmembrane.results.npz import save_frame
+from torchmembrane.results.read import read_results
+from torchmembrane.results.reconstruction import Reconstruction
 
 both = pytest.mark.parametrize("settings", [NPZ, PARQUET], ids=["npz", "parquet"])
 
@@ -229,7 +230,7 @@ def test_a_claimed_folder_is_refused_until_the_other_job_ends(images, tmp_path):
 
 def test_a_lock_ends_with_a_killed_process(tmp_path):
     script = (
-        "import sys, time; from pathlib import Path; from torchmembrane.io.claim import Claim, WHOLE\n"
+        "import sys, time; from pathlib import Path; from torchmembrane.files.folder_lock import Claim, WHOLE\n"
         "with Claim(Path(sys.argv[1]), WHOLE): print('claimed', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", script, tmp_path / "out"], stdout=subprocess.PIPE) as process:
@@ -270,8 +271,8 @@ def test_shards_are_disjoint_and_together_everything(images, tmp_path, settings,
 @both
 def test_worker_processes_give_what_one_process_gives(small_sensor, small_images, tmp_path, monkeypatch, settings):
     from torchmembrane import Reconstructor
-    from torchmembrane.io.store import Settings
     from torchmembrane.jobs.local import reconstruct_files
+    from torchmembrane.results.store import Settings
 
     monkeypatch.setattr(workers, "AHEAD", 1)
     broken = tmp_path / "broken.png"

@@ -15,7 +15,7 @@ from torch.func import functional_call
 from torch.nn.parallel import DistributedDataParallel
 
 import torchmembrane as tm
-from torchmembrane.estimators import kept_state
+from torchmembrane import state_dict as kept_state
 from torchmembrane.markers.dots import locator
 from torchmembrane.markers.noise import pixel_noise
 

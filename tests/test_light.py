@@ -9,14 +9,14 @@ from test_force_balance import ONE, SETTINGS, along_y, at_rest, make, seen
 
 from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
-from torchmembrane.estimators.bearings import marker_rays
-from torchmembrane.estimators.descent import Scales
-from torchmembrane.estimators.traction_loss import stands_out
+from torchmembrane.estimators.force_balance.gauss_newton import Scales
+from torchmembrane.estimators.force_balance.marker_residuals import marker_rays
+from torchmembrane.estimators.force_balance.traction_loss import stands_out
 from torchmembrane.markers.noise import pixel_noise
 from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
 from torchmembrane.simulate.appearance import Appearance
-from torchmembrane.surface.stencil import inner
+from torchmembrane.solve.stencil import inner
 
 CAMERAS = {
     "pinhole": Camera("pinhole", (640, 480), (400, 410), (320, 240), [-0.1, 0.02]),

@@ -19,7 +19,7 @@ from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.cli.main import main
-from torchmembrane.io.images import read_image
+from torchmembrane.files.images import read_image
 from torchmembrane.live.background import Background
 from torchmembrane.live.line import Line, described, summary
 from torchmembrane.live.loop import Seen, Tally, follow

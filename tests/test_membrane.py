@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.linalg import symmetric_adjugate_product, symmetric_determinant
+from torchmembrane.solve.stencil import FEW, apply_stencil, convolved_by_product
+from torchmembrane.solve.symmetric_2x2 import symmetric_adjugate_product, symmetric_determinant
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, half_cylinder, heightfield, spherical_cap
-from torchmembrane.surface.stencil import FEW, apply_stencil, convolved_by_product
 from torchmembrane.surface.tangent import tangent_axes, tangent_frame
 from torchmembrane.surface.topology import (
     TRIANGLE_CORNERS,

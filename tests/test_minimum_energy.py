@@ -7,8 +7,7 @@ from axisymmetric import harmonic, least_energy, neo_hookean
 
 from torchmembrane import MembraneError
 from torchmembrane.estimators.base import Observation
-from torchmembrane.estimators.minimum_energy import MinimumEnergy, grid_laplacian
-from torchmembrane.estimators.settings import MinimumEnergySettings
+from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergy, MinimumEnergySettings, grid_laplacian
 from torchmembrane.mechanics.affine_quadrilateral import AffineQuadrilaterals
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.surface.membrane import Membrane

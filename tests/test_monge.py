@@ -6,9 +6,15 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.estimators.base import Observation
-from torchmembrane.estimators.minimum_energy import MinimumEnergy
+from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergy
+from torchmembrane.estimators.paper.studies.monge import (
+    MongeMinimumEnergy,
+    adjugate,
+    coefficients,
+    form_matrix,
+    metric,
+)
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
-from torchmembrane.paper.monge import MongeMinimumEnergy, adjugate, coefficients, form_matrix, metric
 from torchmembrane.surface.shapes import ellipsoid_cap, heightfield, spherical_cap
 from torchmembrane.surface.topology import corners, triangles_of
 

@@ -13,13 +13,13 @@ import pytest
 import torch
 
 from torchmembrane.camera.model import Camera
-from torchmembrane.estimators import native, native_frames
-from torchmembrane.estimators.bearings import marker_rays
-from torchmembrane.estimators.descent import Scales, State
-from torchmembrane.estimators.deviations import spreads_by_tensors
-from torchmembrane.estimators.force_balance import ForceBalance
-from torchmembrane.estimators.native import takes
-from torchmembrane.estimators.settings import ForceBalanceSettings
+from torchmembrane.estimators.force_balance.estimator import ForceBalance
+from torchmembrane.estimators.force_balance.gauss_newton import Scales, State
+from torchmembrane.estimators.force_balance.kernels import steps as native
+from torchmembrane.estimators.force_balance.kernels.steps import takes
+from torchmembrane.estimators.force_balance.marker_residuals import marker_rays
+from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
+from torchmembrane.estimators.force_balance.uncertainty import spreads_by_tensors
 from torchmembrane.machine_code import aligned, kept
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.solve import native_band
@@ -27,7 +27,7 @@ from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import spherical_cap
 
 CAMERA = Camera("fisheye", (640, 480), (168, 168), (320, 240))
-PACKAGE = Path(native_frames.__file__).parents[1]
+PACKAGE = Path(native.__file__).parents[3]
 LOADS = 8
 factor, backward = (numba.njit(function.py_func) for function in (native_band.factor, native_band.backward))
 SCALES = (0.4, 2.5, 23.0, 0.25, 1e-4)  # tau, outlier, cone, renewal, damping
@@ -246,11 +246,12 @@ def test_frames_of_a_batch_are_shared_out_among_threads(threads, monkeypatch):
     descent = balance.descent
     spread = descent.equations, descent.cavity, given[0], given[2], 2.5
     alone = *taken(balance, *given), descent.native.spread(*spread)
+    frames = native.frames
 
     def watched(*arguments):
         used.add(threading.get_ident())
         entered.wait(60)
-        native_frames.frames(*arguments)
+        frames(*arguments)
 
     monkeypatch.setattr(native, "frames", watched)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
@@ -339,7 +340,7 @@ def test_what_can_be_kept_nowhere_is_compiled_all_the_same():
 def test_what_is_kept_on_disk_hangs_on_all_its_sources():
     """Every file with something compiled is in the fingerprint."""
     compiled = {path.stem for path in PACKAGE.rglob("*.py") if "@compiled" in path.read_text()}
-    tree = ast.parse(Path(native_frames.__file__).read_text())
+    tree = ast.parse(Path(native.__file__).read_text())
     (call,) = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "fingerprint"]
     assert compiled == {node.id for node in ast.walk(call) if isinstance(node, ast.Name)} & compiled
     assert len(compiled) == 5

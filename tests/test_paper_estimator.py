@@ -10,16 +10,15 @@ import torch
 import torchmembrane as tm
 from torchmembrane.estimators.affine_maps import affine_fit
 from torchmembrane.estimators.base import Observation
-from torchmembrane.estimators.flow import FlowInterpolation
-from torchmembrane.estimators.minimum_energy import MinimumEnergy, grid_laplacian
-from torchmembrane.estimators.paper import OCCUPIED, PaperEstimator
-from torchmembrane.estimators.settings import MinimumEnergySettings, PaperSettings
+from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergy, MinimumEnergySettings, grid_laplacian
+from torchmembrane.estimators.minimum_energy.flow import FlowInterpolation
+from torchmembrane.estimators.paper.estimator import OCCUPIED, PaperEstimator, PaperSettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.sensor.factories import cavity_filling, elastic_energy
 from torchmembrane.sensor.parts import Cavity
+from torchmembrane.solve.stencil import inner
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import ellipsoid_cap
-from torchmembrane.surface.stencil import inner
 from torchmembrane.surface.topology import corners
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

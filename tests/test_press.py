@@ -11,9 +11,9 @@ from torchmembrane.simulate import equilibrium as equilibrium_module
 from torchmembrane.simulate.equilibrium import EquilibriumProblem, Liquid, Open
 from torchmembrane.simulate.indenters import Plane, Sphere, facing
 from torchmembrane.simulate.quasi_static import carried, press, presses
+from torchmembrane.solve.stencil import ONE_RING, apply_stencil, inner, one_ring_edges
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import half_cylinder, heightfield, spherical_cap
-from torchmembrane.surface.stencil import ONE_RING, apply_stencil, inner, one_ring_edges
 from torchmembrane.surface.topology import corners, triangles_of
 
 PRESTRETCH = 1.3

@@ -7,9 +7,14 @@ from scipy.integrate import quad, solve_bvp
 from scipy.optimize import minimize
 
 from torchmembrane import MembraneError
-from torchmembrane.paper.pressed_strip import Disc, PressedStrip
-from torchmembrane.paper.profile import ForceBalanceProfile, MinimumEnergyProfile, Obstacle, flat_contact
-from torchmembrane.paper.strip import Strip, area, around
+from torchmembrane.estimators.paper.studies.pressed_strip import Disc, PressedStrip
+from torchmembrane.estimators.paper.studies.profile import (
+    ForceBalanceProfile,
+    MinimumEnergyProfile,
+    Obstacle,
+    flat_contact,
+)
+from torchmembrane.estimators.paper.studies.strip import Strip, area, around
 
 R = 15.0
 SOFT = Strip("neo_hookean", 1.2)

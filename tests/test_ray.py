@@ -10,10 +10,10 @@ from PIL import Image
 
 from torchmembrane import Reconstructor, read_results
 from torchmembrane.errors import MembraneError
-from torchmembrane.io.store import Settings
 from torchmembrane.jobs.frame_reconstructor import FrameReconstructor, outcomes_of
 from torchmembrane.jobs.inputs import find_inputs
 from torchmembrane.jobs.local import reconstruct_files
+from torchmembrane.results.store import Settings
 
 
 def ray_workers() -> list[int]:

@@ -10,15 +10,14 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.estimators.bilinear import bilinear_matrix
-from torchmembrane.estimators.minimum_energy import grid_laplacian
-from torchmembrane.estimators.settings import MinimumEnergySettings
-from torchmembrane.io import results
-from torchmembrane.io.status import Status
+from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergySettings, grid_laplacian
+from torchmembrane.estimators.minimum_energy.flow import bilinear_matrix
 from torchmembrane.mechanics.affine_quadrilateral import AffineQuadrilaterals
 from torchmembrane.mechanics.cavity import rest_balance
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.results import reconstruction as results
+from torchmembrane.results.status import Status
 from torchmembrane.sensor.parts import Cavity
 from torchmembrane.sensor.sensor import Sensor
 

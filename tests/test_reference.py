@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import torchmembrane as tm
-from torchmembrane.io.store import Mesh
-from torchmembrane.io.summary import COLUMNS
+from torchmembrane.results.store import Mesh
+from torchmembrane.results.summary import COLUMNS
 from torchmembrane.sensor import parts
 from torchmembrane.sensor.table import Table
 from torchmembrane.sensor.toml import read_sensor

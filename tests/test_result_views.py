@@ -9,8 +9,8 @@ import trimesh
 
 import torchmembrane as tm
 from torchmembrane.cli.main import main
-from torchmembrane.io.point_cloud import save_contact_cloud
-from torchmembrane.io.results import save_frame
+from torchmembrane.results.npz import save_frame
+from torchmembrane.results.point_cloud import save_contact_cloud
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchmembrane.estimators.robust import Cauchy, GemanMcClure, PseudoHuber
+from torchmembrane.estimators.force_balance.robust import Cauchy, GemanMcClure, PseudoHuber
 
 LOSSES = [GemanMcClure(0.7), Cauchy(0.7), PseudoHuber(0.7)]
 RESIDUALS = torch.linspace(1e-3, 5.0, 60, dtype=torch.float64)

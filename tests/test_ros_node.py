@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 import torchmembrane as tm
-from torchmembrane.io.images import to_grey
+from torchmembrane.files.images import to_grey
 from torchmembrane.sensor.parts import Cavity
 
 NODE = Path(__file__).parents[1] / "ros/torchmembrane_ros/torchmembrane_ros/node.py"

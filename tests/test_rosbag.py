@@ -15,7 +15,7 @@ from torchmembrane import Camera, MembraneError, Sensor
 from torchmembrane.cli.main import main
 from torchmembrane.integrations.messages import CHANNELS, grey_of, projected, unlike
 from torchmembrane.integrations.rosbag import camera_remark
-from torchmembrane.io.read import read_results
+from torchmembrane.results.read import read_results
 from torchmembrane.sensor.parts import Cavity
 
 rosbags = pytest.importorskip("rosbags")

@@ -8,10 +8,10 @@ from scipy.spatial import cKDTree
 from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.base import Observation
-from torchmembrane.estimators.flow import FlowInterpolation
-from torchmembrane.estimators.force_balance import ForceBalance
-from torchmembrane.estimators.minimum_energy import MinimumEnergy
-from torchmembrane.estimators.paper import PaperEstimator
+from torchmembrane.estimators.force_balance.estimator import ForceBalance
+from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergy
+from torchmembrane.estimators.minimum_energy.flow import FlowInterpolation
+from torchmembrane.estimators.paper.estimator import PaperEstimator
 from torchmembrane.markers.screening import MismatchScreen
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere

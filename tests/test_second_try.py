@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchmembrane.control_flow import mended
 from torchmembrane.estimators.base import Equilibrium, Observation
-from torchmembrane.estimators.descent import Scales, State
-from torchmembrane.estimators.force_balance import ALONE, ForceBalance
-from torchmembrane.estimators.settings import ForceBalanceSettings
-from torchmembrane.estimators.traction_loss import BEYOND
+from torchmembrane.estimators.force_balance.estimator import ALONE, ForceBalance
+from torchmembrane.estimators.force_balance.gauss_newton import Scales, State
+from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
+from torchmembrane.estimators.force_balance.traction_loss import BEYOND
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
-from torchmembrane.pieces import mended
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import spherical_cap
 

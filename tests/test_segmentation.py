@@ -9,12 +9,16 @@ import torch
 from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.base import Observation
-from torchmembrane.estimators.flow import FlowInterpolation
-from torchmembrane.estimators.minimum_energy import MinimumEnergy
-from torchmembrane.estimators.paper import PaperEstimator
+from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergy, MinimumEnergySettings
+from torchmembrane.estimators.minimum_energy.flow import FlowInterpolation
+from torchmembrane.estimators.minimum_energy.segmentation import (
+    PolarAngle,
+    Segmentation,
+    polar_angle,
+    reconstruct_and_segment,
+)
+from torchmembrane.estimators.paper.estimator import PaperEstimator, PaperSettings
 from torchmembrane.estimators.regions import PERSISTENCE, SHARE, persistent_peaks, persistent_regions
-from torchmembrane.estimators.segmentation import PolarAngle, Segmentation, polar_angle, reconstruct_and_segment
-from torchmembrane.estimators.settings import MinimumEnergySettings, PaperSettings
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.quasi_static import carried, press

@@ -7,13 +7,13 @@ from test_dots import CENTRE, PATTERNS, PITCH, SIZE, batch, deform, dent, measur
 from test_texture import bump, forward, photograph, still
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.io.store import Settings
 from torchmembrane.markers.dots.ellipse import draw_dots
 from torchmembrane.markers.dots.pattern import DotPattern
 from torchmembrane.markers.placement import place_markers
 from torchmembrane.markers.soft import SoftLocator, SoftTextureLocator
 from torchmembrane.markers.texture.patches import choose_patches
 from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.results.store import Settings
 from torchmembrane.sensor.sensor import Sensor
 
 EXAMPLE = "examples/sensor.toml"

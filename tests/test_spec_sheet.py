@@ -12,12 +12,12 @@ from PIL import Image
 
 from torchmembrane.accuracy import measure, presses, rig, statistics
 from torchmembrane.accuracy.measure import Effort, spec_sheet
+from torchmembrane.accuracy.spec_sheet import CLOSE, LOST, ClosestPair, PairTrial, PressTrial, Spread
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.cli.sheet import sheet_lines
 from torchmembrane.errors import MembraneError
-from torchmembrane.io.results import Reconstruction
-from torchmembrane.io.spec_sheet import CLOSE, LOST, ClosestPair, PairTrial, PressTrial, Spread
+from torchmembrane.results.reconstruction import Reconstruction
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate import dataset
 

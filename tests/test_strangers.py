@@ -14,11 +14,12 @@ from test_batch import NPZ, PARQUET, grey_image, reconstruct
 
 from torchmembrane.cli.main import main
 from torchmembrane.errors import MembraneError
-from torchmembrane.io import frame_table, parquet
-from torchmembrane.io.read import read_frame, read_results
+from torchmembrane.files import parquet
 from torchmembrane.jobs.inputs import find_inputs
 from torchmembrane.jobs.pressure import read_pressures
 from torchmembrane.live.recording import times_of
+from torchmembrane.results import frame_table
+from torchmembrane.results.read import read_frame, read_results
 
 FRAMES = 4
 
@@ -138,7 +139,7 @@ def test_a_damaged_footer_ends_no_process(images, tmp_path):
 import sys, random
 from pathlib import Path
 from torchmembrane.errors import MembraneError
-from torchmembrane.io.parquet import read_table
+from torchmembrane.files.parquet import read_table
 part = Path(sys.argv[1])
 whole, draw, refused = part.read_bytes(), random.Random(0), 0
 begin = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")

@@ -7,7 +7,7 @@ import torch
 from torchmembrane.calibrate.material import Presses
 from torchmembrane.calibrate.stretch_loss import continued
 from torchmembrane.camera.model import Camera
-from torchmembrane.estimators.descent import State
+from torchmembrane.estimators.force_balance.gauss_newton import State
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import torchmembrane as tm
 from torchmembrane.cli.describe import described
-from torchmembrane.io.store import Mesh, Settings
 from torchmembrane.onnx.export import metadata_of
+from torchmembrane.results.store import Mesh, Settings
 
 TURN = Rotation.from_rotvec([20.0, -70.0, 110.0], degrees=True).as_matrix()
 SHIFT = np.array([3.0, -12.0, 41.0])

@@ -12,11 +12,11 @@ from matplotlib.quiver import Quiver
 from matplotlib.transforms import Bbox
 
 from torchmembrane.camera.model import Camera
-from torchmembrane.io.status import Status
-from torchmembrane.io.store import Mesh
 from torchmembrane.plot import frames as view
 from torchmembrane.plot.drawing import save
 from torchmembrane.plot.sensor import sensor_figure
+from torchmembrane.results.status import Status
+from torchmembrane.results.store import Mesh
 from torchmembrane.sensor.parts import Cavity, Markers, Material
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.shapes import ellipsoid_cap, spherical_cap

@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from .camera.ports import Port
     from .errors import MembraneError
     from .estimators.base import Estimator
-    from .estimators.covariance import StandardDeviations
-    from .estimators.force_balance import ForceBalance
-    from .estimators.minimum_energy import MinimumEnergy
-    from .estimators.paper import PaperEstimator
-    from .estimators.settings import ForceBalanceSettings, MinimumEnergySettings, PaperSettings
-    from .io.read import read_results
-    from .io.results import Reconstruction
-    from .io.status import Status
+    from .estimators.force_balance.estimator import ForceBalance
+    from .estimators.force_balance.settings import ForceBalanceSettings
+    from .estimators.force_balance.uncertainty import StandardDeviations
+    from .estimators.minimum_energy.estimator import MinimumEnergy, MinimumEnergySettings
+    from .estimators.paper.estimator import PaperEstimator, PaperSettings
     from .mechanics.hyperelastic import ElasticEnergy
     from .onnx.export import export
     from .pose import Pose
     from .presets import preset
     from .reconstruct import Reconstructor
+    from .results.read import read_results
+    from .results.reconstruction import Reconstruction
+    from .results.status import Status
     from .sensor.parts import Cavity, Markers, Material, Surface
     from .sensor.sensor import Sensor
     from .surface.membrane import Membrane
@@ -45,28 +45,28 @@ _HOMES = {
     "Cavity": "sensor.parts",
     "ElasticEnergy": "mechanics.hyperelastic",
     "Estimator": "estimators.base",
-    "ForceBalance": "estimators.force_balance",
-    "ForceBalanceSettings": "estimators.settings",
+    "ForceBalance": "estimators.force_balance.estimator",
+    "ForceBalanceSettings": "estimators.force_balance.settings",
     "Markers": "sensor.parts",
     "Material": "sensor.parts",
     "Membrane": "surface.membrane",
     "MembraneError": "errors",
-    "MinimumEnergy": "estimators.minimum_energy",
-    "MinimumEnergySettings": "estimators.settings",
-    "PaperEstimator": "estimators.paper",
-    "PaperSettings": "estimators.settings",
+    "MinimumEnergy": "estimators.minimum_energy.estimator",
+    "MinimumEnergySettings": "estimators.minimum_energy.estimator",
+    "PaperEstimator": "estimators.paper.estimator",
+    "PaperSettings": "estimators.paper.estimator",
     "Port": "camera.ports",
     "Pose": "pose",
-    "Reconstruction": "io.results",
+    "Reconstruction": "results.reconstruction",
     "Reconstructor": "reconstruct",
     "Sensor": "sensor.sensor",
-    "StandardDeviations": "estimators.covariance",
-    "Status": "io.status",
+    "StandardDeviations": "estimators.force_balance.uncertainty",
+    "Status": "results.status",
     "Surface": "sensor.parts",
     "Tracker": "track",
     "export": "onnx.export",
     "preset": "presets",
-    "read_results": "io.read",
+    "read_results": "results.read",
 }
 _NAMESPACES = ("calibrate", "simulate")
 

@@ -8,25 +8,25 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .camera.motion import in_pixels, in_words, shift_of
+from .control_flow import piece, unrecorded
 from .errors import MembraneError
 from .estimators.base import Contacts, Equilibrium, Observation, Problem
 from .estimators.breakdown import broken_down
-from .estimators.camera_motion import in_pixels, in_words, shift_of
-from .estimators.choice import ESTIMATORS, AnyEstimator, Settings, estimator_of
-from .estimators.covariance import StandardDeviations
-from .estimators.force_balance import ForceBalance
-from .estimators.kept_state import keep_small
+from .estimators.force_balance.estimator import ForceBalance
+from .estimators.force_balance.uncertainty import StandardDeviations
 from .estimators.precision import PRECISIONS, check_precision, full_precision
-from .io.images import read_image
-from .io.intake import CHANNELS, Channels, grey_batch
-from .io.results import Reconstruction
-from .io.status import Status
+from .estimators.registry import ESTIMATORS, AnyEstimator, Settings, estimator_of
+from .files.grayscale import CHANNELS, Channels, grey_batch
+from .files.images import read_image
 from .markers.coverage import LEAST_COVERAGE, Coverage, facings
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
 from .markers.placement import imaged_vertices, place_markers
-from .pieces import piece, unrecorded
+from .results.reconstruction import Reconstruction
+from .results.status import Status
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
+from .state_dict import keep_small
 from .surface.bicubic import bicubic_shares
 
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .camera.motion import in_pixels, shift_of
 from .errors import MembraneError
-from .estimators.camera_motion import in_pixels, shift_of
-from .io.results import Reconstruction
-from .io.status import Status
 from .markers.drift import ENOUGH, DriftWatch
 from .reconstruct import Reconstructor
+from .results.reconstruction import Reconstruction
+from .results.status import Status
 
 STEADY = 100
 """Frames in which a contact holds still from the beginning before it is said that it may be a drift."""

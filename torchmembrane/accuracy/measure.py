@@ -9,11 +9,11 @@ from typing import NamedTuple
 import torch
 
 from ..errors import MembraneError
-from ..io.spec_sheet import PairTrial, PressTrial, RestTrial, SpecSheet
 from ..sensor.sensor import Sensor
 from . import statistics
 from .presses import pair_states, stroke_states
 from .rig import Rig, image_noise
+from .spec_sheet import PairTrial, PressTrial, RestTrial, SpecSheet
 
 NEAR = 0.05
 """Over the size: within it, or within the markers' spacing, of where it is a contact counts as found."""

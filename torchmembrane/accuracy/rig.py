@@ -8,16 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..io.results import Reconstruction
-from ..io.spec_sheet import PairTrial, PressTrial, RestTrial
-from ..io.status import Status
 from ..markers.noise import pixel_noise
 from ..reconstruct import Reconstructor
+from ..results.reconstruction import Reconstruction
+from ..results.status import Status
 from ..sensor.sensor import Sensor
 from ..simulate.appearance import Appearance, noisy
 from ..simulate.quasi_static import Press, carried
 from ..simulate.simulator import Simulator
 from .presses import PairPress
+from .spec_sheet import PairTrial, PressTrial, RestTrial
 
 USUAL_NOISE = 40.0  # dB, where a rest image does not say
 QUIETEST = 45.0  # dB, of a single frame, also where a rest image averages many

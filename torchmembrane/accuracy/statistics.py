@@ -6,8 +6,8 @@ from itertools import takewhile
 
 import numpy as np
 
-from ..io.spec_sheet import Band, ClosestPair, DeepestPress, LightestTouch, PairTrial, PressTrial, RestFloor, RestTrial, Spread
-from ..io.status import Status
+from ..results.status import Status
+from .spec_sheet import Band, ClosestPair, DeepestPress, LightestTouch, PairTrial, PressTrial, RestFloor, RestTrial, Spread
 
 EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Of the bands, over the hardest press."""

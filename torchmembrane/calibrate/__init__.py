@@ -15,7 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ..targets import Checkerboard, DotBoard
+    from ..camera.targets import Checkerboard, DotBoard
     from .camera import CameraFit, Views, lens_from_views, ports_from_views
     from .depth import DepthFit, rest_from_depth
     from .detection import find_target
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from .weight import WeightFit, material_from_weight
 
 _MODULES = {
-    "..targets": ("Checkerboard", "DotBoard"),
+    "..camera.targets": ("Checkerboard", "DotBoard"),
     ".camera": ("CameraFit", "Views", "lens_from_views", "ports_from_views"),
     ".depth": ("DepthFit", "rest_from_depth"),
     ".detection": ("find_target",),

@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.func import functional_call, jacfwd, vmap
 
 from ..camera.model import Camera
+from ..camera.targets import Checkerboard, DotBoard
 from ..errors import MembraneError
-from ..targets import Checkerboard, DotBoard
 from .fit import Fit, fit, outliers, outline_centres, rotations
 from .poses import lens_and_poses, port_pose
 

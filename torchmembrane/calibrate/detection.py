@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from ..camera.targets import LARGE, MARKS, Checkerboard, DotBoard
 from ..errors import MembraneError
-from ..io.optional import load_opencv
+from ..files.optional import load_opencv
 from ..markers.dots.pattern import find_dots
-from ..targets import LARGE, MARKS, Checkerboard, DotBoard
 
 WINDOW = 0.35  # of the shortest side of a square, in which a corner is fitted
 FAR_OFF = 10**6

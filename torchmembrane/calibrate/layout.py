@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
-from ..io.bounded import read_text
+from ..files.safe_read import read_text
 from ..markers.placement import rim_mask
 from ..sensor.sensor import Sensor
 from ..sensor.toml import MOST_DOTS

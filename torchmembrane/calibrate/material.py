@@ -10,9 +10,9 @@ from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..estimators.force_balance import ForceBalance
-from ..io.status import Status
+from ..estimators.force_balance.estimator import ForceBalance
 from ..reconstruct import Reconstructor
+from ..results.status import Status
 from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor
 from .gauge import UNSURE, FoundPressures, GaugeModulus, modulus_from_pressures

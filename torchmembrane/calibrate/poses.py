@@ -6,9 +6,9 @@ from torch import Tensor
 from torch.func import jacfwd
 
 from ..camera.model import COEFFICIENTS, Camera
+from ..camera.targets import Checkerboard, DotBoard
 from ..errors import MembraneError
-from ..io.optional import load_opencv
-from ..targets import Checkerboard, DotBoard
+from ..files.optional import load_opencv
 from .fit import Fit, fit, rotations
 
 

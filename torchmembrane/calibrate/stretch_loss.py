@@ -10,8 +10,8 @@ looked for from those at its neighbours, too.
 import torch
 
 from ..estimators.base import Equilibrium, Observation
-from ..estimators.descent import State
-from ..estimators.force_balance import ForceBalance
+from ..estimators.force_balance.estimator import ForceBalance
+from ..estimators.force_balance.gauss_newton import State
 
 STEPS = 4  # from a neighbour's solution
 

@@ -8,12 +8,12 @@ import torch
 from scipy.interpolate import RBFInterpolator
 
 from ..camera.model import Camera
+from ..camera.targets import OUTLINE
 from ..errors import MembraneError
 from ..sensor.parts import Markers, Surface
 from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from ..surface.tangent import tangent_axes
-from ..targets import OUTLINE
 
 FINE = 65  # vertices per side of the surface that is calibrated
 

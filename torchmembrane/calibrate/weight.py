@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..io.results import Reconstruction
-from ..io.status import Status
 from ..reconstruct import Reconstructor
+from ..results.reconstruction import Reconstruction
+from ..results.status import Status
 from ..sensor.sensor import Sensor
 from .gauge import CONTRADICTION, UNSURE
 from .material import GAS_ROUNDS, MaterialFit, material_from_images

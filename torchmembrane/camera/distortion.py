@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..linalg import symmetric_adjugate_product, symmetric_determinant
+from ..solve.symmetric_2x2 import symmetric_adjugate_product, symmetric_determinant
 
 LENS_STEPS = 12  # Newton steps that undo a distortion
 FOLD_SAMPLES = 512  # angles from the axis at which a distortion is tested for folding back

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import expect
-from ..io.images import MOST_PIXELS
+from ..files.images import MOST_PIXELS
 from .distortion import fisheye_direction, fisheye_image, pinhole_direction, pinhole_image
 from .mode import Mode
 from .ports import MOST_INDEX, Layers, Port, apparent_points, check_ports, layers_of, refract

@@ -4,7 +4,7 @@ from argparse import Namespace
 from typing import Any
 
 from ..errors import MembraneError
-from ..estimators.choice import ESTIMATORS
+from ..estimators.registry import ESTIMATORS
 from ..reconstruct import Reconstructor
 from ..sensor.sensor import Sensor
 

@@ -10,7 +10,7 @@ from .arguments import add_command, add_sensor, count, number_from, seed
 from .choices import MOST_DECIBEL
 
 if TYPE_CHECKING:
-    from ..io.spec_sheet import SpecSheet
+    from ..accuracy.spec_sheet import SpecSheet
     from ..sensor.sensor import Sensor
 
 PURPOSE = "say in words, and draw, what a sensor file means and what to expect of the sensor"

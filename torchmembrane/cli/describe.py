@@ -7,10 +7,10 @@ import torch
 
 from ..camera.mode import Mode
 from ..camera.model import Camera
-from ..io.results import Frame
-from ..io.status import Status
 from ..markers.placement import in_view
 from ..reconstruct import Reconstructor
+from ..results.reconstruction import Frame
+from ..results.status import Status
 from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
 

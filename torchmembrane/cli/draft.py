@@ -9,21 +9,13 @@ import torch
 from ..calibrate.rim import find_rim
 from ..camera.model import Camera
 from ..errors import MembraneError
-from ..io.images import read_image
+from ..files.images import read_image
 from ..markers.dots.pattern import find_dots
 from ..markers.placement import FEWEST_MARKERS, in_view
 from ..presets.annotate import annotate
 from ..presets.design import AIR
 from ..presets.dot_list import read_drafted_dots
-from ..presets.draft import (
-    SHAPES,
-    RimCircle,
-    balanced,
-    drafted_dots,
-    drafted_surface,
-    focal_of_view,
-    overpressure,
-)
+from ..presets.draft import SHAPES, RimCircle, balanced, drafted_dots, drafted_surface, focal_of_view, overpressure
 from ..reconstruct import Reconstructor
 from ..sensor.parts import Cavity, Markers, Surface
 from ..sensor.sensor import Sensor

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..io.read import Results
+    from ..results.read import Results
 
 DEFAULT_RATE = 10.0
 """Frames per second."""
@@ -26,7 +26,7 @@ class FrameImages:
 
     def of(self, name: str) -> "np.ndarray | None":
         """Grey values `[height, width]` in 0..1, or None."""
-        from ..io.images import read_image
+        from ..files.images import read_image
 
         return read_image(self.files[name], self.size) if name in self.files else None
 

@@ -69,9 +69,7 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: Namespace) -> int:
     """Reconstruct; returns the exit code."""
-    from ..io.claim import Shard
-    from ..io.read import read_results
-    from ..io.store import Mesh, Settings, check_folder
+    from ..files.folder_lock import Shard
     from ..jobs.bags import bag_remarks, result_bag, write_bag
     from ..jobs.inputs import find_inputs, frame_name
     from ..jobs.local import reconstruct_files
@@ -79,6 +77,8 @@ def run(arguments: Namespace) -> int:
     from ..jobs.ray_engine import RayEngine
     from ..jobs.rest import recording_rest
     from ..presets import sensor_file
+    from ..results.read import read_results
+    from ..results.store import Mesh, Settings, check_folder
     from ..sensor.sensor import Sensor
     from .build import build_reconstructor
 

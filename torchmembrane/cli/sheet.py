@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from math import isfinite
 from statistics import median
 
-from ..io.spec_sheet import CLOSE, LOST, SpecSheet, Spread
+from ..accuracy.spec_sheet import CLOSE, LOST, SpecSheet, Spread
 
 LISTED = 4
 """Trials left out that are named one by one."""

@@ -10,7 +10,7 @@ from .arguments import add_command, add_rerun, positive, wants_rerun
 from .film import DEFAULT_RATE, FrameImages, draw_film, images_in
 
 if TYPE_CHECKING:
-    from ..io.read import Results
+    from ..results.read import Results
 
 PURPOSE = "draw stored results"
 EXAMPLES = """\
@@ -45,7 +45,7 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: Namespace) -> int:
     """Draw the results; returns the exit code."""
-    from ..io.read import read_results
+    from ..results.read import read_results
 
     rerun = wants_rerun(arguments)
     if not rerun and arguments.video_out is None:
@@ -72,12 +72,12 @@ def _show(results: "Results", images: FrameImages, save: Path | None) -> None:
 
 
 def _draw(arguments: Namespace) -> int:
-    from ..io.images import read_image
-    from ..io.point_cloud import save_contact_cloud
-    from ..io.read import read_frame
-    from ..io.store import MESH, Mesh
+    from ..files.images import read_image
     from ..plot.drawing import save, show
     from ..plot.frames import figure
+    from ..results.point_cloud import save_contact_cloud
+    from ..results.read import read_frame
+    from ..results.store import MESH, Mesh
 
     name, frame, home = read_frame(arguments.result, arguments.frame)
     if arguments.ply:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from ..io.status import Status
+from ..results.status import Status
 
 
 def broken_down(status: Tensor, vertices: Tensor) -> Tensor | None:

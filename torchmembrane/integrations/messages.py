@@ -12,10 +12,10 @@ from numpy.polynomial.polynomial import polyval
 
 from ..camera.model import Camera
 from ..errors import MembraneError
-from ..io.images import decode_image, to_grey
-from ..io.results import Frame
-from ..io.status import Status
-from ..io.store import Mesh
+from ..files.images import decode_image, to_grey
+from ..results.reconstruction import Frame
+from ..results.status import Status
+from ..results.store import Mesh
 from ..sensor.parts import METRE
 
 CHANNELS = {

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from ..io.optional import load_rerun
-from ..io.results import Frame
-from ..io.status import Status
-from ..io.store import Mesh
+from ..files.optional import load_rerun
+from ..results.reconstruction import Frame
+from ..results.status import Status
+from ..results.store import Mesh
 from ..surface.topology import rim_loop
 
 BLUE, VERMILION, GREY, DARK = (0, 114, 178), (213, 94, 0), (184, 184, 184), (60, 60, 60)

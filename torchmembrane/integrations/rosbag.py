@@ -13,9 +13,9 @@ import numpy as np
 
 from ..camera.model import Camera
 from ..errors import MembraneError
-from ..io.bounded import in_one_line, read_text
-from ..io.optional import load_rosbags
-from ..io.results import Frame
+from ..files.optional import load_rosbags
+from ..files.safe_read import in_one_line, read_text
+from ..results.reconstruction import Frame
 from .messages import POINT_FIELDS, SiUnits, cloud_layout, unlike
 
 BAGS, METADATA = (".mcap", ".db3"), "metadata.yaml"

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 from ..camera.model import Camera
 from ..errors import MembraneError
+from ..files.folder_lock import WHOLE, Shard
 from ..integrations.messages import SiUnits, has_wrench
 from ..integrations.rosbag import BagWriter, camera_remark, image_topic, is_mcap, messages
-from ..io.claim import WHOLE, Shard
-from ..io.read import read_results
-from ..io.store import Mesh
+from ..results.read import read_results
+from ..results.store import Mesh
 from .inputs import Inputs, picture_name
 
 if TYPE_CHECKING:

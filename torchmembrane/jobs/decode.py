@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..files.images import to_grey
+from ..files.optional import load_pyav
+from ..files.provenance import Origin
 from ..integrations.messages import grey_of
 from ..integrations.rosbag import image_topic, is_bag, messages
-from ..io.images import to_grey
-from ..io.optional import load_pyav
-from ..io.origin import Origin
 from .inputs import Inputs, frame_name, picture_name
 
 if TYPE_CHECKING:

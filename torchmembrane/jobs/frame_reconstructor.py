@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..io.origin import Origin, printable
-from ..io.results import Frame, Reconstruction, Stored
-from ..io.status import Status
-from ..io.summary import UNREADABLE
+from ..files.provenance import Origin, printable
+from ..results.npz import Stored
+from ..results.reconstruction import Frame, Reconstruction
+from ..results.status import Status
+from ..results.summary import UNREADABLE
 from .decode import DecodedFrame, Source, decoded, source_of
 from .inputs import frame_name
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import MembraneError
+from ..files.provenance import printable
 from ..integrations.rosbag import BAGS, METADATA, is_bag, metadata_of
-from ..io.origin import printable
-from ..io.store import MESH
+from ..results.store import MESH
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")

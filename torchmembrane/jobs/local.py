@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..io.claim import WHOLE, Shard
-from ..io.optional import load_pyav
-from ..io.origin import printable
-from ..io.status import Status
-from ..io.store import FINISHED, Mesh, Settings
+from ..files.folder_lock import WHOLE, Shard
+from ..files.optional import load_pyav
+from ..files.provenance import printable
+from ..results.status import Status
+from ..results.store import FINISHED, Mesh, Settings
 from .decode import Source, length_of, sources
 from .frame_reconstructor import FrameReconstructor, Outcome
 from .inputs import Inputs, frame_name

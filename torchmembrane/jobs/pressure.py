@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import MembraneError
-from ..io.bounded import in_one_line, read_text, shortened
+from ..files.safe_read import in_one_line, read_text, shortened
 from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
 from .inputs import Inputs, frame_name

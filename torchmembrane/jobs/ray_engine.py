@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
-from ..io.optional import load_ray
-from ..io.origin import printable
+from ..files.optional import load_ray
+from ..files.provenance import printable
 from .decode import Source
 from .frame_reconstructor import FrameReconstructor, Outcome, outcomes_of
 from .workers import Work, batch_for

@@ -5,13 +5,13 @@ from functools import cache
 from pathlib import Path
 from types import TracebackType
 
-from ..io.atomic import PARTIAL
-from ..io.claim import Claim, Shard
-from ..io.frames import open_folder
-from ..io.optional import load_pyarrow
-from ..io.origin import Origin, printable
-from ..io.store import FINISHED, Mesh, check_folder
-from ..io.summary import UNREADABLE, Summary
+from ..files.atomic import PARTIAL
+from ..files.folder_lock import Claim, Shard
+from ..files.optional import load_pyarrow
+from ..files.provenance import Origin, printable
+from ..results.frames import open_folder
+from ..results.store import FINISHED, Mesh, check_folder
+from ..results.summary import UNREADABLE, Summary
 from .frame_reconstructor import Outcome
 from .inputs import Inputs, frame_name
 

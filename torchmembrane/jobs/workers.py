@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..io.store import Mesh
+from ..results.store import Mesh
 from .decode import DecodedFrame, Source, decoded, read_ahead
 from .frame_reconstructor import FrameReconstructor, Outcome
 

@@ -4,8 +4,8 @@ import shutil
 import time
 from typing import TextIO
 
-from ..io.status import Status
-from ..io.store import Mesh
+from ..results.status import Status
+from ..results.store import Mesh
 from .loop import RECENT, Seen, Tally
 
 TERMINAL_SECONDS, PLAIN_SECONDS = 0.1, 1.0

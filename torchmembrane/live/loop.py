@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import MembraneError
-from ..io.results import Frame
-from ..io.status import Status
+from ..results.reconstruction import Frame
+from ..results.status import Status
 from .mailbox import Mailbox, now
 from .streams import Stream
 

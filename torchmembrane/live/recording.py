@@ -5,15 +5,15 @@ from pathlib import Path
 from types import TracebackType
 
 from ..errors import MembraneError
-from ..io.bounded import in_one_line, read_text
-from ..io.claim import WHOLE
-from ..io.images import write_as_taken
-from ..io.origin import Origin
-from ..io.results import Stored
-from ..io.store import Mesh
+from ..files.folder_lock import WHOLE
+from ..files.images import write_as_taken
+from ..files.provenance import Origin
+from ..files.safe_read import in_one_line, read_text
 from ..jobs.frame_reconstructor import Outcome
 from ..jobs.inputs import Inputs
 from ..jobs.result_folder import ResultFolder
+from ..results.npz import Stored
+from ..results.store import Mesh
 from .loop import Seen
 
 IMAGES, TIMES = "images", "times.csv"

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import MembraneError
-from ..io.images import read_image
-from ..io.optional import load_opencv, load_pyav
+from ..files.images import read_image
+from ..files.optional import load_opencv, load_pyav
 from ..jobs.inputs import find_inputs
 
 MOST_MISSED = 100

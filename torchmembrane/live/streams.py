@@ -6,10 +6,11 @@ from typing import Protocol
 import numpy as np
 
 from ..errors import MembraneError
-from ..io.optional import load_edge
-from ..io.results import Frame, completed
-from ..io.store import Mesh, Settings
+from ..files.optional import load_edge
 from ..reconstruct import Reconstructor
+from ..results.npz import completed
+from ..results.reconstruction import Frame
+from ..results.store import Mesh, Settings
 from ..track import Tracker
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ..control_flow import at_hand, piece
 from ..errors import MembraneError
-from ..io.status import Status
-from ..pieces import at_hand, piece
+from ..results.status import Status
 from .locator import Locator, isotropic
 from .placement import FEWEST_MARKERS, PlacedMarkers
 from .screening import MismatchScreen

@@ -11,11 +11,22 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import MembraneError
+from ..solve.stencil import apply_stencil, convolved, stencil_kernels
 from ..surface.membrane import Membrane
-from ..surface.stencil import apply_stencil, convolved, stencil_kernels
 from ..surface.topology import corners, triangles_of
-from .cell_forces import cell_edges, cell_metric, forces_of_stress
-from .metric import adjugate, determinant, edge_vectors, metric, metric_constants, one_ring_constants, products, tensile_part
+from .metric import (
+    adjugate,
+    cell_edges,
+    cell_metric,
+    determinant,
+    edge_vectors,
+    forces_of_stress,
+    metric,
+    metric_constants,
+    one_ring_constants,
+    products,
+    tensile_part,
+)
 
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 _FIRST = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))

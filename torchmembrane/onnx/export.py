@@ -17,12 +17,12 @@ from onnx import TensorProto, helper
 from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten, tree_leaves, tree_map, tree_unflatten
 
+from ..control_flow import FUNCTIONS, Value
 from ..errors import MembraneError
-from ..io.atomic import whole_file
-from ..io.status import Status
-from ..io.store import FORMATS, Mesh, Settings
-from ..pieces import FUNCTIONS, Value
+from ..files.atomic import whole_file
 from ..reconstruct import Reconstructor
+from ..results.status import Status
+from ..results.store import FORMATS, Mesh, Settings
 from .check import checked
 from .graph import Assembly, described, inlined
 from .trace import traced

@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from ..pieces import NAMED
+from ..control_flow import NAMED
 from .trace import OPSET
 
 IR_VERSION = 8

@@ -27,7 +27,7 @@ from torch.onnx._internal.exporter._decomp import create_onnx_friendly_decomposi
 from torch.onnx._internal.exporter._registration import ONNXRegistry
 from torch.onnx._internal.fx.passes.type_promotion import _TypePromotionInterpreter, get_type_promotion_rule
 
-from ..pieces import writing
+from ..control_flow import writing
 
 OPSET = 18
 MANY = 1_000_003

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from ..io.spec_sheet import CLOSE, Band, SpecSheet, Spread
+from ..accuracy.spec_sheet import CLOSE, Band, SpecSheet, Spread
 from .drawing import BLUE, GREY, ROW, VERMILION
 
 BELOW = 5.6
@@ -26,7 +26,7 @@ def draw_sheet(drawing: Figure, sheet: SpecSheet) -> None:
         sheet: what is drawn.
 
     Example:
-        >>> from torchmembrane.io.spec_sheet import ClosestPair, DeepestPress, LightestTouch, RestFloor
+        >>> from torchmembrane.accuracy.spec_sheet import ClosestPair, DeepestPress, LightestTouch, RestFloor
         >>> none = Spread(np.nan, np.nan)
         >>> parts = RestFloor(0, 0, 0, none, none, none), LightestTouch(0, 0, none, none), []
         >>> empty = SpecSheet("a", "mm", "N", 40.0, 0, (9, 9), (7, 7), 1.0, 1.0, [], *parts, ClosestPair(0, 0, none, 0, 0),

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..io.report import Report
+from ..calibrate.report import Report
 from ..sensor.sensor import Sensor
 from .drawing import BLUE, GREY, VERMILION
 

@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
 
-from ..io.atomic import whole_file
+from ..files.atomic import whole_file
 from ..surface.topology import rim_loop
 
 BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # distinct with any colour vision

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ..errors import MembraneError
-from ..io.atomic import whole_file
-from ..io.optional import load_pyav
+from ..files.atomic import whole_file
+from ..files.optional import load_pyav
 
 VIDEOS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
 COLOURS = 64

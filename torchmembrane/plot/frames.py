@@ -8,8 +8,8 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 from matplotlib.tri import Triangulation, TriContourSet
 
-from ..io.status import Status
-from ..io.store import Mesh
+from ..results.status import Status
+from ..results.store import Mesh
 from .drawing import (
     BLUE,
     GREY,
@@ -54,7 +54,7 @@ def figure(
     Example:
         >>> from dataclasses import replace
         >>> from torchmembrane import Reconstructor, Sensor
-        >>> from torchmembrane.io.store import Settings
+        >>> from torchmembrane.results.store import Settings
         >>> sensor = Sensor.from_file("examples/sensor.toml")
         >>> reconstructor = Reconstructor(replace(sensor, markers=replace(sensor.markers, rest_image=None)))
         >>> frame = reconstructor.from_pixels(reconstructor.rest_pixels).frame(0)

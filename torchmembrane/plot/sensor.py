@@ -12,8 +12,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ..accuracy.spec_sheet import SpecSheet
 from ..camera.model import Camera
-from ..io.spec_sheet import SpecSheet
 from ..sensor.sensor import Sensor
 from .accuracy import BELOW, draw_sheet
 from .drawing import (

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..camera.model import Camera
-from ..io.images import to_grey
+from ..files.images import to_grey
 from ..mechanics.cavity import rest_balance
 from ..sensor.factories import elastic_energy
 from ..sensor.parts import METRE, Cavity, Markers, Material, Surface

@@ -9,7 +9,7 @@ import torch
 
 from ..camera.model import Camera
 from ..errors import MembraneError
-from ..io.bounded import in_one_line, read_text, shortened
+from ..files.safe_read import in_one_line, read_text, shortened
 from ..markers.placement import FEWEST_MARKERS
 from ..sensor.parts import OFF_SURFACE, Surface
 from ..sensor.toml import MOST_DOTS, MOST_DOTS_BYTES

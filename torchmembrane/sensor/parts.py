@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from ..camera.model import Camera
 from ..errors import MembraneError, expect
-from ..io.images import read_image, to_grey
+from ..files.images import read_image, to_grey
 from ..pose import Pose
 from ..surface import shapes
 from ..surface.checks import FARTHEST

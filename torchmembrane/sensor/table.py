@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import MembraneError
-from ..io.bounded import lies_within, printable, read_text, shortened
+from ..files.safe_read import lies_within, printable, read_text, shortened
 from .synonyms import did_you_mean
 
 MOST_BYTES, LONGEST_LINE = 2**15, 2000

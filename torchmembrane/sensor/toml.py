@@ -12,8 +12,8 @@ import numpy as np
 from ..camera.model import Camera
 from ..camera.ports import Port
 from ..errors import MembraneError
-from ..io.bounded import in_one_line, read_arrays, read_text, shortened
-from ..io.images import image_size, mean_image, write_image
+from ..files.images import image_size, mean_image, write_image
+from ..files.safe_read import in_one_line, read_arrays, read_text, shortened
 from ..pose import Pose
 from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane

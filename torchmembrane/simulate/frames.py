@@ -11,12 +11,12 @@ import numpy as np
 from PIL import Image
 
 from ..errors import MembraneError
-from ..io.atomic import whole_file
-from ..io.bounded import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays, read_text
-from ..io.images import read_pixels
-from ..io.optional import load_pyarrow, load_pyav
-from ..io.parquet import read_table, refusal
-from ..io.results import save_frame
+from ..files.atomic import whole_file
+from ..files.images import read_pixels
+from ..files.optional import load_pyarrow, load_pyav
+from ..files.parquet import read_table, refusal
+from ..files.safe_read import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays, read_text
+from ..results.npz import save_frame
 from ..sensor.sensor import Sensor
 from .simulator import SimulatedFrame, Simulator
 

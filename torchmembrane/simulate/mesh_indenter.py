@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..io.bounded import DAMAGE, in_one_line, read_bytes
+from ..files.safe_read import DAMAGE, in_one_line, read_bytes
 from .indenters import Indenter, box_distance
 
 KINDS = ("stl", "obj", "ply")

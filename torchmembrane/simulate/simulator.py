@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
-from ..io.images import to_grey
+from ..files.images import to_grey
 from ..sensor.factories import cavity_filling, elastic_energy
 from ..sensor.sensor import Sensor
 from .appearance import DEFAULT_APPEARANCE, Appearance, noisy

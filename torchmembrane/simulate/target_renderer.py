@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from ..camera.model import Camera
-from ..targets import Checkerboard, DotBoard
+from ..camera.targets import Checkerboard, DotBoard
 from .appearance import blurred, noisy
 
 SAMPLES = 4  # along a pixel's side

@@ -24,7 +24,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..pieces import at_hand, named
+from ..control_flow import at_hand, named
 
 LEAF = 140  # rows: halves of a smaller one take no less time
 ITERATED_LEAF = 48

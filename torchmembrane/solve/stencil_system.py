@@ -7,8 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..surface.stencil import STENCIL
 from . import band
+from .stencil import STENCIL
 from .stencil_layouts import NEAR, OFFSETS, Band, Inner, RowBlocks
 
 SLOTS = sorted(range(len(STENCIL)), key=STENCIL.__getitem__)

@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from ..errors import MembraneError
+from ..solve.stencil import apply_stencil, stencil_kernels
 from . import projection
 from .checks import checked_grid, checked_orientation
 from .projection import SurfacePoints
 from .resampling import resampled_grid
-from .stencil import apply_stencil, stencil_kernels
 from .topology import corners, corners_to_vertices, rim_loop, triangles_of, triangles_to_corners
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..linalg import symmetric_adjugate_product, symmetric_determinant
+from ..solve.symmetric_2x2 import symmetric_adjugate_product, symmetric_determinant
 
 NEAREST = 24  # triangles, by their middles, among which the closest point is looked for
 CHUNK = 128  # rays that are tried against all triangles at a time

@@ -15,8 +15,8 @@ from PIL import Image, PngImagePlugin
 from torchmembrane_edge import Session
 
 from torchmembrane import Reconstructor
-from torchmembrane.io.images import read_image
-from torchmembrane.io.results import save_frame
+from torchmembrane.files.images import read_image
+from torchmembrane.results.npz import save_frame
 
 
 def main() -> None:

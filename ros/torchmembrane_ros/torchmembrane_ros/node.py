@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 import torchmembrane as tm
 from torchmembrane.integrations.messages import POINT_FIELDS, SiUnits, cloud_layout, grey_of, has_wrench
-from torchmembrane.io.store import Mesh, Settings
+from torchmembrane.results.store import Mesh, Settings
 
 FIELDS = [PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, name in enumerate(POINT_FIELDS)]
 NEWEST = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

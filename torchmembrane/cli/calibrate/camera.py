@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from ...calibrate.camera import CameraFit, Views, lens_from_views, ports_from_views
+from ...calibrate.report import Report
 from ...camera.model import Camera
+from ...camera.targets import Checkerboard, DotBoard
 from ...errors import MembraneError
-from ...io.report import Report
 from ...plot.calibration import fit_figure
 from ...sensor.sensor import Sensor
-from ...targets import Checkerboard, DotBoard
 from .files import read_sensor, read_targets, write_calibrated
 
 

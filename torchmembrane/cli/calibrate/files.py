@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...calibrate.detection import find_target
+from ...calibrate.report import Report
+from ...camera.targets import Checkerboard, DotBoard
 from ...errors import MembraneError
-from ...io.bounded import read_array, read_text
-from ...io.images import read_image
-from ...io.report import Report
+from ...files.images import read_image
+from ...files.safe_read import read_array, read_text
 from ...jobs.inputs import find_inputs
 from ...plot.drawing import save
 from ...presets import sensor_file
 from ...sensor.sensor import Sensor
 from ...surface.checks import FARTHEST
-from ...targets import Checkerboard, DotBoard
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 
 from ...calibrate.material import STRETCHES, KnownPressures, material_from_images
+from ...calibrate.report import Report
 from ...calibrate.weight import WeightFit, material_from_weight
 from ...errors import MembraneError
-from ...io.report import Report
 from ...jobs.inputs import Inputs, find_inputs
 from ...jobs.pressure import read_pressures
 from ...plot.calibration import material_figure

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 
 from ...calibrate.depth import rest_from_depth
+from ...calibrate.report import Report
 from ...calibrate.rest import rest_from_image
 from ...calibrate.surface import Correction, fine_surface
 from ...calibrate.views import rest_from_views
-from ...io.report import Report
 from ...plot.calibration import fit_figure, surface_figure
 from ...sensor.sensor import Sensor
 from .files import read_depth, read_motions, read_sensor, read_sensor_image, write_calibrated

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...pieces import piece, repeated
+from ...control_flow import piece, repeated
 from ..spacing import FADED, neighbours, spacing, square_distance
 
 WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation

@@ -6,8 +6,8 @@ from scipy import ndimage
 from scipy.spatial import Delaunay, cKDTree
 from torch import Tensor, nn
 
+from ...control_flow import piece
 from ...errors import MembraneError
-from ...pieces import piece
 from ..locator import LocatedMarkers
 from ..noise import pixel_noise
 from ..spacing import safe_length, spacing

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...pieces import piece, repeated, rowwise, unless
+from ...control_flow import piece, repeated, rowwise, unless
 from ..spacing import spacing, thin_out
 from .deformation import FAR, LocalDeformation
 from .flow import SUPPORT, FlowAverages

@@ -5,8 +5,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from ...control_flow import piece
 from ...errors import MembraneError
-from ...pieces import piece
 from ..dots.ellipse import draw_dots, log_radii
 from ..dots.flow import FlowAverages
 from ..dots.locator import membrane_mask

@@ -8,7 +8,7 @@ import torch
 from kornia.filters import gaussian_blur2d
 from torch import Tensor, nn
 
-from ...pieces import piece
+from ...control_flow import piece
 from ..texture.pyramid import low_pass
 
 LEVELS = 5  # of the pyramid, by halves

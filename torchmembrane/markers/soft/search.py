@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...pieces import piece, repeated
+from ...control_flow import piece, repeated
 from ..dots.flow import FlowAverages
 from ..spacing import spacing, thin_out
 from .argmax import Peak, window_peak

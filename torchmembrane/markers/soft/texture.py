@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...pieces import piece
+from ...control_flow import piece
 from ..locator import LocatedMarkers
 from ..texture.locator import PatchLocator
 from ..texture.pyramid import low_pass_pyramid, sample

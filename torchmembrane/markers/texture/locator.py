@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ...control_flow import piece
 from ...errors import MembraneError
-from ...pieces import piece
 from ..locator import LocatedMarkers, isotropic
 from ..neighbourhood import NEIGHBOURS, NeighbourFlow, Neighbourhood
 from .pyramid import LEVELS, low_pass_pyramid

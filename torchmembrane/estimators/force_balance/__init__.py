@@ -1,0 +1,1 @@
+"""Force balance: few, compressive contact forces explain what the markers show."""

@@ -1,0 +1,65 @@
+"""The camera's motion against the rim as four more unknowns: du, dv, rotation and growth of the image, px.
+
+A camera that was bumped sees every marker moved, the rim's as well, which no press does: the motion is found together with the
+surface. With the angles' derivatives `K` in it, a step solves
+
+    [M  B'] [d ]     [g]         B = K^T w J,  T = K^T w K + stiffness,  k = K^T w r + stiffness x motion
+    [B  T ] [dm] = - [k],
+
+by the factor of `M`: with `d = -M^-1 (g + B' dm)` the second row is `(T - B M^-1 B') dm = B M^-1 g - k`.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ...solve.elimination import solve_dense
+
+RARE = 100.0
+"""How much less likely a camera moves than that it stays, a power: a tenfold motion has a likelihood `10^-RARE` times."""
+
+
+class CameraMotion(NamedTuple):
+    """Of a step: `coupling` `B [B, 4, 3 N]` to the vertices, `own` `T [B, 4, 4]` and `slope` `k [B, 4]`."""
+
+    coupling: Tensor
+    own: Tensor
+    slope: Tensor
+
+    def held(self, moved: Tensor, play: float | Tensor) -> "CameraMotion":
+        """With the loss `RARE / 2 log(play^2 + |moved|^2)` of what has `moved [B, 4]`: a camera rarely moves, and then by any
+        amount."""
+        stiffness = RARE / (play**2 + moved.square().sum(-1))
+        one = torch.eye(4, dtype=moved.dtype, device=moved.device)
+        own, slope = self.own + stiffness[:, None, None] * one, self.slope + stiffness[:, None] * moved
+        return CameraMotion(self.coupling, own, slope)
+
+    def eased(self, solved: Tensor, of_motion: Tensor) -> Tensor:
+        """`(M - B' T^-1 B)^-1` of loads whose `M^-1` is `solved [B, L, 3 N]`; `of_motion [B, 4, 3 N]`: that of the coupling."""
+        share = solve_dense(self.own - self.coupling @ of_motion.mT, self.coupling @ solved.mT)
+        eased: Tensor = solved + share.mT @ of_motion
+        return eased
+
+    def eliminated(self, products: Tensor) -> tuple[Tensor, Tensor]:
+        """What three loads' solutions of the surface alone have to do with the loads, `[B, 3, 3]` (row x, column y: `x . M^-1
+        y`), and how the camera follows each, `[B, 4, 3]`; the camera's slope comes with the second load.
+
+        Args:
+            products: the same with `M` alone, of these loads and the coupling, `[B, 7, 7]`.
+        """
+        loads, coupling = products[:, :, :3], products[:, :, 3:]
+        pulled = loads[:, 3:] - F.pad(self.slope[..., None], (1, 1))
+        following = solve_dense(self.own - coupling[:, 3:], pulled)
+        return loads[:, :3] + coupling[:, :3] @ following, following
+
+    def without(self, loads: Tensor, slopes: Tensor) -> Tensor:
+        """Loads `[B, L, 3 N]` on the surface alone, of those that pull the camera by `slopes [B, L, 4]` as well."""
+        kept: Tensor = loads - solve_dense(self.own, slopes.mT).mT @ self.coupling
+        return kept
+
+    def turning(self, y: Tensor) -> Tensor:
+        """`T^-1 B y`, `[B, L, 4]`, of fields `y [B, L, 3 N]`."""
+        turned: Tensor = solve_dense(self.own, self.coupling @ y.mT).mT
+        return turned

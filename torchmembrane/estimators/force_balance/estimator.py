@@ -1,0 +1,357 @@
+"""Force balance: the surface and the pressure whose residual forces, the contact forces, are few and push inwards.
+
+Every vertex carries three equations of equilibrium and one unknown depth. With the contact traction
+
+    q_k = (grad_k U(x) - h_k - p grad_k V(x)) / a_k,    s = -q . n / p0 the compressive normal part, q_t the shear,
+
+    min over x, p:  sum_d 1/2 R^2 log(1 + |r_d(x)|^2 / (R sigma)^2)
+                    + beta sum_k a_k [f(s_k; S_k) + kappa (sqrt(|q_t|^2 / p0^2 + slip^2) - slip) / (1 + c S_k)]
+
+at the cavity's volume. `r_d` is the angle between a marker's ray and its modelled position; its loss (Cauchy) grows ever more
+slowly, so that a wrongly matched marker weighs little. A convex body without friction pushes with at least the fluid's pressure
+or not at all: a small push is the grid's error or noise, a large one a contact. So the loss `f` of a push is quadratic at first
+and saturates beyond `tau` (Geman-McClure), that of a tensile traction stays quadratic, and shear (pseudo-Huber) weighs less
+where something pushes. Whether a vertex is pushed is asked of its surroundings: `S_k` is the rms of `s` over a Gaussian
+neighbourhood of radius `reach` (contacts are patches), and the weights of the steps are taken at `S_k`, smoothed, not at `s_k`.
+
+Iteratively reweighted least squares (IRLS) by Gauss-Newton steps, while `tau` declines from where everything is quadratic
+(graduated non-convexity, GNC): no start but the rest surface is needed. A fine grid starts from the solution on every second of
+its lines, and a `Dent` where something pushes. What has not settled is solved again, by more steps from several starts.
+"""
+
+from dataclasses import replace
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor, nn
+
+from ...camera.model import Camera
+from ...control_flow import mended, piece, rowwise
+from ...mechanics.cavity import CavityLaw, rest_balance
+from ...mechanics.hyperelastic import ElasticEnergy
+from ...solve.stencil import inner, pad_border
+from ...surface.bicubic import Refinement
+from ...surface.membrane import Membrane
+from ...surface.projection import SurfacePoints
+from ..base import Contacts, Deviations, Equilibrium, Observation, Problem
+from ..contacts import ContactPatches
+from .contact_force import ContactForce
+from .gauss_newton import Descent, State
+from .marker_residuals import Bearings, MarkerBearings, marker_rays, seen_from_origin
+from .normal_equations import BalanceEquations
+from .pressure_gauge import gauge_reading, refuse_open
+from .settings import ForceBalanceSettings
+from .starts import Dent
+from .traction_loss import TractionLoss, stands_out
+from .uncertainty import (
+    StandardDeviations,
+    depths,
+    gap_around,
+    noise_effects,
+    of_presses,
+    shares_of_deepest,
+    spreads,
+    standard_deviations,
+)
+
+RESOLVED = 17
+"""Lines of a grid whose own error is small beside the markers'; a coarser one's grows as the square of its step."""
+
+ALONE = 3
+"""Last steps that are damped to settle, on a grid that none precedes and none follows."""
+
+
+class ForceBalance(nn.Module):
+    """Surface, contact tractions and pressure from marker rays.
+
+    A grid with an odd number of lines, at least 11, holds the estimator on every second line as `coarse`. The reference
+    traction `p0` is the rest pressure, or tension / size or (C1 + C2) / size where that is larger.
+
+    Args:
+        membrane: the rest surface on the solver's grid.
+        elasticity: its material.
+        markers: the markers as points of it.
+        positions: `[D, 3]`, their rest positions.
+        noise: angular noise of a marker, radians, where an observation does not say; with the grid's own error in it.
+        filling: the cavity, as for `CavityLaw`.
+        gas: a gas' absolute pressure at rest and its volume.
+        settings: everything else.
+        rest: the markers' rays at rest with their noise; None: from the origin, with `noise`.
+        is_coarse: whether a finer grid follows.
+
+    Limitations:
+        The press must not be so shallow that its tractions drown in noise; two contacts within `reach` are one.
+    """
+
+    finds_tractions: ClassVar[bool] = True
+    element: ClassVar[str] = "triangle"
+    volume: ClassVar[str] = "exact"
+    flow_kind: ClassVar[str] = "smooth"
+    smoothing_weight: ClassVar[float] = 0.0
+    Settings: ClassVar[type[ForceBalanceSettings]] = ForceBalanceSettings
+
+    def __init__(
+        self,
+        membrane: Membrane,
+        elasticity: ElasticEnergy,
+        markers: SurfacePoints,
+        positions: Tensor,
+        noise: float,
+        filling: str = "liquid",
+        gas: tuple[float, float] | None = None,
+        settings: ForceBalanceSettings | None = None,
+        rest: Observation | None = None,
+        is_coarse: bool = False,
+    ):
+        super().__init__()
+        self.settings = settings = settings or ForceBalanceSettings()
+        self.cavity = CavityLaw(membrane, rest_balance(membrane, elasticity)[0], filling, gas)
+        self.size, self.coarseness = membrane.size, max(1.0, (RESOLVED - 1) / (min(membrane.grid) - 1)) ** 2
+        self._far = settings.far * self.coarseness
+        tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
+        self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
+        bearings = MarkerBearings(membrane, markers, positions, noise, rest)
+        self.coarse = self._coarser(membrane, elasticity, bearings, rest=rest, filling=filling, gas=gas)
+        self.refinement = None if self.coarse is None else Refinement(self.coarse.membrane.grid, membrane.grid)
+        cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
+        loss = TractionLoss(membrane, self.reference, cone, settings)
+        self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
+        self.descent = Descent(self.equations, self.cavity, settings)
+        self.dent = Dent(self.descent) if self.coarse is not None and self.coarse.coarse is None else None
+        self.settling = 1 if is_coarse or self.coarse is not None else ALONE
+        self.spacing = self.size / len(bearings.positions) ** 0.5
+        self.patches = ContactPatches(membrane, self.spacing)
+        first = settings.coarse_steps if is_coarse else settings.steps
+        self.steps = first if self.coarse is None else settings.finer_steps if self.dent is None else settings.fine_steps
+        rest = seen_from_origin(bearings.positions) if rest is None else rest
+        loss.push_noise, loss.noise_gain = noise_effects(self.equations, self.cavity, rest, settings.camera_motion)
+
+    @classmethod
+    def of(cls, problem: Problem, settings: ForceBalanceSettings | None = None) -> "ForceBalance":
+        """The estimator of a sensor."""
+        variance = problem.rest_covariance.diagonal(dim1=-2, dim2=-1).mean()
+        noise = float(variance.sqrt() / problem.camera.focal.mean())
+        sure = torch.ones_like(problem.rest_pixels[None, :, 0])
+        rest = marker_rays(problem.camera, problem.rest_pixels[None], problem.positions, sure, problem.rest_covariance[None])
+        surface = problem.membrane, problem.elasticity, problem.markers, problem.positions
+        return cls(*surface, noise, problem.filling, problem.gas, settings, rest)
+
+    def _coarser(self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerBearings, **others: Any) -> Self | None:
+        grid, positions = membrane.grid, bearings.positions
+        if any(count % 2 == 0 or count < 2 * self.settings.coarsest - 1 for count in grid):
+            return None
+        every_second = Membrane(*(a.unflatten(0, grid)[::2, ::2].numpy() for a in (membrane.rest, membrane.fixed)))
+        markers, material = every_second.closest_points(positions.numpy()), elasticity.on(every_second)
+        given = every_second, material, markers, positions, bearings.noise
+        settings = replace(self.settings, outlier=self.settings.coarse_outlier)
+        return type(self)(*given, settings=settings, is_coarse=True, **others)
+
+    @property
+    def membrane(self) -> Membrane:
+        """The rest surface on this grid."""
+        return self.equations.forces.membrane
+
+    @property
+    def dents(self) -> Dent | None:
+        """Those of this grid or of a coarser one."""
+        return self.coarse.dents if self.dent is None and self.coarse is not None else self.dent
+
+    @property
+    def elasticity(self) -> ElasticEnergy:
+        """What the membrane stores."""
+        return self.equations.forces.elasticity
+
+    @property
+    def rest_pressure(self) -> Tensor:
+        """Pressure difference across the membrane at rest, `[]`."""
+        return self.cavity.rest_pressure
+
+    def set_prestretch(self, prestretch: Tensor) -> None:
+        """Another prestretch `[]`, gradients included; rest pressure and load follow, the reference traction stays."""
+        self.elasticity.prestretch = prestretch
+        self.cavity.rest_pressure, self.equations.forces.rest_load = rest_balance(self.membrane, self.elasticity)
+        if self.coarse is not None:
+            self.coarse.set_prestretch(prestretch)
+
+    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
+        """The rays of the markers seen at `pixels [B, D, 2]`, each with its own noise where its `covariance` is given."""
+        if covariance is None:
+            return Observation(*camera.pixel_to_ray(pixels), confidence)
+        return marker_rays(camera, pixels, self.equations.bearings.positions, confidence, covariance)
+
+    def check_gauge(self) -> None:
+        """Refuse a gauge where it tells nothing."""
+        refuse_open(self.cavity.filling)
+
+    def gauged(self, observation: Observation, pressure: Tensor | float) -> Observation:
+        """The observation with the pressure `[B]` or `[]` that a gauge reads, NaN where there is no reading.
+
+        Raises:
+            MembraneError: the cavity is open, or the pressure of another shape.
+        """
+        self.check_gauge()
+        deviation = self.settings.pressure_noise * self.reference
+        return observation._replace(gauge=gauge_reading(pressure, self.rest_pressure, deviation, observation.confidence))
+
+    def forward(self, observation: Observation) -> Equilibrium:
+        """The surface that the markers' rays show."""
+        measured = self.equations.bearings.measured(observation)
+        found = self._solved(measured)
+        return Equilibrium(*mended(self.is_done(found, measured), found, self._patiently, measured, self.chosen))
+
+    def _patiently(self, *measured: Any) -> Equilibrium:
+        """In many small steps: deep presses need them."""
+        return self._solved(Bearings(*measured), patient=True)
+
+    @piece
+    def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
+        """`values` where `done [B]` holds, where the others broke down or are worse than what has converged; else `others`."""
+        first, second = Equilibrium(*values), Equilibrium(*others)
+        is_worse = second.objective > self.settings.worse_objective * first.objective
+        stands = self.is_converged(first) & self.is_explained(first) & is_worse
+        return Equilibrium(*rowwise(done | stands | second.objective.isnan(), first, second))
+
+    def _solved(self, measured: Bearings, patient: bool = False) -> Equilibrium:
+        state, before = self._stepped(measured, patient)
+        return self.equilibrium(*state, before, measured)
+
+    def _stepped(self, measured: Bearings, patient: bool) -> tuple[State, Tensor]:
+        """The state after all steps, on coarser grids too, and the surface before the last."""
+        schedule = self.schedule(patient)
+        last = schedule[-1:] * len(schedule)
+        found: tuple[State, Tensor]
+        if self.dent is None:
+            settling, damping = self.settling, self.settings.settling_damping
+            if patient and self.coarse is not None:
+                settling, damping = self.settings.settling_steps, self.settings.patient_damping
+            found = self.descent(self._begun(measured, patient), measured, schedule, settling=settling, damping=damping)
+        elif patient:
+            quick, slow = (self._undented(measured, patient) for patient in (False, True))
+            found = self.dent.sought(quick, slow, self.at_rest(measured.weight), measured, last)
+        else:
+            found = self.descent(self.dent(*self._undented(measured), measured), measured, last)
+        return found
+
+    def _begun(self, measured: Bearings, patient: bool) -> State:
+        """At what is found on the coarser grid, without one at rest."""
+        if self.coarse is None:
+            return self.at_rest(measured.weight)
+        return State(*self.refined(*self.coarse._stepped(measured, patient)[0]))
+
+    def _undented(self, measured: Bearings, patient: bool = False) -> State:
+        """The state after a first step, whose pushes say where to dent it."""
+        return State(*self.descent(self._begun(measured, patient), measured, self.schedule(patient)[:1])[0])
+
+    def schedule(self, patient: bool = False) -> list[tuple[float, float]]:
+        """`tau` and `R` of every step on this grid; `patient`: a second time."""
+        settings = self.settings
+        steps = settings.patience * self.steps if patient else self.steps
+        if self.coarse is not None and self.dent is None:
+            return [(settings.fine_tau[-1], settings.outlier)] * (steps + patient * settings.settling_steps)
+        coarsest, fine = (settings.patient_tau, settings.patient_fine_tau) if patient else (settings.tau, settings.fine_tau)
+        return settings.gnc_schedule(steps, coarsest if self.coarse is None else fine)
+
+    @piece
+    def at_rest(self, confidence: Tensor) -> State:
+        """The rest surface and pressure and a camera that has not moved, for every row of `confidence [B, D]`."""
+        frames, pressure = confidence.shape[0], self.rest_pressure
+        return State(
+            torch.zeros_like(self.membrane.rest).repeat(frames, 1, 1), pressure.repeat(frames), (0 * pressure).repeat(frames, 4)
+        )
+
+    @piece
+    def coarsened(self, u: Tensor, pressure: Tensor, moved: Tensor) -> State:
+        """Displacements `[B, V, 3]` of every second line, for `coarse`; pressure `[B]`, as far from rest; camera `[B, 4]`."""
+        return State(u.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure - self._above_coarse(), moved)
+
+    @piece
+    def refined(self, u: Tensor, pressure: Tensor, moved: Tensor) -> State:
+        """What `coarse` found on this grid: the displacement is bicubic between its lines, so that it has no folds there."""
+        assert self.refinement is not None  # only called with what the coarser grid has found
+        return State(self.refinement(u) * self.equations.forces.free, pressure + self._above_coarse(), moved)
+
+    def _above_coarse(self) -> Tensor:
+        """By how much the rest pressure is above that of `coarse`, `[]`: every grid has its own."""
+        assert self.coarse is not None
+        return self.rest_pressure - self.coarse.rest_pressure
+
+    @piece
+    def equilibrium(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
+        """What this state amounts to; `before`: the displacement a step earlier."""
+        membrane, loss, x = self.membrane, self.equations.loss, self.membrane.rest + u
+        step = (u - before).square().sum(-1).mean(-1).sqrt() / self.size
+        traction = self.equations.forces(u, pressure) / membrane.rest_area[:, None]
+        within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
+        judged, seen = loss(*within, measured.noise_level), measured.weight.sum(-1).clamp_min(1)
+        angles = self.equations.bearings.angles(u, measured, moved)[0]
+        unexplained = (self.descent.misfit(angles, pressure, measured) + judged.others) / seen
+        objective = unexplained + judged.pushes / seen
+        gain = self.descent.objective_at_rest(measured) / seen - objective
+        scale = 1 + pad_border(loss.contact_scale(judged, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
+        misfit, shared = self.equations.bearings.misfits(angles, measured, self.settings.outlier, self._far)
+        reasons = misfit, moved, objective, unexplained, loss.pushed(judged.push2), shared
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *reasons)
+
+    @piece
+    def is_converged(self, found: Equilibrium) -> Tensor:
+        """`[B]` bool: the last step was short and the volume is what the cavity's law asks for."""
+        error, settings = self.cavity.volume_error(found.volume, found.pressure).abs(), self.settings
+        return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
+
+    @piece
+    def is_settled(self, found: Equilibrium) -> Tensor:
+        """`[B]` bool: neither unfinished nor unexplained, so that more steps would change little."""
+        return (found.relative_step < self.settings.settled_step) & self.is_converged(found) & self.is_explained(found)
+
+    @piece
+    def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
+        """`[B]` bool: settled, likely, no mound for a pit, hardly a marker outside, as beside a contact steps went past."""
+        settings, (least, most, untouched) = self.settings, self.settings.likely_objective
+        outlying = self.equations.bearings.outlying(found.vertices - self.membrane.rest, measured, found.moved, self._far)
+        likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most)
+        pushed = (stands_out(found.reference / self.reference) & ~self.membrane.fixed).any(-1)
+        likely = torch.where(pushed, likely, untouched) * self.coarseness**2
+        done: Tensor = self.is_settled(found) & (found.objective <= likely) & (outlying <= settings.largest_outlying)
+        return done if self.dents is None else done & ~self.dents.is_hollow(found, self.membrane)
+
+    def is_explained(self, found: Equilibrium) -> Tensor:
+        """`[B]` bool: markers off their rays by noise and the model's error alone, neighbours not alike, hardly a pull or shear
+        that no push comes with, not pushed everywhere. How hard is no reason to doubt: a contact may have few markers."""
+        settings, press = self.settings, self._press(found)
+        misfit = (settings.largest_misfit + settings.misfit_of_press * press) * self.coarseness
+        unexplained = (settings.largest_unexplained + settings.unexplained_of_press * press) * self.coarseness**2
+        doubtful = (found.pushed > settings.largest_pushed) | (found.unexplained > unexplained) | (found.misfit > misfit)
+        return torch.logical_not(doubtful | (found.shared_misfit > settings.largest_shared_misfit * self.coarseness))
+
+    def _press(self, found: Equilibrium) -> Tensor:
+        """Rms displacement over the size, `[B]`."""
+        return torch.sqrt((found.vertices - self.membrane.rest).square().sum(-1).mean(-1) / self.size**2)
+
+    def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
+        """Where something pushes."""
+        return self.patches.pushes(found.vertices, normals, found.traction, found.reference, self.equations.loss.surroundings)
+
+    def deviations(self, found: Equilibrium, observation: Observation, contacts: Contacts) -> Deviations:
+        """How far off force and depth may be; spread on the grid of `coarse`, which costs little and knows as much."""
+        u, whole = found.vertices - self.membrane.rest, (found.pressure, found.moved)
+        net, state = (self, State(u, *whole)) if self.coarse is None else (self.coarse, self.coarsened(u, *whole))
+        force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, u)
+        with torch.no_grad():
+            spread = spreads(net.descent, self.settings, state, observation)
+            positions = self.equations.bearings.positions
+            gap = gap_around(shares_of_deepest(depth), positions, observation.confidence, self.membrane)
+        unseen = self.equations.loss.push_noise.mean() * self.reference * self.size**2
+        return of_presses(spread, force, depth.amax(-1), gap, contacts, self.membrane, unseen)
+
+    def standard_deviations(
+        self, x: Tensor, pressure: Tensor, moved: Tensor, observation: Observation, marker_noise: float | Tensor
+    ) -> StandardDeviations:
+        """Of a solution's surface, total force and pressure, as the noise of the markers spreads to first order.
+
+        Limitations:
+            Noise must not change which vertices are pushed, as it does in the shallowest presses and where two answers
+            compete; the grid's and the material's errors are not in it.
+        """
+        x, pressure, moved = (value.to(self.membrane.rest.dtype) for value in (x, pressure, moved))
+        state = State(x - self.membrane.rest, pressure, moved)
+        return standard_deviations(self.equations, self.cavity, self.settings, state, observation, marker_noise)

@@ -1,0 +1,258 @@
+"""Gauss-Newton steps of force balance: surface and pressure, the volume linearised."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ...control_flow import in_parts, piece, repeated, rowwise
+from ...mechanics.cavity import CavityLaw
+from ...solve.implicit import differentiable
+from ...solve.kkt import border_unknowns
+from ...solve.stencil import inner
+from .kernels.steps import NativeSteps, takes
+from .marker_residuals import Bearings
+from .normal_equations import BalanceEquations, NormalEquations
+from .pressure_gauge import gauge_loss, pulled
+from .robust import Cauchy
+from .settings import ForceBalanceSettings
+from .traction_loss import Judged
+
+VERTICES = 9000
+"""Of a batch's surfaces that are worked on at a time, but for a frame for every thread that takes steps by machine code: what a
+step makes of more does not stay in a processor's cache."""
+
+
+class State(NamedTuple):
+    """What the steps change: the surface's displacement `u [B, V, 3]` from rest (positions in float32 would round the strain
+    of a slack sheet), the `pressure [B]`, and by how much the camera has `moved [B, 4]`."""
+
+    u: Tensor
+    pressure: Tensor
+    moved: Tensor
+
+
+class Scales(NamedTuple):
+    """Numbers of a step, `[]` each: the scales `tau` of the compressive traction's loss and `outlier` of the markers'; `cone`
+    as for `TractionLoss.weights`, `renewal` as of its memory; `damping`, the share of the matrix' diagonal that is added."""
+
+    tau: Tensor
+    outlier: Tensor
+    cone: Tensor
+    renewal: Tensor
+    damping: Tensor
+
+
+class Descent(nn.Module):
+    """Reweighted Gauss-Newton steps by a schedule of the losses' scales.
+
+    Args:
+        equations: of the force balance, linearised and weighted.
+        cavity: its law.
+        settings: of the estimator.
+    """
+
+    def __init__(self, equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings):
+        super().__init__()
+        self.equations, self.cavity, self.settings = equations, cavity, settings
+        self.membrane = equations.forces.membrane
+        self.inner_grid = self.membrane.grid[0] - 2, self.membrane.grid[1] - 2
+        self.native, self._given = NativeSteps(), (equations, cavity)
+
+    def forward(
+        self,
+        state: State,
+        measured: Bearings,
+        schedule: list[tuple[float, float]],
+        cone: float | None = None,
+        settling: int = 1,
+        damping: float | None = None,
+    ) -> tuple[State, Tensor]:
+        """The state after the steps of a schedule, and the displacement before the last; `cone`: as for `TractionLoss.weights`;
+        `settling`: so many steps, the last ones, have at least a `damping` (default, `settling_damping`) to settle."""
+        frames = max(1, VERTICES // self.membrane.rest.shape[0])
+        if self.is_native(*state, *measured):
+            frames = max(frames, torch.get_num_threads())
+        cone = self.equations.loss.cone if cone is None else cone
+        damping = self.settings.settling_damping if damping is None else damping
+        taus, size = [tau for tau, _ in schedule], len(schedule)
+        numbers = [self._numbers(taus[: k + 1], damping if size - k <= settling else 0.0) for k in range(size)]
+        rows = [(*scales, cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
+        u, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows, settling)
+        return State(u, pressure, moved), before
+
+    def _numbers(self, taus: list[float], least: float) -> tuple[float, float]:
+        """The renewal and the damping of a step, from the scales `tau` up to its own: while these decline all weights are new,
+        or they would lag behind; `least`: damping, but for a first step."""
+        settings, (first, last) = self.settings, self.settings.tau
+        *before, tau = taus
+        damping = settings.damping * (min(tau, first) / last) ** 2
+        if before:
+            damping = max(damping, least)
+        return settings.renewal if before[-1:] == [tau] else 1.0, damping
+
+    def _stepped(self, u: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The state after the steps, and the displacement before the last; `given`: what is measured, the steps' scales, how
+        many of them settle."""
+        *of_markers, rows, settling = given
+        measured, last = Bearings(*of_markers), rows[-settling:] if settling > 1 else []
+        state: Sequence[Any] = (u, pressure, moved, u, self._unweighted(u))
+        first = rows[: len(rows) - len(last)]
+        if self.is_native(*state, *of_markers):
+            state = self.native.take(*self._given, State(u, pressure, moved), state[4], measured, first)
+        else:
+            state = repeated(self._next, first, state, measured)
+        if last:
+            state = repeated(self._settle, last, (*state, *state[:4], self._none_found(pressure)), measured)[5:]
+        u, pressure, moved, before = state[:4]
+        return u, pressure, moved, before
+
+    def is_native(self, *values: Any) -> bool:
+        """Whether steps of these tensors are taken by machine code."""
+        return takes(*values, self.equations.forces.elasticity.prestretch)
+
+    @piece
+    def _unweighted(self, u: Tensor) -> Tensor:
+        """What the first step has for the weights of a step before, `[B, N]`, and does not ask."""
+        return torch.ones_like(u[:, : self.equations.loss.area.shape[0], 0])
+
+    @piece
+    def _none_found(self, pressure: Tensor) -> Tensor:
+        """The objective of no state, `[B]`."""
+        return torch.full_like(pressure, torch.inf)
+
+    def objective(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> Tensor:
+        """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
+        judged: Judged = self.equations.loss(traction, normal, measured.noise_level)
+        angles = self.equations.bearings.angles(state.u, measured, state.moved)[0]
+        return self.misfit(angles, state.pressure, measured) + judged.others + judged.pushes
+
+    def objective_at_rest(self, measured: Bearings) -> Tensor:
+        """The same of the surface at rest and a camera that has not moved; there are no tractions."""
+        still, none = torch.zeros_like(self.membrane.rest[None]), torch.zeros_like(measured.noise_level)
+        angles = self.equations.bearings.angles(still, measured, none[:, None].expand(-1, 4))[0]
+        return self.misfit(angles, none + self.cavity.rest_pressure, measured)
+
+    def misfit(self, angles: Tensor, pressure: Tensor, measured: Bearings) -> Tensor:
+        """The part `[B]` of markers, seen at `angles [B, 2, D]`, and of a gauge."""
+        misfit = measured.weight * angles.square().sum(1)
+        of_markers: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1)
+        return of_markers + gauge_loss(measured.gauge, pressure - self.cavity.rest_pressure)
+
+    def tractions(self, u: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
+        """The contact tractions of the inner vertices and their outward normals, `[B, 3, N]` each."""
+        traction = self.equations.forces(u, pressure) / self.membrane.rest_area[:, None]
+        normals = self.membrane.normals(self.membrane.rest + u)
+        return inner(traction, self.membrane.grid).mT, inner(normals, self.membrane.grid).mT
+
+    @piece
+    def _next(
+        self,
+        u: Tensor,
+        pressure: Tensor,
+        moved: Tensor,
+        before: Tensor,
+        weights: Tensor,
+        measured: Bearings,
+        *scales: float,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The state, the displacement before, and the weights of normal tractions."""
+        state, weights = self._traced_once(State(u, pressure, moved), weights, measured, scales)
+        return *state, u, weights
+
+    @piece
+    def _settle(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, weights: Tensor, *given: Any) -> list[Tensor]:
+        """As `_next`, and of the states so far that of the lowest objective, the displacement before it, and the objective: a
+        vertex that is pushed in one step and pulled in the next is no answer in every step.
+
+        Args:
+            given: the latter, what is measured, the numbers of the step.
+        """
+        *kept, lowest, measured = given[:6]
+        state, weights = self._traced_once(State(u, pressure, moved), weights, measured, given[6:])
+        objective = self.objective(state, *self.tractions(*state[:2]), measured)
+        is_lower = objective < lowest
+        return [*state, u, weights, *rowwise(is_lower, (*state, u, objective), (*kept, lowest))]
+
+    def _traced_once(self, state: State, weights: Tensor, measured: Bearings, scales: Sequence[float]) -> tuple[State, Tensor]:
+        """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.
+
+        With gradients every step is: those of a nested region come with strides that torch 2.13 does not follow."""
+        if self.is_native(*state, weights, *measured):
+            *after, _, weights = self.native.take(*self._given, state, weights, measured, [scales])
+            return State(*after), weights
+        numbers = Scales(*(torch.as_tensor(scale, dtype=state.u.dtype, device=state.u.device) for scale in scales))
+        step = self.step if torch.compiler.is_exporting() or torch.is_grad_enabled() else self._compiled_once
+        taken: tuple[State, Tensor] = step(state, weights, measured, numbers)
+        return taken
+
+    @torch.compiler.nested_compile_region
+    def _compiled_once(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
+        return self.step(state, weights, measured, scales)
+
+    def step(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
+        """One reweighted Gauss-Newton step, the volume linearised, the longest vertex step capped.
+
+        Args:
+            state: before the step.
+            weights: of the normal tractions in the step before, `[B, N]`.
+            measured: the markers' rays.
+            scales: of the losses, and the step's other numbers.
+
+        Returns:
+            The state and the weights after it.
+        """
+        tau, outlier, cone, renewal, damping = scales
+        equations, (u, pressure, moved) = self.equations, state
+        _, normal, loads, corner, motion, weights = equations.linearised(
+            *state, measured, tau, outlier, cone, memory=(weights, renewal)
+        )
+        loads = torch.cat([loads, motion.coupling], 1)
+        first, last = self.settings.tau
+        blunt = (tau.clamp_max(first) / last) ** 2  # 1 as tau ends
+        solved = self._solved(normal, loads, damping)
+        motion = motion.held(moved, self.settings.camera_motion * blunt)
+        products, following = motion.eliminated(loads @ solved.mT)
+        corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
+        shares = self._shares(u, pressure, products, corner)
+        turn = (following @ shares[..., None])[..., 0]
+        move = F.pad(-(torch.cat([shares, turn], 1)[:, None] @ solved).unflatten(-1, (3, *self.inner_grid))[:, 0], (1, 1, 1, 1))
+        share = self._share(u, move)
+        u = u + share[:, None, None] * move.flatten(2).mT
+        return State(u, pressure + share * shares[:, 2], moved + share[:, None] * turn), weights
+
+    def _solved(self, normal: NormalEquations, loads: Tensor, damping: Tensor) -> Tensor:
+        """The solutions `[B, C, 3 N]` of the equations, damped; gradients take what was solved, not how."""
+        equations = self.equations
+        if torch.compiler.is_compiling():
+            return equations.system.substitute(equations.system.factor(equations.matrix(normal, damping)), loads)
+        with torch.no_grad():
+            substitute = partial(equations.system.substitute, equations.system.factor(equations.matrix(normal, damping)))
+        return differentiable(substitute, partial(equations.product, normal, damping=damping), loads)
+
+    def _shares(self, u: Tensor, pressure: Tensor, products: Tensor, corner: tuple[Tensor, Tensor]) -> Tensor:
+        """Shares `[B, 3]` in a step, but for its sign, of what solves the volume's row, the loads and the pressure's row: the
+        second is 1, the third what the pressure rises by."""
+        one = torch.ones_like(pressure)
+        if self.cavity.filling == "open":
+            return torch.stack([0 * one, one, 0 * one], 1)
+        fWv, vWv = corner
+        change = self.membrane.volume(self.membrane.rest + u) - self.membrane.rest_volume
+        target, compliance = self.cavity.condition(change, pressure)
+        multiplier, rise = border_unknowns(products, vWv, fWv, compliance, target)
+        return torch.stack([multiplier, one, rise], 1)
+
+    def _share(self, u: Tensor, move: Tensor) -> Tensor:
+        """Of a step `move [B, 3, m, n]`, so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
+        settings, tiny = self.settings, torch.finfo(u.dtype).tiny
+        both = torch.stack([move, (self.membrane.rest + u).mT.unflatten(-1, self.membrane.grid)], 1)
+        far2 = move.square().sum(1).flatten(1).amax(-1) / (settings.longest_step * self.membrane.size) ** 2
+        for axis in (-2, -1):
+            change2, edge2 = both.diff(dim=axis).square().sum(2).unbind(1)
+            stretch2 = (change2 / edge2.clamp_min(tiny)).flatten(1).amax(-1)
+            far2 = torch.maximum(far2, stretch2 / settings.largest_stretch**2)
+        share: Tensor = far2.clamp_min(1.0).rsqrt()
+        return share

@@ -1,0 +1,336 @@
+"""The equations of a step of force balance for one frame, by machine code: weights, loads, matrix.
+
+The formulas of `contact_force`, `traction_loss`, `bearings` and `normal_equations`, which say what they mean, once more; a test
+holds both to the same numbers. Vertices `k = i n + j` of the whole grid, but in what is said to be of `N`, the inner ones.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ....machine_code import aligned, compiled
+from ....mechanics.native_membrane import STENCIL, Surface
+from ....solve.native_band import LANES, RANK, ROWS, storage
+from ....solve.stencil_layouts import OFFSETS
+from ..traction_loss import POWER, TINY
+
+BETWEEN = tuple(tuple(OFFSETS.index((b[0] - a[0], b[1] - a[1])) if b >= a else -1 for b in STENCIL) for a in STENCIL)
+"""Of two vertices of a stencil, the offset from one to a later one."""
+VOLUME, FORCES, FLUID, CAMERA, WANTED = 0, 1, 2, 3, 7
+"""Loads: of the volume, the forces, the fluid, the camera's four motions, and in `spread` of four wanted numbers."""
+LOADS = WANTED + 4
+NOTHING = 1e-18
+"""Of a vertex in a mean that does not count below `(far_share / scale_share)^(2 POWER)`, some 1e-4."""
+
+
+class Constants(NamedTuple):
+    """What is constant of an estimator on one grid."""
+
+    surface: Surface
+    area: Any
+    """`[N]`, of the inner vertices."""
+    surroundings: Any
+    """`[N, N]`, column k the mean around vertex k; as `wider`."""
+    surroundings_within: Any
+    """`[N, 2]`: where row i begins and ends to be more than zero."""
+    wider: Any
+    wider_within: Any
+    push_noise: Any
+    """`[N]`"""
+    inwards: Any
+    """`[N, 3]`, at rest."""
+    positions: Any
+    """`[D, 3]`, of the markers at rest."""
+    smooth: tuple[Any, Any]
+    """Numbers of inner vertices and their shares in the markers' displacement, `[D, K]` each."""
+    corners: tuple[Any, Any]
+    """The same in what markers pull, `[D, 3]`."""
+    numbers: "Numbers"
+
+
+class Numbers(NamedTuple):
+    """Settings, and other numbers of an estimator."""
+
+    reference: float
+    size: float
+    friction: float
+    slip: float
+    sparsity: float
+    floor: float
+    last_tau: float
+    first_tau: float
+    scale_share: float
+    far_share: float
+    noise_share: float
+    decrease: float
+    least_scale: float
+    camera_motion: float
+    longest_step: float
+    largest_stretch: float
+    rest_pressure: float
+    rest_volume: float
+    is_open: bool
+    is_gas: bool
+    absolute: float
+    gas_volume: float
+
+
+class Workspace(NamedTuple):
+    """Arrays of a step, made once: to make them would take longer than what is done in them."""
+
+    force: Any
+    """`[m, n, 3]`; as `volume`, the volume's gradient."""
+    volume: Any
+    A: Any
+    """`[3, 21, m, n]`, the tangent stiffness; weighted: `weighted [3, 21, V]`."""
+    weighted: Any
+    W: Any
+    """`[3, 3, V]`"""
+    of_loads: Any
+    """`[3, 2, V]`, forces and the fluid's, weighted."""
+    sums: Any
+    """`[90, V]`, blocks of the matrix."""
+    normal: Any
+    """`[N, 3]`"""
+    fields: Any
+    """`[4, N]`"""
+    blocks: Any
+    """`[D, 3, 3]`, of the markers; their bearing Jacobians, weighted, `jacobians [D, 2, 3]`, and `marker_weights [D]`."""
+    jacobians: Any
+    marker_weights: Any
+    U: Any
+    """The matrix, and `inverse [3 N]`, `panel` and its `scale [3 N]`, as `native_band` stores them."""
+    inverse: Any
+    panel: Any
+    scale: Any
+    loads: Any
+    """`[11, 3 N]`"""
+    y: Any
+    """`[12 x 3 N]`, loads, and then what `native_band` makes of them; the last zero."""
+    width: int
+    """Diagonals of the matrix above the main one."""
+
+
+def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
+    """Arrays for a grid and so many markers."""
+    m, n = grid
+    N, V, width = (m - 2) * (n - 2), m * n, 3 * (2 * (n - 2) + 2) + 2  # to two lines, vertices and components further
+    unknowns, rows, ld = storage(3 * N, width)
+    shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, m, n), weighted=(3, 21, V), W=(3, 3, V), of_loads=(3, 2, V))
+    shapes |= dict(sums=(90, V), normal=(N, 3), fields=(4, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
+    shapes |= dict(marker_weights=(markers,), inverse=(unknowns,), panel=(RANK * ld,), scale=(unknowns,))
+    arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
+    y = aligned(-(-LOADS // ROWS) * ROWS * unknowns, dtype)
+    return Workspace(U=aligned(rows * ld, dtype), y=y, loads=np.zeros((LOADS, unknowns), dtype), width=width, **arrays)
+
+
+@compiled
+def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
+    """`TractionLoss.weights`: `W`, and `before` becomes the weights of the normal tractions; `curvature`: of a push's loss, in
+    place of its weight."""
+    k, N, n = c.numbers, len(c.area), c.surface.free.shape[1]
+    q_n, shear2, push2, around = work.fields
+    for i in range(N):
+        p, q = i // (n - 2) + 1, i % (n - 2) + 1
+        square, along, across2 = 0.0, 0.0, 0.0
+        for a in range(3):
+            square += work.volume[p, q, a] ** 2
+        for a in range(3):
+            work.normal[i, a] = work.volume[p, q, a] / np.sqrt(square)
+            along += work.force[p, q, a] * work.normal[i, a]
+        for a in range(3):
+            across2 += (work.force[p, q, a] - along * work.normal[i, a]) ** 2
+        unit = c.area[i] * k.reference
+        q_n[i], shear2[i] = along / unit, across2 / unit**2
+    push2[:] = 0
+    for i in range(N):
+        if not q_n[i] >= 0:
+            _add(push2, c.surroundings[i], q_n[i] ** 2, c.surroundings_within[i])
+    top = TINY
+    for i in range(N):
+        top = max(top, push2[i])
+    around[:] = 0
+    for i in range(N):
+        share = (push2[i] / top) ** POWER
+        if not share < NOTHING:
+            _add(around, c.wider[i], share, c.wider_within[i])
+    least = min(k.decrease * (tau / k.last_tau - 1) + k.least_scale, 1.0) ** 2
+    for i in range(N):
+        expected = top * max(around[i], TINY) ** (1 / POWER) * k.scale_share**2
+        expected = max(expected, top * k.far_share**2, (k.noise_share * noise_level * c.push_noise[i]) ** 2)
+        at = (i // (n - 2) + 1) * n + i % (n - 2) + 1
+        rho2 = min(max(expected / k.last_tau**2, least), 1.0)
+        pushed = push2[i] / rho2
+        ratio = pushed / tau**2
+        of_push = max(1 - 3 * ratio, 0.0) / (1 + ratio) ** 3 if curvature else 1 / (1 + ratio) ** 2
+        w_n = k.floor + (of_push if q_n[i] < 0 else 1.0)
+        w_n = before[i] * (w_n / before[i]) ** renewal
+        w_t = k.friction / (1 + cone * np.sqrt(pushed + k.slip**4)) / np.sqrt(shear2[i] / rho2 + k.slip**2)
+        scale = k.sparsity / (k.reference * k.size) ** 2 / c.area[i] / rho2
+        for a in range(3):
+            for b in range(3):
+                work.W[a, b, at] = scale * (w_n - w_t) * work.normal[i, a] * work.normal[i, b]
+            work.W[a, a, at] += scale * w_t
+        before[i] = w_n
+
+
+@compiled
+def _add(total, row, share, within):
+    """`total += share row`, of which only the places `within` are not zero."""
+    part, of_row = total[within[0] : within[1]], row[within[0] : within[1]]
+    for i in range(len(part)):
+        part[i] += share * of_row[i]
+
+
+@compiled
+def load_forces(c, work):
+    """`BalanceEquations.loads` of the forces; `f W v` and `v W v`."""
+    m, n = c.surface.free.shape
+    V, loads, of_loads, fWv, vWv = m * n, work.loads, work.of_loads, 0.0, 0.0
+    loads[:], of_loads[:] = 0, 0
+    for i in range(1, m - 1):
+        for j in range(1, n - 1):
+            if c.surface.free[i, j]:
+                k, at = (i - 1) * (n - 2) + j - 1, i * n + j
+                for a in range(3):
+                    for b in range(3):
+                        of_loads[a, 0, at] += work.W[a, b, at] * work.force[i, j, b]
+                        of_loads[a, 1, at] -= work.W[a, b, at] * work.volume[i, j, b]
+                    fWv += of_loads[a, 0, at] * work.volume[i, j, a]
+                    vWv -= of_loads[a, 1, at] * work.volume[i, j, a]
+                    loads[VOLUME, 3 * k + a] = work.volume[i, j, a]
+    A, first, count, sums = work.A.reshape((3, 21, V)), n + 1, V - 2 * n - 2, work.sums
+    for load in range(2):
+        for d in range(3):
+            sums[d] = 0
+            for s in range(7):
+                at = first - STENCIL[s][0] * n - STENCIL[s][1]
+                _add_products(sums[d], first, count, A, 3 * s + d, of_loads, load, at)
+        for k in range((m - 2) * (n - 2)):
+            at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
+            for d in range(3):
+                loads[FORCES + load, 3 * k + d] = sums[d, at]
+    return fWv, vWv
+
+
+@compiled
+def _add_products(total, first, count, a, of_a, b, of_b, at):
+    """`total[first + k] += sum_c a[c, of_a, at + k] b[c, of_b, at + k]`, of `count` vertices."""
+    out = total[first : first + count]
+    a0, a1, a2 = a[0, of_a, at : at + count], a[1, of_a, at : at + count], a[2, of_a, at : at + count]
+    b0, b1, b2 = b[0, of_b, at : at + count], b[1, of_b, at : at + count], b[2, of_b, at : at + count]
+    for k in range(count):
+        out[k] += a0[k] * b0[k] + a1[k] * b1[k] + a2[k] * b2[k]
+
+
+@compiled
+def load_markers(c, work, u, moved, seen, outlier, own, slope):
+    """`MarkerBearings.angles` and what they add to the loads and to the camera's equations, `own [4, 4]` and `slope [4]`; the
+    markers' blocks.
+
+    `seen`: origins `[3, D]`, across `[2, 3, D]`, weight `[D]`, motion `[2, 4, D]`."""
+    (origins, across, weight, motion), (corners, pulls) = seen, c.corners
+    to_marker, jacobian, angle = np.zeros(3), np.zeros((2, 3)), np.zeros(2)
+    for d in range(len(weight)):
+        _place(c, u, d, to_marker)
+        for a in range(3):
+            to_marker[a] -= origins[a, d]
+        distance, square = np.sqrt(to_marker[0] ** 2 + to_marker[1] ** 2 + to_marker[2] ** 2), 0.0
+        for r in range(2):
+            turned = 0.0
+            for a in range(3):
+                turned += across[r, a, d] * to_marker[a] / distance
+            for a in range(3):
+                jacobian[r, a] = (across[r, a, d] - turned * to_marker[a] / distance) / distance
+            for a in range(4):
+                turned += motion[r, a, d] * moved[a]
+            angle[r] = turned
+            square += turned * turned
+        w = weight[d] / (1 + weight[d] * square / outlier**2)
+        work.marker_weights[d] = w
+        for a in range(3):
+            work.jacobians[d, 0, a], work.jacobians[d, 1, a] = w * jacobian[0, a], w * jacobian[1, a]
+            pull = w * (jacobian[0, a] * angle[0] + jacobian[1, a] * angle[1])
+            for b in range(3):
+                work.blocks[d, a, b] = w * (jacobian[0, a] * jacobian[0, b] + jacobian[1, a] * jacobian[1, b])
+            for s in range(3):
+                at, share = 3 * corners[d, s] + a, pulls[d, s]
+                work.loads[FORCES, at] += share * pull
+                for e in range(4):
+                    by_motion = motion[0, e, d] * jacobian[0, a] + motion[1, e, d] * jacobian[1, a]
+                    work.loads[CAMERA + e, at] += share * w * by_motion
+        for a in range(4):
+            slope[a] += w * (motion[0, a, d] * angle[0] + motion[1, a, d] * angle[1])
+            for b in range(4):
+                own[a, b] += w * (motion[0, a, d] * motion[0, b, d] + motion[1, a, d] * motion[1, b, d])
+
+
+@compiled
+def _place(c, u, d, place):
+    """`MarkerBearings.markers`: where marker d is on the surface."""
+    n, (numbers, shares) = c.surface.free.shape[1], c.smooth
+    for a in range(3):
+        place[a] = c.positions[d, a]
+    for s in range(numbers.shape[1]):
+        i = numbers[d, s]
+        for a in range(3):
+            place[a] += shares[d, s] * u[i // (n - 2) + 1, i % (n - 2) + 1, a]
+
+
+@compiled
+def sum_blocks(c, work):
+    """`A^T W A` and the markers' blocks in `sums [10 3 3, V]`: between the vertices and those at `OFFSETS`."""
+    (m, n), (corners, pulls) = c.surface.free.shape, c.corners
+    V, sums, WA = m * n, work.sums, work.weighted
+    A, W, first, count = work.A.reshape((3, 21, V)), work.W, n + 1, V - 2 * n - 2
+    WA[:], sums[:] = 0, 0
+    for a in range(3):
+        for t in range(21):
+            _add_products(WA[a, t], 0, V, W, a, A, t, 0)
+    for s in range(7):
+        at = first - STENCIL[s][0] * n - STENCIL[s][1]
+        for other in range(s, 7):
+            block = 9 * BETWEEN[s][other]
+            for a in range(3):
+                for b in range(3):
+                    _add_products(sums[block + 3 * a + b], first, count, A, 3 * s + a, WA, 3 * other + b, at)
+    for d in range(len(work.blocks)):
+        for s in range(3):
+            for other in range(3):
+                share, k, further = pulls[d, s] * pulls[d, other], corners[d, s], corners[d, other] - corners[d, s]
+                if share != 0 and further >= 0:
+                    block = 9 * (further if further < 2 else further - (n - 2) + 2)
+                    at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
+                    for a in range(3):
+                        for b in range(3):
+                            sums[block + 3 * a + b, at] += share * work.blocks[d, a, b]
+
+
+@compiled
+def fill(c, work, damping, ridge, used):
+    """The matrix of the blocks in `U` and the first loads in `y`, by `scale` with a diagonal of 1, the ridge added to it."""
+    (m, n), U, sums, scale = c.surface.free.shape, work.U, work.sums, work.scale
+    ld, size = len(work.panel) // RANK, len(work.scale)
+    scale[:], U[:] = 1, 0
+    for k in range((m - 2) * (n - 2)):
+        at = (k // (n - 2) + 1) * n + k % (n - 2) + 1
+        for a in range(3):
+            if sums[4 * a, at] > 0:
+                scale[3 * k + a] = 1 / np.sqrt(sums[4 * a, at] * (1 + damping))
+    for i in range(m - 2):
+        for j in range(n - 2):
+            k, at = i * (n - 2) + j, (i + 1) * n + j + 1
+            for block in range(10):
+                p, q = i + OFFSETS[block][0], j + OFFSETS[block][1]
+                if p < m - 2 and 0 <= q < n - 2:
+                    column = 3 * (p * (n - 2) + q)
+                    for a in range(3):
+                        r = 3 * k + a
+                        start = r * ld - r // LANES * LANES + column
+                        for b in range(a if block == 0 else 0, 3):
+                            U[start + b] = sums[9 * block + 3 * a + b, at] * scale[r] * scale[column + b]
+    for r in range(size):
+        U[r * ld + r % LANES] = 1 + ridge
+    for load in range(used):
+        for r in range(size):
+            work.y[load * size + r] = work.loads[load, r] * scale[r]

@@ -1,0 +1,175 @@
+"""A step of force balance by machine code: what `Descent.step` does, frame by frame, without gradients.
+
+On a processor the tensor operations of a step, some six hundred, take longer to begin than to work.
+The formulas are those of `descent`, `camera_motion`, `cavity` and `kkt`.
+"""
+
+import numpy as np
+
+from ....machine_code import compiled
+from ....mechanics.cavity import gas_law_step
+from ....mechanics.native_membrane import linearise
+from ....solve.band import RIDGES
+from ....solve.native_band import RANK, ROWS, backward, factor
+from ..camera_motion import RARE
+from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, load_markers, sum_blocks, weigh
+
+gas_step = compiled(gas_law_step)
+
+
+@compiled
+def step(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales):
+    """From a state to the next: `u [m, n, 3]`, `pressure [1]`, `moved [4]` and `weights [N]`, of the normal tractions,
+    change."""
+    tau, outlier, cone, renewal, damping = scales[0], scales[1], scales[2], scales[3], scales[4]
+    m, n = c.surface.free.shape
+    rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
+    own, slope = np.zeros((4, 4)), np.zeros(4)
+    weigh(c, work, weights, noise_level, tau, cone, renewal, False)
+    fWv, vWv = load_forces(c, work)
+    load_markers(c, work, u, moved, seen, outlier, own, slope)
+    sum_blocks(c, work)
+    size, y = len(work.scale), work.y
+    products = factored(c, work, damping, WANTED)
+    following = _camera_eliminated(c.numbers, products, own, slope, moved, tau)
+    multiplier, one, change = _shares(c.numbers, products, rise, pressure[0], fWv, vWv, gauge)
+    solved, turn = y[:size], np.empty_like(moved)
+    for i in range(size):
+        solved[i] = multiplier * y[i] + one * y[size + i] + change * y[2 * size + i]
+    for a in range(4):
+        turn[a] = multiplier * following[a, 0] + one * following[a, 1] + change * following[a, 2]
+        for i in range(size):
+            solved[i] += turn[a] * y[(3 + a) * size + i]
+    substituted(work, solved)
+    move = solved[: 3 * (m - 2) * (n - 2)].reshape((m - 2, n - 2, 3))
+    share = _share(c, u, move)
+    for i in range(m - 2):
+        for j in range(n - 2):
+            for a in range(3):
+                u[i + 1, j + 1, a] -= share * move[i, j, a]
+    pressure[0] += share * change
+    for a in range(4):
+        moved[a] += share * turn[a]
+
+
+@compiled
+def factored(c, work, damping, used):
+    """The matrix factored, of so many loads `b` the `U^-T b` in `y`; their products `b . M^-1 b'`, `[LOADS, LOADS]`."""
+    width, size, y = work.width, len(work.scale), work.y
+    for ridge in RIDGES:
+        fill(c, work, damping, ridge, used)
+        if factor(work.U, len(work.panel) // RANK, width, size, work.inverse, work.panel, y, -(-used // ROWS) * ROWS):
+            break
+    else:
+        y[:] = np.nan
+    products = np.zeros((LOADS, LOADS))
+    for a in range(used):
+        for b in range(a + 1):
+            total = 0.0
+            for i in range(size):
+                total += y[a * size + i] * y[b * size + i]
+            products[a, b] = products[b, a] = total
+    return products
+
+
+@compiled
+def substituted(work, solved):
+    """A sum `[3 N]` of what `factored` left in `y` becomes the solution for that sum of loads."""
+    backward(work.U, len(work.panel) // RANK, work.width, len(work.scale), work.inverse, solved)
+    for i in range(len(work.scale)):
+        solved[i] *= work.scale[i]
+
+
+@compiled
+def camera_stiffness(k, moved, tau):
+    """Of `CameraMotion.held`."""
+    play = k.camera_motion * (min(tau, k.first_tau) / k.last_tau) ** 2
+    return RARE / (play**2 + moved[0] ** 2 + moved[1] ** 2 + moved[2] ** 2 + moved[3] ** 2)
+
+
+@compiled
+def eliminated(system):
+    """Solutions of `[A b] [4, 4 + n]`, in the columns of `b`."""
+    for a in range(4):
+        pivot = system[a, a]
+        for e in range(system.shape[1]):
+            system[a, e] /= pivot
+        for b in range(4):
+            share = system[b, a] if b != a else 0.0
+            for e in range(system.shape[1]):
+                system[b, e] -= share * system[a, e]
+
+
+@compiled
+def _camera_eliminated(k, products, own, slope, moved, tau):
+    """`CameraMotion.held` and `eliminated`: how the camera follows each load, `[4, 3]`; the loads' products become those with
+    it."""
+    stiffness, system = camera_stiffness(k, moved, tau), np.empty((4, 7))
+    for a in range(4):
+        for b in range(4):
+            system[a, b] = own[a, b] - products[CAMERA + a, CAMERA + b]
+        for b in range(3):
+            system[a, 4 + b] = products[CAMERA + a, b]
+        system[a, a] += stiffness
+        system[a, 4 + FORCES] -= slope[a] + stiffness * moved[a]
+    eliminated(system)
+    for a in range(3):
+        for b in range(3):
+            for e in range(4):
+                products[a, b] += products[a, CAMERA + e] * system[e, 4 + b]
+    return system[:, 4:]
+
+
+@compiled
+def _shares(k, products, rise, pressure, fWv, vWv, gauge):
+    """`Descent._shares`: of the volume's multiplier, the forces and the pressure's change in a step."""
+    if k.is_open:
+        return 0.0, 1.0, 0.0
+    fWv, vWv = fWv - gauge[1] * (pressure - k.rest_pressure - gauge[0]), vWv + gauge[1]
+    target, compliance = cavity_condition(k, rise, pressure)
+    loads = fWv + products[FLUID, FORCES], target + products[VOLUME, FORCES]
+    multiplier, change = border_unknowns(products, vWv, compliance, *loads)
+    return multiplier, 1.0, change
+
+
+@compiled
+def cavity_condition(k, rise, pressure):
+    """`CavityLaw.condition`."""
+    if not k.is_gas:
+        return -rise, 0.0
+    return gas_step(rise, pressure, k.rest_pressure, k.absolute, k.gas_volume)
+
+
+@compiled
+def border_unknowns(products, vWv, compliance, of_fluid, of_volume):
+    """`kkt.border_unknowns`: the volume's multiplier and the pressure's change, from what is on the right of their rows."""
+    a11, a12, a22 = vWv - products[FLUID, FLUID], compliance - products[VOLUME, FLUID], -products[VOLUME, VOLUME]
+    det = a11 * a22 - a12 * a12
+    return (a11 * of_volume - a12 * of_fluid) / det, (of_fluid * a22 - a12 * of_volume) / det
+
+
+@compiled
+def _share(c, u, move):
+    """`Descent._share`: so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
+    (m, n), rest, k, tiny = c.surface.free.shape, c.surface.rest, c.numbers, 1e-30
+    far2, stretch2 = 0.0, 0.0
+    here = np.zeros(3)
+    for i in range(m):
+        for j in range(n):
+            inside = 0 < i < m - 1 and 0 < j < n - 1
+            for a in range(3):
+                here[a] = move[i - 1, j - 1, a] if inside else 0.0
+            far2 = max(far2, here[0] ** 2 + here[1] ** 2 + here[2] ** 2)
+            for axis in range(2):
+                p, q = i + 1 - axis, j + axis
+                if p < m and q < n:
+                    inner = 0 < p < m - 1 and 0 < q < n - 1
+                    change2, edge2 = 0.0, 0.0
+                    for a in range(3):
+                        change = (move[p - 1, q - 1, a] if inner else 0.0) - here[a]
+                        edge = rest[p, q, a] - rest[i, j, a] + (u[p, q, a] - u[i, j, a])
+                        change2 += change * change
+                        edge2 += edge * edge
+                    stretch2 = max(stretch2, change2 / max(edge2, tiny))
+    far2 = max(far2 / (k.longest_step * k.size) ** 2, stretch2 / k.largest_stretch**2, 1.0)
+    return 1 / np.sqrt(far2)

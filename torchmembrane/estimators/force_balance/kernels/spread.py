@@ -1,0 +1,107 @@
+"""How the markers' noise spreads into force and depth, by machine code: what `deviations.spreads` does, without gradients.
+
+With the loads' `U^-T b` all products `b . M^-1 b'` are at hand, so that only the wanted numbers' solutions, camera and cavity
+eliminated, are substituted back.
+"""
+
+import numpy as np
+
+from ....machine_code import compiled
+from ....mechanics.native_membrane import linearise
+from .equations import CAMERA, FLUID, LOADS, VOLUME, WANTED, load_forces, load_markers, sum_blocks, weigh
+from .gauss_newton import border_unknowns, camera_stiffness, cavity_condition, eliminated, factored, substituted
+
+
+@compiled
+def spread_of(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales, found):
+    """Standard deviations `[4]` at the state of a frame."""
+    own, slope, size = np.zeros((4, 4)), np.zeros(4), len(work.scale)
+    rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
+    weigh(c, work, weights, noise_level, scales[0], scales[2], scales[3], True)
+    vWv = load_forces(c, work)[1] + gauge[1]
+    load_markers(c, work, u, moved, seen, scales[1], own, slope)
+    by_pressure = _load_wanted(c, work, u)
+    sum_blocks(c, work)
+    products = factored(c, work, scales[4], LOADS)
+    for a in range(4):
+        own[a, a] += camera_stiffness(c.numbers, moved, scales[0])
+    following = _camera_eased(products, own)
+    compliance, solved = cavity_condition(c.numbers, rise, pressure[0])[1], np.empty(size, u.dtype)
+    for k in range(WANTED, LOADS):
+        multiplier, change = 0.0, 0.0
+        if not c.numbers.is_open:
+            loads = by_pressure[k - WANTED] - products[FLUID, k], -products[VOLUME, k]
+            multiplier, change = border_unknowns(products, vWv, compliance, *loads)
+        for i in range(size):
+            solved[i] = work.y[k * size + i] - multiplier * work.y[VOLUME * size + i] - change * work.y[FLUID * size + i]
+        for e in range(4):
+            share = following[e, k] - multiplier * following[e, VOLUME] - change * following[e, FLUID]
+            for i in range(size):
+                solved[i] += share * work.y[(CAMERA + e) * size + i]
+        substituted(work, solved)
+        found[k - WANTED] = np.sqrt(_at_markers(c, work, solved, own, seen[3]) + change**2 * gauge[1])
+
+
+@compiled
+def _load_wanted(c, work, u):
+    """Loads of the wanted: the total force's derivatives in the inner vertices and the depth's; in the pressure, `[4]`."""
+    (m, n), loads, by_pressure, deepest, count = c.surface.free.shape, work.loads, np.zeros(4), -np.inf, 0
+    N = (m - 2) * (n - 2)
+    depth = work.fields[0]
+    for k in range(N):
+        i, j = k // (n - 2) + 1, k % (n - 2) + 1
+        depth[k] = u[i, j, 0] * c.inwards[k, 0] + u[i, j, 1] * c.inwards[k, 1] + u[i, j, 2] * c.inwards[k, 2]
+        count = count + 1 if depth[k] == deepest else 1 if depth[k] > deepest else count
+        deepest = max(deepest, depth[k])
+        for a in range(3):
+            if c.surface.free[i, j]:
+                by_pressure[a] -= work.volume[i, j, a]
+            for b in range(3):
+                for s in range(7):
+                    loads[WANTED + b, 3 * k + a] += work.A[a, 3 * s + b, i, j]
+    for k in range(N):
+        for a in range(3):
+            loads[WANTED + 3, 3 * k + a] = c.inwards[k, a] / count if depth[k] == deepest else 0.0
+    return by_pressure
+
+
+@compiled
+def _camera_eased(products, own):
+    """`CameraMotion.eased`: how the camera follows each load, `[4, LOADS]`; of the cavity's the products with all become those
+    with it."""
+    system = np.empty((4, 4 + LOADS))
+    for a in range(4):
+        for b in range(4):
+            system[a, b] = own[a, b] - products[CAMERA + a, CAMERA + b]
+        for b in range(LOADS):
+            system[a, 4 + b] = products[CAMERA + a, b]
+    eliminated(system)
+    for a in (VOLUME, FLUID):
+        for b in range(LOADS):
+            if not CAMERA <= b < WANTED:
+                for e in range(4):
+                    products[a, b] += products[a, CAMERA + e] * system[e, 4 + b]
+    return system[:, 4:]
+
+
+@compiled
+def _at_markers(c, work, solved, own, motion):
+    """Variance of a number whose equations' solution is `solved [3 N]`, by all markers' angles."""
+    (corners, pulls), system, total = c.corners, np.empty((4, 5)), 0.0
+    for a in range(4):
+        for b in range(4):
+            system[a, b] = own[a, b]
+        system[a, 4] = 0.0
+        for i in range(len(solved)):
+            system[a, 4] += work.loads[CAMERA + a, i] * solved[i]
+    eliminated(system)
+    for d in range(len(corners)):
+        for r in range(2):
+            turned = 0.0
+            for a in range(3):
+                for s in range(3):
+                    turned += work.jacobians[d, r, a] * pulls[d, s] * solved[3 * corners[d, s] + a]
+            for a in range(4):
+                turned -= work.marker_weights[d] * motion[r, a, d] * system[a, 4]
+            total += turned * turned
+    return total

@@ -1,0 +1,124 @@
+"""The normal equations of a force balance on one grid: forces and bearings, linearised, weighted, put together.
+
+Fields have their components first and the inner vertices, or the markers, last.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ...solve.stencil_layouts import NEAR
+from ...solve.stencil_system import Matrix, StencilSystem
+from .camera_motion import CameraMotion
+from .contact_force import ContactForce, Linearised
+from .marker_residuals import Bearings, MarkerBearings
+from .robust import Cauchy
+from .traction_loss import Memory, TractionLoss
+
+DAMPING = 1e-6
+"""Share of the matrix' diagonal that is added to it where nothing else is said."""
+SLACK = 0.75
+"""Rest tension over shear modulus x thickness, of a prestretch of 1.15, below which a sheet is solved in double precision: so
+little holds it between its markers that float32 moves it by per cents of a press."""
+
+
+class NormalEquations(NamedTuple):
+    """`M = A^T W A + J^T w J`: the forces' tangent stiffness `A [B, 3, 3, 7, N]` and weights `W [B, 3, 3, N]`; the weighted
+    bearing Jacobian `w J [B, 2, 3, D]` and the markers' blocks `J^T w J [B, 3, 3, D]`, in the markers' positions; `w [B, D]`"""
+
+    stiffness: Tensor
+    weights: Tensor
+    weighted_jacobian: Tensor
+    marker_blocks: Tensor
+    marker_weights: Tensor
+
+
+class BalanceEquations(nn.Module):
+    """The equations of a Gauss-Newton step: what forces and markers ask of the inner vertices.
+
+    Args:
+        forces: the contact forces.
+        bearings: the markers' angles.
+        loss: the loss of tractions.
+    """
+
+    def __init__(self, forces: ContactForce, bearings: MarkerBearings, loss: TractionLoss):
+        super().__init__()
+        self.forces, self.bearings, self.loss = forces, bearings, loss
+        self.system = StencilSystem(forces.membrane.grid, forces.inner_free > 0)
+        elasticity = forces.elasticity
+        self.is_slack = bool(elasticity.tension < SLACK * 2 * (elasticity.c1 + elasticity.c2))
+
+    def linearised(
+        self,
+        u: Tensor,
+        pressure: Tensor,
+        moved: Tensor,
+        measured: Bearings,
+        tau: Tensor | float,
+        outlier: Tensor | float,
+        cone: Tensor | float | None = None,
+        curvature: bool = False,
+        memory: Memory | None = None,
+    ) -> tuple[Linearised, NormalEquations, Tensor, tuple[Tensor, Tensor], CameraMotion, Tensor]:
+        """The forces, the normal equations, their loads, the camera's motion and the weights `w_n [B, N]` at a surface; `cone`,
+        `curvature` and `memory` as for `TractionLoss.weights`."""
+        at = self.forces.linearised(u, pressure)
+        W, w_n = self.loss.weights(at.normal, at.force, measured.noise_level, tau, cone, curvature, memory)
+        angle, jacobian = self.bearings.angles(u, measured, moved)
+        weight = measured.weight * Cauchy(outlier).weight(measured.weight * angle.square().sum(1))
+        normal = self.normal_equations(at, W, jacobian, weight)
+        return at, normal, *self.loads(normal, at, angle), self.motion(normal, measured, angle), w_n
+
+    def normal_equations(self, at: Linearised, W: Tensor, jacobian: Tensor, weight: Tensor) -> NormalEquations:
+        """Of forces weighted by `W [B, 3, 3, N]` and angles by `weight [B, D]`, with the bearing Jacobian of the angles."""
+        weighted = weight[:, None, None] * jacobian
+        return NormalEquations(at.stiffness, W, weighted, (jacobian[:, :, :, None] * weighted[:, :, None]).sum(1), weight)
+
+    def loads(self, normal: NormalEquations, at: Linearised, angle: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """`v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, 3, 3 N]`; `f^T W v` and `v^T W v`, `[B]`."""
+        W, v = normal.weights, at.volume
+        weighted = _weighed(W[:, None], torch.stack([at.force, -v], 1))
+        of_forces, of_fluid = self.forces.change(at.stiffness, weighted).split(1, 1)
+        of_markers = (normal.weighted_jacobian * angle[:, :, None]).sum(1) @ self.bearings.vertex_shares
+        loads = torch.cat([v[:, None], of_forces + of_markers[:, None], of_fluid], 1).flatten(2)
+        of_force, of_volume = (weighted * v[:, None]).sum((2, 3)).unbind(1)
+        return loads, (of_force, -of_volume)
+
+    def motion(self, normal: NormalEquations, measured: Bearings, angle: Tensor) -> CameraMotion:
+        """The camera's motion in the equations, with the angles `r [B, 2, D]`."""
+        K, w = measured.motion, normal.marker_weights
+        coupling = (K[:, :, :, None] * normal.weighted_jacobian[:, :, None]).sum(1) @ self.bearings.vertex_shares
+        weighted = (K * w[:, None, None]).movedim(2, 1).flatten(2)
+        own, slope = weighted @ K.movedim(2, 1).flatten(2).mT, (weighted @ angle.flatten(1)[..., None])[..., 0]
+        return CameraMotion(coupling.flatten(2), own, slope)
+
+    def matrix(self, normal: NormalEquations, damping: float | Tensor = DAMPING) -> Matrix:
+        """`M` as `system.factor` takes it, with a share of its diagonal added."""
+        near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1))
+        return self.system.matrix(normal.stiffness, normal.weights, near, damping)
+
+    def product(self, normal: NormalEquations, u: Tensor, damping: float | Tensor | None = None) -> Tensor:
+        """`M u` for `u [B, C, 3 N]`, without the matrix; with `damping` as of `matrix`."""
+        if damping is not None:
+            return self.product(normal, u) + damping * self._diagonal(normal).flatten(1)[:, None] * u
+        u, change, shares = u.unflatten(-1, (3, -1)), self.forces.change, self.bearings.vertex_shares
+        of_forces = change(normal.stiffness, _weighed(normal.weights[:, None], change(normal.stiffness, u)))
+        of_markers = _weighed(normal.marker_blocks[:, None], u @ shares.transpose(0, 1)) @ shares
+        return (of_forces + of_markers).flatten(2)
+
+    def _diagonal(self, normal: NormalEquations) -> Tensor:
+        """Of `M`, `[B, 3, N]`."""
+        A, (m, n) = normal.stiffness, self.forces.membrane.grid
+        squares = (A * (normal.weights[:, :, :, None, None] * A[:, None]).sum(2)).sum(1)
+        planes = squares.unflatten(-1, (m - 2, n - 2)).flatten(0, 1)
+        of_forces = F.conv_transpose2d(planes, self.forces.kernels[:, None], padding=1).reshape(-1, 3, squares.shape[-1])
+        of_markers = normal.marker_blocks.diagonal(dim1=1, dim2=2).mT @ self.bearings.pair_shares[:, : squares.shape[-1]]
+        return of_forces + of_markers
+
+
+def _weighed(blocks: Tensor, field: Tensor) -> Tensor:
+    """Blocks `[..., 3, 3, N]` times a field `[..., 3, N]`."""
+    return (blocks * field[..., None, :, :]).sum(-2)

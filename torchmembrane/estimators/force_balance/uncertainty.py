@@ -1,0 +1,348 @@
+"""Standard deviations of a force balance: how far marker noise spreads into the surface, the total force and the pressure.
+
+At the solution a small change `e` of the measured angles moves surface and pressure by
+
+    [M  m  n] [dx    ]   [J^T w e]
+    [m' c  C] [dp    ] = [   0   ],    M = A^T W A + J^T w J,
+    [n' C  0] [lambda]   [   0   ]
+
+with `c + 1 / sigma^2` in place of `c` where a gauge reads the pressure, whose own noise of one sigma adds `1 / sigma` to the
+second row; and the camera's motion (`camera_motion`) as the step has it; with `W` the curvature of a push's loss (flat where it
+bends down; shear by its parabola), so that noise of covariance S gives the sandwich `H^-1 J^T w S w J H^-1`. One load per
+marker and direction of its noise, all solved with one factor.
+
+**Deviations of a result's force and depth.** A small change of the markers changes the force and the depth by their
+sensitivities, which the transposed equations give: one solve for each wanted number, not for each marker,
+
+    K y = g,    spread^2 = sum_d |w_d (J_d y - K_d T^-1 B y)|^2
+
+with `g` the wanted number's derivative in surface and pressure and the symmetric `K` above. On the estimator's second finest
+grid, which costs little and knows as much. Every marker's noise is what the solve took it for, with a share of the
+displacements in it for the grid and the material; but these err together over many markers, so the spread is too small. What is
+missing was fitted to presses of random sensors (`bench/intervals.py`), as standard deviations that add up:
+
+    of the force    FORCE x spread,  FORCE_SHARE of the force along itself,  AT_RIM of it where a contact reaches the rim,
+                    where no contact is found UNSEEN of what a patch as pushed as the noise pushes would bear
+    of the depth    spread,  DEPTH sqrt(spread gap),  DIP gap (gap + 2 depth) / size
+
+with `gap` the distance to the markers around the deepest point. What lies between them is not seen: it may dip as much further
+as the surface's curvature and the dent's make of `gap`. The mean of spread and gap has no such reason: it is what fits.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ...mechanics.cavity import CavityLaw
+from ...solve.kkt import solve_bordered
+from ...solve.stencil import inner, pad_border
+from ...surface.membrane import Membrane
+from ...surface.tangent import tangent_frame
+from ..base import Contacts, Deviations, Observation
+from .camera_motion import CameraMotion
+from .contact_force import Linearised
+from .gauss_newton import Descent, State
+from .marker_residuals import Bearings
+from .normal_equations import BalanceEquations, NormalEquations
+from .pressure_gauge import pulled
+from .settings import ForceBalanceSettings
+
+
+class StandardDeviations(NamedTuple):
+    """Of `vertices [B, V, 3]` (zero where fixed), total `force [B, 3]` and `pressure [B]`."""
+
+    vertices: Tensor
+    force: Tensor
+    pressure: Tensor
+
+    def known(self, frames: Tensor) -> "StandardDeviations":
+        """The same, NaN but in `frames [B]`, bool."""
+        rows = ((value, frames.reshape(-1, *(1,) * (value.ndim - 1))) for value in self)
+        return StandardDeviations(*(torch.where(row, value, torch.nan) for value, row in rows))
+
+
+class LinearisedSolution(NamedTuple):
+    """A solution, linearised.
+
+    solve        `M^-1` of loads `[B, L, 3 N]`
+    borders      `[B, 2, 3 N]`, `m` and `n`: what the pressure and the volume do to the equations
+    corner       `c` and the compliance `C`, `[B]` each; None where the pressure is fixed (an open cavity)
+    force        `[B, 3, 3 N]`, the total force's derivative in the inner vertices
+    of_pressure  `[B, 3]`, minus its derivative in the pressure
+    motion       the camera's
+    gauge        `1 / sigma` of a gauge's reading, `[B]`, in `c` already; None where there is no gauge
+    """
+
+    solve: Callable[[Tensor], Tensor]
+    borders: Tensor
+    corner: tuple[Tensor, Tensor] | None
+    force: Tensor
+    of_pressure: Tensor
+    motion: CameraMotion
+    gauge: Tensor | None = None
+
+
+def linearise(
+    equations: BalanceEquations,
+    cavity: CavityLaw,
+    state: State,
+    measured: Bearings,
+    scales: tuple[float, float],
+    play: float,
+    curvature: bool = False,
+) -> tuple[Linearised, NormalEquations, LinearisedSolution]:
+    """The equations about a state, and what solves them for small loads.
+
+    Args:
+        equations: of the force balance.
+        cavity: its law.
+        state: the solution.
+        measured: the markers' rays.
+        scales: of the losses of tractions and of markers.
+        play: of the camera, px, as for `CameraMotion.held`.
+        curvature: as for `TractionLoss.weights`.
+    """
+    at, normal, loads, corner, motion, _ = equations.linearised(*state, measured, *scales, curvature=curvature)
+    vWv = pulled(corner, measured.gauge, state.pressure - cavity.rest_pressure)[1]
+    factor, membrane = equations.system.factor(equations.matrix(normal)), equations.forces.membrane
+    compliance = cavity.condition(membrane.volume(membrane.rest + state.u) - membrane.rest_volume, state.pressure)[1]
+    motion = motion.held(state.moved, play)
+    of_motion = equations.system.substitute(factor, motion.coupling)
+    closed = cavity.filling != "open"
+    one = torch.eye(3).to(state.u)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
+    of_force = equations.forces.change(at.stiffness, one).flatten(2)
+    solution = LinearisedSolution(
+        lambda loads: motion.eased(equations.system.substitute(factor, loads), of_motion),
+        loads[:, [2, 0]],
+        (vWv, compliance.expand_as(vWv)) if closed else None,
+        of_force,
+        at.volume.sum(-1),
+        motion,
+        measured.gauge[:, 1].sqrt() if closed and measured.gauge is not None else None,
+    )
+    return at, normal, solution
+
+
+@torch.no_grad()
+def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observation, play: float) -> tuple[Tensor, Tensor]:
+    """What the markers' noise makes at rest, one standard deviation, while all losses are quadratic: the push `S [N]`, and by
+    how much the objective falls in the mean as the surface follows it, over the markers `[]`.
+
+    Args:
+        equations: of the force balance.
+        cavity: its law.
+        rest: the markers' rays at rest.
+        play: of the camera, px, as for `CameraMotion.held`.
+    """
+    membrane, loss = equations.forces.membrane, equations.loss
+    measured = equations.bearings.measured(rest)
+    state = State(
+        torch.zeros_like(membrane.rest[None]), cavity.rest_pressure[None], torch.zeros_like(membrane.rest[:1, :1]).expand(1, 4)
+    )
+    at, normal, solution = linearise(equations, cavity, state, measured, (torch.inf, torch.inf), play)
+    alone = torch.eye(2).to(measured.weight).expand(1, measured.weight.shape[1], 2, 2)
+    loads = noise_loads(equations, normal, measured, solution.motion, alone)
+    dx, dp = changes(solution, loads)
+    dq = equations.forces.change(at.stiffness, dx.unflatten(-1, (3, -1))) - dp[..., None, None] * at.volume[:, None]
+    push = (dq * at.normal[:, None]).sum(2) / (loss.area * loss.reference)
+    gain = 0.5 * (loads * dx).sum() / measured.weight.sum()
+    return (push.square().sum(1) @ loss.surroundings).sqrt()[0], gain
+
+
+def noise_loads(
+    equations: BalanceEquations, normal: NormalEquations, measured: Bearings, motion: CameraMotion, turned: Tensor
+) -> Tensor:
+    """What noise adds to the equations, the camera's motion eliminated: `[B, 2 D, 3 N]`, of independent noises that turn each
+    marker's angles by `turned [B, D, 2, 2]` (noise, angle): `J^T w e - B' T^-1 K^T w e`."""
+    loads = torch.einsum("bdra,bacd,dn->bdrcn", turned, normal.weighted_jacobian, equations.bearings.vertex_shares)
+    slopes = torch.einsum("bdra,bakd,bd->bdrk", turned, measured.motion, normal.marker_weights)
+    return motion.without(loads.flatten(3).flatten(1, 2), slopes.flatten(1, 2))
+
+
+def changes(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor]:
+    """What each load does to the inner vertices, `[B, L, 3 N]`, and to the pressure, `[B, L]`; with a gauge, its noise last.
+
+    Args:
+        solution: the linearised solution.
+        noise_loads: `[B, L, 3 N]`, what one standard deviation of each independent noise adds to the equations, `J^T w e`.
+    """
+    if solution.gauge is not None:
+        noise_loads = F.pad(noise_loads, (0, 0, 0, 1))
+    y = solution.solve(torch.cat([noise_loads, solution.borders], 1))
+    dx, dp = y[:, :-2], torch.zeros_like(noise_loads[..., 0])
+    if solution.corner is not None:
+        border = y[:, -2:]
+        c, C = solution.corner
+        corner = torch.stack([c, C, C, torch.zeros_like(C)], -1).unflatten(-1, (2, 2)) - solution.borders @ border.mT
+        rows = -solution.borders @ dx.mT
+        if solution.gauge is not None:
+            rows = rows + F.pad(solution.gauge[:, None, None], (rows.shape[-1] - 1, 0, 0, 1))
+        rise = torch.linalg.solve(corner, rows)
+        dx, dp = dx - rise.mT @ border, rise[:, 0]
+    return dx, dp
+
+
+def spread(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Standard deviations of the inner vertices `[B, 3 N]`, the total force `[B, 3]` and the pressure `[B]`; arguments as of
+    `changes`."""
+    dx, dp = changes(solution, noise_loads)
+    dF = dx @ solution.force.mT - dp[..., None] * solution.of_pressure[:, None]
+    return _root_sum_square(dx), _root_sum_square(dF), _root_sum_square(dp)
+
+
+def standard_deviations(
+    equations: BalanceEquations,
+    cavity: CavityLaw,
+    settings: ForceBalanceSettings,
+    state: State,
+    observation: Observation,
+    marker_noise: float | Tensor,
+) -> StandardDeviations:
+    """At a solution, of the rays it was found from.
+
+    Args:
+        equations: of the estimator.
+        cavity: its law.
+        settings: its settings.
+        state: the solution.
+        observation: the rays.
+        marker_noise: standard deviation of every marker's angles, radians; or `[B, D, 2, 3]`, how noise in each of two
+            independent directions turns the rays.
+    """
+    measured = equations.bearings.measured(observation)
+    noise = marker_noise if isinstance(marker_noise, Tensor) else marker_noise * tangent_frame(observation.directions)
+    scales = settings.tau[1], settings.outlier
+    _, normal, solution = linearise(equations, cavity, state, measured, scales, settings.camera_motion, curvature=True)
+    turned = torch.einsum("bdrj,bajd->bdra", noise.to(measured.across), measured.across)
+    dx, dF, dp = spread(solution, noise_loads(equations, normal, measured, solution.motion, turned))
+    return StandardDeviations(pad_border(dx.unflatten(-1, (3, -1)).mT, equations.forces.membrane.grid), dF, dp)
+
+
+def _root_sum_square(changes: Tensor) -> Tensor:
+    return changes.square().sum(1).sqrt()
+
+
+FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 0.85, 0.026, 0.12, 0.002
+DEPTH, DIP = 0.43, 0.23
+AROUND = 4
+"""Markers around a point."""
+FINE = 25
+"""Lines of the grids that it was fitted on, at least; on coarser ones the spreads count for more, as the square of the step."""
+
+
+def of_presses(
+    noise: tuple[Tensor, Tensor],
+    force: Tensor,
+    depth: Tensor,
+    gap: Tensor,
+    contacts: Contacts,
+    membrane: Membrane,
+    unseen: Tensor,
+) -> Deviations:
+    """With the model's error.
+
+    Args:
+        noise: of force and depth, as `spreads` gives it.
+        force: `[B, 3]`, as found.
+        depth: `[B]`, as found.
+        gap: `[B]`, to the markers around the deepest point, as of `gap_around`.
+        contacts: as found.
+        membrane: the rest surface on the solver's grid.
+        unseen: the force `[]` that noise alone makes, over the whole surface.
+    """
+    coarse = max(1.0, (FINE - 1) / (min(membrane.grid) - 1)) ** 2
+    of_force, of_depth = (coarse * spread for spread in noise)
+    none = (~contacts.points[..., 0].isfinite().any(1)).to(depth.dtype)
+    at_rim = (contacts.at_rim == 1).any(1).to(depth.dtype)
+    around = (AT_RIM * at_rim).square() * force.square().sum(-1) + (UNSEEN * unseen * none).square()
+    dip = DIP * gap * (gap + 2 * depth) / membrane.size
+    return Deviations(
+        ((FORCE * of_force).square() + FORCE_SHARE**2 * force.square() + around[:, None]).sqrt(),
+        (of_depth.square() + DEPTH**2 * of_depth * gap + dip.square()).sqrt(),
+    )
+
+
+def depths(membrane: Membrane, u: Tensor) -> Tensor:
+    """Displacements `u [B, V, 3]` along the inward rest normals, `[B, V]`."""
+    depth: Tensor = -(u * membrane.rest_normals).sum(-1)
+    return depth
+
+
+def gap_around(deepest: Tensor, positions: Tensor, confidence: Tensor, membrane: Membrane) -> Tensor:
+    """How far off the markers around a point are, `[B]`, length unit, at rest: the `AROUND` nearest that are seen, in the mean.
+
+    Args:
+        deepest: `[B, V]`, the vertices' shares in the point.
+        positions: `[D, 3]`, of the markers at rest.
+        confidence: `[B, D]`, 0 for those not seen.
+        membrane: the rest surface on this grid.
+    """
+    distance = torch.linalg.vector_norm(positions - (deepest @ membrane.rest)[:, None], dim=-1)
+    distance = torch.where(confidence > 0, distance, membrane.size)
+    gap: Tensor = distance.topk(min(AROUND, len(positions)), largest=False).values.mean(-1)
+    return gap
+
+
+def shares_of_deepest(depth: Tensor) -> Tensor:
+    """Of the vertices in the deepest point, by their `depth [B, V]`: where several are, all alike."""
+    deepest = (depth == depth.amax(-1, keepdim=True)).to(depth.dtype)
+    shares: Tensor = deepest / deepest.sum(-1, keepdim=True)
+    return shares
+
+
+def spreads(descent: Descent, settings: ForceBalanceSettings, state: State, observation: Observation) -> tuple[Tensor, Tensor]:
+    """Of the force `[B, 3]` and the depth `[B]` at a solution, by the noise that the solve takes the markers to have."""
+    measured = descent.equations.bearings.measured(observation)
+    if descent.is_native(*state, *measured):
+        both = descent.native.spread(descent.equations, descent.cavity, state, measured, settings.outlier)
+        return both[:, :3], both[:, 3]
+    return spreads_by_tensors(descent.equations, descent.cavity, settings, state, measured)
+
+
+def spreads_by_tensors(
+    equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, state: State, measured: Bearings
+) -> tuple[Tensor, Tensor]:
+    """The same by tensor operations."""
+    membrane = equations.forces.membrane
+    scales, play = (settings.tau[1], settings.outlier), settings.camera_motion
+    _, normal, solution = linearise(equations, cavity, state, measured, scales, play, curvature=True)
+    depth = inner(depths(membrane, state.u)[..., None], membrane.grid)[..., 0]
+    inwards = -inner(membrane.rest_normals, membrane.grid).mT
+    of_depth = shares_of_deepest(depth)[:, None] * inwards
+    wanted = torch.cat([solution.force.expand(of_depth.shape[0], -1, -1), of_depth.flatten(1)[:, None]], 1)
+    by_pressure = torch.cat([-solution.of_pressure, torch.zeros_like(state.pressure)[:, None]], 1)
+    both = spreads_of(equations, normal, solution, measured, wanted, by_pressure)
+    return both[:, :3], both[:, 3]
+
+
+def spreads_of(
+    equations: BalanceEquations,
+    normal: NormalEquations,
+    solution: LinearisedSolution,
+    measured: Bearings,
+    wanted: Tensor,
+    by_pressure: Tensor,
+) -> Tensor:
+    """Standard deviations `[B, L]` of numbers whose derivatives in the inner vertices are `wanted [B, L, 3 N]` and in the
+    pressure `by_pressure [B, L]`, where all angles `across` have a standard deviation of 1, and a gauge its own."""
+    solved = solution.solve(torch.cat([wanted, solution.borders], 1))
+    y, of_gauge = solved[:, :-2], torch.zeros_like(by_pressure)
+    if solution.corner is not None:
+        (c, compliance), (m, n) = solution.corner, solution.borders.unbind(1)
+        of_m, of_n = solved[:, -2:].unbind(1)
+        loads, solutions = (
+            torch.stack([b[:, None].expand_as(a), -a, d[:, None].expand_as(a)], 2)
+            for a, b, d in ((wanted, n, m), (y, of_n, of_m))
+        )
+        zero = torch.zeros_like(by_pressure)
+        y, rise = solve_bordered(loads, solutions, c[:, None], by_pressure, compliance[:, None], zero)
+        of_gauge = of_gauge if solution.gauge is None else rise * solution.gauge[:, None]
+    at_markers = y.unflatten(-1, (3, -1)) @ equations.bearings.vertex_shares.mT
+    of_angles = (normal.weighted_jacobian[:, None] * at_markers[:, :, None]).sum(3)
+    of_camera = solution.motion.turning(y)[..., None, :, None] * normal.marker_weights[:, None, None, None]
+    of_markers = (of_angles - (measured.motion[:, None] * of_camera).sum(3)).square().sum((2, 3))
+    spread: Tensor = (of_markers + of_gauge.square()).sqrt()
+    return spread

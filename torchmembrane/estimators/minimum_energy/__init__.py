@@ -1,0 +1,1 @@
+"""Minimum energy: the surface of least elastic energy on the observed rays."""

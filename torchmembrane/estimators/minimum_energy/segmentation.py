@@ -1,0 +1,225 @@
+"""Where something touches, from the flow alone (section 5.1): polar-angle change, regions that bulge in, the paper's loop.
+
+An inward displacement `-s n` of a point at range `t` turns its ray by `-s (n . e) / t`, where `e` is the direction in which the
+polar angle grows. So `d beta = beta_0 - beta_1` (eq. 29) has the sign of `n . e` where the membrane bulges in: the printed
+`d beta < 0` holds only for a camera above the surface's centre of curvature.
+"""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ...camera.model import Rays
+from ...control_flow import piece
+from ...errors import MembraneError
+from ...surface.membrane import Membrane
+from ..base import CONTACT_POINTS, Contacts, Equilibrium, Observation
+from ..contacts import ContactPatches
+from ..regions import persistent_regions
+
+LEAST = 1e-3  # smallest peak that is a contact, over the surface's size
+DIVERGENT = 0.9  # outward share of the angular flow above which it diverges everywhere: the contact is on the axis
+ON_AXIS = 0.1  # radius of the region then, over the surface's size
+
+
+class ContactRegions(NamedTuple):
+    """Contacts of a batch: `bulge [B, V]` (length unit, positive where the membrane bulges in), `region [B, V]` (0 none, else
+    the number of the contact, strongest first), `points [B, P, 3]`, the regions' centroids, NaN-padded."""
+
+    bulge: Tensor
+    region: Tensor
+    points: Tensor
+
+
+class Segmented(NamedTuple):
+    """What the loop of section 5.1 ends with: the last surface, its contacts, those of eq. 29 alone, and by how much the
+    contacts moved in the last round, over the surface's size, `[B]` (infinite where one came or went)."""
+
+    surface: Equilibrium
+    contacts: ContactRegions
+    first: ContactRegions
+    moved: Tensor
+
+
+class RelaxedEstimator(Protocol):
+    """An estimator whose smoother leaves contacts alone."""
+
+    def solve(self, observation: Observation, relaxed: Tensor) -> Equilibrium:
+        """The surface; `relaxed [B, V]` bool: vertices in contact."""
+        ...
+
+
+class PolarAngle(nn.Module):
+    """Eq. 29 for points of a rest surface: grid vertices or markers.
+
+    Args:
+        points: `[N, 3]` at rest.
+        normals: outward unit normals there, `[N, 3]`.
+        origins: of their rest rays, `[N, 3]`.
+        directions: unit directions of their rest rays, `[N, 3]`.
+
+    Limitations:
+        Where the rays run along the normals (a camera near the centre of curvature) an inward displacement does not turn them:
+        only the stretch around it is visible.
+    """
+
+    range: Tensor
+    rest: Tensor
+    sign: Tensor
+
+    def __init__(self, points: Tensor, normals: Tensor, origins: Tensor, directions: Tensor):
+        super().__init__()
+        self.register_buffer("range", ((points - origins) * directions).sum(-1))
+        self.register_buffer("rest", polar_angle(directions))
+        self.register_buffer("sign", torch.sign((normals * growing_polar_angle(directions)).sum(-1)))
+
+    def change(self, directions: Tensor) -> Tensor:
+        """`d beta = beta_0 - beta_1` in radians, for unit rays `[..., N, 3]` now."""
+        return self.rest - polar_angle(directions)
+
+    def bulge(self, directions: Tensor) -> Tensor:
+        """The change times the range, positive where the membrane bulges in, `[..., N]`."""
+        return self.sign * self.range * self.change(directions)
+
+
+def polar_angle(directions: Tensor) -> Tensor:
+    """Angle between `[..., 3]` and the optical axis, radians (eq. 29: `arccos f / sqrt(u^2 + v^2 + f^2)`)."""
+    return torch.atan2(torch.linalg.vector_norm(directions[..., :2], dim=-1), directions[..., 2])
+
+
+def growing_polar_angle(directions: Tensor) -> Tensor:
+    """Unit vector across each unit direction along which the polar angle grows, `[..., 3]`; zero on the axis."""
+    axis = directions.new_tensor([0.0, 0.0, 1.0])
+    return torch.nn.functional.normalize(directions[..., 2:] * directions - axis, dim=-1)
+
+
+class Segmentation(nn.Module):
+    """Contacts of a membrane, from the rays of its grid vertices or from its surface.
+
+    Args:
+        membrane: the rest surface on the solver's grid.
+        rest_rays: the rest rays of its vertices, `origins` and `directions [V, 3]`.
+        count: how many contacts are reported.
+
+    Limitations:
+        Contacts closer than about a fifth of the surface's size are one. A contact on the axis that turns all rays outwards is
+        a disc of a tenth of that size, however large it is.
+    """
+
+    rest_origins: Tensor
+    rest_directions: Tensor
+    axis_region: Tensor
+
+    def __init__(self, membrane: Membrane, rest_rays: Rays | tuple[Tensor, Tensor], count: int = CONTACT_POINTS):
+        super().__init__()
+        self.membrane, self.count = membrane, count
+        self.polar = PolarAngle(membrane.rest, membrane.rest_normals, *rest_rays)
+        self.register_buffer("rest_origins", rest_rays[0])
+        self.register_buffer("rest_directions", rest_rays[1])
+        self.register_buffer("axis_region", _axis_region(membrane))
+        self.patches = ContactPatches(membrane)
+        self.axis_in_view = bool((self.axis_region > 0).any())
+
+    @piece
+    def by_polar_angle(self, directions: Tensor) -> ContactRegions:
+        """Eq. 29 alone: contacts on the rest surface, for rays `[B, V, 3]`."""
+        bulge = self.polar.bulge(directions) * ~self.membrane.fixed
+        return self._where(self.membrane.rest.expand(bulge.shape[0], -1, -1), bulge, directions)
+
+    @piece
+    def by_normals(self, x: Tensor) -> ContactRegions:
+        """Contacts of a surface `[B, V, 3]`: where it lies inside the rest surface, along the mean of both normals.
+
+        Or the axis, where its rays all turn outwards: a dent there is hidden from a camera that looks along the normals.
+        """
+        return self._inside(x, self.membrane.normals(x))
+
+    @piece
+    def moved(self, before: Tensor, after: Tensor) -> Tensor:
+        """By how much points `[B, P, 3]` moved at most, over the surface's size, `[B]`; infinite where one came or went."""
+        distance = torch.linalg.vector_norm(after - before, dim=-1).nan_to_num().amax(-1)
+        same = (after.isnan() == before.isnan()).flatten(1).all(1)
+        return torch.where(same, distance / self.membrane.size, torch.inf)
+
+    @piece
+    def in_contact(self, region: Tensor) -> Tensor:
+        """`[B, V]` bool, from the numbers of regions."""
+        return region > 0
+
+    def contacts(self, x: Tensor, normals: Tensor) -> Contacts:
+        """`by_normals` as results have it, 1 in a contact, else 0; the surface's `normals [B, V, 3]` are at hand."""
+        regions = self._inside(x, normals)
+        indicator, numbers = (regions.region > 0).to(x.dtype), torch.arange(1, self.count + 1, device=x.device)
+        mine = (regions.region[:, None] == numbers[:, None]).to(x.dtype)
+        contacts: Contacts = self.patches(x, normals, -normals, indicator, regions.points, mine)  # as if pushed evenly
+        return contacts._replace(force=torch.nan * contacts.force, slip=torch.nan * contacts.slip)
+
+    def divergence(self, directions: Tensor) -> Tensor:
+        """Outward share of the angular flow, `[B]`: 1 where every ray turns away from the axis, -1 where all turn to it."""
+        turned = torch.linalg.vector_norm(directions - self.rest_directions, dim=-1)
+        reach: Tensor = self.polar.range * ~self.membrane.fixed
+        least = LEAST * self.membrane.size
+        outward: Tensor = -(reach * self.polar.change(directions)).sum(-1) / (reach * turned).sum(-1).clamp_min(least)
+        return outward
+
+    def _inside(self, x: Tensor, normals: Tensor) -> ContactRegions:
+        normal = torch.nn.functional.normalize(normals + self.membrane.rest_normals, dim=-1)
+        bulge = -((x - self.membrane.rest) * normal).sum(-1)
+        return self._where(x, bulge, torch.nn.functional.normalize(x - self.rest_origins, dim=-1))
+
+    def _where(self, x: Tensor, bulge: Tensor, directions: Tensor) -> ContactRegions:
+        """The regions of `bulge [B, V]` on `x [B, V, 3]`, or where the flow diverges everywhere the axis'."""
+        divergent = (self.divergence(directions) > DIVERGENT)[:, None] & self.axis_in_view
+        region = torch.where(divergent, self.axis_region, self._regions(bulge))
+        weight = torch.where(divergent, torch.ones_like(bulge), bulge.clamp_min(0))
+        return ContactRegions(bulge, region, self._centroids(x, region, weight))
+
+    def _regions(self, bulge: Tensor) -> Tensor:
+        on_grid = bulge.float().unflatten(-1, self.membrane.grid)  # which of them is higher: single precision tells
+        regions: Tensor = persistent_regions(on_grid, self.count, LEAST * self.membrane.size).flatten(1)
+        return regions
+
+    def _centroids(self, x: Tensor, region: Tensor, bulge: Tensor) -> Tensor:
+        weight = bulge * self.membrane.rest_area
+        numbers = torch.arange(1, self.count + 1, device=x.device)
+        weight = weight[:, None] * (region[:, None] == numbers[:, None])
+        centroids: Tensor = weight @ x / weight.sum(-1, keepdim=True)
+        return centroids
+
+
+def reconstruct_and_segment(
+    estimator: RelaxedEstimator, segmentation: Segmentation, observation: Observation, rounds: int
+) -> Segmented:
+    """The loop of section 5.1, a fixed number of times.
+
+    Regions that bulge in by eq. 29 (or the axis, where the flow diverges everywhere); then reconstruct with the smoother
+    relaxed there, take the displacement along the surface's normals, and from it the regions.
+
+    Args:
+        estimator: gives the surface with the smoother relaxed.
+        segmentation: of the same membrane.
+        observation: the rays of the grid's vertices, `[B, V, 3]`.
+        rounds: how often, at least once.
+
+    Raises:
+        MembraneError: no rounds.
+    """
+    if rounds < 1:
+        raise MembraneError(f"reconstruct_and_segment: rounds = {rounds}; expected at least 1")
+    first = before = contacts = segmentation.by_polar_angle(observation.directions)
+    for _ in range(rounds):
+        surface = estimator.solve(observation, segmentation.in_contact(contacts.region))
+        before, contacts = contacts, segmentation.by_normals(surface.vertices)
+    return Segmented(surface, contacts, first, segmentation.moved(before.points, contacts.points))
+
+
+def _axis_region(membrane: Membrane) -> Tensor:
+    """1 at the vertices `[V]` around the point where the optical axis meets the rest surface, else 0."""
+    hit = membrane.ray_points(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
+    if not np.isfinite(hit.distance[0]):
+        return torch.zeros(len(membrane.rest), dtype=torch.long)
+    centre = membrane.rest.new_tensor([0.0, 0.0, float(hit.distance[0])])
+    near: Tensor = torch.linalg.vector_norm(membrane.rest - centre, dim=-1) < ON_AXIS * membrane.size
+    return near.long()

@@ -1,0 +1,1 @@
+"""The paper: its estimator, and the studies that only it needs."""

@@ -1,0 +1,255 @@
+"""The paper's own unknown: heights at fixed (x, y), `z = s(x, y) + psi(x, y)` (eqs. 5-10, 14, 18, 22; Appendix D).
+
+A piece of the membrane with rest slopes `s_x, s_y` moves by the plane map A to x', where the surface has the slopes of
+`s + psi`:
+
+    tr(A^T H A adj G) = m_xx psi_x^2 + m_xy psi_x psi_y + m_yy psi_y^2 + m_x psi_x + m_y psi_y + m_0    (eqs. 55-62)
+
+with G of the rest slopes at x and H of the slopes at x' (eq. 10 prints x for both); the energy is half of it times
+`dx dy / sqrt(det G)`. At fixed (x, y) the volume is exactly linear in psi and the energy is not quadratic, as A depends on psi
+too; at fixed material points (`minimum_energy`) it is the other way round.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ....errors import MembraneError
+from ....mechanics.cavity import rest_balance
+from ....mechanics.hyperelastic import ElasticEnergy
+from ....surface.membrane import Membrane
+from ....surface.topology import corners, triangles_of
+from ...base import Equilibrium
+from ...minimum_energy.estimator import grid_laplacian
+
+STEEPEST = 20.0  # slope of a rest surface that heights can describe
+
+
+class Coefficients(NamedTuple):
+    """`m_xx, m_yy, m_xy, m_x, m_y, m_0` of eqs. 57-62, each `[...]`.
+
+    Example:
+        >>> m = coefficients(torch.eye(2), torch.zeros(2))
+        >>> m(torch.tensor([0.3, 0.4])).item()  # 2 + the squared slope
+        2.25
+    """
+
+    xx: Tensor
+    yy: Tensor
+    xy: Tensor
+    x: Tensor
+    y: Tensor
+    one: Tensor
+
+    def __call__(self, psi_slope: Tensor) -> Tensor:
+        """The quadratic form (56) of the slopes `psi_x, psi_y [..., 2]`."""
+        p, q = psi_slope.unbind(-1)
+        return self.xx * p**2 + self.xy * p * q + self.yy * q**2 + self.x * p + self.y * q + self.one
+
+
+def adjugate(matrix: Tensor) -> Tensor:
+    """`adj M = det M M^-1` of `[..., 2, 2]`.
+
+    Example:
+        >>> adjugate(torch.tensor([[1.0, 2.0], [3.0, 4.0]])).tolist()
+        [[4.0, -2.0], [-3.0, 1.0]]
+    """
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    return torch.stack([torch.stack([d, -b], -1), torch.stack([-c, a], -1)], -2)
+
+
+def metric(slope: Tensor) -> Tensor:
+    """First fundamental form of a graph with slopes `[..., 2]` (eqs. 9, 10), `[..., 2, 2]`.
+
+    Example:
+        >>> metric(torch.tensor([1.0, 2.0])).tolist()
+        [[2.0, 2.0], [2.0, 5.0]]
+    """
+    return torch.eye(2, dtype=slope.dtype, device=slope.device) + slope[..., :, None] * slope[..., None, :]
+
+
+def coefficients(A: Tensor, rest_slope: Tensor, slope: Tensor | None = None) -> Coefficients:
+    """The coefficients of eqs. 57-62.
+
+    With `N = A adj(G) A^T`:
+
+        m_xx = N_11, m_yy = N_22, m_xy = 2 N_12, m_x = 2 (N_11 s_x + N_12 s_y), m_y = 2 (N_12 s_x + N_22 s_y),
+        m_0 = N_11 (1 + s_x^2) + 2 N_12 s_x s_y + N_22 (1 + s_y^2)
+
+    Args:
+        A: plane map, `[..., 2, 2]`.
+        rest_slope: slopes of s at x, `[..., 2]`.
+        slope: slopes of s at x', `[..., 2]`; default: the same, as the paper prints it.
+
+    Returns:
+        The coefficients, each `[...]`.
+    """
+    N = A @ adjugate(metric(rest_slope)) @ A.mT
+    p, q = (rest_slope if slope is None else slope).unbind(-1)
+    xx, xy, yy = N[..., 0, 0], N[..., 0, 1], N[..., 1, 1]
+    constant = xx * (1 + p**2) + 2 * xy * p * q + yy * (1 + q**2)
+    return Coefficients(xx, yy, 2 * xy, 2 * (xx * p + xy * q), 2 * (xy * p + yy * q), constant)
+
+
+def form_matrix(m: Coefficients, dx: float, dy: float) -> Tensor:
+    """Eq. 63: the form in `(psi_ij, psi_i,j+1, psi_i+1,j, 1)` for forward differences, x along i.
+
+    As printed the linear terms stand above the diagonal only.
+
+    Args:
+        m: the coefficients.
+        dx: spacing along i.
+        dy: spacing along j.
+
+    Returns:
+        The matrix, `[..., 4, 4]`.
+    """
+    none = torch.zeros_like(m.one)
+    xx, yy, half = m.xx / dx**2, m.yy / dy**2, m.xy / (2 * dx * dy)
+    x, y = m.x / dx, m.y / dy
+    rows = [
+        [xx + 2 * half + yy, -yy - half, -xx - half, -x - y],
+        [-yy - half, yy, half, y],
+        [-xx - half, half, xx, x],
+        [none, none, none, m.one],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+class MongeMinimumEnergy(nn.Module):
+    """The minimum-energy estimator with heights at fixed (x, y) as unknowns, harmonic material, liquid filling; for study.
+
+    `|Q psi - gamma|^2 + s |S psi|^2` with the volume kept: Q is the derivative of the pieces' 3 x 2 maps in psi; what is of
+    second order in psi in them, the rays meeting a tilted surface, is left out. A rest load in psi is subtracted, so that zero
+    flow gives exactly psi = 0.
+
+    Args:
+        membrane: at rest.
+        elasticity: its elastic energy, "harmonic".
+        rest_rays: of the vertices at rest, `(origins, directions)`, `[V, 3]` each.
+        steps: 1 is the paper's (eqs. 18, 22, about psi = 0); more repeat it about the surface found.
+        smoothing: s over the rest tension.
+
+    Raises:
+        MembraneError: the surface is no graph over (x, y).
+
+    Limitations:
+        Where rays meet the surface between the fixed points, waves of one point's length hardly change what is observed: it
+        needs the smoother of eq. 28.
+
+    Example:
+        >>> from torchmembrane.surface.shapes import spherical_cap
+        >>> cap = spherical_cap(12, 5, 10, (5, 5))
+        >>> rays = torch.zeros_like(cap.rest), cap.rest
+        >>> estimator = MongeMinimumEnergy(cap, ElasticEnergy(cap, "harmonic"), rays)
+        >>> bool((estimator(*rays).vertices - cap.rest).abs().max() < 1e-9)
+        True
+    """
+
+    v: Tensor
+
+    def __init__(
+        self,
+        membrane: Membrane,
+        elasticity: ElasticEnergy,
+        rest_rays: tuple[Tensor, Tensor],
+        steps: int = 1,
+        smoothing: float = 0.1,
+    ) -> None:
+        super().__init__()
+        self.membrane, self.steps = membrane, steps
+        self.rest_pressure, _ = rest_balance(membrane, elasticity)
+        edges = _edges(membrane.rest, membrane.grid)
+        plane = edges[..., :2]
+        footprint = (plane[..., 0, 0] * plane[..., 1, 1] - plane[..., 0, 1] * plane[..., 1, 0]) * membrane.outward / 2
+        steepness = torch.linalg.cross(edges[..., 0, :], edges[..., 1, :]).norm(dim=-1) / 2 / footprint
+        if ((footprint <= 0) | (steepness > STEEPEST)).any():
+            raise MembraneError(
+                f"MongeMinimumEnergy: a piece is {float(steepness.abs().max()):.3g} times its footprint, or folded; expected a "
+                f"surface over the x, y plane, at most {STEEPEST:.3g} times: use MinimumEnergy, whose unknowns are ranges"
+            )
+        self.rest_plane = torch.linalg.inv(plane)
+        self.rest_slope = (self.rest_plane @ edges[..., 2:]).squeeze(-1)
+        self.weight = (elasticity.tension * footprint).sqrt()[..., None, None]
+        shares = footprint.flatten().repeat_interleave(3) / 3
+        self.v = footprint.new_zeros(len(membrane.rest)).index_add(0, membrane.triangles.flatten(), shares)[
+            membrane.free_vertices
+        ]
+        S = grid_laplacian(torch.eye(len(membrane.rest), dtype=torch.float64), membrane.grid)[:, membrane.free_vertices]
+        self.smooth = smoothing * elasticity.tension * S.T @ S
+        Q, gamma = self._linearised(torch.zeros_like(self.v), *rest_rays)
+        self.rest_load = -Q.T @ gamma - self.rest_pressure * self.v
+
+    def forward(self, origins: Tensor, directions: Tensor) -> Equilibrium:
+        """The equilibrium of one frame.
+
+        Args:
+            origins: of the vertices' rays, `[V, 3]`.
+            directions: of the vertices' rays, `[V, 3]`.
+
+        Returns:
+            The `Equilibrium`; its vertices are the material points, where their rays meet the surface found.
+        """
+        psi, pressure, step = self.heights(origins, directions)
+        x = self.material(psi, self._cells(psi, origins, directions), origins, directions)
+        return Equilibrium.without_tractions(x, pressure, self.membrane.volume(self.surface(psi)), step)
+
+    def heights(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`psi` at the free points, the pressure, and the last step over the surface's size (eqs. 22, 27 with `v.psi = 0`)."""
+        psi, v = torch.zeros_like(self.v), self.v
+        for _ in range(self.steps):
+            Q, gamma = self._linearised(psi, origins, directions)
+            load = Q.T @ gamma + self.rest_load - self.smooth @ psi
+            y, z = torch.linalg.solve(Q.T @ Q + self.smooth, torch.stack([load, v], -1)).unbind(-1)
+            pressure = -(v @ y) / (v @ z)
+            step = y + pressure * z
+            psi = psi + step
+        return psi, pressure, step.abs().max() / self.membrane.size
+
+    def _linearised(self, psi: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """`Q` and `gamma` of `|Q step - gamma|^2` about psi (eq. 18)."""
+        cell = self._cells(psi, origins, directions)
+
+        def maps(y: Tensor) -> Tensor:
+            return (self.weight * self.maps(self.material(y, cell, origins, directions))).flatten()
+
+        return torch.func.jacfwd(maps)(psi), -maps(psi)
+
+    def surface(self, psi: Tensor) -> Tensor:
+        """The points `(x, y, s + psi)` over the fixed grid, `[V, 3]`."""
+        lift = psi.new_zeros(len(self.membrane.rest)).index_add(0, self.membrane.free_vertices, psi)
+        return torch.cat([self.membrane.rest[:, :2], self.membrane.rest[:, 2:] + lift[:, None]], 1)
+
+    def _cells(self, psi: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
+        """The triangle of the surface that each ray meets, vertex indices `[V, 3]`."""
+        m, n = self.membrane.grid
+        now = Membrane(self.surface(psi).reshape(m, n, 3), self.membrane.fixed.numpy().reshape(m, n))
+        return torch.from_numpy(now.ray_points(origins, directions).vertices)
+
+    def material(self, psi: Tensor, cell: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
+        """Where the material points are: their rays and the planes of those triangles, `[V, 3]`."""
+        a, b, c = self.surface(psi)[cell].unbind(-2)
+        normal = torch.linalg.cross(b - a, c - a)
+        reach = ((a - origins) * normal).sum(-1, keepdim=True) / (directions * normal).sum(-1, keepdim=True)
+        return torch.where(self.membrane.fixed[:, None], self.membrane.rest, origins + reach * directions)
+
+    def maps(self, x: Tensor) -> Tensor:
+        """The pieces' maps into space, `[A; slope'.A] adj(G)^1/2 / det(G)^1/4`, of vertices `[V, 3]`: `[..., 3, 2]`.
+
+        Half their squares is the energy of Appendix D for each unit of `dx dy`.
+        """
+        edges = _edges(x, self.membrane.grid)
+        A = (self.rest_plane @ edges[..., :2]).mT
+        slope = torch.linalg.solve(edges[..., :2], edges[..., 2:])
+        lifted = torch.cat([A, slope.mT @ A], -2)
+        G = metric(self.rest_slope)
+        scale = torch.linalg.det(G)[..., None, None]
+        Q: Tensor = lifted @ torch.linalg.cholesky(adjugate(G)) / scale**0.25
+        return Q
+
+
+def _edges(x: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Both edges from the first corner of every triangle, `[m-1, n-1, 2, 2, 3]`."""
+    p = triangles_of(corners(x, grid))
+    return p[..., 1:, :] - p[..., :1, :]

@@ -1,0 +1,56 @@
+"""Tables of Parquet files, read within bounds: what a file declares is compared with them before memory is taken."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import MembraneError
+from .optional import load_pyarrow
+from .safe_read import DAMAGE, in_one_line, regular_size
+
+MOST_BYTES = 2**30
+"""Of a file, and of what its columns that are read take in memory."""
+VALUE_BYTES = 8
+"""Of one value, at most."""
+
+
+def read_table(path: Path, what: str, expected: str, columns: Sequence[str] | None = None) -> Any:
+    """A Parquet file as a `pyarrow.Table`; checksums, where it has them, are compared.
+
+    Args:
+        path: of the file.
+        what: is read, for messages.
+        expected: the remedy, for messages.
+        columns: the ones that are read; None: all.
+
+    Raises:
+        FileNotFoundError: there is none.
+        MembraneError: PyArrow is not installed; the file is damaged, too large, or lacks a column.
+    """
+    arrow, parquet = load_pyarrow()
+    try:
+        regular_size(path, MOST_BYTES, what)
+        with parquet.ParquetFile(path, page_checksum_verification=True) as file:
+            if missing := set(columns or ()) - set(file.schema_arrow.names):
+                raise ValueError(f"it has no column {min(missing)}")
+            if (size := _declared_bytes(file.metadata)) > MOST_BYTES:
+                raise ValueError(f"its columns take {size} bytes, more than {MOST_BYTES}")
+            table = file.read(columns)
+        table.validate(full=True)
+        return table
+    except FileNotFoundError:
+        raise
+    except (*DAMAGE, arrow.ArrowException) as error:
+        raise refusal(path, what, expected, error) from error
+
+
+def refusal(path: Path, what: str, expected: str, error: object) -> MembraneError:
+    """The error for a file that is not what it should be."""
+    cause = in_one_line(str(error).removeprefix(f"{path}: "))
+    return MembraneError(f"{path}: not {what}, or damaged ({cause}); expected {expected}")
+
+
+def _declared_bytes(metadata: Any) -> int:
+    """What all columns take in memory, as the file's footer says; what it says of one column may end the process if damaged."""
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    return sum(max(group.total_byte_size, group.num_rows * group.num_columns * VALUE_BYTES) for group in groups)

@@ -1,0 +1,252 @@
+"""The frames of a folder of results as rows of one Parquet dataset: small parts as work goes on, merged into large ones."""
+
+import json
+import re
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..files.atomic import whole_file
+from ..files.optional import load_pyarrow
+from ..files.parquet import read_table, refusal
+from ..files.provenance import Origin
+from ..files.safe_read import DAMAGE
+from .npz import Stored
+from .reconstruction import Frame, Reconstruction
+from .status import Status
+from .store import Mesh
+
+PART_ROWS = 256
+"""Frames of one Parquet file, at least, once there are as many."""
+PART_BYTES = 2**27
+"""Of the arrays of such a file, about: of large surfaces a file holds fewer frames."""
+SAVE_SECONDS = 5.0
+"""Frames are held back for this long at most."""
+PART = re.compile(r"part-\d+")
+A_PART = "a part of torchmembrane's results"
+AS_WRITTEN = "it as it was written: the same reconstruct command again sets it aside and does its frames again"
+COLUMNS = ("name", "status_text", *Origin._fields, "seconds", *Reconstruction._fields)
+
+
+class FrameTable:
+    """Frames as rows of `part-*.parquet`: name, status in words, the file that they are of, and the keys of `Reconstruction`,
+    arrays as nested lists of fixed sizes.
+
+    The schema's metadata hold the shapes (`shapes`, JSON: key to shape), units and the sensor's fingerprint. Rows are held
+    back for `SAVE_SECONDS`, or until `PART_ROWS` of them make a file.
+
+    Args:
+        folder: of the parts.
+        mesh: what the frames share.
+        gate: held while parts are changed.
+
+    Attributes:
+        damaged: parts that could not be read, as far as `stored` has come; they were renamed.
+    """
+
+    def __init__(self, folder: Path, mesh: Mesh, gate: AbstractContextManager[Any]):
+        self.arrow, self.parquet = load_pyarrow()
+        self.folder, self.mesh, self.gate = folder, mesh, gate
+        self.metadata = {key: getattr(mesh, key) for key in ("length_unit", "force_unit", "name", "sensor")}
+        self.damaged: list[Path] = []
+        self.part_rows = max(1, min(PART_ROWS, PART_BYTES // (60 * len(mesh.rest_vertices) + 30 * len(mesh.rest_pixels) + 300)))
+        self._waiting: dict[str, Stored] = {}
+        self._held: dict[Path, tuple[tuple[int, int], frozenset[str]]] = {}
+        self._saved = time.monotonic()
+
+    def names(self) -> set[str]:
+        """Of all frames, stored or held back."""
+        return set().union(self._waiting, *self._index().values())
+
+    def stored(self, wanted: Callable[[str], bool]) -> Iterator[tuple[str, Stored]]:
+        """All frames whose names are wanted, each read whole.
+
+        Parts are put right on the way: what cannot be read is renamed to `*.damaged`, rows that an interrupted merge left
+        twice are taken out, parts of earlier versions are written anew.
+        """
+        with self.gate:
+            seen: set[str] = set()
+            for part in self._parts():
+                try:
+                    table = _table(part)
+                    rows = _stored_rows(table, part)
+                    for stored in rows.values():
+                        self.mesh.check(stored.frame, part)
+                except DAMAGE:
+                    self.damaged.append(part)
+                    part.replace(part.with_suffix(".damaged"))
+                    continue
+                once = {name: stored for name, stored in rows.items() if name not in seen}
+                if not once:
+                    part.unlink()
+                elif len(once) < len(table):
+                    self._put(self._table_of(once), part)
+                elif tuple(table.column_names) != COLUMNS:
+                    self._put(self._table_of(rows), part)
+                seen |= once.keys()
+                yield from ((name, stored) for name, stored in once.items() if wanted(name))
+
+    def read(self, names: Iterable[str]) -> list[Frame]:
+        """The frames of these names, in their order; each part that holds one is read once."""
+        names, found = list(names), {name: stored.frame for name, stored in self._waiting.items()}
+        for part, held in self._index().items():
+            if not held.isdisjoint(names):
+                try:
+                    found |= read_part(part)
+                except FileNotFoundError:  # merged into another one meanwhile
+                    return self.read(names)
+        return [found[name] for name in names]
+
+    def write(self, name: str, stored: Stored) -> None:
+        """Hold a frame back until there are `PART_ROWS` of them, or `save` finds that it is time."""
+        self._waiting[name] = stored
+        if len(self._waiting) >= self.part_rows:
+            self._flush()
+
+    def forget(self, name: str) -> None:
+        """Take a frame away, if it is there."""
+        self._waiting.pop(name, None)
+        with self.gate:
+            self._drop([name])
+
+    def save(self) -> None:
+        """Write the frames that are held back, if the last time was `SAVE_SECONDS` ago."""
+        if time.monotonic() - self._saved >= SAVE_SECONDS:
+            self._flush()
+
+    def close(self) -> None:
+        """Write the frames that are held back, and merge small parts."""
+        self._flush()
+        with self.gate:
+            self._merge(least=2)
+
+    def _flush(self) -> None:
+        self._saved = time.monotonic()
+        if not self._waiting:
+            return
+        with self.gate:
+            self.folder.mkdir(exist_ok=True)
+            self._drop(self._waiting)
+            last = max((int(part.stem.rpartition("-")[2]) for part in self._parts()), default=-1)
+            self._put(self._table_of(self._waiting), self.folder / f"part-{last + 1:05d}.parquet")
+            self._waiting = {}
+            self._merge(least=self.part_rows)
+
+    def _merge(self, least: int) -> None:
+        """Small parts become one where they have `least` rows together. The first of them is replaced, the others are deleted:
+        interrupted in between, rows are there twice until the folder is opened again."""
+        group: dict[Path, int] = {}
+        for part, held in self._index().items():
+            if len(held) < self.part_rows:
+                group[part] = len(held)
+            if sum(group.values()) >= self.part_rows:
+                self._join(list(group))
+                group = {}
+        if sum(group.values()) >= least:
+            self._join(list(group))
+
+    def _join(self, parts: list[Path]) -> None:
+        if len(parts) > 1:
+            self._put(self.arrow.concat_tables([_table(part) for part in parts]), parts[0])
+            for part in parts[1:]:
+                part.unlink()
+
+    def _drop(self, names: Collection[str]) -> None:
+        """Take rows out of the parts that hold them."""
+        for part, held in self._index().items():
+            if held.isdisjoint(names):
+                continue
+            if held <= set(names):
+                part.unlink()
+                continue
+            table = _table(part)
+            self._put(table.filter(self.arrow.array([name not in names for name in _names(table, part)])), part)
+
+    def _parts(self) -> list[Path]:
+        return sorted(path for path in self.folder.glob("part-*.parquet") if PART.fullmatch(path.stem))
+
+    def _index(self) -> dict[Path, frozenset[str]]:
+        """The names in each part; those of parts that have not changed are not read again."""
+        try:
+            versions = {part: _version(part) for part in self._parts()}
+            for part, version in versions.items():
+                if self._held.get(part, ((), ()))[0] != version:
+                    self._held[part] = version, frozenset(_names(_table(part, ["name"]), part))
+        except FileNotFoundError:  # merged into another one meanwhile
+            return self._index()
+        return {part: self._held[part][1] for part in versions}
+
+    def _put(self, table: Any, part: Path) -> None:
+        with whole_file(part) as partial:
+            self.parquet.write_table(table, partial, use_dictionary=False, compression="zstd", write_page_checksum=True)
+
+    def _table_of(self, rows: dict[str, Stored]) -> Any:
+        arrays = [stored.arrays() for stored in rows.values()]
+        values = {key: np.stack([row[key] for row in arrays]) for key in (*Origin._fields, "seconds", *Reconstruction._fields)}
+        shapes = {key: list(values[key].shape[1:]) for key in Reconstruction._fields}
+        columns = {key: self._nested(value) for key, value in values.items()}
+        words = [Status(status).text for status in values["status"]]
+        columns |= {"name": self.arrow.array(list(rows)), "status_text": self.arrow.array(words)}
+        table = self.arrow.table({key: columns[key] for key in COLUMNS})
+        return table.replace_schema_metadata(self.metadata | {"shapes": json.dumps(shapes)})
+
+    def _nested(self, values: np.ndarray) -> Any:
+        column = self.arrow.array(values.ravel())
+        for size in reversed(values.shape[1:]):
+            column = self.arrow.FixedSizeListArray.from_arrays(column, size)
+        return column
+
+
+def read_part(part: Path) -> dict[str, Frame]:
+    """The frames of one part by name.
+
+    Raises:
+        MembraneError: it is not one, or damaged.
+    """
+    table = _table(part)
+    try:
+        return {name: stored.frame for name, stored in _stored_rows(table, part).items()}
+    except DAMAGE as error:
+        raise refusal(part, A_PART, AS_WRITTEN, error) from error
+
+
+def _table(part: Path, columns: list[str] | None = None) -> Any:
+    return read_table(part, A_PART, AS_WRITTEN, columns)
+
+
+def _version(part: Path) -> tuple[int, int]:
+    """What changes when a part is replaced.
+
+    Raises:
+        FileNotFoundError: it is not there any more.
+    """
+    try:
+        stat = part.stat()
+    except OSError as error:
+        if isinstance(error, FileNotFoundError) and not part.is_symlink():
+            raise
+        raise refusal(part, A_PART, AS_WRITTEN, error) from error
+    return stat.st_ino, stat.st_mtime_ns
+
+
+def _names(table: Any, part: Path) -> list[str]:
+    names: list[str] = table["name"].to_pylist()
+    if not all(isinstance(name, str) for name in names):
+        raise refusal(part, A_PART, AS_WRITTEN, "not all its names are text")
+    return names
+
+
+def _stored_rows(table: Any, part: Path) -> dict[str, Stored]:
+    columns = {}
+    for key, shape in json.loads(table.schema.metadata[b"shapes"]).items():
+        values = table[key].combine_chunks()
+        while hasattr(values, "flatten") and hasattr(values.type, "list_size"):
+            values = values.flatten()
+        columns[key] = values.to_numpy(zero_copy_only=False).reshape(len(table), *shape)
+    known = {key: table[key].to_pylist() for key in (*Origin._fields, "seconds") if key in table.column_names}
+    names = _names(table, part)
+    return {name: Stored.of({key: values[i] for key, values in (columns | known).items()}) for i, name in enumerate(names)}

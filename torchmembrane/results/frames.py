@@ -1,0 +1,107 @@
+"""The frames of a folder of results, each as its own NAME.npz or as a row of one Parquet dataset: both speak alike."""
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from ..errors import MembraneError
+from ..files.safe_read import DAMAGE, read_arrays
+from .frame_table import FrameTable
+from .npz import Stored, load_frame, load_stored, save_frame
+from .reconstruction import Frame
+from .store import MESH, Mesh, check_folder
+
+Frames: TypeAlias = "FrameFiles | FrameTable"
+
+
+def open_folder(folder: str | Path, mesh: Mesh, gate: AbstractContextManager[Any]) -> Frames:
+    """The frames of a folder that is made if need be, to be written.
+
+    Args:
+        folder: of the results.
+        mesh: what they share.
+        gate: held while files are changed that other processes change as well.
+
+    Raises:
+        MembraneError: what `check_folder` refuses.
+    """
+    folder = Path(folder)
+    with gate:
+        check_folder(folder, mesh.sensor, mesh.settings)
+        if not (folder / MESH).exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            mesh.save(folder / MESH)
+    return frames_of(folder, mesh, gate)
+
+
+def frames_of(folder: Path, mesh: Mesh, gate: AbstractContextManager[Any] | None = None) -> Frames:
+    """The frames of a folder whose mesh this is."""
+    if mesh.format == "parquet":
+        return FrameTable(folder / "frames", mesh, gate or nullcontext())
+    return FrameFiles(folder, mesh)
+
+
+class FrameFiles:
+    """Frames as one NAME.npz each: the keys of `Reconstruction`, and of `Stored`.
+
+    Args:
+        folder: of the files.
+        mesh: what the frames share.
+
+    Attributes:
+        damaged: files that could not be read, as far as `stored` has come.
+    """
+
+    def __init__(self, folder: Path, mesh: Mesh):
+        self.folder, self.mesh = folder, mesh
+        self.damaged: list[Path] = []
+
+    def names(self) -> set[str]:
+        """Of all frames stored; files that hold no result are left out."""
+        return {path.stem for path in self._files() if _holds_status(path)}
+
+    def stored(self, wanted: Callable[[str], bool]) -> Iterator[tuple[str, Stored]]:
+        """All frames whose names are wanted, each read whole; `damaged` then lists what could not be."""
+        for path in self._files():
+            if wanted(path.stem):
+                try:
+                    stored = load_stored(path)
+                    self.mesh.check(stored.frame, path)
+                except MembraneError:
+                    self.damaged.append(path)
+                    continue
+                yield path.stem, stored
+
+    def read(self, names: Iterable[str]) -> list[Frame]:
+        """The frames of these names, in their order."""
+        return [load_frame(self._path(name)) for name in names]
+
+    def write(self, name: str, stored: Stored) -> None:
+        """Store a frame, in place of an earlier one of its name."""
+        save_frame(self._path(name), stored.arrays())
+
+    def forget(self, name: str) -> None:
+        """Take a frame away, if it is there."""
+        if os.path.exists(self._path(name)):
+            self._path(name).unlink()
+
+    def save(self) -> None:
+        """Nothing is held back."""
+
+    def close(self) -> None:
+        """Nothing is held back."""
+
+    def _files(self) -> list[Path]:
+        return sorted(path for path in self.folder.glob("*.npz") if path.name != MESH)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.npz"
+
+
+def _holds_status(path: Path) -> bool:
+    try:
+        return int(read_arrays(path, ["status"])["status"]) >= 0
+    except DAMAGE:
+        return False

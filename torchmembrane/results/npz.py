@@ -1,0 +1,135 @@
+"""One frame as a file NAME.npz: its arrays, what they were found in, and the seconds that it took."""
+
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from ..errors import MembraneError
+from ..files.atomic import whole_file
+from ..files.provenance import Origin
+from ..files.safe_read import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays
+from .frame_shapes import shape_of
+from .reconstruction import Frame, Reconstruction
+
+ADDED = (
+    *("wrench", "contact_force", "contact_normal", "contact_area", "contact_slip", "contact_curvature", "contact_at_rim"),
+    *("coverage", "camera_motion", "force_deviation", "depth_deviation"),
+)
+"""Arrays that results did not always hold."""
+EXPECTED = "a result NAME.npz, the arrays of Reconstruction"
+
+
+class Stored(NamedTuple):
+    """A frame as it is stored: its arrays, what they were found in, and the seconds that it took.
+
+    Attributes:
+        frame: as `Reconstruction.frame` gives it.
+        origin: the image file, or the video.
+        seconds: NaN where it is not known.
+    """
+
+    frame: Frame
+    origin: Origin = Origin()
+    seconds: float = float("nan")
+
+    @classmethod
+    def of(cls, arrays: dict[str, Any]) -> "Stored":
+        """From all arrays of a file; those that it lacks are as unknown.
+
+        Raises:
+            KeyError: it lacks one that there always was.
+        """
+        known = {key: arrays[key] for key in Origin._fields if key in arrays}
+        origin = Origin()._replace(**{key: value.item() if hasattr(value, "item") else value for key, value in known.items()})
+        return cls(completed(arrays), origin, float(arrays.get("seconds", np.nan)))
+
+    def arrays(self) -> Frame:
+        """All arrays of a file, by name."""
+        known = {key: np.asarray(value) for key, value in self.origin._asdict().items()}
+        return self.frame | known | {"seconds": np.asarray(self.seconds, np.float64)}
+
+
+def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
+    """Write one frame, whole or not at all.
+
+    Args:
+        path: the file, `.npz`.
+        frame: as `Reconstruction.frame` gives it.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> frame = Reconstruction(*torch.ones(26, 1, 3)).frame(0)
+        >>> with TemporaryDirectory() as folder:
+        ...     save_frame(f"{folder}/press.npz", frame)
+        ...     load_frame(f"{folder}/press.npz")["force"].tolist()
+        [1.0, 1.0, 1.0]
+    """
+    arrays: dict[str, Any] = frame
+    content = BytesIO()  # written at once: each write of a file makes other threads wait for their turn
+    try:
+        np.savez(content, **arrays)
+    except ValueError as error:
+        if isinstance(error.__context__, KeyboardInterrupt):  # amid an entry, which zipfile then cannot close
+            raise error.__context__ from None
+        raise
+    with whole_file(path) as partial:
+        partial.write_bytes(content.getbuffer())
+
+
+def load_frame(path: str | Path) -> dict[str, np.ndarray]:
+    """Read a frame.
+
+    Args:
+        path: what `save_frame` wrote.
+
+    Returns:
+        Its arrays by name; see `save_frame` for an example.
+
+    Raises:
+        MembraneError: the file is missing, or not a frame.
+    """
+    return load_stored(Path(path)).frame
+
+
+def load_stored(path: Path) -> Stored:
+    """Read a frame, and what it was found in.
+
+    Raises:
+        MembraneError: as `load_frame`.
+    """
+    arrays = read_arrays(path, None, EXPECTED, NUMBERS + TEXT)
+    try:
+        return Stored.of({key: np.array(array, array.dtype.newbyteorder("=")) for key, array in arrays.items()})
+    except DAMAGE as error:
+        raise MembraneError(f"{path}: not a result of torchmembrane ({in_one_line(error)}); expected {EXPECTED}") from error
+
+
+def completed(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A frame that was stored before there were all of these arrays: those that it lacks are NaN.
+
+    Raises:
+        KeyError: it lacks one that there always was.
+    """
+    sizes = {"P": len(frame["contact_points"])}
+    added = {key: np.full(shape_of(key, sizes), np.nan, np.float32) for key in ADDED if key not in frame}
+    return {key: added[key] if key in added else frame[key] for key in Reconstruction._fields}
+
+
+def stack_frames(frames: list[dict[str, np.ndarray]]) -> Reconstruction:
+    """Frames of one sensor as a batch.
+
+    Args:
+        frames: as `Reconstruction.frame` gives them.
+
+    Returns:
+        The batch, in their order, on the CPU.
+
+    Example:
+        >>> first, second = (Reconstruction(*torch.full((26, 1, 3), value)).frame(0) for value in (1.0, 2.0))
+        >>> stack_frames([first, second]).force.tolist()
+        [[1.0, 1.0, 1.0], [2.0, 2.0, 2.0]]
+    """
+    return Reconstruction(**{k: torch.from_numpy(np.stack([f[k] for f in frames])) for k in Reconstruction._fields})

@@ -1,0 +1,159 @@
+"""Results read back: a folder of `torchmembrane reconstruct` as a sequence of frames that are loaded one by one."""
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..errors import MembraneError, expect
+from ..files.optional import load_pandas
+from .frame_table import PART_ROWS, read_part
+from .frames import frames_of
+from .npz import load_frame, stack_frames
+from .reconstruction import Frame, Reconstruction
+from .store import MESH, Mesh
+
+
+def read_results(folder: str | Path) -> "Results":
+    """The results in a folder, of either format.
+
+    Only names and `mesh.npz` are read now; frames are read where they are asked for. Frames that failed are among them, NaN,
+    with their status; images that could not be read have no frame (`summary.csv` lists them). Frames that are written to the
+    folder later are not included.
+
+    Args:
+        folder: what `torchmembrane reconstruct --out` was given.
+
+    Returns:
+        The frames, in name order.
+
+    Raises:
+        MembraneError: the folder holds no results, or not one frame.
+
+    Example:
+        Here the folder is written by hand, of a surface without vertices; `torchmembrane reconstruct` writes such folders.
+
+        >>> import numpy as np, tempfile
+        >>> from torchmembrane.results.frame_shapes import SHAPES, shape_of
+        >>> from torchmembrane.results.npz import save_frame
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> none = {2: np.zeros((0, 2)), 3: np.zeros((0, 3))}
+        >>> arrays = [none[3], none[3], none[3], np.zeros(0), np.zeros(2), none[2], none[2], np.zeros(2)]
+        >>> Mesh(*arrays, "mm", "N", "finger", "", "force-balance", "neo_hookean", "", "npz").save(folder / MESH)
+        >>> for name in ("rest", "press"):
+        ...     save_frame(folder / f"{name}.npz", {key: np.zeros(shape_of(key, {"V": 0, "D": 0, "P": 4})) for key in SHAPES})
+        >>> results = read_results(folder)
+        >>> results.names, results.mesh.length_unit, int(results["press"]["status"])
+        (['press', 'rest'], 'mm', 0)
+        >>> [float(frame["pressure"]) for frame in results], results.batch().pressure
+        ([0.0, 0.0], tensor([0., 0.], dtype=torch.float64))
+    """
+    return Results(Path(folder))
+
+
+class FoundFrame(NamedTuple):
+    """A frame that was asked for, and the folder in which its `mesh.npz` should be."""
+
+    name: str
+    frame: Frame
+    home: Path
+
+
+def read_frame(path: Path, name: str | None = None) -> FoundFrame:
+    """One frame of whatever holds results.
+
+    Args:
+        path: NAME.npz, a part of a Parquet dataset, or a folder of results.
+        name: of the frame in a part or a folder; default: the first.
+
+    Raises:
+        MembraneError: it holds no results, or none of this name.
+    """
+    if path.is_dir():
+        results = read_results(path)
+        chosen = results.names[0] if name is None else name
+        return FoundFrame(chosen, results[chosen], path)
+    if path.suffix != ".parquet":
+        expect(name in (None, path.stem), "--frame", name, f"a folder or a part to choose from; {path} is one frame")
+        return FoundFrame(path.stem, load_frame(path), path.parent)
+    frames = read_part(path)
+    chosen = next(iter(sorted(frames))) if name is None else name
+    if chosen not in frames:
+        raise MembraneError(f"{path}: no frame {chosen!r}; expected one of {len(frames)}, {min(frames)!r} the first")
+    return FoundFrame(chosen, frames[chosen], path.parent.parent if path.parent.name == "frames" else path.parent)
+
+
+class Results:
+    """The frames of a folder of results: a sequence in name order, and a mapping by name.
+
+    `len(results)` frames; `for frame in results` gives each as a dict of arrays (`Reconstruction.frame`), in the order of
+    `results.names`; `results["press"]` gives one, `"press" in results` asks for it. Frames are read from disk each time and not
+    kept: iterating over a folder of any size takes little memory, and over a Parquet dataset it is faster than asking by name,
+    which reads a part of the dataset each time.
+
+    Args:
+        folder: the folder of results.
+
+    Attributes:
+        folder: the same.
+        mesh: what all frames share: rest surface, triangles, units, settings.
+        names: of all frames, sorted.
+
+    Raises:
+        MembraneError: the folder holds no results, or not one frame.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.mesh = Mesh.load(folder / MESH)
+        self._frames = frames_of(folder, self.mesh)
+        self.names = sorted(self._frames.names())
+        self._known = frozenset(self.names)
+        if not self.names:
+            raise MembraneError(f"{folder}: no frames; expected results of `torchmembrane reconstruct`")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._known
+
+    def __getitem__(self, name: str) -> Frame:
+        if name not in self._known:
+            raise MembraneError(f"{self.folder}: no frame {name!r}; expected one of {len(self)}, {self.names[0]!r} the first")
+        return self._read([name])[0]
+
+    def __iter__(self) -> Iterator[Frame]:
+        names = iter(self.names)
+        while group := list(islice(names, PART_ROWS)):
+            yield from self._read(group)
+
+    def _read(self, names: list[str]) -> list[Frame]:
+        frames = self._frames.read(names)
+        for name, frame in zip(names, frames, strict=True):
+            self.mesh.check(frame, f"{self.folder}: {name}")
+        return frames
+
+    def __repr__(self) -> str:
+        return f"Results({str(self.folder)!r}: {len(self)} frames of {self.mesh.name!r})"
+
+    def batch(self) -> Reconstruction:
+        """All frames as one batch of tensors on the CPU, in the order of `names`.
+
+        Returns:
+            A `Reconstruction` whose tensors have `len(self)` rows. All frames are in memory at once.
+        """
+        return stack_frames(list(self))
+
+    def to_pandas(self) -> Any:
+        """The frames' single numbers (pressure, residual, status ...) as a table.
+
+        Returns:
+            A `pandas.DataFrame`: one row per frame, the names as its index, one column per array that holds one number.
+
+        Raises:
+            MembraneError: pandas is not installed (extra `pandas`).
+        """
+        pandas = load_pandas()
+        rows = [{key: array[()] for key, array in frame.items() if array.ndim == 0} for frame in self]
+        return pandas.DataFrame(rows, index=pandas.Index(self.names, name="name"))

@@ -1,0 +1,239 @@
+"""A folder of results: the settings that all its frames share, and `mesh.npz`, which holds them beside the rest surface."""
+
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from torch import Tensor
+
+from ..errors import MembraneError
+from ..files.safe_read import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays
+from ..pose import Pose
+from .frame_shapes import unlike
+from .npz import save_frame
+from .status import Status
+
+FINISHED = tuple(status for status in Status if status.has_surface)
+"""Status of frames that are not tried again."""
+FORMATS = ("npz", "parquet")
+MESH = "mesh.npz"
+OWN, NONE = "of the sensor", "not measured"
+
+
+class ResultMaker(Protocol):
+    """What makes the results of a folder: a `Reconstructor`."""
+
+    sensor: Any
+    estimator: Any
+    estimator_name: str
+    locator_name: str
+    model: str
+    vertex_pixels: Tensor
+
+    @property
+    def rest_pixels(self) -> Tensor: ...
+
+
+class Settings(NamedTuple):
+    """The choices that shape a result, besides the sensor: all frames of a folder share them."""
+
+    estimator: str
+    energy: str
+    element: str
+    format: str
+    volume: str = "exact"
+    flow: str = "smooth"
+    smoothing: float = 0.0
+    locator: str = "fit"
+    rest: str = ""
+    pressure: str = ""
+    pressure_noise: float = 0.0
+
+    @classmethod
+    def of(cls, reconstructor: ResultMaker, format: str, rest: str = "", pressure: str = "") -> "Settings":
+        """Those of results that a reconstructor makes; `rest`: what was taken for rest in place of the sensor's rest image,
+        `pressure`: the file of a gauge's readings."""
+        estimator = reconstructor.estimator
+        return cls(
+            estimator=reconstructor.estimator_name,
+            energy=reconstructor.model,
+            element=estimator.element,
+            format=format,
+            volume=estimator.volume,
+            flow=estimator.flow_kind,
+            smoothing=estimator.smoothing_weight,
+            locator=reconstructor.locator_name,
+            rest=rest,
+            pressure=pressure,
+            pressure_noise=getattr(estimator.settings, "pressure_noise", 0.0) if pressure else 0.0,
+        )
+
+
+class Mesh(NamedTuple):
+    """What all frames of a folder share, as stored in `mesh.npz`.
+
+    rest_vertices   [V, 3]  the rest surface, camera frame
+    rest_normals    [V, 3]  unit, outward
+    triangles       [T, 3]  int64, outward
+    fixed           [V]     bool, the rim
+    grid            [2]     int64, `V = grid[0] * grid[1]`, row-major
+    vertex_pixels   [V, 2]  where the rest vertices are seen
+    rest_pixels     [D, 2]  where the markers are seen at rest
+    image_size      [2]     int64, width and height, px
+    length_unit, force_unit, name    of the sensor
+    sensor          fingerprint of its file
+    estimator, energy, element, format, volume, flow, smoothing, locator, rest, pressure, pressure_noise    the `Settings`
+    camera_in_tool  [3, 4]  rotation and translation from the camera's frame to the tool's, `p_tool = R p + t`; [0, 4] where the
+                            sensor file has no `[tool]`; `tool` gives it as a `Pose`
+    """
+
+    rest_vertices: np.ndarray
+    rest_normals: np.ndarray
+    triangles: np.ndarray
+    fixed: np.ndarray
+    grid: np.ndarray
+    vertex_pixels: np.ndarray
+    rest_pixels: np.ndarray
+    image_size: np.ndarray
+    length_unit: str
+    force_unit: str
+    name: str
+    sensor: str
+    estimator: str
+    energy: str
+    element: str
+    format: str
+    volume: str = "exact"
+    flow: str = "smooth"
+    smoothing: float = 0.0
+    locator: str = "fit"
+    rest: str = ""
+    pressure: str = ""
+    pressure_noise: float = 0.0
+    camera_in_tool: np.ndarray = np.zeros((0, 4), np.float32)
+
+    @classmethod
+    def of(cls, reconstructor: ResultMaker, settings: Settings) -> "Mesh":
+        """What the frames of a `Reconstructor` share."""
+        sensor, membrane = reconstructor.sensor, reconstructor.estimator.membrane
+        return cls(
+            rest_vertices=_single(membrane.rest),
+            rest_normals=_single(membrane.rest_normals),
+            triangles=membrane.triangles.cpu().numpy().astype(np.int64),
+            fixed=membrane.fixed.cpu().numpy(),
+            grid=np.array(membrane.grid),
+            vertex_pixels=_single(reconstructor.vertex_pixels),
+            rest_pixels=_single(reconstructor.rest_pixels),
+            image_size=np.array(sensor.camera.image_size),
+            length_unit=sensor.length_unit,
+            force_unit=sensor.force_unit,
+            name=sensor.name,
+            sensor=sensor.fingerprint,
+            **settings._asdict(),
+            camera_in_tool=_rows(sensor.tool),
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Mesh":
+        """Read `mesh.npz`.
+
+        Raises:
+            MembraneError: there is none, or it is damaged, or not one.
+        """
+        expected = f"the {MESH} that is written beside results"
+        if not Path(path).exists():
+            raise MembraneError(f"{path}: no such file; expected {expected}")
+        try:
+            arrays = read_arrays(Path(path), None, expected, NUMBERS + TEXT)
+            found: dict[str, Any] = {key: arrays[key] for key in cls._fields if key in arrays or key not in cls._field_defaults}
+            mesh = cls(**{key: array.item() if array.ndim == 0 else array for key, array in found.items()})
+            mesh._refuse_unlike()
+        except DAMAGE as error:
+            cause = in_one_line(str(error).removeprefix(f"{path}: "))
+            raise MembraneError(f"{path}: not a {MESH} of torchmembrane ({cause}); expected {expected}") from error
+        return mesh
+
+    def check(self, frame: dict[str, np.ndarray], path: str | Path) -> None:
+        """Refuse a frame of another membrane or other markers.
+
+        Args:
+            frame: its arrays.
+            path: where it was read, for the message.
+
+        Raises:
+            MembraneError: an array is of another shape or type than here.
+        """
+        if said := unlike(frame, len(self.rest_vertices), len(self.rest_pixels)):
+            raise MembraneError(f"{path}: {said} as of its {MESH}: give the {MESH} of its folder, or reconstruct it again")
+
+    def _refuse_unlike(self) -> None:
+        """Raise `ValueError` where fields do not go together."""
+        V = len(self.rest_vertices)
+        wanted = {"rest_vertices": (V, 3), "rest_normals": (V, 3), "fixed": (V,), "grid": (2,), "image_size": (2,)}
+        wanted |= {"triangles": (len(self.triangles), 3), "vertex_pixels": (V, 2), "rest_pixels": (len(self.rest_pixels), 2)}
+        if self.camera_in_tool.size:  # none is `[0]` as `torchmembrane-edge` once wrote it
+            wanted["camera_in_tool"] = (3, 4)
+        for name, shape in wanted.items():
+            if (array := getattr(self, name)).shape != shape or array.dtype.kind not in NUMBERS:
+                raise ValueError(f"{name} is {array.dtype} {array.shape}, not {shape}")
+        for name, kind in self.__annotations__.items():
+            if kind in (str, float) and not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name} is {type(getattr(self, name)).__name__}, not {kind.__name__}")
+        if self.triangles.size and not 0 <= self.triangles.min() <= self.triangles.max() < V:
+            raise ValueError("its triangles have other corners than its vertices")
+        if int(np.prod(self.grid)) != V or self.format not in FORMATS:
+            raise ValueError(f"its grid is {self.grid.tolist()}, its format {self.format!r}")
+
+    def save(self, path: str | Path) -> None:
+        """Write `mesh.npz`, whole or not at all."""
+        save_frame(path, self._asdict())
+
+    @property
+    def settings(self) -> Settings:
+        """The choices that made the results."""
+        return Settings(*(getattr(self, name) for name in Settings._fields))
+
+    @property
+    def tool(self) -> Pose | None:
+        """The camera's pose in the tool's frame, as `Reconstruction.wrench_in` takes it; None where it is not known."""
+        known = len(self.camera_in_tool) > 0
+        return Pose(self.camera_in_tool[:, :3], self.camera_in_tool[:, 3]) if known else None
+
+    def normal_displacement(self, frame: dict[str, np.ndarray]) -> np.ndarray:
+        """Displacement along the rest normals, `[V]`, length unit: negative where the membrane is pressed in."""
+        along: np.ndarray = (frame["displacement"] * self.rest_normals).sum(-1)
+        return along
+
+
+def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
+    """Refuse a folder whose results are of another sensor (fingerprint) or of other settings, or no results at all."""
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise MembraneError(f"--out {folder}: is a file; expected a folder, new or of earlier results of this sensor")
+    if not (folder / MESH).exists():
+        if any(folder.glob("*.npz")) or (folder / "frames").exists():
+            raise MembraneError(f"--out {folder}: holds .npz files or frames/ but no {MESH}; choose another folder")
+        return
+    mesh = Mesh.load(folder / MESH)
+    if mesh.sensor != sensor:
+        other = f"{in_one_line(repr(mesh.name))} ({in_one_line(mesh.sensor[:12])}, here {sensor[:12]})"
+        raise MembraneError(f"--out {folder}: holds results of another sensor, {other}; choose another folder")
+    for option, before, now in zip(Settings._fields, mesh.settings, settings, strict=True):
+        if before != now:
+            held = in_one_line(before) if before else ""
+            name, none = option.replace("_", "-"), NONE if option == "pressure" else OWN
+            remedy = f"pass --{name} {held}" if held else f"leave --{name} out"
+            raise MembraneError(
+                f"--out {folder}: was made with {name} {held or none}, this call asks for {now or none}; choose another "
+                f"folder, or {remedy}"
+            )
+
+
+def _rows(pose: Pose | None) -> np.ndarray:
+    """Rotation and translation side by side, `[3, 4]`; `[0, 4]` of no pose."""
+    rows = np.zeros((0, 4)) if pose is None else np.column_stack([pose.rotation, pose.translation])
+    return rows.astype(np.float32)
+
+
+def _single(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().numpy().astype(np.float32)

@@ -1,0 +1,76 @@
+"""What a `state_dict` keeps: the camera, the material and what follows from it; all else is rebuilt from the sensor."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from .camera.model import Camera
+from .errors import MembraneError
+
+OF_MATERIAL = ("prestretch", "c1", "c2", "rest_pressure", "rest_load")
+IDENTITY = "rest_markers"
+"""The markers' rest positions `[D, 3]`: those of another sensor are refused."""
+GONE = ("marker_vertices", "marker_weights")
+"""Constants of earlier versions, in states that hold all."""
+ALIKE = 1e-4  # largest distance of rest markers of one sensor, over their extent
+
+
+def keep_small(module: nn.Module) -> None:
+    """Leave constants that are rebuilt from the sensor out of a module's state; parameters that were added stay.
+
+    States that hold all constants can still be loaded: those are checked for their shapes and left out.
+
+    Raises:
+        MembraneError: later, when a state is loaded that is another sensor's, or another grid's.
+    """
+    module.register_state_dict_post_hook(_leave_out)
+    module.register_load_state_dict_pre_hook(_complete)
+
+
+def _kept(module: nn.Module) -> set[str]:
+    """Names of the buffers that are kept, each once."""
+    camera = {f"{path}." for path, part in module.named_modules() if isinstance(part, Camera)}
+    names = [name for name, _ in module.named_buffers()]
+    return {
+        name
+        for name in names
+        if name == IDENTITY or name.rpartition(".")[2] in OF_MATERIAL or any(name.startswith(path) for path in camera)
+    }
+
+
+def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) -> None:
+    kept = _kept(module)
+    for name, _buffer in module.named_buffers(remove_duplicate=False):
+        if name not in kept:
+            state.pop(prefix + name, None)
+
+
+def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Check a state and put the constants in that it lacks, so that those are as they are."""
+    for name in GONE:
+        state.pop(prefix + name, None)
+    kept = _kept(module)
+    first = {id(buffer): name for name, buffer in reversed(list(module.named_buffers()))}
+    for name, buffer in module.named_buffers(remove_duplicate=False):
+        given = state.get(prefix + name)
+        if given is not None and given.shape != buffer.shape:
+            raise MembraneError(
+                f"Reconstructor.load_state_dict: {name} {list(given.shape)}; expected {list(buffer.shape)}: it is the state of "
+                "another sensor or grid; build the Reconstructor from that sensor's file"
+            )
+        if name == IDENTITY and given is not None:
+            _check_identity(given, buffer)
+        if first[id(buffer)] not in kept:
+            state[prefix + name] = buffer
+        elif name not in kept and prefix + first[id(buffer)] in state:
+            state[prefix + name] = state[prefix + first[id(buffer)]]
+
+
+def _check_identity(given: Tensor, own: Tensor) -> None:
+    off = torch.linalg.vector_norm(given.to(own) - own, dim=-1).max()
+    if off > ALIKE * torch.linalg.vector_norm(own.amax(0) - own.amin(0)):
+        raise MembraneError(
+            f"Reconstructor.load_state_dict: {IDENTITY} up to {float(off):.3g} off this sensor's; expected the state of this "
+            "sensor: build the Reconstructor from that sensor's file"
+        )
