@@ -14,14 +14,14 @@ import torch
 from torch import nn
 
 from torchmembrane import MembraneError
-from torchmembrane.control_flow import piece, unless
+from torchmembrane.control_flow import cond, traced
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.files.images import to_grey
 from torchmembrane.live.streams import ModelStream
 from torchmembrane.onnx import export
 from torchmembrane.onnx.export import Piece
 from torchmembrane.onnx.graph import Assembly
-from torchmembrane.onnx.trace import traced
+from torchmembrane.onnx.trace import traced_model
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.results.npz import load_frame
 from torchmembrane.results.reconstruction import Reconstruction
@@ -50,7 +50,7 @@ def reconstructor(small_sensor):
 def model_files(reconstructor, tmp_path_factory):
     """From rest, and from the frame before; what they share is traced once."""
     files = {tracking: tmp_path_factory.mktemp("model") / "model.onnx" for tracking in (False, True)}
-    known, trace = {}, export.traced
+    known, trace = {}, export.traced_model
 
     def once(piece, inputs, outputs):
         key = piece.owner, piece.function, *inputs
@@ -58,7 +58,7 @@ def model_files(reconstructor, tmp_path_factory):
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(export, "traced", once)
+        patch.setattr(export, "traced_model", once)
         for tracking, path in files.items():
             export.export(reconstructor, path, tracking=tracking)
     return files
@@ -112,11 +112,11 @@ def test_a_tracking_model_follows_dots_from_the_frames_before(model_files, recon
 
 
 class Search(nn.Module):
-    @piece
+    @traced
     def follow(self, x):
         return (x > 0).all(-1), 2 * x
 
-    @piece
+    @traced
     def search(self, y):
         return (y - 1,)
 
@@ -124,7 +124,7 @@ class Search(nn.Module):
 def test_what_runs_unless_a_condition_holds_runs_only_then():
     tracer, search = export.Tracer(), Search()
     positive, doubled = search.follow(tracer.given("x", torch.ones(2, 3)))
-    (y,) = unless(positive, (doubled,), lambda: search.search(doubled))
+    (y,) = cond(positive, (doubled,), lambda: search.search(doubled))
     tracer.assembly.named(y.name, "result")
     x, result = (onnx.helper.make_tensor_value_info(n, onnx.TensorProto.FLOAT, ["batch", 3]) for n in ("x", "result"))
     session = opened(tracer.assembly.model([x], [result], {}).SerializeToString())
@@ -287,8 +287,8 @@ def test_a_repeated_piece_is_a_loop():
     pulls = np.array([0.1, 0.3, 0.2], np.float32)
     names = ("height", "speed", "drag", "pull")
     inputs = dict(zip(names, (height, speed, drag, torch.tensor(0.1)), strict=True))
-    piece, assembly = traced(Piece(Fall(), Fall.step), inputs, ["a", "b"]), Assembly()
-    last = assembly.repeat(piece, {name: name for name in names[:3]}, 3, {"pull": pulls})
+    model, assembly = traced_model(Piece(Fall(), Fall.step), inputs, ["a", "b"]), Assembly()
+    last = assembly.loop(model, {name: name for name in names[:3]}, 3, {"pull": pulls})
     for name, here in zip(("end", "rate"), last.values(), strict=True):
         assembly.named(here, name)
     value = lambda name: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", 3])  # noqa: E731

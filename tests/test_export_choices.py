@@ -17,7 +17,7 @@ from torchmembrane.estimators.minimum_energy.flow import FLOWS
 from torchmembrane.onnx import check, export, trace
 from torchmembrane.onnx.check import Agreement, check_images, checked
 from torchmembrane.onnx.graph import Assembly
-from torchmembrane.onnx.trace import traced
+from torchmembrane.onnx.trace import traced_model
 from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.solve.inverse_root import by_products
@@ -116,7 +116,7 @@ class Lengths(torch.nn.Module):
 @pytest.mark.parametrize("frames", [1, 2, 5])
 @pytest.mark.parametrize("further", [lambda x, batch: x, lambda x, batch: x / batch])
 def test_lengths_of_the_batch_stay_free(frames, further):
-    model = traced(Lengths(further), {"x": torch.rand(2, 3)}, ["y"])
+    model = traced_model(Lengths(further), {"x": torch.rand(2, 3)}, ["y"])
     x = torch.rand(frames, 3)
     found = onnxruntime.InferenceSession(model.SerializeToString()).run(None, {"x": x.numpy()})[0]
     np.testing.assert_array_equal(found, Lengths(further)(x))
@@ -145,10 +145,10 @@ class Composite(torch.nn.Module):
 
 def test_a_graph_captured_at_once_is_what_torch_makes_of_it_in_two_steps(monkeypatch):
     inputs = {"x": torch.rand(2, 3, 3), "y": torch.rand(2, 3, 3)}
-    at_once = traced(Composite(), inputs, ["a", "b"])
+    at_once = traced_model(Composite(), inputs, ["a", "b"])
     monkeypatch.setattr(trace, "_captured", torch.export.export)
     monkeypatch.setattr(trace, "_quick", nullcontext)
-    in_two_steps = traced(Composite(), inputs, ["a", "b"])
+    in_two_steps = traced_model(Composite(), inputs, ["a", "b"])
     assert [node.op_type for node in at_once.graph.node] == [node.op_type for node in in_two_steps.graph.node]
     assert at_once.SerializeToString(deterministic=True) == in_two_steps.SerializeToString(deterministic=True)
 
@@ -162,7 +162,7 @@ class WithOnes(torch.nn.Module):
 
 def test_products_with_one_are_left_out():
     inputs = {"x": torch.rand(2, 3), "y": torch.rand(2, 3)}
-    model = traced(WithOnes(), inputs, ["a", "b", "c"])
+    model = traced_model(WithOnes(), inputs, ["a", "b", "c"])
     assert sorted(node.op_type for node in model.graph.node) == ["Add", "Mul", "Mul", "Mul", "ReduceSum"]
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     found = session.run(None, {name: value.numpy() for name, value in inputs.items()})
@@ -182,7 +182,7 @@ class Selected(torch.nn.Module):
 
 @pytest.mark.parametrize("frames", [1, 2, 5])
 def test_entries_of_rows_are_selected_one_by_one_and_whole_rows_as_such(frames):
-    model = traced(Selected(), {"x": torch.rand(2, 2, 5)}, ["a", "b", "c"])
+    model = traced_model(Selected(), {"x": torch.rand(2, 2, 5)}, ["a", "b", "c"])
     nodes = [node.op_type for node in model.graph.node]
     assert nodes.count("GatherElements") == 1 and nodes.count("Gather") == 1  # of rows and from the back it is the same one
     assert "Concat" not in nodes
@@ -194,7 +194,7 @@ def test_entries_of_rows_are_selected_one_by_one_and_whole_rows_as_such(frames):
 
 def test_a_number_that_depends_on_the_batch_is_refused():
     with pytest.raises(ValueError, match="depends on the batch's length, as a number"):
-        traced(Lengths(lambda x, batch: x + float(2 * batch)), {"x": torch.rand(2, 3)}, ["y"])
+        traced_model(Lengths(lambda x, batch: x + float(2 * batch)), {"x": torch.rand(2, 3)}, ["y"])
 
 
 class Rooted(torch.nn.Module):
@@ -211,10 +211,10 @@ class Rooted(torch.nn.Module):
 def test_a_named_function_is_one_node_only_while_a_piece_is_traced():
     random = torch.randn(2, 60, 60)
     matrix = random @ random.mT + torch.eye(60)
-    (node,) = traced(Rooted(), {"x": matrix}, ["y"]).graph.node
+    (node,) = traced_model(Rooted(), {"x": matrix}, ["y"]).graph.node
     assert (node.domain, node.op_type, list(node.attribute[0].ints)) == ("torchmembrane", "by_products", [60, 60])
     with pytest.raises(Exception, match="cholesky|decompos"):
-        traced(Rooted(torch.linalg.cholesky), {"x": matrix}, ["y"])
+        traced_model(Rooted(torch.linalg.cholesky), {"x": matrix}, ["y"])
     root = by_products(matrix)
     torch.testing.assert_close(root @ matrix @ root.mT, torch.eye(60).expand(2, -1, -1), atol=1e-3, rtol=0)
 
@@ -251,7 +251,7 @@ def test_what_float32_makes_of_a_model_is_no_disagreement(sensor, monkeypatch):
     assert checked(b"", made) == found
 
 
-@pytest.mark.parametrize("part", ["traced", "checked"])
+@pytest.mark.parametrize("part", ["traced_model", "checked"])
 def test_a_failure_is_said_in_one_line_and_nothing_is_written(part, small_sensor, tmp_path, monkeypatch, capsys):
     def refuse(*_):
         if part == "checked":

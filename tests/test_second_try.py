@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchmembrane.control_flow import mended
+from torchmembrane.control_flow import retry_rows
 from torchmembrane.estimators.base import Equilibrium, Observation
 from torchmembrane.estimators.force_balance.estimator import ALONE, ForceBalance
 from torchmembrane.estimators.force_balance.gauss_newton import Scales, State
@@ -220,7 +220,7 @@ def test_only_rows_that_are_not_done_are_worked_out_again():
         return (10 * x,)
 
     done = torch.tensor([True, False, True])
-    (taken,) = mended(
+    (taken,) = retry_rows(
         done, (torch.arange(3.0),), again, (torch.arange(3.0),), lambda _, values, others: (values[0] + others[0],)
     )
     assert asked == [[1.0]] and taken.tolist() == [0.0, 11.0, 2.0]

@@ -1,6 +1,6 @@
 """The order of an estimator's or a locator's steps, written once: for tensors, which take them at once, and for the exporter.
 
-A method that is a `piece`, `repeated` and `unless` do on tensors what they say. Given a `Value`, which stands for a tensor in a
+A method that is a `traced`, `fori_loop` and `cond` do on tensors what they say. Given a `Value`, which stands for a tensor in a
 graph that is being written, they are added to its `graph` instead. Between pieces values are only handed on.
 """
 
@@ -27,14 +27,14 @@ class Graph(Protocol):
         """Values of `function(owner, *inputs)`."""
         ...
 
-    def repeat(
+    def fori_loop(
         self, step: Callable[..., Any], rows: Sequence[tuple[float, ...]], state: Sequence[Any], given: Sequence[Any]
     ) -> Any:
-        """Values as `repeated` gives them."""
+        """Values as `fori_loop` gives them."""
         ...
 
-    def unless(self, done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[Any]]) -> Any:
-        """Values as `unless` gives them."""
+    def cond(self, done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[Any]]) -> Any:
+        """Values as `cond` gives them."""
         ...
 
 
@@ -45,7 +45,7 @@ class Value:
         self.graph = graph
 
 
-def piece(method: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
+def traced(method: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
     """Make a method one that a graph holds as it is traced once.
 
     Args:
@@ -54,7 +54,7 @@ def piece(method: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
     Example:
         >>> import torch
         >>> class Doubling(torch.nn.Module):
-        ...     @piece
+        ...     @traced
         ...     def forward(self, x):
         ...         return 2 * x
         >>> Doubling()(torch.tensor(3))
@@ -72,7 +72,7 @@ def piece(method: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
     return called
 
 
-def named(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[torch.Tensor], torch.Tensor]:
+def onnx_function(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[torch.Tensor], torch.Tensor]:
     """Make a function, to a tensor of the shape and type of its argument, one that a piece being traced holds as one node of
     the domain `NAMED`, its type the function's name: its own nodes are traced once for every shape and precision."""
 
@@ -103,7 +103,7 @@ def writing() -> Iterator[None]:
         _writing.reset(token)
 
 
-def repeated(
+def fori_loop(
     step: Callable[..., Any], rows: int | Sequence[tuple[float, ...]], state: Sequence[Any], *given: Any
 ) -> Sequence[Any]:
     """Take `state = step(*state, *given, *row)` for every row.
@@ -115,19 +115,19 @@ def repeated(
         given: what it does not.
 
     Example:
-        >>> repeated(lambda x, y, rate: (x + rate * y,), [(0.5,), (0.25,)], (1.0,), 4.0)
+        >>> fori_loop(lambda x, y, rate: (x + rate * y,), [(0.5,), (0.25,)], (1.0,), 4.0)
         (4.0,)
     """
     graph, table = _graph((*state, *given)), [()] * rows if isinstance(rows, int) else rows
     if graph is not None:
-        written: Sequence[Any] = graph.repeat(step, table, state, given)
+        written: Sequence[Any] = graph.fori_loop(step, table, state, given)
         return written
     for row in table:
         state = step(*state, *given, *row)
     return state
 
 
-def unless(done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[Any]]) -> Sequence[Any]:
+def cond(done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[Any]]) -> Sequence[Any]:
     """Take what `otherwise` gives, which is `values` where `done` holds: worked out only if somewhere it does not, but for a
     compiled graph, and for a device that would have to be waited for.
 
@@ -138,12 +138,12 @@ def unless(done: Any, values: Sequence[Any], otherwise: Callable[[], Sequence[An
     """
     graph = _graph(values)
     if graph is None:
-        return values if at_hand(done) and bool(done.all()) else otherwise()
-    written: Sequence[Any] = graph.unless(done, values, otherwise)
+        return values if can_sync(done) and bool(done.all()) else otherwise()
+    written: Sequence[Any] = graph.cond(done, values, otherwise)
     return written
 
 
-def in_parts(
+def chunked(
     size: int, function: Callable[..., Sequence[torch.Tensor]], given: Sequence[Any], *constants: Any
 ) -> Sequence[torch.Tensor]:
     """`function(*given, *constants)` of at most so many rows at a time: in a larger batch a processor waits for its memory.
@@ -157,17 +157,17 @@ def in_parts(
         constants: what it needs of all.
 
     Example:
-        >>> in_parts(2, lambda x, add: (x + add, x[:1]), [torch.arange(3)], 1)
+        >>> chunked(2, lambda x, add: (x + add, x[:1]), [torch.arange(3)], 1)
         [tensor([1, 2, 3]), tensor([0, 2])]
     """
-    if _graph(given) is not None or not at_hand(given[0]) or len(given[0]) <= size:
+    if _graph(given) is not None or not can_sync(given[0]) or len(given[0]) <= size:
         return function(*given, *constants)
     rows = range(0, len(given[0]), size)
     parts = [function(*(None if one is None else one[k : k + size] for one in given), *constants) for k in rows]
     return [torch.cat(values) for values in zip(*parts, strict=True)]
 
 
-def side_by_side(
+def stacked(
     function: Callable[..., Sequence[torch.Tensor]], starts: Sequence[Sequence[Any]], given: Sequence[Any]
 ) -> list[Sequence[Any]]:
     """`function(start, given)` of every start: of tensors at once, in one batch, which takes little longer than one where they
@@ -183,7 +183,7 @@ def side_by_side(
         >>> class Rate(NamedTuple):
         ...     value: torch.Tensor
         >>> starts = [(torch.tensor([1.0, 2.0]),), (torch.tensor([3.0, 4.0]),)]
-        >>> side_by_side(lambda start, rate: [start[0] * rate.value], starts, Rate(torch.tensor([1.0, 10.0])))
+        >>> stacked(lambda start, rate: [start[0] * rate.value], starts, Rate(torch.tensor([1.0, 10.0])))
         [[tensor([ 1., 20.])], [tensor([ 3., 40.])]]
     """
     if _graph((*starts, given)) is not None:
@@ -195,7 +195,7 @@ def side_by_side(
     return [list(values) for values in zip(*found, strict=True)]
 
 
-def unrecorded(function: Callable[..., Output], *given: Any) -> Output:
+def in_inference_mode(function: Callable[..., Output], *given: Any) -> Output:
     """`function(*given)`, a named tuple of tensors; where no gradient is recorded in inference mode, a tenth faster for many
     small tensors, of which copies come out that gradients may be taken of later.
 
@@ -204,7 +204,7 @@ def unrecorded(function: Callable[..., Output], *given: Any) -> Output:
         >>> class Twice(NamedTuple):
         ...     value: torch.Tensor
         >>> with torch.no_grad():
-        ...     found = unrecorded(lambda x: Twice(2 * x), torch.tensor(3.0))
+        ...     found = in_inference_mode(lambda x: Twice(2 * x), torch.tensor(3.0))
         >>> found, found.value.is_inference()
         (Twice(value=tensor(6.)), False)
     """
@@ -216,7 +216,7 @@ def unrecorded(function: Callable[..., Output], *given: Any) -> Output:
     return copies
 
 
-def rowwise(done: torch.Tensor, values: Sequence[torch.Tensor], others: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+def where_rows(done: torch.Tensor, values: Sequence[torch.Tensor], others: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     """`values` in the rows where `done [B]` holds, else `others`; each `[B, ...]`."""
     return [
         torch.where(done.reshape(-1, *(1,) * (value.ndim - 1)), value, other)
@@ -224,7 +224,7 @@ def rowwise(done: torch.Tensor, values: Sequence[torch.Tensor], others: Sequence
     ]
 
 
-def mended(
+def retry_rows(
     done: Any,
     values: Sequence[Any],
     again: Callable[..., Sequence[Any]],
@@ -246,8 +246,8 @@ def mended(
     """
     chosen = chosen or partial(_taken, None)
     if _graph(values) is not None:
-        return unless(done, values, lambda: chosen(done, values, again(*given)))
-    if not at_hand(done) or bool(done.all()):
+        return cond(done, values, lambda: chosen(done, values, again(*given)))
+    if not can_sync(done) or bool(done.all()):
         return values
     rows = (~done).nonzero().ravel()
     others = again(*(None if one is None else one[rows] for one in given))
@@ -255,12 +255,12 @@ def mended(
     return [value.index_copy(0, rows, other) for value, other in zip(values, taken, strict=True)]
 
 
-@piece
+@traced
 def _taken(_: None, done: torch.Tensor, values: Sequence[torch.Tensor], others: Sequence[torch.Tensor]) -> Any:
-    return rowwise(done, values, others)
+    return where_rows(done, values, others)
 
 
-def at_hand(done: torch.Tensor) -> bool:
+def can_sync(done: torch.Tensor) -> bool:
     """Whether its values can be looked at now."""
     return done.device.type == "cpu" and not torch.compiler.is_compiling()
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from .camera.motion import in_pixels, in_words, shift_of
-from .control_flow import piece, unrecorded
+from .control_flow import in_inference_mode, traced
 from .errors import MembraneError
 from .estimators.base import Contacts, Equilibrium, Observation, Problem
 from .estimators.breakdown import broken_down
@@ -196,7 +196,7 @@ class Reconstructor(nn.Module):
     ) -> Reconstruction:
         """As `forward`, from grey images `[B, 1, height, width]` in 0..1 of this module's precision and `pixels [B, D, 2]`
         of the frames before; nothing is checked."""
-        return unrecorded(self._seen, grey, before, rest_pixels, pressure)
+        return in_inference_mode(self._seen, grey, before, rest_pixels, pressure)
 
     def from_pixels(
         self,
@@ -219,7 +219,7 @@ class Reconstructor(nn.Module):
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
             flow = self.observer.from_pixels(pixels, confidence, rest_pixels)
-            return unrecorded(self._solve, flow, pressure)
+            return in_inference_mode(self._solve, flow, pressure)
 
     def _seen(self, grey: Tensor, before: Tensor | None, rest: Tensor | None, *gauge: Any) -> Reconstruction:
         return self._solve(self.observer(grey, before, rest), *gauge)
@@ -232,7 +232,7 @@ class Reconstructor(nn.Module):
             return self._solve(flow._replace(status=broken), pressure)
         return self.result(found, observation, flow.displacement, confidence, status)
 
-    @piece
+    @traced
     def observation(self, displacement: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
         """What the estimator is given, from the markers' displacements `[B, D, 2]`, confidence `[B, D]` and covariance
         `[B, D, 2, 2]`; default: that of the rest image's."""
@@ -243,7 +243,7 @@ class Reconstructor(nn.Module):
         error = (LEAST_ERROR**2 + MODEL_ERROR**2 * square)[:, None, None, None] * one
         return self.estimator.prepare(self.camera, self.rest_pixels + displacement, confidence, covariance + error)
 
-    @piece
+    @traced
     def result(
         self, found: Equilibrium, observation: Observation, displacement: Tensor, confidence: Tensor, status: Tensor
     ) -> Reconstruction:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..control_flow import at_hand, piece
+from ..control_flow import can_sync, traced
 from ..errors import MembraneError
 from ..results.status import Status
 from .locator import Locator, isotropic
@@ -160,7 +160,7 @@ class MarkerObserver(nn.Module):
         before = None if previous is None else self.located(previous)
         return MarkerFlow(*self.displaced(*self.locator(images, before), status, rest_pixels), status)
 
-    @piece
+    @traced
     def check(self, images: Tensor) -> Tensor:
         """Status `[B]` of images."""
         flat, sparse = images.flatten(1), images[..., ::SPARSE, ::SPARSE]
@@ -170,12 +170,12 @@ class MarkerObserver(nn.Module):
         blank = (high - low < LEAST_CONTRAST) | ((saturated > SATURATED_SHARE) & (mean > 0.5))
         return (Status.BLANK.value * blank.to(torch.int64)).masked_fill(bad, Status.BAD_VALUES.value)
 
-    @piece
+    @traced
     def located(self, pixels: Tensor) -> Tensor:
         """`pixels` of a result as the locator found them."""
         return pixels - self.rest_pixels + self.measured_rest
 
-    @piece
+    @traced
     def displaced(
         self, pixels: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor, rest_pixels: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -207,7 +207,7 @@ class MarkerObserver(nn.Module):
         covariance = self.rest_covariance + isotropic(confidence, NOISE)
         return MarkerFlow(displacement, self.screen(displacement, confidence), covariance, status)
 
-    @piece
+    @traced
     def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
         """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""
         found = confidence > FOUND
@@ -225,6 +225,6 @@ def _checked_confidence(confidence: Tensor | None, pixels: Tensor) -> Tensor:
     confidence, shape = torch.as_tensor(confidence).to(pixels), pixels.shape[:2]
     if confidence.shape not in (shape, shape[1:]):
         raise MembraneError(f"from_pixels: confidence {list(confidence.shape)}; expected {list(shape)}, one for each marker")
-    if at_hand(confidence) and not ((confidence >= 0) & (confidence <= 1)).all():
+    if can_sync(confidence) and not ((confidence >= 0) & (confidence <= 1)).all():
         raise MembraneError("from_pixels: confidence outside 0..1; expected 0 for a lost marker, up to 1 for a sure one")
     return confidence.expand(shape)

@@ -1,6 +1,6 @@
 """A sensor's whole reconstruction, image to result, as one ONNX file: `torchmembrane export`.
 
-The reconstructor is called with `Value`s: what it and its parts mark as a `piece` is traced once each and put together.
+The reconstructor is called with `Value`s: what it and its parts mark as `traced` is traced once each and put together.
 """
 
 import json
@@ -25,7 +25,7 @@ from ..results.status import Status
 from ..results.store import FORMATS, Mesh, Settings
 from .check import checked
 from .graph import Assembly, described, inlined
-from .trace import traced
+from .trace import traced_model
 
 FORMAT = 1
 EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
@@ -75,10 +75,10 @@ class Tracer:
         model, names, found = self._trace(owner, function, inputs)
         return self._known(found, self.assembly.append(model, names))
 
-    def repeat(
+    def fori_loop(
         self, step: Callable[..., Any], rows: Sequence[tuple[float, ...]], state: Sequence[Any], given: Sequence[Any]
     ) -> Any:
-        """Values after a loop of a bound piece, as `pieces.repeated`."""
+        """Values after a loop of a bound piece, as `control_flow.fori_loop`."""
         assert isinstance(step, MethodType) and isinstance(step.__self__, nn.Module)
         precise = state[0].example.dtype == torch.float64
         columns = [np.array(column, np.float64 if precise else np.float32) for column in zip(*rows, strict=True)]
@@ -86,14 +86,14 @@ class Tracer:
         model, names, found = self._trace(step.__self__, unwrap(step.__func__), [*state, *given, *row])
         tables = dict(zip(reversed(names), reversed(columns), strict=False))
         names = {name: here for name, here in names.items() if name not in tables}
-        return self._known(found, self.assembly.repeat(model, names, len(rows), tables))
+        return self._known(found, self.assembly.loop(model, names, len(rows), tables))
 
-    def unless(self, done: Known, values: Sequence[Known], otherwise: Callable[[], Sequence[Known]]) -> Sequence[Known]:
-        """Values after a conditional, as `pieces.unless`."""
+    def cond(self, done: Known, values: Sequence[Known], otherwise: Callable[[], Sequence[Known]]) -> Sequence[Known]:
+        """Values after a conditional, as `control_flow.cond`."""
         condition = self.call(None, _everywhere, (done,))
         names = {k: value.name for k, value in enumerate(values)}
         kinds = [_kind(value.example) for value in values]
-        with self.assembly.unless(condition.name, names, kinds):
+        with self.assembly.cond(condition.name, names, kinds):
             names |= {k: value.name for k, value in enumerate(otherwise())}
         return [Known(self, names[k], value.example) for k, value in enumerate(values)]
 
@@ -121,7 +121,7 @@ class Tracer:
             self.progress(getattr(function, "__qualname__", ""))
             outputs = [f"output {k}" for k, _ in enumerate(value for value in tree_leaves(found) if value is not None)]
             try:
-                self.traced[key] = self._whole(traced(Piece(owner, function, arranged), examples, outputs))
+                self.traced[key] = self._whole(traced_model(Piece(owner, function, arranged), examples, outputs))
             except Exception as error:  # of torch's exporter and of what it calls, which raise what they like
                 reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
                 name = getattr(function, "__qualname__", str(function))
@@ -129,17 +129,17 @@ class Tracer:
         return self.traced[key], names, found
 
     def _whole(self, model: onnx.ModelProto) -> onnx.ModelProto:
-        """The model with the nodes of the `named` functions that it holds."""
+        """The model with the nodes of the `onnx_function`s that it holds."""
         return inlined(model, self._function)
 
     def _function(self, node: onnx.NodeProto) -> onnx.ModelProto:
-        """The model of a `named` function for the sizes that a node has, but for the batch, and its precision."""
+        """The model of a `onnx_function` for the sizes that a node has, but for the batch, and its precision."""
         given = {attribute.name: attribute for attribute in node.attribute}
         name, sizes, width = node.op_type, tuple(given["sizes"].ints), given["bytes"].i
         if (name, sizes, width) not in self.traced:
             example = {"value": torch.zeros(EXAMPLES, *sizes, dtype=torch.float32 if width == 4 else torch.float64)}
             piece = Piece(None, lambda _, value: FUNCTIONS[name](value))
-            self.traced[name, sizes, width] = self._whole(traced(piece, example, ["result"]))
+            self.traced[name, sizes, width] = self._whole(traced_model(piece, example, ["result"]))
         return self.traced[name, sizes, width]
 
     def _known(self, found: Any, names: dict[str, str]) -> Any:

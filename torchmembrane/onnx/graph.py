@@ -21,7 +21,7 @@ SPARSE_SIZE, SPARSE_SHARE = 4096, 0.7
 
 
 def inlined(model: onnx.ModelProto, function: Callable[[onnx.NodeProto], onnx.ModelProto]) -> onnx.ModelProto:
-    """The model with the nodes of `pieces.named` functions, of one input and output each, replaced by those of their models."""
+    """The model with the nodes of `onnx_function`s, of one input and output each, replaced by those of their models."""
     graph, nodes, constants = model.graph, [], {}
     for node in graph.node:
         if node.domain != NAMED:
@@ -58,7 +58,7 @@ class Assembly:
 
     Nodes are named `PART/...` after the `part` at the time.
 
-    `append` and `repeat` take a model from `traced` and the names that its inputs have here, and return its outputs' names.
+    `append` and `loop` take a model from `traced_model` and the names that its inputs have here, and return its outputs' names.
     """
 
     def __init__(self) -> None:
@@ -121,9 +121,7 @@ class Assembly:
         """Give a value the name of an output."""
         self.nodes.append(helper.make_node("Identity", [name], [output]))
 
-    def repeat(
-        self, piece: onnx.ModelProto, names: dict[str, str], steps: int, tables: dict[str, np.ndarray]
-    ) -> dict[str, str]:
+    def loop(self, piece: onnx.ModelProto, names: dict[str, str], steps: int, tables: dict[str, np.ndarray]) -> dict[str, str]:
         """Add a Loop of the piece, whose outputs, in order, are the next values of its first inputs.
 
         `tables` hold, for further inputs, a row for every step; inputs not in them keep their value.
@@ -148,7 +146,7 @@ class Assembly:
         return last
 
     @contextmanager
-    def unless(self, condition: str, names: dict[Any, str], kinds: Sequence[int]) -> Iterator[None]:
+    def cond(self, condition: str, names: dict[Any, str], kinds: Sequence[int]) -> Iterator[None]:
         """Pieces appended inside run where `condition` (bool) is false only.
 
         `names` of values here, of such element types; inside they are to be given the names of what replaces them. On leaving

@@ -118,7 +118,7 @@ def _quick() -> Iterator[None]:
         yield
 
 
-def traced(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> onnx.ModelProto:
+def traced_model(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> onnx.ModelProto:
     """A module as ONNX, its inputs and outputs named in order; the first axis of every input is the batch (of scalars none).
 
     Traced is a batch of `MANY` frames, a length that nothing else has, and what the graph then holds of it is made free. With a

@@ -24,7 +24,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..control_flow import at_hand, named
+from ..control_flow import can_sync, onnx_function
 
 LEAF = 140  # rows: halves of a smaller one take no less time
 ITERATED_LEAF = 48
@@ -54,13 +54,13 @@ def by_cholesky(matrix: Tensor) -> Tensor:
         return _by_parts(matrix, by_cholesky, LEAF)
     factor, info = torch.linalg.cholesky_ex(matrix)
     one = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    if at_hand(info) and any(info.flatten().tolist()):
+    if can_sync(info) and any(info.flatten().tolist()):
         ridge = torch.where(info > 0, RIDGE * matrix.abs().sum(-1).amax(-1), 0.0)
         factor = torch.linalg.cholesky_ex(matrix + ridge[..., None, None] * one).L
     return torch.linalg.solve_triangular(factor, one.expand_as(matrix), upper=False)
 
 
-@named
+@onnx_function
 def by_products(matrix: Tensor) -> Tensor:
     """Too small in the directions of a leaf's eigenvalues below its largest over `LARGEST_CONDITION`."""
     if matrix.shape[-1] > ITERATED_LEAF:

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from ...camera.model import Camera
-from ...control_flow import mended, piece, rowwise
+from ...control_flow import retry_rows, traced, where_rows
 from ...mechanics.cavity import CavityLaw, rest_balance
 from ...mechanics.hyperelastic import ElasticEnergy
 from ...solve.stencil import inner, pad_border
@@ -197,19 +197,19 @@ class ForceBalance(nn.Module):
         """The surface that the markers' rays show."""
         measured = self.equations.bearings.measured(observation)
         found = self._solved(measured)
-        return Equilibrium(*mended(self.is_done(found, measured), found, self._patiently, measured, self.chosen))
+        return Equilibrium(*retry_rows(self.is_done(found, measured), found, self._patiently, measured, self.chosen))
 
     def _patiently(self, *measured: Any) -> Equilibrium:
         """In many small steps: deep presses need them."""
         return self._solved(Bearings(*measured), patient=True)
 
-    @piece
+    @traced
     def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
         """`values` where `done [B]` holds, where the others broke down or are worse than what has converged; else `others`."""
         first, second = Equilibrium(*values), Equilibrium(*others)
         is_worse = second.objective > self.settings.worse_objective * first.objective
         stands = self.is_converged(first) & self.is_explained(first) & is_worse
-        return Equilibrium(*rowwise(done | stands | second.objective.isnan(), first, second))
+        return Equilibrium(*where_rows(done | stands | second.objective.isnan(), first, second))
 
     def _solved(self, measured: Bearings, patient: bool = False) -> Equilibrium:
         state, before = self._stepped(measured, patient)
@@ -251,7 +251,7 @@ class ForceBalance(nn.Module):
         coarsest, fine = (settings.patient_tau, settings.patient_fine_tau) if patient else (settings.tau, settings.fine_tau)
         return settings.gnc_schedule(steps, coarsest if self.coarse is None else fine)
 
-    @piece
+    @traced
     def at_rest(self, confidence: Tensor) -> State:
         """The rest surface and pressure and a camera that has not moved, for every row of `confidence [B, D]`."""
         frames, pressure = confidence.shape[0], self.rest_pressure
@@ -259,12 +259,12 @@ class ForceBalance(nn.Module):
             torch.zeros_like(self.membrane.rest).repeat(frames, 1, 1), pressure.repeat(frames), (0 * pressure).repeat(frames, 4)
         )
 
-    @piece
+    @traced
     def coarsened(self, u: Tensor, pressure: Tensor, moved: Tensor) -> State:
         """Displacements `[B, V, 3]` of every second line, for `coarse`; pressure `[B]`, as far from rest; camera `[B, 4]`."""
         return State(u.unflatten(1, self.membrane.grid)[:, ::2, ::2].flatten(1, 2), pressure - self._above_coarse(), moved)
 
-    @piece
+    @traced
     def refined(self, u: Tensor, pressure: Tensor, moved: Tensor) -> State:
         """What `coarse` found on this grid: the displacement is bicubic between its lines, so that it has no folds there."""
         assert self.refinement is not None  # only called with what the coarser grid has found
@@ -275,7 +275,7 @@ class ForceBalance(nn.Module):
         assert self.coarse is not None
         return self.rest_pressure - self.coarse.rest_pressure
 
-    @piece
+    @traced
     def equilibrium(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
         """What this state amounts to; `before`: the displacement a step earlier."""
         membrane, loss, x = self.membrane, self.equations.loss, self.membrane.rest + u
@@ -292,18 +292,18 @@ class ForceBalance(nn.Module):
         reasons = misfit, moved, objective, unexplained, loss.pushed(judged.push2), shared
         return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *reasons)
 
-    @piece
+    @traced
     def is_converged(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: the last step was short and the volume is what the cavity's law asks for."""
         error, settings = self.cavity.volume_error(found.volume, found.pressure).abs(), self.settings
         return ~((found.relative_step > settings.largest_relative_step) | (error > settings.largest_volume_error))
 
-    @piece
+    @traced
     def is_settled(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: neither unfinished nor unexplained, so that more steps would change little."""
         return (found.relative_step < self.settings.settled_step) & self.is_converged(found) & self.is_explained(found)
 
-    @piece
+    @traced
     def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
         """`[B]` bool: settled, likely, no mound for a pit, hardly a marker outside, as beside a contact steps went past."""
         settings, (least, most, untouched) = self.settings, self.settings.likely_objective

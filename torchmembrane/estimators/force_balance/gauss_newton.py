@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...control_flow import in_parts, piece, repeated, rowwise
+from ...control_flow import chunked, fori_loop, traced, where_rows
 from ...mechanics.cavity import CavityLaw
 from ...solve.implicit import differentiable
 from ...solve.kkt import border_unknowns
@@ -81,7 +81,7 @@ class Descent(nn.Module):
         taus, size = [tau for tau, _ in schedule], len(schedule)
         numbers = [self._numbers(taus[: k + 1], damping if size - k <= settling else 0.0) for k in range(size)]
         rows = [(*scales, cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
-        u, pressure, moved, before = in_parts(frames, self._stepped, (*state, *measured), rows, settling)
+        u, pressure, moved, before = chunked(frames, self._stepped, (*state, *measured), rows, settling)
         return State(u, pressure, moved), before
 
     def _numbers(self, taus: list[float], least: float) -> tuple[float, float]:
@@ -104,9 +104,9 @@ class Descent(nn.Module):
         if self.is_native(*state, *of_markers):
             state = self.native.take(*self._given, State(u, pressure, moved), state[4], measured, first)
         else:
-            state = repeated(self._next, first, state, measured)
+            state = fori_loop(self._next, first, state, measured)
         if last:
-            state = repeated(self._settle, last, (*state, *state[:4], self._none_found(pressure)), measured)[5:]
+            state = fori_loop(self._settle, last, (*state, *state[:4], self._none_found(pressure)), measured)[5:]
         u, pressure, moved, before = state[:4]
         return u, pressure, moved, before
 
@@ -114,12 +114,12 @@ class Descent(nn.Module):
         """Whether steps of these tensors are taken by machine code."""
         return takes(*values, self.equations.forces.elasticity.prestretch)
 
-    @piece
+    @traced
     def _unweighted(self, u: Tensor) -> Tensor:
         """What the first step has for the weights of a step before, `[B, N]`, and does not ask."""
         return torch.ones_like(u[:, : self.equations.loss.area.shape[0], 0])
 
-    @piece
+    @traced
     def _none_found(self, pressure: Tensor) -> Tensor:
         """The objective of no state, `[B]`."""
         return torch.full_like(pressure, torch.inf)
@@ -148,7 +148,7 @@ class Descent(nn.Module):
         normals = self.membrane.normals(self.membrane.rest + u)
         return inner(traction, self.membrane.grid).mT, inner(normals, self.membrane.grid).mT
 
-    @piece
+    @traced
     def _next(
         self,
         u: Tensor,
@@ -163,7 +163,7 @@ class Descent(nn.Module):
         state, weights = self._traced_once(State(u, pressure, moved), weights, measured, scales)
         return *state, u, weights
 
-    @piece
+    @traced
     def _settle(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, weights: Tensor, *given: Any) -> list[Tensor]:
         """As `_next`, and of the states so far that of the lowest objective, the displacement before it, and the objective: a
         vertex that is pushed in one step and pulled in the next is no answer in every step.
@@ -175,7 +175,7 @@ class Descent(nn.Module):
         state, weights = self._traced_once(State(u, pressure, moved), weights, measured, given[6:])
         objective = self.objective(state, *self.tractions(*state[:2]), measured)
         is_lower = objective < lowest
-        return [*state, u, weights, *rowwise(is_lower, (*state, u, objective), (*kept, lowest))]
+        return [*state, u, weights, *where_rows(is_lower, (*state, u, objective), (*kept, lowest))]
 
     def _traced_once(self, state: State, weights: Tensor, measured: Bearings, scales: Sequence[float]) -> tuple[State, Tensor]:
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.

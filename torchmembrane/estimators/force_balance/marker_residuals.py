@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from ...camera.model import Camera
 from ...camera.motion import motion_of_pixels
-from ...control_flow import piece
+from ...control_flow import traced
 from ...markers.spacing import neighbours
 from ...solve.stencil import inner
 from ...solve.stencil_layouts import NEAR
@@ -120,7 +120,7 @@ class MarkerBearings(nn.Module):
         spread = torch.full_like(self.positions[:, 0], noise**2) if across is None else _spread(across)[0]
         self.register_buffer("rest_spread", spread)
 
-    @piece
+    @traced
     def measured(self, observation: Observation) -> Bearings:
         """The markers' rays as `angles` takes them."""
         origins, directions, confidence, across, motion, gauge = observation.to(self.positions.dtype)

@@ -8,7 +8,7 @@ every grid has a rest pressure of its own. Where there is no reading the weight 
 import torch
 from torch import Tensor
 
-from ...control_flow import at_hand
+from ...control_flow import can_sync
 from ...errors import MembraneError
 
 
@@ -37,7 +37,7 @@ def gauge_reading(pressure: Tensor | float, rest_pressure: Tensor, deviation: fl
     read, frames = torch.as_tensor(pressure).to(confidence), len(confidence)
     if read.shape not in ((), (frames,)):
         raise MembraneError(f"pressure {list(read.shape)}; expected [{frames}], one reading for each frame, NaN where none is")
-    if at_hand(read) and bool(read.isinf().any()):
+    if can_sync(read) and bool(read.isinf().any()):
         raise MembraneError("pressure: inf; expected force / length^2 across the membrane, NaN where there is no reading")
     known = read.isfinite().expand(frames)
     change = torch.where(known, read - rest_pressure, 0.0)

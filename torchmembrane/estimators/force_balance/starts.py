@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from ...control_flow import piece, rowwise, side_by_side
+from ...control_flow import stacked, traced, where_rows
 from ...solve.stencil import pad_border
 from ...surface.membrane import Membrane
 from ..base import Equilibrium
@@ -54,17 +54,17 @@ class Dent(nn.Module):
         self.register_buffer("area", self.membrane.rest_area / size**2)
         self.register_buffer("free", (~self.membrane.fixed).double())
 
-    @piece
+    @traced
     def forward(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
         """The state, its surface dented where the middle of the pushes around, weighted by their squares, is near."""
         return self._dented(u, pressure, moved, measured, DEPTH, WIDTH)
 
-    @piece
+    @traced
     def deep(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
         """The state, dented deeper."""
         return self._dented(u, pressure, moved, measured, *DEEP)
 
-    @piece
+    @traced
     def wide(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
         """The state, dented deeper and wider."""
         return self._dented(u, pressure, moved, measured, *WIDE)
@@ -115,17 +115,17 @@ class Dent(nn.Module):
             state, before = self.descent(State(*start), measured, schedule)
             return *state, before
 
-        best, *others = side_by_side(stepped, starts, measured)
+        best, *others = stacked(stepped, starts, measured)
         for other in others:
             best = self.lower(best, other, measured)
         return State(*best[:3]), best[3]
 
-    @piece
+    @traced
     def lower(self, kept: Stepped, other: Stepped, measured: Bearings) -> Stepped:
         """`other` in the rows where its objective is lower than that of `kept`, or `kept` has none."""
         of_kept, of_other = (
             self.descent.objective(State(*each[:3]), *self.descent.tractions(*each[:2]), measured) for each in (kept, other)
         )
         is_lower = of_other < torch.where(of_kept.isnan(), torch.inf, LOWER * of_kept)
-        u, pressure, moved, before = rowwise(is_lower, other, kept)
+        u, pressure, moved, before = where_rows(is_lower, other, kept)
         return u, pressure, moved, before

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...camera.model import Rays
-from ...control_flow import piece
+from ...control_flow import traced
 from ...errors import MembraneError
 from ...mechanics.affine_quadrilateral import AffineQuadrilaterals
 from ...mechanics.hyperelastic import ElasticEnergy
@@ -169,7 +169,7 @@ class MinimumEnergy(VertexRays):
             t, latest, changes = self.step(t, latest, changes, origins, directions, relaxed, *linear)
         return self.equilibrium(t, origins, directions, relaxed, *linear)
 
-    @piece
+    @traced
     def rays(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, ...]:
         """Rays `[..., 3, V]` on which the rim stays: `d = 0`; where the volume is linear also its derivative `v [..., V]`, and
         by how much it is above that at rest at the rest ranges `[...]`."""
@@ -180,13 +180,13 @@ class MinimumEnergy(VertexRays):
             return origins, directions
         return origins, directions, *self._volume(origins + self.rest_range * directions, directions)
 
-    @piece
+    @traced
     def start(self, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None, *linear: Tensor) -> State:
         """Ranges `[..., V]` and history after the first step, from rest, on rays as `rays` gives them."""
         t = self.rest_range.expand(directions[..., 0, :].shape)
         return first(t, self._move(t, origins, directions, relaxed, *linear)[0])
 
-    @piece
+    @traced
     def step(
         self,
         t: Tensor,
@@ -201,7 +201,7 @@ class MinimumEnergy(VertexRays):
         move, _ = self._move(t, origins, directions, relaxed, *linear)
         return accelerated(t, move, latest, changes)
 
-    @piece
+    @traced
     def equilibrium(
         self, t: Tensor, origins: Tensor, directions: Tensor, relaxed: Tensor | None = None, *linear: Tensor
     ) -> Equilibrium:

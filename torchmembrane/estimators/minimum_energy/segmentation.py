@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ...camera.model import Rays
-from ...control_flow import piece
+from ...control_flow import traced
 from ...errors import MembraneError
 from ...surface.membrane import Membrane
 from ..base import CONTACT_POINTS, Contacts, Equilibrium, Observation
@@ -122,13 +122,13 @@ class Segmentation(nn.Module):
         self.patches = ContactPatches(membrane)
         self.axis_in_view = bool((self.axis_region > 0).any())
 
-    @piece
+    @traced
     def by_polar_angle(self, directions: Tensor) -> ContactRegions:
         """Eq. 29 alone: contacts on the rest surface, for rays `[B, V, 3]`."""
         bulge = self.polar.bulge(directions) * ~self.membrane.fixed
         return self._where(self.membrane.rest.expand(bulge.shape[0], -1, -1), bulge, directions)
 
-    @piece
+    @traced
     def by_normals(self, x: Tensor) -> ContactRegions:
         """Contacts of a surface `[B, V, 3]`: where it lies inside the rest surface, along the mean of both normals.
 
@@ -136,14 +136,14 @@ class Segmentation(nn.Module):
         """
         return self._inside(x, self.membrane.normals(x))
 
-    @piece
+    @traced
     def moved(self, before: Tensor, after: Tensor) -> Tensor:
         """By how much points `[B, P, 3]` moved at most, over the surface's size, `[B]`; infinite where one came or went."""
         distance = torch.linalg.vector_norm(after - before, dim=-1).nan_to_num().amax(-1)
         same = (after.isnan() == before.isnan()).flatten(1).all(1)
         return torch.where(same, distance / self.membrane.size, torch.inf)
 
-    @piece
+    @traced
     def in_contact(self, region: Tensor) -> Tensor:
         """`[B, V]` bool, from the numbers of regions."""
         return region > 0

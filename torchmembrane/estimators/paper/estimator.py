@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...camera.model import Rays
-from ...control_flow import piece
+from ...control_flow import traced
 from ...errors import MembraneError
 from ...mechanics.affine_quadrilateral import AffineQuadrilaterals
 from ...mechanics.hyperelastic import ElasticEnergy
@@ -140,7 +140,7 @@ class PaperEstimator(VertexRays):
         found = reconstruct_and_segment(self, self.segmentation, observation, self.settings.rounds)
         return found.surface._replace(relative_step=found.moved)
 
-    @piece
+    @traced
     def solve(self, observation: Observation, relaxed: Tensor) -> Equilibrium:
         """Eq. 22 once, by two solves with one factor (eqs. 25-27).
 

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...control_flow import piece, repeated
+from ...control_flow import fori_loop, traced
 from ..spacing import FADED, neighbours, spacing, square_distance
 
 WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
@@ -54,10 +54,10 @@ class LocalDeformation(nn.Module):
         """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, 2, 2, K]`."""
         first, *scene = self.begin(blobs, valid)
         gradient: Tensor
-        (gradient,) = repeated(self.refine, [(width,) for width in WIDTHS], (first,), *scene, valid)
+        (gradient,) = fori_loop(self.refine, [(width,) for width in WIDTHS], (first,), *scene, valid)
         return gradient
 
-    @piece
+    @traced
     def begin(self, blobs: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """What the fits need of a frame.
 
@@ -82,7 +82,7 @@ class LocalDeformation(nn.Module):
         ratio = square[:, 0, :, :4].clamp_min(1e-12).sqrt().mean(-1).clamp(0.4, 2.0)
         return ratio[:, None, None] * eye, around, away.transpose(1, 2), beside.transpose(1, 2), nearby
 
-    @piece
+    @traced
     def refine(
         self, gradient: Tensor, around: Tensor, away: Tensor, beside: Tensor, nearby: Tensor, valid: Tensor, width: float
     ) -> tuple[Tensor]:

@@ -6,7 +6,7 @@ from scipy import ndimage
 from scipy.spatial import Delaunay, cKDTree
 from torch import Tensor, nn
 
-from ...control_flow import piece
+from ...control_flow import traced
 from ...errors import MembraneError
 from ..locator import LocatedMarkers
 from ..noise import pixel_noise
@@ -159,7 +159,7 @@ class DotLocator(nn.Module):
         place, certainty, strain = self.match(blobs, log_radius, valid, previous)
         return self.end(level_0, level_1, level_2, blobs, log_radius, valid, place, certainty, strain)
 
-    @piece
+    @traced
     def begin(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """The levels of the pyramid, and the blobs: centres `[B, K, 2]`, log radius `[B, K]`, and how surely one is a dot."""
         image = 1 - image if self.polarity == "light" else image
@@ -172,7 +172,7 @@ class DotLocator(nn.Module):
         start = self._alike(blobs, BLOB), self._alike(log_radius, SHARE), self._alike(valid, SHARE)
         return level_0, level_1, level_2, *start
 
-    @piece
+    @traced
     def end(
         self,
         level_0: Tensor,

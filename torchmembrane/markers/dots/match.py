@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...control_flow import piece, repeated, rowwise, unless
+from ...control_flow import cond, fori_loop, traced, where_rows
 from ..spacing import spacing, thin_out
 from .deformation import FAR, LocalDeformation
 from .flow import SUPPORT, FlowAverages
@@ -142,23 +142,23 @@ class DotMatcher(nn.Module):
         def searched() -> Sequence[Tensor]:
             return self.either(kept, *followed, *self.search(blobs, log_radius, valid))
 
-        weight, flow, strain = unless(kept, followed, searched)
+        weight, flow, strain = cond(kept, followed, searched)
         weight, flow, strain, complete = self.sure(weight, flow, strain, *unstrained)
 
         def doubted() -> Sequence[Tensor]:
             known, base = self.scene(self.deformation(blobs, valid), blobs, log_radius, valid)
             begun = self.from_sure(weight, flow, strain, known, base)
-            return self.either(complete, weight, flow, strain, *repeated(self.doubt, DOUBTS, begun, known, base))
+            return self.either(complete, weight, flow, strain, *fori_loop(self.doubt, DOUBTS, begun, known, base))
 
-        return self.end(*unless(complete, (weight, flow, strain), doubted))
+        return self.end(*cond(complete, (weight, flow, strain), doubted))
 
     def search(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> State:
         """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""
         known, base, *start = self.begin(*self.scene(self.deformation(blobs, valid), blobs, log_radius, valid))
-        grown = repeated(self.grow, self.steps, start, known, base)
-        return self.best(*repeated(self.settle, SETTLING, grown, known, base))
+        grown = fori_loop(self.grow, self.steps, start, known, base)
+        return self.best(*fori_loop(self.settle, SETTLING, grown, known, base))
 
-    @piece
+    @traced
     def follow(self, known: Tensor, base: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As `search`, from the frames before, in the scene that is `unstrained`; and in which frames `[B]` all dots that were
         found could be followed."""
@@ -175,7 +175,7 @@ class DotMatcher(nn.Module):
         weight, flow, strain = state
         return weight, flow, strain, ~(found & ~(weight >= KEPT)).any(-1)
 
-    @piece
+    @traced
     def sure(
         self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -185,25 +185,25 @@ class DotMatcher(nn.Module):
         weight, flow, strain = self.from_sure(weight, flow, strain, known, base)
         return weight, flow, self.averages.gradient(weight, flow, strain), complete
 
-    @piece
+    @traced
     def from_sure(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
         """A step from the dots that are found alone: which they are and where, not how surely."""
         found = (weight >= KEPT).to(flow.dtype)
         return self.settle(found, found[:, None] * flow, torch.zeros_like(strain), known, base)
 
-    @piece
+    @traced
     def unstrained(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """The `scene` of blobs whose arrangement says nothing."""
         eye = torch.eye(2, dtype=blobs.dtype, device=blobs.device)
         return self.scene(eye[..., None].expand(*valid.shape[:1], 2, 2, valid.shape[1]), blobs, log_radius, valid)
 
-    @piece
+    @traced
     def either(self, kept: Tensor, weight: Tensor, flow: Tensor, strain: Tensor, *others: Tensor) -> State:
         """These dots in the frames `kept [B]`, the others in the others."""
-        weight, flow, strain = rowwise(kept, (weight, flow, strain), others)
+        weight, flow, strain = where_rows(kept, (weight, flow, strain), others)
         return weight, flow, strain
 
-    @piece
+    @traced
     def scene(self, deformation: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """What `choose` needs to know of the blobs: `[B, 7, K]`, `[B, D, K]`."""
         strain = deformation - torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
@@ -212,7 +212,7 @@ class DotMatcher(nn.Module):
         misfit = ((self.log_radius[:, None] - (log_radius + 3 * (1 - valid))[:, None]) / self.size_tolerance).square()
         return known, misfit + self.stiffness[:, None] * position.square().sum(1, keepdim=True)
 
-    @piece
+    @traced
     def begin(self, known: Tensor, base: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """The scene of every start; weight, flow and strain of the dots before the first step."""
         starts = self.starts.shape[0]
@@ -222,18 +222,18 @@ class DotMatcher(nn.Module):
         weight, flow, strain = self.choose(flow, FAR + flow[:, 0], known, base)
         return known, base, (weight.unflatten(0, (-1, starts)) * self.starts).flatten(0, 1), flow, strain
 
-    @piece
+    @traced
     def grow(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
         """One step outwards along the strain measured."""
         return self.choose(*self.averages.along(weight, flow, strain), known, base)
 
-    @piece
+    @traced
     def settle(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
         """One step along the strain measured and what the neighbours' flow says of it."""
         gradient = self.averages.gradient(weight, flow, strain)
         return self.choose(*self.averages.along(weight, flow, gradient), known, base)
 
-    @piece
+    @traced
     def doubt(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
         """Some steps more after those that took another's blob have been let go."""
         state = weight * trust(*self.neighbour_steps(self.pixels.mT + flow, weight, strain)), flow, strain
@@ -241,7 +241,7 @@ class DotMatcher(nn.Module):
             state = self.settle(*state, known, base)
         return state
 
-    @piece
+    @traced
     def best(self, weight: Tensor, flow: Tensor, strain: Tensor) -> State:
         """The best start's."""
         starts = self.starts.shape[0]
@@ -255,7 +255,7 @@ class DotMatcher(nn.Module):
 
         return of_best(weight), of_best(flow), of_best(strain)
 
-    @piece
+    @traced
     def end(self, weight: Tensor, flow: Tensor, strain: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Positions, certainty and strain, as `forward` returns them."""
         return self.pixels + self.origin + flow.mT, weight, strain.movedim(-1, 1)

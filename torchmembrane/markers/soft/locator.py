@@ -5,7 +5,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from ...control_flow import piece
+from ...control_flow import traced
 from ...errors import MembraneError
 from ..dots.ellipse import draw_dots, log_radii
 from ..dots.flow import FlowAverages
@@ -143,14 +143,14 @@ class SoftLocator(nn.Module):
             place = self.join(place, self.find_small(levels, self.predict_small(place, weight)))
         return self.judge(self.fit(levels, place), usable)
 
-    @piece
+    @traced
     def begin(self, image: Tensor) -> tuple[list[Tensor], Tensor]:
         """The pyramid, and which frames are usable `[B]`."""
         finite = image.isfinite()
         dark = torch.where(finite, 1 - image if self.polarity == "light" else image, 0.0)
         return self.levels(dark), finite.flatten(1).all(1)
 
-    @piece
+    @traced
     def of_large(self, values: Tensor) -> Tensor:
         """Of values `[B, D, ...]` those of the large dots."""
         return values[:, self.large]
@@ -159,12 +159,12 @@ class SoftLocator(nn.Module):
         """Pyramid of the logarithm of images `[B, 1, H, W]`, in which uneven light only adds; zero off the membrane."""
         return pyramid((dark.clamp(0, 1) / MIDDLE + DARKEST).log() * self.inside)
 
-    @piece
+    @traced
     def join(self, large: Tensor, small: Tensor) -> Tensor:
         """Values of all dots in the pattern's order, from those of the large and of the small ones `[B, ...]`."""
         return torch.cat([large, small], 1)[:, self.order]
 
-    @piece
+    @traced
     def predict_small(self, place: Tensor, weight: Tensor) -> Tensor:
         """Where the large dots at `place [B, L, 2]` px, of `weight [B, L]`, predict the small ones: `[B, S, 2]` px."""
         none = self.rest[self.small].expand(place.shape[0], -1, -1)
@@ -174,7 +174,7 @@ class SoftLocator(nn.Module):
             predicted, gradient, _ = predict(self.averages, weight, flow, gradient)
         return (self.rest + predicted)[:, self.small]
 
-    @piece
+    @traced
     def find_small(self, levels: list[Tensor], predicted: Tensor) -> Tensor:
         """Pixels `[B, S, 2]` of the small dots about `predicted [B, S, 2]` px, on a coarse level."""
         assert self.by_large is not None
@@ -196,14 +196,14 @@ class SoftLocator(nn.Module):
         """What `forward` returns; `usable [B]` says which frames are."""
         return self.decide(found.place, *self.compare(found), usable)
 
-    @piece
+    @traced
     def compare(self, found: Found) -> tuple[Tensor, Tensor]:
         """Where its neighbours put each dot `[B, D, 2]` px, and how much it looks like one and belongs with them `[B, D]`."""
         flow, quality = found.place - self.rest, self.quality(found)
         local: NeighbourFlow = self.neighbourhood(flow, quality, self.tolerance)
         return self.rest + local.flow, quality * local.trust(flow)
 
-    @piece
+    @traced
     def mix(self, place: Tensor, expected: Tensor, trust: Tensor) -> Tensor:
         """Between `place` and `expected`, by `trust [B, D]` in the former."""
         return trust[..., None] * place + (1 - trust[..., None]) * expected
@@ -214,7 +214,7 @@ class SoftLocator(nn.Module):
         alike = torch.sigmoid(20 * (found.response / (level + 1e-3) - FAINTER))
         return torch.sigmoid(30 * (found.response - FAINTEST)) * alike * found.sharpness
 
-    @piece
+    @traced
     def decide(self, place: Tensor, expected: Tensor, confidence: Tensor, usable: Tensor) -> LocatedMarkers:
         """As `judge`, from what `compare` gives."""
         if self.by_large is not None:

@@ -8,7 +8,7 @@ import torch
 from kornia.filters import gaussian_blur2d
 from torch import Tensor, nn
 
-from ...control_flow import piece
+from ...control_flow import traced
 from ..texture.pyramid import low_pass
 
 LEVELS = 5  # of the pyramid, by halves
@@ -99,7 +99,7 @@ class DotResponse(nn.Module):
         self.register_buffer(f"covered{k}", 1 / (gaussians(mask, self.rungs[k]) + LEAST_SHARE))
         self.register_buffer(f"limit{k}", torch.as_tensor(np.array([width, height]) - 1 - self.half_width))
 
-    @piece
+    @traced
     def maps(self, levels: list[Tensor]) -> list[Tensor]:
         """Responses to dark discs on each level in use, one map for each scale: `[B, scales, h, w]`.
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...control_flow import piece, repeated
+from ...control_flow import fori_loop, traced
 from ..dots.flow import FlowAverages
 from ..spacing import spacing, thin_out
 from .argmax import Peak, window_peak
@@ -65,7 +65,7 @@ class DotSearch(nn.Module):
             peak = self._peak(self.response.maps(levels), pixels[None])
             self.strength, self.spread = peak.strength[0].clamp_min(1e-3), peak.spread[0]
 
-    @piece
+    @traced
     def forward(self, maps: Sequence[Tensor], predicted: Tensor) -> Found:
         """The dots about `predicted [B, D, 2]` px, from the responses on each level."""
         peak = self._peak(maps, predicted)
@@ -117,10 +117,10 @@ class DotGrowth(nn.Module):
             Pixels `[B, D, 2]` and weight `[B, D]` in 0..1.
         """
         maps, *state = self.begin(levels, previous)
-        weight, flow, _ = repeated(self.step, self.steps, state, *maps)
+        weight, flow, _ = fori_loop(self.step, self.steps, state, *maps)
         return self.moved(flow), weight
 
-    @piece
+    @traced
     def begin(self, levels: list[Tensor], previous: Tensor | None = None) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
         """The responses on each level, and before the first step weight, flow and its gradient, as `step` has them."""
         maps, batch = self.search.response.maps(levels), levels[0].shape[0]
@@ -132,7 +132,7 @@ class DotGrowth(nn.Module):
             weight = torch.where(kept, 1.0, weight)
         return maps, weight, flow, torch.zeros_like(flow)[..., None].repeat(1, 1, 1, 2)
 
-    @piece
+    @traced
     def step(self, weight: Tensor, flow: Tensor, gradient: Tensor, *maps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """One step of the growth: weight `[B, D]`, flow `[B, D, 2]` and its gradient `[B, D, 2, 2]` after it."""
         predicted, gradient, support = predict(self.averages, weight, flow, gradient)
@@ -140,7 +140,7 @@ class DotGrowth(nn.Module):
         believed = torch.sigmoid(10 * (support - UNSUPPORTED)) * found.response / (found.response + FAINT)
         return believed * found.sharpness, found.place - self.pixels, gradient
 
-    @piece
+    @traced
     def moved(self, flow: Tensor) -> Tensor:
         """Pixels `[B, D, 2]` of the dots after that flow."""
         return self.pixels + flow

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...control_flow import piece
+from ...control_flow import traced
 from ..locator import LocatedMarkers
 from ..texture.locator import PatchLocator
 from ..texture.pyramid import low_pass_pyramid, sample
@@ -93,7 +93,7 @@ class SoftTextureLocator(PatchLocator):
         )
         self.to(torch.get_default_dtype())
 
-    @piece
+    @traced
     def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
         """Locate the patches in a batch of frames.
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...control_flow import piece
+from ...control_flow import traced
 from ...errors import MembraneError
 from ..locator import LocatedMarkers, isotropic
 from ..neighbourhood import NEIGHBOURS, NeighbourFlow, Neighbourhood
@@ -125,7 +125,7 @@ class TextureLocator(PatchLocator):
         self.search = Search(templates[-1])
         self.to(torch.get_default_dtype())
 
-    @piece
+    @traced
     def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
         """Locate the patches in a batch of frames; the gradient takes the last level only, the rest is where to look.
 
