@@ -49,14 +49,14 @@ layers: $(READY)
 	$(BIN)/lint-imports
 
 bench: $(READY)
-	$(BIN)/python bench/speed.py --json out/bench/speed.json
+	$(BIN)/python -m bench.speed.speed --json out/bench/speed.json
 
 soak: $(READY)
-	$(BIN)/python bench/fuzz.py --hours $(SOAK) --seed $(SEED) --json out/bench/fuzz.json
+	$(BIN)/python -m bench.robustness.fuzz --hours $(SOAK) --seed $(SEED) --json out/bench/fuzz.json
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[ray]"
-	for way in --format=npz --format=parquet --engine=ray; do $(BIN)/python bench/kills.py --kills $(KILLS) $$way || exit 1; done
-	$(BIN)/python bench/random_sensors.py out/bench/random --sensors $$(( ($(PRESSES) + 3) / 4 )) --presses 4
-	$(BIN)/python bench/range.py out/bench/random --json out/bench/range.json
+	for way in --format=npz --format=parquet --engine=ray; do $(BIN)/python -m bench.robustness.crash_recovery --kills $(KILLS) $$way || exit 1; done
+	$(BIN)/python -m bench.data.random_sensors out/bench/random --sensors $$(( ($(PRESSES) + 3) / 4 )) --presses 4
+	$(BIN)/python -m bench.accuracy.range out/bench/random --json out/bench/range.json
 
 figures: $(READY)
 	$(BIN)/python docs/figures.py

@@ -1,4 +1,4 @@
-"""Damaged and hostile files, a few of each kind, always the same: `make soak` tries as many as there is time for."""
+"""Damaged and malformed files, a few of each kind, always the same: `make soak` tries as many as there is time for."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ COUNTS = ["sensors=120", "images=120", "npz=60", "parquet=60", "readings=100", "
 
 def test_damaged_files_are_refused_in_one_line_or_answered():
     """In a process of its own, whose memory is limited."""
-    command = [sys.executable, "bench/fuzz.py", "--count", *COUNTS, "--seed", "7"]
+    command = [sys.executable, "-m", "bench.robustness.fuzz", "--count", *COUNTS, "--seed", "7"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "refused" in done.stdout and "answered, OK" in done.stdout and "decoded, in part" in done.stdout

@@ -19,7 +19,7 @@ sensitivities, which the transposed equations give: one solve for each wanted nu
 with `g` the wanted number's derivative in surface and pressure and the symmetric `K` above. On the estimator's second finest
 grid, which costs little and knows as much. Every marker's noise is what the solve took it for, with a share of the
 displacements in it for the grid and the material; but these err together over many markers, so the spread is too small. What is
-missing was fitted to presses of random sensors (`bench/intervals.py`), as standard deviations that add up:
+missing was fitted to presses of random sensors (`bench/accuracy/intervals.py`), as standard deviations that add up:
 
     of the force    FORCE x spread,  FORCE_SHARE of the force along itself,  AT_RIM of it where a contact reaches the rim,
                     where no contact is found UNSEEN of what a patch as pushed as the noise pushes would bear
