@@ -302,7 +302,7 @@ def wait_for(condition, seconds=120):
 QUICKLY_SAVING = """
 import sys
 from torchmembrane.cli.main import main
-from torchmembrane.io import frame_table
+from torchmembrane.results import frame_table
 frame_table.SAVE_SECONDS = 0.2
 sys.exit(main(sys.argv[1:]))
 """
