@@ -146,8 +146,8 @@ class Composite(torch.nn.Module):
 def test_a_graph_captured_at_once_is_what_torch_makes_of_it_in_two_steps(monkeypatch):
     inputs = {"x": torch.rand(2, 3, 3), "y": torch.rand(2, 3, 3)}
     at_once = traced_model(Composite(), inputs, ["a", "b"])
-    monkeypatch.setattr(trace, "_captured", torch.export.export)
-    monkeypatch.setattr(trace, "_quick", nullcontext)
+    monkeypatch.setattr(trace.EXPORTER, "captured", torch.export.export)
+    monkeypatch.setattr(trace.EXPORTER, "at_work", nullcontext)
     in_two_steps = traced_model(Composite(), inputs, ["a", "b"])
     assert [node.op_type for node in at_once.graph.node] == [node.op_type for node in in_two_steps.graph.node]
     assert at_once.SerializeToString(deterministic=True) == in_two_steps.SerializeToString(deterministic=True)

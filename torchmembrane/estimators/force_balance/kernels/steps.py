@@ -118,7 +118,7 @@ def takes(*values: Any) -> bool:
         not torch.compiler.is_compiling()
         and all(type(value) is Tensor and value.device.type == "cpu" for value in tensors)
         and not (torch.is_grad_enabled() and any(value.requires_grad for value in tensors))
-        and not any(torch._C._functorch.is_functorch_wrapped_tensor(value) for value in tensors)
+        and all(torch.func.debug_unwrap(value, recurse=False) is value for value in tensors)
     )
 
 
