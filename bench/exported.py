@@ -23,7 +23,7 @@ from accuracy import cases_in
 from record import write
 
 import torchmembrane as tm
-from torchmembrane.reconstruct import ESTIMATORS
+from torchmembrane.estimators.registry import ESTIMATORS
 
 BATCHES = (1, 3, 16)
 
