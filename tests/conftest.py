@@ -19,7 +19,8 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 torch.set_num_threads(1)
 gc.set_threshold(100_000, 50, 100)  # tracing makes millions of objects that stay
 LONG = ["test_export_sensors", "test_material", "test_drift", "test_export", "test_compile", "test_deviations", "test_fuzz",
-        "test_tutorial", "test_gauge_modulus", "test_jobs", "test_learning_stack", "test_learning", "test_weight"]  # fmt: skip
+        "test_tutorial", "test_gauge_modulus", "test_open_estimators", "test_jobs", "test_learning_stack", "test_learning",
+        "test_weight"]  # fmt: skip
 
 
 def pytest_collection_modifyitems(items):

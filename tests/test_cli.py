@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchmembrane import __version__, presets, reconstruct
+from torchmembrane import __version__, presets
 from torchmembrane.calibrate import camera
 from torchmembrane.camera import model
 from torchmembrane.cli import arguments as types
@@ -21,6 +21,7 @@ from torchmembrane.cli import main as cli
 from torchmembrane.errors import MembraneError
 from torchmembrane.estimators.minimum_energy.estimator import ELEMENTS, VOLUMES
 from torchmembrane.estimators.minimum_energy.flow import FLOWS
+from torchmembrane.estimators.registry import ESTIMATORS
 from torchmembrane.markers import placement
 from torchmembrane.mechanics import hyperelastic
 from torchmembrane.presets import draft
@@ -257,7 +258,7 @@ def test_help_loads_nothing_heavy(arguments):
 
 
 def test_the_options_choices_are_what_the_package_has():
-    assert choices.ESTIMATORS == tuple(reconstruct.ESTIMATORS) and choices.ENERGIES == hyperelastic.MODELS
+    assert choices.ESTIMATORS == tuple(ESTIMATORS) and choices.ENERGIES == hyperelastic.MODELS
     assert (choices.ELEMENTS, choices.VOLUMES, choices.FLOWS) == (ELEMENTS, VOLUMES, FLOWS)
     assert choices.RESULT_FORMATS == store.FORMATS
     assert choices.LOCATORS == placement.LOCATORS

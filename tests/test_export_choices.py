@@ -14,11 +14,12 @@ from torchmembrane.cli import main as cli
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.minimum_energy.estimator import ELEMENTS, VOLUMES
 from torchmembrane.estimators.minimum_energy.flow import FLOWS
+from torchmembrane.estimators.registry import ESTIMATORS
 from torchmembrane.onnx import check, export, trace
 from torchmembrane.onnx.check import Agreement, check_images, checked
 from torchmembrane.onnx.graph import Assembly
 from torchmembrane.onnx.trace import traced_model
-from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
+from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.solve.inverse_root import by_products
 

@@ -23,7 +23,7 @@ import torch
 import torchmembrane as tm
 from bench.accuracy.accuracy import cases_in
 from bench.data.record import write
-from torchmembrane.reconstruct import ESTIMATORS
+from torchmembrane.estimators.registry import ESTIMATORS
 
 BATCHES = (1, 3, 16)
 

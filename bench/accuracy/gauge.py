@@ -50,7 +50,7 @@ def rows_of(folder: Path, kinds: list[str], noise: float, told: list[float]) -> 
         depth = json.loads(str(truth["stroke"]))["depth"] / sensor.membrane.size
         share = forces[path] / max(force for other, force in forces.items() if other.stem.startswith("light"))
         for good, reader in readers.items():
-            reference = reader.check_gauge().reference
+            reference = reader.estimator.reference
             error = noise * reference * np.random.default_rng([int(folder.name[1:]), number]).normal()
             reading = float(reader.rest_pressure) + float(truth["p"] - truth["p0"]) + error
             with torch.no_grad():

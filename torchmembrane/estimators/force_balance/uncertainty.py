@@ -41,7 +41,8 @@ from ...solve.kkt import solve_bordered
 from ...solve.stencil import inner, pad_border
 from ...surface.membrane import Membrane
 from ...surface.tangent import tangent_frame
-from ..base import Contacts, Deviations, Observation
+from ..base import Deviations, Observation, StandardDeviations
+from ..contacts import Contacts
 from .camera_motion import CameraMotion
 from .contact_force import Linearised
 from .gauss_newton import Descent, State
@@ -49,19 +50,6 @@ from .marker_residuals import Bearings
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import pulled
 from .settings import ForceBalanceSettings
-
-
-class StandardDeviations(NamedTuple):
-    """Of `vertices [B, V, 3]` (zero where fixed), total `force [B, 3]` and `pressure [B]`."""
-
-    vertices: Tensor
-    force: Tensor
-    pressure: Tensor
-
-    def known(self, frames: Tensor) -> "StandardDeviations":
-        """The same, NaN but in `frames [B]`, bool."""
-        rows = ((value, frames.reshape(-1, *(1,) * (value.ndim - 1))) for value in self)
-        return StandardDeviations(*(torch.where(row, value, torch.nan) for value, row in rows))
 
 
 class LinearisedSolution(NamedTuple):

@@ -105,9 +105,8 @@ class PaperEstimator(VertexRays):
         part of the depth. Of a press on the optical axis it finds next to none: the contact is then a disc around the axis.
     """
 
-    element: ClassVar[str] = "quadrilateral"
-    volume: ClassVar[str] = "linear"
     Settings: ClassVar[type[PaperSettings]] = PaperSettings
+    default_locator: ClassVar[str] = "soft"
     settings: PaperSettings
     energy: AffineQuadrilaterals
 
@@ -127,9 +126,14 @@ class PaperEstimator(VertexRays):
         self.system = GridSystem(membrane.grid, inner(self.free[:, None], membrane.grid).squeeze(-1) > 0)
 
     @property
-    def smoothing_weight(self) -> float:
-        """The weight of the smoother of eq. 28."""
-        return self.settings.smoothing
+    def element(self) -> str:
+        """The paper's affine quadrilaterals."""
+        return "quadrilateral"
+
+    @property
+    def volume(self) -> str:
+        """Linearised once, at the rest ranges (eq. 21)."""
+        return "linear"
 
     def forward(self, observation: Observation) -> Equilibrium:
         """The surface on the rays of the grid's vertices.
