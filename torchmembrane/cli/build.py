@@ -8,12 +8,11 @@ from ..estimators.registry import ESTIMATORS
 from ..reconstruct import Reconstructor
 from ..sensor.sensor import Sensor
 
-OPTIONS = ("element", "volume", "flow", "smoothing", "pressure_noise")
+OPTIONS = ("flow", "smoothing", "pressure_noise")
 
 
 def build_reconstructor(sensor: Sensor, arguments: Namespace) -> Reconstructor:
-    """The reconstructor of `--estimator`, `--energy`, `--element`, `--volume`, `--flow`, `--smoothing`, `--pressure-noise` and
-    `--locator`.
+    """The reconstructor of `--estimator`, `--energy`, `--flow`, `--smoothing`, `--pressure-noise` and `--locator`.
 
     Raises:
         MembraneError: an option that the estimator does not have.

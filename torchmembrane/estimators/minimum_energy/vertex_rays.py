@@ -11,7 +11,7 @@ from ...mechanics.cavity import CavityLaw, rest_balance
 from ...mechanics.hyperelastic import ElasticEnergy
 from ...surface.membrane import Membrane
 from ..base import Contacts, Deviations, Equilibrium, Observation, Problem
-from .flow import VertexFlow
+from .flow import FlowInterpolation, VertexFlow
 from .segmentation import Segmentation
 
 
@@ -60,15 +60,15 @@ class VertexRays(nn.Module):
         """The estimator of a sensor; settings as for the class."""
         settings = settings or cls.Settings()
         rays = problem.camera.pixel_to_ray(problem.vertex_pixels)
-        flow = VertexFlow(problem, settings.flow)
+        flow = VertexFlow(problem, cls.interpolation(problem, settings))
         build: Any = cls  # with the arguments of the estimators themselves
         built: Self = build(problem.membrane, problem.elasticity, rays, problem.filling, problem.gas, settings, flow)
         return built
 
-    @property
-    def flow_kind(self) -> str:
-        """The flow between the markers: "smooth" or "bilinear"."""
-        return str(self.settings.flow)
+    @classmethod
+    def interpolation(cls, problem: Problem, settings: Any) -> FlowInterpolation:
+        """The flow between the sensor's markers, here smooth."""
+        return FlowInterpolation(problem.membrane, problem.markers)
 
     @property
     def rest_pressure(self) -> Tensor:
