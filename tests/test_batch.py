@@ -19,7 +19,7 @@ from torchmembrane.files.images import read_image
 from torchmembrane.jobs.inputs import find_inputs
 from torchmembrane.jobs.local import reconstruct_files
 from torchmembrane.results import frame_table, frames
-from torchmembrane.results import reconstruction as results
+from torchmembrane.results import npz as results
 from torchmembrane.results.read import read_results
 from torchmembrane.results.status import Status
 from torchmembrane.results.store import Mesh, Settings
