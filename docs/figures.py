@@ -33,6 +33,7 @@ from pressed import (
     TOP,
     TWO,
     Shown,
+    contact_regions,
     contact_words,
     error_words,
     from_flow,
@@ -98,7 +99,7 @@ def figure_8() -> Figure:
     """Initial segmentation: motion of the dots, change of the polar angle, the region that bulges in."""
     shown, results = pressed("bubble", *BUBBLE), {title: reconstructed("bubble", BUBBLE, title) for title in ESTIMATORS}
     r, result = reconstructor("bubble", PAPER), results[PAPER]
-    first = segmented(shown, result, PAPER).first
+    first = segmented(shown, result).first
     drawing = Figure(figsize=(15, 4.4), dpi=100, layout="constrained")
     a, b, c = drawing.subplots(1, 3)
     draw_matches(a, shown, measured_flow(shown, result), "(a) matches")
@@ -117,16 +118,16 @@ def figure_8() -> Figure:
 
 
 def contacts_figure(name: str, sensor: str, strokes) -> Figure:
-    """Eq. 29 alone, the paper's reconstruct and segment, the same of minimum energy, and force balance's tractions."""
+    """Contacts by eq. 29 alone, by the paper's loop, on the surface of minimum energy, and by force balance's tractions."""
     shown, results = pressed(sensor, *strokes), {title: reconstructed(sensor, strokes, title) for title in ESTIMATORS}
-    paper, energy = (segmented(shown, results[title], title) for title in (PAPER, ENERGY))
+    paper, energy = segmented(shown, results[PAPER]), contact_regions(shown, results[ENERGY])
     drawing = Figure(figsize=(18, 4.6), dpi=100, layout="constrained")
     drawing.suptitle(name)
     *loops, c = drawing.subplots(1, 4)
     contacts = {
         "eq. 29 alone (the paper, first)": paper.first,
         "reconstruct and segment (the paper)": paper.contacts,
-        "the same loop around minimum energy": energy.contacts,
+        "contacts of minimum energy's surface": energy,
     }
     for axes, (title, regions) in zip(loops, contacts.items(), strict=True):
         points = regions.points[0].numpy()

@@ -7,7 +7,8 @@ import numpy as np
 import torch
 
 from torchmembrane import Reconstruction, Reconstructor, Status
-from torchmembrane.estimators.minimum_energy.segmentation import Segmented, reconstruct_and_segment
+from torchmembrane.estimators.minimum_energy.segmentation import ContactRegions
+from torchmembrane.estimators.paper.estimator import Segmented
 from torchmembrane.presets import preset_file
 from torchmembrane.simulate import Appearance, Cylinder, Simulator, Sphere, press
 
@@ -18,7 +19,6 @@ ESTIMATORS = {
     ENERGY: {"estimator": "minimum-energy"},
     BALANCE: {"estimator": "force-balance"},
 }
-ROUNDS = 8  # of the reconstruct / segment loop around minimum energy; the paper's estimator has its own
 
 TOP = ((1.2, (0, 0, 6), (-0.35, -0.1, -1.0), 2.5),)
 TWO = ((1.5, (0, 0, 6), (-0.7, -0.2, -1.0), 1.8), (1.5, (0, 0, 6), (0.7, 0.3, -1.0), 1.5))
@@ -83,13 +83,18 @@ def measured_flow(shown: Shown, result: Reconstruction) -> torch.Tensor:
     return result.pixels[0] - reconstructor(shown.sensor).rest_pixels
 
 
-def segmented(shown: Shown, result: Reconstruction, title: str) -> Segmented:
-    """What the reconstruct / segment loop ends with around an estimator, from the markers of its result."""
-    r = reconstructor(shown.sensor, title)
-    rounds = getattr(r.estimator.settings, "rounds", ROUNDS)
+def segmented(shown: Shown, result: Reconstruction) -> Segmented:
+    """What the paper's loop of reconstruction and segmentation ends with, from the markers of its result."""
+    r = reconstructor(shown.sensor, PAPER)
     with torch.no_grad():
         rays = r.observation((result.pixels - r.rest_pixels).nan_to_num(), result.confidence)
-        return reconstruct_and_segment(r.estimator, r.estimator.segmentation, rays, rounds)
+        return r.estimator.reconstruct_and_segment(rays, r.estimator.settings.rounds)
+
+
+def contact_regions(shown: Shown, result: Reconstruction) -> ContactRegions:
+    """Where the surface of minimum energy lies inside the rest surface."""
+    with torch.no_grad():
+        return reconstructor(shown.sensor, ENERGY).estimator.segmentation.by_normals(result.vertices)
 
 
 def error_words(shown: Shown, result: Reconstruction) -> str:

@@ -1,4 +1,4 @@
-"""The quick start with whatever versions are installed: `make test-lowest` runs it with the lowest that `pyproject.toml` allows.
+"""The quick start with whatever versions are installed: `make test-lowest` takes the lowest that `pyproject.toml` allows.
 
 An image of the examples is reconstructed by each estimator of the command's, and a gradient is taken of one.
 """

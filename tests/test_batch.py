@@ -19,7 +19,7 @@ from torchmembrane.files.images import read_image
 from torchmembrane.jobs.inputs import find_inputs
 from torchmembrane.jobs.local import reconstruct_files
 from torchmembrane.results import frame_table, frames
-from torchmembrane.results import reconstruction as results
+from torchmembrane.results import npz as results
 from torchmembrane.results.read import read_results
 from torchmembrane.results.status import Status
 from torchmembrane.results.store import Mesh, Settings
@@ -297,13 +297,18 @@ def test_another_sensor_s_folder_is_refused_untouched(images, tmp_path):
     assert before == {path: path.read_bytes() for path in (tmp_path / "out").iterdir()}
 
 
-@pytest.mark.parametrize(
-    "option, value", [("energy", "harmonic"), ("element", "quadrilateral"), ("format", "parquet"), ("locator", "soft")]
-)
+@pytest.mark.parametrize("option, value", [("energy", "harmonic"), ("format", "parquet"), ("locator", "soft")])
 def test_other_settings_are_refused(images, tmp_path, option, value):
     reconstruct(images[:1], tmp_path / "out")
     with pytest.raises(MembraneError, match=f"{option} .*{value}.*--{option}"):
         reconstruct(images, tmp_path / "out", NPZ._replace(**{option: value}))
+
+
+@pytest.mark.parametrize("name, value", [("element", "quadrilateral"), ("volume", "linear")])
+def test_what_no_option_chooses_is_not_advised(images, tmp_path, name, value):
+    reconstruct(images[:1], tmp_path / "out", NPZ._replace(**{name: value}))
+    with pytest.raises(MembraneError, match=f"made with {name} {value}.*choose another folder$"):
+        reconstruct(images, tmp_path / "out")
 
 
 def test_a_folder_from_before_there_was_a_choice_of_locators_was_made_with_fit(images, tmp_path):

@@ -9,7 +9,7 @@ from scipy.optimize import minimize, minimize_scalar
 from torch.func import functional_call
 
 from torchmembrane.camera.distortion import distort
-from torchmembrane.camera.model import Camera, paper_image_point
+from torchmembrane.camera.model import Camera
 from torchmembrane.errors import MembraneError
 
 PORTS = {"air": [], "port": [(2.0, 3.0, 1.49)], "stack": [(2.0, 1.0, 1.49), (3.5, 0.5, 1.52), (4.0, 1.0, 1.4)]}
@@ -328,10 +328,10 @@ def test_nan_stays_where_it_is_also_in_gradients(lens, ports):
 
 
 def test_paper_looks_at_the_inverted_image():
-    points = torch.tensor([[3.0, -2.0, 11.0]], dtype=torch.float64)
-    assert_close(paper_image_point(points, 400.0), torch.tensor([[-400 * 3 / 11, 400 * 2 / 11]]).double(), 1e-4)
-    camera = camera_of("pinhole", focal=(400.0, 400.0))
-    assert_close(camera.point_to_pixel(points), camera.centre - paper_image_point(points, 400.0), 1e-10)
+    """Eq. 1 has `u = -f x / z, v = -f y / z`: the image behind the lens, from which a pixel goes the other way."""
+    points, camera = torch.tensor([[3.0, -2.0, 11.0]], dtype=torch.float64), camera_of("pinhole", focal=(400.0, 400.0))
+    inverted = -400.0 * points[:, :2] / points[:, 2:]
+    assert_close(camera.point_to_pixel(points), camera.centre - inverted, 1e-10)
 
 
 def test_state_dict_carries_the_parameters(lens, ports):

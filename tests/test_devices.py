@@ -15,7 +15,6 @@ CASES = [
     ("force-balance", {}),
     ("force-balance", dict(locator="soft")),
     ("minimum-energy", {}),
-    ("minimum-energy", dict(settings=tm.MinimumEnergySettings(element="quadrilateral", volume="linear"), model="harmonic")),
     ("paper", {}),
 ]
 

@@ -16,7 +16,6 @@ from torchmembrane.errors import MembraneError
 from torchmembrane.markers.dots.bands import bands, blur_rows
 from torchmembrane.markers.dots.coherence import Coherence
 from torchmembrane.markers.dots.deformation import monomial_map
-from torchmembrane.markers.dots.ellipse import metric_of
 from torchmembrane.markers.dots.fit import EllipseFit
 from torchmembrane.markers.dots.locator import DotLocator, membrane_mask
 from torchmembrane.markers.dots.pattern import DotPattern, find_dots, measure_dots
@@ -543,12 +542,6 @@ def test_windows_hold_the_pixels_around_each_dot_at_their_places(radius):
     place = middle[..., None] + fit.stride[..., None] * fit.linear[1:]
     torch.testing.assert_close(values, place[..., 0, :] + 1000 * place[..., 1, :])
     assert (middle - torch.tensor(pixels)).abs().max() <= 0.5 * fit.stride.max() + 1e-9
-
-
-def test_the_metric_is_the_length_in_unit_circles():
-    shape, x = (torch.randn(5, 2, n, dtype=torch.float64, generator=torch.Generator().manual_seed(n)) for n in (2, 3))
-    metric = metric_of(shape).movedim(-1, 0)
-    torch.testing.assert_close(x.mT @ metric @ x, torch.linalg.solve(shape, x).mT @ torch.linalg.solve(shape, x))
 
 
 def test_the_mapping_takes_monomials_of_a_point_to_its_image():

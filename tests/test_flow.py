@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from affine_maps import LocalAffineMaps, affine_fit, weighted_affine_fit
 
 from torchmembrane import MembraneError
-from torchmembrane.estimators.affine_maps import LocalAffineMaps, affine_fit, weighted_affine_fit
-from torchmembrane.estimators.minimum_energy.flow import FlowInterpolation, bilinear_matrix, roughness, weights
+from torchmembrane.estimators.minimum_energy.flow import FlowInterpolation, roughness, weights
+from torchmembrane.estimators.paper.bilinear import BilinearFlow, bilinear_matrix
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.projection import SurfacePoints
 from torchmembrane.surface.shapes import heightfield, spherical_cap
@@ -116,7 +117,7 @@ def test_bilinear_flow_is_exact_for_bilinear_fields_between_dots():
     """On a net of dots a field bilinear in the grid's coordinates comes back exactly inside the net (section 5)."""
     field = heightfield(np.linspace(-3, 3, 17), np.linspace(-2, 2, 17), np.full((17, 17), 5.0))
     xyz, points = pattern(field, 7)
-    flow = FlowInterpolation(field, points, "bilinear")
+    flow = BilinearFlow(field, points)
     bilinear = lambda p: torch.from_numpy(np.stack([1 + p[:, 0] * p[:, 1], p[:, 0] - 2 * p[:, 1]], 1))  # noqa: E731
     got = flow(bilinear(xyz), torch.ones(len(xyz), dtype=torch.float64))
     inner = (field.rest[:, 0].abs() <= xyz[:, 0].max()) & (field.rest[:, 1].abs() <= xyz[:, 1].max())
@@ -131,12 +132,12 @@ def test_bilinear_flow_between_scattered_dots_stays_between_their_values():
     vertices = cap.triangles.numpy()[rng.integers(len(cap.triangles), size=60)]
     points = SurfacePoints(vertices, rng.dirichlet((1, 1, 1), 60), np.zeros(60))
     s, c = torch.from_numpy(rng.uniform(1, 2, (60, 2))), torch.ones(60, dtype=torch.float64)
-    got = FlowInterpolation(cap, points, "bilinear")(s, c)
+    got = BilinearFlow(cap, points)(s, c)
     assert (got >= -1e-9).all() and (got <= 2 + 1e-9).all()
     assert (got[~cap.fixed] > 0).float().mean() > 0.95
     c[7] = 0
     s[7] = torch.nan
-    assert FlowInterpolation(cap, points, "bilinear")(s, c).isfinite().all()
+    assert BilinearFlow(cap, points)(s, c).isfinite().all()
 
 
 def test_every_vertex_lies_where_its_bilinear_weights_say():
@@ -154,12 +155,6 @@ def test_every_vertex_lies_where_its_bilinear_weights_say():
     short = ~between & ~membrane.fixed.numpy() & (matrix.sum(1) > 0.02)
     toward = (matrix @ dots)[short] / matrix.sum(1)[short, None] - place[short]
     assert np.linalg.norm(toward, axis=1).max() < 8
-
-
-def test_an_unknown_kind_of_flow_is_refused():
-    cap = spherical_cap(12, 9, 15)
-    with pytest.raises(MembraneError, match="expected one of smooth, bilinear"):
-        FlowInterpolation(cap, pattern(cap, 5)[1], "cubic")
 
 
 def spd(*shape, seed=0):

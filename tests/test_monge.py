@@ -11,7 +11,6 @@ from torchmembrane.estimators.paper.studies.monge import (
     MongeMinimumEnergy,
     adjugate,
     coefficients,
-    form_matrix,
     metric,
 )
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
@@ -64,6 +63,21 @@ def test_the_paper_s_polynomials_with_60_and_62_corrected():
         torch.testing.assert_close(mine, right)
         misprinted = mine is got.x or mine is got.one
         assert ((mine - wrong).abs().max() > 1e-3) == misprinted
+
+
+def form_matrix(m, dx, dy):
+    """Eq. 63, `[..., 4, 4]`: the form of coefficients `m` in `(psi_ij, psi_i,j+1, psi_i+1,j, 1)` for forward differences, `dx`
+    along i and `dy` along j. As printed the linear terms stand above the diagonal only."""
+    none = torch.zeros_like(m.one)
+    xx, yy, half = m.xx / dx**2, m.yy / dy**2, m.xy / (2 * dx * dy)
+    x, y = m.x / dx, m.y / dy
+    rows = [
+        [xx + 2 * half + yy, -yy - half, -xx - half, -x - y],
+        [-yy - half, yy, half, y],
+        [-xx - half, half, xx, x],
+        [none, none, none, m.one],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def test_the_expanded_matrix_is_the_form_of_forward_differences():

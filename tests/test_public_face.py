@@ -105,9 +105,8 @@ def test_wrong_words_are_refused(sensor):
     ):
         with pytest.raises(tm.MembraneError, match=said):
             tm.Reconstructor(sensor, **wrong)
-    for wrong in (dict(flow="cubic"), dict(element="hexagon"), dict(volume="guessed")):
-        with pytest.raises(tm.MembraneError, match="expected one of"):
-            tm.MinimumEnergySettings(**wrong)
+    with pytest.raises(tm.MembraneError, match="expected one of"):
+        tm.PaperSettings(flow="cubic")
     with pytest.raises(tm.MembraneError, match="steps = 1; expected at least 2"):
         tm.ForceBalanceSettings(steps=1)
 

@@ -11,6 +11,7 @@ from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergy
 from torchmembrane.estimators.minimum_energy.flow import FlowInterpolation
+from torchmembrane.estimators.paper.bilinear import BilinearFlow
 from torchmembrane.estimators.paper.estimator import PaperEstimator
 from torchmembrane.markers.screening import MismatchScreen
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
@@ -92,8 +93,8 @@ def test_the_surface_error_grows_by_less_than_a_fifth(pressed, estimator):
             balance = ForceBalance(dome, elasticity, points, dots, 0.1 / 168)
             x = balance(balance.prepare(CAMERA, observed, confidence)).vertices
         else:
-            kind, flow_kind = (PaperEstimator, "bilinear") if estimator == "paper" else (MinimumEnergy, "smooth")
-            flow = FlowInterpolation(dome, points, flow_kind)(observed - rest, confidence)
+            kind, flow_kind = (PaperEstimator, BilinearFlow) if estimator == "paper" else (MinimumEnergy, FlowInterpolation)
+            flow = flow_kind(dome, points)(observed - rest, confidence)
             least = kind(dome, elasticity, CAMERA.pixel_to_ray(vertex_pixels))
             x = least(Observation(*CAMERA.pixel_to_ray(vertex_pixels + flow), confidence)).vertices
         u = (x - dome.rest)[:, torch.from_numpy(points.vertices.astype(int))]

@@ -11,8 +11,6 @@ from .errors import MembraneError
 OF_MATERIAL = ("prestretch", "c1", "c2", "rest_pressure", "rest_load")
 IDENTITY = "rest_markers"
 """The markers' rest positions `[D, 3]`: those of another sensor are refused."""
-GONE = ("marker_vertices", "marker_weights")
-"""Constants of earlier versions, in states that hold all."""
 ALIKE = 1e-4  # largest distance of rest markers of one sensor, over their extent
 
 
@@ -48,8 +46,6 @@ def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) ->
 
 def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
     """Check a state and put the constants in that it lacks, so that those are as they are."""
-    for name in GONE:
-        state.pop(prefix + name, None)
     kept = _kept(module)
     first = {id(buffer): name for name, buffer in reversed(list(module.named_buffers()))}
     for name, buffer in module.named_buffers(remove_duplicate=False):

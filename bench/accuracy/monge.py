@@ -30,10 +30,8 @@ def forms(reconstructor: tm.Reconstructor) -> dict[str, Callable[[Observation], 
         monge = MongeMinimumEnergy(membrane, elasticity, rest_rays, steps)
         return lambda observation: monge(observation.origins[0], observation.directions[0])
 
-    linear = tm.MinimumEnergySettings(volume="linear")
     return {
-        "material, exact volume": reconstructor.estimator,
-        "material, linear volume": tm.MinimumEnergy(membrane, elasticity, rest_rays, settings=linear),
+        "material points": reconstructor.estimator,
         "fixed x y, once (eq. 22)": at_fixed_points(1),
         "fixed x y, five times": at_fixed_points(5),
     }

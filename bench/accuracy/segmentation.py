@@ -5,8 +5,8 @@ python -m bench.accuracy.segmentation CASES [--images] [--json FILE]
 CASES as for accuracy.py, with `contact_centroid_each [I, 3]` in the truth. Printed: for each case, then in the median and at
 worst, the contact error in the sensor's length unit (the larger of the mean distance from the true contacts to the nearest
 found, and back; 10 where none is found), the surface's error over its displacement (rms at the markers), and of the presses by
-several bodies how many contacts are found. The loop is run around the paper's estimator, around it with the energy over the
-free part only (`PaperSettings.free_part_only`), and around minimum energy of the sensor's material. From exact markers with
+several bodies how many contacts are found. The loop is run around the paper's estimator, also with the energy over the free
+part only (`PaperSettings.free_part_only`); of minimum energy the contacts of its surface are taken. From exact markers with
 0.05 px noise, or with --images from the last image of every case, where the paper's estimator finds them by the soft locator.
 """
 
@@ -22,10 +22,10 @@ import torch
 import torchmembrane as tm
 from bench.accuracy.accuracy import cases_in
 from bench.data.record import write
-from torchmembrane.estimators.minimum_energy.segmentation import Segmented, reconstruct_and_segment
+from torchmembrane.estimators.paper.estimator import Segmented
 
 NOISE, NONE_FOUND, ROUNDS = 0.05, 10.0, 8
-PAPER, FREE, MATERIAL, BALANCE = "loop, paper", "loop, paper, free part only", "loop, material", "force balance"
+PAPER, FREE, MATERIAL, BALANCE = "loop, paper", "loop, paper, free part only", "minimum energy", "force balance"
 OPTIONS = {
     PAPER: {"estimator": "paper", "locator": "soft"},
     MATERIAL: {"estimator": "minimum-energy"},
@@ -58,7 +58,7 @@ def segmented(r: tm.Reconstructor, seen: tm.Reconstruction, free_part_only=False
     if free_part_only:
         r.estimator.settings = replace(usual, free_part_only=True)
     observation = r.observation(moved, seen.confidence)
-    got = reconstruct_and_segment(r.estimator, r.estimator.segmentation, observation, ROUNDS)
+    got = r.estimator.reconstruct_and_segment(observation, ROUNDS)
     r.estimator.settings = usual
     return got, r.result(got.surface, observation, moved, seen.confidence, seen.status)
 
@@ -77,16 +77,14 @@ def ways(root: Path, case: dict, images: bool) -> dict[str, tuple[float, float, 
     for name in OPTIONS:
         r = reconstructor(root / case["sensor"], name)
         seen = r(r.read(root / case["images"][-1])) if images else r.from_pixels(torch.from_numpy(truth["uv_deformed"] + noise))
-        if name == BALANCE:
+        if name != PAPER:
             keep(name, seen.contact_points, seen)
             continue
         got, result = segmented(r, seen)
-        if name == PAPER:
-            keep("eq. 29", got.first.points, result)
+        keep("eq. 29", got.first.points, result)
         keep(name, got.contacts.points, result)
-        if name == PAPER:
-            got, result = segmented(r, seen, free_part_only=True)
-            keep(FREE, got.contacts.points, result)
+        got, result = segmented(r, seen, free_part_only=True)
+        keep(FREE, got.contacts.points, result)
     return found
 
 

@@ -5,8 +5,7 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import splu
 
-from torchmembrane.estimators.minimum_energy.estimator import grid_laplacian
-from torchmembrane.estimators.paper.estimator import PaperEstimator
+from torchmembrane.estimators.paper.estimator import PaperEstimator, grid_laplacian
 from torchmembrane.surface.topology import corners
 
 

@@ -2,13 +2,11 @@
 
 python -m bench.speed.speed [--sensor examples/sensor.toml] [--image examples/press_on_axis.png] [--device cpu] [--json FILE]
 
-The paper: its estimator with the soft locator, stage by stage, and `paper_twin` of its solve. Minimum energy: the twin of the
-harmonic problem (linear triangles, volume linearised once, eq. 22) is as one would write it for one frame, sparse assembly and
-factorisation by scipy; that of the sensor's material with an exact volume, `energy_twin`, makes the same steps. Force balance
-(17 x 17): beside `balance_twin`, which makes the same steps. Paper, force balance
-and solves alone: processor time, the least of several turns, taken in turn, as other programs may share the cores. How accurate
-the 17 x 17 grid is: `accuracy/ablation.py`, its base row. With 2000000000 as the environment's MALLOC_TRIM_THRESHOLD_ and
-MALLOC_MMAP_THRESHOLD_ glibc keeps freed memory: a quarter less time in batches.
+The paper: its estimator with the soft locator, stage by stage, and `paper_twin` of its solve. Minimum energy: beside
+`energy_twin`, which makes the same steps. Force balance (17 x 17): beside `balance_twin`, which does so too. Paper, force
+balance and solves alone: processor time, the least of several turns, taken in turn, as other programs may share the cores. How
+accurate the 17 x 17 grid is: `accuracy/ablation.py`, its base row. With 2000000000 as the environment's
+MALLOC_TRIM_THRESHOLD_ and MALLOC_MMAP_THRESHOLD_ glibc keeps freed memory: a quarter less time in batches.
 """
 
 import argparse
@@ -20,9 +18,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import scipy.sparse as sparse
 import torch
-from scipy.sparse.linalg import splu
 
 import torchmembrane as tm
 from bench.data.record import median_seconds, write
@@ -30,47 +26,11 @@ from bench.speed.balance_twin import BalanceTwin
 from bench.speed.energy_twin import EnergyTwin
 from bench.speed.paper_twin import PaperTwin
 from torchmembrane.estimators.base import Observation
-from torchmembrane.surface.topology import corners
-
-
-def scipy_twin(reconstructor):
-    """A function of one frame's ray directions `[V, 3]` that returns the vertices of eq. 22."""
-    estimator, membrane = reconstructor.estimator, reconstructor.estimator.membrane
-    index = corners(torch.arange(len(membrane.rest))[:, None], membrane.grid)[..., 0].reshape(-1, 4).numpy()
-    up = torch.zeros_like(membrane.rest)
-    up[:, 2] = 1
-    local = estimator.elasticity.stiffness_along(membrane.rest, up).reshape(-1, 4, 4).numpy().astype(float)
-    row, column = np.repeat(index, 4, 1).ravel(), np.tile(index, (1, 4)).ravel()
-    free, fixed = membrane.free_vertices.numpy(), membrane.fixed.numpy()
-    rest_range = estimator.rest_range.numpy().astype(float)
-    X, h, p0 = (a.numpy().astype(float) for a in (membrane.rest, estimator.rest_load, estimator.rest_pressure))
-    V0 = float(membrane.rest_volume)
-
-    def solve(d):
-        dots = np.einsum("qic,qjc->qij", d[index], d[index])
-        K = sparse.csc_matrix(((local * dots).ravel(), (row, column)), shape=(len(X), len(X)))
-        start = np.where(fixed[:, None], X, rest_range[:, None] * d)
-        x = torch.from_numpy(start).to(membrane.rest)
-        v = (membrane.volume_gradient(x).numpy() * d).sum(1)
-        load = p0 * v + (h * d).sum(1) - K @ rest_range
-        factor = splu(K[free][:, free])
-        y, w = factor.solve(load[free]), factor.solve(v[free])
-        multiplier = (v[free] @ y - (V0 - float(membrane.volume(x)))) / (v[free] @ w)
-        start[free] += (y - multiplier * w)[:, None] * d[free]
-        return start
-
-    return solve
 
 
 def minimum_energy(args):
-    for label, options in (
-        (
-            "harmonic, triangles, linear volume",
-            dict(model="harmonic", settings=tm.MinimumEnergySettings(volume="linear")),
-        ),
-        ("the sensor's material, exact volume", {}),
-    ):
-        reconstructor = tm.Reconstructor.from_file(args.sensor, "minimum-energy", **options).to(args.device)
+    for label, model in (("harmonic", "harmonic"), ("the sensor's material", None)):
+        reconstructor = tm.Reconstructor.from_file(args.sensor, "minimum-energy", model=model).to(args.device)
         locator, estimator = reconstructor.observer.locator, reconstructor.estimator
         image = reconstructor.read(args.image)
         with torch.no_grad():
@@ -89,7 +49,7 @@ def minimum_energy(args):
                 yield dict(estimator=label, batch=batch, milliseconds_a_frame=times)
                 print(f"{label}, batch {batch}: " + ", ".join(f"{k} {t[0]:.2f} ms" for k, t in times.items()), flush=True)
             if args.device == "cpu":
-                twin = scipy_twin(reconstructor) if options else EnergyTwin(estimator)
+                twin = EnergyTwin(estimator)
                 one = Observation(*(None if part is None else part[:1] for part in observation))
                 d = one.directions[0].double().numpy()
                 gap = np.abs(twin(d) - estimator(one).vertices[0].numpy()).max()

@@ -212,26 +212,6 @@ class Camera(nn.Module):
         return layers_of(self.port_distance, self.port_thickness, self.port_index)
 
 
-def paper_image_point(points: Tensor, focal: Tensor | float) -> Tensor:
-    """The paper's eq. 1, `u = -f x / z, v = -f y / z`.
-
-    The paper looks at the inverted image behind the lens. Everything else here uses the computer-vision convention,
-    `u = f x / z + c`, so that `pixel = centre - paper_image_point(points, focal)` for an undistorted pinhole in air.
-
-    Args:
-        points: `[..., 3]`, length unit.
-        focal: in the unit of the image points.
-
-    Returns:
-        `[..., 2]`, in the unit of the focal length.
-
-    Example:
-        >>> paper_image_point(torch.tensor([1.0, -2.0, 10.0]), 400.0).tolist()
-        [-40.0, 80.0]
-    """
-    return -focal * points[..., :2] / points[..., 2:]
-
-
 def _check_lens(
     model: str, image_size: Sequence[int], focal: Sequence[float], centre: Sequence[float], distortion: Sequence[float]
 ) -> None:

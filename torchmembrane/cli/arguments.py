@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from ..errors import MembraneError
-from .choices import ELEMENTS, ENERGIES, ESTIMATORS, FLOWS, LOCATORS, VOLUMES
+from .choices import ENERGIES, ESTIMATORS, FLOWS, LOCATORS
 
 Add: TypeAlias = Callable[..., Action]
 """A parser's `add_argument`."""
@@ -46,16 +46,13 @@ def add_sensor(add: Add) -> None:
     add("sensor", metavar="SENSOR.toml", help="the sensor file, or preset:NAME")
 
 
-def add_estimator(add: Add, element: str) -> None:
-    """How markers and the surface are found; `element` is the help of --element."""
+def add_estimator(add: Add) -> None:
+    """How markers and the surface are found."""
     named = f"{', '.join(ESTIMATORS)}, the name of an installed one, or MODULE:CLASS, your own"
     add("--estimator", metavar="NAME", default=ESTIMATORS[0], help=f"how the surface is found: {named} (default: %(default)s)")
     add("--energy", choices=ENERGIES, help="the membrane's elastic energy (default: the sensor file's)")
-    add("--element", choices=ELEMENTS, help=element)
-    add("--volume", choices=VOLUMES, help="minimum-energy: its constraint, exact (default) or linearised at rest (eq. 21)")
-    add("--flow", choices=FLOWS, help="between the markers; minimum-energy: smooth (default), paper: bilinear (default)")
-    weight = "weight of the smoother (eq. 28; default: 0.1 for quadrilaterals and paper, else 0)"
-    add("--smoothing", metavar="S", type=not_negative, help=weight)
+    add("--flow", choices=FLOWS, help="paper: the flow between the markers (default: bilinear)")
+    add("--smoothing", metavar="S", type=positive, help="paper: weight of the smoother (eq. 28; default: 0.1)")
     how = "how markers are found: least-squares fit, or soft-argmax (default: soft for paper, else fit)"
     add("--locator", choices=LOCATORS, help=how)
 
@@ -120,14 +117,6 @@ def weight(text: str) -> float:
     if unit is None:
         raise ArgumentTypeError(f"{text!r}; expected a weight with its unit, {', '.join(NEWTONS)}, as 200g")
     return positive(text.strip().removesuffix(unit).strip()) * NEWTONS[unit]
-
-
-def not_negative(text: str) -> float:
-    """A number, 0 or more."""
-    value: float = _values(text, float, 1, "a number, 0 or more")[0]
-    if value < 0:
-        raise ArgumentTypeError(f"{text!r}; expected a number, 0 or more")
-    return value
 
 
 def number_from(least: float, most: float, expected: str = "a number") -> Callable[[str], float]:

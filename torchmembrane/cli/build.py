@@ -11,12 +11,11 @@ from ..estimators.registry import ESTIMATORS, estimator_kind
 from ..reconstruct import Reconstructor
 from ..sensor.sensor import Sensor
 
-OPTIONS = ("element", "volume", "flow", "smoothing", "pressure_noise")
+OPTIONS = ("flow", "smoothing", "pressure_noise")
 
 
 def build_reconstructor(sensor: Sensor, arguments: Namespace) -> Reconstructor:
-    """The reconstructor of `--estimator`, `--energy`, `--element`, `--volume`, `--flow`, `--smoothing`, `--pressure-noise` and
-    `--locator`.
+    """The reconstructor of `--estimator`, `--energy`, `--flow`, `--smoothing`, `--pressure-noise` and `--locator`.
 
     An estimator MODULE:CLASS is looked for in the current directory first.
 

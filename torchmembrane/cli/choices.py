@@ -6,8 +6,6 @@ A test holds every one of them to what the package itself has.
 ESTIMATORS = ("force-balance", "minimum-energy", "paper")
 LOCATORS = ("fit", "soft")
 ENERGIES = ("harmonic", "neo_hookean", "mooney_rivlin")
-ELEMENTS = ("triangle", "quadrilateral")
-VOLUMES = ("exact", "linear")
 FLOWS = ("smooth", "bilinear")
 ENGINES = ("local", "ray")
 RESULT_FORMATS = ("npz", "parquet")

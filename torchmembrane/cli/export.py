@@ -26,7 +26,7 @@ def add_parser(commands: Any) -> None:
     add = add_command(commands, "export", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     add("-o", "--out", metavar="MODEL.onnx", type=Path, required=True, help="the model's file")
-    add_estimator(add, "as for reconstruct (default: triangle)")
+    add_estimator(add)
     add("--tracking", action="store_true", help="follow the dots of the frame before, given with the image")
 
 

@@ -61,7 +61,7 @@ def add_parser(commands: Any) -> None:
     add("--images", metavar="FOLDER", type=Path, help="the images of a folder in name order, likewise")
     add("--rate", metavar="HZ", type=positive, help="pace of files (default: a video's own; of images 30)")
     add("--grid", metavar=("M", "N"), nargs=2, type=count, help="solver grid (default: the sensor file's)")
-    add_estimator(add, "as for reconstruct (default: triangle)")
+    add_estimator(add)
     model = "compute by onnxruntime with a model of torchmembrane export; needs torchmembrane-edge"
     add("--model", metavar="MODEL.onnx", type=Path, help=model)
     add_device(add)

@@ -41,7 +41,7 @@ def add_parser(commands: Any) -> None:
     add_sensor(add)
     add("images", metavar="IMAGES", nargs="+", help="image files, globs (quoted or not), folders, videos, or bags")
     add("--out", metavar="DIR", type=Path, required=True, help="folder of the results: new, or of the same sensor")
-    add_estimator(add, "triangle (default), or quadrilateral: the paper's, harmonic, with the tension of --energy")
+    add_estimator(add)
     add_device(add)
     add("--batch", metavar="N", type=count_or_auto, help="frames computed at once (default: auto, by the memory there is)")
     each = "processes of one thread each; 1: none but this one (default: one per core, if there are frames enough)"

@@ -17,6 +17,8 @@ FINISHED = tuple(status for status in Status if status.has_surface)
 """Status of frames that are not tried again."""
 FORMATS = ("npz", "parquet")
 MESH = "mesh.npz"
+FIXED = ("element", "volume")
+"""Settings that no option of the command chooses: each estimator has its own."""
 OWN, NONE = "of the sensor", "not measured"
 
 
@@ -222,10 +224,10 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
         if before != now:
             held = in_one_line(before) if before else ""
             name, none = option.replace("_", "-"), NONE if option == "pressure" else OWN
-            remedy = f"pass --{name} {held}" if held else f"leave --{name} out"
+            remedy = f", or pass --{name} {held}" if held else f", or leave --{name} out"
             raise MembraneError(
                 f"--out {folder}: was made with {name} {held or none}, this call asks for {now or none}; choose another "
-                f"folder, or {remedy}"
+                f"folder{'' if option in FIXED else remedy}"
             )
 
 

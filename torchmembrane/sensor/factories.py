@@ -3,9 +3,6 @@
 import warnings
 from typing import NamedTuple
 
-from torch import Tensor
-
-from ..mechanics.cavity import CavityLaw
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..surface.membrane import Membrane
 from .sensor import Sensor
@@ -88,25 +85,3 @@ def cavity_filling(sensor: Sensor, membrane: Membrane, *, warn: bool = False) ->
             )
         return CavityFilling("liquid")
     return CavityFilling("gas", (sensor.gas_pressure, sensor.cavity.volume or membrane.cavity_volume))
-
-
-def cavity_law(sensor: Sensor, membrane: Membrane, rest_pressure: Tensor, *, warn: bool = False) -> CavityLaw:
-    """The law of a sensor's cavity under a membrane of any grid.
-
-    Args:
-        sensor: gives filling, pressure and volume.
-        membrane: the rest surface.
-        rest_pressure: the pressure difference at rest `[]`, from `rest_balance`.
-        warn: as for `cavity_filling`.
-
-    Returns:
-        The `CavityLaw`.
-
-    Example:
-        >>> import torch
-        >>> from torchmembrane.sensor.sensor import Sensor
-        >>> sensor = Sensor.from_file("examples/sensor.toml")
-        >>> cavity_law(sensor, sensor.membrane, torch.tensor(0.02)).filling
-        'liquid'
-    """
-    return CavityLaw(membrane, rest_pressure, *cavity_filling(sensor, membrane, warn=warn))

@@ -1,11 +1,11 @@
-"""Where something touches, from the flow alone (section 5.1): polar-angle change, regions that bulge in, the paper's loop.
+"""Where something touches, from the flow or the surface alone (section 5.1): polar-angle change, regions that bulge in.
 
 An inward displacement `-s n` of a point at range `t` turns its ray by `-s (n . e) / t`, where `e` is the direction in which the
 polar angle grows. So `d beta = beta_0 - beta_1` (eq. 29) has the sign of `n . e` where the membrane bulges in: the printed
 `d beta < 0` holds only for a camera above the surface's centre of curvature.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,9 +13,7 @@ from torch import Tensor, nn
 
 from ...camera.model import Rays
 from ...control_flow import traced
-from ...errors import MembraneError
 from ...surface.membrane import Membrane
-from ..base import Equilibrium, Observation
 from ..contacts import (
     CONTACT_POINTS,
     LEAST_BULGE,
@@ -37,24 +35,6 @@ class ContactRegions(NamedTuple):
     bulge: Tensor
     region: Tensor
     points: Tensor
-
-
-class Segmented(NamedTuple):
-    """What the loop of section 5.1 ends with: the last surface, its contacts, those of eq. 29 alone, and by how much the
-    contacts moved in the last round, over the surface's size, `[B]` (infinite where one came or went)."""
-
-    surface: Equilibrium
-    contacts: ContactRegions
-    first: ContactRegions
-    moved: Tensor
-
-
-class RelaxedEstimator(Protocol):
-    """An estimator whose smoother leaves contacts alone."""
-
-    def solve(self, observation: Observation, relaxed: Tensor) -> Equilibrium:
-        """The surface; `relaxed [B, V]` bool: vertices in contact."""
-        ...
 
 
 class PolarAngle(nn.Module):
@@ -177,32 +157,6 @@ class Segmentation(nn.Module):
         region = torch.where(divergent, self.axis_region, bulge_regions(bulge, self.membrane, self.count))
         weight = torch.where(divergent, torch.ones_like(bulge), bulge.clamp_min(0))
         return ContactRegions(bulge, region, region_centroids(x, region, weight, self.membrane, self.count))
-
-
-def reconstruct_and_segment(
-    estimator: RelaxedEstimator, segmentation: Segmentation, observation: Observation, rounds: int
-) -> Segmented:
-    """The loop of section 5.1, a fixed number of times.
-
-    Regions that bulge in by eq. 29 (or the axis, where the flow diverges everywhere); then reconstruct with the smoother
-    relaxed there, take the displacement along the surface's normals, and from it the regions.
-
-    Args:
-        estimator: gives the surface with the smoother relaxed.
-        segmentation: of the same membrane.
-        observation: the rays of the grid's vertices, `[B, V, 3]`.
-        rounds: how often, at least once.
-
-    Raises:
-        MembraneError: no rounds.
-    """
-    if rounds < 1:
-        raise MembraneError(f"reconstruct_and_segment: rounds = {rounds}; expected at least 1")
-    first = before = contacts = segmentation.by_polar_angle(observation.directions)
-    for _ in range(rounds):
-        surface = estimator.solve(observation, segmentation.in_contact(contacts.region))
-        before, contacts = contacts, segmentation.by_normals(surface.vertices)
-    return Segmented(surface, contacts, first, segmentation.moved(before.points, contacts.points))
 
 
 def _axis_region(membrane: Membrane) -> Tensor:

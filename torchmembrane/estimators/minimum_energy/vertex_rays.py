@@ -12,7 +12,7 @@ from ...mechanics.hyperelastic import ElasticEnergy
 from ...surface.membrane import Membrane
 from ..base import Equilibrium, Estimator, Observation, Problem
 from ..contacts import Contacts
-from .flow import VertexFlow
+from .flow import FlowInterpolation, VertexFlow
 from .segmentation import Segmentation
 
 
@@ -58,10 +58,15 @@ class VertexRays(Estimator):
         """The estimator of a sensor; settings as for the class."""
         settings = settings or cls.Settings()
         rays = problem.camera.pixel_to_ray(problem.vertex_pixels)
-        flow = VertexFlow(problem, settings.flow)
+        flow = VertexFlow(problem, cls.interpolation(problem, settings))
         build: Any = cls  # with the arguments of the estimators themselves
         built: Self = build(problem.membrane, problem.elasticity, rays, problem.filling, problem.gas, settings, flow)
         return built
+
+    @classmethod
+    def interpolation(cls, problem: Problem, settings: Any) -> FlowInterpolation:
+        """The flow between the sensor's markers, here smooth."""
+        return FlowInterpolation(problem.membrane, problem.markers)
 
     def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
         """The rays of the grid's vertices, moved by the flow of the markers seen at `pixels [B, D, 2]`; all are as sure."""

@@ -27,12 +27,15 @@ from ...solve.grid_system import GridSystem
 from ...solve.kkt import constrained_minimum
 from ...solve.stencil import inner, pad_border
 from ...surface.membrane import Membrane
-from ..base import Equilibrium, Observation
-from ..minimum_energy.flow import FLOWS, VertexFlow
-from ..minimum_energy.segmentation import reconstruct_and_segment
+from ...surface.topology import corners, corners_to_vertices
+from ..base import Equilibrium, Observation, Problem
+from ..minimum_energy.flow import FlowInterpolation, VertexFlow
+from ..minimum_energy.segmentation import ContactRegions
 from ..minimum_energy.vertex_rays import VertexRays
+from .bilinear import BilinearFlow
 
 OCCUPIED = 1e-3  # weight of a quadrilateral that lies wholly in a contact, where the energy is the free part's
+FLOWS = {"smooth": FlowInterpolation, "bilinear": BilinearFlow}
 CONVERGED = 0.01  # move of the contacts in the last round, over the surface's size, of a converged frame
 
 
@@ -51,6 +54,16 @@ class QuadraticProgramme(NamedTuple):
     load: Tensor
     v: Tensor
     rise: Tensor
+
+
+class Segmented(NamedTuple):
+    """What the loop of section 5.1 ends with: the last surface, its contacts, those of eq. 29 alone, and by how much the
+    contacts moved in the last round, over the surface's size, `[B]` (infinite where one came or went)."""
+
+    surface: Equilibrium
+    contacts: ContactRegions
+    first: ContactRegions
+    moved: Tensor
 
 
 @dataclass(frozen=True)
@@ -125,6 +138,17 @@ class PaperEstimator(VertexRays):
         self.settings, self.elasticity = settings or PaperSettings(), elasticity
         self.system = GridSystem(membrane.grid, inner(self.free[:, None], membrane.grid).squeeze(-1) > 0)
 
+    @classmethod
+    def interpolation(cls, problem: Problem, settings: PaperSettings) -> FlowInterpolation:
+        """The flow between the sensor's markers."""
+        flow: FlowInterpolation = FLOWS[settings.flow](problem.membrane, problem.markers)
+        return flow
+
+    @property
+    def flow_kind(self) -> str:
+        """The flow between the markers: "bilinear" or "smooth"."""
+        return self.settings.flow
+
     @property
     def element(self) -> str:
         """The paper's affine quadrilaterals."""
@@ -141,8 +165,25 @@ class PaperEstimator(VertexRays):
         Args:
             observation: the ray of every vertex now, `[B, V, 3]`.
         """
-        found = reconstruct_and_segment(self, self.segmentation, observation, self.settings.rounds)
+        found = self.reconstruct_and_segment(observation, self.settings.rounds)
         return found.surface._replace(relative_step=found.moved)
+
+    def reconstruct_and_segment(self, observation: Observation, rounds: int) -> Segmented:
+        """The loop of section 5.1, a fixed number of times.
+
+        Regions that bulge in by eq. 29 (or the axis, where the flow diverges everywhere); then reconstruct with the smoother
+        relaxed there, take the displacement along the surface's normals, and from it the regions.
+
+        Args:
+            observation: the rays of the grid's vertices, `[B, V, 3]`.
+            rounds: how often, at least once.
+        """
+        segmentation = self.segmentation
+        first = before = contacts = segmentation.by_polar_angle(observation.directions)
+        for _ in range(rounds):
+            surface = self.solve(observation, segmentation.in_contact(contacts.region))
+            before, contacts = contacts, segmentation.by_normals(surface.vertices)
+        return Segmented(surface, contacts, first, segmentation.moved(before.points, contacts.points))
 
     @traced
     def solve(self, observation: Observation, relaxed: Tensor) -> Equilibrium:
@@ -240,3 +281,11 @@ def _smoother_stencil(relaxed: Tensor, grid: tuple[int, int], free: Tensor) -> T
         ],
         1,
     )
+
+
+def grid_laplacian(psi: Tensor, grid: tuple[int, int]) -> Tensor:
+    """S of eq. 28 for `psi [..., V, C]` (symmetric): every vertex against its neighbours along the grid's lines."""
+    laplacian = torch.tensor(
+        [[2.0, -1, 0, -1], [-1, 2, -1, 0], [0, -1, 2, -1], [-1, 0, -1, 2]], dtype=psi.dtype, device=psi.device
+    )
+    return 0.5 * corners_to_vertices(laplacian @ corners(psi, grid), grid)

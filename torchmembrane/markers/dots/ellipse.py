@@ -49,13 +49,6 @@ def size_tolerance(shapes: np.ndarray, sizes: np.ndarray) -> float:
     return float(np.clip(0.45 * abs(np.median(log_radius[sizes == 1]) - np.median(log_radius[sizes == 0])), 0.2, 0.45))
 
 
-def metric_of(shape: Tensor) -> Tensor:
-    """`(S S^T)^-1 [2, 2, ...]` of `shape [..., 2, 2]`: `x^T (S S^T)^-1 x = |S^-1 x|^2`."""
-    a, b, c, d = shape.flatten(-2).movedim(-1, 0).split(1)
-    uv, area = a * c + b * d, a * d - b * c
-    return torch.cat([c * c + d * d, -uv, -uv, a * a + b * b]).unflatten(0, (2, 2)) / (area * area)
-
-
 def draw_dots(pixels: np.ndarray, shapes: np.ndarray, image_size: tuple[int, int]) -> Tensor:
     """The pattern as dark dots on white.
 

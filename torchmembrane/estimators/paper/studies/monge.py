@@ -21,7 +21,7 @@ from ....mechanics.hyperelastic import ElasticEnergy
 from ....surface.membrane import Membrane
 from ....surface.topology import corners, triangles_of
 from ...base import Equilibrium
-from ...minimum_energy.estimator import grid_laplacian
+from ..estimator import grid_laplacian
 
 STEEPEST = 20.0  # slope of a rest surface that heights can describe
 
@@ -90,31 +90,6 @@ def coefficients(A: Tensor, rest_slope: Tensor, slope: Tensor | None = None) -> 
     xx, xy, yy = N[..., 0, 0], N[..., 0, 1], N[..., 1, 1]
     constant = xx * (1 + p**2) + 2 * xy * p * q + yy * (1 + q**2)
     return Coefficients(xx, yy, 2 * xy, 2 * (xx * p + xy * q), 2 * (xy * p + yy * q), constant)
-
-
-def form_matrix(m: Coefficients, dx: float, dy: float) -> Tensor:
-    """Eq. 63: the form in `(psi_ij, psi_i,j+1, psi_i+1,j, 1)` for forward differences, x along i.
-
-    As printed the linear terms stand above the diagonal only.
-
-    Args:
-        m: the coefficients.
-        dx: spacing along i.
-        dy: spacing along j.
-
-    Returns:
-        The matrix, `[..., 4, 4]`.
-    """
-    none = torch.zeros_like(m.one)
-    xx, yy, half = m.xx / dx**2, m.yy / dy**2, m.xy / (2 * dx * dy)
-    x, y = m.x / dx, m.y / dy
-    rows = [
-        [xx + 2 * half + yy, -yy - half, -xx - half, -x - y],
-        [-yy - half, yy, half, y],
-        [-xx - half, half, xx, x],
-        [none, none, none, m.one],
-    ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 class MongeMinimumEnergy(nn.Module):

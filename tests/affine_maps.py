@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..surface.topology import corners
+from torchmembrane.surface.topology import corners
 
 
 class AffineMap(NamedTuple):
