@@ -243,6 +243,11 @@ class Estimator(nn.Module, ABC):
         return self.cavity.rest_pressure
 
     @property
+    def must_compile(self) -> bool:
+        """Whether the first frame waits for machine code to be compiled; default: no."""
+        return False
+
+    @property
     def solves_in_double(self) -> bool:
         """Whether this sensor must be solved in double precision, whatever the results are in; default: no."""
         return False

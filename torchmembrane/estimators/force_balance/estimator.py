@@ -22,6 +22,7 @@ its lines, and a `Dent` where something pushes. What has not settled is solved a
 from dataclasses import replace
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -37,6 +38,7 @@ from ..base import Deviations, Equilibrium, Estimator, Observation, Problem, Sta
 from ..contacts import Contacts
 from .contact_force import ContactForce
 from .gauss_newton import Descent, State
+from .kernels.steps import compiled
 from .marker_residuals import Bearings, MarkerBearings, marker_rays, seen_from_origin
 from .normal_equations import BalanceEquations
 from .pressure_gauge import gauge_reading, refuse_open
@@ -132,6 +134,12 @@ class ForceBalance(Estimator):
         given = every_second, material, markers, positions, bearings.noise
         settings = replace(self.settings, outlier=self.settings.coarse_outlier)
         return type(self)(*given, settings=settings, is_coarse=True, **others)
+
+    @property
+    def must_compile(self) -> bool:
+        """Whether the first frame waits for machine code to be compiled."""
+        rest = self.membrane.rest
+        return rest.device.type == "cpu" and not compiled.is_compiled(np.dtype(str(rest.dtype).removeprefix("torch.")))
 
     @property
     def solves_in_double(self) -> bool:
