@@ -50,7 +50,11 @@ OPTIONS: dict[str, Any] = dict(nogil=True, error_model="numpy", fastmath={"contr
 INNER: dict[str, Any] = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 compiled = numba.njit(**OPTIONS, **INNER)
-"""Of a function that others call, not Python: its arguments would take as long to unpack as it takes to compile."""
+"""Of a function that others call, not Python: its arguments would take as long to unpack as it takes to compile.
+
+What is quick to compile: a constant argument is passed as `np.intp(4)` or `np.bool_(True)`, as a function is compiled again for
+each literal; loops that need not be unrolled run to a length that is read from an array.
+"""
 
 
 def kept(function: Callable[..., Any]) -> Any:
