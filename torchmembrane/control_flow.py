@@ -87,8 +87,8 @@ def traced(method: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
 def onnx_function(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[torch.Tensor], torch.Tensor]:
     """Decorate a function that is traced for ONNX once for each shape and precision, however often it is called.
 
-    In the trace of a `traced` method a call is one node of the domain `NAMED`, which the exporter replaces by the function's own
-    nodes. Eagerly and compiled it is the function itself.
+    In the trace of a `traced` method a call is one node of the domain `NAMED`, which the exporter replaces by the function's
+    own nodes. Eagerly and compiled it is the function itself.
 
     Args:
         function: from a tensor to one of the same shape and type.
