@@ -1,5 +1,6 @@
 # make demo | make test | make lint (style, types, layers) | make bench | make figures: each sets itself up on a machine with Python 3.11+ only.
 # make soak SOAK=HOURS PRESSES=10000 KILLS=10: damaged files for so many hours, jobs killed, random sensors pressed; all hours long.
+# make test-lowest: the quick start with the lowest versions that pyproject.toml allows, in .venv-lowest.
 # make docs: the site in out/site, links checked.
 # make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
 # make test-cpp | make test-arm: the C++ example (needs cmake); the edge package on an emulated aarch64. On Debian.
@@ -11,6 +12,7 @@ SEED ?= $(shell date +%s)
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+LOWEST := .venv-lowest
 
 WEB := export/web
 CPP := out/cpp
@@ -19,7 +21,7 @@ PACKAGES := $(WEB)/node_modules/.package-lock.json
 SENSOR := examples/sensor.toml examples/rest_grid.npz examples/dots.csv examples/rest.png
 IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
 
-.PHONY: demo test lint style types layers bench soak figures docs web test-web test-cpp test-arm clean
+.PHONY: demo test test-lowest lint style types layers bench soak figures docs web test-web test-cpp test-arm clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -35,6 +37,14 @@ demo: $(READY)
 
 test: $(READY) lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations=8
+
+test-lowest: $(LOWEST)/.ready
+	$(LOWEST)/bin/python tests/lowest.py
+
+$(LOWEST)/.ready: pyproject.toml constraints-lowest.txt
+	$(PYTHON) -m venv --clear $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --quiet --constraint constraints-lowest.txt --editable .
+	touch $@
 
 lint: style types layers
 
@@ -115,4 +125,4 @@ $(PACKAGES): $(WEB)/package.json $(WEB)/package-lock.json
 	cd $(WEB) && npm ci
 
 clean:
-	rm -rf $(VENV) out build *.egg-info $(WEB)/dist $(WEB)/node_modules
+	rm -rf $(VENV) $(LOWEST) out build *.egg-info $(WEB)/dist $(WEB)/node_modules

@@ -1,6 +1,6 @@
-"""The quick start with whatever versions are installed: `make test-lowest` takes the lowest that `pyproject.toml` allows.
+"""The quick start with the lowest versions that `pyproject.toml` allows, as `make test-lowest` installs them.
 
-An image of the examples is reconstructed by each estimator of the command's, and a gradient is taken of one.
+Images of the examples are reconstructed by minimum energy and by force balance, and a gradient is taken through the latter.
 """
 
 import warnings

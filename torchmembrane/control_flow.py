@@ -11,7 +11,6 @@ tensor (`can_sync`), both sides of a branch are, and the result is selected from
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
 from functools import partial, wraps
 from typing import Any, ParamSpec, Protocol, TypeVar
 
@@ -24,7 +23,7 @@ NAMED = "torchmembrane"
 """The ONNX domain of the nodes that stand for an `onnx_function`."""
 FUNCTIONS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {}
 """Every `onnx_function` by its name."""
-_writing = ContextVar("writing", default=False)
+_writing = False  # a plain name: torch.compile of earlier versions than 2.13 reads no ContextVar
 
 
 class Graph(Protocol):
@@ -96,7 +95,7 @@ def onnx_function(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[
 
     @wraps(function)
     def called(value: torch.Tensor) -> torch.Tensor:
-        if not (torch.compiler.is_exporting() and _writing.get()):
+        if not (_writing and torch.compiler.is_exporting()):
             return function(value)
         kept: torch.Tensor = torch.onnx.ops.symbolic(
             f"{NAMED}::{function.__name__}",
@@ -114,11 +113,12 @@ def onnx_function(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[
 @contextmanager
 def writing() -> Iterator[None]:
     """Within, each call of an `onnx_function` is traced as one node."""
-    token = _writing.set(True)
+    global _writing
+    before, _writing = _writing, True
     try:
         yield
     finally:
-        _writing.reset(token)
+        _writing = before
 
 
 def fori_loop(
@@ -306,7 +306,7 @@ def retry_rows(
         >>> retry_rows(x > 1, [x], lambda x: [10 * x], [x])
         [tensor([10.,  2.])]
     """
-    chosen = chosen or partial(_retried, None)
+    chosen = partial(_retried, None) if chosen is None else chosen
     if _graph(values) is not None:
         return cond(done, values, lambda: chosen(done, values, again(*given)))
     if not can_sync(done):

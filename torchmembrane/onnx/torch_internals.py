@@ -37,8 +37,8 @@ except ImportError as error:
     if not (error.name or "").startswith("torch"):
         raise  # onnxscript is not installed
     raise MembraneError(
-        f"export: torch {torch.__version__} lacks a private part that the export needs ({error}); expected a version "
-        f"with which it was tried: {', '.join(CHECKED)}"
+        f"export: torch {torch.__version__} lacks a private part that the export needs ({error}); expected a version with "
+        f"which it was tried: {', '.join(CHECKED)}"
     ) from error
 
 __all__ = ["CHECKED", "TorchExporter", "empty_batches", "replaced", "tree_flatten", "tree_leaves", "tree_map", "tree_unflatten"]

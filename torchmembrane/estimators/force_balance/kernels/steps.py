@@ -116,8 +116,8 @@ def takes(*values: Any) -> bool:
     """Whether steps of these tensors are taken by machine code: on a processor, alone, without gradients."""
     tensors = [value for value in values if value is not None]
     return (
-        is_used()
-        and not torch.compiler.is_compiling()
+        not torch.compiler.is_compiling()
+        and is_used()
         and all(type(value) is Tensor and value.device.type == "cpu" for value in tensors)
         and not (torch.is_grad_enabled() and any(value.requires_grad for value in tensors))
         and all(torch.func.debug_unwrap(value, recurse=False) is value for value in tensors)
