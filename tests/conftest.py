@@ -8,6 +8,7 @@ import torch
 from PIL import Image
 
 from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
@@ -27,6 +28,12 @@ def pytest_collection_modifyitems(items):
     """The longest files first, so that no process has one left to do when the others are through."""
     place = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))
+
+
+@pytest.fixture
+def few_steps():
+    """Settings for torch.compile and torch.export, which unroll all steps: every branch of the solve, each of few steps."""
+    return ForceBalanceSettings(steps=2, coarse_steps=2, fine_steps=2, finer_steps=2, patience=1, settling_steps=2)
 
 
 @pytest.fixture(autouse=True)
