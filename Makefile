@@ -1,4 +1,5 @@
 # make demo | make test | make lint (style, types, layers) | make bench | make figures: each sets itself up on a machine with Python 3.11+ only.
+# make test-all: every test, those that `make test` leaves out for their length as well; weekly and before a release.
 # make soak SOAK=HOURS PRESSES=10000 KILLS=10: damaged files for so many hours, jobs killed, random sensors pressed; all hours long.
 # make test-lowest: the quick start with the lowest versions that pyproject.toml allows, in .venv-lowest.
 # make docs: the site in out/site, links checked.
@@ -19,9 +20,11 @@ CPP := out/cpp
 PAGE := $(WEB)/dist/index.html
 PACKAGES := $(WEB)/node_modules/.package-lock.json
 SENSOR := examples/sensor.toml examples/rest_grid.npz examples/dots.csv examples/rest.png
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder \
+	--durations=8
 IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
 
-.PHONY: demo test test-lowest lint style types layers bench soak figures docs web test-web test-cpp test-arm clean
+.PHONY: demo test test-all test-lowest lint style types layers bench soak figures docs web test-web test-cpp test-arm clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -36,7 +39,10 @@ demo: $(READY)
 		examples/flat_plate.png --out out/demo --figures
 
 test: $(READY) lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations=8
+	$(PYTEST)
+
+test-all: $(READY) lint
+	$(PYTEST) -m ""
 
 test-lowest: $(LOWEST)/.ready
 	$(LOWEST)/bin/python tests/lowest.py

@@ -193,14 +193,14 @@ def with_odd(draw: st.DrawFn, case: Case) -> Case:
 
 
 @st.composite
-def sensors(draw: st.DrawFn) -> Case:
-    """The example's sensor with one or two files changed."""
-    case: Case = {name: (EXAMPLES / name).read_bytes() for name in SENSOR}
+def sensors(draw: st.DrawFn, files: dict[str, bytes]) -> Case:
+    """A sensor's `files`, of the names `SENSOR`, with one or two changed."""
+    case: Case = dict(files)
     mutations = {"sensor.toml": lambda data: sensor_text(data.decode()), "rest_grid.npz": arrays, "rest.png": damaged}
     mutations["dots.csv"] = lambda data: table(data.decode())
     often = ["sensor.toml"] * 10 + ["dots.csv"] * 5 + ["rest_grid.npz"] * 4 + ["rest.png"]
     for name in draw(st.lists(st.sampled_from(often), min_size=1, max_size=2, unique=True)):
-        case[name] = draw(mutations[name](case[name]))
+        case[name] = draw(mutations[name](files[name]))
     return draw(with_odd(case))
 
 
