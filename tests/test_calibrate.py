@@ -284,7 +284,13 @@ def test_a_calibrated_sensor_reconstructs_its_rest(design, truth, image):
 
 
 @pytest.mark.parametrize(
-    "name, pressed", [("rest", False), ("press_on_axis", True), ("flat_plate", True), ("two_contacts", True)]
+    "name, pressed",
+    [
+        ("rest", False),
+        ("press_on_axis", True),
+        pytest.param("flat_plate", True, marks=pytest.mark.full),
+        pytest.param("two_contacts", True, marks=pytest.mark.full),
+    ],
 )
 def test_a_pressed_image_is_noticed_to_be_no_rest(name, pressed):
     sensor = Sensor.from_file("examples/sensor.toml")

@@ -6,6 +6,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,8 @@ SENSOR = str(EXAMPLES / "sensor.toml")
 
 @pytest.fixture(scope="module")
 def example_reconstructor():
-    return Reconstructor(Sensor.from_file(SENSOR))
+    sensor = Sensor.from_file(SENSOR)
+    return Reconstructor(replace(sensor, membrane=sensor.surface.membrane((9, 9))))
 
 
 @pytest.fixture

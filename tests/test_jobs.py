@@ -323,7 +323,9 @@ def test_a_killed_command_keeps_what_is_done(small_sensor, small_images, tmp_pat
     def done() -> int:
         return len(rows_in(out)) if format == "parquet" else len(list(out.glob("k*.npz")))
 
-    with subprocess.Popen([sys.executable, "-c", QUICKLY_SAVING, *command, workers], stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", QUICKLY_SAVING, *command, workers], stderr=subprocess.PIPE, text=True
+    ) as process:
         wait_for(lambda: done() > 0 or process.poll() is not None)
         process.send_signal(end)
         said = process.communicate()[1]

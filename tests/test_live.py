@@ -18,6 +18,7 @@ import pytest
 from PIL import Image
 
 import torchmembrane as tm
+from torchmembrane.cli.live import _stopped_by_signals
 from torchmembrane.cli.main import main
 from torchmembrane.files.images import read_image
 from torchmembrane.live.background import Background
@@ -410,6 +411,18 @@ def test_wrong_usage_of_the_command_is_said(small_sensor, options, said, capsys,
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_asks_for_the_end_and_the_second_is_an_interruption(number):
+    before = signal.getsignal(number)
+    with _stopped_by_signals() as stop:
+        assert not stop.is_set()
+        signal.raise_signal(number)
+        assert stop.is_set()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+    assert signal.getsignal(number) == before
+
+
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.full), signal.SIGTERM])
 def test_a_signal_ends_the_command_with_its_summary(small_sensor, small_images, tmp_path, number):
     """From a folder of a minute; `z` is answered on the way."""
     for k in range(1800):
