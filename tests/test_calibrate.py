@@ -176,7 +176,7 @@ def test_centre_of_an_outline_is_that_of_its_ellipse():
 # boards
 
 
-@pytest.mark.parametrize("turn", [0.0, 2.0])
+@pytest.mark.parametrize("turn", [pytest.param(0.0, marks=pytest.mark.full), 2.0])
 def test_board_dots_are_named_right_in_any_turn_and_when_cut(turn):
     camera = Camera("pinhole", SIZE, (150, 150), (160, 120), (-0.1, 0.02))
     R = Rotation.from_euler("xz", [0.3, turn]).as_matrix()

@@ -12,7 +12,7 @@ import torch
 import torchmembrane as tm
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 
-FEW = ForceBalanceSettings(steps=2, coarse_steps=1, fine_steps=1, finer_steps=1, settling_steps=2, patience=2)
+FEW = ForceBalanceSettings(steps=2, coarse_steps=2, fine_steps=2, finer_steps=2, settling_steps=2, patience=2)
 CASES = [
     ("force-balance", dict(settings=FEW)),
     ("force-balance", dict(settings=FEW, locator="soft")),

@@ -13,7 +13,14 @@ from torchmembrane import Camera, MembraneError, Sensor
 from torchmembrane.calibrate.rim import find_rim
 from torchmembrane.cli.main import main
 from torchmembrane.presets.dot_list import read_drafted_dots
-from torchmembrane.presets.draft import RimCircle, balanced, drafted_dots, drafted_surface, overpressure
+from torchmembrane.presets.draft import (
+    RimCircle,
+    balanced,
+    drafted_dots,
+    drafted_surface,
+    overpressure,
+    pressure_in_hectopascal,
+)
 from torchmembrane.sensor.parts import METRE, Cavity, Markers, Material
 from torchmembrane.simulate.appearance import noisy
 from torchmembrane.simulate.render import Renderer
@@ -223,6 +230,11 @@ def test_what_is_missing_or_too_much_is_named(tmp_path, capsys, arguments, said)
     assert main(["init", str(tmp_path / "sensor.toml"), *arguments.split()]) == 2
     error = capsys.readouterr().err
     assert said in error and len(error.splitlines()) == 1 and not (tmp_path / "sensor.toml").exists()
+
+
+@pytest.mark.parametrize("text", ["250000 Pa", "2500hPa", "2500 mbar", "250kPa", "2.5 bar", "36.259434 psi"])
+def test_a_pressure_is_the_same_in_all_of_its_units(text):
+    assert pressure_in_hectopascal(text) == pytest.approx(2500.0, rel=1e-6)
 
 
 @pytest.mark.parametrize("text", ["20", "20 furlongs", "hPa"])

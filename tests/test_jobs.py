@@ -22,7 +22,15 @@ from torchmembrane.files.folder_lock import WHOLE, Claim, Shard
 from torchmembrane.files.provenance import Origin
 from torchmembrane.jobs import workers
 from torchmembrane.jobs.inputs import find_inputs
-from torchmembrane.jobs.workers import LARGEST_BATCH, MEMORY_SHARE, batch_for, frame_bytes
+from torchmembrane.jobs.workers import (
+    FRAMES_EACH,
+    LARGEST_BATCH,
+    MEMORY_SHARE,
+    batch_for,
+    frame_bytes,
+    memory_here,
+    workers_for,
+)
 from torchmembrane.results import frame_table
 from torchmembrane.results.npz import save_frame
 from torchmembrane.results.read import read_results
@@ -367,6 +375,23 @@ def test_batches_take_their_share_of_the_memory_at_most(monkeypatch, workers, ve
     taken = workers * frame_bytes(size, vertices)
     assert batch == 1 or batch * taken <= MEMORY_SHARE * memory
     assert batch == LARGEST_BATCH or (batch + 1) * taken > MEMORY_SHARE * memory
+
+
+def test_worker_processes_are_as_many_as_are_worth_their_start_and_no_more_than_cores(monkeypatch):
+    monkeypatch.setattr("torchmembrane.jobs.workers.cores", lambda: 4)
+    frames = [0, 1, 2 * FRAMES_EACH - 1, 2 * FRAMES_EACH, 3 * FRAMES_EACH, 100 * FRAMES_EACH]
+    assert [workers_for(count, "cpu") for count in frames] == [1, 1, 1, 2, 3, 4]
+    assert workers_for(100 * FRAMES_EACH, "cuda") == 1
+
+
+def test_the_memory_is_the_container_s_where_that_has_less(tmp_path, monkeypatch):
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr("torchmembrane.jobs.workers.CONTAINER", limit)
+    machine = memory_here()
+    for text, expected in ((str(2**20), 2**20), (str(2**60), machine), ("max\n", machine)):
+        limit.write_text(text)
+        assert memory_here() == expected
+    assert machine > 2**20
 
 
 PEAK = """
