@@ -1,7 +1,6 @@
 """The command `torchmembrane simulate` as a person uses it, its data sets, and the sensors that come with the package."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -273,7 +272,7 @@ def test_a_simulation_on_the_solver_s_own_grid_is_refused():
 @pytest.mark.parametrize("name", NAMES)
 def test_every_dot_of_a_preset_is_found_in_its_rest_image(name):
     sensor = preset(name)
-    reconstructor = Reconstructor(replace(sensor, membrane=sensor.surface.membrane((17, 17))))
+    reconstructor = Reconstructor(sensor)
     rest = reconstructor(torch.from_numpy(sensor.markers.rest_image)).frame(0)
     assert sensor.name == name and int(rest["status"]) == 0 and (rest["confidence"] > 0.8).all()
     strength = reconstructor.observer.locator.strength  # what each dot's own blob is expected to have

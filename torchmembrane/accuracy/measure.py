@@ -81,11 +81,8 @@ def spec_sheet(
         balls and boxes, every second with friction.
 
     Example:
-        >>> from dataclasses import replace
         >>> from torchmembrane.presets import preset
-        >>> bubble = preset("bubble")
-        >>> bubble = replace(bubble, membrane=bubble.surface.membrane((9, 9)))  # quicker, less accurate
-        >>> sheet = spec_sheet(bubble, effort=Effort(strokes=1, frames=2, directions=0, distances=0, rest=1))
+        >>> sheet = spec_sheet(preset("bubble"), effort=Effort(strokes=1, frames=2, directions=0, distances=0, rest=1))
         >>> len(sheet.presses), sheet.force_unit, sheet.rest.touched
         (2, 'N', 0)
     """
