@@ -59,7 +59,7 @@ def render(pixels, shapes, noise=0.02, seed=0, kept=None):
     steps = np.arange(-2, 3) / 5
     kept = np.ones(len(pixels), bool) if kept is None else kept
     for centre, shape in zip(pixels[kept], shapes[kept], strict=True):
-        (u0, v0), reach = np.round(centre).astype(int), 12
+        (u0, v0), reach = np.round(centre).astype(int), int(min(12, np.linalg.norm(shape, 2) + 2))
         patch = np.s_[max(v0 - reach, 0) : v0 + reach + 1, max(u0 - reach, 0) : u0 + reach + 1]
         place = np.stack([u[patch], v[patch]], -1)[..., None, None, :] + np.stack(np.meshgrid(steps, steps), -1)
         inside = np.linalg.norm((place - centre) @ np.linalg.inv(shape).T, axis=-1) < 1
