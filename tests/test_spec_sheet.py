@@ -11,8 +11,9 @@ import torch
 from PIL import Image
 
 from torchmembrane.accuracy import measure, presses, rig, statistics
-from torchmembrane.accuracy.measure import Effort, spec_sheet
-from torchmembrane.accuracy.spec_sheet import CLOSE, LOST, ClosestPair, PairTrial, PressTrial, Spread
+from torchmembrane.accuracy.finished import FinishedSeries
+from torchmembrane.accuracy.measure import spec_sheet
+from torchmembrane.accuracy.spec_sheet import CLOSE, LOST, ClosestPair, Effort, PairTrial, PressTrial, Spread
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.cli.sheet import sheet_lines
@@ -311,6 +312,24 @@ def test_a_sheet_is_what_its_trials_give(sheet, sensor):
     assert np.median([t.force_error for t in firm]) < 0.5 and np.median([t.surface_error for t in firm]) < 0.5
 
 
+def test_an_interrupted_sheet_is_the_same_to_the_last_bit(sensor, sheet, tmp_path, monkeypatch):
+    """Its frames at rest and one stroke from the file."""
+
+    def stop(simulator, number, *rest):
+        if number == 1:
+            raise KeyboardInterrupt
+        return strokes(simulator, number, *rest)
+
+    strokes = presses.stroke_states
+    monkeypatch.setattr(measure, "stroke_states", stop)
+    with pytest.raises(KeyboardInterrupt):
+        spec_sheet(sensor, 3, effort=LITTLE, finished=FinishedSeries.open(tmp_path, "1", sensor, 3, None, LITTLE))
+    monkeypatch.setattr(measure, "stroke_states", strokes)
+    kept = FinishedSeries.open(tmp_path, "1", sensor, 3, None, LITTLE)
+    assert list(kept.outcomes) == [0, 1]
+    assert repr(spec_sheet(sensor, 3, effort=LITTLE, finished=kept)) == repr(sheet)
+
+
 def test_noise_is_that_of_the_rest_image(sensor):
     simulator = rig.Simulator(sensor, appearance=rig.Appearance(noise=33.0))
     noisy = replace(sensor, markers=replace(sensor.markers, rest_image=simulator.rest_image()))
@@ -332,7 +351,8 @@ def test_the_command_prints_and_draws_the_sheet(small_sensor, sheet, monkeypatch
     call = ["check", str(small_sensor / "sensor.toml"), "--accuracy", "--seed", "3", "--jobs", "1"]
     assert cli.main([*call, "--out", str(tmp_path / "a.png")]) == 0
     said = capsys.readouterr().out
-    assert asked == dict(seed=3, noise=None, jobs=1, name="cap")
+    assert {"progress", "finished"} < asked.keys() and asked["finished"].path.parent == tmp_path
+    assert {key: asked[key] for key in ("seed", "noise", "jobs", "name")} == dict(seed=3, noise=None, jobs=1, name="cap")
     assert said.endswith("\n".join(sheet_lines(sheet)) + f"\ndrawn in {tmp_path / 'a.png'}\n")
     for part in ("at rest   surface", "lightest  ", "errors    by the true force", "two       ", "deepest   press", "force, N"):
         assert part in said
@@ -374,10 +394,12 @@ def test_other_processes_leave_the_sensor_as_it_is(sensor, work, monkeypatch):
         def imap(self, work, tasks):
             return iter(())
 
+        imap_unordered = imap
+
     monkeypatch.setattr("multiprocessing.context.SpawnContext.Pool", lambda _, *arguments: Pool(*arguments))
     if work is measure:
         made = rig.Rig(gridded, 40.0)
-        assert list(measure._in_processes(made, [measure.Series("rest", k, LITTLE, 0) for k in range(2)], 2)) == []
+        assert list(measure._in_processes(made, [(k, measure.Series("rest", k, LITTLE, 0)) for k in range(2)], 2)) == []
     else:
         list(dataset._in_processes(rig.Simulator(gridded), dataset.Plan(), [0, 1], 2))
     overwritten = [np.full((9, 9, 3), 7.0) for _ in range(50)]

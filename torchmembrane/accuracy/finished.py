@@ -6,7 +6,6 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
-from .. import __version__
 from ..errors import MembraneError
 from ..files.atomic import whole_file
 from ..files.safe_read import read_text
@@ -29,11 +28,14 @@ class FinishedSeries(NamedTuple):
     outcomes: dict[int, Outcome]
 
     @classmethod
-    def open(cls, folder: Path, sensor: Sensor, seed: int, noise: float | None, effort: Effort) -> "FinishedSeries":
-        """The file of one spec sheet; what it holds is used only if sensor, seed, noise, effort and version are the same.
+    def open(
+        cls, folder: Path, version: str, sensor: Sensor, seed: int, noise: float | None, effort: Effort
+    ) -> "FinishedSeries":
+        """The file of one spec sheet: another version, sensor, seed, noise or effort has another file.
 
         Args:
             folder: where the file is.
+            version: of the package.
             sensor: the sensor.
             seed: of the trials.
             noise: of the images, dB; None: that of the rest image.
@@ -42,7 +44,7 @@ class FinishedSeries(NamedTuple):
         Raises:
             MembraneError: the file cannot be read.
         """
-        key = json.dumps([__version__, sensor.fingerprint, seed, noise, effort])
+        key = json.dumps([version, sensor.fingerprint, seed, noise, effort])
         path = folder / f"accuracy-{hashlib.sha256(key.encode()).hexdigest()[:12]}.unfinished.json"
         return cls(path, _read(path) if path.exists() else {})
 

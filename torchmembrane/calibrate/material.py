@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..estimators.force_balance.estimator import ForceBalance
-from ..reconstruct import Reconstructor
 from ..progress import Progress, silent, within
+from ..reconstruct import Reconstructor
 from ..results.status import Status
 from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor

@@ -6,6 +6,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .. import __version__
 from ..errors import MembraneError
 from .arguments import add_command, add_sensor, count, number_from, seed
 from .choices import MOST_DECIBEL
@@ -84,7 +85,7 @@ def _finished(sensor: "Sensor", arguments: Namespace) -> "FinishedSeries":
     from ..accuracy.spec_sheet import Effort
 
     folder = arguments.out.parent if arguments.out else Path()
-    finished = FinishedSeries.open(folder, sensor, arguments.seed or 0, arguments.noise, Effort())
+    finished = FinishedSeries.open(folder, __version__, sensor, arguments.seed or 0, arguments.noise, Effort())
     if finished.outcomes:
         print(
             f"check --accuracy: goes on from {len(finished.outcomes)} finished series in {finished.path}",
@@ -100,8 +101,8 @@ def _sheet(sensor: "Sensor", arguments: Namespace, finished: "FinishedSeries") -
     from .sheet import sheet_lines
 
     jobs = arguments.jobs or os.cpu_count() or 1
-    options = dict(noise=arguments.noise, jobs=jobs, finished=finished)
     with ProgressDisplay("check --accuracy") as progress:
-        sheet = spec_sheet(sensor, arguments.seed or 0, **options, progress=progress)
+        options: dict[str, Any] = dict(noise=arguments.noise, jobs=jobs, finished=finished, progress=progress)
+        sheet = spec_sheet(sensor, arguments.seed or 0, **options)
     print("\n".join(sheet_lines(sheet)))
     return sheet
