@@ -34,7 +34,8 @@ def duration(seconds: float) -> str:
 class ProgressDisplay:
     """Shows what a computation tells of its progress; the object is the computation's `progress`.
 
-    The time left is that of the work so far, counted from the first call, times the work left over the work done.
+    The time left is by the rate of the latter half of the work done since the first call: what only the beginning takes, other
+    processes to start or code to compile, is soon forgotten.
 
     Args:
         title: of the command.
@@ -48,7 +49,7 @@ class ProgressDisplay:
 
     def __init__(self, title: str) -> None:
         self.title = title
-        self.began: tuple[float, float] | None = None
+        self.told: list[tuple[float, float]] = []
         self.said = -LINE_SECONDS
 
     def __enter__(self) -> "ProgressDisplay":
@@ -87,10 +88,13 @@ class ProgressDisplay:
             share: of the work that is done.
             now: seconds, of any clock; the first call begins.
         """
-        if self.began is None:
-            self.began = share, now
-        first, start = self.began
-        return (now - start) * (1 - share) / (share - first) if share > first else None
+        self.told.append((share, now))
+        first = self.told[0][0]
+        before = [(done, at) for done, at in self.told if done < share]
+        if not before:
+            return None
+        half = next((each for each in before if each[0] >= (first + share) / 2), before[-1])
+        return (now - half[1]) * (1 - share) / (share - half[0])
 
     def write(self, line: str) -> None:
         """Write a line of its own, above the bar where there is one."""
