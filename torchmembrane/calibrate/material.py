@@ -31,7 +31,7 @@ GAS_SETTLED = 0.1  # change of a gas' modulus, relative, that changes the prestr
 FINE = 4001  # prestretches over which the probability is summed
 # What takes how much of the time, measured: of all, the markers in the images; of a round, the losses with pressures, forces or
 # neither known; over a solve from rest, the steps from both neighbours' solutions.
-IMAGES_SHARE, PROFILE_SHARE, CONTINUED = 0.05, (0.6, 0.85, 1.0), 1.0
+IMAGES_SHARE, PROFILE_SHARE, CONTINUED = 0.05, (0.6, 0.8, 1.0), 0.1
 
 
 class LossProfile(NamedTuple):

@@ -26,7 +26,9 @@ examples:
 
 --accuracy presses the sensor in the simulator, some 150 images, and reconstructs them: noise at rest, the lightest touch found,
 errors of force, depth and place, how near two touches are told apart, how deep a press may be. Some minutes of processor time,
-more for larger images. SENSOR.toml may be preset:NAME.
+more for larger images. Interrupted, it keeps the series of presses that are finished, in accuracy-*.unfinished.json beside
+--out, else in the current folder; the same command goes on from there and removes the file at the end. SENSOR.toml may be
+preset:NAME.
 
 exit code: 0 the sensor can be used, 2 it cannot: the message says why"""
 
