@@ -8,6 +8,7 @@ from multiprocessing.reduction import ForkingPickler
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 from torchmembrane.accuracy import measure, presses, rig, statistics
@@ -18,6 +19,7 @@ from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.cli.sheet import sheet_lines
 from torchmembrane.errors import MembraneError
+from torchmembrane.plot.accuracy import draw_sheet
 from torchmembrane.results.reconstruction import Reconstruction
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate import dataset
@@ -171,6 +173,29 @@ def test_bands_hold_the_errors_of_their_presses():
     for band, force in zip(table, forces, strict=True):
         assert band.force == pytest.approx((0.055, 0.091)) and band.depth == pytest.approx((5.5 * force, 9.1 * force))
         assert band.found == 0.9 and band.place == pytest.approx((0.55, 1.41))
+
+
+def test_a_press_as_hard_as_a_band_s_end_is_in_that_band_only():
+    table = statistics.bands([trial(force) for force in (1.0, 3.0, 100.0)], near=NEAR)
+    assert [(band.high, band.presses) for band in table] == [(1, 1), (3, 1), (100, 1)]
+
+
+def test_pairs_begin_at_the_widest_distance_and_come_nearer_by_the_same_ratio(small_rig, monkeypatch):
+    places = []
+    monkeypatch.setattr(presses, "_pair", lambda simulator, place, way: places.append(place) or [None])
+    presses.pair_states(small_rig.simulator, 0, 3, 0)
+    apart = [np.linalg.norm(place[1] - place[0]) for place in places]
+    size = small_rig.simulator.membrane.size
+    wanted = [presses.WIDEST * size * presses.NEARER**k for k in range(3)]
+    assert len(places) > 0 and min(abs(apart[0] / np.array(wanted) - 1)) < 0.1  # the tangent's points, brought to the surface
+
+
+def test_presses_are_drawn_with_their_errors_in_percent(sheet):
+    bad = trial(2.0, depth=0.7, surface_error=0.4)
+    figure = Figure()
+    draw_sheet(figure, sheet._replace(presses=[trial(1.0, depth=0.5, surface_error=0.1), bad]))
+    points = {line.get_label(): line.get_xydata().tolist() for line in figure.axes[2].lines}
+    assert points["reconstructed"] == [[0.5, pytest.approx(10)]] and points["not"] == [[0.7, pytest.approx(40)]]
 
 
 def test_bands_without_results_say_so():

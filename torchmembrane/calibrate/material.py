@@ -325,7 +325,7 @@ class Presses:
         return fitted.modulus, fitted.deviation, change, fitted.pressures
 
     def modulus(
-        self, log_stretch: float, deviation: float, forces: np.ndarray, progress: Progress
+        self, log_stretch: float, deviation: float, forces: np.ndarray, progress: Progress = silent
     ) -> tuple[float, float, float, np.ndarray]:
         """The modulus from presses of known force.
 
