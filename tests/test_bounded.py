@@ -173,6 +173,7 @@ OTHERS_FILES = {
     "sensor/table.py": "tomllib, of text",
     "cli/calibrate/files.py": "np.loadtxt, of text",
     "simulate/frames.py": "JSON, of text, and of a table's metadata",
+    "accuracy/finished.py": "JSON, of text",
     "jobs/decode.py": "PyAV reads videos itself",
     "live/sources.py": "PyAV reads videos itself",
 }

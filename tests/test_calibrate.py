@@ -463,5 +463,5 @@ def test_values_that_calibrate_nothing_are_refused_in_one_line(tmp_path, capsys,
     np.save("far.npy", np.full((480, 640), 1e300))
     Image.new("L", (16, 12)).save("small.png")
     assert cli.main(["calibrate", step, str(example / "sensor.toml"), *options, "--out", "out"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line and not Path("out").exists()
+    begun, line = capsys.readouterr().err.splitlines()
+    assert begun.startswith(f"calibrate {step}: ") and words in line and not Path("out").exists()

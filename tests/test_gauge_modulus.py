@@ -65,6 +65,15 @@ def test_the_deviation_is_that_of_readings_which_are_off_as_supposed(found):
     assert draws[:, 0].std() == pytest.approx(np.median(draws[:, 1]), rel=0.15)
 
 
+def test_readings_off_a_line_enlarge_the_deviation_as_a_fit_of_two_unknowns_has_it():
+    """numpy's weighted line, its covariance scaled by chi squared over two less than the readings."""
+    sigma = np.hypot(PRESSURE_ERROR * CHANGE, GAUGE_ERROR * REST)
+    readings = 1013 + 0.4 * CHANGE + sigma * np.array([1, -1, -1, 1])
+    fit = modulus_from_pressures(liquid, readings, False, 1.0, gas=False)
+    (slope, _), covariance = np.polyfit(CHANGE, readings, 1, w=1 / sigma, cov=True)
+    assert fit.modulus == pytest.approx(slope) and fit.deviation == pytest.approx(np.sqrt(covariance[0, 0]))
+
+
 def test_the_gas_is_solved_with_its_modulus():
     readings = soft_gas(0.4).change
     fit = modulus_from_pressures(soft_gas, readings, True, 1.0, gas=True)

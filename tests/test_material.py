@@ -11,9 +11,11 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.calibrate.material import STRETCHES, Presses, _log_stretch, material_from_pixels
+from torchmembrane.calibrate.report import Report
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
+from torchmembrane.plot.calibration import material_figure
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
@@ -102,6 +104,15 @@ def test_a_gas_of_unknown_modulus_is_found_as_one_whose_file_says_it(presses):
     assert found[0] == pytest.approx(found[1], rel=0.1)
     liquid = material_from_pixels(sensor(told), pixels, forces).values
     assert abs(liquid[0] / found[1][0] - 1) > 0.08
+
+
+def test_the_figure_marks_one_deviation_on_either_side_of_the_prestretch():
+    none, known = np.zeros((0, 2)), np.array([1.4, 0.1])
+    report = Report("material", ["prestretch"], [""], known[:1], known[:1], known[1:], np.eye(1), none, none, 0.0, [])
+    profile = np.array([1.1, 1.4, 1.8]), np.array([[4.0], [0.0], [1.0]])
+    figure = material_figure(report, SimpleNamespace(profile=profile, forces=none, pressures=none), [])
+    (span,) = figure.axes[0].patches
+    assert span.get_extents().transformed(figure.axes[0].transData.inverted()).intervalx == pytest.approx([1.3, 1.5])
 
 
 def test_rest_tells_no_prestretch():

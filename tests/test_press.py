@@ -139,6 +139,16 @@ def test_forces_balance_and_the_liquid_keeps_its_volume(dome, slid):
     torch.testing.assert_close((state.traction * dome.vertex_area(state.vertices)[:, None]).sum(0), state.force)
 
 
+def test_a_contact_s_point_is_the_centroid_of_its_normal_forces(dome):
+    """Without friction nodal forces are normal ones; here their centroid is 0.1 off the mean of the vertices that touch."""
+    ball = tip(dome, (0.3, 0, -1.0))
+    state = press(dome, elasticity_of(dome), [[ball, ball.moved((0.3, 0, -1.0))]])
+    force = state.traction.norm(dim=-1) * dome.vertex_area(state.vertices)
+    centroid = force @ state.vertices / force.sum()
+    torch.testing.assert_close(state.contact_points[0], centroid)
+    assert (centroid - state.vertices[state.contact].mean(0)).norm() > 0.01
+
+
 def test_nothing_penetrates_and_friction_stays_in_its_cone(dome, slid):
     ball, state = slid
     assert state.penetration < 1e-6

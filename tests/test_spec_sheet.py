@@ -8,15 +8,18 @@ from multiprocessing.reduction import ForkingPickler
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 from torchmembrane.accuracy import measure, presses, rig, statistics
-from torchmembrane.accuracy.measure import Effort, spec_sheet
-from torchmembrane.accuracy.spec_sheet import CLOSE, LOST, ClosestPair, PairTrial, PressTrial, Spread
+from torchmembrane.accuracy.finished import FinishedSeries
+from torchmembrane.accuracy.measure import spec_sheet
+from torchmembrane.accuracy.spec_sheet import CLOSE, LOST, ClosestPair, Effort, PairTrial, PressTrial, Spread
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.cli.sheet import sheet_lines
 from torchmembrane.errors import MembraneError
+from torchmembrane.plot.accuracy import draw_sheet
 from torchmembrane.results.reconstruction import Reconstruction
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate import dataset
@@ -172,6 +175,29 @@ def test_bands_hold_the_errors_of_their_presses():
         assert band.found == 0.9 and band.place == pytest.approx((0.55, 1.41))
 
 
+def test_a_press_as_hard_as_a_band_s_end_is_in_that_band_only():
+    table = statistics.bands([trial(force) for force in (1.0, 3.0, 100.0)], near=NEAR)
+    assert [(band.high, band.presses) for band in table] == [(1, 1), (3, 1), (100, 1)]
+
+
+def test_pairs_begin_at_the_widest_distance_and_come_nearer_by_the_same_ratio(small_rig, monkeypatch):
+    places = []
+    monkeypatch.setattr(presses, "_pair", lambda simulator, place, way: places.append(place) or [None])
+    presses.pair_states(small_rig.simulator, 0, 3, 0)
+    apart = [np.linalg.norm(place[1] - place[0]) for place in places]
+    size = small_rig.simulator.membrane.size
+    wanted = [presses.WIDEST * size * presses.NEARER**k for k in range(3)]
+    assert len(places) > 0 and min(abs(apart[0] / np.array(wanted) - 1)) < 0.1  # the tangent's points, brought to the surface
+
+
+def test_presses_are_drawn_with_their_errors_in_percent(sheet):
+    bad = trial(2.0, depth=0.7, surface_error=0.4)
+    figure = Figure()
+    draw_sheet(figure, sheet._replace(presses=[trial(1.0, depth=0.5, surface_error=0.1), bad]))
+    points = {line.get_label(): line.get_xydata().tolist() for line in figure.axes[2].lines}
+    assert points["reconstructed"] == [[0.5, pytest.approx(10)]] and points["not"] == [[0.7, pytest.approx(40)]]
+
+
 def test_bands_without_results_say_so():
     (band,) = statistics.bands([trial(status=7)], NEAR)
     assert band.relied_on == 0 and math.isnan(band.found) and math.isnan(band.force.median)
@@ -311,6 +337,24 @@ def test_a_sheet_is_what_its_trials_give(sheet, sensor):
     assert np.median([t.force_error for t in firm]) < 0.5 and np.median([t.surface_error for t in firm]) < 0.5
 
 
+def test_an_interrupted_sheet_is_the_same_to_the_last_bit(sensor, sheet, tmp_path, monkeypatch):
+    """Its frames at rest and one stroke from the file."""
+
+    def stop(simulator, number, *rest):
+        if number == 1:
+            raise KeyboardInterrupt
+        return strokes(simulator, number, *rest)
+
+    strokes = presses.stroke_states
+    monkeypatch.setattr(measure, "stroke_states", stop)
+    with pytest.raises(KeyboardInterrupt):
+        spec_sheet(sensor, 3, effort=LITTLE, finished=FinishedSeries.open(tmp_path, "1", sensor, 3, None, LITTLE))
+    monkeypatch.setattr(measure, "stroke_states", strokes)
+    kept = FinishedSeries.open(tmp_path, "1", sensor, 3, None, LITTLE)
+    assert list(kept.outcomes) == [0, 1]
+    assert repr(spec_sheet(sensor, 3, effort=LITTLE, finished=kept)) == repr(sheet)
+
+
 def test_noise_is_that_of_the_rest_image(sensor):
     simulator = rig.Simulator(sensor, appearance=rig.Appearance(noise=33.0))
     noisy = replace(sensor, markers=replace(sensor.markers, rest_image=simulator.rest_image()))
@@ -332,7 +376,8 @@ def test_the_command_prints_and_draws_the_sheet(small_sensor, sheet, monkeypatch
     call = ["check", str(small_sensor / "sensor.toml"), "--accuracy", "--seed", "3", "--jobs", "1"]
     assert cli.main([*call, "--out", str(tmp_path / "a.png")]) == 0
     said = capsys.readouterr().out
-    assert asked == dict(seed=3, noise=None, jobs=1, name="cap")
+    assert {"progress", "finished"} < asked.keys() and asked["finished"].path.parent == tmp_path
+    assert {key: asked[key] for key in ("seed", "noise", "jobs", "name")} == dict(seed=3, noise=None, jobs=1, name="cap")
     assert said.endswith("\n".join(sheet_lines(sheet)) + f"\ndrawn in {tmp_path / 'a.png'}\n")
     for part in ("at rest   surface", "lightest  ", "errors    by the true force", "two       ", "deepest   press", "force, N"):
         assert part in said
@@ -374,10 +419,12 @@ def test_other_processes_leave_the_sensor_as_it_is(sensor, work, monkeypatch):
         def imap(self, work, tasks):
             return iter(())
 
+        imap_unordered = imap
+
     monkeypatch.setattr("multiprocessing.context.SpawnContext.Pool", lambda _, *arguments: Pool(*arguments))
     if work is measure:
         made = rig.Rig(gridded, 40.0)
-        assert list(measure._in_processes(made, [measure.Series("rest", k, LITTLE, 0) for k in range(2)], 2)) == []
+        assert list(measure._in_processes(made, [(k, measure.Series("rest", k, LITTLE, 0)) for k in range(2)], 2)) == []
     else:
         list(dataset._in_processes(rig.Simulator(gridded), dataset.Plan(), [0, 1], 2))
     overwritten = [np.full((9, 9, 3), 7.0) for _ in range(50)]

@@ -61,7 +61,8 @@ def told(monkeypatch):
 
     made = replace(sensor, material=replace(sensor.material, shear_modulus=1.0))
     monkeypatch.setattr(weight_module, "Reconstructor", Made)
-    monkeypatch.setattr(weight_module, "material_from_images", lambda *_: weight_module.MaterialFit(made, *[np.zeros(2)] * 6))
+    material = weight_module.MaterialFit(made, *[np.zeros(2)] * 6)
+    monkeypatch.setattr(weight_module, "material_from_images", lambda *_, **__: material)
     return change, lambda weight: weight_module.material_from_weight(sensor, torch.zeros(3, 1, 2, 2), weight)
 
 
@@ -74,9 +75,26 @@ def test_the_modulus_is_in_proportion_to_the_weight(told):
     assert fit(2.0).deviation == pytest.approx(0.03 / 3**0.5)  # each known to 0.06 / 2
 
 
+def test_images_are_weighed_by_their_noise_and_their_scatter_enlarges_the_deviation(told):
+    """All know the force to 0.06; means weighted by the inverse squares of relative deviations, chi squared over 2."""
+    change, fit = told
+    force = np.array([1.9, 2.0, 2.1])
+    change(force=torch.tensor([[0.0, 0.0, -f] for f in force], dtype=torch.float32))
+    scaled = 2 * force * (force**2).sum() / (force**3).sum()
+    found = fit(2.0)
+    assert found.forces == pytest.approx(scaled, rel=1e-5)
+    scatter = np.sqrt((((scaled - 2) / 0.06) ** 2).sum() / 2)
+    assert scatter > 1.1 and found.deviation == pytest.approx(0.06 / np.sqrt((scaled**2).sum()) * scatter, rel=1e-4)
+
+
+BOTH_AT_RIM = {"contact_at_rim": torch.ones(3, 2), "contact_force": torch.tensor([[[0, 0, -0.15]] * 2] * 3)}
+"""Each less than a tenth of the force, both more."""
+
+
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
+        (BOTH_AT_RIM, "image 1: the press reaches the rim"),
         ({"contact_at_rim": torch.tensor([[0, 0], [1.0, 0], [0, 0]])}, "image 2: the press reaches the rim"),
         ({"force_deviation": torch.full((3, 3), 1.0)}, "image 1 shows a force that is known to 50 % only"),
         ({"force_deviation": torch.full((3, 3), 0.2)}, "scale of forces to 5.8% only"),

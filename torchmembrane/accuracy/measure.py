@@ -3,48 +3,25 @@
 import multiprocessing
 import pickle
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
 
 from ..errors import MembraneError
+from ..progress import Progress, silent
 from ..sensor.sensor import Sensor
 from . import statistics
+from .finished import FinishedSeries
 from .presses import pair_states, stroke_states
 from .rig import Rig, image_noise
-from .spec_sheet import PairTrial, PressTrial, RestTrial, SpecSheet
+from .spec_sheet import Effort, Outcome, SpecSheet
 
 NEAR = 0.05
 """Over the size: within it, or within the markers' spacing, of where it is a contact counts as found."""
-REST, STROKE, PAIR = "rest", "stroke", "pair"
-
-
-class Effort(NamedTuple):
-    """How much is tried.
-
-    Attributes:
-        strokes: from the first touch on, towards random places.
-        frames: of each stroke.
-        directions: in which two touches are moved together.
-        distances: between them that are tried.
-        rest: frames at rest.
-    """
-
-    strokes: int = 8
-    frames: int = 14
-    directions: int = 3
-    distances: int = 7
-    rest: int = 24
-
-
-class Outcome(NamedTuple):
-    """What one series of trials gave; `reason` where it could not be simulated."""
-
-    rest: Sequence[RestTrial] = ()
-    presses: Sequence[PressTrial] = ()
-    pairs: Sequence[PairTrial] = ()
-    reason: str = ""
+REST, STROKE, PAIR = "frames at rest", "stroke", "pairs"
+WORK = {REST: 1.0, STROKE: 1.0, PAIR: 1.0}
+"""Time that a series takes over that of a stroke, measured."""
 
 
 class Series(NamedTuple):
@@ -57,7 +34,14 @@ class Series(NamedTuple):
 
 
 def spec_sheet(
-    sensor: Sensor, seed: int = 0, *, noise: float | None = None, effort: Effort | None = None, jobs: int = 1
+    sensor: Sensor,
+    seed: int = 0,
+    *,
+    noise: float | None = None,
+    effort: Effort | None = None,
+    jobs: int = 1,
+    finished: FinishedSeries | None = None,
+    progress: Progress = silent,
 ) -> SpecSheet:
     """What to expect of a sensor: trials on a simulated one, through images.
 
@@ -69,6 +53,8 @@ def spec_sheet(
         noise: of the images, white over its standard deviation, dB; default: as in the rest image (`image_noise`).
         effort: how much is tried.
         jobs: processes.
+        finished: series that an interrupted call of the same arguments has finished, which keeps those of this call as well.
+        progress: is told how far it is.
 
     Returns:
         The `SpecSheet`. Trials that cannot be simulated are left out, and said.
@@ -86,15 +72,14 @@ def spec_sheet(
         >>> len(sheet.presses), sheet.force_unit, sheet.rest.touched
         (2, 'N', 0)
     """
-    from tqdm import tqdm
-
     effort = effort or Effort()
     noise = image_noise(sensor) if noise is None else noise
-    rig = Rig(sensor, noise)
     series = [Series(REST, 0, effort, seed)]
     series += [Series(STROKE, k, effort, seed) for k in range(effort.strokes)]
     series += [Series(PAIR, k, effort, seed) for k in range(effort.directions)]
-    outcomes = list(tqdm(_in_processes(rig, series, jobs), total=len(series), unit="series", desc="accuracy"))
+    progress(_share_done(series, finished.outcomes if finished else ()), "the sensor in the simulator")
+    rig = Rig(sensor, noise)
+    outcomes = _outcomes(rig, series, jobs, finished, progress)
     left_out = [outcome.reason for outcome in outcomes if outcome.reason]
     presses = [trial for outcome in outcomes for trial in outcome.presses]
     pairs = [trial for outcome in outcomes for trial in outcome.pairs]
@@ -123,6 +108,26 @@ def spec_sheet(
     )
 
 
+def _outcomes(
+    rig: Rig, series: Sequence[Series], jobs: int, finished: FinishedSeries | None, progress: Progress
+) -> list[Outcome]:
+    """What all series give, in their order: those finished before as they were kept, the others as they are tried now."""
+    outcomes = dict(finished.outcomes) if finished else {}
+    waiting = [(k, series[k]) for k in range(len(series)) if k not in outcomes]
+    progress(_share_done(series, outcomes), f"{len(waiting)} series of presses")
+    for k, outcome in _in_processes(rig, waiting, jobs):
+        outcomes[k] = outcome
+        if finished:
+            finished.keep(k, outcome)
+        progress(_share_done(series, outcomes), f"{len(outcomes)} of {len(series)} series done")
+    return [outcomes[k] for k in range(len(series))]
+
+
+def _share_done(series: Sequence[Series], done: Iterable[int]) -> float:
+    """The share of the work in the series of these numbers."""
+    return sum(WORK[series[k].kind] for k in done) / sum(WORK[each.kind] for each in series)
+
+
 def outcome_of(rig: Rig, series: Series) -> Outcome:
     """What a series of trials gives on this rig."""
     kind, number, effort, seed = series
@@ -138,15 +143,16 @@ def outcome_of(rig: Rig, series: Series) -> Outcome:
         return Outcome(reason=str(error))
 
 
-def _in_processes(rig: Rig, series: Sequence[Series], jobs: int) -> Iterator[Outcome]:
+def _in_processes(rig: Rig, series: Sequence[tuple[int, Series]], jobs: int) -> Iterator[tuple[int, Outcome]]:
+    """Numbers of series and what they give, as they are done."""
     jobs = min(jobs, len(series))
     if jobs <= 1:
-        yield from (outcome_of(rig, each) for each in series)
+        yield from ((k, outcome_of(rig, each)) for k, each in series)
         return
     sensor = pickle.dumps(rig.simulator.sensor)  # as bytes: torch would move tensors whose memory arrays look at
     arguments = sensor, rig.simulator.appearance.noise
     with multiprocessing.get_context("spawn").Pool(jobs, _begin, arguments) as pool:
-        yield from pool.imap(_work, series)
+        yield from pool.imap_unordered(_work, series)
 
 
 _rig: Rig
@@ -160,5 +166,6 @@ def _begin(sensor: bytes, noise: float) -> None:
     _rig = Rig(pickle.loads(sensor), noise)
 
 
-def _work(series: Series) -> Outcome:
-    return outcome_of(_rig, series)
+def _work(numbered: tuple[int, Series]) -> tuple[int, Outcome]:
+    number, series = numbered
+    return number, outcome_of(_rig, series)

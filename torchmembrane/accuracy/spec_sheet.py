@@ -99,6 +99,33 @@ class RestTrial(NamedTuple):
     status: int
 
 
+class Effort(NamedTuple):
+    """How much is tried.
+
+    Attributes:
+        strokes: from the first touch on, towards random places.
+        frames: of each stroke.
+        directions: in which two touches are moved together.
+        distances: between them that are tried.
+        rest: frames at rest.
+    """
+
+    strokes: int = 8
+    frames: int = 14
+    directions: int = 3
+    distances: int = 7
+    rest: int = 24
+
+
+class Outcome(NamedTuple):
+    """What one series of trials gave; `reason` where it could not be simulated."""
+
+    rest: Sequence[RestTrial] = ()
+    presses: Sequence[PressTrial] = ()
+    pairs: Sequence[PairTrial] = ()
+    reason: str = ""
+
+
 class RestFloor(NamedTuple):
     """What frames at rest give that should give nothing.
 

@@ -7,6 +7,7 @@ import torch
 
 from ..errors import MembraneError
 from ..markers.placement import rim_mask
+from ..progress import Progress, silent
 from ..sensor.sensor import Sensor
 from .surface import Correction, SurfaceProjection, correction, fine_surface, recalibrated, surface_projection
 from .views import placed_dots
@@ -32,7 +33,7 @@ class DepthFit(NamedTuple):
     deviations: np.ndarray
 
 
-def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> DepthFit:
+def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, progress: Progress = silent) -> DepthFit:
     """Rest surface from a depth image, and the dots on it from the rest image.
 
     The depths within the rim's outline are averaged over squares of 24 px; the designed surface is moved along its normals onto
@@ -42,6 +43,7 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> Dep
         sensor: the design.
         depth: `[H, W]` z along the camera's axis, length unit; NaN or 0 where there is none.
         image: `[H, W]` the membrane at rest, grey in 0..1.
+        progress: is told how far it is.
 
     Returns:
         The sensor with the surface and dots found, and what they rest on.
@@ -71,6 +73,7 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> Dep
         raise MembraneError(
             f"calibrate depth: the depth image is {list(depth.shape)}; expected [{height}, {width}], the camera's"
         )
+    progress(0.0, "depths on the designed surface")
     surface = fine_surface(sensor)
     points, cells = _points(sensor, depth)
     projection = surface_projection(surface, points)
@@ -89,7 +92,9 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray) -> Dep
     deviations = np.sqrt(spread / (counts - 1).clip(1))[kept]
     normals = normals[kept] / np.linalg.norm(normals[kept], axis=1, keepdims=True)
     projection = SurfaceProjection(closest[kept], normals, distance[kept])
+    progress(0.3, "surface through the depths")
     change = correction(surface, projection, deviations**2)
+    progress(0.5, "dots of the image")
     dots, sizes = placed_dots(recalibrated(sensor, surface, change.vertices, None, None, image), image)
     moved = recalibrated(sensor, surface, change.vertices, dots, sizes, image)
     return DepthFit(moved, change, projection, deviations)

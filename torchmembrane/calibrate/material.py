@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..estimators.force_balance.estimator import ForceBalance
+from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
 from ..results.status import Status
 from ..sensor.factories import elastic_energy
@@ -28,6 +29,9 @@ FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known f
 GAS_ROUNDS = 4
 GAS_SETTLED = 0.1  # change of a gas' modulus, relative, that changes the prestretch by less than its deviation
 FINE = 4001  # prestretches over which the probability is summed
+# What takes how much of the time, measured: of all, the markers in the images; of a round, the losses with pressures, forces or
+# neither known; over a solve from rest, the steps from both neighbours' solutions.
+IMAGES_SHARE, PROFILE_SHARE, CONTINUED = 0.05, (0.6, 0.8, 1.0), 0.1
 
 
 class LossProfile(NamedTuple):
@@ -82,7 +86,12 @@ class KnownPressures(NamedTuple):
 
 
 def material_from_images(
-    sensor: Sensor, images: Tensor, forces: np.ndarray | None = None, pressures: KnownPressures | None = None
+    sensor: Sensor,
+    images: Tensor,
+    forces: np.ndarray | None = None,
+    pressures: KnownPressures | None = None,
+    *,
+    progress: Progress = silent,
 ) -> MaterialFit:
     """Prestretch from images of presses, and the modulus where forces or pressures are known; see `material_from_pixels`.
 
@@ -91,6 +100,7 @@ def material_from_images(
         images: `[B, 1, H, W]` grey in 0..1.
         forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
         pressures: in place of forces, what a gauge read.
+        progress: is told how far it is.
 
     Returns:
         The sensor with the material found.
@@ -98,17 +108,24 @@ def material_from_images(
     Raises:
         MembraneError: an image shows too few markers, or as of `material_from_pixels`.
     """
+    progress(0.0, f"markers of {len(images)} images")
     reconstructor = _reconstructor(sensor)
     with torch.no_grad():
         flow = reconstructor.observer.judge(*reconstructor.observer(images.double()))
     displacement, confidence, _, status = flow
     for i in np.flatnonzero(status != Status.OK):
         raise MembraneError(f"calibrate material: image {i + 1}: {Status(int(status[i])).text}; leave it out")
-    return _material(sensor, reconstructor, displacement, confidence, forces, pressures)
+    known = MeasuredPresses(displacement, confidence, forces, pressures)
+    return _material(sensor, reconstructor, known, within(progress, IMAGES_SHARE, 1.0))
 
 
 def material_from_pixels(
-    sensor: Sensor, pixels: Tensor, forces: np.ndarray | None = None, pressures: KnownPressures | None = None
+    sensor: Sensor,
+    pixels: Tensor,
+    forces: np.ndarray | None = None,
+    pressures: KnownPressures | None = None,
+    *,
+    progress: Progress = silent,
 ) -> MaterialFit:
     """Prestretch from presses, and the modulus where their forces, or the pressures in the cavity, are known.
 
@@ -127,6 +144,7 @@ def material_from_pixels(
         pixels: `[B, D, 2]` of the markers in B images of presses (NaN where lost), less what rest images show beside the model.
         forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
         pressures: in place of forces, what a gauge read.
+        progress: is told how far it is.
 
     Returns:
         The sensor with the material found.
@@ -144,24 +162,32 @@ def material_from_pixels(
     pixels = torch.as_tensor(pixels).to(reconstructor.rest_pixels)
     lost = ~pixels.isfinite().all(-1)
     displacement = torch.where(lost[..., None], 0.0, pixels - reconstructor.rest_pixels)
-    return _material(sensor, reconstructor, displacement, (~lost).to(pixels), forces, pressures)
+    return _material(sensor, reconstructor, MeasuredPresses(displacement, (~lost).to(pixels), forces, pressures), progress)
+
+
+class MeasuredPresses(NamedTuple):
+    """What is known of presses: the markers' displacement `[B, D, 2]` px and confidence `[B, D]`, forces or pressures as of
+    `material_from_pixels`."""
+
+    displacement: Tensor
+    confidence: Tensor
+    forces: np.ndarray | None
+    pressures: KnownPressures | None
 
 
 def _material(
-    sensor: Sensor,
-    reconstructor: Reconstructor,
-    displacement: Tensor,
-    confidence: Tensor,
-    forces: np.ndarray | None,
-    pressures: KnownPressures | None,
-    rounds: int = GAS_ROUNDS,
+    sensor: Sensor, reconstructor: Reconstructor, known: MeasuredPresses, progress: Progress, rounds: int = GAS_ROUNDS
 ) -> MaterialFit:
+    displacement, confidence, forces, pressures = known
     if forces is not None and pressures is not None:
         raise MembraneError("calibrate material: forces and pressures; expected one of them, either gives the modulus")
     if pressures is not None:
         reconstructor.estimator.check_gauge()
     presses = Presses(reconstructor, displacement, confidence)
-    profile = presses.profile()
+    of_round, later = _shares(sensor, forces is not None or pressures is not None, rounds, progress)
+    of_profile = PROFILE_SHARE[0 if pressures is not None else 1 if forces is not None else 2]
+    profile = presses.profile(within(of_round, 0.0, of_profile))
+    of_modulus = within(of_round, of_profile, 1.0)
     each = np.array([_log_stretch(profile.stretches, losses[:, None]) for losses in profile.losses.T])
     log_stretch, deviation = _log_stretch(profile.stretches, profile.losses)
     variances = each[:, 1] ** 2 + PRESTRETCH_ERROR**2
@@ -172,9 +198,9 @@ def _material(
     material = replace(sensor.material, prestretch=prestretch)
     magnitudes, gauged = np.full((2, len(each), 2), np.nan)
     if forces is not None:
-        modulus, scatter, change, magnitudes = presses.modulus(log_stretch, deviation, np.asarray(forces, float))
+        modulus, scatter, change, magnitudes = presses.modulus(log_stretch, deviation, np.asarray(forces, float), of_modulus)
     elif pressures is not None:
-        modulus, scatter, change, gauged = presses.gauge_modulus(log_stretch, deviation, pressures)
+        modulus, scatter, change, gauged = presses.gauge_modulus(log_stretch, deviation, pressures, of_modulus)
     if forces is not None or pressures is not None:
         values, effects = [prestretch, modulus], [*effects, [change, scatter]]
         thickness = material.thickness or 1.0
@@ -183,8 +209,15 @@ def _material(
     covariance = np.array(effects) @ np.array(effects).T
     made = replace(sensor, material=material)
     if rounds and not _is_settled(sensor, made):
-        return _material(made, _reconstructor(made), displacement, confidence, forces, pressures, rounds - 1)
+        return _material(made, _reconstructor(made), known, later, rounds - 1)
     return MaterialFit(made, np.array(values), covariance, profile, alone, magnitudes, gauged)
+
+
+def _shares(sensor: Sensor, with_modulus: bool, rounds: int, progress: Progress) -> tuple[Progress, Progress]:
+    """The progress of one round and of those after it: a gas' modulus, first unknown, is expected to settle in the second."""
+    again = sensor.cavity.filling == "gas" and with_modulus and rounds == GAS_ROUNDS and sensor.force_unit == "relative"
+    share = 0.5 if again else 1.0
+    return within(progress, 0.0, share), within(progress, share, 1.0)
 
 
 def _is_settled(sensor: Sensor, made: Sensor) -> bool:
@@ -241,23 +274,33 @@ class Presses:
         with torch.no_grad():
             return estimator, estimator(self.observation)
 
-    def profile(self) -> LossProfile:
+    def profile(self, progress: Progress) -> LossProfile:
         """The presses' losses at `STRETCHES`, and closer together around the lowest."""
-        modulus = self.reconstructor.sensor.material.modulus
-        solutions = {stretch: self.explained(stretch, modulus) for stretch in STRETCHES}
-        total = self._profile(solutions).losses.sum(1)
+        work = np.array([len(STRETCHES), CONTINUED * len(STRETCHES), BETWEEN, CONTINUED * (len(STRETCHES) + BETWEEN)])
+        ends = np.cumsum([0.0, *work / work.sum()]).tolist()
+        solve, follow, solve_between, follow_all = (within(progress, *pair) for pair in zip(ends, ends[1:], strict=False))
+        solutions = self._solutions(STRETCHES, solve)
+        total = self._profile(solutions, follow).losses.sum(1)
         k = min(max(int(np.argmin(total)), 1), len(STRETCHES) - 2)
         between = np.geomspace(STRETCHES[k - 1], STRETCHES[k + 1], BETWEEN + 2)[1:-1]
-        return self._profile(solutions | {stretch: self.explained(stretch, modulus) for stretch in between})
+        return self._profile(solutions | self._solutions(between, solve_between), follow_all)
 
-    def _profile(self, solutions: dict[float, Explained]) -> LossProfile:
+    def _solutions(self, stretches: np.ndarray, progress: Progress) -> dict[float, Explained]:
+        """What explains the presses at each prestretch, solved from rest."""
+        modulus, found = self.reconstructor.sensor.material.modulus, {}
+        for k, stretch in enumerate(stretches):
+            progress(k / len(stretches), f"force balance at prestretch {stretch:.3g}")
+            found[stretch] = self.explained(stretch, modulus)
+        return found
+
+    def _profile(self, solutions: dict[float, Explained], progress: Progress) -> LossProfile:
         stretches = sorted(solutions)
-        best = continued([solutions[stretch] for stretch in stretches], self.observation)
+        best = continued([solutions[stretch] for stretch in stretches], self.observation, progress)
         seen = self.observation.confidence.sum(-1)
         return LossProfile(np.array(stretches), np.array([(seen * found.unexplained).numpy() for _, found in best]))
 
     def gauge_modulus(
-        self, log_stretch: float, deviation: float, pressures: KnownPressures
+        self, log_stretch: float, deviation: float, pressures: KnownPressures, progress: Progress
     ) -> tuple[float, float, float, np.ndarray]:
         """The modulus from pressures; arguments and what is returned as of `modulus`, with pressure changes for forces."""
         gas, modulus = self.reconstructor.estimator.cavity.filling == "gas", self.reconstructor.sensor.material.modulus
@@ -271,15 +314,19 @@ class Presses:
             rest = float(estimator.rest_pressure)
             return FoundPressures((it.pressure - rest).numpy(), spread.pressure.numpy(), rest)
 
-        def fit(stretch: float, begin: float) -> GaugeModulus:
+        def fit(stretch: float, begin: float, share: float) -> GaugeModulus:
+            progress(share, f"modulus from pressures at prestretch {stretch:.3g}")
             return modulus_from_pressures(partial(found, stretch), readings, pressures.since_rest, begin, gas)
 
-        fitted = fit(np.exp(log_stretch), modulus)
-        low, high = (fit(np.exp(log_stretch + s * deviation), fitted.modulus).modulus - fitted.modulus for s in (-1, 1))
+        fitted = fit(np.exp(log_stretch), modulus, 0.0)
+        sides = ((np.exp(log_stretch + s * deviation), share) for s, share in ((-1, 1 / 3), (1, 2 / 3)))
+        low, high = (fit(stretch, fitted.modulus, share).modulus - fitted.modulus for stretch, share in sides)
         change = float(np.sign(high - low) * max(abs(low), abs(high)))
         return fitted.modulus, fitted.deviation, change, fitted.pressures
 
-    def modulus(self, log_stretch: float, deviation: float, forces: np.ndarray) -> tuple[float, float, float, np.ndarray]:
+    def modulus(
+        self, log_stretch: float, deviation: float, forces: np.ndarray, progress: Progress = silent
+    ) -> tuple[float, float, float, np.ndarray]:
         """The modulus from presses of known force.
 
         A gas resists in newtons: there the presses are explained anew with each modulus.
@@ -288,6 +335,7 @@ class Presses:
             log_stretch: logarithm of the prestretch.
             deviation: its standard deviation.
             forces: as for `material_from_pixels`.
+            progress: is told how far it is.
 
         Returns:
             The modulus; its standard deviation at this prestretch; its change with one deviation of the prestretch, the larger
@@ -295,10 +343,12 @@ class Presses:
             of the forces found and measured, `[B, 2]`.
         """
         modulus = self.reconstructor.sensor.material.modulus
+        progress(0.0, "modulus from forces")
         self._refuse_unpressed(float(np.exp(log_stretch)), modulus, np.isfinite(forces).all(1))
         for _ in range(GAS_ROUNDS if self.reconstructor.estimator.cavity.filling == "gas" else 1):
             ratios, magnitudes = self._ratios(np.exp(log_stretch), modulus, forces)
             modulus = float(ratios.mean() * modulus)
+        progress(0.5, "modulus with the prestretch's error")
         sides = [self._ratios(np.exp(log_stretch + s * deviation), modulus, forces)[0].mean() for s in (-1, 1)]
         change = -modulus * np.abs(np.array(sides) - 1).max()
         relative = max(FORCE_ERROR, ratios.std(ddof=1) / ratios.mean() if len(ratios) > 1 else 0.0)

@@ -12,6 +12,7 @@ from torch.func import jacfwd, vmap
 from ..errors import MembraneError
 from ..markers.dots.pattern import measure_dots
 from ..markers.spacing import neighbours
+from ..progress import Progress, silent
 from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from .fit import Fit, fit, outliers, outline_centres, rotations, with_common_errors
@@ -44,7 +45,7 @@ class RestFit(NamedTuple):
     shifts: np.ndarray
 
 
-def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
+def rest_from_image(sensor: Sensor, image: np.ndarray, *, progress: Progress = silent) -> RestFit:
     """Pose of the rest surface, then each dot's position on it, from a rest image of listed dots.
 
     The pose is the one from which the camera sees the listed dots where they are measured; what is left is taken for errors of
@@ -53,6 +54,7 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
     Args:
         sensor: the design, with a list of dots.
         image: `[H, W]` the membrane at rest, grey in 0..1.
+        progress: is told how far it is.
 
     Returns:
         The sensor with pose and dots found, and the fit.
@@ -77,9 +79,11 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
     """
     if sensor.markers.positions is None:
         raise MembraneError("calibrate rest: the sensor lists no dots; expected [markers] file, or use views or depth")
+    progress(0.0, "dots of the image")
     surface, X = fine_surface(sensor), sensor.markers.positions
     sizes = np.array([int(size == "large") for size in sensor.markers.sizes or ()])
     outlines, pixels = measured_outlines(sensor, surface, X, sizes, image)
+    progress(0.3, "pose of the rest surface")
     pivot = surface.rest[surface.fixed].mean(0)
     visible = np.isfinite(pixels).all(1)
     used = visible.copy()
@@ -105,8 +109,10 @@ def rest_from_image(sensor: Sensor, image: np.ndarray) -> RestFit:
 
     left = pixels - modelled(torch.from_numpy(found), torch.from_numpy(outlines)).numpy()
     _warn_of_press(sensor, pixels[visible], left[visible])
+    progress(0.75, "dots on the rest surface")
     _, tangents = frames_at(surface, X)
     shifts = _nulling(sensor, move(outlines), rotation @ tangents, pixels, visible)
+    progress(0.77, "rest surface where it was found")
     moved = recalibrated(sensor, surface, move(surface.rest.numpy()), move(X) + shifts, sensor.markers.sizes, image)
     return RestFit(moved, NAMES, result.in_degrees(1), pixels, left, shifts)
 

@@ -12,20 +12,23 @@ import torch
 from ..estimators.base import Equilibrium, Observation
 from ..estimators.force_balance.estimator import ForceBalance
 from ..estimators.force_balance.gauss_newton import State
+from ..progress import Progress, silent
 
 STEPS = 4  # from a neighbour's solution
 
 Explained = tuple[ForceBalance, Equilibrium]
 
 
-def continued(solutions: list[Explained], observation: Observation) -> list[Explained]:
+def continued(solutions: list[Explained], observation: Observation, progress: Progress = silent) -> list[Explained]:
     """The solutions at increasing prestretches, each the better one of itself and what its neighbours' lead to, upwards and
     then downwards."""
     upwards: list[Explained] = []
-    for own in solutions:
+    for k, own in enumerate(solutions):
+        progress(k / (2 * len(solutions)), "prestretches from their lower neighbours")
         upwards.append(_better(own, upwards[-1], observation) if upwards else own)
     downwards: list[Explained] = []
-    for own in reversed(upwards):
+    for k, own in enumerate(reversed(upwards)):
+        progress(0.5 + k / (2 * len(solutions)), "prestretches from their upper neighbours")
         downwards.append(_better(own, downwards[-1], observation) if downwards else own)
     return downwards[::-1]
 

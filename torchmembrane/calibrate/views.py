@@ -9,6 +9,7 @@ import torch
 from ..errors import MembraneError
 from ..markers.dots.pattern import find_dots
 from ..markers.placement import rim_mask
+from ..progress import Progress, silent, within
 from ..sensor.sensor import Sensor
 from .bundle import Bundle, bundle_adjusted
 from .fit import Fit, rotations, with_common_errors
@@ -53,7 +54,14 @@ def placed_dots(sensor: Sensor, image: np.ndarray) -> tuple[np.ndarray, list[str
     return positions[met], ["large" if size else "small" for size in pattern.sizes[met]]
 
 
-def rest_from_views(sensor: Sensor, images: Sequence[np.ndarray], motions: np.ndarray, travel_error: float) -> ViewsFit:
+def rest_from_views(
+    sensor: Sensor,
+    images: Sequence[np.ndarray],
+    motions: np.ndarray,
+    travel_error: float,
+    *,
+    progress: Progress = silent,
+) -> ViewsFit:
     """Dots and rest surface from P views by a camera that moved; the first view is the sensor's own.
 
     Bundle adjustment: all dots, all poses but the first. Then the designed surface is moved along its normals onto the dots.
@@ -64,6 +72,7 @@ def rest_from_views(sensor: Sensor, images: Sequence[np.ndarray], motions: np.nd
         motions: `[P, 6]` where the camera was, roughly: its position (length unit) and rotation (rotation vector, degrees) in
             the first camera's frame, the first row zeros. Dots must be predicted to half their pitch.
         travel_error: standard deviation of the second view's travel. Images do not show the scale; this length sets it.
+        progress: is told how far it is.
 
     Returns:
         The sensor with surface and dots found, and the fit.
@@ -80,12 +89,14 @@ def rest_from_views(sensor: Sensor, images: Sequence[np.ndarray], motions: np.nd
         )
     if not np.linalg.norm(motions[1, :3]) > 0:
         raise MembraneError("calibrate views: the second view did not travel; expected that its travel sets the scale")
-    bundle, sizes = _measured(sensor, images, motions)
+    bundle, sizes = _measured(sensor, images, motions, within(progress, 0.0, 0.6))
+    progress(0.6, "bundle adjustment")
     bundle, kept = bundle.in_two_views()
     sizes = [size for size, keep in zip(sizes, kept, strict=True) if keep]
     problem, found = bundle_adjusted(sensor.camera, bundle, travel_error)
     found = with_common_errors(found, problem.jacobian(found.values), _shared_errors(sensor, bundle.pixels, problem.used))
     dots, residuals = found.values[problem.own :].reshape(-1, 3), problem.pixel_residuals(found.values)
+    progress(0.8, "rest surface through the dots")
     surface = fine_surface(sensor)
     projection, n = surface_projection(surface, dots), problem.own
     blocks = np.stack([found.covariance[d : d + 3, d : d + 3] for d in range(n, len(found.values), 3)])
@@ -97,14 +108,18 @@ def rest_from_views(sensor: Sensor, images: Sequence[np.ndarray], motions: np.nd
     return ViewsFit(moved, names, found, dots, found.deviations[n:].reshape(-1, 3), change, residuals)
 
 
-def _measured(sensor: Sensor, images: Sequence[np.ndarray], motions: np.ndarray) -> tuple[Bundle, list[str]]:
+def _measured(
+    sensor: Sensor, images: Sequence[np.ndarray], motions: np.ndarray, progress: Progress
+) -> tuple[Bundle, list[str]]:
     """The dots as first placed and as measured in every view, and their sizes."""
+    progress(0.0, "dots of the first view")
     surface = fine_surface(sensor)
     dots, sizes = placed_dots(sensor, images[0])
     large = np.array([size == "large" for size in sizes], dtype=int)
     rotation_vectors, positions = np.deg2rad(motions[:, 3:]), motions[:, :3]
     outlines, pixels = [], []
-    for image, vector, position in zip(images, rotation_vectors, positions, strict=True):
+    for p, (image, vector, position) in enumerate(zip(images, rotation_vectors, positions, strict=True)):
+        progress((1 + p) / (1 + len(images)), f"dots of view {p + 1} of {len(images)}")
         R = rotations(torch.from_numpy(vector)).numpy()
 
         def camera_points(x: np.ndarray, R: np.ndarray = R, position: np.ndarray = position) -> np.ndarray:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
 from ..results.reconstruction import Reconstruction
 from ..results.status import Status
@@ -17,6 +18,8 @@ from .material import GAS_ROUNDS, MaterialFit, material_from_images
 
 SURE = 0.05  # relative standard deviation of the scale, at most: two of them are a tenth
 AT_THE_RIM = 0.1  # share of the force in patches that reach the rim, from which on it is refused
+
+MATERIAL_SHARE = 0.8  # of the time, measured: of `material_from_images`
 
 
 class WeightFit(NamedTuple):
@@ -35,7 +38,7 @@ class WeightFit(NamedTuple):
     deviation: float
 
 
-def material_from_weight(sensor: Sensor, images: Tensor, weight: float) -> WeightFit:
+def material_from_weight(sensor: Sensor, images: Tensor, weight: float, *, progress: Progress = silent) -> WeightFit:
     """Prestretch and modulus from images of presses by one known force.
 
     Prestretch and a first modulus are `material_from_images`'; the modulus is then scaled until the sensor's own
@@ -46,6 +49,7 @@ def material_from_weight(sensor: Sensor, images: Tensor, weight: float) -> Weigh
         sensor: the sensor, calibrated but for its material.
         images: `[B, 1, H, W]` grey in 0..1, each under the weight alone.
         weight: the force's magnitude, N.
+        progress: is told how far it is.
 
     Returns:
         The sensor, and how surely its forces are scaled.
@@ -58,7 +62,9 @@ def material_from_weight(sensor: Sensor, images: Tensor, weight: float) -> Weigh
         The scale is that of presses such as these: pushed by the same weight elsewhere, or ten times as hard, the grid's and
         the material's errors are others (docs/recipes.md).
     """
-    material = material_from_images(sensor, images, np.full((len(images), 1), weight))
+    known = np.full((len(images), 1), weight)
+    material = material_from_images(sensor, images, known, progress=within(progress, 0.0, MATERIAL_SHARE))
+    progress(MATERIAL_SHARE, "modulus from the weight")
     made = material.sensor
     gas = made.cavity.filling == "gas"
     for _ in range(GAS_ROUNDS if gas else 1):

@@ -1,15 +1,19 @@
 """`torchmembrane check`: what a sensor file means, in words and drawn, and what to expect of the sensor."""
 
 import os
+import sys
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .. import __version__
 from ..errors import MembraneError
 from .arguments import add_command, add_sensor, count, number_from, seed
 from .choices import MOST_DECIBEL
+from .progress import ProgressDisplay, announce
 
 if TYPE_CHECKING:
+    from ..accuracy.finished import FinishedSeries
     from ..accuracy.spec_sheet import SpecSheet
     from ..sensor.sensor import Sensor
 
@@ -22,7 +26,9 @@ examples:
 
 --accuracy presses the sensor in the simulator, some 150 images, and reconstructs them: noise at rest, the lightest touch found,
 errors of force, depth and place, how near two touches are told apart, how deep a press may be. Some minutes of processor time,
-more for larger images. SENSOR.toml may be preset:NAME.
+more for larger images. Interrupted, it keeps the series of presses that are finished, in accuracy-*.unfinished.json beside
+--out, else in the current folder; the same command goes on from there and removes the file at the end. SENSOR.toml may be
+preset:NAME.
 
 exit code: 0 the sensor can be used, 2 it cannot: the message says why"""
 
@@ -44,6 +50,8 @@ def run(arguments: Namespace) -> int:
     for name in ("seed", "noise", "jobs"):
         if getattr(arguments, name) is not None and not arguments.accuracy:
             raise MembraneError(f"--{name} goes with --accuracy only: add it")
+    if arguments.accuracy:
+        announce("check --accuracy")
     from ..presets import sensor_file
     from ..reconstruct import Reconstructor
     from ..sensor.sensor import Sensor
@@ -58,24 +66,45 @@ def run(arguments: Namespace) -> int:
         problem = MembraneError(f"{arguments.sensor}: {error}")
     frame = None if reconstructor is None else rest_frame(reconstructor)
     print("\n".join(described(sensor, reconstructor, frame)), flush=True)
-    sheet = _sheet(sensor, arguments) if arguments.accuracy and not problem else None
+    finished = _finished(sensor, arguments) if arguments.accuracy and not problem else None
+    sheet = _sheet(sensor, arguments, finished) if finished else None
     if arguments.out:
         from ..plot.drawing import save
         from ..plot.sensor import sensor_figure
 
         save(sensor_figure(sensor, reconstructor, frame, sheet), arguments.out)
         print(f"drawn in {arguments.out}")
+    if finished:
+        finished.remove()
     if problem:
         raise problem
     return 0
 
 
-def _sheet(sensor: "Sensor", arguments: Namespace) -> "SpecSheet":
+def _finished(sensor: "Sensor", arguments: Namespace) -> "FinishedSeries":
+    """The series that an interrupted command has finished, and a line that says so."""
+    from ..accuracy.finished import FinishedSeries
+    from ..accuracy.spec_sheet import Effort
+
+    folder = arguments.out.parent if arguments.out else Path()
+    finished = FinishedSeries.open(folder, __version__, sensor, arguments.seed or 0, arguments.noise, Effort())
+    if finished.outcomes:
+        print(
+            f"check --accuracy: goes on from {len(finished.outcomes)} finished series in {finished.path}",
+            file=sys.stderr,
+            flush=True,
+        )
+    return finished
+
+
+def _sheet(sensor: "Sensor", arguments: Namespace, finished: "FinishedSeries") -> "SpecSheet":
     """The sensor's spec sheet, printed."""
     from ..accuracy.measure import spec_sheet
     from .sheet import sheet_lines
 
     jobs = arguments.jobs or os.cpu_count() or 1
-    sheet = spec_sheet(sensor, arguments.seed or 0, noise=arguments.noise, jobs=jobs)
+    with ProgressDisplay("check --accuracy") as progress:
+        options: dict[str, Any] = dict(noise=arguments.noise, jobs=jobs, finished=finished, progress=progress)
+        sheet = spec_sheet(sensor, arguments.seed or 0, **options)
     print("\n".join(sheet_lines(sheet)))
     return sheet

@@ -6,6 +6,7 @@ from time import monotonic
 from typing import Any
 
 from .arguments import add_command, add_estimator, add_sensor
+from .progress import ProgressDisplay, announce
 
 PURPOSE = "write image to result as one ONNX model"
 EXAMPLES = """\
@@ -32,8 +33,7 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: Namespace) -> int:
     """Write the model; returns the exit code."""
-    from tqdm import tqdm
-
+    announce("export")
     from ..errors import MembraneError
     from ..presets import sensor_file
     from ..sensor.sensor import Sensor
@@ -45,14 +45,10 @@ def run(arguments: Namespace) -> int:
         raise MembraneError(
             f'export needs {error.name}, which is not installed: pip install "torchmembrane[export]"'
         ) from error
-    reconstructor = build_reconstructor(Sensor.from_file(sensor_file(arguments.sensor)), arguments)
-    start = monotonic()
-    with tqdm(desc="export", unit=" pieces", bar_format="{desc}: {n}{unit} {elapsed}{postfix}", disable=None) as bar:
-
-        def said(piece: str) -> None:
-            bar.set_postfix_str(piece, refresh=False)
-            bar.update()
-
-        export(reconstructor, arguments.out, tracking=arguments.tracking, progress=said)
+    sensor, start = Sensor.from_file(sensor_file(arguments.sensor)), monotonic()
+    with ProgressDisplay("export") as progress:
+        progress(0.0, "sensor")
+        reconstructor = build_reconstructor(sensor, arguments)
+        export(reconstructor, arguments.out, tracking=arguments.tracking, progress=progress)
     print(f"written: {arguments.out}, {arguments.out.stat().st_size / 1e6:.1f} MB, {monotonic() - start:.0f} s")
     return 0

@@ -15,12 +15,13 @@ from ..errors import MembraneError
 from ..presets import sensor_file
 from ..sensor.sensor import Sensor
 from ..simulate.appearance import Appearance
-from ..simulate.dataset import KINDS, Plan, make_frames, stroke_to
+from ..simulate.dataset import KINDS, DatasetOutcome, Plan, make_frames, stroke_to
 from ..simulate.frames import Video, open_frames
 from ..simulate.indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge
 from ..simulate.mesh_indenter import MeshIndenter
 from ..simulate.simulator import Simulator, Stroke
 from .describe import pressure_in_words
+from .progress import ProgressDisplay
 
 LENGTHS = {
     "radius": (1e-3, 100.0),
@@ -40,20 +41,24 @@ def simulate(arguments: Namespace) -> int:
     torch.set_num_threads(1)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     appearance = Appearance(noise=arguments.noise, highlight=arguments.highlight, blur=arguments.blur)
-    simulator = Simulator(sensor, arguments.grid, appearance, arguments.dots, arguments.missing)
-    return (_random if arguments.random else _single)(arguments, simulator)
+    options = arguments.grid, appearance, arguments.dots, arguments.missing
+    if not arguments.random:
+        return _single(arguments, Simulator(sensor, *options))
+    with ProgressDisplay("simulate --random") as progress:
+        progress.begin("the sensor in the simulator")
+        outcome = _random(arguments, Simulator(sensor, *options), progress)
+    print(f"presses: {outcome.made} made, {outcome.failed} failed, {outcome.skipped} there before; in {arguments.out}")
+    return 1 if outcome.failed else 0
 
 
-def _random(arguments: Namespace, simulator: Simulator) -> int:
+def _random(arguments: Namespace, simulator: Simulator, progress: ProgressDisplay) -> DatasetOutcome:
     kinds = arguments.indenter.split(",") if arguments.indenter else KINDS
     if unknown := [kind for kind in kinds if kind not in KINDS]:
         raise MembraneError(f"--indenter {unknown[0]}: no random indenter; expected some of {', '.join(KINDS)}")
     plan = Plan(kinds, arguments.friction, arguments.seed, arguments.increment)
     shared = {"kinds": list(kinds), "friction": plan.friction, "increment": plan.increment}
     frames = open_frames(arguments.out, simulator, shared, arguments.format)
-    outcome = make_frames(simulator, plan, arguments.random, frames, arguments.jobs)
-    print(f"presses: {outcome.made} made, {outcome.failed} failed, {outcome.skipped} there before; in {arguments.out}")
-    return 1 if outcome.failed else 0
+    return make_frames(simulator, plan, arguments.random, frames, arguments.jobs, progress.write, progress)
 
 
 def _single(arguments: Namespace, simulator: Simulator) -> int:

@@ -33,6 +33,7 @@ from .choices import (
     PRESETS,
     SIMULATION_FORMATS,
 )
+from .progress import announce
 
 PURPOSE = "press a sensor's membrane and render its image, with the truth"
 EXAMPLES = f"""\
@@ -121,6 +122,7 @@ def _add_appearance(add: Add) -> None:
 def run(arguments: Namespace) -> int:
     """Simulate; returns the exit code."""
     _check_options(arguments)
+    announce("simulate")
     from .press import simulate
 
     return simulate(arguments)

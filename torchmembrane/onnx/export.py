@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from ..control_flow import FUNCTIONS, Value
 from ..errors import MembraneError
 from ..files.atomic import whole_file
+from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
 from ..results.status import Status
 from ..results.store import FORMATS, Mesh, Settings
@@ -28,6 +29,7 @@ from .torch_internals import tree_flatten, tree_leaves, tree_map, tree_unflatten
 from .trace import traced_model
 
 FORMAT = 1
+CHECK, PIECES = 0.8, 30  # share of the time before the check, and pieces, of the default estimator, measured
 EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
 
 
@@ -62,7 +64,7 @@ class Tracer:
     Nodes are named after the part of the package that they come from.
     """
 
-    def __init__(self, progress: Callable[[str], object] = lambda _: None) -> None:
+    def __init__(self, progress: Progress = silent) -> None:
         self.assembly, self.progress = Assembly(), progress
         self.traced: dict[tuple[Any, ...], onnx.ModelProto] = {}
 
@@ -118,7 +120,7 @@ class Tracer:
             self.assembly.part = type(owner).__module__.removeprefix("torchmembrane.").partition(".")[0]
         key = (owner, function, str(structure), *fixed.items(), *(value.shape for value in examples.values()))
         if key not in self.traced:
-            self.progress(getattr(function, "__qualname__", ""))
+            self.progress(len(self.traced) / (len(self.traced) + PIECES), getattr(function, "__qualname__", ""))
             outputs = [f"output {k}" for k, _ in enumerate(value for value in tree_leaves(found) if value is not None)]
             try:
                 self.traced[key] = self._whole(traced_model(Piece(owner, function, arranged), examples, outputs))
@@ -162,7 +164,7 @@ def export(
     path: str | Path,
     *,
     tracking: bool = False,
-    progress: Callable[[str], object] = lambda _: None,
+    progress: Progress = silent,
 ) -> onnx.ModelProto:
     """Write the whole reconstruction, image to result, as one ONNX model, if it agrees with torch.
 
@@ -174,7 +176,7 @@ def export(
         reconstructor: the sensor's.
         path: the model's file.
         tracking: follow the dots of the frames before; of a texture, which is not followed, the model is the same.
-        progress: is told what comes next: the pieces' names, some thirty, and at last the check.
+        progress: is told how far it is, and the names of the pieces, some thirty; the last step is the check.
 
     Returns:
         The model. Input `image [batch, 1, height, width]`, grey in 0..1; with `tracking`, of dots, also `previous_pixels
@@ -186,16 +188,17 @@ def export(
     """
     if reconstructor.rest_pixels.dtype != torch.float32:
         raise MembraneError(f"export: the reconstructor is {reconstructor.rest_pixels.dtype}; expected torch.float32")
+    progress(0.0, "image")
     width, height = reconstructor.image_size
     image = torch.rand(EXAMPLES, 1, height, width, generator=torch.Generator().manual_seed(0)).to(reconstructor.rest_pixels)
-    tracer = Tracer(progress)
+    tracer = Tracer(within(progress, 0.0, CHECK))
     inputs = [tracer.given("image", image)]
     if tracking and reconstructor.observer.locator.follows:
         inputs.append(tracer.given("previous_pixels", reconstructor.rest_pixels.repeat(EXAMPLES, 1, 1)))
     values: Any = inputs  # stand for tensors
     result: Any = reconstructor.reconstruct_grey(*values)
     model = _finished(tracer, inputs, result, reconstructor)
-    progress("check against torch")
+    progress(CHECK, "check against torch")
     checked(model.SerializeToString(), reconstructor)
     with whole_file(path) as partial:
         onnx.save(model, partial)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
+from ..progress import Progress, silent
 from .frames import SimulatedFrames
 from .indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge, facing
 from .simulator import SimulatedFrame, Simulator, Stroke
@@ -156,9 +157,7 @@ def _random_body(kind: str, size: float, rng: np.random.Generator) -> Indenter:
 
 
 def _report(line: str) -> None:
-    from tqdm import tqdm
-
-    tqdm.write(line, file=sys.stderr)
+    print(line, file=sys.stderr)
 
 
 def make_frames(
@@ -168,6 +167,7 @@ def make_frames(
     frames: SimulatedFrames,
     jobs: int = 1,
     report: Callable[[str], None] = _report,
+    progress: Progress = silent,
 ) -> DatasetOutcome:
     """Make the frames 0 to `count - 1` of a data set that `frames` does not hold yet.
 
@@ -179,23 +179,22 @@ def make_frames(
         count: of the data set's frames.
         frames: where they are kept.
         jobs: processes.
-        report: takes a line for each press that fails.
+        report: takes a line for each press that fails; default: it is written to stderr.
+        progress: is told how far it is.
     """
-    from tqdm import tqdm
-
     names = {number: f"s{plan.seed}_{number:06d}" for number in range(count)}
     held = frames.names()
     wanted = [number for number, name in names.items() if name not in held]
     failed, skipped = 0, count - len(wanted)
     try:
-        for number, made in tqdm(
-            _in_processes(simulator, plan, wanted, jobs), total=count, initial=skipped, unit="press", desc="simulate"
-        ):
+        progress(skipped / count, f"{len(wanted)} presses")
+        for done, (number, made) in enumerate(_in_processes(simulator, plan, wanted, jobs), skipped + 1):
             if isinstance(made, str):
                 failed += 1
                 report(f"{names[number]}: {made}")
             else:
                 frames.write(names[number], made)
+            progress(done / count, f"press {done} of {count}")
     finally:
         frames.flush()
     return DatasetOutcome(len(wanted) - failed, failed, skipped)

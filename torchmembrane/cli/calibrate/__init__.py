@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from ..arguments import Add, add_command, count_pair, positive, weight
 from ..choices import PORTS
+from ..progress import announce
 
 PURPOSE = "find lens, ports, rest surface and dots from images; make a layout of dots"
 CONTENT = """
@@ -50,6 +51,7 @@ def add_parser(commands: Any) -> None:
 
 
 def _run(module: str, step: str, arguments: Namespace) -> int:
+    announce(f"calibrate {step}")
     return int(getattr(import_module(f".{module}", __name__), step)(arguments))
 
 

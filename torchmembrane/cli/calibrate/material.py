@@ -12,7 +12,9 @@ from ...errors import MembraneError
 from ...jobs.inputs import Inputs, find_inputs
 from ...jobs.pressure import read_pressures
 from ...plot.calibration import material_figure
+from ...progress import Progress
 from ...sensor.sensor import Sensor
+from ..progress import ProgressDisplay
 from .files import read_forces, read_sensor, read_sensor_image, write_calibrated
 
 
@@ -23,8 +25,12 @@ def material(arguments: Namespace) -> int:
     forces = read_forces(arguments.forces, paths) if arguments.forces else None
     pressures = _pressures(arguments, inputs, sensor) if arguments.pressure else None
     images = torch.from_numpy(np.stack([read_sensor_image(path, sensor) for path in paths]))[:, None]
-    weighed = _weighed(arguments, sensor, images) if arguments.weight else None
-    found = material_from_images(sensor, images, forces, pressures) if weighed is None else weighed.material
+    with ProgressDisplay("calibrate material") as progress:
+        weighed = _weighed(arguments, sensor, images, progress) if arguments.weight else None
+        if weighed is None:
+            found = material_from_images(sensor, images, forces, pressures, progress=progress)
+        else:
+            found = weighed.material
     unit, n = sensor.length_unit, len(found.values)
     each = zip(paths, found.each, strict=True)
     notes = [f"{path.name} alone: prestretch {one:.3f} ± {sd:.2g}" for path, (one, sd) in each]
@@ -50,12 +56,12 @@ def material(arguments: Namespace) -> int:
     return write_calibrated(arguments, made, report, material_figure(report, found, [path.name for path in paths]))
 
 
-def _weighed(arguments: Namespace, sensor: Sensor, images: torch.Tensor) -> WeightFit:
+def _weighed(arguments: Namespace, sensor: Sensor, images: torch.Tensor, progress: Progress) -> WeightFit:
     if arguments.forces or arguments.pressure:
         raise MembraneError(
             "calibrate material: --weight and --forces or --pressure; expected one of them, either gives newtons"
         )
-    return material_from_weight(sensor, images, arguments.weight)
+    return material_from_weight(sensor, images, arguments.weight, progress=progress)
 
 
 def _pressures(arguments: Namespace, inputs: Inputs, sensor: Sensor) -> KnownPressures:

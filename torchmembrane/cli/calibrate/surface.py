@@ -13,6 +13,7 @@ from ...calibrate.surface import Correction, fine_surface
 from ...calibrate.views import rest_from_views
 from ...plot.calibration import fit_figure, surface_figure
 from ...sensor.sensor import Sensor
+from ..progress import ProgressDisplay
 from .files import read_depth, read_motions, read_sensor, read_sensor_image, write_calibrated
 
 if TYPE_CHECKING:
@@ -23,7 +24,8 @@ def rest(arguments: Namespace) -> int:
     """`torchmembrane calibrate rest`"""
     sensor = read_sensor(arguments)
     image = read_sensor_image(arguments.image, sensor)
-    found = rest_from_image(sensor, image)
+    with ProgressDisplay("calibrate rest") as progress:
+        found = rest_from_image(sensor, image, progress=progress)
     units = ["degrees"] * 3 + [sensor.length_unit] * 3
     shifts = np.linalg.norm(found.shifts, axis=1)
     notes = [
@@ -38,9 +40,9 @@ def rest(arguments: Namespace) -> int:
 def views(arguments: Namespace) -> int:
     """`torchmembrane calibrate views`"""
     sensor, motions = read_sensor(arguments), read_motions(arguments.motions)
-    found = rest_from_views(
-        sensor, [read_sensor_image(path, sensor) for path in arguments.images], motions, arguments.travel_error
-    )
+    images = [read_sensor_image(path, sensor) for path in arguments.images]
+    with ProgressDisplay("calibrate views") as progress:
+        found = rest_from_views(sensor, images, motions, arguments.travel_error, progress=progress)
     unit, P = sensor.length_unit, len(motions)
     design = np.concatenate([motions[1:, 3:], motions[1:, :3]], 1).ravel()
     rms = np.sqrt((found.deviations**2).mean(0))
@@ -58,7 +60,9 @@ def views(arguments: Namespace) -> int:
 def depth(arguments: Namespace) -> int:
     """`torchmembrane calibrate depth`"""
     sensor = read_sensor(arguments)
-    found = rest_from_depth(sensor, read_depth(arguments.depth, arguments.unit), read_sensor_image(arguments.image, sensor))
+    values, image = read_depth(arguments.depth, arguments.unit), read_sensor_image(arguments.image, sensor)
+    with ProgressDisplay("calibrate depth") as progress:
+        found = rest_from_depth(sensor, values, image, progress=progress)
     unit = sensor.length_unit
     notes = [
         f"{len(found.deviations)} squares of depths, each known to {np.median(found.deviations):.4f} {unit}",

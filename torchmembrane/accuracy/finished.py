@@ -1,0 +1,87 @@
+"""Series of trials that are finished, kept in a file until all are: an interrupted spec sheet goes on from there."""
+
+import hashlib
+import json
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+from ..errors import MembraneError
+from ..files.atomic import whole_file
+from ..files.safe_read import read_text
+from ..sensor.sensor import Sensor
+from .spec_sheet import Effort, Outcome, PairTrial, PressTrial, RestTrial
+
+MOST_BYTES = 2**26
+EXPECTED = "series of trials as check --accuracy keeps them"
+
+
+class FinishedSeries(NamedTuple):
+    """The file that keeps finished series, and what it held when it was opened.
+
+    Attributes:
+        path: the file; it need not exist.
+        outcomes: of the finished series, by their number.
+    """
+
+    path: Path
+    outcomes: dict[int, Outcome]
+
+    @classmethod
+    def open(
+        cls, folder: Path, version: str, sensor: Sensor, seed: int, noise: float | None, effort: Effort
+    ) -> "FinishedSeries":
+        """The file of one spec sheet: another version, sensor, seed, noise or effort has another file.
+
+        Args:
+            folder: where the file is.
+            version: of the package.
+            sensor: the sensor.
+            seed: of the trials.
+            noise: of the images, dB; None: that of the rest image.
+            effort: how much is tried.
+
+        Raises:
+            MembraneError: the file cannot be read.
+        """
+        key = json.dumps([version, sensor.fingerprint, seed, noise, effort])
+        path = folder / f"accuracy-{hashlib.sha256(key.encode()).hexdigest()[:12]}.unfinished.json"
+        return cls(path, _read(path) if path.exists() else {})
+
+    def keep(self, number: int, outcome: Outcome) -> None:
+        """Write the file anew with one more series, whole or not at all.
+
+        Args:
+            number: of the series.
+            outcome: what its trials gave.
+        """
+        self.outcomes[number] = outcome
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with whole_file(self.path) as partial:
+                partial.write_text(json.dumps(self.outcomes), encoding="utf-8")
+        except OSError as error:
+            warnings.warn(f"{self.path}: not written ({error.strerror}); an interruption loses what is done", stacklevel=2)
+
+    def remove(self) -> None:
+        """Remove the file, as the sheet is done."""
+        self.path.unlink(missing_ok=True)
+
+
+def _read(path: Path) -> dict[int, Outcome]:
+    try:
+        content = json.loads(read_text(path, MOST_BYTES, EXPECTED))
+        return {int(number): _outcome(*fields) for number, fields in content.items()}
+    except MembraneError:
+        raise
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise MembraneError(f"{path}: not readable; expected {EXPECTED}: remove the file to begin anew") from error
+
+
+def _outcome(rest: list[list], presses: list[list], pairs: list[list], reason: str) -> Outcome:
+    return Outcome(
+        [RestTrial(*trial) for trial in rest],
+        [PressTrial(*trial) for trial in presses],
+        [PairTrial(*trial) for trial in pairs],
+        reason,
+    )
