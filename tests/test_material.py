@@ -81,6 +81,7 @@ def test_modulus_is_proportional_to_the_forces_and_needs_but_one_of_them(presses
 
 
 @pytest.mark.filterwarnings("ignore:.*acts as a liquid")
+@pytest.mark.usefixtures("calibration_grids")
 def test_a_gas_of_unknown_modulus_is_found_as_one_whose_file_says_it(presses):
     """Its prestretch would else be that of a liquid, which keeps its volume."""
     pixels, forces = (values[:1] for values in presses)
@@ -104,6 +105,7 @@ def test_a_harmonic_membrane_is_refused():
         material_from_pixels(sensor(Material("harmonic", 1.5)), torch.zeros(1, 81, 2))
 
 
+@pytest.mark.usefixtures("calibration_grids")
 def test_command_finds_the_material_of_the_example_images(tmp_path):
     name = "press_on_axis"
     truth = np.load(EXAMPLES / f"{name}_truth.npz")
