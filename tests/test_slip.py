@@ -10,35 +10,12 @@ PAGE = Path(__file__).parents[1] / "docs" / "slip.md"
 CODE = "\n".join(re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S))
 
 
-COARSER = {
-    'sensor = tm.preset("fingertip")': 'sensor = tm.preset("fingertip")\n'
-    "sensor = replace(sensor, membrane=sensor.surface.membrane((17, 17)))",
-    "grid=(37, 37)": "grid=(26, 26)",
-}
-
-
-def ran(code):
-    """What the code has defined after it ran."""
-    names: dict = {}
-    exec(compile(code, PAGE.name, "exec"), names)
-    return names
-
-
 @pytest.fixture(scope="module")
-def as_it_is():
-    return ran(CODE)
-
-
-@pytest.fixture(scope="module", params=["coarser", pytest.param("as it is", marks=pytest.mark.full)])
-def page(request):
-    """The page simulated on fewer vertices, and as it is."""
-    if request.param == "as it is":
-        return request.getfixturevalue("as_it_is")
-    code = CODE
-    for said, coarser in COARSER.items():
-        assert said in code
-        code = code.replace(said, coarser)
-    return ran(code)
+def page():
+    """What the page's code has defined after it ran."""
+    names: dict = {}
+    exec(compile(CODE, PAGE.name, "exec"), names)
+    return names
 
 
 def test_the_slip_ratio_is_that_of_the_simulated_tractions(page):
@@ -71,9 +48,7 @@ def test_an_even_rise_and_a_plateau_are_found_exactly(page):
         assert (onset, plateau) == pytest.approx((meet, 0.02 + 0.1 * meet), abs=1e-9)
 
 
-@pytest.mark.full
-def test_the_page_says_what_it_gives(as_it_is):
-    page = as_it_is
+def test_the_page_says_what_it_gives(page):
     said = [float(number) for line in re.findall(r'print\(f".*"\)  # (.*)', CODE) for number in re.findall(r"-?[\d.]+", line)]
     given = [page[name] for name in ("plateau", "friction", "onset", "true_onset", "stuck", "slid")]
     assert said == pytest.approx(given, abs=0.06)

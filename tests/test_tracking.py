@@ -12,7 +12,7 @@ from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.simulator import Simulator
 
 SLACK = 1.2
-FRAMES = 3
+FRAMES = 6
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def stream():
     sensor = tm.preset("bubble")
     membrane = sensor.surface.membrane((17, 17))
     sensor = replace(sensor, material=replace(sensor.material, prestretch=SLACK), membrane=membrane)
-    simulator, size = Simulator(sensor, (26, 26)), membrane.size
+    simulator, size = Simulator(sensor, (30, 30)), membrane.size
     aim = membrane.rest[membrane.fixed].mean(0).numpy()
     stroke = stroke_to(simulator, Sphere(size / 5), aim, np.array([0.0, 0.1, -1.0]), 0.35 * size)
     rng = np.random.default_rng(0)

@@ -21,7 +21,7 @@ FORCES = {name: float(np.linalg.norm(np.load(EXAMPLES / f"{name}_truth.npz")["fo
 
 
 def test_one_known_weight_gives_the_forces_of_other_presses(tmp_path, capsys, calibration_grids):
-    """Of a sensor whose file has no modulus and a wrong prestretch; that of a plate, which asks more of the grids, with `full`."""
+    """Of a sensor whose file has no modulus and a wrong prestretch; a plate, which asks more of the grids, with `full`."""
     text = (EXAMPLES / "sensor.toml").read_text().replace("shear_modulus = 1.0\nthickness = 1.0\n", "")
     names = NAMES
     if calibration_grids == "coarse":
