@@ -7,6 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
+from torchmembrane.calibrate import material
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.reconstruct import Reconstructor
@@ -76,3 +77,14 @@ def small_sensor(tmp_path_factory):
 def small_images(small_sensor):
     """Those three frames."""
     return [small_sensor / f"press{k}.png" for k in range(3)]
+
+
+@pytest.fixture(params=["coarse", pytest.param("default", marks=pytest.mark.full)])
+def calibration_grids(request, monkeypatch):
+    """Those of `calibrate material`: coarser ones and fewer prestretches; with the mark `full` its own."""
+    if request.param == "coarse":
+        monkeypatch.setattr(material, "GRID", (9, 9))
+        monkeypatch.setattr(material, "PRESSURE_GRID", (17, 17))
+        monkeypatch.setattr(material, "STRETCHES", np.geomspace(1.05, 1.7, 6))
+        monkeypatch.setattr(material, "BETWEEN", 3)
+    return request.param

@@ -147,7 +147,8 @@ class Stream:
     def __init__(self):
         sensor = preset("fingertip")
         sensor = replace(sensor, membrane=sensor.surface.membrane((17, 17)))
-        self.simulator = Simulator(sensor, grid=(31, 31))
+        self.simulator = Simulator(sensor, grid=(26, 26))
+        self.changes, self.clean = {}, {}
         (rest,) = self.images([self.simulator.membrane.rest], seed=99)
         self.reconstructor = tm.Reconstructor(replace(sensor, markers=replace(sensor.markers, rest_image=to_grey(rest))))
         membrane, way = self.simulator.membrane, np.array([0.0, 0.0, -1.0])
@@ -157,6 +158,13 @@ class Stream:
 
     def aged(self, size, swells=True):
         """The membrane after a drift of `size` px: its fluid swells, or its tension falls in an open cavity."""
+        if swells not in self.changes:
+            self.changes[swells] = self._change(swells)
+        moved, length = self.changes[swells]
+        return self.rest + size / length * moved
+
+    def _change(self, swells):
+        """Where all vertices go, and how far the dots do, rms, px."""
         membrane, elasticity = self.simulator.membrane, self.simulator.elasticity
         p0, load = rest_balance(membrane, elasticity)
         softer = elasticity.on(membrane)
@@ -164,14 +172,19 @@ class Stream:
         cause = (elasticity, Liquid(1.001 * float(membrane.rest_volume))) if swells else (softer, Open())
         moved = EquilibriumProblem(membrane, *cause, load).solve(self.rest, float(p0)).vertices - self.rest
         at, was = (np.asarray(self.simulator.renderer.dots(self.rest + k * moved).pixels) for k in (1, 0))
-        return self.rest + size / np.sqrt(np.square(at - was).sum(1).mean()) * moved
+        return moved, np.sqrt(np.square(at - was).sum(1).mean())
 
     def images(self, surfaces, seed=0):
         """Of each surface, rendered once, with noise of its own."""
         rng = np.random.default_rng(seed)
-        with torch.no_grad():
-            clean = {id(x): self.simulator.renderer(x) for x in {id(x): x for x in surfaces}.values()}
-        return [(255 * noisy(clean[id(x)], 35.0, rng)).round().byte().numpy() for x in surfaces]
+        return [(255 * noisy(self._rendered(x), 35.0, rng)).round().byte().numpy() for x in surfaces]
+
+    def _rendered(self, surface):
+        key = surface.numpy().tobytes()
+        if key not in self.clean:
+            with torch.no_grad():
+                self.clean[key] = self.simulator.renderer(surface)
+        return self.clean[key]
 
 
 @pytest.fixture(scope="module")
@@ -196,13 +209,13 @@ def said(tracker, images):
 
 
 def test_noise_alone_is_no_drift(stream, at_rest):
-    """From the sensor's rest image, and from each of the frames in turn, with the noise that the locator says."""
+    """From the sensor's rest image, and from several of the frames in turn, with the noise that the locator says."""
     r = stream.reconstructor
     tracker = tm.Tracker(r)
     assert np.isnan(tracker.drift) and said(tracker, at_rest) == [] and tracker.drift < 0.01
     with torch.no_grad():
         flow = r.observer(r.grey(np.stack(at_rest)))
-    for k in range(len(at_rest)):
+    for k in range(0, len(at_rest), 6):
         own = flow.covariance[k] - r.observer.rest_covariance
         watched = DriftWatch(r.rest_pixels, own, r.observer.seen_at_rest, r.image_size)
         for displacement, confidence in zip(flow.displacement, flow.confidence, strict=True):
@@ -210,7 +223,7 @@ def test_noise_alone_is_no_drift(stream, at_rest):
             assert not watched.drift().is_certain
 
 
-@pytest.mark.parametrize("swells", [True, False])
+@pytest.mark.parametrize("swells", [True, pytest.param(False, marks=pytest.mark.full)])
 def test_a_membrane_that_has_changed_is_said_once_and_nulled_by_rezero(stream, at_rest, swells):
     tracker, aged = tm.Tracker(stream.reconstructor), stream.images([stream.aged(0.15, swells)] * 60, seed=1)
     assert said(tracker, at_rest[:ENOUGH]) == []
@@ -224,17 +237,17 @@ def test_a_membrane_that_has_changed_is_said_once_and_nulled_by_rezero(stream, a
     assert "rezero" in again
 
 
-def test_rezero_knows_the_noise_of_its_frame(stream):
+@pytest.mark.parametrize("k", [0, pytest.param(1, marks=pytest.mark.full)])
+def test_rezero_knows_the_noise_of_its_frame(stream, k):
     """Much more than that of the rest image, which was averaged."""
     with torch.no_grad():
         clean = stream.simulator.renderer(stream.rest)
-    images = [(255 * noisy(clean, 22.0, np.random.default_rng([7, k]))).round().byte().numpy() for k in range(24)]
+    images = [(255 * noisy(clean, 22.0, np.random.default_rng([7, i]))).round().byte().numpy() for i in range(24)]
     sensor = stream.reconstructor.sensor
     averaged = replace(sensor, markers=replace(sensor.markers, rest_image=clean.numpy().astype(np.float32)))
-    for k in range(2):
-        tracker = tm.Tracker(tm.Reconstructor(averaged))
-        tracker.rezero(images[k])
-        assert said(tracker, images[2:]) == [] and tracker.drift < 0.015
+    tracker = tm.Tracker(tm.Reconstructor(averaged))
+    tracker.rezero(images[k])
+    assert said(tracker, images[2:]) == [] and tracker.drift < 0.015
 
 
 def test_the_same_stream_says_the_same_again(stream, at_rest):
@@ -247,7 +260,7 @@ def test_the_same_stream_says_the_same_again(stream, at_rest):
 
 @pytest.mark.parametrize("shift", [0.2, 3.0])
 def test_a_moved_camera_is_a_drift_and_one_that_is_found_is_named(stream, at_rest, shift):
-    moved = [ndimage.shift(image / 255, (0.0, shift), order=3, mode="nearest").clip(0, 1) for image in at_rest]
+    moved = [ndimage.shift(image / 255, (0.0, shift), order=3, mode="nearest").clip(0, 1) for image in at_rest[:16]]
     tracker = tm.Tracker(stream.reconstructor)
     ((_, words),) = said(tracker, moved)
     assert tracker.drift == pytest.approx(shift, rel=0.06)
@@ -269,22 +282,26 @@ def test_a_moved_camera_is_told_from_a_touch_and_from_noise(stream):
         assert not watch.is_rigid(moved + noise, seen)
 
 
-def test_presses_in_between_are_no_drift(stream, at_rest):
-    tracker, pressed = tm.Tracker(stream.reconstructor), stream.images(stream.pressed * 5, seed=3)
-    images = [image for k in range(5) for image in (*at_rest[4 * k : 4 * k + 4], *pressed[6 * k : 6 * k + 6])]
+@pytest.mark.parametrize("rounds", [3, pytest.param(5, marks=pytest.mark.full)])
+def test_presses_in_between_are_no_drift(stream, at_rest, rounds):
+    tracker, pressed = tm.Tracker(stream.reconstructor), stream.images(stream.pressed * rounds, seed=3)
+    images = [image for k in range(rounds) for image in (*at_rest[4 * k : 4 * k + 4], *pressed[6 * k : 6 * k + 6])]
     assert said(tracker, images) == [] and tracker.drift < 0.015
+
+
+SOON = 14
 
 
 @pytest.fixture
 def soon(monkeypatch):
     """A contact holds still for a few frames only before it is asked about."""
-    monkeypatch.setattr(track, "STEADY", 20)
+    monkeypatch.setattr(track, "STEADY", SOON)
 
 
 def test_a_press_that_is_held_is_no_drift(stream, at_rest, soon):
     tracker = tm.Tracker(stream.reconstructor)
     for pressed in stream.pressed[:2]:
-        assert said(tracker, at_rest[:12] + stream.images([pressed] * 25, seed=9)) == [] and tracker.drift < 0.01
+        assert said(tracker, at_rest[:12] + stream.images([pressed] * (SOON + 3), seed=9)) == [] and tracker.drift < 0.01
 
 
 @pytest.fixture
@@ -310,26 +327,26 @@ def touched_from(stream, monkeypatch):
 
 def test_a_rest_image_that_had_aged_before_the_stream_is_said(stream, soon, touched_from):
     touched_from(0)
-    aged, tracker = stream.images([stream.aged(0.15)] * 45, seed=5), tm.Tracker(stream.reconstructor)
-    ((frame, words),) = said(tracker, aged[:25])
-    assert frame == 19 and "from the beginning" in words and "if nothing touches, it has aged" in words
+    aged, tracker = stream.images([stream.aged(0.15)] * 36, seed=5), tm.Tracker(stream.reconstructor)
+    ((frame, words),) = said(tracker, aged[:18])
+    assert frame == SOON - 1 and "from the beginning" in words and "if nothing touches, it has aged" in words
     assert tracker.drift == pytest.approx(0.15, abs=0.03)
     tracker.rezero()
-    assert said(tracker, aged[25:]) == []
+    assert said(tracker, aged[18:]) == []
 
 
 def test_a_contact_that_moves_or_is_large_is_no_drift(stream, soon, touched_from):
     touched_from(0)
-    light, large = (stream.images([stream.aged(size)] * 24, seed=6) for size in (0.15, 0.4))
-    other = stream.images([stream.rest - (stream.aged(0.15) - stream.rest)] * 18, seed=7)
-    assert said(tm.Tracker(stream.reconstructor), light[:18] + other + light[:18]) == []
+    light, large = (stream.images([stream.aged(size)] * (SOON + 3), seed=6) for size in (0.15, 0.4))
+    other = stream.images([stream.rest - (stream.aged(0.15) - stream.rest)] * (SOON - 2), seed=7)
+    assert said(tm.Tracker(stream.reconstructor), light[: SOON - 2] + other + light[: SOON - 2]) == []
     assert said(tm.Tracker(stream.reconstructor), large) == []
 
 
 def test_a_slow_drift_is_said_even_where_it_is_taken_for_a_contact(stream, touched_from):
     """From the twentieth frame on every frame is one with a contact."""
     moved = stream.aged(0.1) - stream.rest
-    images = stream.images([stream.rest + k / 5 * moved for k in range(6)], seed=4)
+    images = stream.images([stream.rest + k / 5 * moved for k in range(5)], seed=4)
     touched_from(20)
     ((frame, words),) = said(tm.Tracker(stream.reconstructor), [image for image in images for _ in range(10)])
     assert 20 < frame < 40 and "without contact" in words
@@ -338,4 +355,4 @@ def test_a_slow_drift_is_said_even_where_it_is_taken_for_a_contact(stream, touch
 def test_what_comes_at_once_may_well_be_a_contact(stream, at_rest, touched_from):
     touched_from(20)
     (aged,) = stream.images([stream.aged(0.1)], seed=8)
-    assert said(tm.Tracker(stream.reconstructor), at_rest[:20] + [aged] * 30) == []
+    assert said(tm.Tracker(stream.reconstructor), at_rest[:20] + [aged] * 20) == []

@@ -83,7 +83,6 @@ def test_modulus_is_proportional_to_the_forces_and_needs_but_one_of_them(presses
     assert np.allclose(twice, 2 * one) and one[0] > 0 > one[2]
 
 
-@pytest.mark.filterwarnings("ignore:.*acts as a liquid")
 def test_of_a_measured_force_counts_what_is_along_the_one_that_is_found():
     """Turned by 60 degrees it is half as much along it; of a magnitude all is."""
     traction, area = torch.tensor([[[0.0, 0.0, -0.2], [0.0, 0.0, -0.1]]], dtype=torch.float64), torch.tensor([5.0, 10.0])
@@ -95,6 +94,8 @@ def test_of_a_measured_force_counts_what_is_along_the_one_that_is_found():
         assert ratios == pytest.approx([ratio]) and magnitudes.ravel() == pytest.approx([2.0, 3.0])
 
 
+@pytest.mark.filterwarnings("ignore:.*acts as a liquid")
+@pytest.mark.usefixtures("calibration_grids")
 def test_a_gas_of_unknown_modulus_is_found_as_one_whose_file_says_it(presses):
     """Its prestretch would else be that of a liquid, which keeps its volume."""
     pixels, forces = (values[:1] for values in presses)
@@ -127,6 +128,7 @@ def test_a_harmonic_membrane_is_refused():
         material_from_pixels(sensor(Material("harmonic", 1.5)), torch.zeros(1, 81, 2))
 
 
+@pytest.mark.usefixtures("calibration_grids")
 def test_command_finds_the_material_of_the_example_images(tmp_path):
     name = "press_on_axis"
     truth = np.load(EXAMPLES / f"{name}_truth.npz")
