@@ -24,7 +24,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxpro
 	--durations=8
 IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
 
-.PHONY: demo test test-all test-lowest lint style types layers bench soak figures docs web test-web test-cpp test-arm clean
+.PHONY: demo test test-all checked test-lowest lint style types layers bench soak figures docs web test-web test-cpp test-arm clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -38,11 +38,16 @@ demo: $(READY)
 	$(BIN)/torchmembrane reconstruct examples/sensor.toml examples/press_on_axis.png examples/two_contacts.png \
 		examples/flat_plate.png --out out/demo --figures
 
-test: $(READY) lint
+test: $(READY) checked
 	$(PYTEST)
 
-test-all: $(READY) lint
+test-all: $(READY) checked
+	@echo 'Every test: those of make test, and those marked full (pytest -m full --collect-only -q lists them).'
 	$(PYTEST) -m ""
+
+checked: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/compile.py & compiling=$$!; $(MAKE) --no-print-directory lint; found=$$?; \
+		wait $$compiling && exit $$found
 
 test-lowest: $(LOWEST)/.ready
 	$(LOWEST)/bin/python tests/lowest.py

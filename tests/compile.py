@@ -1,0 +1,23 @@
+"""Compiles the solve's machine code for both precisions, while the style is checked: else every process of the tests would."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+import torchmembrane as tm
+
+SENSOR = Path(__file__).parents[1] / "examples" / "sensor.toml"
+
+
+def main() -> None:
+    sensor = tm.Sensor.from_file(SENSOR)
+    small = replace(sensor, membrane=sensor.surface.membrane((9, 9)))
+    for dtype in (torch.float32, torch.float64):
+        reconstructor = tm.Reconstructor(small, dtype=dtype)
+        with torch.no_grad():
+            reconstructor.from_pixels(reconstructor.rest_pixels)
+
+
+if __name__ == "__main__":
+    main()
