@@ -1,5 +1,7 @@
 # make demo | make test | make lint (style, types, layers) | make bench | make figures: each sets itself up on a machine with Python 3.11+ only.
+# make test-all: every test, those that `make test` leaves out for their length as well; weekly and before a release.
 # make soak SOAK=HOURS PRESSES=10000 KILLS=10: damaged files for so many hours, jobs killed, random sensors pressed; all hours long.
+# make test-lowest: the quick start with the lowest versions that pyproject.toml allows, in .venv-lowest.
 # make docs: the site in out/site, links checked.
 # make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
 # make test-cpp | make test-arm: the C++ example (needs cmake); the edge package on an emulated aarch64. On Debian.
@@ -11,15 +13,18 @@ SEED ?= $(shell date +%s)
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+LOWEST := .venv-lowest
 
 WEB := export/web
 CPP := out/cpp
 PAGE := $(WEB)/dist/index.html
 PACKAGES := $(WEB)/node_modules/.package-lock.json
 SENSOR := examples/sensor.toml examples/rest_grid.npz examples/dots.csv examples/rest.png
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder \
+	--durations=8
 IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
 
-.PHONY: demo test lint style types layers bench soak figures docs web test-web test-cpp test-arm clean
+.PHONY: demo test test-all test-lowest lint style types layers bench soak figures docs web test-web test-cpp test-arm clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -34,7 +39,18 @@ demo: $(READY)
 		examples/flat_plate.png --out out/demo --figures
 
 test: $(READY) lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations=8
+	$(PYTEST)
+
+test-all: $(READY) lint
+	$(PYTEST) -m ""
+
+test-lowest: $(LOWEST)/.ready
+	$(LOWEST)/bin/python tests/lowest.py
+
+$(LOWEST)/.ready: pyproject.toml constraints-lowest.txt
+	$(PYTHON) -m venv --clear $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --quiet --constraint constraints-lowest.txt --editable .
+	touch $@
 
 lint: style types layers
 
@@ -49,14 +65,14 @@ layers: $(READY)
 	$(BIN)/lint-imports
 
 bench: $(READY)
-	$(BIN)/python bench/speed.py --json out/bench/speed.json
+	$(BIN)/python -m bench.speed.speed --json out/bench/speed.json
 
 soak: $(READY)
-	$(BIN)/python bench/fuzz.py --hours $(SOAK) --seed $(SEED) --json out/bench/fuzz.json
+	$(BIN)/python -m bench.robustness.fuzz --hours $(SOAK) --seed $(SEED) --json out/bench/fuzz.json
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[ray]"
-	for way in --format=npz --format=parquet --engine=ray; do $(BIN)/python bench/kills.py --kills $(KILLS) $$way || exit 1; done
-	$(BIN)/python bench/random_sensors.py out/bench/random --sensors $$(( ($(PRESSES) + 3) / 4 )) --presses 4
-	$(BIN)/python bench/range.py out/bench/random --json out/bench/range.json
+	for way in --format=npz --format=parquet --engine=ray; do $(BIN)/python -m bench.robustness.crash_recovery --kills $(KILLS) $$way || exit 1; done
+	$(BIN)/python -m bench.data.random_sensors out/bench/random --sensors $$(( ($(PRESSES) + 3) / 4 )) --presses 4
+	$(BIN)/python -m bench.accuracy.range out/bench/random --json out/bench/range.json
 
 figures: $(READY)
 	$(BIN)/python docs/figures.py
@@ -115,4 +131,4 @@ $(PACKAGES): $(WEB)/package.json $(WEB)/package-lock.json
 	cd $(WEB) && npm ci
 
 clean:
-	rm -rf $(VENV) out build *.egg-info $(WEB)/dist $(WEB)/node_modules
+	rm -rf $(VENV) $(LOWEST) out build *.egg-info $(WEB)/dist $(WEB)/node_modules

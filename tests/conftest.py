@@ -8,6 +8,7 @@ import torch
 from PIL import Image
 
 from torchmembrane.camera.model import Camera
+from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
@@ -18,14 +19,21 @@ from torchmembrane.simulate.simulator import Simulator
 EXAMPLES = Path(__file__).parents[1] / "examples"
 torch.set_num_threads(1)
 gc.set_threshold(100_000, 50, 100)  # tracing makes millions of objects that stay
-LONG = ["test_export_sensors", "test_material", "test_drift", "test_export", "test_compile", "test_deviations", "test_fuzz",
-        "test_tutorial", "test_gauge_modulus", "test_jobs", "test_learning_stack", "test_learning", "test_weight"]  # fmt: skip
+LONG = ["test_export", "test_export_sensors", "test_drift", "test_compile", "test_learning_stack", "test_jobs", "test_learning",
+        "test_fuzz", "test_material", "test_deviations", "test_calibrate", "test_tutorial", "test_gauge_modulus",
+        "test_export_choices", "test_open_estimators", "test_weight"]  # fmt: skip
 
 
 def pytest_collection_modifyitems(items):
     """The longest files first, so that no process has one left to do when the others are through."""
     place = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))
+
+
+@pytest.fixture
+def few_steps():
+    """Settings for torch.compile and torch.export, which unroll all steps: every branch of the solve, each of few steps."""
+    return ForceBalanceSettings(steps=2, coarse_steps=2, fine_steps=2, finer_steps=2, patience=1, settling_steps=2)
 
 
 @pytest.fixture(autouse=True)

@@ -39,10 +39,14 @@ def gradients(model: nn.Module, pixels: torch.Tensor) -> list[torch.Tensor]:
     return [parameter.grad for parameter in model.parameters()]
 
 
-if __name__ == "__main__":
-    rank, processes, folder = int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])
-    torch.set_num_threads(1)
+def train(rank: int, processes: int, folder: Path) -> None:
+    """One of the processes: keeps the gradients that all find together."""
     dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=processes)
     batch = torch.load(folder / "pixels.pt")
     torch.save(gradients(DistributedDataParallel(grasp()), batch[rank::processes]), folder / f"{rank}.pt")
     dist.destroy_process_group()
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    train(int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))

@@ -26,10 +26,20 @@ def quoted(text: str) -> list[str]:
 def quoted_paths(text: str) -> list[str]:
     """Quoted paths of Python files.
 
-    >>> quoted_paths("`solve/kkt.py`, `bench/speed.py --compiled`, `kkt.py`")
-    ['bench/speed.py', 'solve/kkt.py']
+    >>> quoted_paths("`solve/kkt.py`, `python docs/reference.py --check`, `kkt.py`")
+    ['docs/reference.py', 'solve/kkt.py']
     """
     return sorted(set(re.findall(r"`(?:python )?((?:\w+/)+\w+\.py)\b", text)))
+
+
+def quoted_benchmarks(text: str) -> list[str]:
+    """Paths of the benchmarks that a text names, as a file or in a command.
+
+    >>> quoted_benchmarks("`bench/a/one.py` (`python -m\\nbench.a.two DATA`), python bench/a/three.py")
+    ['bench/a/one.py', 'bench/a/three.py', 'bench/a/two.py']
+    """
+    modules = re.findall(r"python -m\s+(bench(?:\.\w+)+)", text)
+    return sorted({*re.findall(r"\bbench/[\w/]+\.py\b", text), *(f"{name.replace('.', '/')}.py" for name in modules)})
 
 
 def meant_by(name: str) -> object:

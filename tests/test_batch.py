@@ -135,6 +135,27 @@ def test_summary_holds_what_the_frames_say(images, tmp_path):
     assert float(row["seconds"]) > 0
 
 
+def test_the_summary_names_the_deepest_place_and_none_where_a_part_of_the_surface_is_not_known(images, tmp_path):
+    class Uneven(Denting):
+        """Vertex 8 twice as deep as the others; of the second image vertex 7 is not known."""
+
+        def __call__(self, batch):
+            found = super().__call__(batch)
+            vertices, displacement = found.vertices.clone(), found.displacement.clone()
+            displacement[:, 8] *= 2
+            vertices[:, 8] += displacement[:, 8] / 2
+            if self.calls == [2]:
+                displacement[1, 7] = torch.nan
+            return found._replace(vertices=vertices, displacement=displacement)
+
+    made = reconstruct(images, tmp_path / "out", reconstructor=Uneven())[2]
+    rows, level = summary_of(tmp_path / "out"), 130 / 255
+    place = (made.estimator.membrane.rest - 2 * level * made.estimator.membrane.rest_normals)[8]
+    assert float(rows["i3"]["deepest"]) == pytest.approx(-2 * level, abs=1e-5)
+    assert [float(rows["i3"][f"deepest_{axis}"]) for axis in "xyz"] == pytest.approx(place.tolist(), abs=1e-4)
+    assert [rows["i1"][key] for key in ("deepest", "deepest_x", "deepest_y", "deepest_z")] == [""] * 4
+
+
 def test_broken_files_do_not_stop_their_batch(images, tmp_path):
     images[1].write_bytes(b"no image at all")
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
@@ -319,6 +340,12 @@ def test_a_folder_from_before_there_was_a_choice_of_locators_was_made_with_fit(i
     assert Mesh.load(path).settings.locator == "soft"
     np.savez(path, **older)
     assert Mesh.load(path).settings == NPZ and NPZ.locator == "fit"
+
+
+def test_a_folder_of_frames_in_parquet_without_their_mesh_is_refused(images, tmp_path):
+    (tmp_path / "out" / "frames").mkdir(parents=True)
+    with pytest.raises(MembraneError, match="no mesh.npz"):
+        reconstruct(images, tmp_path / "out")
 
 
 def test_a_folder_of_other_files_is_refused(images, tmp_path):

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from torchmembrane.errors import MembraneError
+from torchmembrane.files import safe_read
 from torchmembrane.files.safe_read import lies_within, read_array, read_arrays, read_bytes, read_text
 
 NAMES = ("vertices", "fixed")
@@ -101,15 +102,16 @@ def test_a_damaged_file_of_arrays_is_refused_in_one_line(tmp_path, kind):
     refusal(read_arrays, path, NAMES)
 
 
-def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path):
-    """1.5 GB of zeros in 1.5 MB, said by the directory or hidden from it."""
+def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    """48 MB of zeros in 48 kB where 1 MB is the bound, said by the directory or hidden from it."""
+    monkeypatch.setattr(safe_read, "MOST_ARRAY_BYTES", 2**20)
     path = tmp_path / "bomb.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file, file.open("vertices.npy", "w", force_zip64=True) as member:
-        header = "{'descr': '<f8', 'fortran_order': False, 'shape': (8000, 8000, 3), }"
+        header = "{'descr': '<f8', 'fortran_order': False, 'shape': (2000, 1000, 3), }"
         member.write(npy(header + " " * (117 - len(header)) + "\n"))
-        for _ in range(1465):
-            member.write(bytes(2**20))
-    assert path.stat().st_size < 2e6 and "its arrays take 1536" in refusal(read_arrays, path, ["vertices"])
+        for _ in range(48):
+            member.write(bytes(10**6))
+    assert path.stat().st_size < 6e4 and "its arrays take 48000128 bytes" in refusal(read_arrays, path, ["vertices"])
     with zipfile.ZipFile(path) as file:
         true = struct.pack("<I", file.getinfo("vertices.npy").file_size)
     content = path.read_bytes()

@@ -176,7 +176,7 @@ def test_centre_of_an_outline_is_that_of_its_ellipse():
 # boards
 
 
-@pytest.mark.parametrize("turn", [0.0, 2.0])
+@pytest.mark.parametrize("turn", [pytest.param(0.0, marks=pytest.mark.full), 2.0])
 def test_board_dots_are_named_right_in_any_turn_and_when_cut(turn):
     camera = Camera("pinhole", SIZE, (150, 150), (160, 120), (-0.1, 0.02))
     R = Rotation.from_euler("xz", [0.3, turn]).as_matrix()
@@ -284,7 +284,13 @@ def test_a_calibrated_sensor_reconstructs_its_rest(design, truth, image):
 
 
 @pytest.mark.parametrize(
-    "name, pressed", [("rest", False), ("press_on_axis", True), ("flat_plate", True), ("two_contacts", True)]
+    "name, pressed",
+    [
+        ("rest", False),
+        ("press_on_axis", True),
+        pytest.param("flat_plate", True, marks=pytest.mark.full),
+        pytest.param("two_contacts", True, marks=pytest.mark.full),
+    ],
 )
 def test_a_pressed_image_is_noticed_to_be_no_rest(name, pressed):
     sensor = Sensor.from_file("examples/sensor.toml")

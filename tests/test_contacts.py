@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchmembrane import Reconstructor, Status
-from torchmembrane.estimators.contacts import ContactPatches
+from torchmembrane.estimators.contacts import BESIDE, MOVED, ContactPatches
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.estimators.force_balance.traction_loss import TractionLoss
 from torchmembrane.markers.coverage import Coverage, facings
@@ -89,6 +89,14 @@ def test_a_flat_plate_is_one_contact(edge, rough):
     assert (found.points[0, 0, :2]).norm() < 0.5
 
 
+def test_the_area_of_a_contact_is_that_of_the_deformed_surface():
+    """The sheet and all on it a tenth larger: the same patch, of 1.21 times the area."""
+    traction, normals, _ = pressed_by(DOME.rest[None], [(0.0, 0.0, 12.0)])
+    once, larger = told(DOME.rest[None], traction, normals), told(1.1 * DOME.rest[None], traction, normals)
+    torch.testing.assert_close(larger.area, 1.21 * once.area, equal_nan=True)
+    torch.testing.assert_close(larger.points, 1.1 * once.points, equal_nan=True)
+
+
 @pytest.mark.parametrize("form", ["dent", "saddle"])
 def test_curvatures_are_those_of_the_surface(form):
     """A dent in the shape of a sphere, and a saddle, on a plane: principal curvatures hollow seen from outside are positive."""
@@ -153,6 +161,23 @@ def test_a_patch_at_the_rim_says_so_and_one_clear_of_it_does_not():
             assert told(pushed, traction, normals).at_rim[0, 0] == 0
             said.append(False)
     assert set(said) == {True, False}
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_on_a_coarse_grid_the_rim_is_reached_by_movement_that_grows_with_the_distance_from_it(share):
+    """No vertex is as near the rim as `BESIDE`: of the nearest is asked so many times more as it is farther away."""
+    dome = spherical_cap(12, 9, 3, (7, 7))
+    patches, inner = ContactPatches(dome, spacing=dome.size), (~dome.fixed).nonzero()[:, 0]
+    from_rim = torch.cdist(dome.rest[inner], dome.rest[dome.fixed]).amin(1)
+    vertex, farther = inner[from_rim.argmin()], float(from_rim.min() / (BESIDE * dome.size))
+    assert farther > 1.2
+    x, normals = dome.rest[None].clone(), dome.normals(dome.rest)[None]
+    x[0, dome.rest[:, 2].argmax(), 2] -= 1.0
+    x[0, vertex, 2] -= share * MOVED * farther
+    touched = torch.zeros(1, len(dome.rest), dtype=torch.float64)
+    touched[0, vertex] = 1
+    found = patches(x, normals, -normals * touched[..., None], touched, x[:, vertex, None].mT, touched[:, None])
+    assert bool(found.at_rim[0, 0] == 1) == (share > 1)
 
 
 def test_a_push_in_the_middle_of_a_sheet_that_moves_as_a_whole_is_clear_of_the_rim():

@@ -9,7 +9,8 @@ import torch
 
 from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
-from torchmembrane.estimators.base import Contacts, Observation
+from torchmembrane.estimators.base import Observation
+from torchmembrane.estimators.contacts import Contacts
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.estimators.force_balance.uncertainty import (

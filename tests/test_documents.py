@@ -4,7 +4,7 @@ import re
 import tomllib
 
 import pytest
-from quoted_names import PAGES, ROOT, meant_by, quoted, quoted_paths
+from quoted_names import PACKAGE, PAGES, ROOT, meant_by, quoted, quoted_benchmarks, quoted_paths
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 CHANGELOG = (ROOT / "CHANGELOG.md").read_text()
@@ -125,3 +125,11 @@ def test_named_code_exists(page):
 def test_named_files_exist(page):
     folders = (ROOT, ROOT / "torchmembrane")
     assert not [path for path in quoted_paths(page.read_text()) if not any((folder / path).exists() for folder in folders)]
+
+
+def test_named_benchmarks_exist():
+    """In documents, in the Makefile, and in docstrings."""
+    sources = [path for folder in (ROOT / "bench", PACKAGE) for path in sorted(folder.rglob("*.py"))]
+    texts = [*PAGES, ROOT / "CHANGELOG.md", ROOT / "Makefile", ROOT / "bench" / "README.md", *sources]
+    named = {name: path for path in texts for name in quoted_benchmarks(path.read_text())}
+    assert len(named) > 30 and {name: path for name, path in named.items() if not (ROOT / name).exists()} == {}

@@ -1,9 +1,7 @@
 """Dots: found and measured in the rest image, located and matched in frames, all through rendered pixels."""
 
-import importlib
 import warnings
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +11,7 @@ from kornia.filters import gaussian_blur2d
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from bench.accuracy import thresholded_dots
 from torchmembrane.errors import MembraneError
 from torchmembrane.markers.dots.bands import bands, blur_rows
 from torchmembrane.markers.dots.coherence import Coherence
@@ -60,7 +59,7 @@ def render(pixels, shapes, noise=0.02, seed=0, kept=None):
     steps = np.arange(-2, 3) / 5
     kept = np.ones(len(pixels), bool) if kept is None else kept
     for centre, shape in zip(pixels[kept], shapes[kept], strict=True):
-        (u0, v0), reach = np.round(centre).astype(int), 12
+        (u0, v0), reach = np.round(centre).astype(int), int(min(12, np.linalg.norm(shape, 2) + 2))
         patch = np.s_[max(v0 - reach, 0) : v0 + reach + 1, max(u0 - reach, 0) : u0 + reach + 1]
         place = np.stack([u[patch], v[patch]], -1)[..., None, None, :] + np.stack(np.meshgrid(steps, steps), -1)
         inside = np.linalg.norm((place - centre) @ np.linalg.inv(shape).T, axis=-1) < 1
@@ -205,14 +204,7 @@ def test_follows_a_smooth_flow_of_one_and_a_half_pitches(arrangement, two_sizes,
         assert error.max() < 0.5 and np.median(error) < 0.06 and np.percentile(error, 95) < 0.2, k
 
 
-@pytest.fixture
-def thresholded_dots(monkeypatch):
-    """`bench/thresholded_dots.py`, the paper's way to dots."""
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "bench")
-    return importlib.import_module("thresholded_dots")
-
-
-def test_components_are_the_dark_spots_of_an_image(thresholded_dots):
+def test_components_are_the_dark_spots_of_an_image():
     """Section 5: centre of gravity and area of what is darker than the threshold, in a dark and in a light image."""
     v, u = np.mgrid[:60, :90]
     spots, image = [(20.0, 15.0, 5.0), (60.5, 40.0, 8.0), (75.0, 12.5, 3.0)], np.full((60, 90), 0.8)
@@ -226,7 +218,7 @@ def test_components_are_the_dark_spots_of_an_image(thresholded_dots):
         assert area[order].tolist() == [spot.sum() for spot in inside]
 
 
-def test_the_threshold_parts_an_image_with_least_spread(thresholded_dots):
+def test_the_threshold_parts_an_image_with_least_spread():
     """Otsu's: no other level leaves less, with few dark pixels or many; unlike the mean grey where they are few."""
     rng = np.random.default_rng(0)
     for dark in (200, 3000, 9000):
@@ -241,13 +233,13 @@ def test_the_threshold_parts_an_image_with_least_spread(thresholded_dots):
         assert dark > 200 or spread(image.mean()) > 1.3 * least
 
 
-def test_components_are_joined_by_their_sides(thresholded_dots):
+def test_components_are_joined_by_their_sides():
     image = np.full((30, 40), 0.8)
     image[5:10, 5:10] = image[10:16, 10:16] = 0.1  # corner to corner
     assert sorted(thresholded_dots.components(image, "dark")[1].tolist()) == [25, 36]
 
 
-def test_small_dots_are_looked_for_where_the_large_ones_around_went(thresholded_dots):
+def test_small_dots_are_looked_for_where_the_large_ones_around_went():
     """In a flow of more than half the small dots' spacing, where the nearest small one is often another."""
     s = scene("hexagonal")
     paper = thresholded_dots.ThresholdedDots(render(s.pixels, s.shapes, seed=7), s.pixels, s.sizes == 1, "dark")
@@ -260,7 +252,7 @@ def test_small_dots_are_looked_for_where_the_large_ones_around_went(thresholded_
     assert np.nanmax(error) < 0.6 and np.isfinite(error).mean() > 0.97
 
 
-def test_a_dot_that_is_not_there_is_lost_and_none_of_its_neighbours_is_taken_for_it(thresholded_dots):
+def test_a_dot_that_is_not_there_is_lost_and_none_of_its_neighbours_is_taken_for_it():
     """Of another size or of its own; all others are found."""
     s = scene()
     paper = thresholded_dots.ThresholdedDots(render(s.pixels, s.shapes, seed=7), s.pixels, s.sizes == 1, "dark")
@@ -271,7 +263,7 @@ def test_a_dot_that_is_not_there_is_lost_and_none_of_its_neighbours_is_taken_for
     assert len(set(s.sizes[~kept])) == 2 and np.isnan(error[~kept]).all() and error[kept].max() < 0.6
 
 
-def test_a_dot_is_looked_for_within_three_quarters_of_the_spacing_and_taken_once(thresholded_dots):
+def test_a_dot_is_looked_for_within_three_quarters_of_the_spacing_and_taken_once():
     """One dot alone moves by half or by nine tenths of the spacing, out of the pattern; then one up, where a lost one was."""
     v, u = np.mgrid[:260, :260]
     pixels = 40.0 * np.stack(np.meshgrid(np.arange(1, 6), np.arange(1, 6)), -1).reshape(-1, 2) + 10
@@ -295,7 +287,7 @@ def test_a_dot_is_looked_for_within_three_quarters_of_the_spacing_and_taken_once
 
 
 @pytest.mark.parametrize("field", [slide, dent])
-def test_threshold_and_components_follow_a_small_flow(thresholded_dots, field):
+def test_threshold_and_components_follow_a_small_flow(field):
     """Section 5: the nearest component of the dot's size, large dots first; all are found, some tenths of a pixel off."""
     s = scene()
     paper = thresholded_dots.ThresholdedDots(render(s.pixels, s.shapes, seed=7), s.pixels, s.sizes == 1, "dark")

@@ -52,6 +52,17 @@ def test_certainty_counts_standard_deviations_of_what_noise_makes(monkeypatch, f
     assert abs(certainty.mean()) < 0.35 and certainty.std() == pytest.approx(1, abs=0.25)
 
 
+@pytest.mark.parametrize("threshold, share", [(0.0, 0.406), (1.0, 0.145)])
+def test_a_moved_camera_counts_standard_deviations_of_what_noise_makes(monkeypatch, threshold, share):
+    """Frozen noise and that of one frame: a chi-squared of 4 over its mean, in standard deviations."""
+    monkeypatch.setattr(drift, "CERTAIN", threshold)
+    monkeypatch.setattr(drift, "LARGEST_ROUGHNESS", np.inf)
+    watched, _, root, generator = watch()
+    noise = (root @ torch.randn(600, D, 2, 1, generator=generator, dtype=torch.float64))[..., 0] * 2**0.5
+    found = [watched.is_rigid(one, torch.ones(D)) for one in noise]
+    assert np.mean(found) == pytest.approx(share, abs=0.05)
+
+
 def fields(pixels):
     """Smooth ways to drift, rms 1 px."""
     u, v = (2 * pixels / torch.tensor(SIZE) - 1).unbind(-1)

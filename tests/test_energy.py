@@ -6,6 +6,7 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.mechanics.affine_quadrilateral import AffineQuadrilaterals
+from torchmembrane.mechanics.cavity import gas_law_step
 from torchmembrane.mechanics.hyperelastic import MODELS, ElasticEnergy
 from torchmembrane.mechanics.metric import metric
 from torchmembrane.solve.stencil import apply_stencil, inner, one_ring_edges
@@ -285,6 +286,19 @@ def test_rest_pressure_is_tension_times_curvature(make, curvature):
         p0 = (force * normal)[free].sum() / (push * normal)[free].sum()
         errors.append(abs(float(p0 / (elasticity.tension * curvature)) - 1))
     assert errors[1] < 0.01 and errors[1] < 0.6 * errors[0] + 1e-9
+
+
+@pytest.mark.parametrize("rise", [-20.0, 0.0, 35.0])
+def test_a_step_of_a_gas_has_the_slope_of_its_law_and_ends_on_it(rise):
+    p0, absolute, volume, pressure = 0.7, 4.0, 100.0, 0.2
+
+    def law(rise):
+        return p0 + absolute * (volume / (volume + rise) - 1)
+
+    target, compliance = gas_law_step(rise, pressure, p0, absolute, volume)
+    slope = (law(rise + 1e-4) - law(rise - 1e-4)) / 2e-4
+    assert compliance == pytest.approx(-1 / slope, rel=1e-6)
+    assert pressure + target / compliance == pytest.approx(law(rise), rel=1e-12)
 
 
 def test_an_unknown_model_is_refused(membrane):

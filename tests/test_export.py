@@ -1,5 +1,6 @@
 """The exported model against torch, and the package that runs it where torch is not installed."""
 
+import functools
 import importlib.metadata
 import json
 import subprocess
@@ -8,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 import torch
+from onnxruntime import InferenceSession, SessionOptions
 from torch import nn
 
 from torchmembrane import MembraneError
@@ -48,7 +49,7 @@ def reconstructor(small_sensor):
 
 @pytest.fixture(scope="module")
 def model_files(reconstructor, tmp_path_factory):
-    """From rest, and from the frame before; what they share is traced once."""
+    """From rest, and from the frame before; what they share is traced once, and `export` checks the latter only."""
     files = {tracking: tmp_path_factory.mktemp("model") / "model.onnx" for tracking in (False, True)}
     known, trace = {}, export.traced_model
 
@@ -59,8 +60,9 @@ def model_files(reconstructor, tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(export, "traced_model", once)
-        for tracking, path in files.items():
-            export.export(reconstructor, path, tracking=tracking)
+        export.export(reconstructor, files[True], tracking=True)
+        patch.setattr(export, "checked", lambda *_: None)
+        export.export(reconstructor, files[False])
     return files
 
 
@@ -69,10 +71,31 @@ def model_file(model_files):
     return model_files[False]
 
 
-def opened(model: str | bytes) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
+@functools.cache
+def opened(model: str | bytes) -> InferenceSession:
+    """One session for each model, as it takes long to optimise one; what becomes of a file is kept as .ort beside it."""
+    options = SessionOptions()
     options.intra_op_num_threads = 1
-    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    if str(model).endswith(".onnx"):
+        options.optimized_model_filepath = str(Path(model).with_suffix(".ort"))
+    return InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
+@pytest.fixture(scope="module")
+def ort_file(model_file):
+    """The model in onnxruntime's own format."""
+    opened(str(model_file))
+    return model_file.with_suffix(".ort")
+
+
+@pytest.fixture
+def edge(monkeypatch):
+    """The package for machines without torch, which runs the sessions that are open."""
+    monkeypatch.syspath_prepend(ROOT / "export")
+    import torchmembrane_edge
+
+    monkeypatch.setattr("onnxruntime.InferenceSession", lambda model, *_, **__: opened(model))
+    return torchmembrane_edge
 
 
 @pytest.fixture(scope="module")
@@ -184,36 +207,44 @@ def bare_python(tmp_path_factory):
     return lambda code: subprocess.run([sys.executable, "-I", "-S", "-c", begin + code], capture_output=True, text=True)
 
 
-def test_edge_runs_without_torch(model_file, reconstructor, images, bare_python, tmp_path):
+@pytest.fixture(scope="module")
+def edge_calls(ort_file, images, bare_python, tmp_path_factory):
+    """What the command says of good images, whose results are in a folder, of a broken one, and of no model, in one process."""
+    folder = tmp_path_factory.mktemp("edge")
+    (folder / "broken.png").write_bytes(b"no image")
+    calls = [
+        [str(ort_file), *map(str, images), "--out", str(folder), "--batch", "2"],
+        [str(ort_file), str(folder / "broken.png"), str(images[0]), "--out", str(folder / "part")],
+        ["nothing.onnx", "a.png", "--out", "b"],
+    ]
+    code = "codes = [main(call) for call in " + repr(calls) + "]; print('exit codes', codes)"
+    return bare_python("from torchmembrane_edge.cli import main; " + code), folder
+
+
+def test_edge_runs_without_torch(edge_calls, reconstructor, images, bare_python):
     for name in ("torch", "kornia", "torchmembrane"):
         assert "ModuleNotFoundError" in bare_python(f"import {name}").stderr
-    arguments = [str(model_file), *map(str, images), "--out", str(tmp_path), "--batch", "2"]
-    done = bare_python(f"from torchmembrane_edge.cli import main; sys.exit(main({arguments!r}))")
-    assert done.returncode == 0, done.stderr
+    done, folder = edge_calls
+    assert done.returncode == 0 and "exit codes [0, " in done.stdout, done.stderr
     assert "3 reconstructed, 0 failed" in done.stdout
     with torch.no_grad():
         expected = reconstructor(reconstructor.read(*images))
     for i, path in enumerate(images):
-        frame = load_frame(tmp_path / f"{path.stem}.npz")
+        frame = load_frame(folder / f"{path.stem}.npz")
         assert np.abs(frame["vertices"] - expected.vertices[i].numpy()).max() < 1e-3
         assert {key: value.dtype for key, value in frame.items()} == {
             key: value.dtype for key, value in expected.frame(i).items()
         }
-    mesh = Mesh.load(tmp_path / "mesh.npz")
+    mesh = Mesh.load(folder / "mesh.npz")
     np.testing.assert_array_equal(mesh.rest_vertices, reconstructor.estimator.membrane.rest.numpy())
     assert mesh.sensor == reconstructor.sensor.fingerprint and mesh.fixed.dtype == bool
     assert mesh.camera_in_tool.shape == (0, 4) and mesh.tool is None
 
 
-def test_edge_opens_a_model_in_the_format_of_onnxruntime(model_file, images, monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(ROOT / "export")
-    from torchmembrane_edge import Session
+def test_edge_opens_a_model_in_the_format_of_onnxruntime(model_file, ort_file, images, edge):
     from torchmembrane_edge.cli import _read
 
-    options = onnxruntime.SessionOptions()
-    options.optimized_model_filepath = str(tmp_path / "model.ort")
-    onnxruntime.InferenceSession(str(model_file), options, providers=["CPUExecutionProvider"])
-    plain, converted = Session(model_file), Session(tmp_path / "model.ort")
+    plain, converted = edge.Session(model_file), edge.Session(ort_file)
     assert converted.status_texts == plain.status_texts and converted.mesh["sensor"] == plain.mesh["sensor"]
     image = _read(images[2], plain.image_size)
     expected, found = plain.run(image), converted.run(image)
@@ -231,12 +262,9 @@ def test_edge_sees_the_same_grey(kind, shape, monkeypatch):
     np.testing.assert_array_equal(grey(image[None])[0], to_grey(image))
 
 
-def test_edge_follows_a_video(model_files, reconstructor, images, monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "export")
-    from torchmembrane_edge import EdgeError, Session
-
+def test_edge_follows_a_video(model_files, reconstructor, images, edge):
     frames = reconstructor.read(*images)[:, 0].numpy()
-    state, found = None, list(Session(model_files[True]).track([*frames[:2], 0 * frames[0], frames[2]]))
+    state, found = None, list(edge.Session(model_files[True]).track([*frames[:2], 0 * frames[0], frames[2]]))
     with torch.no_grad():
         for frame, k in zip(found, (0, 1, None, 2), strict=True):
             if k is None:
@@ -245,16 +273,13 @@ def test_edge_follows_a_video(model_files, reconstructor, images, monkeypatch):
                 continue
             state = reconstructor(reconstructor.read(images[k]), state)
             assert np.abs(frame["vertices"] - state.vertices.numpy()).max() < 1e-3
-    with pytest.raises(EdgeError, match="does not track"):
-        next(Session(model_files[False]).track(frames))
+    with pytest.raises(edge.EdgeError, match="does not track"):
+        next(edge.Session(model_files[False]).track(frames))
 
 
-def test_a_stream_by_a_model_gives_what_the_model_gives(model_files, reconstructor, images, monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(ROOT / "export")
-    from torchmembrane_edge import Session
-
+def test_a_stream_by_a_model_gives_what_the_model_gives(model_files, reconstructor, images, edge, tmp_path):
     frames, sensor = reconstructor.read(*images)[:, 0].numpy(), reconstructor.sensor.fingerprint
-    expected = Session(model_files[True]).track(frames)
+    expected = edge.Session(model_files[True]).track(frames)
     stream = ModelStream(model_files[True], sensor)
     for image, each in zip(frames, expected, strict=True):
         frame = stream(image, 0.0)
@@ -268,13 +293,11 @@ def test_a_stream_by_a_model_gives_what_the_model_gives(model_files, reconstruct
         ModelStream(tmp_path / "none.onnx", sensor)
 
 
-def test_edge_says_what_is_wrong(model_file, images, bare_python, tmp_path):
-    (tmp_path / "broken.png").write_bytes(b"no image")
-    arguments = [str(model_file), str(tmp_path / "broken.png"), str(images[0]), "--out", str(tmp_path)]
-    done = bare_python(f"from torchmembrane_edge.cli import main; sys.exit(main({arguments!r}))")
-    assert done.returncode == 1 and "broken.png: not readable" in done.stderr and "1 reconstructed, 1 failed" in done.stdout
-    done = bare_python("from torchmembrane_edge.cli import main; sys.exit(main(['nothing.onnx', 'a.png', '--out', 'b']))")
-    assert done.returncode == 2 and "nothing.onnx: no such file" in done.stderr
+def test_edge_says_what_is_wrong(edge_calls):
+    done, _ = edge_calls
+    assert done.stdout.endswith(", 1, 2]\n"), done.stdout
+    assert "broken.png: not readable" in done.stderr and "1 reconstructed, 1 failed" in done.stdout
+    assert "nothing.onnx: no such file" in done.stderr
 
 
 class Fall(nn.Module):
@@ -295,7 +318,7 @@ def test_a_repeated_piece_is_a_loop():
     model = assembly.model([value(name) for name in names[:3]], [value("end"), value("rate")], {})
     assert [node.op_type for node in model.graph.node] == ["Loop", "Identity", "Identity"]
     feeds = {name: inputs[name].numpy() for name in names[:3]}
-    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    session = opened(model.SerializeToString())
     for pull in pulls:
         height, speed = height + speed, speed * (1 - drag) - pull
     for found, expected in zip(session.run(None, feeds), (height, speed), strict=True):

@@ -1,6 +1,7 @@
 """What the command's choices are put together of, exported and run; models that cannot be written, or are not the same."""
 
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import onnx
@@ -9,14 +10,18 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
+from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.paper.estimator import FLOWS
+from torchmembrane.estimators.registry import ESTIMATORS
 from torchmembrane.onnx import check, export, trace
 from torchmembrane.onnx.check import Agreement, check_images, checked
+from torchmembrane.onnx.export import Piece
 from torchmembrane.onnx.graph import Assembly
 from torchmembrane.onnx.trace import traced_model
-from torchmembrane.reconstruct import ESTIMATORS, Reconstructor
+from torchmembrane.reconstruct import Reconstructor
+from torchmembrane.sensor.parts import Cavity
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.solve.inverse_root import by_products
 
@@ -74,6 +79,45 @@ def test_every_flow_agrees_with_torch(sensor, flow):
         expected = made.observation(*inputs.values()).directions
     for directions in ran(tracer, inputs, found.directions):
         np.testing.assert_allclose(directions, expected[: len(directions)].numpy(), rtol=0, atol=1e-5)
+
+
+def agree_as_pieces(piece, inputs, **tolerance):
+    """The values of a piece, and that its model gives them of three frames and of one."""
+    with torch.no_grad():
+        expected = piece(*inputs.values())
+    names = [f"output {k}" for k in range(len(expected))]
+    model = traced_model(piece, {name: value[:2] for name, value in inputs.items()}, names)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    for count in (1, 3):
+        found = session.run(names, {name: value[:count].numpy() for name, value in inputs.items()})
+        for got, value in zip(found, expected, strict=True):
+            np.testing.assert_allclose(got, value[:count].numpy(), **tolerance)
+    return expected
+
+
+BEHIND = {"ports": [(2, 3, 1.49)], "medium_index": 1.33}
+
+
+@pytest.mark.parametrize("model, behind", [("fisheye", {}), ("fisheye", BEHIND), ("pinhole", {}), ("pinhole", BEHIND)])
+def test_every_camera_agrees_with_torch(model, behind):
+    camera = Camera(model, (640, 480), (400, 400), (320, 240), **behind).float()
+    points = torch.rand(3, 20, 3) * torch.tensor([8.0, 6.0, 10.0]) + torch.tensor([-4.0, -3.0, 15.0])
+    (pixels,) = agree_as_pieces(Piece(camera, Camera.point_to_pixel), {"points": points}, rtol=0, atol=1e-3)
+    assert pixels.isfinite().all()
+    agree_as_pieces(Piece(camera, Camera.pixel_to_ray), {"pixels": pixels}, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("cavity", [Cavity("liquid"), Cavity("gas", 1013.0), Cavity("open")], ids=lambda cavity: cavity.filling)
+def test_the_step_of_every_cavity_agrees_with_torch(sensor, cavity):
+    made = Reconstructor(replace(sensor, cavity=cavity)).estimator.descent
+    x, p = made.membrane.rest + torch.rand(3, *made.membrane.rest.shape), made.cavity.rest_pressure * (1 + torch.rand(3))
+    inputs = {"u": x - made.membrane.rest, "pressure": p, "products": torch.randn(3, 3, 3)}
+    inputs |= {"load": torch.rand(3), "corner": torch.rand(3)}
+    step = Piece(made, lambda owner, u, p, products, *corner: owner._shares(u, p, products, corner))
+    (shares,) = agree_as_pieces(step, inputs, rtol=1e-4)
+    assert (shares[:, 2].abs().max() > 0) == (cavity.filling != "open")
+    error = Piece(made.cavity, lambda owner, volume, p: owner.volume_error(volume, p))
+    agree_as_pieces(error, {"volume": made.membrane.volume(x), "pressure": p}, rtol=1e-4, atol=1e-6)
 
 
 def test_nan_beside_a_surface_is_no_agreement(sensor, monkeypatch):
@@ -142,8 +186,8 @@ class Composite(torch.nn.Module):
 def test_a_graph_captured_at_once_is_what_torch_makes_of_it_in_two_steps(monkeypatch):
     inputs = {"x": torch.rand(2, 3, 3), "y": torch.rand(2, 3, 3)}
     at_once = traced_model(Composite(), inputs, ["a", "b"])
-    monkeypatch.setattr(trace, "_captured", torch.export.export)
-    monkeypatch.setattr(trace, "_quick", nullcontext)
+    monkeypatch.setattr(trace.EXPORTER, "captured", torch.export.export)
+    monkeypatch.setattr(trace.EXPORTER, "at_work", nullcontext)
     in_two_steps = traced_model(Composite(), inputs, ["a", "b"])
     assert [node.op_type for node in at_once.graph.node] == [node.op_type for node in in_two_steps.graph.node]
     assert at_once.SerializeToString(deterministic=True) == in_two_steps.SerializeToString(deterministic=True)

@@ -65,7 +65,7 @@ def shown(name, *strokes):
     )
     found = []
     for kind in (PaperEstimator, MinimumEnergy, ForceBalance):
-        estimator = kind.of(problem, None)
+        estimator = kind.from_problem(problem)
         found.append(estimator(estimator.prepare(sensor.camera, seen[None], torch.ones(1, len(dots), dtype=torch.float64))))
         assert estimator.is_converged(found[-1]).all()
     return Shown(sensor, membrane, state, carried(state.vertices, fine, membrane.rest), *found)

@@ -1,16 +1,20 @@
-"""Damaged and hostile files, a few of each kind, always the same: `make soak` tries as many as there is time for."""
+"""Damaged and malformed files, a few of each kind, always the same: `make soak` tries as many as there is time for."""
 
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
-COUNTS = ["sensors=120", "images=120", "npz=60", "parquet=60", "readings=100", "dots=100", "videos=30"]
+FEW = ["sensors=40", "images=40", "npz=20", "parquet=20", "readings=35", "dots=35", "videos=15"]
+MORE = ["sensors=120", "images=120", "npz=60", "parquet=60", "readings=100", "dots=100", "videos=30"]
 
 
-def test_damaged_files_are_refused_in_one_line_or_answered():
+@pytest.mark.parametrize("counts, lines", [(FEW, ["--lines", "9"]), pytest.param(MORE, [], marks=pytest.mark.full)])
+def test_damaged_files_are_refused_in_one_line_or_answered(counts, lines):
     """In a process of its own, whose memory is limited."""
-    command = [sys.executable, "bench/fuzz.py", "--count", *COUNTS, "--seed", "7"]
+    command = [sys.executable, "-m", "bench.robustness.fuzz", "--count", *counts, "--seed", "7", *lines]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "refused" in done.stdout and "answered, OK" in done.stdout and "decoded, in part" in done.stdout

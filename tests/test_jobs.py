@@ -14,15 +14,23 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
-from PIL import Image
 from test_batch import CONTRACT, NPZ, PARQUET, Denting, grey_image, reconstruct, summary_of
 
+from torchmembrane.cli.main import main
 from torchmembrane.errors import MembraneError
 from torchmembrane.files.folder_lock import WHOLE, Claim, Shard
 from torchmembrane.files.provenance import Origin
 from torchmembrane.jobs import workers
 from torchmembrane.jobs.inputs import find_inputs
-from torchmembrane.jobs.workers import LARGEST_BATCH, MEMORY_SHARE, batch_for, frame_bytes
+from torchmembrane.jobs.workers import (
+    FRAMES_EACH,
+    LARGEST_BATCH,
+    MEMORY_SHARE,
+    batch_for,
+    frame_bytes,
+    memory_here,
+    workers_for,
+)
 from torchmembrane.results import frame_table
 from torchmembrane.results.npz import save_frame
 from torchmembrane.results.read import read_results
@@ -134,15 +142,16 @@ def ends_of_values(path: Path) -> list[int]:
         return [start - 1 for start in [*sorted(member.header_offset for member in archive.infolist())[1:], archive.start_dir]]
 
 
+@pytest.mark.parametrize("others", [6, pytest.param(25, marks=pytest.mark.full)])
 @both
-def test_a_damaged_result_is_done_again_and_that_is_said_once(images, tmp_path, settings):
+def test_a_damaged_result_is_done_again_and_that_is_said_once(images, tmp_path, settings, others):
     """Wherever a bit flips the answers stay what they were; where it flips in an array's values, that is noticed."""
     reconstruct(images, tmp_path / "out", settings)
     damaged = tmp_path / "out" / ("i3.npz" if settings is NPZ else "frames/part-00000.parquet")
     before, whole = read_results(tmp_path / "out").batch(), damaged.read_bytes()
     in_values = ends_of_values(damaged)
     assert len(in_values) >= len(CONTRACT)
-    for place in (*in_values, *np.linspace(0.02, 0.98, 25) * len(whole)):
+    for place in (*in_values, *np.linspace(0.02, 0.98, others) * len(whole)):
         content = bytearray(whole)
         content[int(place)] ^= 0x10
         damaged.write_bytes(content)
@@ -268,7 +277,7 @@ def test_shards_are_disjoint_and_together_everything(images, tmp_path, settings,
         assert rows_in(tmp_path / "out") == good
 
 
-@both
+@pytest.mark.parametrize("settings", [pytest.param(NPZ, id="npz", marks=pytest.mark.full), pytest.param(PARQUET, id="parquet")])
 def test_worker_processes_give_what_one_process_gives(small_sensor, small_images, tmp_path, monkeypatch, settings):
     from torchmembrane import Reconstructor
     from torchmembrane.jobs.local import reconstruct_files
@@ -281,15 +290,14 @@ def test_worker_processes_give_what_one_process_gives(small_sensor, small_images
     found, lines = [], []
     for count in (1, 2):
         out, made = tmp_path / f"out{count}", Settings.of(reconstructor, settings.format)
-        options = {"batch": 1, "workers": count, "report": lines.append, "figures": settings is NPZ}
+        options = {"batch": 1, "workers": count, "report": lines.append, "figures": count == 2}
         counts = reconstruct_files(reconstructor, find_inputs([*small_images, broken]), out, made, **options)
         assert (counts.reconstructed, counts.failed) == (3, 1)
         found.append(read_results(out))
     assert found[0].names == found[1].names and lines[0] == lines[1]
     for a, b in zip(*found, strict=True):
         assert all(np.array_equal(a[key], b[key], equal_nan=True) for key in a)
-    if settings is NPZ:
-        assert len(list((tmp_path / "out2").glob("press*.png"))) == 3
+    assert len(list((tmp_path / "out2").glob("press*.png"))) == 3
 
 
 def wait_for(condition, seconds=120):
@@ -299,11 +307,12 @@ def wait_for(condition, seconds=120):
         time.sleep(0.02)
 
 
+FRAMES = 40
 QUICKLY_SAVING = """
 import sys
 from torchmembrane.cli.main import main
-from torchmembrane.io import frame_table
-frame_table.SAVE_SECONDS = 0.2
+from torchmembrane.results import frame_table
+frame_table.SAVE_SECONDS = 0.0
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -311,34 +320,29 @@ sys.exit(main(sys.argv[1:]))
 @pytest.mark.parametrize(
     "end, format, workers", [(signal.SIGTERM, "npz", "1"), (signal.SIGTERM, "parquet", "2"), (signal.SIGKILL, "parquet", "1")]
 )
-def test_a_killed_command_keeps_what_is_done(small_sensor, small_images, tmp_path, end, format, workers):
+def test_a_killed_command_keeps_what_is_done(small_sensor, small_images, tmp_path, capsys, end, format, workers):
     (tmp_path / "images").mkdir()
-    for k in range(120):
-        Image.open(small_images[k % 3]).save(tmp_path / "images" / f"k{k:03d}.png")
+    for k in range(FRAMES):
+        (tmp_path / "images" / f"k{k:03d}.png").hardlink_to(small_images[k % 3])
     out = tmp_path / "out"
-    options = ["--out", str(out), "--format", format, "--workers", workers, "--batch", "2"]
-    command = [
-        sys.executable,
-        "-c",
-        QUICKLY_SAVING,
-        "reconstruct",
-        str(small_sensor / "sensor.toml"),
-        str(tmp_path / "images"),
-    ]
+    options = ["--out", str(out), "--format", format, "--batch", "1", "--workers"]
+    command = ["reconstruct", str(small_sensor / "sensor.toml"), str(tmp_path / "images"), *options]
 
     def done() -> int:
         return len(rows_in(out)) if format == "parquet" else len(list(out.glob("k*.npz")))
 
-    with subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", QUICKLY_SAVING, *command, workers], stderr=subprocess.PIPE, text=True
+    ) as process:
         wait_for(lambda: done() > 0 or process.poll() is not None)
         process.send_signal(end)
         said = process.communicate()[1]
     assert process.returncode == (130 if end == signal.SIGTERM else -signal.SIGKILL), said
     kept = done()
-    assert 0 < kept < 120
-    finished = subprocess.run([*command, *options], capture_output=True, text=True)
-    assert f"{120 - kept} reconstructed, 0 failed, {kept} finished before" in finished.stdout
-    assert read_results(out).names == list(summary_of(out)) == [f"k{k:03d}" for k in range(120)]
+    assert 0 < kept < FRAMES
+    main([*command, "1"])
+    assert f"{FRAMES - kept} reconstructed, 0 failed, {kept} finished before" in capsys.readouterr().out
+    assert read_results(out).names == list(summary_of(out)) == [f"k{k:03d}" for k in range(FRAMES)]
     assert not [path for path in out.rglob(".*")]
 
 
@@ -373,13 +377,31 @@ def test_batches_take_their_share_of_the_memory_at_most(monkeypatch, workers, ve
     assert batch == LARGEST_BATCH or (batch + 1) * taken > MEMORY_SHARE * memory
 
 
+def test_worker_processes_are_as_many_as_are_worth_their_start_and_no_more_than_cores(monkeypatch):
+    monkeypatch.setattr("torchmembrane.jobs.workers.cores", lambda: 4)
+    frames = [0, 1, 2 * FRAMES_EACH - 1, 2 * FRAMES_EACH, 3 * FRAMES_EACH, 100 * FRAMES_EACH]
+    assert [workers_for(count, "cpu") for count in frames] == [1, 1, 1, 2, 3, 4]
+    assert workers_for(100 * FRAMES_EACH, "cuda") == 1
+
+
+def test_the_memory_is_the_container_s_where_that_has_less(tmp_path, monkeypatch):
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr("torchmembrane.jobs.workers.CONTAINER", limit)
+    machine = memory_here()
+    for text, expected in ((str(2**20), 2**20), (str(2**60), machine), ("max\n", machine)):
+        limit.write_text(text)
+        assert memory_here() == expected
+    assert machine > 2**20
+
+
 PEAK = """
 import ctypes, re, sys, torch
 from pathlib import Path
 import torchmembrane as tm
 torch.set_num_threads(1)
 reconstructor = tm.Reconstructor.from_file(sys.argv[1])
-images = reconstructor.read(*sys.argv[2:]).repeat(6, 1, 1, 1)[:16]
+frames = int(sys.argv[2])
+images = reconstructor.read(*sys.argv[3:]).repeat(6, 1, 1, 1)[:frames]
 ctypes.CDLL(None).malloc_trim(0)
 Path("/proc/self/clear_refs").write_text("5")
 held = lambda: int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) * 1024
@@ -390,19 +412,18 @@ print(held() - before, len(reconstructor.vertex_pixels), *reconstructor.image_si
 """
 
 
-def test_a_batch_takes_no_more_memory_than_it_is_taken_for(tmp_path):
+@pytest.mark.parametrize("frames", [4, pytest.param(16, marks=pytest.mark.full)])
+def test_a_batch_takes_no_more_memory_than_it_is_taken_for(frames):
     examples = Path(__file__).parents[1] / "examples"
     presses = [str(examples / f"{name}.png") for name in ("press_on_axis", "two_contacts", "flat_plate")]
-    command = [sys.executable, "-c", PEAK, str(examples / "sensor.toml"), *presses]
+    command = [sys.executable, "-c", PEAK, str(examples / "sensor.toml"), str(frames), *presses]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     peak, vertices, width, height = map(int, done.stdout.split())
-    assert 10 * 2**20 < peak <= 16 * frame_bytes((width, height), vertices)
+    assert 10 * 2**20 < peak <= frames * frame_bytes((width, height), vertices)
 
 
 @both
 def test_view_draws_a_frame_of_a_folder_or_a_part(small_sensor, small_images, tmp_path, monkeypatch, capsys, settings):
-    from torchmembrane.cli.main import main
-
     monkeypatch.setattr("torchmembrane.cli.view._has_display", lambda: False)
     out, given = tmp_path / "out", [str(small_sensor / "sensor.toml"), *map(str, small_images[:2])]
     assert main(["reconstruct", *given, "--out", str(out), "--format", settings.format]) == 0

@@ -162,6 +162,14 @@ def test_noise_is_measured_beside_edges_and_dots(noise):
     assert measured.item() == pytest.approx(noise, rel=0.12)
 
 
+@pytest.mark.parametrize("cut", [0.0, 1.0])
+def test_noise_is_not_measured_where_the_image_is_black_or_white(cut):
+    draw = 0.03 * torch.randn(1, 1, 480, 640, generator=torch.Generator().manual_seed(0))
+    image = torch.full((1, 1, 480, 640), 0.5)
+    image[..., :213] = cut
+    assert pixel_noise((image + draw).clamp(0, 1)).item() == pytest.approx(0.03, rel=0.12)
+
+
 @pytest.fixture(scope="module")
 def fingertip():
     sensor = preset("fingertip")

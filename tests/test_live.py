@@ -18,11 +18,12 @@ import pytest
 from PIL import Image
 
 import torchmembrane as tm
+from torchmembrane.cli.live import _stopped_by_signals
 from torchmembrane.cli.main import main
 from torchmembrane.files.images import read_image
 from torchmembrane.live.background import Background
 from torchmembrane.live.line import Line, described, summary
-from torchmembrane.live.loop import Seen, Tally, follow
+from torchmembrane.live.loop import RECENT, Seen, Tally, follow
 from torchmembrane.live.mailbox import Mailbox, capture
 from torchmembrane.live.recording import Recording, times_of
 from torchmembrane.live.sources import MOST_MISSED, Timed, camera_images, folder_images, paced, video_images
@@ -238,6 +239,17 @@ def test_a_camera_s_failures_are_said(camera, monkeypatch):
     assert played.released
 
 
+def test_a_camera_may_miss_any_number_of_reads_but_not_in_a_row(camera, monkeypatch):
+    monkeypatch.setattr("torchmembrane.live.sources.BREATH", 0.0)
+    monkeypatch.setattr("torchmembrane.live.sources.MOST_MISSED", 3)
+    camera([np.zeros((6, 8, 3), np.uint8)] * 3, missed=(2, 3, 5, 6))
+    source = camera_images(0, (8, 6))
+    for _ in range(3):
+        next(source)
+    with pytest.raises(tm.MembraneError, match="no image in 3 reads"):
+        next(source)
+
+
 @pytest.fixture(scope="module")
 def video(tmp_path_factory):
     """Ten pictures at 25 Hz."""
@@ -321,6 +333,15 @@ def test_the_line_says_rate_latency_status_and_wrench(stream):
     assert summary(Tally()) == "no frame was captured"
     tally.add(seen(6, status=int(tm.Status.BLANK)))
     assert "7 captured, 4 followed, 1 of them without a surface, 3 dropped" in summary(tally)
+
+
+def test_rate_and_latency_of_the_line_are_of_the_latest_frames_and_of_the_summary_of_all(stream):
+    tally = Tally()
+    for k in range(3 * RECENT):
+        at, latency = (k, 0.5) if k < 2 * RECENT else (2 * RECENT + 0.1 * (k - 2 * RECENT), 0.05)
+        tally.add(seen(k)._replace(time=float(at), latency=latency))
+    assert described(seen(3 * RECENT), tally, stream.mesh).startswith("10.0 Hz, 50 ms (95 %: 50), 0 dropped | ok")
+    assert "latency 500 ms in the median, 500 ms at 95 %" in summary(tally)
 
 
 def test_the_line_is_rewritten_in_a_terminal_and_plain_elsewhere(stream, monkeypatch):
@@ -410,6 +431,18 @@ def test_wrong_usage_of_the_command_is_said(small_sensor, options, said, capsys,
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_asks_for_the_end_and_the_second_is_an_interruption(number):
+    before = signal.getsignal(number)
+    with _stopped_by_signals() as stop:
+        assert not stop.is_set()
+        signal.raise_signal(number)
+        assert stop.is_set()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+    assert signal.getsignal(number) == before
+
+
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.full), signal.SIGTERM])
 def test_a_signal_ends_the_command_with_its_summary(small_sensor, small_images, tmp_path, number):
     """From a folder of a minute; `z` is answered on the way."""
     for k in range(1800):

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -81,6 +82,17 @@ def test_modulus_is_proportional_to_the_forces_and_needs_but_one_of_them(presses
 
 
 @pytest.mark.filterwarnings("ignore:.*acts as a liquid")
+def test_of_a_measured_force_counts_what_is_along_the_one_that_is_found():
+    """Turned by 60 degrees it is half as much along it; of a magnitude all is."""
+    traction, area = torch.tensor([[[0.0, 0.0, -0.2], [0.0, 0.0, -0.1]]], dtype=torch.float64), torch.tensor([5.0, 10.0])
+    explained = SimpleNamespace(membrane=SimpleNamespace(rest_area=area)), SimpleNamespace(traction=traction)
+    presses = SimpleNamespace(explained=lambda stretch, modulus: explained)
+    turned = 3.0 * np.array([[np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)]])
+    for forces, ratio in ((turned, 0.75), (3.0 * np.array([[0.0, 0.0, -1.0]]), 1.5), (np.array([[3.0]]), 1.5)):
+        ratios, magnitudes = Presses._ratios(presses, 1.2, 0.4, forces)
+        assert ratios == pytest.approx([ratio]) and magnitudes.ravel() == pytest.approx([2.0, 3.0])
+
+
 def test_a_gas_of_unknown_modulus_is_found_as_one_whose_file_says_it(presses):
     """Its prestretch would else be that of a liquid, which keeps its volume."""
     pixels, forces = (values[:1] for values in presses)

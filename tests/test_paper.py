@@ -5,7 +5,7 @@ import re
 
 import pytest
 import torch
-from quoted_names import ROOT, meant_by, quoted
+from quoted_names import ROOT, meant_by, quoted, quoted_benchmarks
 
 from torchmembrane.cli.calibrate import STEPS
 from torchmembrane.surface.topology import corners
@@ -53,7 +53,7 @@ def test_calibration_names_every_step_and_no_other():
 
 
 def test_every_named_bench_and_figure_is_made():
-    assert all((ROOT / path).exists() for path in set(re.findall(r"bench/\w+\.py", TEXT)))
+    assert all((ROOT / path).exists() for path in quoted_benchmarks(TEXT))
     made = {int(n) for n in re.findall(r"^def figure_(\d+)", (ROOT / "docs" / "figures.py").read_text(), re.M)}
     assert {int(n) for n in re.findall(r"figures/figure_(\d+)\.png", TEXT)} == made
 

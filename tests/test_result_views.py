@@ -51,5 +51,7 @@ def test_the_command_writes_the_contact_as_a_cloud_that_others_read(result, tmp_
     assert main(["view", str(tmp_path / "press.npz"), "--ply", str(tmp_path / "press.ply")]) == 0
     assert f"{len(touched)} points of contact" in capsys.readouterr().out and len(touched) > 0
     np.testing.assert_allclose(trimesh.load(tmp_path / "press.ply").vertices, touched, rtol=1e-5)
+    half = frame | {"contact": np.where(np.arange(81) < 3, 0.5001, 0.5).astype(np.float32)}
+    assert save_contact_cloud(tmp_path / "half.ply", half) == 3
     nothing = frame | {"contact": np.full_like(frame["contact"], np.nan)}
     assert save_contact_cloud(tmp_path / "none.ply", nothing) == 0

@@ -13,7 +13,7 @@ from PIL import Image
 
 from torchmembrane import Camera, MembraneError, Sensor
 from torchmembrane.cli.main import main
-from torchmembrane.integrations.messages import CHANNELS, grey_of, projected, unlike
+from torchmembrane.integrations.messages import CHANNELS, cloud_layout, grey_of, projected, unlike
 from torchmembrane.integrations.rosbag import camera_remark
 from torchmembrane.results.read import read_results
 from torchmembrane.sensor.parts import Cavity
@@ -240,6 +240,13 @@ def test_other_images_are_refused(change, said):
 FIELDS = ("encoding", "width", "height", "step", "is_bigendian", "data")
 
 
+def test_a_cloud_is_dense_where_all_of_its_values_are_finite():
+    points = np.ones((3, 7), np.float32)
+    assert cloud_layout(points)["is_dense"]
+    points[1, 4] = np.nan
+    assert not cloud_layout(points)["is_dense"]
+
+
 def test_a_camera_info_that_disagrees_is_said(small_sensor):
     camera = Sensor.from_file(small_sensor / "sensor.toml").camera
     assert unlike(camera_info(camera)[1], camera) is None
@@ -285,6 +292,16 @@ def test_only_a_camera_info_beside_the_images_is_one(tmp_path, small_sensor, pic
     for name, beside, said in (("image", raw(0, pictures[0], "mono8"), False), ("info", other, True)):
         bag = write_bag(tmp_path / name, StoragePlugin.MCAP, [("/finger/camera_info", beside), image]) / "metadata.yaml"
         assert (camera_remark(bag, TOPIC, camera) is not None) == said
+
+
+def test_a_camera_info_is_beside_the_topic_of_compressed_images_too(tmp_path, small_sensor, pictures):
+    camera = Sensor.from_file(small_sensor / "sensor.toml").camera
+    messages = [
+        ("/finger/camera_info", camera_info(camera, centre=(camera.centre + 30).tolist())),
+        (f"{TOPIC}/compressed", compressed(0, pictures[0])),
+    ]
+    bag = write_bag(tmp_path / "run", StoragePlugin.MCAP, messages) / "metadata.yaml"
+    assert "px off" in camera_remark(bag, f"{TOPIC}/compressed", camera)
 
 
 def test_what_cannot_be_is_refused_in_one_line(tmp_path, gas_sensor, small_images, pictures, capsys):

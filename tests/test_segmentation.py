@@ -65,6 +65,19 @@ def test_a_line_of_hills_is_cut_where_they_stand_alone():
     assert (persistent_regions(-heights.abs(), 4, 0.5) == 0).all()
 
 
+def test_movement_is_that_of_the_farthest_point_and_infinite_where_one_comes_or_goes():
+    membrane, lost = spherical_cap(12, 9, FAR), [torch.nan] * 3
+    segmentation = Segmentation(membrane, central(membrane.rest))
+    before = torch.tensor([[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], lost]] * 4)
+    after = before.clone()
+    after[1, 0] += torch.tensor([0.3, 0.0, 0.4])
+    after[1, 1] += torch.tensor([0.0, 0.1, 0.0])
+    after[2, 2] = torch.tensor([7.0, 8.0, 9.0])
+    after[3, 1] = torch.nan
+    expected = torch.tensor([0.0, 0.5 / float(membrane.size), torch.inf, torch.inf])
+    torch.testing.assert_close(segmentation.moved(before, after).float(), expected)
+
+
 def neighbours(vertex, shape):
     """The up to eight around a vertex, numbered row by row."""
     i, j = divmod(vertex, shape[1])

@@ -15,7 +15,16 @@ from torchmembrane.errors import MembraneError
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.factories import cavity_filling, elastic_energy
-from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.parts import (
+    LEAST_APART,
+    OFF_SURFACE,
+    Cavity,
+    Markers,
+    Material,
+    Surface,
+    refuse_coincident,
+    refuse_off_surface,
+)
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.shapes import spherical_cap
 
@@ -413,6 +422,7 @@ def test_a_sensor_made_in_python_is_checked_alike(tmp_path):
         (dict(rest_image=np.zeros((10, 10))), "rest_image is 10 x 10 px"),
         (dict(positions=[[0.0, 0.0, 4.0]], sizes=["small"]), "markers.positions[0] at [0.0, 0.0, 4.0]"),
         (dict(positions=[[0.0, 4.0]], sizes=["small"]), "expected [D, 3]"),
+        (dict(positions=[[0.0, 0.0, 14.0], [0.0, 0.0, np.inf]], sizes=["small"] * 2), "expected [D, 3], finite"),
         (dict(sizes=["small"]), "expected 3 times"),
     ):
         with pytest.raises(MembraneError) as caught:
@@ -559,6 +569,18 @@ def test_dots_that_lie_on_one_another_are_named_with_both_lines(tmp_path):
     twice = dataclasses.replace(sensor.markers, positions=np.repeat(sensor.markers.positions, 2, 0), sizes=["small"] * 6)
     with pytest.raises(MembraneError, match=r"markers.positions\[1\] .* lies on that .*remove one"):
         dataclasses.replace(sensor, markers=twice)
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 1000.0])
+def test_how_far_off_or_near_a_dot_may_be_is_measured_by_the_surface(scale):
+    membrane = spherical_cap(12.0 * scale, 6.0 * scale, 8.0 * scale, (9, 9))
+    dot, outward, unit = membrane.rest[40].numpy(), membrane.rest_normals[40].numpy(), membrane.size
+    refuse_off_surface(membrane, (dot + 0.9 * OFF_SURFACE * unit * outward)[None], ["a"])
+    with pytest.raises(MembraneError, match="off the rest surface"):
+        refuse_off_surface(membrane, (dot + 1.1 * OFF_SURFACE * unit * outward)[None], ["a"])
+    refuse_coincident(membrane, np.stack([dot, dot + [1.1 * LEAST_APART * unit, 0, 0]]), ["a", "b"])
+    with pytest.raises(MembraneError, match="lies on that"):
+        refuse_coincident(membrane, np.stack([dot, dot + [0.9 * LEAST_APART * unit, 0, 0]]), ["a", "b"])
 
 
 def test_more_dots_than_can_be_followed_are_refused_by_their_number(tmp_path):

@@ -15,7 +15,7 @@ from torchmembrane.markers.dots.locator import DotLocator, short
 from torchmembrane.markers.dots.pyramid import mean_pyramid
 from torchmembrane.markers.noise import pixel_noise
 from torchmembrane.onnx.graph import Assembly, described
-from torchmembrane.onnx.trace import traced
+from torchmembrane.onnx.trace import traced_model
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.sensor import Sensor
 
@@ -125,7 +125,7 @@ class Formula(torch.nn.Module):
 def test_numbers_are_exported_in_double_precision(formula):
     """Torch's own exporter rounds them to single."""
     x = torch.rand(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.1
-    model = traced(Formula(formula), {"x": x}, ["y"])
+    model = traced_model(Formula(formula), {"x": x}, ["y"])
     (found,) = onnxruntime.InferenceSession(model.SerializeToString()).run(None, {"x": x.numpy()})
     np.testing.assert_allclose(found, formula(x), rtol=1e-15)
 

@@ -229,6 +229,8 @@ def test_what_rounding_has_left_without_a_factor_gets_a_ridge_and_nothing_else_d
     roots = by_cholesky(torch.stack([one, barely_indefinite]))
     assert (roots[0] == one).all()
     torch.testing.assert_close(roots[1].mT @ roots[1] @ (barely_indefinite + 2 * RIDGE * one), one)
+    compiled = torch.compile(by_cholesky, fullgraph=True, backend="eager")
+    assert (compiled(torch.stack([one, barely_indefinite])) == roots).all()
 
 
 def test_anderson_solves_a_linear_fixed_point_in_two_unknowns_at_the_third_evaluation():

@@ -266,10 +266,16 @@ def overlap(a: Bbox, b: Bbox) -> float:
 SIZES = [(640, 480), (256, 256), (200, 900), (1200, 200), (64, 48), (1920, 1080), (4000, 3000)]
 
 
-@pytest.mark.parametrize("size", SIZES)
+SHORT = ("press", "N", Status.OK)
+LONG = ("a_recording_of_the_left_hand_2026-11-24_frame_000123", "relative", Status.HIDDEN)
+
+
 @pytest.mark.parametrize(
-    ("name", "unit", "status"),
-    [("press", "N", Status.OK), ("a_recording_of_the_left_hand_2026-11-24_frame_000123", "relative", Status.HIDDEN)],
+    ("size", "name", "unit", "status"),
+    [
+        *(pytest.param(size, *LONG, marks=pytest.mark.full if size == SIZES[-1] else ()) for size in SIZES),
+        *(pytest.param(size, *SHORT, marks=() if size in SIZES[:4] else pytest.mark.full) for size in SIZES),
+    ],
 )
 def test_no_words_are_clipped_or_on_one_another_whatever_the_image_s_shape(monkeypatch, size, name, unit, status):
     monkeypatch.setattr(sys.modules[__name__], "SIZE", size)

@@ -103,6 +103,12 @@ def test_a_weight_needs_its_unit(text):
         arguments.weight(text)
 
 
+def test_a_weight_is_the_same_in_all_of_its_units():
+    """Of 200 g under standard gravity."""
+    for text in ("0.2 kg", "200 g", "1961.33 mN", "1.96133N"):
+        assert arguments.weight(text) == pytest.approx(1.96133, rel=1e-12)
+
+
 def test_a_weight_beside_forces_is_refused(tmp_path, capsys):
     (tmp_path / "forces.csv").write_text("image,force\nflat_plate.png,1\n")
     call = ["calibrate", "material", str(EXAMPLES / "sensor.toml"), str(EXAMPLES / "flat_plate.png"), "--weight", "2N"]

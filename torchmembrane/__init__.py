@@ -21,12 +21,13 @@ if TYPE_CHECKING:
     from .camera.model import Camera
     from .camera.ports import Port
     from .errors import MembraneError
-    from .estimators.base import Estimator
+    from .estimators.base import Deviations, Equilibrium, Estimator, Observation, Problem, StandardDeviations
+    from .estimators.contacts import Contacts
     from .estimators.force_balance.estimator import ForceBalance
     from .estimators.force_balance.settings import ForceBalanceSettings
-    from .estimators.force_balance.uncertainty import StandardDeviations
     from .estimators.minimum_energy.estimator import MinimumEnergy, MinimumEnergySettings
     from .estimators.paper.estimator import PaperEstimator, PaperSettings
+    from .estimators.registry import register_estimator
     from .mechanics.hyperelastic import ElasticEnergy
     from .onnx.export import export
     from .pose import Pose
@@ -43,7 +44,10 @@ if TYPE_CHECKING:
 _HOMES = {
     "Camera": "camera.model",
     "Cavity": "sensor.parts",
+    "Contacts": "estimators.contacts",
+    "Deviations": "estimators.base",
     "ElasticEnergy": "mechanics.hyperelastic",
+    "Equilibrium": "estimators.base",
     "Estimator": "estimators.base",
     "ForceBalance": "estimators.force_balance.estimator",
     "ForceBalanceSettings": "estimators.force_balance.settings",
@@ -53,27 +57,33 @@ _HOMES = {
     "MembraneError": "errors",
     "MinimumEnergy": "estimators.minimum_energy.estimator",
     "MinimumEnergySettings": "estimators.minimum_energy.estimator",
+    "Observation": "estimators.base",
     "PaperEstimator": "estimators.paper.estimator",
     "PaperSettings": "estimators.paper.estimator",
     "Port": "camera.ports",
     "Pose": "pose",
+    "Problem": "estimators.base",
     "Reconstruction": "results.reconstruction",
     "Reconstructor": "reconstruct",
     "Sensor": "sensor.sensor",
-    "StandardDeviations": "estimators.force_balance.uncertainty",
+    "StandardDeviations": "estimators.base",
     "Status": "results.status",
     "Surface": "sensor.parts",
     "Tracker": "track",
     "export": "onnx.export",
     "preset": "presets",
     "read_results": "results.read",
+    "register_estimator": "estimators.registry",
 }
 _NAMESPACES = ("calibrate", "simulate")
 
 __all__ = [
     "Camera",
     "Cavity",
+    "Contacts",
+    "Deviations",
     "ElasticEnergy",
+    "Equilibrium",
     "Estimator",
     "ForceBalance",
     "ForceBalanceSettings",
@@ -83,10 +93,12 @@ __all__ = [
     "MembraneError",
     "MinimumEnergy",
     "MinimumEnergySettings",
+    "Observation",
     "PaperEstimator",
     "PaperSettings",
     "Port",
     "Pose",
+    "Problem",
     "Reconstruction",
     "Reconstructor",
     "Sensor",
@@ -99,6 +111,7 @@ __all__ = [
     "export",
     "preset",
     "read_results",
+    "register_estimator",
     "simulate",
 ]
 

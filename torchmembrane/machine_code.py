@@ -1,12 +1,48 @@
-"""Functions of arrays as machine code, made by numba at their first call: loops without Python, for one frame at a time."""
+"""Functions of arrays as machine code, made by numba at their first call: loops without Python, for one frame at a time.
+
+Compiling takes about `SECONDS`, once for each precision; the code is kept on disk. Where that is not worth the wait,
+`using(False)` leaves the work to tensor operations, which give the same numbers up to rounding.
+"""
 
 import hashlib
-from collections.abc import Callable
+import logging
+import platform
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
+from llvmlite.binding import get_host_cpu_name
+
+SECONDS = 25
+"""Of compiling for one precision, about, on a core of 2023."""
+
+_used = ContextVar("machine code is used", default=True)
+
+
+@contextmanager
+def using(wanted: bool) -> Iterator[None]:
+    """Within, whether machine code is used or tensor operations are.
+
+    Example:
+        >>> with using(False):
+        ...     is_used()
+        False
+    """
+    token = _used.set(wanted)
+    try:
+        yield
+    finally:
+        _used.reset(token)
+
+
+def is_used() -> bool:
+    """Whether machine code may be used here."""
+    return _used.get()
+
 
 OPTIONS: dict[str, Any] = dict(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 """NaN and infinity are what they are, sums come in any order."""
@@ -14,7 +50,11 @@ OPTIONS: dict[str, Any] = dict(nogil=True, error_model="numpy", fastmath={"contr
 INNER: dict[str, Any] = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 compiled = numba.njit(**OPTIONS, **INNER)
-"""Of a function that others call, not Python: its arguments would take as long to unpack as it takes to compile."""
+"""Of a function that others call, not Python: its arguments would take as long to unpack as it takes to compile.
+
+What is quick to compile: a constant argument is passed as `np.intp(4)` or `np.bool_(True)`, as a function is compiled again for
+each literal; loops that need not be unrolled run to a length that is read from an array.
+"""
 
 
 def kept(function: Callable[..., Any]) -> Any:
@@ -29,6 +69,44 @@ def kept(function: Callable[..., Any]) -> Any:
         return numba.njit(cache=True, **OPTIONS)(function)
     except RuntimeError:  # numba's, of a place to write
         return numba.njit(**OPTIONS)(function)
+
+
+class Kept:
+    """What is known of a `kept` function: for which precisions it has been compiled, in this process or on disk.
+
+    Args:
+        function: as `kept` gives it.
+        sources: `fingerprint` of its sources.
+    """
+
+    def __init__(self, function: Any, sources: str):
+        folder, version = getattr(function.stats, "cache_path", None), f"{platform.python_version()} {numba.__version__}"
+        self.folder = Path(folder) if folder else None
+        self.key = hashlib.sha256(f"{sources} {version} {get_host_cpu_name()}".encode()).hexdigest()[:16]
+        self.known: set[str] = set()
+
+    def is_compiled(self, dtype: np.dtype[Any]) -> bool:
+        """Whether a call with arrays of this precision finds machine code."""
+        if dtype.name not in self.known and self.folder and self._mark(dtype).exists():
+            self.known.add(dtype.name)
+        return dtype.name in self.known
+
+    @contextmanager
+    def compiling(self, dtype: np.dtype[Any]) -> Iterator[None]:
+        """Around a call: where it compiles, that is logged, and noted when it is done."""
+        if not self.is_compiled(dtype):
+            logging.getLogger("torchmembrane").warning(
+                "torchmembrane: compiling machine code for %s, about %d s, once", dtype.name, SECONDS
+            )
+        yield
+        if dtype.name not in self.known:
+            self.known.add(dtype.name)
+            if self.folder and self.folder.exists():
+                self._mark(dtype).touch()
+
+    def _mark(self, dtype: np.dtype[Any]) -> Path:
+        assert self.folder is not None
+        return self.folder / f"torchmembrane-{self.key}-{dtype.name}.compiled"
 
 
 def fingerprint(*files: str | None) -> str:

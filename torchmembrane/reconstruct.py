@@ -11,12 +11,10 @@ from torch import Tensor, nn
 from .camera.motion import in_pixels, in_words, shift_of
 from .control_flow import in_inference_mode, traced
 from .errors import MembraneError
-from .estimators.base import Contacts, Equilibrium, Observation, Problem
-from .estimators.breakdown import broken_down
-from .estimators.force_balance.estimator import ForceBalance
-from .estimators.force_balance.uncertainty import StandardDeviations
+from .estimators.base import Equilibrium, Estimator, Observation, Problem, StandardDeviations
+from .estimators.contacts import Contacts
 from .estimators.precision import PRECISIONS, check_precision, full_precision
-from .estimators.registry import ESTIMATORS, AnyEstimator, Settings, estimator_of
+from .estimators.registry import built_estimator, estimator_kind
 from .files.grayscale import CHANNELS, Channels, grey_batch
 from .files.images import read_image
 from .markers.coverage import LEAST_COVERAGE, Coverage, facings
@@ -41,13 +39,14 @@ class Reconstructor(nn.Module):
     Args:
         sensor: a `Sensor` (`Reconstructor.from_file` reads one).
         estimator: "force-balance"; "minimum-energy", which finds no tractions and flattens what is narrow and far; or "paper",
-            the paper's own: linear, harmonic, with its contact segmentation.
-        settings: of that estimator, `ForceBalanceSettings`, `MinimumEnergySettings` or `PaperSettings`.
+            the paper's own: linear, harmonic, with its contact segmentation; or one of your own: the name it is registered
+            under, "module:Class", or the class.
+        settings: of that estimator, an instance of its `Settings`, as `ForceBalanceSettings`; default: `Settings()`.
         model: the elastic energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin".
         channels: order of the channels of colour images, "rgb" or "bgr".
         dtype: of images and results, torch.float32 or torch.float64; slack sheets are solved in the latter whatever it is.
         locator: how markers are found in images: "fit", by least squares, or "soft", by soft-argmax of responses; default:
-            "soft" for "paper", else "fit".
+            the estimator's: "soft" for "paper", else "fit".
         check_rest: whether a rest image that disagrees with the model by more than calibration could explain is refused.
 
     Raises:
@@ -68,9 +67,9 @@ class Reconstructor(nn.Module):
     def __init__(
         self,
         sensor: Sensor,
-        estimator: str = "force-balance",
+        estimator: str | type[Estimator] = "force-balance",
         *,
-        settings: Settings | None = None,
+        settings: Any = None,
         model: str | None = None,
         channels: Channels = "rgb",
         dtype: torch.dtype = torch.float32,
@@ -78,18 +77,17 @@ class Reconstructor(nn.Module):
         check_rest: bool = True,
     ):
         super().__init__()
-        if estimator not in ESTIMATORS:
-            raise MembraneError(f"Reconstructor: estimator = {estimator!r}; expected one of {', '.join(ESTIMATORS)}")
-        locator = locator or ("soft" if estimator == "paper" else "fit")
+        name, kind = estimator_kind(estimator)
+        locator = locator or kind.default_locator
         if channels not in CHANNELS:
             raise MembraneError(f"Reconstructor: channels = {channels!r}; expected 'rgb' or 'bgr'")
         if dtype not in PRECISIONS:
             raise MembraneError(f"Reconstructor: dtype = {dtype}; expected torch.float32 or torch.float64")
-        self.sensor, self.estimator_name, self.locator_name, self.channels = sensor, estimator, locator, channels
+        self.sensor, self.estimator_name, self.locator_name, self.channels = sensor, name, locator, channels
         self.image_size, self.model = sensor.camera.image_size, model or sensor.material.model
         self.camera, membrane = copy.deepcopy(sensor.camera), copy.deepcopy(sensor.membrane)
         vertex_pixels = self.camera.point_to_pixel(membrane.rest)
-        imaged = imaged_vertices(sensor, vertex_pixels, whole=estimator != "force-balance")
+        imaged = imaged_vertices(sensor, vertex_pixels, whole=kind.needs_every_vertex)
         markers, cavity = place_markers(sensor, vertex_pixels, locator), cavity_filling(sensor, membrane, warn=True)
         positions, model_pixels = torch.from_numpy(markers.positions), torch.from_numpy(markers.model_pixels)
         self.marker_points = markers.points
@@ -113,18 +111,17 @@ class Reconstructor(nn.Module):
         facing = facings(positions, self.marker_shares @ membrane.rest_normals)
         self.coverage = Coverage(membrane, positions, self.observer.seen_at_rest, facing)
         self.to(dtype)
-        self._solve_by(estimator_of(problem, estimator, settings), dtype)
+        self._solve_by(built_estimator(problem, name, kind, settings), dtype)
         keep_small(self)
 
-    def _solve_by(self, estimator: AnyEstimator, dtype: torch.dtype) -> None:
-        """Take an estimator, of a precision but for a slack sheet's: that is in double, and so is what it is given."""
-        is_slack = isinstance(estimator, ForceBalance) and estimator.equations.is_slack
-        self.estimator = estimator if is_slack else estimator.to(dtype)
-        if is_slack:
+    def _solve_by(self, estimator: Estimator, dtype: torch.dtype) -> None:
+        """Take an estimator, in a precision unless it must be in double, as of a slack sheet: so is what it is given then."""
+        self.estimator = estimator if estimator.solves_in_double else estimator.to(dtype)
+        if estimator.solves_in_double:
             self.observer.locator.be_exact()
 
     @classmethod
-    def from_file(cls, path: str | Path, estimator: str = "force-balance", **options: Any) -> "Reconstructor":
+    def from_file(cls, path: str | Path, estimator: str | type[Estimator] = "force-balance", **options: Any) -> "Reconstructor":
         """The reconstructor of a sensor file; options as for the class."""
         sensor = Sensor.from_file(path)
         try:
@@ -300,30 +297,15 @@ class Reconstructor(nn.Module):
 
     def _gauged(self, observation: Observation, pressure: Tensor | float | None) -> Observation:
         """The observation with what a gauge reads, if one does."""
-        return observation if pressure is None else self.check_gauge().gauged(observation, pressure)
-
-    def check_gauge(self) -> ForceBalance:
-        """The estimator, refused where a measured pressure tells it nothing.
-
-        Raises:
-            MembraneError: it is not force balance, or the cavity is open.
-        """
-        if not isinstance(self.estimator, ForceBalance):
-            raise MembraneError(f"Reconstructor: pressure for {self.estimator_name}; expected estimator = 'force-balance'")
-        self.estimator.check_gauge()
-        return self.estimator
+        return observation if pressure is None else self.estimator.gauged(observation, pressure)
 
     def standard_deviations(self, result: Reconstruction, pressure: Tensor | float | None = None) -> StandardDeviations:
         """Of vertices, total force and pressure of `result`, caused by the locator's noise, and by that of a gauge where its
         `pressure` was given; NaN where there is no surface.
 
         Raises:
-            MembraneError: the estimator finds no contacts.
+            MembraneError: the estimator knows none.
         """
-        if not isinstance(self.estimator, ForceBalance):
-            raise MembraneError(
-                f"Reconstructor: standard deviations of {self.estimator_name}; expected estimator = 'force-balance'"
-            )
         pixels = torch.where(result.pixels.isfinite(), result.pixels, self.rest_pixels)
         origins, directions = self.camera.pixel_to_ray(pixels)
         distance = torch.linalg.vector_norm(result.markers - origins, dim=-1)[..., None, None]
@@ -348,3 +330,19 @@ class Reconstructor(nn.Module):
                 f"Reconstructor: previous has pixels {given}; expected {expected}: an earlier result for each image"
             )
         return previous.pixels.to(self.rest_pixels)
+
+
+def broken_down(status: Tensor, vertices: Tensor) -> Tensor | None:
+    """Statuses `[B]` with the frames whose solve broke down said; None where none did, or no gradient is asked for.
+
+    A broken solve passes NaN to all that its gradient reaches, also what the batch's other frames share with it: so it is not
+    the one to be differentiated.
+
+    Args:
+        status: `[B]`, before the solve.
+        vertices: `[B, V, 3]` that it found.
+    """
+    if torch.compiler.is_compiling() or not isinstance(vertices, Tensor) or not vertices.requires_grad:
+        return None
+    broken = (status == Status.OK.value) & ~vertices.flatten(1).isfinite().all(1)
+    return torch.where(broken, Status.NO_SOLUTION.value, status) if bool(broken.any()) else None

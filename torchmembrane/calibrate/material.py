@@ -159,7 +159,7 @@ def _material(
     if forces is not None and pressures is not None:
         raise MembraneError("calibrate material: forces and pressures; expected one of them, either gives the modulus")
     if pressures is not None:
-        reconstructor.check_gauge()
+        reconstructor.estimator.check_gauge()
     presses = Presses(reconstructor, displacement, confidence)
     profile = presses.profile()
     each = np.array([_log_stretch(profile.stretches, losses[:, None]) for losses in profile.losses.T])

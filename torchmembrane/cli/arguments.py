@@ -48,7 +48,8 @@ def add_sensor(add: Add) -> None:
 
 def add_estimator(add: Add) -> None:
     """How markers and the surface are found."""
-    add("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="how the surface is found (default: %(default)s)")
+    named = f"{', '.join(ESTIMATORS)}, the name of an installed one, or MODULE:CLASS, your own"
+    add("--estimator", metavar="NAME", default=ESTIMATORS[0], help=f"how the surface is found: {named} (default: %(default)s)")
     add("--energy", choices=ENERGIES, help="the membrane's elastic energy (default: the sensor file's)")
     add("--flow", choices=FLOWS, help="paper: the flow between the markers (default: bilinear)")
     add("--smoothing", metavar="S", type=positive, help="paper: weight of the smoother (eq. 28; default: 0.1)")

@@ -11,6 +11,7 @@ from ..markers.placement import in_view
 from ..reconstruct import Reconstructor
 from ..results.reconstruction import Frame
 from ..results.status import Status
+from ..sensor.factories import elastic_energy
 from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
 
@@ -117,7 +118,7 @@ def _material(sensor: Sensor, reconstructor: Reconstructor | None) -> list[str]:
     if relative:
         lines.append("without shear_modulus and thickness forces are relative, in units of their product")
     if reconstructor is not None:
-        tension, pressure = float(reconstructor.estimator.elasticity.tension), float(reconstructor.estimator.rest_pressure)
+        tension, pressure = float(elastic_energy(sensor, sensor.membrane).tension), float(reconstructor.rest_pressure)
         held = f"{tension:.4g} {'(relative)' if relative else f'N/{unit}'}"
         lines.append(f"at rest: tension {held}, pressure difference {pressure_in_words(pressure, sensor)}")
     return lines

@@ -45,7 +45,7 @@ SIGTERM end it with a summary. In a terminal the line is rewritten in place, els
 
 exit code: 0 ended or stopped, 2 wrong usage, or a source that gives no images (any more)"""
 SOURCES = ("camera", "video", "images")
-OF_TORCH = ("grid", "energy", "element", "volume", "flow", "smoothing", "locator")
+OF_TORCH = ("grid", "energy", "flow", "smoothing", "locator")
 DEFAULTS = {"estimator": "force-balance", "device": "cpu"}
 """Of torch as well."""
 DEFAULT_RATE = 30.0

@@ -1,9 +1,13 @@
-"""Contact patches from tractions: where something pushes, the patches' centroids, and what each tells of what touches.
+"""Contact patches: where something pushes, the patches' centroids, and what each tells of what touches.
 
-A patch is what lies around a peak of the smoothed push that stands for itself, however weak it is beside the others. Every
-vertex belongs to the patch whose peak is nearest to it on the rest surface, with all of its traction: the patches' forces add
-up to the total force, also where the estimate smears a push over the contact's edge.
+A patch of tractions is what lies around a peak of the smoothed push that stands for itself, however weak it is beside the
+others. Every vertex belongs to the patch whose peak is nearest to it on the rest surface, with all of its traction: the
+patches' forces add up to the total force, also where the estimate smears a push over the contact's edge.
+
+Where no tractions are known, a contact is a region of the surface that lies inside the rest surface.
 """
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -12,9 +16,10 @@ from ..solve.elimination import solve_dense
 from ..solve.stencil import inner, pad_border
 from ..surface.membrane import Membrane
 from ..surface.tangent import tangent_frame
-from .base import CONTACT_POINTS, Contacts
-from .regions import persistent_peaks
+from .regions import persistent_peaks, persistent_regions
 
+CONTACT_POINTS = 4
+"""Contacts that are reported at most."""
 LEAST = 0.03
 """Smallest peak of the smoothed push that is a patch of its own, over the highest."""
 APART = 0.3
@@ -31,6 +36,32 @@ MOVED = 0.225
 """Displacement there over the largest of all, above which the patch may reach the rim: it does if both say so."""
 LEAST_STEPS = 2.0
 """Grid steps that a patch spans at least where curvatures are told."""
+LEAST_BULGE = 1e-3
+"""Over the surface's size: the smallest displacement into the rest surface that is a contact of its own."""
+
+
+class Contacts(NamedTuple):
+    """Where something touches in a batch, and what that tells: of P = 4 contacts, the strongest first, NaN where there are
+    fewer.
+
+    indicator  [B, V]  how surely each vertex is touched, 0..1
+    points     [B, P, 3]  centroids of the contacts, length unit
+    force      [B, P, 3]  on the membrane; NaN where no tractions are found
+    normal     [B, P, 3]  mean outward normal of the membrane there
+    area       [B, P]  length^2
+    slip       [B, P]  shear force over normal force; NaN where no tractions are found
+    curvature  [B, P, 2]  principal curvatures of the surface there, positive where the object bulges into the membrane
+    at_rim     [B, P]  1 where the contact reaches the rim, else 0
+    """
+
+    indicator: Tensor
+    points: Tensor
+    force: Tensor
+    normal: Tensor
+    area: Tensor
+    slip: Tensor
+    curvature: Tensor
+    at_rim: Tensor
 
 
 def contact_indicator(traction: Tensor, normals: Tensor, reference: float | Tensor) -> Tensor:
@@ -84,6 +115,28 @@ def contact_points(vertices: Tensor, rest: Tensor, inward_force: Tensor, peaks: 
     return torch.where(present[..., None], points, torch.nan), mine
 
 
+def bulge_inwards(x: Tensor, normals: Tensor, membrane: Membrane) -> Tensor:
+    """How far a surface `x [B, V, 3]` with outward `normals [B, V, 3]` lies inside the rest surface, `[B, V]`, along the mean
+    of both normals."""
+    normal = torch.nn.functional.normalize(normals + membrane.rest_normals, dim=-1)
+    return -((x - membrane.rest) * normal).sum(-1)
+
+
+def bulge_regions(bulge: Tensor, membrane: Membrane, count: int) -> Tensor:
+    """Numbers of the regions `[B, V]`, 0 none, that stand out of `bulge [B, V]`, at most `count`, the strongest first."""
+    on_grid = bulge.float().unflatten(-1, membrane.grid)  # which of them is higher: single precision tells
+    return persistent_regions(on_grid, count, LEAST_BULGE * membrane.size).flatten(1)
+
+
+def region_centroids(x: Tensor, region: Tensor, weight: Tensor, membrane: Membrane, count: int) -> Tensor:
+    """Centroids `[B, count, 3]` of numbered regions of `x [B, V, 3]`, weighted by `weight [B, V]`; NaN where there is none."""
+    weight = weight * membrane.rest_area
+    numbers = torch.arange(1, count + 1, device=x.device)
+    weight = weight[:, None] * (region[:, None] == numbers[:, None])
+    centroids: Tensor = weight @ x / weight.sum(-1, keepdim=True)
+    return centroids
+
+
 class ContactPatches(nn.Module):
     """What contact patches tell of the bodies that touch.
 
@@ -122,6 +175,25 @@ class ContactPatches(nn.Module):
         points, mine = contact_points(x, membrane.rest, push * membrane.rest_area, peaks)
         contacts: Contacts = self(x, normals, traction, indicator, points, mine)
         return contacts
+
+    def bulges(self, x: Tensor, normals: Tensor, traction: Tensor | None = None) -> Contacts:
+        """Where a surface `x [B, V, 3]` lies inside the rest surface, with the forces of its `traction [B, V, 3]`, if known."""
+        bulge = bulge_inwards(x, normals, self.membrane)
+        region = bulge_regions(bulge, self.membrane, CONTACT_POINTS)
+        points = region_centroids(x, region, bulge.clamp_min(0), self.membrane, CONTACT_POINTS)
+        return self.of_regions(x, normals, region, points, traction)
+
+    def of_regions(
+        self, x: Tensor, normals: Tensor, region: Tensor, points: Tensor, traction: Tensor | None = None
+    ) -> Contacts:
+        """Contacts that are numbered regions `[B, V]` with centroids `points [B, P, 3]`: the indicator is 1 in them, else 0."""
+        indicator, numbers = (region > 0).to(x.dtype), torch.arange(1, points.shape[1] + 1, device=x.device)
+        mine = (region[:, None] == numbers[:, None]).to(x.dtype)
+        even = -normals if traction is None else traction  # as if pushed evenly
+        contacts: Contacts = self(x, normals, even, indicator, points, mine)
+        if traction is not None:
+            return contacts
+        return contacts._replace(force=torch.nan * contacts.force, slip=torch.nan * contacts.slip)
 
     def forward(
         self, x: Tensor, normals: Tensor, traction: Tensor, indicator: Tensor, points: Tensor, mine: Tensor

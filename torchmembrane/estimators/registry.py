@@ -1,29 +1,149 @@
-"""The estimators by their names."""
+"""The estimators by their names: those of the package, those that were registered, and those of installed packages."""
 
+from importlib import import_module
+from importlib.metadata import entry_points
 from typing import Any
 
 from ..errors import MembraneError
-from .base import Problem
+from ..sensor.synonyms import did_you_mean
+from .base import Estimator, Problem
 from .force_balance.estimator import ForceBalance
-from .force_balance.settings import ForceBalanceSettings
-from .minimum_energy.estimator import MinimumEnergy, MinimumEnergySettings
-from .paper.estimator import PaperEstimator, PaperSettings
+from .minimum_energy.estimator import MinimumEnergy
+from .paper.estimator import PaperEstimator
 
-AnyEstimator = ForceBalance | MinimumEnergy | PaperEstimator
-Settings = ForceBalanceSettings | MinimumEnergySettings | PaperSettings
-ESTIMATORS: dict[str, type[ForceBalance] | type[MinimumEnergy] | type[PaperEstimator]] = {
+GROUP = "torchmembrane.estimators"
+"""The entry points by which an installed package gives estimators their names."""
+ESTIMATORS: dict[str, type[Estimator]] = {
     "force-balance": ForceBalance,
     "minimum-energy": MinimumEnergy,
     "paper": PaperEstimator,
 }
+PROTOCOL = ("Settings", "from_problem", "prepare", "forward", "is_converged")
+"""What a subclass of `Estimator` must define."""
 
 
-def estimator_of(problem: Problem, name: str, settings: Settings | None) -> AnyEstimator:
-    """The estimator of that name; refuses settings of another one."""
-    kind: Any = ESTIMATORS[name]
+def register_estimator(name: str, kind: type[Estimator]) -> None:
+    """Give an estimator a name, by which `Reconstructor` and the command line's `--estimator` know it in this process.
+
+    An installed package registers its estimators by entry points of the group `torchmembrane.estimators` instead, which hold in
+    every process.
+
+    Args:
+        name: letters, digits, hyphens and underscores.
+        kind: a subclass of `Estimator`.
+
+    Raises:
+        MembraneError: the name is another class's or has other characters, or the class lacks a part of the protocol.
+
+    Example:
+        >>> import torchmembrane as tm
+        >>> register_estimator("force-balance", tm.ForceBalance)  # again: nothing changes
+        >>> register_estimator("paper", tm.ForceBalance)
+        Traceback (most recent call last):
+        torchmembrane.errors.MembraneError: register_estimator: 'paper' is PaperEstimator's; expected another name
+    """
+    if not name.replace("-", "_").isidentifier():
+        raise MembraneError(f"register_estimator: name = {name!r}; expected letters, digits, hyphens and underscores")
+    check_protocol(kind, f"register_estimator: {name!r}")
+    if ESTIMATORS.setdefault(name, kind) is not kind:
+        raise MembraneError(f"register_estimator: {name!r} is {ESTIMATORS[name].__qualname__}'s; expected another name")
+
+
+def estimator_kind(given: str | type[Estimator]) -> tuple[str, type[Estimator]]:
+    """The name and the class of an estimator.
+
+    Args:
+        given: a name, `MODULE:CLASS`, or the class. The name of a class that is not registered is `MODULE:CLASS`.
+
+    Raises:
+        MembraneError: there is none of that name, the module or the class does not exist, or lacks a part of the protocol.
+
+    Example:
+        >>> estimator_kind("torchmembrane.estimators.paper.estimator:PaperEstimator")[0]
+        'paper'
+    """
+    if isinstance(given, str) and ":" not in given:
+        return given, _named(given)
+    kind = _imported(given) if isinstance(given, str) else given
+    check_protocol(kind, f"Reconstructor: estimator = {given!r}")
+    registered = (name for name, other in ESTIMATORS.items() if other is kind)
+    return next(registered, f"{kind.__module__}:{kind.__qualname__}"), kind
+
+
+def check_protocol(kind: Any, given: str) -> None:
+    """Refuse what is no class with the protocol of an estimator.
+
+    Args:
+        kind: anything.
+        given: what to call it in an error.
+
+    Raises:
+        MembraneError: it is no class, or lacks parts of the protocol, which are named.
+    """
+    if not isinstance(kind, type):
+        raise MembraneError(f"{given} is no class; expected a subclass of torchmembrane.Estimator")
+    lacking = [] if issubclass(kind, Estimator) else ["the base class torchmembrane.Estimator"]
+    lacking += [part for part in PROTOCOL if not _defines(kind, part)]
+    settings = getattr(kind, "Settings", None)
+    if settings is not None and not getattr(getattr(settings, "__dataclass_params__", None), "frozen", False):
+        lacking.append("@dataclass(frozen=True) at Settings")
+    if lacking:
+        raise MembraneError(f"{given} lacks {', '.join(lacking)}; see torchmembrane.Estimator for what an estimator defines")
+
+
+def built_estimator(problem: Problem, name: str, kind: type[Estimator], settings: Any = None) -> Estimator:
+    """The estimator of a sensor.
+
+    Args:
+        problem: the sensor's.
+        name: of the estimator, for messages.
+        kind: its class.
+        settings: of that class; None: its defaults.
+
+    Raises:
+        MembraneError: settings of another estimator.
+    """
     if settings is not None and not isinstance(settings, kind.Settings):
         raise MembraneError(
             f"Reconstructor: settings are {type(settings).__name__}; expected {kind.Settings.__name__} for {name}"
         )
-    built: AnyEstimator = kind.of(problem, settings)
+    built = kind.from_problem(problem, settings)
+    built.name = name
     return built
+
+
+def _named(name: str) -> type[Estimator]:
+    """The estimator of that name, which an installed package may give."""
+    if name in ESTIMATORS:
+        return ESTIMATORS[name]
+    points = entry_points(group=GROUP)
+    values = {f"{point.module}:{point.attr}" for point in points if point.name == name}
+    if len(values) > 1:
+        raise MembraneError(f"estimator {name!r}: installed packages have {', '.join(sorted(values))}; expected MODULE:CLASS")
+    if not values:
+        names = list(dict.fromkeys([*ESTIMATORS, *sorted(point.name for point in points)]))
+        meant = did_you_mean(name, names, "`register_estimator` gives a class a name")
+        raise MembraneError(f"Reconstructor: estimator = {name!r}; expected one of {', '.join(names)} or MODULE:CLASS; {meant}")
+    register_estimator(name, _imported(values.pop()))
+    return ESTIMATORS[name]
+
+
+def _imported(path: str) -> Any:
+    """What `MODULE:CLASS` stands for."""
+    name, _, member = path.partition(":")
+    try:
+        module = import_module(name)
+    except (ImportError, ValueError) as error:
+        raise MembraneError(
+            f"estimator {path!r}: the module {name!r} cannot be imported ({error}); expected MODULE:CLASS, of a module in the "
+            "current directory or of an installed package"
+        ) from error
+    if not hasattr(module, member):
+        where = getattr(module, "__file__", None) or name
+        raise MembraneError(f"estimator {path!r}: no {member!r} in {where}; expected MODULE:CLASS, a class of that module")
+    return getattr(module, member)
+
+
+def _defines(kind: type, part: str) -> bool:
+    """Whether a class or one of its bases, `Estimator` and its own left out, defines this part of the protocol."""
+    return any(part in vars(base) for base in kind.__mro__ if base not in Estimator.__mro__)

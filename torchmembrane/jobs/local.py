@@ -14,6 +14,7 @@ from ..errors import MembraneError
 from ..files.folder_lock import WHOLE, Shard
 from ..files.optional import load_pyav
 from ..files.provenance import printable
+from ..machine_code import SECONDS
 from ..results.status import Status
 from ..results.store import FINISHED, Mesh, Settings
 from .decode import Source, length_of, sources
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
 
 Engine: TypeAlias = Callable[[Work, Iterator[Source], int | None], Iterator[list[Outcome]]]
 """Computes what becomes of all frames, in batches of a size, by default of its own."""
+
+FEW_FRAMES = 50
+"""A job of fewer frames does not wait for machine code to be compiled."""
 
 
 class FrameCounts(NamedTuple):
@@ -106,6 +110,7 @@ def reconstruct_files(
         mine = (source for source in sources(inputs, reconstructor) if shard.holds(source.name))
         waiting = (source for source in mine if source.name not in folder.finished)
         with _progress(inputs, shard, folder.finished) as progress:
+            work = work._replace(machine_code=_by_machine_code(reconstructor, progress.all_left))
             for group in (engine or _local(reconstructor, workers, progress.left))(work, waiting, batch):
                 for outcome in group:
                     done[_kept(folder, outcome, report)] += 1
@@ -114,6 +119,25 @@ def reconstruct_files(
     good = sum(done[status] for status in FINISHED)
     doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN]
     return FrameCounts(good, *doubts, done.total() - good, progress.initial)
+
+
+def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:
+    """Whether a job is solved by machine code, from its first frame to its last, which is said where that is not compiled yet.
+
+    A few frames take less time by tensor operations than compiling does.
+
+    Args:
+        reconstructor: of the job.
+        left: its frames; None where that is not known.
+    """
+    if not reconstructor.estimator.must_compile or left == 0:
+        return True
+    if few := left is not None and left < FEW_FRAMES:
+        _write_line(
+            f"torchmembrane: {left} frames are solved by tensor operations; the first job of {FEW_FRAMES} frames or more "
+            f"compiles machine code, which takes about {SECONDS} s, once"
+        )
+    return not few
 
 
 def _kept(folder: ResultFolder, outcome: Outcome, report: Callable[[str], None]) -> int:
@@ -151,6 +175,7 @@ class _Progress:
         lengths = [(length or 0) // shard.total for length in (length_of(path, inputs.topic) for path in inputs.videos)]
         total = len(mine) + sum(lengths)
         self.left = total - self.initial
+        self.all_left = self.left if all(lengths) else None
         self.bar = tqdm(total=total if all(lengths) else None, initial=self.initial, unit="frame", desc="reconstruct")
 
     def update(self, frames: int, done: Counter[int]) -> None:

@@ -43,7 +43,7 @@ def recording_pressures(reconstructor: "Reconstructor", path: Path, inputs: Inpu
         MembraneError: a pressure tells nothing to this estimator or of this cavity; the sensor has no modulus; the table is not
             as expected.
     """
-    reconstructor.check_gauge()
+    reconstructor.estimator.check_gauge()
     sensor = reconstructor.sensor
     if sensor.force_unit != "N":
         raise MembraneError(

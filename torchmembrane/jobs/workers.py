@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..machine_code import using
 from ..results.store import Mesh
 from .decode import DecodedFrame, Source, decoded, read_ahead
 from .frame_reconstructor import FrameReconstructor, Outcome
@@ -48,14 +49,17 @@ class Work(NamedTuple):
     Attributes:
         reconstructor: makes their results.
         figures: the folder of a figure for every frame, and the mesh of the results; None: no figures.
+        machine_code: whether the solve takes its steps by machine code, or all of them by tensor operations.
     """
 
     reconstructor: FrameReconstructor
     figures: tuple[Path, Mesh] | None = None
+    machine_code: bool = True
 
     def outcomes(self, group: list[DecodedFrame]) -> list[Outcome]:
         """What becomes of decoded frames."""
-        found = self.reconstructor.outcomes(group)
+        with using(self.machine_code):
+            found = self.reconstructor.outcomes(group)
         if self.figures:
             from ..plot.drawing import save
             from ..plot.frames import figure

@@ -176,23 +176,21 @@ def _complete(free, force, A):
     """`A` in earlier vertices, transposed, and in the vertices themselves: minus the sum of the others. Then zero what is not
     free."""
     m, n = free.shape
-    V = m * n
-    planes, first, last = A.reshape((3, 21, V)), n + 1, V - n - 1
-    for s in range(OWN):
-        shift, there = STENCIL[s][0] * n + STENCIL[s][1], 3 * (LAST - s)
-        for c in range(3):
-            for d in range(3):
-                for k in range(first, last):
-                    planes[c, 3 * s + d, k] = planes[d, there + c, k + shift]
-    for c in range(3):
-        for d in range(3):
-            own = planes[c, 3 * OWN + d]
-            own[:] = 0
-            for s in range(LAST + 1):
-                if s != OWN:
-                    other = planes[c, 3 * s + d]
-                    for k in range(V):
-                        own[k] -= other[k]
+    V, blocks = m * n, len(A) * A.shape[1]
+    planes, first, last = A.reshape((blocks, V)), n + 1, V - n - 1
+    for block in range(blocks):
+        c, s, d = block // 21, block % 21 // 3, block % 3
+        if s < OWN:
+            shift, transposed = STENCIL[s][0] * n + STENCIL[s][1], planes[21 * d + 3 * (LAST - s) + c]
+            for k in range(first, last):
+                planes[block, k] = transposed[k + shift]
+        elif s == OWN:
+            planes[block] = 0
+    for block in range(blocks):
+        if block % 21 // 3 != OWN:
+            own = planes[block // 21 * 21 + 3 * OWN + block % 3]
+            for k in range(V):
+                own[k] -= planes[block, k]
     for i in range(m):
         for j in range(n):
             if not (0 < i < m - 1 and 0 < j < n - 1 and free[i, j]):

@@ -15,7 +15,6 @@ import onnx
 import torch
 from onnx import TensorProto, helper
 from torch import Tensor, nn
-from torch.utils._pytree import tree_flatten, tree_leaves, tree_map, tree_unflatten
 
 from ..control_flow import FUNCTIONS, Value
 from ..errors import MembraneError
@@ -25,6 +24,7 @@ from ..results.status import Status
 from ..results.store import FORMATS, Mesh, Settings
 from .check import checked
 from .graph import Assembly, described, inlined
+from .torch_internals import tree_flatten, tree_leaves, tree_map, tree_unflatten
 from .trace import traced_model
 
 FORMAT = 1

@@ -2,11 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import cache, partial
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import onnx
@@ -19,15 +15,9 @@ from onnxscript import opset18
 from onnxscript.function_libs.torch_lib.ops.core import aten_index_select, aten_scalar_tensor
 from onnxscript.optimizer import fold_constants_ir
 from torch import Tensor, nn
-from torch._subclasses.fake_tensor import FakeTensorMode
-from torch.export import _trace
-from torch.export.exported_program import _override_composite_implicit_decomp, _split_decomp_table_to_cia_and_python_decomp
-from torch.onnx._internal.exporter import _fx_passes
-from torch.onnx._internal.exporter._decomp import create_onnx_friendly_decomposition_table, get_onnx_implemented_overloads
-from torch.onnx._internal.exporter._registration import ONNXRegistry
-from torch.onnx._internal.fx.passes.type_promotion import _TypePromotionInterpreter, get_type_promotion_rule
 
 from ..control_flow import writing
+from .torch_internals import TorchExporter, empty_batches
 
 OPSET = 18
 MANY = 1_000_003
@@ -47,17 +37,6 @@ TIDY = passes.Sequential(
     common.NameFixPass(),
 )
 """What torch's exporter does too, but for its patterns, which take most of its time and change next to nothing here."""
-_from_torchlib = ONNXRegistry.from_torchlib
-
-
-@cache
-def _registry(**options: Any) -> ONNXRegistry:
-    """The operators of torch's exporter, which it reads anew for every model, a second each; but for numbers in double
-    precision, which it rounds to single, and for what is selected of rows."""
-    registry = _from_torchlib(**options)
-    registry.register_op(torch.ops.aten.scalar_tensor.default, _number)
-    registry.register_op(torch.ops.aten.index_select.default, _selected)
-    return registry
 
 
 def _number(s: float, dtype: int = TensorProto.FLOAT, layout: str = "", device: str = "", pin_memory: bool = False) -> Any:
@@ -78,44 +57,8 @@ def _selected(self: Any, dim: int, index: Any) -> Any:
     return opset18.GatherElements(self, opset18.Expand(index, shape), axis=len(others))
 
 
-def _promoted(interpreter: _TypePromotionInterpreter, node: torch.fx.Node) -> Any:
-    """The exporter's pass that makes operands of several types one, without working out anew what it leaves as it is.
-
-    That took a fifth of the time of tracing.
-    """
-    if node.op != "call_function":
-        return torch.fx.Interpreter.run_node(interpreter, node)
-    with interpreter._set_current_node(node):
-        rule = get_type_promotion_rule(node, interpreter.type_promotion_table)
-        if rule is not None:
-            interpreter._maybe_promote_node(node, rule)
-    return node.meta.get("val")
-
-
-def _captured(module: nn.Module, examples: tuple[Tensor, ...]) -> torch.export.ExportedProgram:
-    """The module's operators as ONNX has them, captured in one go: by torch's exporter it would be in two."""
-    kept, decomposed = _decompositions()
-    at_once = partial(_trace._export_to_aten_ir, decomp_table=decomposed)
-    with patch.object(_trace, "_export_to_aten_ir", at_once), _override_composite_implicit_decomp(kept):
-        return _trace._export(module, examples, strict=False, pre_dispatch=False)
-
-
-@cache
-def _decompositions() -> tuple[dict[Any, Any], ...]:
-    """What operators without ONNX are made of, composite ones and others."""
-    table: dict[Any, Any] = create_onnx_friendly_decomposition_table(set(get_onnx_implemented_overloads(_registry())))
-    return _split_decomp_table_to_cia_and_python_decomp(table)
-
-
-@contextmanager
-def _quick() -> Iterator[None]:
-    """Torch's exporter without what it does again for every model, or to what `_captured` is already."""
-    with (
-        patch.object(ONNXRegistry, "from_torchlib", staticmethod(_registry)),
-        patch.object(_TypePromotionInterpreter, "run_node", _promoted),
-        patch.object(_fx_passes, "decompose_with_registry", lambda program, _: program),
-    ):
-        yield
+EXPORTER = TorchExporter({torch.ops.aten.scalar_tensor.default: _number, torch.ops.aten.index_select.default: _selected})
+"""With numbers in double precision, which torch's own rounds to single, and rows selected as onnxruntime is quick at."""
 
 
 def traced_model(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> onnx.ModelProto:
@@ -128,15 +71,11 @@ def traced_model(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str
         ValueError: a number, not a length, depends on the batch's length.
     """
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    with FakeTensorMode(allow_non_fake_inputs=True):
-        examples = tuple(
-            torch.empty(MANY, *value.shape[1:], dtype=value.dtype) if value.ndim else torch.empty_like(value)
-            for value in inputs.values()
-        )
-    with warnings.catch_warnings(), _quick(), writing():
+    examples = empty_batches(inputs.values(), MANY)
+    with warnings.catch_warnings(), EXPORTER.at_work(), writing():
         warnings.simplefilter("ignore")  # of the exporter about itself
         program = torch.onnx.export(
-            _captured(module.eval(), examples),
+            EXPORTER.captured(module.eval(), examples),
             input_names=list(inputs),
             output_names=outputs,
             opset_version=OPSET,

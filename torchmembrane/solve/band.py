@@ -26,7 +26,6 @@ def takes(matrix: Tensor) -> bool:
     return matrix.device.type == "cpu" and not recorded and not torch.compiler.is_exporting()
 
 
-@torch.library.custom_op("torchmembrane::band_factor", mutates_args=())
 def factor(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
     """Cholesky factors of matrices, NaN of one that is not positive.
 
@@ -43,6 +42,28 @@ def factor(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
         tensor([[[2., 1.],
                  [2., 0.]]])
     """
+    factors: Tensor = torch.ops.torchmembrane.band_factor(runs, starts)
+    return factors
+
+
+def solve(factors: Tensor, b: Tensor) -> Tensor:
+    """Solutions for the rows of `b [B, C, n]`, from what `factor` gives.
+
+    Example:
+        >>> solve(factor([torch.tensor([[[4.0, 2.0], [5.0, 0.0]]])], [0]), torch.tensor([[[6.0, 7.0]]]))
+        tensor([[[1., 1.]]])
+    """
+    solved: Tensor = torch.ops.torchmembrane.band_solve(factors, b)
+    return solved
+
+
+# Defined one by one: `torch.library.custom_op` loads torch's compiler, which takes a second, at the first call.
+torch.library.define("torchmembrane::band_factor", "(Tensor[] runs, SymInt[] starts) -> Tensor")
+torch.library.define("torchmembrane::band_solve", "(Tensor factors, Tensor b) -> Tensor")
+
+
+@torch.library.impl("torchmembrane::band_factor", "CPU")
+def _factor(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
     pbtrf = _lapack("pbtrf", runs[0].dtype)
     matrices = [run.numpy() for run in runs]
     factors = runs[0].new_empty(*runs[0].shape[:2], starts[-1] + runs[-1].shape[-1])
@@ -60,19 +81,13 @@ def factor(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
     return factors
 
 
-@factor.register_fake
+@torch.library.register_fake("torchmembrane::band_factor")
 def _(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
     return runs[0].new_empty(*runs[0].shape[:2], starts[-1] + runs[-1].shape[-1])
 
 
-@torch.library.custom_op("torchmembrane::band_solve", mutates_args=())
-def solve(factors: Tensor, b: Tensor) -> Tensor:
-    """Solutions for the rows of `b [B, C, n]`, from what `factor` gives.
-
-    Example:
-        >>> solve(factor([torch.tensor([[[4.0, 2.0], [5.0, 0.0]]])], [0]), torch.tensor([[[6.0, 7.0]]]))
-        tensor([[[1., 1.]]])
-    """
+@torch.library.impl("torchmembrane::band_solve", "CPU")
+def _solve(factors: Tensor, b: Tensor) -> Tensor:
     pbtrs = _lapack("pbtrs", b.dtype)
     solved = b.clone(memory_format=torch.contiguous_format)
     with _one_thread():
@@ -81,12 +96,12 @@ def solve(factors: Tensor, b: Tensor) -> Tensor:
     return solved
 
 
-@solve.register_fake
+@torch.library.register_fake("torchmembrane::band_solve")
 def _(factors: Tensor, b: Tensor) -> Tensor:
     return torch.empty_like(b, memory_format=torch.contiguous_format)
 
 
-@solve.register_vmap
+@torch.library.register_vmap("torchmembrane::band_solve")
 def _(info: Any, dims: tuple[int | None, int | None], factors: Tensor, b: Tensor) -> tuple[Tensor, int]:
     each = [
         part.expand(info.batch_size, *part.shape) if dim is None else part.movedim(dim, 0)

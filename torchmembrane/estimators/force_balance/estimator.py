@@ -22,8 +22,9 @@ its lines, and a `Dent` where something pushes. What has not settled is solved a
 from dataclasses import replace
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ...camera.model import Camera
 from ...control_flow import retry_rows, traced, where_rows
@@ -33,26 +34,18 @@ from ...solve.stencil import inner, pad_border
 from ...surface.bicubic import Refinement
 from ...surface.membrane import Membrane
 from ...surface.projection import SurfacePoints
-from ..base import Contacts, Deviations, Equilibrium, Observation, Problem
-from ..contacts import ContactPatches
+from ..base import Deviations, Equilibrium, Estimator, Observation, Problem, StandardDeviations
+from ..contacts import Contacts
 from .contact_force import ContactForce
 from .gauss_newton import Descent, State
+from .kernels.steps import compiled
 from .marker_residuals import Bearings, MarkerBearings, marker_rays, seen_from_origin
 from .normal_equations import BalanceEquations
 from .pressure_gauge import gauge_reading, refuse_open
 from .settings import ForceBalanceSettings
 from .starts import Dent
 from .traction_loss import TractionLoss, stands_out
-from .uncertainty import (
-    StandardDeviations,
-    depths,
-    gap_around,
-    noise_effects,
-    of_presses,
-    shares_of_deepest,
-    spreads,
-    standard_deviations,
-)
+from .uncertainty import depths, gap_around, noise_effects, of_presses, shares_of_deepest, spreads, standard_deviations
 
 RESOLVED = 17
 """Lines of a grid whose own error is small beside the markers'; a coarser one's grows as the square of its step."""
@@ -61,7 +54,7 @@ ALONE = 3
 """Last steps that are damped to settle, on a grid that none precedes and none follows."""
 
 
-class ForceBalance(nn.Module):
+class ForceBalance(Estimator):
     """Surface, contact tractions and pressure from marker rays.
 
     A grid with an odd number of lines, at least 11, holds the estimator on every second line as `coarse`. The reference
@@ -83,12 +76,11 @@ class ForceBalance(nn.Module):
         The press must not be so shallow that its tractions drown in noise; two contacts within `reach` are one.
     """
 
-    finds_tractions: ClassVar[bool] = True
-    element: ClassVar[str] = "triangle"
-    volume: ClassVar[str] = "exact"
-    flow_kind: ClassVar[str] = "smooth"
-    smoothing_weight: ClassVar[float] = 0.0
     Settings: ClassVar[type[ForceBalanceSettings]] = ForceBalanceSettings
+    needs_every_vertex: ClassVar[bool] = False
+    finds_tractions: ClassVar[bool] = True
+    in_parts: ClassVar[bool] = True
+    settings: ForceBalanceSettings
 
     def __init__(
         self,
@@ -103,9 +95,8 @@ class ForceBalance(nn.Module):
         rest: Observation | None = None,
         is_coarse: bool = False,
     ):
-        super().__init__()
-        self.settings = settings = settings or ForceBalanceSettings()
-        self.cavity = CavityLaw(membrane, rest_balance(membrane, elasticity)[0], filling, gas)
+        settings, spacing = settings or ForceBalanceSettings(), membrane.size / len(positions) ** 0.5
+        super().__init__(membrane, CavityLaw(membrane, rest_balance(membrane, elasticity)[0], filling, gas), settings, spacing)
         self.size, self.coarseness = membrane.size, max(1.0, (RESOLVED - 1) / (min(membrane.grid) - 1)) ** 2
         self._far = settings.far * self.coarseness
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
@@ -119,15 +110,13 @@ class ForceBalance(nn.Module):
         self.descent = Descent(self.equations, self.cavity, settings)
         self.dent = Dent(self.descent) if self.coarse is not None and self.coarse.coarse is None else None
         self.settling = 1 if is_coarse or self.coarse is not None else ALONE
-        self.spacing = self.size / len(bearings.positions) ** 0.5
-        self.patches = ContactPatches(membrane, self.spacing)
         first = settings.coarse_steps if is_coarse else settings.steps
         self.steps = first if self.coarse is None else settings.finer_steps if self.dent is None else settings.fine_steps
         rest = seen_from_origin(bearings.positions) if rest is None else rest
         loss.push_noise, loss.noise_gain = noise_effects(self.equations, self.cavity, rest, settings.camera_motion)
 
     @classmethod
-    def of(cls, problem: Problem, settings: ForceBalanceSettings | None = None) -> "ForceBalance":
+    def from_problem(cls, problem: Problem, settings: ForceBalanceSettings | None = None) -> Self:
         """The estimator of a sensor."""
         variance = problem.rest_covariance.diagonal(dim1=-2, dim2=-1).mean()
         noise = float(variance.sqrt() / problem.camera.focal.mean())
@@ -147,9 +136,15 @@ class ForceBalance(nn.Module):
         return type(self)(*given, settings=settings, is_coarse=True, **others)
 
     @property
-    def membrane(self) -> Membrane:
-        """The rest surface on this grid."""
-        return self.equations.forces.membrane
+    def must_compile(self) -> bool:
+        """Whether the first frame waits for machine code to be compiled."""
+        rest = self.membrane.rest
+        return rest.device.type == "cpu" and not compiled.is_compiled(np.dtype(str(rest.dtype).removeprefix("torch.")))
+
+    @property
+    def solves_in_double(self) -> bool:
+        """Whether the sheet is slack, which single precision cannot solve."""
+        return self.equations.is_slack
 
     @property
     def dents(self) -> Dent | None:
@@ -160,11 +155,6 @@ class ForceBalance(nn.Module):
     def elasticity(self) -> ElasticEnergy:
         """What the membrane stores."""
         return self.equations.forces.elasticity
-
-    @property
-    def rest_pressure(self) -> Tensor:
-        """Pressure difference across the membrane at rest, `[]`."""
-        return self.cavity.rest_pressure
 
     def set_prestretch(self, prestretch: Tensor) -> None:
         """Another prestretch `[]`, gradients included; rest pressure and load follow, the reference traction stays."""

@@ -19,7 +19,7 @@ sensitivities, which the transposed equations give: one solve for each wanted nu
 with `g` the wanted number's derivative in surface and pressure and the symmetric `K` above. On the estimator's second finest
 grid, which costs little and knows as much. Every marker's noise is what the solve took it for, with a share of the
 displacements in it for the grid and the material; but these err together over many markers, so the spread is too small. What is
-missing was fitted to presses of random sensors (`bench/intervals.py`), as standard deviations that add up:
+missing was fitted to presses of random sensors (`bench/accuracy/intervals.py`), as standard deviations that add up:
 
     of the force    FORCE x spread,  FORCE_SHARE of the force along itself,  AT_RIM of it where a contact reaches the rim,
                     where no contact is found UNSEEN of what a patch as pushed as the noise pushes would bear
@@ -41,7 +41,8 @@ from ...solve.kkt import solve_bordered
 from ...solve.stencil import inner, pad_border
 from ...surface.membrane import Membrane
 from ...surface.tangent import tangent_frame
-from ..base import Contacts, Deviations, Observation
+from ..base import Deviations, Observation, StandardDeviations
+from ..contacts import Contacts
 from .camera_motion import CameraMotion
 from .contact_force import Linearised
 from .gauss_newton import Descent, State
@@ -49,19 +50,6 @@ from .marker_residuals import Bearings
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import pulled
 from .settings import ForceBalanceSettings
-
-
-class StandardDeviations(NamedTuple):
-    """Of `vertices [B, V, 3]` (zero where fixed), total `force [B, 3]` and `pressure [B]`."""
-
-    vertices: Tensor
-    force: Tensor
-    pressure: Tensor
-
-    def known(self, frames: Tensor) -> "StandardDeviations":
-        """The same, NaN but in `frames [B]`, bool."""
-        rows = ((value, frames.reshape(-1, *(1,) * (value.ndim - 1))) for value in self)
-        return StandardDeviations(*(torch.where(row, value, torch.nan) for value, row in rows))
 
 
 class LinearisedSolution(NamedTuple):

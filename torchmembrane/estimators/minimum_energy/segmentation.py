@@ -14,11 +14,16 @@ from torch import Tensor, nn
 from ...camera.model import Rays
 from ...control_flow import traced
 from ...surface.membrane import Membrane
-from ..base import CONTACT_POINTS, Contacts
-from ..contacts import ContactPatches
-from ..regions import persistent_regions
+from ..contacts import (
+    CONTACT_POINTS,
+    LEAST_BULGE,
+    ContactPatches,
+    Contacts,
+    bulge_inwards,
+    bulge_regions,
+    region_centroids,
+)
 
-LEAST = 1e-3  # smallest peak that is a contact, over the surface's size
 DIVERGENT = 0.9  # outward share of the angular flow above which it diverges everywhere: the contact is on the axis
 ON_AXIS = 0.1  # radius of the region then, over the surface's size
 
@@ -132,42 +137,26 @@ class Segmentation(nn.Module):
     def contacts(self, x: Tensor, normals: Tensor) -> Contacts:
         """`by_normals` as results have it, 1 in a contact, else 0; the surface's `normals [B, V, 3]` are at hand."""
         regions = self._inside(x, normals)
-        indicator, numbers = (regions.region > 0).to(x.dtype), torch.arange(1, self.count + 1, device=x.device)
-        mine = (regions.region[:, None] == numbers[:, None]).to(x.dtype)
-        contacts: Contacts = self.patches(x, normals, -normals, indicator, regions.points, mine)  # as if pushed evenly
-        return contacts._replace(force=torch.nan * contacts.force, slip=torch.nan * contacts.slip)
+        return self.patches.of_regions(x, normals, regions.region, regions.points)
 
     def divergence(self, directions: Tensor) -> Tensor:
         """Outward share of the angular flow, `[B]`: 1 where every ray turns away from the axis, -1 where all turn to it."""
         turned = torch.linalg.vector_norm(directions - self.rest_directions, dim=-1)
         reach: Tensor = self.polar.range * ~self.membrane.fixed
-        least = LEAST * self.membrane.size
+        least = LEAST_BULGE * self.membrane.size
         outward: Tensor = -(reach * self.polar.change(directions)).sum(-1) / (reach * turned).sum(-1).clamp_min(least)
         return outward
 
     def _inside(self, x: Tensor, normals: Tensor) -> ContactRegions:
-        normal = torch.nn.functional.normalize(normals + self.membrane.rest_normals, dim=-1)
-        bulge = -((x - self.membrane.rest) * normal).sum(-1)
+        bulge = bulge_inwards(x, normals, self.membrane)
         return self._where(x, bulge, torch.nn.functional.normalize(x - self.rest_origins, dim=-1))
 
     def _where(self, x: Tensor, bulge: Tensor, directions: Tensor) -> ContactRegions:
         """The regions of `bulge [B, V]` on `x [B, V, 3]`, or where the flow diverges everywhere the axis'."""
         divergent = (self.divergence(directions) > DIVERGENT)[:, None] & self.axis_in_view
-        region = torch.where(divergent, self.axis_region, self._regions(bulge))
+        region = torch.where(divergent, self.axis_region, bulge_regions(bulge, self.membrane, self.count))
         weight = torch.where(divergent, torch.ones_like(bulge), bulge.clamp_min(0))
-        return ContactRegions(bulge, region, self._centroids(x, region, weight))
-
-    def _regions(self, bulge: Tensor) -> Tensor:
-        on_grid = bulge.float().unflatten(-1, self.membrane.grid)  # which of them is higher: single precision tells
-        regions: Tensor = persistent_regions(on_grid, self.count, LEAST * self.membrane.size).flatten(1)
-        return regions
-
-    def _centroids(self, x: Tensor, region: Tensor, bulge: Tensor) -> Tensor:
-        weight = bulge * self.membrane.rest_area
-        numbers = torch.arange(1, self.count + 1, device=x.device)
-        weight = weight[:, None] * (region[:, None] == numbers[:, None])
-        centroids: Tensor = weight @ x / weight.sum(-1, keepdim=True)
-        return centroids
+        return ContactRegions(bulge, region, region_centroids(x, region, weight, self.membrane, self.count))
 
 
 def _axis_region(membrane: Membrane) -> Tensor:

@@ -2,7 +2,7 @@
 
 from typing import Any, ClassVar, Self
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from ...camera.model import Camera, Rays
 from ...errors import MembraneError
@@ -10,12 +10,13 @@ from ...mechanics.affine_quadrilateral import AffineQuadrilaterals
 from ...mechanics.cavity import CavityLaw, rest_balance
 from ...mechanics.hyperelastic import ElasticEnergy
 from ...surface.membrane import Membrane
-from ..base import Contacts, Deviations, Equilibrium, Observation, Problem
+from ..base import Equilibrium, Estimator, Observation, Problem
+from ..contacts import Contacts
 from .flow import FlowInterpolation, VertexFlow
 from .segmentation import Segmentation
 
 
-class VertexRays(nn.Module):
+class VertexRays(Estimator):
     """Rest state, flow and contacts of an estimator whose unknowns are the ranges `t_k`, `x_k = o_k + t_k d_k`.
 
     The rest load `h = grad U(X) - p0 grad V(X)` is subtracted, so that zero flow gives exactly zero displacement.
@@ -29,9 +30,7 @@ class VertexRays(nn.Module):
         flow: what carries the markers' pixels to the grid's vertices; `prepare` alone needs it.
     """
 
-    finds_tractions: ClassVar[bool] = False
-    Settings: ClassVar[Any]
-    settings: Any
+    in_parts: ClassVar[bool] = True
     rest_range: Tensor
     rest_load: Tensor
     free: Tensor
@@ -45,18 +44,17 @@ class VertexRays(nn.Module):
         gas: tuple[float, float] | None,
         flow: VertexFlow | None,
     ):
-        super().__init__()
-        self.membrane, self.energy, self.flow = membrane, energy, flow
-        self.segmentation = Segmentation(membrane, rest_rays)
         rest_pressure, rest_load = rest_balance(membrane, energy)
-        self.cavity = CavityLaw(membrane, rest_pressure, filling, gas)
+        super().__init__(membrane, CavityLaw(membrane, rest_pressure, filling, gas))
+        self.energy, self.flow = energy, flow
+        self.segmentation = Segmentation(membrane, rest_rays)
         origins, directions = rest_rays
         self.register_buffer("rest_range", ((membrane.rest - origins) * directions).sum(-1))
         self.register_buffer("rest_load", rest_load.mT.contiguous().mT)  # as forces come: components first in memory
         self.register_buffer("free", (~membrane.fixed).double())
 
     @classmethod
-    def of(cls, problem: Problem, settings: Any = None) -> Self:
+    def from_problem(cls, problem: Problem, settings: Any = None) -> Self:
         """The estimator of a sensor; settings as for the class."""
         settings = settings or cls.Settings()
         rays = problem.camera.pixel_to_ray(problem.vertex_pixels)
@@ -70,11 +68,6 @@ class VertexRays(nn.Module):
         """The flow between the sensor's markers, here smooth."""
         return FlowInterpolation(problem.membrane, problem.markers)
 
-    @property
-    def rest_pressure(self) -> Tensor:
-        """Pressure difference across the membrane at rest, `[]`, force unit per length unit squared."""
-        return self.cavity.rest_pressure
-
     def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
         """The rays of the grid's vertices, moved by the flow of the markers seen at `pixels [B, D, 2]`; all are as sure."""
         if self.flow is None:
@@ -83,14 +76,6 @@ class VertexRays(nn.Module):
             )
         return Observation(*camera.pixel_to_ray(self.flow(pixels, confidence)), confidence)
 
-    def is_explained(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: always, for the surface is on every ray."""
-        return ~found.misfit.isnan()
-
     def contacts(self, found: Equilibrium, normals: Tensor) -> Contacts:
         """Where the membrane bulges in along its `normals [B, V, 3]` (section 5.1)."""
         return self.segmentation.contacts(found.vertices, normals)
-
-    def deviations(self, found: Equilibrium, observation: Observation, contacts: Contacts) -> Deviations:
-        """NaN: without tractions nothing is known of them."""
-        return Deviations.unknown(found)

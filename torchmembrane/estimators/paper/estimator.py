@@ -118,9 +118,8 @@ class PaperEstimator(VertexRays):
         part of the depth. Of a press on the optical axis it finds next to none: the contact is then a disc around the axis.
     """
 
-    element: ClassVar[str] = "quadrilateral"
-    volume: ClassVar[str] = "linear"
     Settings: ClassVar[type[PaperSettings]] = PaperSettings
+    default_locator: ClassVar[str] = "soft"
     settings: PaperSettings
     energy: AffineQuadrilaterals
 
@@ -151,9 +150,14 @@ class PaperEstimator(VertexRays):
         return self.settings.flow
 
     @property
-    def smoothing_weight(self) -> float:
-        """The weight of the smoother of eq. 28."""
-        return self.settings.smoothing
+    def element(self) -> str:
+        """The paper's affine quadrilaterals."""
+        return "quadrilateral"
+
+    @property
+    def volume(self) -> str:
+        """Linearised once, at the rest ranges (eq. 21)."""
+        return "linear"
 
     def forward(self, observation: Observation) -> Equilibrium:
         """The surface on the rays of the grid's vertices.

@@ -10,6 +10,7 @@ import numpy as np
 
 from ....machine_code import aligned, compiled
 from ....mechanics.native_membrane import STENCIL, Surface
+from ....solve.band import RIDGES
 from ....solve.native_band import LANES, RANK, ROWS, storage
 from ....solve.stencil_layouts import OFFSETS
 from ..robust import geman_mcclure_curvature, geman_mcclure_weight
@@ -109,6 +110,8 @@ class Workspace(NamedTuple):
     """`[11, 3 N]`"""
     y: Any
     """`[12 x 3 N]`, loads, and then what `native_band` makes of them; the last zero."""
+    ridges: Any
+    """`band.RIDGES`: a loop over an array is compiled once, over a tuple once for each of its numbers."""
     width: int
     """Diagonals of the matrix above the main one."""
 
@@ -123,6 +126,7 @@ def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
     shapes |= dict(marker_weights=(markers,), inverse=(unknowns,), panel=(RANK * ld,), scale=(unknowns,))
     arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
     y = aligned(-(-LOADS // ROWS) * ROWS * unknowns, dtype)
+    arrays |= dict(ridges=np.array(RIDGES, dtype))
     return Workspace(U=aligned(rows * ld, dtype), y=y, loads=np.zeros((LOADS, unknowns), dtype), width=width, **arrays)
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from ....machine_code import compiled
 from ....mechanics.cavity import gas_law_step
 from ....mechanics.native_membrane import linearise
-from ....solve.band import RIDGES
 from ....solve.native_band import RANK, ROWS, backward, factor
 from ....solve.symmetric_2x2 import symmetric_solution
 from ..camera_motion import camera_stiffness
@@ -26,12 +25,12 @@ def step(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales)
     m, n = c.surface.free.shape
     rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
     own, slope = np.zeros((4, 4)), np.zeros(4)
-    weigh(c, work, weights, noise_level, tau, cone, renewal, False)
+    weigh(c, work, weights, noise_level, tau, cone, renewal, np.bool_(False))
     fWv, vWv = load_forces(c, work)
     load_markers(c, work, u, moved, seen, outlier, own, slope)
     sum_blocks(c, work)
     size, y = len(work.scale), work.y
-    products = factored(c, work, damping, WANTED)
+    products = factored(c, work, damping, np.intp(WANTED))
     following = _camera_eliminated(c.numbers, products, own, slope, moved, tau)
     multiplier, one, change = _shares(c.numbers, products, rise, pressure[0], fWv, vWv, gauge)
     solved, turn = y[:size], np.empty_like(moved)
@@ -57,11 +56,12 @@ def step(c, work, u, pressure, moved, weights, seen, noise_level, gauge, scales)
 def factored(c, work, damping, used):
     """The matrix factored, of so many loads `b` the `U^-T b` in `y`; their products `b . M^-1 b'`, `[LOADS, LOADS]`."""
     width, size, y = work.width, len(work.scale), work.y
-    for ridge in RIDGES:
-        fill(c, work, damping, ridge, used)
-        if factor(work.U, len(work.panel) // RANK, width, size, work.inverse, work.panel, y, -(-used // ROWS) * ROWS):
-            break
-    else:
+    tried, found = 0, False
+    while not found and tried < len(work.ridges):
+        fill(c, work, damping, work.ridges[tried], used)
+        found = factor(work.U, len(work.panel) // RANK, width, size, work.inverse, work.panel, y, -(-used // ROWS) * ROWS)
+        tried += 1
+    if not found:
         y[:] = np.nan
     products = np.zeros((LOADS, LOADS))
     for a in range(used):
@@ -91,11 +91,11 @@ def stiffness_at(k, moved, tau):
 @compiled
 def eliminated(system):
     """Solutions of `[A b] [4, 4 + n]`, in the columns of `b`."""
-    for a in range(4):
+    for a in range(len(system)):
         pivot = system[a, a]
         for e in range(system.shape[1]):
             system[a, e] /= pivot
-        for b in range(4):
+        for b in range(len(system)):
             share = system[b, a] if b != a else 0.0
             for e in range(system.shape[1]):
                 system[b, e] -= share * system[a, e]

@@ -17,12 +17,12 @@ def spread_of(c, work, u, pressure, moved, weights, seen, noise_level, gauge, sc
     """Standard deviations `[4]` at the state of a frame."""
     own, slope, size = np.zeros((4, 4)), np.zeros(4), len(work.scale)
     rise = linearise(c.surface, u, pressure, work.force, work.A, work.volume) - c.numbers.rest_volume
-    weigh(c, work, weights, noise_level, scales[0], scales[2], scales[3], True)
+    weigh(c, work, weights, noise_level, scales[0], scales[2], scales[3], np.bool_(True))
     vWv = load_forces(c, work)[1] + gauge[1]
     load_markers(c, work, u, moved, seen, scales[1], own, slope)
     by_pressure = _load_wanted(c, work, u)
     sum_blocks(c, work)
-    products = factored(c, work, scales[4], LOADS)
+    products = factored(c, work, scales[4], np.intp(LOADS))
     for a in range(4):
         own[a, a] += stiffness_at(c.numbers, moved, scales[0])
     following = _camera_eased(products, own)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ....machine_code import fingerprint, kept
+from ....machine_code import Kept, fingerprint, is_used, kept
 from ....mechanics import cavity, native_membrane
 from ....mechanics.cavity import CavityLaw
 from ....mechanics.native_membrane import Surface, surface_of
@@ -92,7 +92,8 @@ class NativeSteps:
                 work = self._idle[dtype].pop()
             except IndexError:
                 work = workspace(grid, len(constants.positions), dtype)
-            frames(constants, work, *part[:-1], rows, part[-1])
+            with compiled.compiling(np.dtype(dtype)):
+                frames(constants, work, *part[:-1], rows, part[-1])
             self._idle[dtype].append(work)
 
         if threads <= 1:
@@ -113,13 +114,14 @@ class NativeSteps:
 
 
 def takes(*values: Any) -> bool:
-    """Whether steps of these tensors can be taken: on a processor, alone, without gradients."""
+    """Whether steps of these tensors are taken by machine code: on a processor, alone, without gradients."""
     tensors = [value for value in values if value is not None]
     return (
         not torch.compiler.is_compiling()
+        and is_used()
         and all(type(value) is Tensor and value.device.type == "cpu" for value in tensors)
         and not (torch.is_grad_enabled() and any(value.requires_grad for value in tensors))
-        and not any(torch._C._functorch.is_functorch_wrapped_tensor(value) for value in tensors)
+        and all(torch.func.debug_unwrap(value, recurse=False) is value for value in tensors)
     )
 
 
@@ -210,10 +212,11 @@ def _entry(sources: str) -> Any:
     return frames
 
 
-frames = _entry(
-    fingerprint(
-        __file__,
-        *(each.__file__ for each in (camera_motion, cavity, equations, gauss_newton, native_band, native_membrane)),
-        *(each.__file__ for each in (robust, spread, symmetric_2x2)),
-    )
+SOURCES = fingerprint(
+    __file__,
+    *(each.__file__ for each in (camera_motion, cavity, equations, gauss_newton, native_band, native_membrane)),
+    *(each.__file__ for each in (robust, spread, symmetric_2x2)),
 )
+frames = _entry(SOURCES)
+compiled = Kept(frames, SOURCES)
+"""For which precisions `frames` has been compiled."""

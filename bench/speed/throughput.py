@@ -1,0 +1,62 @@
+"""Frames a second from image files to results in the steady state: one thread of one process, and worker processes.
+
+    OMP_NUM_THREADS=1 python -m bench.speed.throughput SENSOR.toml IMAGE [--workers 2] [--frames 300] [--format parquet]
+
+Runs the command on copies of an image, once on N and once on 3 N of them; the rate is that of the difference, so that starting
+does not count. Processor time, of all processes together, is given beside the time on the clock: on a shared machine it alone
+says what the work costs.
+"""
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+
+def timed(command: list[str]) -> tuple[float, float]:
+    """Seconds on the clock, and of processors."""
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run(command, check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return time.perf_counter() - start, spent
+
+
+def main() -> None:
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    parser.add_argument("sensor")
+    parser.add_argument("image", type=Path)
+    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--format", default="parquet")
+    arguments = parser.parse_args()
+    with TemporaryDirectory() as name:
+        folder, few, many = Path(name), arguments.frames, 3 * arguments.frames
+        for count in (few, many):
+            (folder / str(count)).mkdir()
+            for k in range(count):
+                shutil.copy(arguments.image, folder / str(count) / f"k{k:05d}{arguments.image.suffix}")
+        rates = []
+        for workers in (1, arguments.workers):
+            times = []
+            for count in (few, many):
+                out = folder / f"out{workers}_{count}"
+                base = [sys.executable, "-m", "torchmembrane", "reconstruct", arguments.sensor, str(folder / str(count))]
+                times.append(timed([*base, "--out", str(out), "--format", arguments.format, "--workers", str(workers)]))
+            clock, spent = (b - a for a, b in zip(*times, strict=True))
+            rates.append((many - few) / clock)
+            print(
+                f"{workers} worker(s): {rates[-1]:5.1f} frames/s, {1000 * spent / (many - few):5.1f} ms of processor a frame, "
+                f"{spent / clock:.2f} cores busy, start {times[0][0] - few / rates[-1]:.1f} s",
+                flush=True,
+            )
+        print(f"{rates[1] / rates[0]:.2f} times as fast; load of the machine {os.getloadavg()[0]:.1f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,140 @@
+"""The private parts of torch on which the export depends; no other file of the package uses any.
+
+With public functions alone, `torch.export.export` and `torch.onnx.export`, the models are the same, but an export takes several
+times as long. Private parts may change with every version of torch: `CHECKED` are the versions with which they were tried, and
+`tests/test_torch_internals.py` names each one that is missing or works differently.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import cached_property, partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..errors import MembraneError
+
+CHECKED = ("2.13.0",)
+"""Versions of torch."""
+
+try:
+    from torch._subclasses.fake_tensor import FakeTensorMode
+    from torch.export import _trace
+    from torch.export.exported_program import (
+        _override_composite_implicit_decomp,
+        _split_decomp_table_to_cia_and_python_decomp,
+    )
+    from torch.onnx._internal.exporter import _fx_passes
+    from torch.onnx._internal.exporter._decomp import (
+        create_onnx_friendly_decomposition_table,
+        get_onnx_implemented_overloads,
+    )
+    from torch.onnx._internal.exporter._registration import ONNXRegistry
+    from torch.onnx._internal.fx.passes.type_promotion import _TypePromotionInterpreter, get_type_promotion_rule
+    from torch.utils._pytree import tree_flatten, tree_leaves, tree_map, tree_unflatten
+except ImportError as error:
+    if not (error.name or "").startswith("torch"):
+        raise  # onnxscript is not installed
+    raise MembraneError(
+        f"export: torch {torch.__version__} lacks a private part that the export needs ({error}); expected a version with "
+        f"which it was tried: {', '.join(CHECKED)}"
+    ) from error
+
+__all__ = ["CHECKED", "TorchExporter", "empty_batches", "replaced", "tree_flatten", "tree_leaves", "tree_map", "tree_unflatten"]
+
+
+def empty_batches(values: Iterable[Tensor], frames: int) -> tuple[Tensor, ...]:
+    """Tensors to trace with, that take no memory: like the values, but so many frames long (scalars have none)."""
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        return tuple(
+            torch.empty(frames, *value.shape[1:], dtype=value.dtype) if value.ndim else torch.empty_like(value)
+            for value in values
+        )
+
+
+@contextmanager
+def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """Give a module or a class another value of one of its names, and then the old one back.
+
+    Raises:
+        MembraneError: it has no such name of its own.
+    """
+    if name not in vars(owner):
+        raise MembraneError(
+            f"export: torch {torch.__version__} has no {owner.__name__}.{name}, which the export replaces; expected a version "
+            f"with which it was tried: {', '.join(CHECKED)}"
+        )
+    before = vars(owner)[name]
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, before)
+
+
+class TorchExporter:
+    """Torch's exporter to ONNX without the work that it repeats for every model.
+
+    Args:
+        translations: by operator of torch, a function that writes it in ONNX, in place of torch's own.
+    """
+
+    def __init__(self, translations: dict[Any, Callable[..., Any]]) -> None:
+        self.translations = translations
+        self._registries: dict[Any, ONNXRegistry] = {}
+        self._from_torchlib = ONNXRegistry.from_torchlib
+
+    def _registry(self, **options: Any) -> ONNXRegistry:
+        """The operators of torch's exporter and the translations. Torch reads them anew for every model, a second each."""
+        key = tuple(options.items())
+        if key not in self._registries:
+            self._registries[key] = self._from_torchlib(**options)
+            for operator, translation in self.translations.items():
+                self._registries[key].register_op(operator, translation)
+        return self._registries[key]
+
+    @cached_property
+    def _decompositions(self) -> tuple[dict[Any, Any], ...]:
+        """What operators that ONNX lacks are made of: composite ones, and others."""
+        table: dict[Any, Any] = create_onnx_friendly_decomposition_table(set(get_onnx_implemented_overloads(self._registry())))
+        return _split_decomp_table_to_cia_and_python_decomp(table)
+
+    def captured(self, module: nn.Module, examples: tuple[Tensor, ...]) -> torch.export.ExportedProgram:
+        """The module as a program of operators that ONNX has.
+
+        Torch's exporter captures a program of its own operators first, and decomposes these in a second step.
+        """
+        kept, decomposed = self._decompositions
+        at_once = partial(_trace._export_to_aten_ir, decomp_table=decomposed)
+        with replaced(_trace, "_export_to_aten_ir", at_once), _override_composite_implicit_decomp(kept):
+            return _trace._export(module, examples, strict=False, pre_dispatch=False)
+
+    @contextmanager
+    def at_work(self) -> Iterator[None]:
+        """Within, `torch.onnx.export` of a program that is `captured` leaves out what it would repeat."""
+        with ExitStack() as stack:
+            for owner, name, value in (
+                (ONNXRegistry, "from_torchlib", staticmethod(self._registry)),
+                (_TypePromotionInterpreter, "run_node", _promoted),
+                (_fx_passes, "decompose_with_registry", _as_it_is),
+            ):
+                stack.enter_context(replaced(owner, name, value))
+            yield
+
+
+def _as_it_is(program: torch.export.ExportedProgram, registry: ONNXRegistry) -> torch.export.ExportedProgram:
+    """A program that is `captured`, decomposed already."""
+    return program
+
+
+def _promoted(interpreter: _TypePromotionInterpreter, node: torch.fx.Node) -> Any:
+    """The exporter's pass that gives the operands of a node one type; torch's also computes again what it leaves as it is, a
+    fifth of the time of tracing."""
+    if node.op != "call_function":
+        return torch.fx.Interpreter.run_node(interpreter, node)
+    with interpreter._set_current_node(node):
+        rule = get_type_promotion_rule(node, interpreter.type_promotion_table)
+        if rule is not None:
+            interpreter._maybe_promote_node(node, rule)
+    return node.meta.get("val")
