@@ -8,7 +8,7 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.solve.stencil import FEW, apply_stencil, convolved_by_product
-from torchmembrane.solve.symmetric_2x2 import symmetric_adjugate_product, symmetric_determinant
+from torchmembrane.solve.symmetric_2x2 import symmetric_adjugate_product, symmetric_determinant, symmetric_solution
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import disc_grid, ellipsoid_cap, half_cylinder, heightfield, spherical_cap
 from torchmembrane.surface.tangent import tangent_axes, tangent_frame
@@ -293,7 +293,8 @@ def test_symmetric_closed_forms_solve_their_systems():
     a, b, c, u, v = rng.normal(size=(5, 40))
     matrix = np.stack([np.stack([a, b], -1), np.stack([b, c], -1)], -2)
     solved = np.stack(symmetric_adjugate_product(a, b, c, u, v), -1) / symmetric_determinant(a, b, c)[:, None]
-    np.testing.assert_allclose((matrix @ solved[..., None])[..., 0], np.stack([u, v], -1), atol=1e-9)
+    for x in (solved, np.stack(symmetric_solution(a, b, c, u, v), -1)):
+        np.testing.assert_allclose((matrix @ x[..., None])[..., 0], np.stack([u, v], -1), atol=1e-9)
 
 
 def test_a_convolution_by_product_is_one():

@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from .symmetric_2x2 import symmetric_solution
+
 
 class ConstrainedMinimum(NamedTuple):
     """`y [..., N]` and the multiplier `[...]`; the fluid's pressure is minus the multiplier."""
@@ -75,10 +77,8 @@ def border_unknowns(
     """`lambda` and `r` of `solve_bordered`, `[...]` each, from the products of the loads (rows) with their solutions, `[..., 3,
     3]`, and the other arguments."""
     nMn, nMg, nMm, _, _, _, _, mMg, mMm = products.flatten(-2).unbind(-1)
-    a11, a12, a22 = corner - mMm, compliance - nMm, -nMn
-    b1, b2 = load + mMg, target + nMg
-    det = a11 * a22 - a12 * a12
-    return (a11 * b2 - a12 * b1) / det, (b1 * a22 - a12 * b2) / det
+    rise, multiplier = symmetric_solution(corner - mMm, compliance - nMm, -nMn, load + mMg, target + nMg)
+    return multiplier, rise
 
 
 def _dot(p: Tensor, q: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ surface. With the angles' derivatives `K` in it, a step solves
 by the factor of `M`: with `d = -M^-1 (g + B' dm)` the second row is `(T - B M^-1 B') dm = B M^-1 g - k`.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -17,8 +17,28 @@ from torch import Tensor
 
 from ...solve.elimination import solve_dense
 
+Scalar = TypeVar("Scalar", float, Tensor)
+
 RARE = 100.0
 """How much less likely a camera moves than that it stays, a power: a tenfold motion has a likelihood `10^-RARE` times."""
+
+
+def camera_stiffness(play: Any, moved2: Scalar) -> Scalar:
+    """The weight of the parabola that touches the loss `RARE / 2 log(play^2 + |m|^2)` of a motion `m` with `|m|^2 = moved2`.
+
+    Args:
+        play: px, below which a motion hardly counts.
+        moved2: px^2, `[...]`.
+
+    Returns:
+        1 / px^2, `[...]`.
+
+    Example:
+        >>> camera_stiffness(3.0, 16.0)
+        4.0
+    """
+    stiffness: Scalar = RARE / (play**2 + moved2)
+    return stiffness
 
 
 class CameraMotion(NamedTuple):
@@ -31,7 +51,7 @@ class CameraMotion(NamedTuple):
     def held(self, moved: Tensor, play: float | Tensor) -> "CameraMotion":
         """With the loss `RARE / 2 log(play^2 + |moved|^2)` of what has `moved [B, 4]`: a camera rarely moves, and then by any
         amount."""
-        stiffness = RARE / (play**2 + moved.square().sum(-1))
+        stiffness = camera_stiffness(play, moved.square().sum(-1))
         one = torch.eye(4, dtype=moved.dtype, device=moved.device)
         own, slope = self.own + stiffness[:, None, None] * one, self.slope + stiffness[:, None] * moved
         return CameraMotion(self.coupling, own, slope)

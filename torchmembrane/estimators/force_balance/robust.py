@@ -7,9 +7,33 @@ non-convexity (GNC): the problem begins quadratic.
 Reference: Barron 2019, A general and adaptive robust loss function; Blake and Zisserman 1987, Visual reconstruction.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from torch import Tensor
+
+Scalar = TypeVar("Scalar", float, Tensor)
+
+
+def geman_mcclure_weight(ratio: Scalar) -> Scalar:
+    """`loss'(r) / r` of Geman and McClure's loss, from `ratio = r^2 / s^2`, `[...]`; in 0..1.
+
+    Example:
+        >>> geman_mcclure_weight(1.0)
+        0.25
+    """
+    weight: Scalar = (1 + ratio) ** -2
+    return weight
+
+
+def geman_mcclure_curvature(ratio: Scalar) -> Scalar:
+    """`loss''(r)` of Geman and McClure's loss, from `ratio = r^2 / s^2`, `[...]`; negative beyond `ratio = 1/3`.
+
+    Example:
+        >>> geman_mcclure_curvature(1.0)
+        -0.25
+    """
+    curvature: Scalar = (1 - 3 * ratio) / (1 + ratio) ** 3
+    return curvature
 
 
 class GemanMcClure(NamedTuple):
@@ -32,12 +56,11 @@ class GemanMcClure(NamedTuple):
 
     def weight(self, r2: Tensor) -> Tensor:
         """The weight, of the shape of `r2`, in 0..1."""
-        return (1 + r2 / self.scale**2) ** -2
+        return geman_mcclure_weight(r2 / self.scale**2)
 
     def curvature(self, r2: Tensor) -> Tensor:
         """The second derivative in `r`, zero where it is negative."""
-        ratio = r2 / self.scale**2
-        return (1 - 3 * ratio).clamp_min(0) / (1 + ratio) ** 3
+        return geman_mcclure_curvature(r2 / self.scale**2).clamp_min(0)
 
 
 class Cauchy(NamedTuple):

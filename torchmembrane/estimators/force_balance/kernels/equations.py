@@ -13,8 +13,10 @@ from ....mechanics.native_membrane import STENCIL, Surface
 from ....solve.band import RIDGES
 from ....solve.native_band import LANES, RANK, ROWS, storage
 from ....solve.stencil_layouts import OFFSETS
+from ..robust import geman_mcclure_curvature, geman_mcclure_weight
 from ..traction_loss import POWER, TINY
 
+curvature_of_push, weight_of_push = compiled(geman_mcclure_curvature), compiled(geman_mcclure_weight)
 BETWEEN = tuple(tuple(OFFSETS.index((b[0] - a[0], b[1] - a[1])) if b >= a else -1 for b in STENCIL) for a in STENCIL)
 """Of two vertices of a stencil, the offset from one to a later one."""
 VOLUME, FORCES, FLUID, CAMERA, WANTED = 0, 1, 2, 3, 7
@@ -166,7 +168,7 @@ def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
         rho2 = min(max(expected / k.last_tau**2, least), 1.0)
         pushed = push2[i] / rho2
         ratio = pushed / tau**2
-        of_push = max(1 - 3 * ratio, 0.0) / (1 + ratio) ** 3 if curvature else 1 / (1 + ratio) ** 2
+        of_push = max(curvature_of_push(ratio), 0.0) if curvature else weight_of_push(ratio)
         w_n = k.floor + (of_push if q_n[i] < 0 else 1.0)
         w_n = before[i] * (w_n / before[i]) ** renewal
         w_t = k.friction / (1 + cone * np.sqrt(pushed + k.slip**4)) / np.sqrt(shear2[i] / rho2 + k.slip**2)

@@ -10,10 +10,11 @@ from ....machine_code import compiled
 from ....mechanics.cavity import gas_law_step
 from ....mechanics.native_membrane import linearise
 from ....solve.native_band import RANK, ROWS, backward, factor
-from ..camera_motion import RARE
+from ....solve.symmetric_2x2 import symmetric_solution
+from ..camera_motion import camera_stiffness
 from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, load_markers, sum_blocks, weigh
 
-gas_step = compiled(gas_law_step)
+gas_step, solution_2x2, stiffness_of_camera = compiled(gas_law_step), compiled(symmetric_solution), compiled(camera_stiffness)
 
 
 @compiled
@@ -81,10 +82,10 @@ def substituted(work, solved):
 
 
 @compiled
-def camera_stiffness(k, moved, tau):
-    """Of `CameraMotion.held`."""
+def stiffness_at(k, moved, tau):
+    """The camera's stiffness at a scale `tau` of the tractions' loss."""
     play = k.camera_motion * (min(tau, k.first_tau) / k.last_tau) ** 2
-    return RARE / (play**2 + moved[0] ** 2 + moved[1] ** 2 + moved[2] ** 2 + moved[3] ** 2)
+    return stiffness_of_camera(play, moved[0] ** 2 + moved[1] ** 2 + moved[2] ** 2 + moved[3] ** 2)
 
 
 @compiled
@@ -104,7 +105,7 @@ def eliminated(system):
 def _camera_eliminated(k, products, own, slope, moved, tau):
     """`CameraMotion.held` and `eliminated`: how the camera follows each load, `[4, 3]`; the loads' products become those with
     it."""
-    stiffness, system = camera_stiffness(k, moved, tau), np.empty((4, 7))
+    stiffness, system = stiffness_at(k, moved, tau), np.empty((4, 7))
     for a in range(4):
         for b in range(4):
             system[a, b] = own[a, b] - products[CAMERA + a, CAMERA + b]
@@ -143,9 +144,9 @@ def cavity_condition(k, rise, pressure):
 @compiled
 def border_unknowns(products, vWv, compliance, of_fluid, of_volume):
     """`kkt.border_unknowns`: the volume's multiplier and the pressure's change, from what is on the right of their rows."""
-    a11, a12, a22 = vWv - products[FLUID, FLUID], compliance - products[VOLUME, FLUID], -products[VOLUME, VOLUME]
-    det = a11 * a22 - a12 * a12
-    return (a11 * of_volume - a12 * of_fluid) / det, (of_fluid * a22 - a12 * of_volume) / det
+    corner, beside = vWv - products[FLUID, FLUID], compliance - products[VOLUME, FLUID]
+    change, multiplier = solution_2x2(corner, beside, -products[VOLUME, VOLUME], of_fluid, of_volume)
+    return multiplier, change
 
 
 @compiled

@@ -9,7 +9,7 @@ import numpy as np
 from ....machine_code import compiled
 from ....mechanics.native_membrane import linearise
 from .equations import CAMERA, FLUID, LOADS, VOLUME, WANTED, load_forces, load_markers, sum_blocks, weigh
-from .gauss_newton import border_unknowns, camera_stiffness, cavity_condition, eliminated, factored, substituted
+from .gauss_newton import border_unknowns, cavity_condition, eliminated, factored, stiffness_at, substituted
 
 
 @compiled
@@ -24,7 +24,7 @@ def spread_of(c, work, u, pressure, moved, weights, seen, noise_level, gauge, sc
     sum_blocks(c, work)
     products = factored(c, work, scales[4], np.intp(LOADS))
     for a in range(4):
-        own[a, a] += camera_stiffness(c.numbers, moved, scales[0])
+        own[a, a] += stiffness_at(c.numbers, moved, scales[0])
     following = _camera_eased(products, own)
     compliance, solved = cavity_condition(c.numbers, rise, pressure[0])[1], np.empty(size, u.dtype)
     for k in range(WANTED, LOADS):

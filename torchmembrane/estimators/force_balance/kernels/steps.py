@@ -13,8 +13,9 @@ from ....machine_code import Kept, fingerprint, is_used, kept
 from ....mechanics import cavity, native_membrane
 from ....mechanics.cavity import CavityLaw
 from ....mechanics.native_membrane import Surface, surface_of
-from ....solve import native_band
+from ....solve import native_band, symmetric_2x2
 from ....solve.stencil import inner
+from .. import camera_motion, robust
 from ..marker_residuals import Bearings
 from ..normal_equations import DAMPING, BalanceEquations
 from . import equations, gauss_newton, spread
@@ -213,7 +214,8 @@ def _entry(sources: str) -> Any:
 
 SOURCES = fingerprint(
     __file__,
-    *(each.__file__ for each in (cavity, equations, gauss_newton, native_band, native_membrane, spread)),
+    *(each.__file__ for each in (camera_motion, cavity, equations, gauss_newton, native_band, native_membrane)),
+    *(each.__file__ for each in (robust, spread, symmetric_2x2)),
 )
 frames = _entry(SOURCES)
 compiled = Kept(frames, SOURCES)
