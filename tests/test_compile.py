@@ -54,7 +54,7 @@ def test_the_compiled_reconstruction_is_one_graph_and_agrees(estimator, settings
         if reconstructor.finds_tractions:
             reading = {"pressure": 1.1 * expected.pressure}
             pairs.append((compiled(images, expected, **reading), reconstructor(images, expected, **reading)))
-    assert expected.displacement.norm(dim=-1).max() > 0.5
+    assert expected.displacement.norm(dim=-1).max() > 0.1
     for got, want in pairs:
         for key, value in want._asdict().items():
             torch.testing.assert_close(got._asdict()[key], value, rtol=1e-6, atol=1e-6, equal_nan=True)
