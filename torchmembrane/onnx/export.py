@@ -29,7 +29,7 @@ from .torch_internals import tree_flatten, tree_leaves, tree_map, tree_unflatten
 from .trace import traced_model
 
 FORMAT = 1
-CHECK, PIECES = 0.8, 30  # share of the time before the check, and pieces, of the default estimator, measured
+CHECK, PIECES = 0.8, 36  # share of the time before the check, and how many pieces, roughly, of the default estimator
 EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
 
 
@@ -120,7 +120,7 @@ class Tracer:
             self.assembly.part = type(owner).__module__.removeprefix("torchmembrane.").partition(".")[0]
         key = (owner, function, str(structure), *fixed.items(), *(value.shape for value in examples.values()))
         if key not in self.traced:
-            self.progress(len(self.traced) / (len(self.traced) + PIECES), getattr(function, "__qualname__", ""))
+            self.progress(min(1.0, len(self.traced) / PIECES), getattr(function, "__qualname__", ""))
             outputs = [f"output {k}" for k, _ in enumerate(value for value in tree_leaves(found) if value is not None)]
             try:
                 self.traced[key] = self._whole(traced_model(Piece(owner, function, arranged), examples, outputs))
