@@ -174,7 +174,7 @@ def test_an_interrupted_sheet_goes_on_from_the_series_that_are_finished(tried, s
     sensor, told = Sensor.from_file(small_sensor / "sensor.toml"), []
 
     def finished():
-        return FinishedSeries.open(tmp_path, "1", sensor, 7, 40.0, TRIED)
+        return FinishedSeries.resumed(tmp_path, "1", sensor, 7, 40.0, TRIED)
 
     whole = spec_sheet(sensor, 7, noise=40.0, effort=TRIED)
     assert len(tried.series) == 4
@@ -196,8 +196,8 @@ def test_series_are_kept_for_the_same_trials_only(small_sensor, tmp_path):
     same = ("1", sensor, 7, 40.0, TRIED)
     others = [("2", *same[1:]), ("1", preset("bubble"), *same[2:]), (*same[:2], 8, *same[3:])]
     others += [(*same[:3], None, TRIED), (*same[:4], TRIED._replace(rest=2))]
-    paths = {FinishedSeries.open(tmp_path, *each).path for each in (same, *others)}
-    assert len(paths) == 1 + len(others) and FinishedSeries.open(tmp_path, *same).path in paths
+    paths = {FinishedSeries.resumed(tmp_path, *each).path for each in (same, *others)}
+    assert len(paths) == 1 + len(others) and FinishedSeries.resumed(tmp_path, *same).path in paths
 
 
 DAMAGED = ["", "[]", '{"0": [[], []]}', '{"a": [[], [], [], ""]}', '{"0": [[[1]], [], [], ""]}', "[" * 9999]
@@ -206,9 +206,9 @@ DAMAGED = ["", "[]", '{"0": [[], []]}', '{"a": [[], [], [], ""]}', '{"0": [[[1]]
 @pytest.mark.parametrize("content", DAMAGED)
 def test_a_damaged_file_of_series_is_refused(content, small_sensor, tmp_path):
     same = (tmp_path, "1", Sensor.from_file(small_sensor / "sensor.toml"), 7, 40.0, TRIED)
-    FinishedSeries.open(*same).path.write_text(content)
+    FinishedSeries.resumed(*same).path.write_text(content)
     with pytest.raises(MembraneError, match="remove the file to begin anew"):
-        FinishedSeries.open(*same)
+        FinishedSeries.resumed(*same)
 
 
 def test_where_nothing_can_be_kept_the_work_goes_on(small_sensor, tmp_path):

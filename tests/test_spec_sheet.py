@@ -349,9 +349,9 @@ def test_an_interrupted_sheet_is_the_same_to_the_last_bit(sensor, sheet, tmp_pat
     strokes = presses.stroke_states
     monkeypatch.setattr(measure, "stroke_states", stop)
     with pytest.raises(KeyboardInterrupt):
-        spec_sheet(sensor, 3, effort=LITTLE, finished=FinishedSeries.open(tmp_path, "1", sensor, 3, None, LITTLE))
+        spec_sheet(sensor, 3, effort=LITTLE, finished=FinishedSeries.resumed(tmp_path, "1", sensor, 3, None, LITTLE))
     monkeypatch.setattr(measure, "stroke_states", strokes)
-    kept = FinishedSeries.open(tmp_path, "1", sensor, 3, None, LITTLE)
+    kept = FinishedSeries.resumed(tmp_path, "1", sensor, 3, None, LITTLE)
     assert list(kept.outcomes) == [0, 1]
     assert repr(spec_sheet(sensor, 3, effort=LITTLE, finished=kept)) == repr(sheet)
 

@@ -28,7 +28,7 @@ class FinishedSeries(NamedTuple):
     outcomes: dict[int, Outcome]
 
     @classmethod
-    def open(
+    def resumed(
         cls, folder: Path, version: str, sensor: Sensor, seed: int, noise: float | None, effort: Effort
     ) -> "FinishedSeries":
         """The file of one spec sheet: another version, sensor, seed, noise or effort has another file.

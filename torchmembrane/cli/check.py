@@ -87,7 +87,7 @@ def _finished(sensor: "Sensor", arguments: Namespace) -> "FinishedSeries":
     from ..accuracy.spec_sheet import Effort
 
     folder = arguments.out.parent if arguments.out else Path()
-    finished = FinishedSeries.open(folder, __version__, sensor, arguments.seed or 0, arguments.noise, Effort())
+    finished = FinishedSeries.resumed(folder, __version__, sensor, arguments.seed or 0, arguments.noise, Effort())
     if finished.outcomes:
         print(
             f"check --accuracy: goes on from {len(finished.outcomes)} finished series in {finished.path}",
