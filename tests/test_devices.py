@@ -10,12 +10,10 @@ import pytest
 import torch
 
 import torchmembrane as tm
-from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 
-FEW = ForceBalanceSettings(steps=2, coarse_steps=2, fine_steps=2, finer_steps=2, settling_steps=2, patience=2)
 CASES = [
-    ("force-balance", dict(settings=FEW)),
-    ("force-balance", dict(settings=FEW, locator="soft")),
+    ("force-balance", {}),
+    ("force-balance", dict(locator="soft")),
     ("minimum-energy", {}),
     ("paper", {}),
 ]
@@ -37,7 +35,7 @@ def test_images_go_through_every_estimator(sensor, estimator, options):
 
 
 def test_frames_are_tracked_gauged_and_taken_from_markers(sensor):
-    reconstructor = tm.Reconstructor(sensor, settings=FEW).to("meta")
+    reconstructor = tm.Reconstructor(sensor).to("meta")
     images = torch.empty(2, 1, 480, 640, device="meta")
     first = reconstructor(images)
     followed = reconstructor(images, first, pressure=torch.empty(2, device="meta"))
