@@ -141,6 +141,13 @@ def test_lambert_s_law_and_vignetting_on_a_flat_plate():
     assert ratio.max() / ratio.min() < 1.001
 
 
+def test_the_corner_farthest_from_the_principal_point_loses_the_share_of_vignetting():
+    camera = Camera("pinhole", (160, 120), (100, 100), (40, 50))
+    pixels = torch.tensor([[40.0, 50.0], [159.5, 119.5], [159.5, -0.5]], dtype=torch.float64)
+    middle, farthest, other = vignette(pixels, camera, 0.3).tolist()
+    assert middle == 1 and farthest == pytest.approx(0.7) and 0.7 < other < 1
+
+
 def test_light_falls_with_the_square_of_the_distance_and_the_cosine():
     up, lights = torch.tensor([[0.0, 0, -1]]), torch.zeros(1, 3)
     near, far = diffuse_light(torch.tensor([[0.0, 0, 2]]), up, lights), diffuse_light(torch.tensor([[0.0, 0, 4]]), up, lights)
