@@ -11,7 +11,7 @@ from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
-from torchmembrane.simulate.appearance import Appearance, blurred, diffuse_light, noisy
+from torchmembrane.simulate.appearance import Appearance, blurred, diffuse_light, noisy, vignette
 from torchmembrane.simulate.pattern import Dots, Painted, Speckle, pattern_of
 from torchmembrane.simulate.raster import visible_triangles
 from torchmembrane.simulate.render import Renderer, render
