@@ -141,6 +141,7 @@ def test_either_winding_gives_the_same_surface(membrane):
     m, n = membrane.grid
     turned = Membrane(membrane.rest.reshape(m, n, 3).numpy().transpose(1, 0, 2))
     torch.testing.assert_close(turned.rest_volume, membrane.rest_volume, rtol=5e-3, atol=0)
+    assert turned.outward == -membrane.outward and turned.cavity_volume == pytest.approx(membrane.cavity_volume, rel=0.1)
     same = turned.rest_normals.reshape(n, m, 3).transpose(0, 1).reshape(-1, 3)
     assert ((same * membrane.rest_normals).sum(-1) > 0.95).all()
 

@@ -68,7 +68,7 @@ def test_elsewhere_than_on_a_terminal_lines_come_at_once_and_then_every_few_seco
         progress(0.25, "force balance")
     first, second = capsys.readouterr().err.splitlines()
     assert first == "calibrate material: 0 %: images"
-    assert second == "calibrate material: 25 %, about 16 s left: force balance"
+    assert second == "calibrate material: 25 %, about 5 s left: force balance"
 
 
 def test_on_a_terminal_there_is_a_bar(monkeypatch):

@@ -11,7 +11,7 @@ from torchmembrane import MembraneError
 from torchmembrane.camera.model import Camera
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
-from torchmembrane.simulate.appearance import Appearance, blurred, diffuse_light, noisy
+from torchmembrane.simulate.appearance import Appearance, blurred, diffuse_light, noisy, vignette
 from torchmembrane.simulate.pattern import Dots, Painted, Speckle, pattern_of
 from torchmembrane.simulate.raster import visible_triangles
 from torchmembrane.simulate.render import Renderer, render
@@ -139,6 +139,13 @@ def test_lambert_s_law_and_vignetting_on_a_flat_plate():
     expected *= 1 - 0.3 * ((u - 79.5) ** 2 + (v - 59.5) ** 2) / (80**2 + 60**2)
     ratio = image[10:110, 10:150] / expected
     assert ratio.max() / ratio.min() < 1.001
+
+
+def test_the_corner_farthest_from_the_principal_point_loses_the_share_of_vignetting():
+    camera = Camera("pinhole", (160, 120), (100, 100), (40, 50))
+    pixels = torch.tensor([[40.0, 50.0], [159.5, 119.5], [159.5, -0.5]], dtype=torch.float64)
+    middle, farthest, other = vignette(pixels, camera, 0.3).tolist()
+    assert middle == 1 and farthest == pytest.approx(0.7) and 0.7 < other < 1
 
 
 def test_light_falls_with_the_square_of_the_distance_and_the_cosine():
