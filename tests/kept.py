@@ -42,7 +42,7 @@ def kept(name: str, parameters: object, make: Callable[[], Arrays]) -> Arrays:
             for old in FOLDER.glob(f"{name}-*.npz"):
                 old.unlink()
             with whole_file(path) as partial, partial.open("wb") as file:
-                np.savez(file, allow_pickle=False, **arrays)
+                np.savez(file, **arrays)
         with np.load(path, allow_pickle=False) as found:
             return {key: found[key] for key in found}
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from kept import kept
 from PIL import Image
 
 import torchmembrane as tm
@@ -32,14 +33,19 @@ def sensor_of(filling="liquid", grid=13):
 @pytest.fixture(scope="module")
 def strokes():
     """By the filling: exact pixels `[3, D, 2]` of three depths of a press on 20 x 20 vertices, and the pressure changes."""
-    found = {}
-    for filling in FILLINGS:
-        simulator = Simulator(sensor_of(filling), grid=(20, 20))
-        stroke = Stroke(Sphere(3.0).touching(simulator.membrane, WAY), WAY, 1.8)
-        states = list(simulator.presses(stroke, ("push",), 3))
-        pixels = torch.from_numpy(np.stack([simulator.renderer.dots(state.vertices).pixels for state in states]))
-        found[filling] = pixels, torch.tensor([float(state.pressure - state.rest_pressure) for state in states])
-    return found
+
+    def simulated():
+        arrays = {}
+        for filling in FILLINGS:
+            simulator = Simulator(sensor_of(filling), grid=(20, 20))
+            stroke = Stroke(Sphere(3.0).touching(simulator.membrane, WAY), WAY, 1.8)
+            states = list(simulator.presses(stroke, ("push",), 3))
+            arrays[filling] = np.stack([simulator.renderer.dots(state.vertices).pixels for state in states])
+            arrays[f"{filling} rise"] = np.array([float(state.pressure - state.rest_pressure) for state in states], np.float32)
+        return arrays
+
+    found = {name: torch.from_numpy(array) for name, array in kept("gauge_strokes", None, simulated).items()}
+    return {filling: (found[filling], found[f"{filling} rise"]) for filling in FILLINGS}
 
 
 def reconstructor_of(filling="liquid", noise=0.01, dtype=torch.float64, **settings):
