@@ -7,6 +7,7 @@ import torch
 
 from ..camera.mode import Mode
 from ..camera.model import Camera
+from ..machine_code import using
 from ..markers.placement import in_view
 from ..reconstruct import Reconstructor
 from ..results.reconstruction import Frame
@@ -29,7 +30,7 @@ def rest_frame(reconstructor: Reconstructor) -> Frame | None:
     image = reconstructor.sensor.markers.rest_image
     if image is None:
         return None
-    with torch.no_grad():
+    with torch.no_grad(), using(not reconstructor.estimator.must_compile):  # one frame is not worth the wait
         return reconstructor(torch.from_numpy(image)).frame(0)
 
 
