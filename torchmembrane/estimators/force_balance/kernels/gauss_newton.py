@@ -85,7 +85,10 @@ def substituted(work, solved):
 def stiffness_at(k, moved, tau):
     """The camera's stiffness at a scale `tau` of the tractions' loss."""
     play = k.camera_motion * (min(tau, k.first_tau) / k.last_tau) ** 2
-    return stiffness_of_camera(play, moved[0] ** 2 + moved[1] ** 2 + moved[2] ** 2 + moved[3] ** 2)
+    moved2 = 0.0  # summed in double precision
+    for a in range(4):
+        moved2 += moved[a] ** 2
+    return stiffness_of_camera(play, moved2)
 
 
 @compiled
