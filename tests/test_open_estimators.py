@@ -234,7 +234,7 @@ def traced(made: tm.Reconstructor) -> tuple[list[str], dict]:
     rays = made.camera.pixel_to_ray(made.rest_pixels + torch.rand(2, *made.rest_pixels.shape))
     given = {"directions": rays.direction, "confidence": torch.ones(rays.direction.shape[:2])}
     parts: list[str] = []
-    tracer = Tracer(parts.append)
+    tracer = Tracer(lambda share, step: parts.append(step))
     known = {name: tracer.given(name, value) for name, value in given.items()}
     found = made.estimator(tm.Observation(known["directions"], **known))
     tracer.assembly.named(found.vertices.name, "vertices")

@@ -89,7 +89,7 @@ def test_on_a_terminal_there_is_a_bar(monkeypatch):
         ("calibrate rest", ["calibrate", "rest", "a.toml", "a.png", "--out", "out"]),
         ("check --accuracy", ["check", "a.toml", "--accuracy"]),
         ("export", ["export", "a.toml", "-o", "a.onnx"]),
-        ("simulate", ["simulate", "a.toml", "--random", "3", "--out", "out"]),
+        ("simulate --random", ["simulate", "a.toml", "--random", "3", "--out", "out"]),
     ],
 )
 def test_a_line_comes_before_torch_is_imported(title, arguments):

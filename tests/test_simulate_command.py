@@ -228,7 +228,7 @@ def test_a_folder_of_another_look_or_sensor_is_refused(sensor_path, tmp_path, ca
 )
 def test_wrong_calls_give_2_and_a_message_and_no_folder(sensor_path, tmp_path, capsys, options, expected):
     code, _, errors = run(capsys, "simulate", sensor_path, *options, "--out", tmp_path / "out")
-    assert code == 2 and errors.startswith("torchmembrane: error: ") and expected in errors
+    assert code == 2 and errors.splitlines()[-1].startswith("torchmembrane: error: ") and expected in errors
     assert not (tmp_path / "out").exists()
 
 

@@ -122,7 +122,8 @@ def _add_appearance(add: Add) -> None:
 def run(arguments: Namespace) -> int:
     """Simulate; returns the exit code."""
     _check_options(arguments)
-    announce("simulate")
+    if arguments.random is not None:
+        announce("simulate --random")
     from .press import simulate
 
     return simulate(arguments)
