@@ -107,6 +107,16 @@ def glossary() -> list[tuple[str, list[str], list[str]]]:
     return [(row[0], *(re.findall(r"`([^`]+)`", cell) for cell in row[2:])) for row in rows if row[0] != "the field's word"]
 
 
+FIELD_S_WORDS = """traction field; force distribution; shear; marker displacement; marker flow; reference; undeformed;
+no-contact; wrench; contact patch; contact mask; indentation depth; inverse finite elements; incipient slip; prestretch;
+marker-based visuotactile sensor; bearing; GNC; IRLS; tangent stiffness; one-ring"""
+
+
+@pytest.mark.parametrize("word", re.split(r";\s", FIELD_S_WORDS))
+def test_glossary_has_the_field_s_words(word):
+    assert any(word in row[0] for row in glossary())
+
+
 @pytest.mark.parametrize("word, names, symbols", glossary(), ids=lambda value: value if isinstance(value, str) else "")
 def test_glossary_names_the_code_and_the_symbols(word, names, symbols):
     assert names

@@ -208,14 +208,15 @@ def said(tracker, images):
     return found
 
 
-def test_noise_alone_is_no_drift(stream, at_rest):
-    """From the sensor's rest image, and from several of the frames in turn, with the noise that the locator says."""
+@pytest.mark.parametrize("step", [6, pytest.param(1, marks=pytest.mark.full)])
+def test_noise_alone_is_no_drift(stream, at_rest, step):
+    """From the sensor's rest image, and from every so many of the frames in turn, with the noise that the locator says."""
     r = stream.reconstructor
     tracker = tm.Tracker(r)
     assert np.isnan(tracker.drift) and said(tracker, at_rest) == [] and tracker.drift < 0.01
     with torch.no_grad():
         flow = r.observer(r.grey(np.stack(at_rest)))
-    for k in range(0, len(at_rest), 6):
+    for k in range(0, len(at_rest), step):
         own = flow.covariance[k] - r.observer.rest_covariance
         watched = DriftWatch(r.rest_pixels, own, r.observer.seen_at_rest, r.image_size)
         for displacement, confidence in zip(flow.displacement, flow.confidence, strict=True):

@@ -209,3 +209,8 @@ def test_public_names_have_an_example(face):
     shown = {name: value for name, value in public.items() if callable(value) and not is_record(value)}
     without = {name for name, value in shown.items() if ">>>" not in (value.__doc__ or "")}
     assert len(shown) > 5 and without == EXAMPLES_LEFT_OUT.keys() & shown.keys()
+
+
+@pytest.mark.parametrize("page, at_least", [("conventions.md", 9), ("mathematics.md", 20), ("force_balance.md", 9)])
+def test_the_pages_that_state_limits_quote_them(page, at_least):
+    assert len(QUOTED.findall((ROOT / "docs" / page).read_text())) >= at_least

@@ -1,6 +1,8 @@
 """Laws of when machine code is used: it is known for which precisions it exists, and a job is solved in one way."""
 
 import logging
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -55,8 +57,20 @@ def test_compiling_is_said_once_with_its_expected_time(function, caplog):
             with code.compiling(DOUBLE):
                 pass
     assert [record.getMessage() for record in caplog.records] == [
-        "torchmembrane: compiling machine code for float64, about 25 s, once"
+        "torchmembrane: compiling machine code for float64, about 30 s, once"
     ]
+
+
+def test_threads_that_begin_together_say_it_once(function, caplog):
+    code, begun = Kept(function, "sources"), threading.Barrier(4)
+
+    def call(_):
+        with code.compiling(SINGLE):
+            begun.wait(60)  # all are within before one has compiled
+
+    with caplog.at_level(logging.WARNING, "torchmembrane"), ThreadPoolExecutor(4) as pool:
+        list(pool.map(call, range(4)))
+    assert len(caplog.records) == 1
 
 
 def test_where_nothing_can_be_kept_this_process_knows_it_alone():

@@ -11,14 +11,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numba
 import numpy as np
 from llvmlite.binding import get_host_cpu_name
 
-SECONDS = 25
-"""Of compiling for one precision, about, on a core of 2023."""
+SECONDS = 30
+"""Of compiling for one precision, about: a first frame of `examples/` with an empty `NUMBA_CACHE_DIR`, on a core with AVX-512."""
 
 _used = ContextVar("machine code is used", default=True)
 
@@ -84,6 +85,8 @@ class Kept:
         self.folder = Path(folder) if folder else None
         self.key = hashlib.sha256(f"{sources} {version} {get_host_cpu_name()}".encode()).hexdigest()[:16]
         self.known: set[str] = set()
+        self.announced: set[str] = set()
+        self.lock = Lock()
 
     def is_compiled(self, dtype: np.dtype[Any]) -> bool:
         """Whether a call with arrays of this precision finds machine code."""
@@ -94,7 +97,10 @@ class Kept:
     @contextmanager
     def compiling(self, dtype: np.dtype[Any]) -> Iterator[None]:
         """Around a call: where it compiles, that is logged, and noted when it is done."""
-        if not self.is_compiled(dtype):
+        with self.lock:  # threads begin their first calls at the same time
+            is_new = not self.is_compiled(dtype) and dtype.name not in self.announced
+            self.announced.add(dtype.name)
+        if is_new:
             logging.getLogger("torchmembrane").warning(
                 "torchmembrane: compiling machine code for %s, about %d s, once", dtype.name, SECONDS
             )

@@ -110,7 +110,7 @@ def reconstruct_files(
         mine = (source for source in sources(inputs, reconstructor) if shard.holds(source.name))
         waiting = (source for source in mine if source.name not in folder.finished)
         with _progress(inputs, shard, folder.finished) as progress:
-            work = work._replace(machine_code=_by_machine_code(reconstructor, progress.all_left))
+            work = work._replace(machine_code=engine is not None or _by_machine_code(reconstructor, progress.all_left))
             for group in (engine or _local(reconstructor, workers, progress.left))(work, waiting, batch):
                 for outcome in group:
                     done[_kept(folder, outcome, report)] += 1

@@ -88,6 +88,7 @@ class Segmentation(nn.Module):
         membrane: the rest surface on the solver's grid.
         rest_rays: the rest rays of its vertices, `origins` and `directions [V, 3]`.
         count: how many contacts are reported.
+        patches: of the membrane, where they are at hand.
 
     Limitations:
         Contacts closer than about a fifth of the surface's size are one. A contact on the axis that turns all rays outwards is
@@ -98,14 +99,20 @@ class Segmentation(nn.Module):
     rest_directions: Tensor
     axis_region: Tensor
 
-    def __init__(self, membrane: Membrane, rest_rays: Rays | tuple[Tensor, Tensor], count: int = CONTACT_POINTS):
+    def __init__(
+        self,
+        membrane: Membrane,
+        rest_rays: Rays | tuple[Tensor, Tensor],
+        count: int = CONTACT_POINTS,
+        patches: ContactPatches | None = None,
+    ):
         super().__init__()
         self.membrane, self.count = membrane, count
         self.polar = PolarAngle(membrane.rest, membrane.rest_normals, *rest_rays)
         self.register_buffer("rest_origins", rest_rays[0])
         self.register_buffer("rest_directions", rest_rays[1])
         self.register_buffer("axis_region", _axis_region(membrane))
-        self.patches = ContactPatches(membrane)
+        self.patches = ContactPatches(membrane) if patches is None else patches
         self.axis_in_view = bool((self.axis_region > 0).any())
 
     @traced

@@ -47,7 +47,7 @@ class VertexRays(Estimator):
         rest_pressure, rest_load = rest_balance(membrane, energy)
         super().__init__(membrane, CavityLaw(membrane, rest_pressure, filling, gas))
         self.energy, self.flow = energy, flow
-        self.segmentation = Segmentation(membrane, rest_rays)
+        self.segmentation = Segmentation(membrane, rest_rays, patches=self.patches)
         origins, directions = rest_rays
         self.register_buffer("rest_range", ((membrane.rest - origins) * directions).sum(-1))
         self.register_buffer("rest_load", rest_load.mT.contiguous().mT)  # as forces come: components first in memory
