@@ -19,7 +19,7 @@ import numpy as np
 from llvmlite.binding import get_host_cpu_name
 
 SECONDS = 30
-"""Of compiling for one precision, about: a first frame of `examples/` with an empty `NUMBA_CACHE_DIR`, on a core with AVX-512."""
+"""Compiling for one precision takes about this long: a frame of `examples/`, no cache yet, a core with AVX-512."""
 
 _used = ContextVar("machine code is used", default=True)
 
