@@ -10,6 +10,7 @@ from PIL import Image
 from torchmembrane.calibrate import material
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
+from torchmembrane.markers.dots import pattern
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
@@ -35,6 +36,23 @@ def pytest_collection_modifyitems(items):
 def few_steps():
     """Settings for torch.compile and torch.export, which unroll all steps: every branch of the solve, each of few steps."""
     return ForceBalanceSettings(steps=2, coarse_steps=2, fine_steps=2, finer_steps=2, patience=1, settling_steps=2)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _blobs_found_once():
+    """What is found in an image by the search for blobs, half a second of each `Reconstructor`, is kept for the next one."""
+    search, found = pattern.find_blobs, {}
+
+    def find_blobs(dark, mask=None):
+        key = dark.shape, dark.tobytes(), None if mask is None else mask.tobytes()
+        key = tuple(hash(part) for part in key)
+        if key not in found:
+            found[key] = search(dark, mask)
+        return tuple(field.copy() for field in found[key])
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(pattern, "find_blobs", find_blobs)
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -147,7 +147,7 @@ class Stream:
     def __init__(self):
         sensor = preset("fingertip")
         sensor = replace(sensor, membrane=sensor.surface.membrane((17, 17)))
-        self.simulator = Simulator(sensor, grid=(26, 26))
+        self.simulator = Simulator(sensor, grid=(20, 20))
         self.changes, self.clean = {}, {}
         (rest,) = self.images([self.simulator.membrane.rest], seed=99)
         self.reconstructor = tm.Reconstructor(replace(sensor, markers=replace(sensor.markers, rest_image=to_grey(rest))))

@@ -216,7 +216,8 @@ def inside_unit_disc(place: Tensor, slope: Tensor) -> Tensor:
         [1.0, 0.5, 0.0]
     """
     rho = place.norm(dim=-1).clamp_min(1e-6)
-    per_sample = (slope * (place / rho[:, None])[..., None]).sum(-2).norm(dim=-1).clamp_min(1e-12)
+    outward = place / rho[:, None]
+    per_sample = (slope[:, 0] * outward[:, :1] + slope[:, 1] * outward[:, 1:]).norm(dim=-1).clamp_min(1e-12)
     return (0.5 + (1 - rho) / per_sample).clamp(0, 1)
 
 

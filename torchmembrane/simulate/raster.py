@@ -60,11 +60,11 @@ def _spans(corners: Tensor, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor
     rows = (bottom[:, 1].ceil().clamp_max(height).long() - first).clamp_min(0)
     triangle = torch.arange(len(rows), device=rows.device).repeat_interleave(rows)
     before = rows.cumsum(0) - rows
-    row = torch.arange(len(triangle), device=rows.device) - (before - first)[triangle]
+    row = torch.arange(len(triangle), device=rows.device) - (before - first).index_select(0, triangle)
     long, upper, lower = _line(top, bottom), _line(top, middle), _line(middle, bottom)
-    above = row < middle[triangle, 1]
-    one = _u_at(long[triangle], row)
-    other = _u_at(torch.where(above[:, None], upper[triangle], lower[triangle]), row)
+    above = row < middle[:, 1].index_select(0, triangle)
+    one = _u_at(long.index_select(0, triangle), row)
+    other = _u_at(torch.where(above[:, None], upper.index_select(0, triangle), lower.index_select(0, triangle)), row)
     return triangle, row, torch.minimum(one, other), torch.maximum(one, other)
 
 
@@ -103,5 +103,6 @@ class LinearOnTriangles(NamedTuple):
 
     def at(self, triangle: Tensor, place: Tensor) -> Tensor:
         """Values `[S, C]` at the points `place [S, 2]` of the image in `triangle [S]`."""
-        step = place - self.corner[triangle]
-        return self.value[triangle] + (self.slope[triangle] * step[:, None]).sum(-1)
+        value, slope, corner = (field.index_select(0, triangle) for field in self)  # twice as fast as by brackets
+        step = place - corner
+        return value + (slope[..., 0] * step[:, :1] + slope[..., 1] * step[:, 1:])

@@ -223,15 +223,15 @@ class Renderer(nn.Module):
         """One image `[H, W]` before lens and chip: the mean of the samples of each pixel."""
         corners, visible = self._visible(x, self.samples)
         sample = torch.nonzero(visible.view(-1) >= 0).squeeze(-1)
-        triangle = visible.view(-1)[sample]
+        triangle = visible.view(-1).index_select(0, sample)
         place = torch.stack([sample % visible.shape[1], sample // visible.shape[1]], -1).float()
         brightness = torch.stack([self.albedo * light[:, 0], light[:, 1]], -1)[self.surface.triangles]
         grey, shine = LinearOnTriangles.of(corners, brightness).at(triangle, place).unbind(-1)
-        near = torch.nonzero(self.inked[triangle]).squeeze(-1)
+        near = torch.nonzero(self.inked.index_select(0, triangle)).squeeze(-1)
         if len(near):
             linear = LinearOnTriangles.of(corners[self.inked], self.dot_place)
-            row = self.dot_row[triangle[near]]
-            covered = inside_unit_disc(linear.at(row, place[near]), linear.slope[row])
+            row = self.dot_row.index_select(0, triangle.index_select(0, near))
+            covered = inside_unit_disc(linear.at(row, place.index_select(0, near)), linear.slope.index_select(0, row))
             grey[near] *= 1 + (self.ink - 1) * covered
         image = torch.full(visible.shape, self.appearance.outside, device=visible.device)
         image.view(-1)[sample] = grey + shine

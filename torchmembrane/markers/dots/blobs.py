@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
+from scipy import fft, ndimage
 
 from ...errors import MembraneError
 
@@ -12,6 +12,7 @@ SMALLEST = 1.2  # px, radius of the smallest dot looked for
 LARGEST = 1 / 16  # radius of the largest, of the image's shorter side
 ELONGATION = 4.0  # long over short axis of a dot at most
 FEWEST = 6
+LONG_FILTER = 2.0  # px, standard deviation of Gaussians from which on cosine series are both exact and faster
 SOLIDITY = 0.75  # of its ellipse that a dot fills, or a dot that its ellipse fills
 
 
@@ -28,15 +29,41 @@ def blob_seeds(dark: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Maxima `[S, 2]` (u, v) over place and scale of the Hessian's determinant, and their radii `[S]`, best first."""
     count = max(1, int(np.log(min(dark.shape) * LARGEST / SMALLEST) / np.log(SCALES)) + 1)
     radii = SMALLEST * SCALES ** np.arange(count)
+    series = fft.dctn(dark)
     scales = []
     for sigma in radii / np.sqrt(2):
-        vv, uu, uv = (ndimage.gaussian_filter(dark, sigma, order) for order in ((2, 0), (0, 2), (1, 1)))
+        vv, uu, uv = second_derivatives(dark, series, sigma)
         scales.append(sigma**2 * np.sqrt(np.maximum(uu * vv - uv**2, 0)) * (uu + vv > 0))
     responses = np.array(scales)
     peak = (responses == ndimage.maximum_filter(responses, (3, 3, 3))) & (responses > 0.01)
     scale, v, u = np.nonzero(peak)
     order = np.argsort(-responses[peak])
     return np.stack([u, v], -1)[order], radii[scale[order]]
+
+
+def second_derivatives(image: np.ndarray, series: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Those of an image that goes on mirrored, smoothed by a Gaussian of `sigma` px: vv, uu and uv, `[H, W]` each.
+
+    Args:
+        image: `[H, W]`.
+        series: `scipy.fft.dctn` of it. From `LONG_FILTER` on each of its terms is smoothed and derived exactly.
+        sigma: px.
+
+    Example:
+        >>> image = np.random.default_rng(0).random((30, 40))
+        >>> found = second_derivatives(image, fft.dctn(image), 3.0)
+        >>> orders = (2, 0), (0, 2), (1, 1)
+        >>> max(float(np.abs(a - ndimage.gaussian_filter(image, 3.0, b)).max()) for a, b in zip(found, orders)) < 1e-4
+        True
+    """
+    if sigma < LONG_FILTER:
+        vv, uu, uv = (ndimage.gaussian_filter(image, sigma, order) for order in ((2, 0), (0, 2), (1, 1)))
+        return vv, uu, uv
+    height, width = image.shape
+    v, u = np.pi * np.arange(height)[:, None] / height, np.pi * np.arange(width) / width
+    smooth = series * np.exp(-(sigma**2) * v**2 / 2) * np.exp(-(sigma**2) * u**2 / 2)
+    sines = np.pad((u * v * smooth)[1:, 1:], (0, 1))  # those of a DST begin with one half wave
+    return fft.idctn(-(v**2) * smooth), fft.idctn(-(u**2) * smooth), fft.idstn(sines)
 
 
 def grow_blob(dark: np.ndarray, seed: np.ndarray, radius: float) -> Blob | None:
