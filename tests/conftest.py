@@ -1,5 +1,6 @@
 import gc
 from dataclasses import replace
+from functools import partialmethod
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Sphere
+from torchmembrane.simulate.render import Renderer
 from torchmembrane.simulate.simulator import Simulator
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -30,6 +32,14 @@ def pytest_collection_modifyitems(items):
     """The longest files first, so that no process has one left to do when the others are through."""
     place = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))
+
+
+@pytest.fixture(scope="module")
+def quick_images():
+    """Images of the simulator are of 2 x 2 samples a pixel, not of 4 x 4; the outlines of dots are as exact."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Renderer, "__init__", partialmethod(Renderer.__init__, samples=2))
+        yield
 
 
 @pytest.fixture

@@ -16,6 +16,8 @@ from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
 from torchmembrane.simulate.appearance import Appearance
 
+pytestmark = pytest.mark.usefixtures("quick_images")
+
 SIZE = (640, 480)
 
 

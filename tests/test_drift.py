@@ -21,6 +21,8 @@ from torchmembrane.simulate.equilibrium import EquilibriumProblem, Liquid, Open
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.simulator import Simulator, Stroke
 
+pytestmark = pytest.mark.usefixtures("quick_images")
+
 SIZE, NOISE = (640, 480), 0.04
 D = 150
 

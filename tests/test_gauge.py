@@ -19,6 +19,8 @@ from torchmembrane.simulate import Simulator, Sphere, Stroke
 from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.dataset import stroke_to
 
+pytestmark = pytest.mark.usefixtures("quick_images")
+
 WAY = np.array([0.1, 0.2, -1.0]) / np.linalg.norm([0.1, 0.2, -1.0])
 NAN = float("nan")
 

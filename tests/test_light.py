@@ -18,6 +18,8 @@ from torchmembrane.simulate import Simulator, Sphere, Stroke
 from torchmembrane.simulate.appearance import Appearance, noisy
 from torchmembrane.solve.stencil import inner
 
+pytestmark = pytest.mark.usefixtures("quick_images")
+
 CAMERAS = {
     "pinhole": Camera("pinhole", (640, 480), (400, 410), (320, 240), [-0.1, 0.02]),
     "fisheye": Camera("fisheye", (640, 480), (180, 180), (320, 240), [-0.01, 0.002]),

@@ -1,9 +1,7 @@
 """An estimator of one's own, as docs/own_estimator.md has it: in Reconstructor, jobs, the command line and exported models."""
 
-import os
 import re
 import shlex
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,7 +87,15 @@ class Still(tm.Estimator):
 
 
 def test_the_page_s_python_and_commands_run_and_find_the_same(folder, monkeypatch, capsys):
+    """Of the exported model here the estimator's part, below the whole."""
     monkeypatch.chdir(folder)
+    exported = []
+
+    def export_part(reconstructor, path, **options):
+        exported.append((reconstructor, traced(reconstructor)))
+        path.touch()
+
+    monkeypatch.setattr("torchmembrane.onnx.export.export", export_part)
     for call in COMMANDS:
         assert main(call) == 0, call
     assert str(folder) in sys.path
@@ -105,6 +111,19 @@ def test_the_page_s_python_and_commands_run_and_find_the_same(folder, monkeypatc
         alone = tm.Reconstructor(reconstructor.sensor, "linear_map:LinearMap")(reconstructor.read("examples/press_on_axis.png"))
     for key, value in alone.frame(0).items():
         np.testing.assert_array_equal(stored["press_on_axis"][key], value, err_msg=key)
+    ((made, (parts, vertices)),) = exported
+    assert parts == ["LinearMap.forward"] and torch.equal(made.estimator.spread, reconstructor.estimator.spread)
+    np.testing.assert_allclose(vertices["found"], vertices["expected"], rtol=0, atol=1e-5)
+
+
+@pytest.mark.full
+def test_the_page_s_exported_model_gives_what_torch_gives(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    (call,) = (call for call in COMMANDS if call[0] == "export")
+    assert main(call) == 0
+    names: dict = {}
+    exec(compile(USE, "own_estimator.md", "exec"), names)
+    reconstructor = names["reconstructor"]
     grey = reconstructor.grey(reconstructor.read("examples/press_on_axis.png", "examples/flat_plate.png"))
     with torch.no_grad():
         expected = reconstructor.reconstruct_grey(grey)
@@ -114,13 +133,14 @@ def test_the_page_s_python_and_commands_run_and_find_the_same(folder, monkeypatc
         np.testing.assert_allclose(found[key], getattr(expected, key).numpy(), rtol=0, atol=2e-5, err_msg=key)
 
 
-def test_the_command_finds_it_in_the_current_directory_also_in_worker_processes(folder, small_sensor, small_images, tmp_path):
+def test_the_command_finds_it_in_the_current_directory_also_in_worker_processes(
+    folder, small_sensor, small_images, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(folder)
+    assert str(folder) not in sys.path and "" not in sys.path and "linear_map" not in sys.modules
     call = ["reconstruct", small_sensor / "sensor.toml", *small_images, "--out", tmp_path / "out", "--workers", "2"]
-    call += ["--batch", "1", "--estimator", "linear_map:LinearMap"]
-    code = "import sys; from torchmembrane.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    isolated = [sys.executable, "-P", "-c", code, *map(str, call)]  # -P: without the current directory
-    done = subprocess.run(isolated, cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
-    assert done.returncode == 0 and "3 reconstructed, 0 failed" in done.stdout, done.stderr
+    assert main([*map(str, call), "--batch", "1", "--estimator", "linear_map:LinearMap"]) == 0
+    assert "3 reconstructed, 0 failed" in capsys.readouterr().out
     assert len(tm.read_results(tmp_path / "out").names) == 3
 
 

@@ -15,6 +15,8 @@ from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
 from torchmembrane.simulate.appearance import Appearance
 
+pytestmark = pytest.mark.usefixtures("quick_images")
+
 WAY = np.array([0.1, 0.2, -1.0]) / np.linalg.norm([0.1, 0.2, -1.0])
 
 

@@ -11,6 +11,8 @@ from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.simulator import Simulator
 
+pytestmark = pytest.mark.usefixtures("quick_images")
+
 SLACK = 1.2
 FRAMES = 6
 
