@@ -29,16 +29,26 @@ def blob_seeds(dark: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Maxima `[S, 2]` (u, v) over place and scale of the Hessian's determinant, and their radii `[S]`, best first."""
     count = max(1, int(np.log(min(dark.shape) * LARGEST / SMALLEST) / np.log(SCALES)) + 1)
     radii = SMALLEST * SCALES ** np.arange(count)
-    series = fft.dctn(dark)
-    scales = []
-    for sigma in radii / np.sqrt(2):
+    series = fft.dctn(dark.astype(np.float32))
+    responses = np.empty((count, *dark.shape), np.float32)
+    for response, sigma in zip(responses, (radii / np.sqrt(2)).tolist(), strict=True):
         vv, uu, uv = second_derivatives(dark, series, sigma)
-        scales.append(sigma**2 * np.sqrt(np.maximum(uu * vv - uv**2, 0)) * (uu + vv > 0))
-    responses = np.array(scales)
-    peak = (responses == ndimage.maximum_filter(responses, (3, 3, 3))) & (responses > 0.01)
-    scale, v, u = np.nonzero(peak)
-    order = np.argsort(-responses[peak])
+        response[:] = sigma**2 * np.sqrt(np.maximum(uu * vv - uv**2, 0)) * (uu + vv > 0)
+    scale, v, u = _maxima(responses, 0.01).T
+    order = np.argsort(-responses[scale, v, u])
     return np.stack([u, v], -1)[order], radii[scale[order]]
+
+
+def _maxima(values: np.ndarray, least: float) -> np.ndarray:
+    """Indices `[N, 3]` of the `values [A, B, C]` above `least`, not negative, that none of the 26 around them exceeds."""
+    peak = values > least
+    for axis in range(3):  # of the six nearest first: few are left for the others
+        above, of = np.moveaxis(peak, axis, 0), np.moveaxis(values, axis, 0)
+        above[1:] &= of[1:] >= of[:-1]
+        above[:-1] &= of[:-1] >= of[1:]
+    place, padded = np.argwhere(peak), np.pad(values, 1)
+    around = np.max([padded[tuple((place + step).T)] for step in np.ndindex(3, 3, 3)], 0)
+    return place[values[peak] >= around]
 
 
 def second_derivatives(image: np.ndarray, series: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -60,8 +70,9 @@ def second_derivatives(image: np.ndarray, series: np.ndarray, sigma: float) -> t
         vv, uu, uv = (ndimage.gaussian_filter(image, sigma, order) for order in ((2, 0), (0, 2), (1, 1)))
         return vv, uu, uv
     height, width = image.shape
-    v, u = np.pi * np.arange(height)[:, None] / height, np.pi * np.arange(width) / width
-    smooth = series * np.exp(-(sigma**2) * v**2 / 2) * np.exp(-(sigma**2) * u**2 / 2)
+    v, u = (np.pi / size * np.arange(size, dtype=series.dtype) for size in (height, width))
+    v = v[:, None]
+    smooth = series * np.exp(-(sigma**2) / 2 * v**2) * np.exp(-(sigma**2) / 2 * u**2)
     sines = np.pad((u * v * smooth)[1:, 1:], (0, 1))  # those of a DST begin with one half wave
     return fft.idctn(-(v**2) * smooth), fft.idctn(-(u**2) * smooth), fft.idstn(sines)
 
