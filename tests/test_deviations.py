@@ -246,6 +246,14 @@ def test_deviations_of_an_answer_are_its_spreads_and_what_the_model_leaves_out()
     close(of(nothing).depth, torch.tensor([DIP * 0.9]))
 
 
+def test_depths_are_along_the_rest_normals_however_the_surface_tilts():
+    """A steep dent and a shift across the rest normals: the dent's own depth everywhere."""
+    dome = spherical_cap(12.0, 9.0, 3.0, grid=(9, 9))
+    dent = 3 * torch.exp(-(dome.rest - dome.rest[40]).square().sum(-1) / 8)
+    across = torch.linalg.cross(dome.rest_normals, torch.tensor([0.3, -1.0, 0.2]).double().expand_as(dome.rest_normals))
+    torch.testing.assert_close(depths(dome, (0.7 * across - dent[:, None] * dome.rest_normals)[None])[0], dent)
+
+
 def test_the_gap_is_the_mean_distance_to_the_nearest_markers_that_are_seen():
     """Of the deepest vertex; lost markers leave a gap, and where hardly any are seen it is the surface's size."""
     dome = spherical_cap(12.0, 9.0, 3.0, grid=(9, 9))

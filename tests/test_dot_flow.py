@@ -6,6 +6,7 @@ import torch
 
 from torchmembrane.markers.dots.coherence import Coherence
 from torchmembrane.markers.dots.flow import FlowAverages
+from torchmembrane.markers.spacing import thin_out
 from torchmembrane.solve.elimination import solve_dense, solve_positive
 
 EDGE = -7.0
@@ -61,6 +62,14 @@ def test_no_weight_is_subnormal():
         for name, buffer in module.float().named_buffers():
             size = buffer.abs()
             assert not ((size > 0) & (size < torch.finfo(torch.float32).tiny)).any(), name
+
+
+def test_points_are_thinned_out_from_the_first_on():
+    """The first stays; each other stays that is farther than the gap from all that stay before it, and no other."""
+    line = np.stack([np.array([0.0, 1.0, 2.0, 3.5, 3.0]), np.zeros(5)], -1)
+    assert thin_out(line, 1.2).tolist() == line[[0, 2, 3]].tolist()
+    assert thin_out(line[::-1], 1.2).tolist() == line[[4, 1]].tolist()
+    assert thin_out(line[:0], 1.2).shape == (0, 2)
 
 
 def test_small_systems_are_solved_as_in_exported_models():

@@ -274,6 +274,14 @@ def test_noise_has_the_level_asked_for():
     assert torch.equal(noisy(grey, None, np.random.default_rng(0)), grey)
 
 
+@pytest.mark.parametrize("end", [0.0, 1.0])
+def test_noise_leaves_no_grey_beyond_black_and_white(end):
+    """There half of the noise is cut off: of the other half the mean is its deviation over the root of two pi."""
+    image = noisy(torch.full((200, 200), end), 30.0, np.random.default_rng(0))
+    assert image.min() >= 0 and image.max() <= 1
+    assert (image - end).abs().mean().item() == pytest.approx(10**-1.5 / (2 * np.pi) ** 0.5, rel=0.02)
+
+
 def test_wrong_arguments_are_refused():
     sensor = plate_sensor(CAMERAS["pinhole"])
     away = plate_sensor(Camera("pinhole", SIZE, (100, 100), (1e4, 0)))
