@@ -51,6 +51,24 @@ def test_the_time_left_forgets_a_slow_beginning():
     assert left == pytest.approx(70)
 
 
+def test_two_processes_that_end_together_do_not_make_the_time_left_short():
+    """Each takes 20 s for a twentieth of the work, and they began together: 20 s for a tenth."""
+    display = ProgressDisplay("a")
+    display.time_left(0.0, 0.0)
+    for pair in range(1, 10):
+        for share, now in ((0.1 * pair - 0.05, 20.0 * pair), (0.1 * pair, 20.0 * pair + 0.1)):
+            left = display.time_left(share, now)
+            assert left is None or left == pytest.approx(200 * (1 - share), rel=0.5) or share < 0.2
+    assert left is not None
+
+
+def test_no_time_is_told_by_a_beginning_that_is_a_small_part_of_the_work():
+    """Processes start for 15 s, and then each of a thousand presses takes 1 s."""
+    display = ProgressDisplay("a")
+    said = [display.time_left(done / 1000, 15.0 + done if done else 0.0) for done in range(6)]
+    assert said[:4] == [None] * 4 and said[4:] == [pytest.approx(1000 - done) for done in (4, 5)]
+
+
 def test_a_part_of_the_work_tells_its_share_of_the_whole():
     told = []
     part = within(within(lambda *said: told.append(said), 0.5, 1.0), 0.2, 0.6)

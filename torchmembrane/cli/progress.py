@@ -7,6 +7,10 @@ from typing import Any
 
 LINE_SECONDS = 5.0
 """Between two lines where stderr is no terminal."""
+LEAST_STEPS = 2
+"""Of which the rate is taken at least: processes side by side end several at once, and then none for a while."""
+LEAST_SHARE = 0.1
+"""Of the work that is done before the rate of its beginning counts, when processes may have had to start."""
 
 
 def announce(title: str) -> None:
@@ -34,8 +38,8 @@ def duration(seconds: float) -> str:
 class ProgressDisplay:
     """Shows what a computation tells of its progress; the object is the computation's `progress`.
 
-    The time left is by the rate of the latter half of the work done since the first call: what only the beginning takes, other
-    processes to start or code to compile, is soon forgotten.
+    The time left is by the rate of the latter half of the work done since the first call, of `LEAST_STEPS` at least: what only
+    the beginning takes, other processes to start or code to compile, is soon forgotten.
 
     Args:
         title: of the command.
@@ -82,7 +86,7 @@ class ProgressDisplay:
             self.said = monotonic()
 
     def time_left(self, share: float, now: float) -> float | None:
-        """Seconds until all is done; None until a part is done.
+        """Seconds until all is done; None until there is a rate to tell it by.
 
         Args:
             share: of the work that is done.
@@ -93,8 +97,12 @@ class ProgressDisplay:
         before = [(done, at) for done, at in self.told if done < share]
         if not before:
             return None
-        half = next((each for each in before if each[0] >= (first + share) / 2), before[-1])
-        return (now - half[1]) * (1 - share) / (share - half[0])
+        latter = sum(done < (first + share) / 2 for done, _ in before)
+        start = min(latter, max(1, len(before) - LEAST_STEPS), len(before) - 1)
+        if start <= 1 and share - first < LEAST_SHARE:
+            return None
+        done, at = before[start]
+        return (now - at) * (1 - share) / (share - done)
 
     def write(self, line: str) -> None:
         """Write a line of its own, above the bar where there is one."""

@@ -186,31 +186,46 @@ def make_frames(
     held = frames.names()
     wanted = [number for number, name in names.items() if name not in held]
     failed, skipped = 0, count - len(wanted)
+
+    def tell(done: int) -> None:
+        progress((skipped + done) / count, f"press {skipped + done} of {count}")
+
     try:
         progress(skipped / count, f"{len(wanted)} presses")
-        for done, (number, made) in enumerate(_in_processes(simulator, plan, wanted, jobs), skipped + 1):
+        for number, made in _in_processes(simulator, plan, wanted, jobs, tell):
             if isinstance(made, str):
                 failed += 1
                 report(f"{names[number]}: {made}")
             else:
                 frames.write(names[number], made)
-            progress(done / count, f"press {done} of {count}")
     finally:
         frames.flush()
     return DatasetOutcome(len(wanted) - failed, failed, skipped)
 
 
 def _in_processes(
-    simulator: Simulator, plan: Plan, numbers: Sequence[int], jobs: int
+    simulator: Simulator, plan: Plan, numbers: Sequence[int], jobs: int, tell: Callable[[int], None] = lambda done: None
 ) -> Iterator[tuple[int, SimulatedFrame | str]]:
+    """Numbers and what comes of them, in their order; `tell` takes how many are done, in whatever order."""
     jobs = min(jobs, len(numbers))
     if jobs <= 1:
-        yield from ((number, _frame_or_reason(simulator, plan, number)) for number in numbers)
+        for done, number in enumerate(numbers, 1):
+            made = number, _frame_or_reason(simulator, plan, number)
+            tell(done)
+            yield made
         return
     context = multiprocessing.get_context("spawn")
     shared = pickle.dumps((simulator, plan))  # as bytes: torch would move tensors whose memory the sensor's arrays look at
     with context.Pool(jobs, _begin, (shared,)) as pool:
-        yield from pool.imap(_work, numbers)
+        early: dict[int, SimulatedFrame | str] = {}
+        waiting = iter(numbers)
+        due = next(waiting)
+        for done, (number, frame) in enumerate(pool.imap_unordered(_work, numbers), 1):
+            tell(done)
+            early[number] = frame
+            while due in early:
+                yield due, early.pop(due)
+                due = next(waiting, -1)
 
 
 _simulator: Simulator
