@@ -7,9 +7,9 @@ from typing import Any
 
 LINE_SECONDS = 5.0
 """Between two lines where stderr is no terminal."""
-LEAST_STEPS = 2
+FEWEST_STEPS = 2
 """Of which the rate is taken at least: processes side by side end several at once, and then none for a while."""
-LEAST_SHARE = 0.1
+LEAST_DONE = 0.1
 """Of the work that is done before the rate of its beginning counts, when processes may have had to start."""
 
 
@@ -38,7 +38,7 @@ def duration(seconds: float) -> str:
 class ProgressDisplay:
     """Shows what a computation tells of its progress; the object is the computation's `progress`.
 
-    The time left is by the rate of the latter half of the work done since the first call, of `LEAST_STEPS` at least: what only
+    The time left is by the rate of the latter half of the work done since the first call, of `FEWEST_STEPS` at least: what only
     the beginning takes, other processes to start or code to compile, is soon forgotten.
 
     Args:
@@ -98,8 +98,8 @@ class ProgressDisplay:
         if not before:
             return None
         latter = sum(done < (first + share) / 2 for done, _ in before)
-        start = min(latter, max(1, len(before) - LEAST_STEPS), len(before) - 1)
-        if start <= 1 and share - first < LEAST_SHARE:
+        start = min(latter, max(1, len(before) - FEWEST_STEPS), len(before) - 1)
+        if start <= 1 and share - first < LEAST_DONE:
             return None
         done, at = before[start]
         return (now - at) * (1 - share) / (share - done)
