@@ -119,6 +119,7 @@ def test_the_page_s_python_and_commands_run_and_find_the_same(folder, monkeypatc
 @pytest.mark.full
 def test_the_page_s_exported_model_gives_what_torch_gives(folder, monkeypatch):
     monkeypatch.chdir(folder)
+    Path("out").mkdir(exist_ok=True)
     (call,) = (call for call in COMMANDS if call[0] == "export")
     assert main(call) == 0
     names: dict = {}
