@@ -6,7 +6,7 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.mechanics.affine_quadrilateral import AffineQuadrilaterals
-from torchmembrane.mechanics.cavity import gas_law_step
+from torchmembrane.mechanics.cavity import CavityLaw, gas_law_step
 from torchmembrane.mechanics.hyperelastic import MODELS, ElasticEnergy
 from torchmembrane.mechanics.metric import metric
 from torchmembrane.solve.stencil import apply_stencil, inner, one_ring_edges
@@ -304,3 +304,15 @@ def test_a_step_of_a_gas_has_the_slope_of_its_law_and_ends_on_it(rise):
 def test_an_unknown_model_is_refused(membrane):
     with pytest.raises(MembraneError, match="expected one of"):
         ElasticEnergy(membrane, "hookean")
+
+
+@pytest.mark.parametrize("filling, gas, error", [("liquid", None, 0.0), ("gas", (0.1, 2600.0), 2e-4)])
+def test_a_step_of_the_cavity_s_condition_ends_on_its_law(filling, gas, error):
+    """From a volume 1 % of the gas's off the law, with a step of the pressure: but for the square of that step."""
+    law = CavityLaw(spherical_cap(12, 9, 3, (9, 9)), torch.tensor(0.02, dtype=torch.float64), filling, gas)
+    pressure, step = torch.tensor([0.018, 0.023], dtype=torch.float64), 1e-4
+    rise = law.target_volume(law.rest_volume, pressure) + 26.0 - law.rest_volume
+    target, compliance = law.condition(rise, pressure)
+    volume = law.rest_volume + rise + target - compliance * step
+    expected = law.target_volume(volume, pressure + step)
+    torch.testing.assert_close(volume, expected, rtol=0, atol=2600 * error + 1e-9)
