@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from bench.accuracy import thresholded_dots
 from torchmembrane.errors import MembraneError
 from torchmembrane.markers.dots.bands import bands, blur_rows
+from torchmembrane.markers.dots.blobs import _maxima
 from torchmembrane.markers.dots.coherence import Coherence
 from torchmembrane.markers.dots.deformation import monomial_map
 from torchmembrane.markers.dots.fit import EllipseFit
@@ -594,3 +595,10 @@ def test_wrong_arguments_are_named():
     with pytest.raises(MembraneError, match="1 of them NaN"):
         s.pixels[4] = np.nan
         DotLocator(pattern, SIZE, "dark")
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 1, 2), (5, 7, 9), (4, 20, 30)])
+def test_maxima_are_the_values_that_a_maximum_filter_leaves(shape):
+    values = np.random.default_rng(0).integers(0, 6, shape) / 5
+    expected = (values == ndimage.maximum_filter(values, (3, 3, 3))) & (values > 0.5)
+    np.testing.assert_array_equal(_maxima(values, 0.5), np.argwhere(expected))
