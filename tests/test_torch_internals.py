@@ -21,6 +21,7 @@ BROKEN = f"torch {torch.__version__} changed {{}}: mend torchmembrane/onnx/torch
 ATTRIBUTES = [
     ("torch.export._trace", "_export"),
     ("torch.export._trace", "_export_to_aten_ir"),
+    ("torch.fx.config", "do_not_emit_stack_traces"),
     ("torch.onnx._internal.exporter._fx_passes", "decompose_with_registry"),
     ("torch.onnx._internal.exporter._registration", "ONNXRegistry.from_torchlib"),
     ("torch.onnx._internal.exporter._registration", "ONNXRegistry.register_op"),
