@@ -25,17 +25,24 @@ def sensor():
     return dataclasses.replace(whole, membrane=whole.membrane.resampled((17, 17)))
 
 
+@pytest.fixture(params=[pytest.param("all steps", marks=pytest.mark.full), "few steps"])
+def settings(request, few_steps):
+    """Of force balance: each step is the same operations once more."""
+    return few_steps if request.param == "few steps" else None
+
+
 @pytest.mark.parametrize(("estimator", "options"), CASES)
-def test_images_go_through_every_estimator(sensor, estimator, options):
-    reconstructor = tm.Reconstructor(sensor, estimator, **options).to("meta")
+def test_images_go_through_every_estimator(sensor, estimator, options, settings):
+    of_balance = settings if estimator == "force-balance" else None
+    reconstructor = tm.Reconstructor(sensor, estimator, settings=of_balance, **options).to("meta")
     images = torch.empty(2, 480, 640, 3, dtype=torch.uint8, device="meta")
     result = reconstructor(images)
     assert {values.device.type for values in result} == {"meta"}
     assert result.vertices.shape == (2, 289, 3)
 
 
-def test_frames_are_tracked_gauged_and_taken_from_markers(sensor):
-    reconstructor = tm.Reconstructor(sensor).to("meta")
+def test_frames_are_tracked_gauged_and_taken_from_markers(sensor, settings):
+    reconstructor = tm.Reconstructor(sensor, settings=settings).to("meta")
     images = torch.empty(2, 1, 480, 640, device="meta")
     first = reconstructor(images)
     followed = reconstructor(images, first, pressure=torch.empty(2, device="meta"))

@@ -29,7 +29,7 @@ from .torch_internals import tree_flatten, tree_leaves, tree_map, tree_unflatten
 from .trace import traced_model
 
 FORMAT = 1
-CHECK, PIECES = 0.8, 36  # share of the time before the check, and how many pieces, roughly, of the default estimator
+CHECK, NODES = 0.65, 11_500  # share of the time before the check, and how many nodes are traced, of the default estimator
 EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
 
 
@@ -67,6 +67,7 @@ class Tracer:
     def __init__(self, progress: Progress = silent) -> None:
         self.assembly, self.progress = Assembly(), progress
         self.traced: dict[tuple[Any, ...], onnx.ModelProto] = {}
+        self.nodes = 0  # of the pieces traced so far
 
     def given(self, name: str, example: Tensor) -> Known:
         """An input of the graph."""
@@ -120,7 +121,7 @@ class Tracer:
             self.assembly.part = type(owner).__module__.removeprefix("torchmembrane.").partition(".")[0]
         key = (owner, function, str(structure), *fixed.items(), *(value.shape for value in examples.values()))
         if key not in self.traced:
-            self.progress(min(1.0, len(self.traced) / PIECES), getattr(function, "__qualname__", ""))
+            self.progress(min(1.0, self.nodes / NODES), getattr(function, "__qualname__", ""))
             outputs = [f"output {k}" for k, _ in enumerate(value for value in tree_leaves(found) if value is not None)]
             try:
                 self.traced[key] = self._whole(traced_model(Piece(owner, function, arranged), examples, outputs))
@@ -128,6 +129,7 @@ class Tracer:
                 reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
                 name = getattr(function, "__qualname__", str(function))
                 raise MembraneError(f"export: {name} cannot be written as ONNX: {reason.strip()}") from error
+            self.nodes += len(self.traced[key].graph.node)
         return self.traced[key], names, found
 
     def _whole(self, model: onnx.ModelProto) -> onnx.ModelProto:
