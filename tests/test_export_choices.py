@@ -183,6 +183,12 @@ class Composite(torch.nn.Module):
         return torch.nn.functional.layer_norm(angle, (3,)), angle[:, None].expand_as(x).diff(dim=-1).clamp(max=1)
 
 
+def test_a_model_in_a_folder_that_does_not_exist_is_refused_before_any_work(sensor, tmp_path, monkeypatch):
+    monkeypatch.setattr(export, "Tracer", None)
+    with pytest.raises(MembraneError, match="missing/model.onnx: the folder .*missing does not exist; make it first"):
+        export.export(Reconstructor(sensor, "paper", locator="fit"), tmp_path / "missing" / "model.onnx")
+
+
 def test_a_graph_captured_at_once_is_what_torch_makes_of_it_in_two_steps(monkeypatch):
     inputs = {"x": torch.rand(2, 3, 3), "y": torch.rand(2, 3, 3)}
     at_once = traced_model(Composite(), inputs, ["a", "b"])

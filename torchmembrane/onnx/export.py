@@ -185,9 +185,11 @@ def export(
         [batch, D, 2]`, NaN to start from rest. Outputs as `Reconstruction`.
 
     Raises:
-        MembraneError: a reconstructor of another precision than float32, or one that cannot be written, or is not the same
-            when it is.
+        MembraneError: a folder that does not exist, a reconstructor of another precision than float32, or one that cannot be
+            written, or is not the same when it is.
     """
+    if not Path(path).parent.is_dir():
+        raise MembraneError(f"export: {path}: the folder {Path(path).parent} does not exist; make it first")
     if reconstructor.rest_pixels.dtype != torch.float32:
         raise MembraneError(f"export: the reconstructor is {reconstructor.rest_pixels.dtype}; expected torch.float32")
     progress(0.0, "image")
