@@ -109,7 +109,7 @@ class TorchExporter:
         at_once = partial(_trace._export_to_aten_ir, decomp_table=decomposed)
         with ExitStack() as stack:
             stack.enter_context(replaced(_trace, "_export_to_aten_ir", at_once))
-            stack.enter_context(replaced(torch.fx.config, "do_not_emit_stack_traces", True))  # a twelfth of the time
+            stack.enter_context(replaced(torch.fx.config, "do_not_emit_stack_traces", True))  # no model holds them
             stack.enter_context(_override_composite_implicit_decomp(kept))
             return _trace._export(module, examples, strict=False, pre_dispatch=False)
 
