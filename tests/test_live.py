@@ -15,12 +15,14 @@ from threading import Event
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.cli.live import _stopped_by_signals
 from torchmembrane.cli.main import main
-from torchmembrane.files.images import read_image
+from torchmembrane.files.grayscale import grey_batch
+from torchmembrane.files.images import read_image, write_as_taken
 from torchmembrane.live.background import Background
 from torchmembrane.live.line import Line, described, summary
 from torchmembrane.live.loop import RECENT, Seen, Tally, follow
@@ -217,9 +219,88 @@ def test_a_camera_gives_red_green_blue_of_the_sensor_s_size(camera):
     source = camera_images(0, (8, 6))
     for image in images:
         np.testing.assert_array_equal(next(source), image)
-    assert played.asked == {cv2.CAP_PROP_FRAME_WIDTH: 8, cv2.CAP_PROP_FRAME_HEIGHT: 6} and not played.released
+    asked = {cv2.CAP_PROP_FRAME_WIDTH: 8, cv2.CAP_PROP_FRAME_HEIGHT: 6, cv2.CAP_PROP_ORIENTATION_AUTO: 0}
+    assert played.asked == asked and not played.released
     source.close()
     assert played.released
+
+
+PICTURE = np.random.default_rng(0).integers(0, 255, (6, 8), np.uint8)
+"""Asymmetric: mirrored or turned it is another."""
+
+
+class AsCaptured:
+    """`Capture` of frames that are given as they are."""
+
+    def __init__(self, frame):
+        self.frame = frame
+
+    def isOpened(self):  # noqa: N802
+        return True
+
+    def set(self, key, value):
+        pass
+
+    def read(self):
+        return True, self.frame
+
+    def release(self):
+        pass
+
+
+def colour(grey):
+    return np.stack([grey // 2, grey, grey // 3], -1)
+
+
+LAYOUTS = {
+    "grey": (PICTURE, PICTURE),
+    "grey, one channel": (PICTURE[..., None], PICTURE),
+    "grey, 16 bits": (PICTURE.astype(np.uint16) * 257, PICTURE.astype(np.uint16) * 257),
+    "BGR": (colour(PICTURE)[..., ::-1], colour(PICTURE)),
+    "BGRA": (np.dstack([colour(PICTURE)[..., ::-1], PICTURE]), colour(PICTURE)),
+    "BGR, 16 bits": (colour(PICTURE)[..., ::-1].astype(np.uint16) * 257, colour(PICTURE).astype(np.uint16) * 257),
+    "BGR, rows backwards in memory": (colour(PICTURE)[::-1].copy()[::-1, :, ::-1], colour(PICTURE)),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_frames_of_every_layout_are_the_picture_and_are_kept_as_it(layout, monkeypatch, tmp_path):
+    """None is mirrored, turned or of other colours; what is kept has the same grey values."""
+    import cv2
+
+    given, expected = LAYOUTS[layout]
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: AsCaptured(given))
+    seen = next(camera_images(0, (8, 6)))
+    np.testing.assert_array_equal(seen, expected)
+    assert seen.dtype == expected.dtype
+    one = torch.zeros((), dtype=torch.float64)
+    grey = grey_batch(seen, (8, 6), "rgb", one)[0, 0].numpy()
+    kept = read_image(write_as_taken(tmp_path / "kept", seen), (8, 6))
+    np.testing.assert_allclose(kept, grey, atol=0.51 / 255 if seen.dtype == np.uint8 and seen.ndim == 3 else 1e-5)
+
+
+@pytest.fixture
+def edge_cli(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "export")
+    import torchmembrane_edge.cli
+
+    return torchmembrane_edge.cli
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_edge_package_takes_frames_of_every_layout_alike(layout, edge_cli):
+    given, expected = LAYOUTS[layout]
+    np.testing.assert_array_equal(edge_cli._red_first(given), expected)
+
+
+def test_frames_of_two_channels_are_refused(monkeypatch, edge_cli):
+    import cv2
+
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: AsCaptured(np.dstack([PICTURE, PICTURE])))
+    with pytest.raises(tm.MembraneError, match=r"--camera 0: frames \[6, 8, 2\]; expected grey, BGR or BGRA"):
+        next(camera_images(0, (8, 6)))
+    with pytest.raises(edge_cli.EdgeError, match=r"frames \[6, 8, 2\]; expected grey, BGR or BGRA"):
+        edge_cli._red_first(np.dstack([PICTURE, PICTURE]))
 
 
 def test_a_camera_s_failures_are_said(camera, monkeypatch):

@@ -1,6 +1,7 @@
 """The command `torchmembrane-edge`. Exit codes: 0 all well, 1 some frames failed, 2 wrong usage."""
 
 import argparse
+import re
 import sys
 import time
 from importlib.util import find_spec
@@ -23,12 +24,24 @@ def main(argv=None) -> int:
             return watch(session, arguments.camera, arguments.frames)
         if not arguments.images or not arguments.out:
             raise EdgeError("nothing to do; expected IMAGES and --out DIR, or --camera NUMBER")
-        return reconstruct(session, arguments.images, arguments.out, 1 if session.tracks else arguments.batch)
+        if arguments.batch < 1:
+            raise EdgeError(f"--batch {arguments.batch}; expected at least 1")
+        return reconstruct(session, in_order(arguments.images), arguments.out, 1 if session.tracks else arguments.batch)
     except (EdgeError, OSError) as error:
         print(f"torchmembrane-edge: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 0
+
+
+def in_order(paths: list) -> list:
+    """The paths as they are given; in the order of the numbers in their names where they come as shells expand a pattern."""
+
+    def numbered(path):
+        parts = re.split("([0-9]+)", str(path))  # texts at even places, numbers at odd ones
+        return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)], str(path)
+
+    return sorted(paths, key=numbered) if paths == sorted(paths) else paths
 
 
 def reconstruct(session: Session, paths: list, out: Path, batch: int) -> int:
@@ -72,6 +85,7 @@ def watch(session: Session, camera: int, frames: int | None) -> int:
     capture = cv2.VideoCapture(camera)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
     capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # image files are not turned either
     number, result = 0, None
     try:
         while frames is None or number < frames:
@@ -79,13 +93,23 @@ def watch(session: Session, camera: int, frames: int | None) -> int:
             if not taken:
                 raise EdgeError(f"camera {camera} gives no image; expected one of {width} x {height} px")
             start = time.perf_counter()
-            result = session.run(image[None, :, :, ::-1], result)
+            result = session.run(_red_first(image)[None], result)
             milliseconds = 1000 * (time.perf_counter() - start)
             print(f"{number}: {_line(session, result)}, {milliseconds:.1f} ms", flush=True)
             number += 1
     finally:
         capture.release()
     return 0
+
+
+def _red_first(image: np.ndarray) -> np.ndarray:
+    """A frame of OpenCV's - grey, BGR or BGRA - as grey `[height, width]` or RGB."""
+    channels = 1 if image.ndim == 2 else image.shape[-1]
+    if channels == 1:
+        return image.reshape(image.shape[:2])
+    if channels not in (3, 4):
+        raise EdgeError(f"the camera gives frames {list(image.shape)}; expected grey, BGR or BGRA")
+    return image[..., 2::-1]
 
 
 def _line(session: Session, result: dict) -> str:

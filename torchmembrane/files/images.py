@@ -248,7 +248,8 @@ def write_as_taken(stem: str | Path, image: np.ndarray) -> Path:
 
     Args:
         stem: the file without its ending, `.png` or `.tiff`.
-        image: `[height, width]` or `[height, width, 3]` uint8, or grey values as for `write_image`.
+        image: `[height, width]` uint8 or uint16, `[height, width, 3]` uint8, or grey values as for `write_image`; of
+            `[height, width, 3]` uint16 the grey values are written.
 
     Returns:
         The path.
@@ -260,6 +261,8 @@ def write_as_taken(stem: str | Path, image: np.ndarray) -> Path:
         ...     path.name, read_image(path).round(3).tolist()
         ('red.png', [[0.29899999499320984]])
     """
+    if image.dtype == np.uint16 and image.ndim == 3:
+        image = image @ np.array(GREY) / 65535
     if image.dtype.kind == "f":
         return write_image(stem, image)
     path = Path(f"{stem}.png")

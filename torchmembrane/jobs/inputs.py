@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import MembraneError
+from ..files.order import in_order
 from ..files.provenance import printable
 from ..integrations.rosbag import BAGS, METADATA, is_bag, metadata_of
 from ..results.store import MESH
@@ -69,12 +70,14 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
     """Files, globs and folders as files.
 
     Args:
-        arguments: paths of files, folders (their images in name order, or the bag that it is) and glob patterns.
+        arguments: paths of files, folders (their images in name order, or the bag that it is) and glob patterns. Numbers in
+            names count as numbers: 2 before 10.
         video: take every file for a video.
         topic: of the bags' images.
 
     Returns:
-        The files, images and videos each in the order of the call.
+        The files, images and videos each in the order of the call; where that is the plain order of their names, which shells
+        give, in that of the numbers in them.
 
     Raises:
         MembraneError: an argument names no file, or two frames would have one name.
@@ -84,6 +87,8 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
         ['flat_plate.png', 'press_on_axis.png', 'two_contacts.png']
     """
     paths = [path for argument in arguments for path in _expanded(str(argument), VIDEOS if video else IMAGES)]
+    if paths == sorted(paths):  # as a shell expands a pattern
+        paths.sort(key=in_order)
     is_video = {path: video or path.suffix.lower() in VIDEOS or is_bag(path) for path in paths}
     inputs = Inputs([path for path in paths if not is_video[path]], [path for path in paths if is_video[path]], topic)
     if topic is not None and not inputs.bags:
@@ -103,13 +108,14 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
 def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
     path = Path(argument)
     if path.is_dir():
-        found = metadata_of(path) or sorted(p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
+        files = (p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
+        found = metadata_of(path) or sorted(files, key=in_order)
         if not found:
             raise MembraneError(f"{path}: the folder holds no files {' '.join(suffixes)}; expected one or more")
         return found
     if path.exists():
         return [path]
-    found = [Path(match) for match in sorted(glob.glob(argument, recursive=True))]
+    found = [Path(match) for match in sorted(glob.glob(argument, recursive=True), key=in_order)]
     if not any(p.is_file() for p in found):
         raise MembraneError(f"{argument}: no such file, no pattern that matches one; expected images, globs, folders")
     return [p for p in found if p.is_file()]

@@ -8,6 +8,7 @@ from types import TracebackType
 from ..files.atomic import PARTIAL
 from ..files.folder_lock import Claim, Shard
 from ..files.optional import load_pyarrow
+from ..files.order import in_order
 from ..files.provenance import Origin, printable
 from ..results.frames import open_folder
 from ..results.store import FINISHED, Mesh, check_folder
@@ -105,7 +106,7 @@ class ResultFolder:
         def is_of(origin: Origin, file: Path) -> bool:
             return origin.is_of(file)
 
-        files = {name: file for name in sorted(origins) if (file := self._file_of(name))}
+        files = {name: file for name in sorted(origins, key=in_order) if (file := self._file_of(name))}
         changed = [name for name, file in files.items() if not is_of(origins[name], file)]
         self.finished.difference_update(changed)
         damaged = [path for path in self.frames.damaged if path.parent != self.path or self._file_of(path.stem)]

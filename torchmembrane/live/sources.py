@@ -27,7 +27,7 @@ class Timed(NamedTuple):
 
 
 def camera_images(camera: int | str, size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """The images of a camera by OpenCV, RGB `[height, width, 3]` uint8, without end.
+    """The images of a camera by OpenCV, RGB `[height, width, 3]` or grey `[height, width]`, without end.
 
     Args:
         camera: its number, or the path or address of a stream that OpenCV opens.
@@ -42,6 +42,7 @@ def camera_images(camera: int | str, size: tuple[int, int]) -> Iterator[np.ndarr
         raise MembraneError(f"--camera {camera}: cannot be opened; expected a camera's number, 0 the first, or its path")
     opened.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
     opened.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+    opened.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # images and videos are not turned either
     return _read(opened, camera, size)
 
 
@@ -52,13 +53,26 @@ def _read(opened: Any, camera: int | str, size: tuple[int, int]) -> Iterator[np.
             taken, image = opened.read()
             if taken:
                 missed = 0
-                yield _checked(image[..., ::-1], size, f"--camera {camera}")
+                yield _checked(_red_first(image, camera), size, f"--camera {camera}")
             else:
                 missed += 1
                 time.sleep(BREATH)
         raise MembraneError(f"--camera {camera}: no image in {missed} reads; is it unplugged, or used by another program?")
     finally:
         opened.release()
+
+
+def _red_first(image: np.ndarray, camera: int | str) -> np.ndarray:
+    """A frame of OpenCV's - grey, BGR or BGRA - as grey `[height, width]` or RGB."""
+    channels = 1 if image.ndim == 2 else image.shape[-1]
+    if channels == 1:
+        return image.reshape(image.shape[:2])
+    if channels not in (3, 4):
+        raise MembraneError(
+            f"--camera {camera}: frames {list(image.shape)}; expected grey, BGR or BGRA: choose another format of the camera "
+            "(two channels are mostly YUV)"
+        )
+    return image[..., 2::-1]
 
 
 def video_images(path: Path, size: tuple[int, int], rate: float | None) -> Iterator[Timed]:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from ..errors import MembraneError, expect
 from ..files.optional import load_pandas
+from ..files.order import in_order
 from .frame_table import PART_ROWS, read_part
 from .frames import frames_of
 from .npz import load_frame, stack_frames
@@ -77,9 +78,10 @@ def read_frame(path: Path, name: str | None = None) -> FoundFrame:
         expect(name in (None, path.stem), "--frame", name, f"a folder or a part to choose from; {path} is one frame")
         return FoundFrame(path.stem, load_frame(path), path.parent)
     frames = read_part(path)
-    chosen = next(iter(sorted(frames))) if name is None else name
+    first = min(frames, key=in_order)
+    chosen = first if name is None else name
     if chosen not in frames:
-        raise MembraneError(f"{path}: no frame {chosen!r}; expected one of {len(frames)}, {min(frames)!r} the first")
+        raise MembraneError(f"{path}: no frame {chosen!r}; expected one of {len(frames)}, {first!r} the first")
     return FoundFrame(chosen, frames[chosen], path.parent.parent if path.parent.name == "frames" else path.parent)
 
 
@@ -97,7 +99,7 @@ class Results:
     Attributes:
         folder: the same.
         mesh: what all frames share: rest surface, triangles, units, settings.
-        names: of all frames, sorted.
+        names: of all frames, in order: numbers within them count as numbers.
 
     Raises:
         MembraneError: the folder holds no results, or not one frame.
@@ -107,7 +109,7 @@ class Results:
         self.folder = folder
         self.mesh = Mesh.load(folder / MESH)
         self._frames = frames_of(folder, self.mesh)
-        self.names = sorted(self._frames.names())
+        self.names = sorted(self._frames.names(), key=in_order)
         self._known = frozenset(self.names)
         if not self.names:
             raise MembraneError(f"{folder}: no frames; expected results of `torchmembrane reconstruct`")

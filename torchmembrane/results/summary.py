@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..files.atomic import whole_file
+from ..files.order import in_order
 from ..files.provenance import printable
 from ..files.safe_read import regular_size
 from .npz import Stored
@@ -75,7 +76,8 @@ class Summary:
             with whole_file(self.path) as unfinished, open(unfinished, "w", newline="", encoding="utf-8") as file:
                 writer = csv.DictWriter(file, COLUMNS)
                 writer.writeheader()
-                writer.writerows({key: _escaped(key, rows[name][key]) for key in COLUMNS} for name in sorted(rows))
+                for name in sorted(rows, key=in_order):
+                    writer.writerow({key: _escaped(key, rows[name][key]) for key in COLUMNS})
         self.rows = {}
 
     def _set(self, *values: object) -> None:
