@@ -266,14 +266,28 @@ def test_markers_that_the_press_turns_away_are_not_hidden(fingertip):
         volume=net.membrane.rest_volume[None], misfit=0 * pressure, unexplained=0 * pressure, shared_misfit=0 * pressure
     )
     markers = reconstructor.rest_markers + reconstructor.marker_shares @ u
+    moved_by = reconstructor.camera.point_to_pixel(markers) - reconstructor.rest_pixels
     facing = facings(markers, reconstructor.marker_shares @ net.membrane.normals(rest + u))
     walls, number = facing < 0.4, int((facing < 0.4).sum())
     others = torch.zeros_like(walls)
     others[0, facing[0].argsort(descending=True)[:number]] = True
     for lost, status in ((walls, Status.OK), (others, Status.HIDDEN)):
         confidence = torch.where(lost, 0.0, seen)
-        told = reconstructor.result(found, observation, torch.zeros(1, seen.shape[1], 2), confidence, torch.zeros(1))
+        told = reconstructor.result(found, observation, moved_by, confidence, torch.zeros(1))
         assert int(told.status) == status and float(told.coverage) < 0.85
+
+
+@pytest.mark.parametrize("off, status", [(1.4, Status.OK), (1.6, Status.UNEXPLAINED)])
+def test_a_residual_of_pixels_is_never_ok(fingertip, off, status):
+    """Whatever the other numbers of the frame say: here all are those of a surface at rest that is explained."""
+    reconstructor = fingertip[1]
+    seen = torch.ones(1, len(reconstructor.rest_markers))
+    rest = torch.zeros(1, seen.shape[1], 2)
+    observation = reconstructor.observation(rest, seen)
+    found = reconstructor.estimator(observation)
+    told = reconstructor.result(found, observation, rest + torch.tensor([0.6 * off, 0.8 * off]), seen, torch.zeros(1))
+    assert int(told.status) == status
+    torch.testing.assert_close(told.residual, torch.tensor([off]), rtol=0.02, atol=0)
 
 
 def test_a_hidden_part_is_said(fingertip, pressed):

@@ -29,6 +29,7 @@ from .surface.bicubic import bicubic_shares
 
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
 LEAST_ERROR = 0.02  # px
+LARGEST_RESIDUAL = 1.5  # px, of a plausible answer, however noisy its image
 
 
 class Reconstructor(nn.Module):
@@ -253,7 +254,8 @@ class Reconstructor(nn.Module):
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))
         normals, broken = membrane.normals(x), ~x.flatten(1).isfinite().all(1)
         in_view = self.coverage.in_view(confidence, facings(markers, self.marker_shares @ normals.to(markers)))
-        gone, status = (status != Status.OK.value) | broken, self._judged(status, found, in_view, broken)
+        residual = (miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()
+        gone, status = (status != Status.OK.value) | broken, self._judged(status, found, residual, in_view, broken)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
         deviations = self.estimator.deviations(found, observation, contacts)
         wrench = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1)
@@ -268,7 +270,7 @@ class Reconstructor(nn.Module):
             pressure=found.pressure,
             pressure_change=found.pressure - self.estimator.rest_pressure,
             volume_error=self.estimator.cavity.volume_error(found.volume, found.pressure),
-            residual=(miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt(),
+            residual=residual,
             wrench=wrench,
             coverage=self.coverage(confidence),
             camera_motion=in_words(found.moved, self.image_size),
@@ -283,13 +285,13 @@ class Reconstructor(nn.Module):
         measured = torch.where(lost[..., None], torch.nan, pixels).to(markers)
         return Reconstruction(pixels=measured, confidence=confidence, status=status.to(torch.int32), **kept)
 
-    def _judged(self, status: Tensor, found: Equilibrium, coverage: Tensor, broken: Tensor) -> Tensor:
+    def _judged(self, status: Tensor, found: Equilibrium, residual: Tensor, coverage: Tensor, broken: Tensor) -> Tensor:
         """Statuses `[B]`, of frames that had none before the solve too: of several that hold the last."""
         ok = status == Status.OK.value
         for of_this, value in (
             (~self.estimator.is_converged(found), Status.NOT_CONVERGED.value),
             (coverage < LEAST_COVERAGE, Status.HIDDEN.value),
-            (~self.estimator.is_explained(found), Status.UNEXPLAINED.value),
+            (~self.estimator.is_explained(found) | (residual > LARGEST_RESIDUAL), Status.UNEXPLAINED.value),
             (broken, Status.NO_SOLUTION.value),
         ):
             status = torch.where(ok & of_this, value, status)
