@@ -244,10 +244,30 @@ def test_a_pressure_without_a_known_unit_is_refused(tmp_path, capsys, text):
     assert "expected a number and its unit" in capsys.readouterr().err
 
 
-def test_a_file_is_not_written_over_unless_it_is_asked_for(tmp_path, capsys):
+@pytest.mark.parametrize("lost", ["_dots.csv", ".toml"])
+def test_no_file_is_written_over_unless_it_is_asked_for(tmp_path, capsys, lost):
+    """Not the sensor file, nor one of those beside it, of which another may be the user's own."""
     path = drafted(tmp_path, "dome")
+    path.with_name(f"sensor{lost}").unlink()
+    before = {file: file.read_bytes() for file in tmp_path.iterdir()}
     assert main(["init", str(path), "--shape", "dome", *SHAPES["dome"].split(), *FISHEYE]) == 2
-    assert "--force" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "is there already" in said and "--force" in said
+    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("option, name", [("--dots", "sensor_dots.csv"), ("--rest", "sensor_rest.png")])
+def test_what_is_read_is_never_written_over(tmp_path, capsys, option, name):
+    path = drafted(tmp_path, "dome")
+    given = tmp_path / name
+    given.touch()
+    (tmp_path / "here").symlink_to(tmp_path)
+    before = {file: file.read_bytes() for file in tmp_path.iterdir() if file.is_file()}
+    options = [argument for argument in FISHEYE if argument != "--pitch"]
+    command = ["init", str(path), "--force", "--shape", "dome", *SHAPES["dome"].split(), *options]
+    assert main([*command, option, str(tmp_path / "here" / name)]) == 2
+    assert f"would write over {given}, which it reads" in capsys.readouterr().err
+    assert {file: file.read_bytes() for file in tmp_path.iterdir() if file.is_file()} == before
 
 
 def test_on_a_terminal_what_is_missing_is_asked_for(tmp_path, monkeypatch):

@@ -10,6 +10,8 @@ from ..errors import MembraneError
 from .arguments import Add, add_command, count_pair, positive, positive_pair, vector
 from .choices import DRAFTS, FILLINGS, FROM_IMAGE, LENGTH_UNITS, LENSES, LONGEST_SIDE, POLARITIES
 
+COMPANIONS = ("_dots.csv", "_grid.npz", "_rest.png", "_rest.tiff")
+"""Ends of the names of the files that are written beside a sensor file."""
 PURPOSE = "write a sensor file, with a word on every key, from a few numbers"
 EXAMPLES = """\
 examples:
@@ -141,8 +143,12 @@ def run(arguments: Namespace) -> int:
     path: Path = arguments.sensor
     if path.suffix != ".toml":
         raise MembraneError(f"init {path}: expected a file that ends with .toml, as sensor.toml")
-    if path.exists() and not arguments.force:
-        raise MembraneError(f"init {path}: is there already; choose another name, or pass --force to write over it")
+    read = [Path(file).resolve() for file in (arguments.rest, arguments.dots) if file is not None]
+    for file in (path, *(path.with_name(path.stem + ending) for ending in COMPANIONS)):
+        if file.resolve() in read:
+            raise MembraneError(f"init {path}: would write over {file}, which it reads; choose another name")
+        if file.exists() and not arguments.force:
+            raise MembraneError(f"init {path}: {file} is there already; choose another name, or pass --force to write over it")
     if arguments.shape is None:
         arguments.shape = _asked("shape", *QUESTIONS["shape"])
     from .draft import needed, refuse_foreign, write_draft
