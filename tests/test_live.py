@@ -229,23 +229,11 @@ PICTURE = np.random.default_rng(0).integers(0, 255, (6, 8), np.uint8)
 """Asymmetric: mirrored or turned it is another."""
 
 
-class AsCaptured:
-    """`Capture` of frames that are given as they are."""
-
-    def __init__(self, frame):
-        self.frame = frame
-
-    def isOpened(self):  # noqa: N802
-        return True
-
-    def set(self, key, value):
-        pass
+class AsCaptured(Capture):
+    """Frames as they are given."""
 
     def read(self):
-        return True, self.frame
-
-    def release(self):
-        pass
+        return True, self.images[0]
 
 
 def colour(grey):
@@ -269,7 +257,7 @@ def test_frames_of_every_layout_are_the_picture_and_are_kept_as_it(layout, monke
     import cv2
 
     given, expected = LAYOUTS[layout]
-    monkeypatch.setattr(cv2, "VideoCapture", lambda number: AsCaptured(given))
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: AsCaptured([given]))
     seen = next(camera_images(0, (8, 6)))
     np.testing.assert_array_equal(seen, expected)
     assert seen.dtype == expected.dtype
@@ -296,7 +284,7 @@ def test_the_edge_package_takes_frames_of_every_layout_alike(layout, edge_cli):
 def test_frames_of_two_channels_are_refused(monkeypatch, edge_cli):
     import cv2
 
-    monkeypatch.setattr(cv2, "VideoCapture", lambda number: AsCaptured(np.dstack([PICTURE, PICTURE])))
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: AsCaptured([np.dstack([PICTURE, PICTURE])]))
     with pytest.raises(tm.MembraneError, match=r"--camera 0: frames \[6, 8, 2\]; expected grey, BGR or BGRA"):
         next(camera_images(0, (8, 6)))
     with pytest.raises(edge_cli.EdgeError, match=r"frames \[6, 8, 2\]; expected grey, BGR or BGRA"):

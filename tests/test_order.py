@@ -44,6 +44,12 @@ def test_numbers_in_names_count_as_numbers(series):
     assert all(in_order(one) < in_order(after) for one, after in pairwise(names))
 
 
+def test_numbers_of_any_length_are_compared():
+    """Names of damaged results may be longer than Python makes an int of."""
+    names = ["f" + "9" * 4999, "f1" + "0" * 4999]
+    assert sorted(names[::-1], key=in_order) == names
+
+
 def test_names_of_one_number_differ_by_their_letters():
     assert sorted(["f_1", "f_01", "g_1", "F_1"], key=in_order) == ["F_1", "f_01", "f_1", "g_1"]
 

@@ -39,7 +39,8 @@ def in_order(paths: list) -> list:
 
     def numbered(path):
         parts = re.split("([0-9]+)", str(path))  # texts at even places, numbers at odd ones
-        return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)], str(path)
+        digits = [part.lstrip("0") for part in parts]
+        return [(len(digits[k]), digits[k]) if k % 2 else (-1, part) for k, part in enumerate(parts)], str(path)
 
     return sorted(paths, key=numbered) if paths == sorted(paths) else paths
 

@@ -262,7 +262,7 @@ def write_as_taken(stem: str | Path, image: np.ndarray) -> Path:
         ('red.png', [[0.29899999499320984]])
     """
     if image.dtype == np.uint16 and image.ndim == 3:
-        image = image @ np.array(GREY) / 65535
+        image = to_grey(image)
     if image.dtype.kind == "f":
         return write_image(stem, image)
     path = Path(f"{stem}.png")

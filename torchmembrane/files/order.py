@@ -14,4 +14,5 @@ def in_order(name: str | Path) -> tuple[list[tuple[int, str]], str]:
         ['e_11', 'f_1', 'f_2', 'f_10']
     """
     parts = NUMBER.split(str(name))  # texts at even places, numbers at odd ones
-    return [(int(part), "") if place % 2 else (-1, part) for place, part in enumerate(parts)], str(name)
+    digits = [part.lstrip("0") for part in parts]
+    return [(len(digits[k]), digits[k]) if k % 2 else (-1, part) for k, part in enumerate(parts)], str(name)
