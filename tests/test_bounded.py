@@ -165,7 +165,8 @@ READERS = {"open", "read_text", "read_bytes", "read_table", "read_metadata", "Pa
 LOADERS = {"np", "json", "tomllib", "pickle", "trimesh"}
 OTHERS_FILES = {
     "files/safe_read.py": "the one place",
-    "files/images.py": "Image.open, of bytes",
+    "files/decoder.py": "Image.open, of bytes or of a regular file of bounded size",
+    "files/images.py": "open, of such a file, whose pages are read one by one",
     "files/parquet.py": "PyArrow reads itself, of what was looked at before",
     "results/frame_table.py": "JSON of a table's metadata, through io.parquet",
     "results/summary.py": "line by line, as long as it likes, of a regular file",
@@ -174,8 +175,8 @@ OTHERS_FILES = {
     "cli/calibrate/files.py": "np.loadtxt, of text",
     "simulate/frames.py": "JSON, of text, and of a table's metadata",
     "accuracy/finished.py": "JSON, of text",
-    "jobs/decode.py": "PyAV reads videos itself",
-    "live/sources.py": "PyAV reads videos itself",
+    "files/video.py": "PyAV reads videos itself",
+    "files/video_end.py": "heads of boxes, some bytes each, of a regular file",
 }
 """Modules that call a reader themselves, and why that is within bounds."""
 OWN_FILES = {

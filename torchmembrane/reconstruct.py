@@ -149,7 +149,7 @@ class Reconstructor(nn.Module):
         """Image files as a batch `[B, 1, height, width]` in 0..1, in this module's precision and on its device."""
         grey = []
         for path in paths:
-            grey.append(grey_batch(read_image(path, self.image_size), self.image_size, "rgb", self.rest_pixels))
+            grey.append(grey_batch(read_image(path, self.image_size, self.camera.bits), self.image_size, "rgb", self.rest_pixels))
         return torch.cat(grey)
 
     def forward(
@@ -183,7 +183,7 @@ class Reconstructor(nn.Module):
 
     def grey(self, images: Tensor | np.ndarray) -> Tensor:
         """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
-        return grey_batch(images, self.image_size, self.channels, self.rest_pixels)
+        return grey_batch(images, self.image_size, self.channels, self.rest_pixels, self.camera.bits)
 
     def reconstruct_grey(
         self,

@@ -1,7 +1,7 @@
 """Lens and ports from images of a flat target in several poses (section 5.2)."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -84,8 +84,8 @@ def lens_from_views(camera: Camera, board: Checkerboard, views: Views) -> Camera
     start, poses = lens_and_poses(bare, board, views.pixels)
     found = _fit_camera(_BoardProblem(start, board, views, LENS, {}), poses, "calibrate camera")
     values = {name: getattr(found.camera, name).tolist() for name in LENS}
-    whole = Camera(camera.model, camera.image_size, **values, ports=camera.ports, medium_index=float(camera.medium_index))
-    return found._replace(camera=whole)
+    known: dict[str, Any] = dict(ports=camera.ports, medium_index=float(camera.medium_index), bits=camera.bits)
+    return found._replace(camera=Camera(camera.model, camera.image_size, **values, **known))
 
 
 def ports_from_views(camera: Camera, board: DotBoard, views: Views, held: Sequence[str] = ()) -> CameraFit:
@@ -240,4 +240,5 @@ def _with(camera: Camera, values: Mapping[str, Tensor]) -> Camera:
 
     ports = list(zip(get("port_distance"), get("port_thickness"), get("port_index"), strict=True))
     lens = get("focal"), get("centre"), get("distortion")
-    return Camera(camera.model, camera.image_size, *lens, ports=ports, medium_index=get("medium_index")[0])
+    medium = get("medium_index")[0]
+    return Camera(camera.model, camera.image_size, *lens, ports=ports, medium_index=medium, bits=camera.bits)

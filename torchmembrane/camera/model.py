@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import expect
-from ..files.images import MOST_PIXELS
+from ..files.decoder import MOST_PIXELS
+from ..files.levels import check_bits
 from .distortion import fisheye_direction, fisheye_image, pinhole_direction, pinhole_image
 from .mode import Mode
 from .ports import MOST_INDEX, Layers, Port, apparent_points, check_ports, layers_of, refract
@@ -58,6 +59,7 @@ class Camera(nn.Module):
         distortion: coefficients; what is left off is zero, an empty list leaves the distortion out of the computation.
         ports: layers (distance, thickness, index) in order from the camera; what lies before and between them is air.
         medium_index: refractive index of all that follows the last port; without ports it plays no part.
+        bits: of its values, 8 to 16, where images of 16 bits hold fewer; None: all bits of what they are stored in.
 
     Attributes:
         focal: `[2]`, as all others a float64 tensor.
@@ -99,6 +101,7 @@ class Camera(nn.Module):
         distortion: Sequence[float] = (),
         ports: Sequence[Sequence[float]] = (),
         medium_index: float = 1.0,
+        bits: int | None = None,
     ) -> None:
         super().__init__()
         _check_lens(model, image_size, focal, centre, distortion)
@@ -106,6 +109,7 @@ class Camera(nn.Module):
             1 <= medium_index <= MOST_INDEX, "Camera: medium_index", medium_index, "1 (air) or more, at most 5; water has 1.33"
         )
         check_ports("Camera", ports)
+        check_bits(bits)
         self.model = model
         self.image_size = (int(image_size[0]), int(image_size[1]))
         padding = [0.0] * (COEFFICIENTS[model] - len(distortion)) if len(distortion) else []
@@ -117,6 +121,7 @@ class Camera(nn.Module):
         self._parameter("port_index", [port[2] for port in ports])
         self._parameter("medium_index", medium_index)
         self.mode: Mode | None = None
+        self.bits = None if bits is None else int(bits)
 
     def _parameter(self, name: str, value: float | list[float]) -> None:
         self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
@@ -149,7 +154,7 @@ class Camera(nn.Module):
         blocks = (binning, binning) if isinstance(binning, int) else binning
         mode = Mode.of(self.image_size, self.focal.tolist(), self.centre.tolist(), part, blocks)
         lens = mode.size, mode.binned_focal, mode.binned_centre, self.distortion.tolist()
-        made = Camera(self.model, *lens, ports=self.ports, medium_index=self.medium_index.item())
+        made = Camera(self.model, *lens, ports=self.ports, medium_index=self.medium_index.item(), bits=self.bits)
         made.mode = mode
         return made
 

@@ -26,6 +26,7 @@ from .arguments import (
 if TYPE_CHECKING:
     import numpy as np
 
+    from ..camera.model import Camera
     from ..live.loop import Seen, Tally
     from ..live.streams import Stream
     from ..sensor.sensor import Sensor
@@ -48,7 +49,6 @@ SOURCES = ("camera", "video", "images")
 OF_TORCH = ("grid", "energy", "flow", "smoothing", "locator")
 DEFAULTS = {"estimator": "force-balance", "device": "cpu"}
 """Of torch as well."""
-DEFAULT_RATE = 30.0
 
 
 def add_parser(commands: Any) -> None:
@@ -81,7 +81,7 @@ def run(arguments: Namespace) -> int:
 
     _check(arguments)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
-    images, stream = _images(arguments, sensor.camera.image_size), _stream(arguments, sensor)
+    images, stream = _images(arguments, sensor.camera), _stream(arguments, sensor)
     line = Line(stream.mesh, sys.stdout)
     warnings.showwarning = lambda message, *_: line.say(f"torchmembrane: warning: {message}")  # main restores it
     with ExitStack() as stack:
@@ -113,14 +113,15 @@ def _check(arguments: Namespace) -> None:
     check_device(arguments.device)
 
 
-def _images(arguments: Namespace, size: tuple[int, int]) -> "Iterator[np.ndarray]":
-    from ..live.sources import camera_images, folder_images, paced, video_images
+def _images(arguments: Namespace, camera: "Camera") -> "Iterator[np.ndarray]":
+    from ..live.sources import IMAGE_RATE, camera_images, folder_images, paced, video_images
 
+    size, bits = camera.image_size, camera.bits
     if arguments.camera is not None:
         return camera_images(arguments.camera, size)
     if arguments.video is not None:
-        return paced(video_images(arguments.video, size, arguments.rate))
-    return paced(folder_images(arguments.images, size, arguments.rate or DEFAULT_RATE))
+        return paced(video_images(arguments.video, size, arguments.rate, bits))
+    return paced(folder_images(arguments.images, size, arguments.rate or IMAGE_RATE, bits))
 
 
 def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
@@ -133,7 +134,7 @@ def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
     from .build import build_reconstructor
 
     if arguments.model is not None:
-        return ModelStream(arguments.model, sensor.fingerprint, arguments.threads)
+        return ModelStream(arguments.model, sensor.fingerprint, arguments.threads, sensor.camera.bits)
     torch.set_num_threads(arguments.threads)
     if arguments.grid is not None:
         sensor = replace(sensor, membrane=sensor.surface.membrane(tuple(arguments.grid)))

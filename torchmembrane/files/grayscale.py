@@ -6,16 +6,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..control_flow import can_sync
 from ..errors import MembraneError
 from .images import GREY
+from .levels import refuse_beyond, white_of
 
 Channels = Literal["rgb", "bgr"]
 CHANNELS = ("rgb", "bgr")
 SHAPES = "[H, W], [H, W, 3], [B, H, W], [B, 1 | 3, H, W] or [B, H, W, 1 | 3]"
-WHITE = {torch.uint8: 255.0, torch.uint16: 65535.0}
+STORED_BITS = {torch.uint8: 8, torch.uint16: 16}
 
 
-def grey_batch(images: Tensor | np.ndarray, size: tuple[int, int], channels: Channels, like: Tensor) -> Tensor:
+def grey_batch(
+    images: Tensor | np.ndarray, size: tuple[int, int], channels: Channels, like: Tensor, bits: int | None = None
+) -> Tensor:
     """Grey images `[B, 1, height, width]` in 0..1, of the precision and on the device of `like`.
 
     Args:
@@ -24,9 +28,11 @@ def grey_batch(images: Tensor | np.ndarray, size: tuple[int, int], channels: Cha
         size: width and height, px.
         channels: order of the three channels, "rgb" or "bgr".
         like: a tensor.
+        bits: of the camera, where uint16 images hold fewer: white is `2^bits - 1`.
 
     Raises:
-        MembraneError: another shape, size or type; says what came, what was expected, and how to permute.
+        MembraneError: another shape, size or type, or values beyond `bits`; says what came, what was expected, and how to
+            permute.
 
     Example:
         >>> photograph = np.zeros((480, 640, 3), np.uint8)
@@ -34,11 +40,15 @@ def grey_batch(images: Tensor | np.ndarray, size: tuple[int, int], channels: Cha
         [1, 1, 480, 640]
     """
     pixels = _tensor(images)
-    if not (pixels.is_floating_point() or pixels.dtype in WHITE):
+    if not (pixels.is_floating_point() or pixels.dtype in STORED_BITS):
         raise MembraneError(f"images of type {pixels.dtype}; expected uint8, uint16, or float in 0..1")
     planes = _planes(pixels, (size[1], size[0]))
-    white = WHITE.get(pixels.dtype)
-    planes = [plane.to(like) if white is None else plane.to(like) / white for plane in planes]
+    planes = [plane.to(like) for plane in planes]
+    if not pixels.is_floating_point():
+        white = white_of(STORED_BITS[pixels.dtype], bits)
+        if bits is not None and can_sync(pixels):
+            refuse_beyond(max(plane.max() for plane in planes), white)
+        planes = [plane / white for plane in planes]
     if len(planes) == 1:
         return planes[0][:, None]
     red, green, blue = planes if channels == "rgb" else reversed(planes)

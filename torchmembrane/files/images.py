@@ -1,38 +1,46 @@
 """Images as grey values: 0.299 R + 0.587 G + 0.114 B in floating point, the same on every path."""
 
-import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from io import BytesIO
+from itertools import islice
 from pathlib import Path
+from typing import IO
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ..errors import MembraneError
-from .safe_read import DAMAGE, in_one_line, read_bytes
+from .atomic import whole_file
+from .decoder import opened, pictures, refuse_damaged, stored
+from .levels import refuse_beyond, white_of
+from .safe_read import DAMAGE, in_one_line, read_bytes, regular_size
 
-FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
-MOST_PIXELS, MOST_IMAGE_BYTES = 2**25, 2**28
+MOST_IMAGE_BYTES, MOST_STACK_BYTES = 2**28, 2**32
+"""Of a file; of a TIFF of several pages, which are read one by one."""
+MOST_PICTURES = 2**17
+"""In a file."""
 GREY = (0.299, 0.587, 0.114)
 
 
-def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
+def read_image(path: str | Path, size: tuple[int, int] | None = None, bits: int | None = None) -> np.ndarray:
     """An image file's grey values, float32 `[height, width]` in 0..1.
 
-    Grey of 8 and 16 bits and of float (TIFF), RGB, palette, CMYK; alpha is ignored, of several frames the first is taken.
-    EXIF orientation is not applied: pixels are the camera's own. Colour of 16 bits arrives as 8 bits (Pillow's limit). Whatever
-    the decoders remark is an error: checksums of PNG, corrupt or missing data in JPEG, lengths that do not add up in WebP.
+    Grey of 8 and 16 bits and of float (TIFF), RGB, palette, CMYK; alpha is ignored. EXIF orientation is not applied: pixels
+    are the camera's own. Colour of 16 bits arrives as 8 bits (Pillow's limit). Whatever the decoders remark is an error, but
+    for padding in a JPEG: checksums of PNG, corrupt or missing data in JPEG, lengths that do not add up in WebP.
 
     Args:
-        path: a PNG, JPEG, BMP, TIFF or WebP file.
+        path: a PNG, JPEG, BMP, TIFF or WebP file with one picture.
         size: width and height that it must have, px; it is looked at before pixels are decoded.
+        bits: of the camera, where 16-bit files hold fewer; None: as the file says, or 16.
 
     Returns:
         Grey values.
 
     Raises:
-        MembraneError: the file is missing, no image, too large, of another size, truncated or damaged; names the file and the
-            cause.
+        MembraneError: the file is missing, no image, too large, of another size, truncated or damaged, or it has several
+            pictures or values beyond `bits`; names the file and the cause.
 
     Limitations:
         TIFF, BMP and WebP have no checksums, JPEG has none for what decodes without remark: damage that leaves the file well
@@ -43,29 +51,27 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> np.ndar
         >>> image.shape, str(image.dtype), float(image.max()) <= 1
         ((480, 640), 'float32', True)
     """
-    return decode_image(_content(path), path, size)
+    return decode_image(_content(path), path, size, bits)
 
 
-def decode_image(content: bytes, name: str | Path, size: tuple[int, int] | None = None) -> np.ndarray:
+def decode_image(
+    content: bytes, name: str | Path, size: tuple[int, int] | None = None, bits: int | None = None
+) -> np.ndarray:
     """The grey values of an image file's content, as `read_image` gives them.
 
     Args:
         content: of a PNG, JPEG, BMP, TIFF or WebP file.
         name: what an error calls it.
         size: width and height that it must have, px.
+        bits: as `read_image`.
 
     Raises:
         MembraneError: as `read_image`.
     """
-    with _opened(name, content) as image:
-        if size is not None and image.size != size:
-            raise MembraneError(
-                f"{name}: the image is {image.width} x {image.height} px, expected {size[0]} x {size[1]}: use images of this "
-                "sensor's camera; where its mode crops or bins them, say so in the file's [camera]"
-            )
-        image.load()
-        _refuse_damaged(image, content)
-        return to_grey(_array(image))
+    with _opened_single(name, content) as image:
+        grey = _grey_of(image, size, bits)
+        refuse_damaged(image, content)
+        return grey
 
 
 def read_pixels(name: str | Path, content: bytes | None = None) -> np.ndarray:
@@ -83,10 +89,10 @@ def read_pixels(name: str | Path, content: bytes | None = None) -> np.ndarray:
         dtype('uint8')
     """
     content = _content(name) if content is None else content
-    with _opened(name, content) as image:
-        image.load()
-        _refuse_damaged(image, content)
-        return _array(image)
+    with _opened_single(name, content) as image:
+        values = stored(image).values
+        refuse_damaged(image, content)
+        return values
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
@@ -96,14 +102,80 @@ def image_size(path: str | Path) -> tuple[int, int]:
         path: as `read_image`.
 
     Raises:
-        MembraneError: the file is missing, no image, or too large.
+        MembraneError: the file is missing, no image, too large, or has several pictures.
 
     Example:
         >>> image_size("examples/rest.png")
         (640, 480)
     """
-    with _opened(path, _content(path)) as image:
+    with _opened_single(path, _content(path)) as image:
         return image.size
+
+
+def picture_count(path: Path, most: int = MOST_PICTURES) -> int:
+    """How many pictures a file has, up to so many: pages of a TIFF, frames of an animated PNG or WebP, pictures of an MPO; 0
+    where it is no image that is read here.
+
+    Example:
+        >>> picture_count(Path("examples/rest.png")), picture_count(Path("examples/sensor.toml"))
+        (1, 0)
+    """
+    found = 0
+    try:
+        with _opened_stack(path) as image:
+            for _ in islice(pictures(image), most):
+                found += 1
+    except MembraneError:  # reading them says what it is
+        pass
+    return found
+
+
+def stack_images(path: Path, size: tuple[int, int], bits: int | None = None) -> Iterator[np.ndarray | MembraneError]:
+    """The pictures of a file one after another, as `read_image` gives one; one that cannot be read is the reason why.
+
+    Args:
+        path: a PNG, JPEG, BMP, TIFF or WebP file of one picture or more.
+        size: width and height that they must have, px.
+        bits: as `read_image`.
+
+    Yields:
+        Grey values, or an error that does not name the file.
+
+    Raises:
+        MembraneError: the file is no image, too large, or damaged so that no further picture is found.
+    """
+    number = 0
+    with _opened_stack(path) as image:
+        content = b"" if image.format == "TIFF" else _content(path)
+        try:
+            if image.format != "MPO":
+                refuse_damaged(image, content)
+            for number, _ in enumerate(islice(pictures(image), MOST_PICTURES), 1):
+                yield _picture(image, size, bits, content)
+        except DAMAGE as error:
+            if isinstance(error, MembraneError):
+                raise
+            raise MembraneError(f"the file is damaged, or ends early, after {number} pictures ({in_one_line(error)})") from error
+
+
+def _picture(image: Image.Image, size: tuple[int, int], bits: int | None, content: bytes) -> np.ndarray | MembraneError:
+    try:
+        grey = _grey_of(image, size, bits)
+        if image.format == "MPO":
+            refuse_damaged(image, content[image.offset :])  # type: ignore[attr-defined]
+        return grey
+    except MembraneError as error:
+        return error
+    except DAMAGE as error:
+        return MembraneError(f"not readable as an image ({in_one_line(error)})")
+
+
+def _grey_of(image: Image.Image, size: tuple[int, int] | None, bits: int | None) -> np.ndarray:
+    """The current picture's grey values."""
+    found = stored(image, size)
+    if found.halved and bits is not None:
+        raise ValueError(f"its values are colour of 16 bits, of which 8 are read, so bits = {bits} is lost: save them as grey")
+    return to_grey(found.values, found.bits or bits)
 
 
 def _content(path: str | Path) -> bytes:
@@ -114,51 +186,39 @@ def _content(path: str | Path) -> bytes:
 
 
 @contextmanager
-def _opened(path: str | Path, content: bytes) -> Iterator[Image.Image]:
-    """An image whose header is read, from its file's content; whatever fails inside is an error that names the file."""
-    expected = "a whole PNG, JPEG or TIFF"
+def _opened_single(path: str | Path, content: bytes) -> Iterator[Image.Image]:
+    """The image of a file that must have one picture."""
+    with opened(path, BytesIO(content)) as image:
+        places = list(islice(pictures(image), MOST_PICTURES))
+        if len(places) != 1:
+            raise MembraneError(
+                f"it holds {len(places)} pictures; expected one: save the one that is meant as a file of its own (reconstruct "
+                "and live --images take all of them, as frames)"
+            )
+        if image.tell() != places[0]:
+            image.seek(places[0])
+        yield image
+
+
+@contextmanager
+def _opened_stack(path: Path) -> Iterator[Image.Image]:
+    """The image of a file that is read as far as pictures are asked for."""
+    expected = "a readable image file"
     try:
-        with Image.open(io.BytesIO(content), formats=FORMATS) as image:
-            if image.width * image.height > MOST_PIXELS:
-                raise ValueError(f"{image.width} x {image.height} px; at most {MOST_PIXELS} px are read")
-            yield image
-    except MembraneError as error:
-        raise MembraneError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-    except (*DAMAGE, Image.DecompressionBombError) as error:
-        cause = "cannot identify image file" if isinstance(error, UnidentifiedImageError) else in_one_line(error)
-        raise MembraneError(f"{path}: not readable as an image ({cause}); expected {expected}") from error
+        regular_size(path, MOST_STACK_BYTES, expected)
+        file: IO[bytes] = open(path, "rb")
+    except OSError as error:
+        raise MembraneError(f"{path}: not readable ({in_one_line(error)}); expected {expected}") from error
+    with file, opened(path, file) as image:
+        yield image
 
 
-def _refuse_damaged(image: Image.Image, content: bytes) -> None:
-    """Refuse what decoding passes over: wrong checksums of a PNG, what libjpeg only remarks of a JPEG."""
-    if image.format == "PNG":
-        with Image.open(io.BytesIO(content), formats=FORMATS) as twin:
-            twin.verify()
-    if image.format == "WEBP" and not _fills_its_file(content):
-        raise ValueError("its chunks do not fill the file")
-    if image.format in ("JPEG", "MPO") and image.mode in ("L", "RGB"):
-        from kornia_rs.io import ImageDecoder
-
-        try:
-            ImageDecoder().decode_gray8(content)
-        except Exception as error:  # it raises nothing narrower
-            raise ValueError("corrupt JPEG data") from error
-
-
-def _fills_its_file(riff: bytes) -> bool:
-    """Whether the chunks of a RIFF file, one behind the other, are as long as they say together."""
-    at, end = 12, 8 + int.from_bytes(riff[4:8], "little")
-    while at < end:
-        size = int.from_bytes(riff[at + 4 : at + 8], "little")
-        at += 8 + size + size % 2
-    return at == end == len(riff)
-
-
-def mean_image(paths: Sequence[Path]) -> np.ndarray:
+def mean_image(paths: Sequence[Path], bits: int | None = None) -> np.ndarray:
     """The mean of the grey values of image files of one size, float32 `[height, width]` in 0..1.
 
     Args:
         paths: one file or more.
+        bits: as `read_image`.
 
     Raises:
         MembraneError: as `read_image`; or the images differ in size.
@@ -170,18 +230,19 @@ def mean_image(paths: Sequence[Path]) -> np.ndarray:
             raise MembraneError(f"{path} is {sizes[0]} px; expected {sizes[1]} as {paths[0]}: give images of one camera mode")
     total = np.zeros(first[::-1])
     for path in paths:
-        total += read_image(path, first)
+        total += read_image(path, first, bits)
     return (total / len(paths)).astype(np.float32)
 
 
-def to_grey(array: np.ndarray) -> np.ndarray:
+def to_grey(array: np.ndarray, bits: int | None = None) -> np.ndarray:
     """Grey values of an array as float32 `[height, width]` in 0..1.
 
     Args:
         array: `[height, width]` grey or `[height, width, 3]` RGB; uint8 (0..255), uint16 (0..65535) or float (0..1).
+        bits: of the camera, where a uint16 holds fewer: white is `2^bits - 1`.
 
     Raises:
-        MembraneError: another shape or type, a value not finite or outside 0..1.
+        MembraneError: another shape or type, a value not finite, outside 0..1 or beyond `bits`.
 
     Returns:
         Grey values.
@@ -199,7 +260,8 @@ def to_grey(array: np.ndarray) -> np.ndarray:
             raise MembraneError(f"to_grey: float values from {low} to {high}; expected finite, in 0..1: divide by white")
         white = 1.0
     elif array.dtype.kind == "u" and array.dtype.itemsize <= 2:
-        white = np.iinfo(array.dtype).max
+        white = white_of(8 * array.dtype.itemsize, bits)
+        refuse_beyond(array.max(), white)
     else:
         raise MembraneError(f"to_grey: values of type {array.dtype}; expected uint8, uint16 or float in 0..1")
     if array.ndim == 3:
@@ -212,14 +274,15 @@ def to_grey(array: np.ndarray) -> np.ndarray:
     return (array.astype(np.float64) / white).astype(np.float32)
 
 
-def write_image(stem: str | Path, grey: np.ndarray) -> Path:
-    """Write grey values so that `read_image` gives the same bits.
+def write_image(stem: str | Path, grey: np.ndarray, bits: int | None = None) -> Path:
+    """Write grey values so that `read_image` gives the same numbers.
 
-    PNG of 8 or 16 bits where that holds the values exactly, else a TIFF of floats.
+    PNG of 8 or 16 bits where that holds the values exactly, else a TIFF of floats. The file is there whole or not at all.
 
     Args:
         stem: the file without its ending, `.png` or `.tiff`.
         grey: `[height, width]` in 0..1.
+        bits: of the camera, with which it will be read.
 
     Returns:
         The path.
@@ -231,25 +294,22 @@ def write_image(stem: str | Path, grey: np.ndarray) -> Path:
         ...     path.name, read_image(path).round(1).tolist()
         ('ramp.png', [[0.0, 0.20000000298023224, 1.0]])
     """
-    stem = Path(stem)
     for depth in (np.uint8, np.uint16):
-        levels = np.rint(grey.astype(np.float64) * np.iinfo(depth).max).astype(depth)
-        if np.array_equal(to_grey(levels), grey):
-            path = stem.with_name(stem.name + ".png")
-            Image.fromarray(levels).save(path)
-            return path
-    path = stem.with_name(stem.name + ".tiff")
-    Image.fromarray(grey).save(path)
-    return path
+        white = white_of(8 * np.dtype(depth).itemsize, bits)
+        levels = np.rint(grey.astype(np.float64) * white).astype(depth)
+        if np.array_equal(to_grey(levels, bits), grey):
+            return _written(Path(f"{stem}.png"), levels)
+    return _written(Path(f"{stem}.tiff"), grey)
 
 
-def write_as_taken(stem: str | Path, image: np.ndarray) -> Path:
-    """Write an image as a camera gave it, losslessly and fast.
+def write_as_taken(stem: str | Path, image: np.ndarray, bits: int | None = None) -> Path:
+    """Write an image as a camera gave it, losslessly and fast; the file is there whole or not at all.
 
     Args:
         stem: the file without its ending, `.png` or `.tiff`.
         image: `[height, width]` uint8 or uint16, `[height, width, 3]` uint8, or grey values as for `write_image`; of
             `[height, width, 3]` uint16 the grey values are written.
+        bits: of the camera, with which it will be read.
 
     Returns:
         The path.
@@ -262,21 +322,14 @@ def write_as_taken(stem: str | Path, image: np.ndarray) -> Path:
         ('red.png', [[0.29899999499320984]])
     """
     if image.dtype == np.uint16 and image.ndim == 3:
-        image = to_grey(image)
+        image = to_grey(image, bits)
     if image.dtype.kind == "f":
-        return write_image(stem, image)
-    path = Path(f"{stem}.png")
-    Image.fromarray(np.ascontiguousarray(image)).save(path, compress_level=1)
+        return write_image(stem, image, bits)
+    return _written(Path(f"{stem}.png"), np.ascontiguousarray(image), compress_level=1)
+
+
+def _written(path: Path, values: np.ndarray, **options: int) -> Path:
+    with whole_file(path) as partial:
+        Image.fromarray(values).save(partial, "TIFF" if path.suffix == ".tiff" else "PNG", **options)
     return path
 
-
-def _array(image: Image.Image) -> np.ndarray:
-    if image.mode == "I":  # 16-bit grey as Pillow of some versions opens it
-        values = np.asarray(image)
-        if values.min() < 0 or values.max() > 65535:
-            raise ValueError(f"32-bit values from {values.min()} to {values.max()}; 8 or 16 bits are read")
-        return values.astype(np.uint16)
-    if image.mode == "F" or image.mode.startswith("I;16"):
-        return np.asarray(image)
-    grey = image.mode in ("1", "L", "LA", "La")
-    return np.asarray(image.convert("L" if grey else "RGB"))

@@ -34,18 +34,19 @@ SAMPLES = 32
 LENSES = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
 
 
-def grey_of(message: Any, size: tuple[int, int]) -> np.ndarray:
+def grey_of(message: Any, size: tuple[int, int], bits: int | None = None) -> np.ndarray:
     """Grey values `[height, width]` in 0..1 of a `sensor_msgs/Image` or `CompressedImage`.
 
     Args:
         message: the message.
         size: width and height that it must have, px.
+        bits: of the camera, where 16 hold fewer.
 
     Raises:
-        MembraneError: another size, an encoding without a grey or colour value for every pixel, or a damaged image.
+        MembraneError: another size, values beyond `bits`, an encoding without a grey or colour value for every pixel, or a damaged image.
     """
     if not hasattr(message, "encoding"):
-        return decode_image(bytes(message.data), f"an image of format {message.format!r}", size)
+        return decode_image(bytes(message.data), f"an image of format {message.format!r}", size, bits)
     if message.encoding not in CHANNELS:
         raise MembraneError(f"image of encoding {message.encoding!r}; expected one of {', '.join(CHANNELS)}")
     kind, values, colours = CHANNELS[message.encoding]
@@ -57,7 +58,7 @@ def grey_of(message: Any, size: tuple[int, int]) -> np.ndarray:
         raise MembraneError(f"the image has {len(rows)} bytes in lines of {message.step}; expected {message.height} of {line}")
     lines = rows[: message.step * message.height].reshape(message.height, message.step)[:, :line]
     pixels = np.ascontiguousarray(lines).view(item).reshape(message.height, message.width, values).astype(kind)
-    return to_grey(pixels[..., 0] if len(colours) == 1 else pixels[..., colours])
+    return to_grey(pixels[..., 0] if len(colours) == 1 else pixels[..., colours], bits)
 
 
 def unlike(info: Any, camera: Camera) -> str | None:

@@ -1,4 +1,5 @@
-"""Frames decoded in the background: images, and the pictures of videos and bags, a batch ahead of the one that is computed."""
+"""Frames decoded in the background: images, and the pictures of videos, bags and stacks of images, a batch ahead of the one
+that is computed."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -7,13 +8,14 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..files.images import to_grey
-from ..files.optional import load_pyav
+from ..files.images import picture_count, stack_images, to_grey
 from ..files.provenance import Origin
+from ..files.video import picture_total, picture_values, video_pictures
 from ..integrations.messages import grey_of
 from ..integrations.rosbag import image_topic, is_bag, messages
 from .inputs import Inputs, frame_name, picture_name
@@ -57,10 +59,10 @@ class DecodedFrame(NamedTuple):
 
 
 def sources(inputs: Inputs, reconstructor: "Reconstructor") -> Iterator[Source]:
-    """All frames of the inputs: the images, then the videos' and bags' pictures, which are called STEM_NUMBER."""
+    """All frames of the inputs: the images, then the pictures of videos, bags and stacks, which are called STEM_NUMBER."""
     yield from map(source_of, inputs.images)
     for path in inputs.videos:
-        yield from _pictures(path, _bag(path, inputs.topic) if is_bag(path) else _video(path, reconstructor))
+        yield from _pictures(path, _loads(path, inputs.topic, reconstructor))
 
 
 def source_of(path: Path) -> Source:
@@ -117,17 +119,8 @@ def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch:
 
 
 def length_of(path: Path, topic: str | None) -> int | None:
-    """The number of frames that a video or bag says it has; None where it does not say, or is none."""
-    if is_bag(path):
-        return image_topic(path, topic)[1]
-    av = load_pyav()
-    if not path.is_file():
-        return None
-    try:
-        with av.open(str(path)) as container:
-            return container.streams.video[0].frames or None
-    except (av.FFmpegError, IndexError):
-        return None
+    """The number of frames that a video, bag or stack says it has; None where it does not say, or is none."""
+    return image_topic(path, topic)[1] if is_bag(path) else picture_count(path) or picture_total(path)
 
 
 def _read(path: Path, reconstructor: "Reconstructor") -> Tensor:
@@ -135,7 +128,7 @@ def _read(path: Path, reconstructor: "Reconstructor") -> Tensor:
 
 
 def _pictures(path: Path, pictures: Iterator[Load]) -> Iterator[Source]:
-    """The frames of a video or bag one after another; one that cannot be decoded ends it."""
+    """The frames of a file of several one after another; where no further one can be found, the reason is a frame as well."""
     number = -1
     try:
         origin = origin_of(path)
@@ -148,35 +141,27 @@ def _pictures(path: Path, pictures: Iterator[Load]) -> Iterator[Source]:
         yield Source(picture_name(path, number + 1), path, refusal, Origin())
 
 
-def _video(path: Path, reconstructor: "Reconstructor") -> Iterator[Load]:
-    av, (width, height) = load_pyav(), reconstructor.sensor.camera.image_size
-    try:
-        with av.open(str(path)) as container:
-            _refuse_size(container.streams.video[0], width, height)
-            for picture in container.decode(video=0):
-                _refuse_size(picture, width, height)
-                yield partial(_video_image, picture)
-    except (av.FFmpegError, IndexError) as error:
-        raise MembraneError(f"video: {str(error).removeprefix(f'{path}: ')}") from error
-
-
-def _refuse_size(pictures: Any, width: int, height: int) -> None:
-    if (pictures.width, pictures.height) != (width, height):
-        raise MembraneError(f"the video is {pictures.width} x {pictures.height} px, the sensor's images {width} x {height}")
-
-
-def _bag(path: Path, topic: str | None) -> Iterator[Load]:
-    for image in messages(path, image_topic(path, topic)[0]):
-        yield partial(_bag_image, image.message)
+def _loads(path: Path, topic: str | None, reconstructor: "Reconstructor") -> Iterator[Load]:
+    """What gives the pictures of a file of several."""
+    if is_bag(path):
+        yield from (partial(_bag_image, image.message) for image in messages(path, image_topic(path, topic)[0]))
+        return
+    camera = reconstructor.sensor.camera
+    of_stack = picture_count(path, 1) > 0
+    for picture in stack_images(path, camera.image_size, camera.bits) if of_stack else video_pictures(path, camera.image_size):
+        yield partial(_refuse, str(picture)) if isinstance(picture, MembraneError) else partial(_image, picture)
 
 
 def _bag_image(message: Any, reconstructor: "Reconstructor") -> Tensor:
-    grey = grey_of(message, reconstructor.sensor.camera.image_size)
+    camera = reconstructor.sensor.camera
+    grey = grey_of(message, camera.image_size, camera.bits)
     return torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels)
 
 
-def _video_image(picture: Any, reconstructor: "Reconstructor") -> Tensor:
-    grey = to_grey(picture.to_ndarray(format="rgb24"))
+def _image(picture: Any, reconstructor: "Reconstructor") -> Tensor:
+    """The image of a picture: grey values, or what PyAV gives."""
+    of_stack = isinstance(picture, np.ndarray)
+    grey = picture if of_stack else to_grey(picture_values(picture, reconstructor.sensor.camera.bits))
     return torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels)
 
 

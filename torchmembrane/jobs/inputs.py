@@ -1,4 +1,4 @@
-"""What a call names - files, globs, folders - as image files, videos and bags, in the order of the call."""
+"""What a call names - files, globs, folders - as image files, and as videos, bags and stacks of images, in the order of the call."""
 
 import glob
 from collections import Counter
@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import MembraneError
+from ..files.images import picture_count
 from ..files.order import in_order
 from ..files.provenance import printable
 from ..integrations.rosbag import BAGS, METADATA, is_bag, metadata_of
 from ..results.store import MESH
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
+VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".gif")
 
 
 class Inputs(NamedTuple):
@@ -21,7 +22,8 @@ class Inputs(NamedTuple):
 
     Attributes:
         images: image files.
-        videos: video files and bags, which are their `metadata.yaml` or a storage file.
+        videos: files of several frames: videos, image files of several pictures, and bags, which are their `metadata.yaml`
+            or a storage file.
         topic: of the bags' images; None: the only one.
     """
 
@@ -33,6 +35,11 @@ class Inputs(NamedTuple):
     def bags(self) -> list[Path]:
         """Those of the videos that are bags."""
         return [path for path in self.videos if is_bag(path)]
+
+    @property
+    def need_pyav(self) -> bool:
+        """Whether some of the videos are neither bags nor images."""
+        return any(not is_bag(path) and not picture_count(path, 1) for path in self.videos)
 
     def video_of(self, name: str) -> Path | None:
         """The video whose frame would have this name, STEM_NUMBER.
@@ -89,7 +96,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
     paths = [path for argument in arguments for path in _expanded(str(argument), VIDEOS if video else IMAGES)]
     if paths == sorted(paths):  # as a shell expands a pattern
         paths.sort(key=in_order)
-    is_video = {path: video or path.suffix.lower() in VIDEOS or is_bag(path) for path in paths}
+    is_video = {path: video or path.suffix.lower() in VIDEOS or is_bag(path) or picture_count(path, 2) > 1 for path in paths}
     inputs = Inputs([path for path in paths if not is_video[path]], [path for path in paths if is_video[path]], topic)
     if topic is not None and not inputs.bags:
         raise MembraneError(f"--topic {topic}: none of the inputs is a bag, {' or '.join(BAGS)}")

@@ -102,7 +102,7 @@ def reconstruct_files(
     mesh = Mesh.of(reconstructor, settings)
     if figures and (shadowed := [path for path in inputs.images if path.parent.resolve() == out.resolve()]):
         raise MembraneError(f"--out {out}: figures would overwrite images there ({shadowed[0]}); choose another")
-    if len(inputs.videos) > len(inputs.bags):
+    if inputs.need_pyav:
         load_pyav()
     done: Counter[int] = Counter()
     work = Work(FrameReconstructor(reconstructor, rest_pixels, pressure), (out, mesh) if figures else None)

@@ -9,14 +9,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import MembraneError
-from ..files.images import read_image
-from ..files.optional import load_opencv, load_pyav
+from ..files.images import picture_count, stack_images
+from ..files.optional import load_opencv
+from ..files.order import in_order
+from ..files.video import picture_values, video_pictures
 from ..jobs.inputs import find_inputs
 
 MOST_MISSED = 100
 """Reads of a camera that fail in a row before it is given up."""
 BREATH = 0.01
 """Seconds between them."""
+
+
+IMAGE_RATE = 30.0
+"""Hz, of what has no pace of its own."""
 
 
 class Timed(NamedTuple):
@@ -75,38 +81,55 @@ def _red_first(image: np.ndarray, camera: int | str) -> np.ndarray:
     return image[..., 2::-1]
 
 
-def video_images(path: Path, size: tuple[int, int], rate: float | None) -> Iterator[Timed]:
-    """The pictures of a video, RGB `[height, width, 3]` uint8, due at its own pace or at `rate`, Hz.
+def video_images(path: Path, size: tuple[int, int], rate: float | None, bits: int | None = None) -> Iterator[Timed]:
+    """The pictures of a video, RGB `[height, width, 3]` uint8 or grey `[height, width]` in 0..1, due at its own pace or at
+    `rate`, Hz; those of an image file of several pictures, which has no pace of its own, at `IMAGE_RATE`.
+
+    One that is damaged is left out, with a warning.
 
     Raises:
-        MembraneError: PyAV is missing; the file is no video, damaged, or of another size.
+        MembraneError: PyAV is missing; the file is no video, ends early, or is of another size.
     """
-    av = load_pyav()
-    if not path.is_file():
-        raise MembraneError(f"--video {path}: no such file; expected a video")
+    if picture_count(path, 1):
+        yield from _of_files([path], size, rate or IMAGE_RATE, bits)
+        return
     try:
-        with av.open(str(path)) as container:
-            own = float(container.streams.video[0].average_rate or 1)
-            for number, picture in enumerate(container.decode(video=0)):
-                due = number / rate if rate else number / own if picture.time is None else picture.time
-                yield Timed(due, _checked(picture.to_ndarray(format="rgb24"), size, f"--video {path}"))
-    except (av.FFmpegError, IndexError) as error:
-        raise MembraneError(f"--video {path}: not readable as a video ({error}); expected one that FFmpeg decodes") from error
+        for number, picture in enumerate(video_pictures(path, size)):
+            if isinstance(picture, MembraneError):
+                warnings.warn(f"--video {path}: frame {number}: {picture}; left out", stacklevel=2)
+                continue
+            due = number / (rate or IMAGE_RATE) if rate or picture.time is None else picture.time
+            yield Timed(due, picture_values(picture, bits))
+    except MembraneError as error:
+        raise MembraneError(f"--video {path}: {error}") from error
 
 
-def folder_images(folder: Path, size: tuple[int, int], rate: float) -> Iterator[Timed]:
-    """The images of a folder in name order, grey `[height, width]` in 0..1, due at `rate`, Hz.
+def folder_images(folder: Path, size: tuple[int, int], rate: float, bits: int | None = None) -> Iterator[Timed]:
+    """The images of a folder in name order, of a file of several pictures all of them, grey `[height, width]` in 0..1, due at
+    `rate`, Hz.
 
     One that cannot be read is left out, with a warning.
 
     Raises:
         MembraneError: the folder holds no images.
     """
-    for number, path in enumerate(find_inputs([folder]).images):
+    found = find_inputs([folder])
+    yield from _of_files(sorted([*found.images, *found.videos], key=in_order), size, rate, bits)
+
+
+def _of_files(paths: Iterable[Path], size: tuple[int, int], rate: float, bits: int | None) -> Iterator[Timed]:
+    number = 0
+    for path in paths:
         try:
-            yield Timed(number / rate, read_image(path, size))
+            for image in stack_images(path, size, bits):
+                if isinstance(image, MembraneError):
+                    warnings.warn(f"{path}: {image}; left out", stacklevel=3)
+                else:
+                    yield Timed(number / rate, image)
+                number += 1
         except MembraneError as error:
-            warnings.warn(f"{error}; left out", stacklevel=2)
+            warnings.warn(f"{error}; left out", stacklevel=3)
+            number += 1
 
 
 def paced(images: Iterable[Timed]) -> Iterator[np.ndarray]:

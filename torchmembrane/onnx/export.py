@@ -172,7 +172,8 @@ def export(
 
     Standard operators only, batch free, float32, but for the solve of slack sheets, float64. Run on the sensor at rest and
     pressed, both simulated, it must give torch's statuses, and vertices within 3e-5 of the surface's size. The model's metadata
-    hold `format`, `status_texts` and `mesh` (the fields of `Mesh`) as JSON.
+    hold `format`, `status_texts` and `mesh` (the fields of `Mesh`) as JSON, and `bits` where the sensor's camera states them:
+    images of 16 bits are then divided by `2^bits - 1` before they are given to the model.
 
     Args:
         reconstructor: the sensor's.
@@ -229,4 +230,6 @@ def metadata_of(reconstructor: Reconstructor) -> dict[str, str]:
     plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in mesh.items()}
     texts = {str(status.value): status.text for status in Status}
     metadata = {"format": str(FORMAT), "name": mesh["name"], "length_unit": mesh["length_unit"]}
+    bits = reconstructor.sensor.camera.bits
+    metadata |= {} if bits is None else {"bits": str(bits)}
     return metadata | {"force_unit": mesh["force_unit"], "status_texts": json.dumps(texts), "mesh": json.dumps(plain)}

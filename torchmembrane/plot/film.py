@@ -13,6 +13,7 @@ from PIL import Image
 from ..errors import MembraneError
 from ..files.atomic import whole_file
 from ..files.optional import load_pyav
+from ..files.video import ffmpeg_name
 
 VIDEOS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
 COLOURS = 64
@@ -92,7 +93,7 @@ def _write_gif(path: Path, pictures: Iterator[np.ndarray], rate: float, last: fl
 def _write_video(path: Path, container_format: str, pictures: Iterator[np.ndarray], rate: float) -> None:
     av, first = load_pyav(), next(pictures)
     height, width = (size - size % 2 for size in first.shape[:2])  # H.264 takes even sizes
-    with av.open(str(path), "w", format=container_format) as container:
+    with av.open(ffmpeg_name(path), "w", format=container_format) as container:
         track = container.add_stream("h264", rate=Fraction(rate).limit_denominator(1000))
         track.width, track.height, track.pix_fmt = width, height, "yuv420p"
         for picture in chain([first], pictures):

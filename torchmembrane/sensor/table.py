@@ -126,6 +126,11 @@ class Table:
         """A list of finite numbers, `count` of them where that is given."""
         return [float(value) for value in self._list(key, count, _finite, "finite")]
 
+    def whole_number(self, key: str) -> int:
+        """A whole number."""
+        value: int = self._get(key, _whole, "a whole number")
+        return value
+
     def whole_numbers(self, key: str, count: int) -> list[int]:
         """A list of `count` whole numbers."""
         return self._list(key, count, _whole, "whole")

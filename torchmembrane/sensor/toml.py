@@ -101,7 +101,9 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
         tables["markers"]["file"] = f"{path.stem}_dots.csv"
         _write_dots(path.with_name(tables["markers"]["file"]), markers.positions, markers.sizes or [])
     if markers.rest_image is not None:
-        tables["markers"]["rest_image"] = write_image(path.with_name(f"{path.stem}_rest"), markers.rest_image).name
+        tables["markers"]["rest_image"] = write_image(
+            path.with_name(f"{path.stem}_rest"), markers.rest_image, parts.camera.bits
+        ).name
     ports, medium = tables["camera"].pop("ports"), tables["camera"].pop("medium")
     blocks = {name: toml_lines(name, table) for name, table in tables.items()}
     for port in ports:
@@ -121,6 +123,7 @@ def tables_of(parts: SensorParts) -> dict[str, dict[str, Any]]:
             "model": camera.model,
             "image_size": list(camera.image_size),
             **{key: getattr(camera, key).tolist() for key in ("focal", "centre", "distortion")},
+            **({} if camera.bits is None else {"bits": camera.bits}),
             "ports": [port._asdict() for port in camera.ports],
             "medium": {"index": camera.medium_index.item()} if camera.ports else {},
         },
@@ -165,7 +168,7 @@ def default_grid(markers: Markers) -> tuple[int, int]:
 
 
 def _read_camera(table: Table) -> Camera:
-    table.allow(("model", "image_size", "focal", "centre", "distortion", "crop", "binning", "ports", "medium"))
+    table.allow(("model", "image_size", "focal", "centre", "distortion", "crop", "binning", "bits", "ports", "medium"))
     ports = table.tables("ports")
     medium = table.table("medium") if ports or "medium" in table else None
     for part in ports:
@@ -183,6 +186,7 @@ def _read_camera(table: Table) -> Camera:
             distortion=table.numbers("distortion"),
             ports=[Port(*(port.number(key) for key in Port._fields)) for port in ports],
             medium_index=medium.number("index") if medium else 1.0,
+            bits=table.whole_number("bits") if "bits" in table else None,
         )
         return calibrated.in_mode(crop, binning) if "crop" in table or "binning" in table else calibrated
 
@@ -222,7 +226,7 @@ def _read_markers(table: Table, camera: Camera) -> tuple[Markers, list[str]]:
     with table.naming("rest_image"):
         for path in images[:1]:  # the others are of the same size, or refused
             refuse_other_size(image_size(path), camera)
-        return Markers(kind, polarity, positions, sizes, mean_image(images) if images else None), lines
+        return Markers(kind, polarity, positions, sizes, mean_image(images, camera.bits) if images else None), lines
 
 
 def _dots_to_come(table: Table) -> Markers:

@@ -32,7 +32,7 @@ class TrackerNode(Node):
         super().__init__("torchmembrane")
         reconstructor = tm.Reconstructor.from_file(self.declare_parameter("sensor", "sensor.toml").value)
         self.tracker = tm.Tracker(reconstructor)
-        self.size = reconstructor.image_size
+        self.camera = reconstructor.sensor.camera
         mesh = Mesh.of(reconstructor, Settings.of(reconstructor, "npz"))
         self.units = SiUnits(mesh, reconstructor.sensor.gas_pressure)
         kind = CompressedImage if self.declare_parameter("compressed", False).value else Image
@@ -45,7 +45,7 @@ class TrackerNode(Node):
     def follow(self, message: Image | CompressedImage) -> None:
         """Reconstruct an image, and publish what it gives."""
         try:
-            frame = self.tracker(grey_of(message, self.size)).frame(0)
+            frame = self.tracker(grey_of(message, self.camera.image_size, self.camera.bits)).frame(0)
         except tm.MembraneError as error:
             self.get_logger().warning(str(error))
             return

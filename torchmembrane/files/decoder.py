@@ -1,0 +1,176 @@
+"""Image files decoded by Pillow: opened within bounds, values as they are stored, refused where damage shows."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from ..errors import MembraneError
+from .jpeg import is_whole
+from .levels import HIGHEST
+from .safe_read import DAMAGE, in_one_line
+
+FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
+MOST_PIXELS = 2**25
+KIND, OLD_KIND, BITS_PER_SAMPLE, PHOTOMETRIC, DESCRIPTION = 254, 255, 258, 262, 270
+"""Tags of a TIFF's page."""
+REDUCED_OR_MASK, OLD_REDUCED, WHITE_IS_ZERO = 0b101, 2, 0
+"""Values of these tags."""
+IMAGEJ = re.compile(r"ImageJ=.*^images=(\d+)", re.DOTALL | re.MULTILINE)
+
+
+class Stored(NamedTuple):
+    """A picture as its file stores it.
+
+    Attributes:
+        values: `[height, width]` or `[height, width, 3]`.
+        bits: of a value, where the file says that of 16 fewer are used.
+        halved: whether the file's values have 16 bits, of which the upper 8 are left.
+    """
+
+    values: np.ndarray
+    bits: int | None
+    halved: bool
+
+
+@contextmanager
+def opened(path: str | Path, file: IO[bytes]) -> Iterator[Image.Image]:
+    """An image whose header is read; whatever fails inside the block is an error that names the file.
+
+    Args:
+        path: what messages call it.
+        file: with its content.
+
+    Raises:
+        MembraneError: it is no image, too large, or damaged.
+    """
+    expected = "a whole PNG, JPEG or TIFF"
+    try:
+        with Image.open(file, formats=FORMATS) as image:
+            if image.width * image.height > MOST_PIXELS:
+                raise ValueError(f"{image.width} x {image.height} px; at most {MOST_PIXELS} px are read")
+            yield image
+    except MembraneError as error:
+        raise MembraneError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    except (*DAMAGE, Image.DecompressionBombError) as error:
+        cause = "cannot identify image file" if isinstance(error, UnidentifiedImageError) else in_one_line(error)
+        raise MembraneError(f"{path}: not readable as an image ({cause}); expected {expected}") from error
+
+
+def pictures(image: Image.Image) -> Iterator[int]:
+    """Go to each picture of an opened image in turn; the places of those that are pictures of their own.
+
+    What belongs to a picture is passed over: previews and masks of a TIFF, pictures of other sizes in an MPO, which are its
+    previews and gain maps.
+
+    Raises:
+        MembraneError: the file says that it holds pictures to which its directory does not lead.
+        Exception: of `DAMAGE`, where a picture's place is not readable.
+    """
+    size, place, held = image.size, 0, 0
+    while True:
+        if not _belongs_to_another(image, size):
+            held += 1
+            yield place
+        place += 1
+        try:
+            if not getattr(image, "is_animated", False):
+                break
+            image.seek(place)
+        except EOFError:
+            break
+    if (told := _told(image)) > max(held, 1):
+        raise MembraneError(
+            f"holds {told} pictures as ImageJ says there, and its directory leads to {held}; expected a page for each: save "
+            "it as a sequence of images, or as a TIFF with a page for each"
+        )
+
+
+def _belongs_to_another(image: Image.Image, size: tuple[int, int]) -> bool:
+    if image.format == "TIFF":
+        tags = image.tag_v2  # type: ignore[attr-defined]
+        return bool(tags.get(KIND, 0) & REDUCED_OR_MASK) or tags.get(OLD_KIND) == OLD_REDUCED
+    return image.format == "MPO" and image.size != size
+
+
+def _told(image: Image.Image) -> int:
+    """Pictures that a TIFF of ImageJ says it has; ImageJ leaves the pages of large ones out."""
+    if image.format != "TIFF":
+        return 0
+    image.seek(0)
+    said = IMAGEJ.match(str(image.tag_v2.get(DESCRIPTION, "")))  # type: ignore[attr-defined]
+    return int(said[1]) if said else 0
+
+
+def stored(image: Image.Image, size: tuple[int, int] | None = None) -> Stored:
+    """The current picture of an opened image.
+
+    Args:
+        image: as `opened` gives it.
+        size: width and height that it must have, px; it is looked at before pixels are decoded.
+
+    Raises:
+        MembraneError: another size.
+        Exception: of `DAMAGE`, where it is not decodable.
+    """
+    if size is not None and image.size != size:
+        raise MembraneError(
+            f"the image is {image.width} x {image.height} px, expected {size[0]} x {size[1]}: use images of this "
+            "sensor's camera; where its mode crops or bins them, say so in the file's [camera]"
+        )
+    halved = any(";16" in str(tile[3]) for tile in image.tile) and not image.mode.startswith("I")
+    image.load()
+    values, bits = _values(image), None
+    if image.format == "TIFF":
+        tags = image.tag_v2  # type: ignore[attr-defined]
+        stated = tags.get(BITS_PER_SAMPLE, (16,))[0]
+        bits = stated if values.dtype == np.uint16 and stated < 16 else None
+        if tags.get(PHOTOMETRIC) == WHITE_IS_ZERO and values.dtype != np.uint8:  # Pillow turns these alone round
+            values = (HIGHEST if values.dtype == np.uint16 else 1) - values
+    return Stored(values, bits, halved)
+
+
+def refuse_damaged(image: Image.Image, content: bytes) -> None:
+    """Refuse what decoding passes over: wrong checksums of a PNG, what libjpeg remarks of a JPEG, lengths of a WebP.
+
+    Args:
+        image: that was loaded.
+        content: of its file; of a JPEG among several in a file, from its beginning on.
+
+    Raises:
+        ValueError: it is damaged; of a PNG others of `DAMAGE` as well.
+    """
+    if image.format == "PNG":
+        with Image.open(BytesIO(content), formats=FORMATS) as twin:
+            twin.verify()
+    if image.format == "WEBP" and not _fills_its_file(content):
+        raise ValueError("its chunks do not fill the file")
+    if image.format in ("JPEG", "MPO") and image.mode in ("L", "RGB") and not is_whole(content):
+        raise ValueError("corrupt JPEG data")
+
+
+def _fills_its_file(riff: bytes) -> bool:
+    """Whether the chunks of a RIFF file, one behind the other, are as long as they say together."""
+    at, end = 12, 8 + int.from_bytes(riff[4:8], "little")
+    while at < end:
+        size = int.from_bytes(riff[at + 4 : at + 8], "little")
+        at += 8 + size + size % 2
+    return at == end == len(riff)
+
+
+def _values(image: Image.Image) -> np.ndarray:
+    if image.mode == "I":  # 16-bit grey as Pillow of some versions opens it
+        values = np.asarray(image)
+        if values.min() < 0 or values.max() > HIGHEST:
+            raise ValueError(f"32-bit values from {values.min()} to {values.max()}; 8 or 16 bits are read, or float in 0..1")
+        return values.astype(np.uint16)
+    if image.mode == "F" or image.mode.startswith("I;16"):
+        values = np.asarray(image)
+        return values.astype(values.dtype.newbyteorder("="))
+    grey = image.mode in ("1", "L", "LA", "La")
+    return np.asarray(image.convert("L" if grey else "RGB"))
