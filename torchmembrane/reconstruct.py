@@ -147,10 +147,8 @@ class Reconstructor(nn.Module):
 
     def read(self, *paths: str | Path) -> Tensor:
         """Image files as a batch `[B, 1, height, width]` in 0..1, in this module's precision and on its device."""
-        grey = []
-        for path in paths:
-            grey.append(grey_batch(read_image(path, self.image_size, self.camera.bits), self.image_size, "rgb", self.rest_pixels))
-        return torch.cat(grey)
+        images = [read_image(path, self.image_size, self.camera.bits) for path in paths]
+        return torch.cat([grey_batch(image, self.image_size, "rgb", self.rest_pixels) for image in images])
 
     def forward(
         self,

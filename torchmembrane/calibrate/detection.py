@@ -7,6 +7,7 @@ import numpy as np
 
 from ..camera.targets import LARGE, MARKS, Checkerboard, DotBoard
 from ..errors import MembraneError
+from ..files.levels import too_few_bits
 from ..files.optional import load_opencv
 from ..markers.dots.pattern import find_dots
 
@@ -49,7 +50,7 @@ def _find_corners(image: np.ndarray, board: Checkerboard) -> np.ndarray:
     if not found:
         raise MembraneError(
             f"no checkerboard of {board.columns} x {board.rows} inner corners found; expected all of it in the image, sharp, "
-            "with a light margin"
+            f"with a light margin{too_few_bits(image)}"
         )
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
     lattice = corners.reshape(board.rows, board.columns, 2)

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter1d
 
 from ..errors import MembraneError
+from ..files.levels import too_few_bits
 
 RAYS = 180
 SMOOTH = 1.5  # px, of the image before its edges are taken
@@ -83,6 +84,7 @@ def find_rim(image: np.ndarray, inside: np.ndarray | None = None) -> RimOutline:
         raise MembraneError(
             f"no rim is seen in the rest image: the best outline shows an edge along {share:.0%} of its length; expected a rim "
             f"of which half is in the image and {SEEN:.0%} stands out from what is around it: read it off, --rim U,V,RADIUS"
+            f"{too_few_bits(image)}"
         )
     return best
 

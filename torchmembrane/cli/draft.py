@@ -48,7 +48,7 @@ def needed(arguments: Namespace) -> list[str]:
 
 def write_draft(arguments: Namespace) -> list[str]:
     """Write the sensor that the arguments describe; returns what was made, assumed and derived, in lines."""
-    rest = None if arguments.rest is None else read_image(arguments.rest)
+    rest = None if arguments.rest is None else read_image(arguments.rest, bits=arguments.bits)
     seen = _rim_in_words(arguments, rest) if arguments.rim == FROM_IMAGE and rest is not None else []
     camera, distance = _optics(arguments, rest)
     lengths = {name: value for name in LENGTHS if (value := getattr(arguments, name)) is not None}
@@ -97,7 +97,8 @@ def _optics(arguments: Namespace, rest: np.ndarray | None) -> Optics:
         circle, centre = RimCircle(arguments.radius, pixels, arguments.lens), arguments.centre or [u, v]
         distance = distance or circle.distance(focal)
         focal = focal or circle.focal(distance)
-    return Optics(Camera(arguments.lens, tuple(size), (round(focal, 3),) * 2, centre), float(f"{distance:.7g}"))
+    camera = Camera(arguments.lens, tuple(size), (round(focal, 3),) * 2, centre, bits=arguments.bits)
+    return Optics(camera, float(f"{distance:.7g}"))
 
 
 def _rim_in_words(arguments: Namespace, rest: np.ndarray) -> list[str]:

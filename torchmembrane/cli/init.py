@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MembraneError
-from .arguments import Add, add_command, count_pair, positive, positive_pair, vector
+from .arguments import Add, add_command, count, count_pair, positive, positive_pair, vector
 from .choices import DRAFTS, FILLINGS, FROM_IMAGE, LENGTH_UNITS, LENSES, LONGEST_SIDE, POLARITIES
 
 COMPANIONS = ("_dots.csv", "_grid.npz", "_rest.png", "_rest.tiff")
@@ -106,6 +106,8 @@ def _add_camera(add: Add) -> None:
     add("--view", metavar="DEGREES", type=positive, help="in place of --focal: field of view across the image's width")
     centre = positive_pair("two numbers, U,V")
     add("--centre", metavar="U,V", type=centre, help="principal point, px (default: the rim's centre, else the image's)")
+    few = "of the camera, where 16-bit images hold fewer, as 10 or 12 (default: 16)"
+    add("--bits", metavar="N", type=count, help=few)
     rim = "the rim's circle in the rest image, px, as an image viewer tells it; auto: found in the image"
     add("--rim", metavar="U,V,RADIUS|auto", type=_rim, help=rim)
 

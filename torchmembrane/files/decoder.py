@@ -123,7 +123,7 @@ def stored(image: Image.Image, size: tuple[int, int] | None = None) -> Stored:
             f"the image is {image.width} x {image.height} px, expected {size[0]} x {size[1]}: use images of this "
             "sensor's camera; where its mode crops or bins them, say so in the file's [camera]"
         )
-    halved = any(";16" in str(tile[3]) for tile in image.tile) and not image.mode.startswith("I")
+    halved = any(";16" in str(tile[3]) for tile in getattr(image, "tile", ())) and not image.mode.startswith("I")
     image.load()
     values, bits = _values(image), None
     if image.format == "TIFF":

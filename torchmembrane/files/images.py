@@ -54,9 +54,7 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None, bits: int 
     return decode_image(_content(path), path, size, bits)
 
 
-def decode_image(
-    content: bytes, name: str | Path, size: tuple[int, int] | None = None, bits: int | None = None
-) -> np.ndarray:
+def decode_image(content: bytes, name: str | Path, size: tuple[int, int] | None = None, bits: int | None = None) -> np.ndarray:
     """The grey values of an image file's content, as `read_image` gives them.
 
     Args:
@@ -150,12 +148,13 @@ def stack_images(path: Path, size: tuple[int, int], bits: int | None = None) -> 
         try:
             if image.format != "MPO":
                 refuse_damaged(image, content)
-            for number, _ in enumerate(islice(pictures(image), MOST_PICTURES), 1):
+            for _ in islice(pictures(image), MOST_PICTURES):
                 yield _picture(image, size, bits, content)
+                number += 1
         except DAMAGE as error:
             if isinstance(error, MembraneError):
                 raise
-            raise MembraneError(f"the file is damaged, or ends early, after {number} pictures ({in_one_line(error)})") from error
+            raise MembraneError(f"damaged, or ends early, after {number} pictures ({in_one_line(error)})") from error
 
 
 def _picture(image: Image.Image, size: tuple[int, int], bits: int | None, content: bytes) -> np.ndarray | MembraneError:
@@ -332,4 +331,3 @@ def _written(path: Path, values: np.ndarray, **options: int) -> Path:
     with whole_file(path) as partial:
         Image.fromarray(values).save(partial, "TIFF" if path.suffix == ".tiff" else "PNG", **options)
     return path
-

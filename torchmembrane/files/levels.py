@@ -1,5 +1,7 @@
 """Levels of grey: which of them is white where a camera has fewer bits than its images are stored in."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -27,7 +29,7 @@ def check_bits(bits: int | None) -> None:
         torchmembrane.errors.MembraneError: Camera: bits is 7; expected a whole number from 8 to 16, the bits of the camera's \
 values where these are stored in 16, or leave it out
     """
-    right = bits is None or (float(bits).is_integer() and FEWEST_BITS <= bits <= MOST_BITS)
+    right = bits is None or (isinstance(bits, int | np.integer) and FEWEST_BITS <= bits <= MOST_BITS)
     expected = f"a whole number from {FEWEST_BITS} to {MOST_BITS}, the bits of the camera's values where these are stored in 16"
     expect(right, "Camera: bits", bits, f"{expected}, or leave it out")
 
@@ -43,7 +45,7 @@ def white_of(stored: int, bits: int | None) -> int:
         >>> white_of(16, 12), white_of(16, None), white_of(8, 12)
         (4095, 65535, 255)
     """
-    return 2 ** (bits if bits is not None and stored == 16 else stored) - 1
+    return (1 << (bits if bits is not None and stored == 16 else stored)) - 1
 
 
 def refuse_beyond(highest: Any, white: int) -> None:
@@ -64,6 +66,15 @@ def refuse_beyond(highest: Any, white: int) -> None:
         )
 
 
+@contextmanager
+def telling_bits(image: np.ndarray) -> Iterator[None]:
+    """Add to the refusal of an image, inside the block, what `too_few_bits` says of it."""
+    try:
+        yield
+    except MembraneError as error:
+        raise MembraneError(f"{error}{too_few_bits(image)}") from error
+
+
 def too_few_bits(image: np.ndarray) -> str:
     """What to add to the refusal of an image that shows nothing: how high its values go, if they are those of a camera of fewer
     bits, stored in 16; "" of all other images.
@@ -73,7 +84,7 @@ def too_few_bits(image: np.ndarray) -> str:
 
     Example:
         >>> too_few_bits(np.array([[90, 612]], np.uint16))
-        '; its values go up to 612 of 65535, as of a camera of 10 bits: say bits = 10 in [camera] of the sensor file (--bits of init)'
+        '; its values go up to 612 of 65535, as of a camera of 10 bits: say bits = 10 in the file\'s [camera] (init: --bits)'
         >>> too_few_bits(np.array([[90, 61200]], np.uint16)), too_few_bits(np.array([[1, 3]], np.uint8) / 255)
         ('', '')
     """
@@ -87,6 +98,6 @@ def too_few_bits(image: np.ndarray) -> str:
     if whole is None or not (np.rint(whole) % (HIGHEST // 255)).any():  # of colour; of 8 bits
         return ""
     return (
-        f"; its values go up to {highest:.0f} of {HIGHEST}, as of a camera of {bits} bits: say bits = {bits} in [camera] of the "
-        "sensor file (--bits of init)"
+        f"; its values go up to {highest:.0f} of {HIGHEST}, as of a camera of {bits} bits: say bits = {bits} in the file's "
+        "[camera] (init: --bits)"
     )

@@ -13,7 +13,6 @@ from .optional import load_pyav
 from .safe_read import in_one_line
 from .video_end import missing_end
 
-
 GREY_OF_16 = ("gray16le", "gray16be")
 """Formats of pictures, as FFmpeg calls them."""
 NOT_WHOLE = "it, or one that it is coded by, is not whole"
@@ -44,7 +43,8 @@ def video_pictures(path: Path, size: tuple[int, int]) -> Iterator[Any]:
         `av.VideoFrame`, or a `MembraneError` that does not name the file.
 
     Raises:
-        MembraneError: PyAV is not installed; the file is no video, one of another size, or it ends early, which tells how many frames there are.
+        MembraneError: PyAV is not installed; the file is no video, one of another size, or it ends early, and how many frames
+            of how many there are.
     """
     av, number, damage = load_pyav(), 0, ""
     with _opened(path) as (container, stream):
@@ -131,8 +131,8 @@ def _stream(container: Any) -> Any:
 def _refuse_size(pictures: Any, size: tuple[int, int]) -> None:
     if (pictures.width, pictures.height) != size:
         raise MembraneError(
-            f"images of {pictures.width} x {pictures.height} px; expected the sensor's {size[0]} x {size[1]}: choose that mode of "
-            "the camera, or say in the file's [camera] how its mode crops or bins"
+            f"images of {pictures.width} x {pictures.height} px; expected the sensor's {size[0]} x {size[1]}: choose that mode "
+            "of the camera, or say in the file's [camera] how its mode crops or bins"
         )
 
 

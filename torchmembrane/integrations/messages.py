@@ -43,7 +43,8 @@ def grey_of(message: Any, size: tuple[int, int], bits: int | None = None) -> np.
         bits: of the camera, where 16 hold fewer.
 
     Raises:
-        MembraneError: another size, values beyond `bits`, an encoding without a grey or colour value for every pixel, or a damaged image.
+        MembraneError: another size, values beyond `bits`, an encoding without a grey or colour value for every pixel, or a
+            damaged image.
     """
     if not hasattr(message, "encoding"):
         return decode_image(bytes(message.data), f"an image of format {message.format!r}", size, bits)

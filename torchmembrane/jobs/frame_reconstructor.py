@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..files.levels import too_few_bits
 from ..files.provenance import Origin, printable
 from ..results.npz import Stored
 from ..results.reconstruction import Frame, Reconstruction
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Outcome(NamedTuple):
-    """What became of a frame: its result, or the reason why it gave no image."""
+    """What became of a frame: its result, with what is to be added to its status, or the reason why it gave no image."""
 
     name: str
     file: Path
@@ -40,7 +41,7 @@ class Outcome(NamedTuple):
     @property
     def status_text(self) -> str:
         """The same in words."""
-        return self.reason if self.stored is None else Status(self.status).text
+        return self.reason if self.stored is None else f"{Status(self.status).text}{self.reason}"
 
 
 class FrameReconstructor:
@@ -104,7 +105,7 @@ class FrameReconstructor:
         return [
             Outcome(frame.name, frame.file, None, frame.reason)
             if frame.image is None
-            else Outcome(frame.name, frame.file, Stored(next(frames), frame.origin, seconds))
+            else _outcome(frame, frame.image, Stored(next(frames), frame.origin, seconds))
             for frame in group
         ]
 
@@ -155,12 +156,20 @@ class FrameReconstructor:
         return frame | {"status": np.array(UNREADABLE, np.int32)}
 
 
+def _outcome(frame: DecodedFrame, image: Tensor, stored: Stored) -> Outcome:
+    shows_nothing = not Status(int(stored.frame["status"])).has_surface
+    return Outcome(frame.name, frame.file, stored, too_few_bits(image.cpu().numpy()) if shows_nothing else "")
+
+
 def outcomes_of(rows: dict[str, np.ndarray]) -> list[Outcome]:
     """What `FrameReconstructor` gave as columns, frame by frame."""
     frames = [dict(zip(rows, values, strict=True)) for values in zip(*rows.values(), strict=True)]
-    return [
-        Outcome(str(frame["name"]), Path(str(frame["path"])), None, str(frame["status_text"]))
-        if frame["status"] == UNREADABLE
-        else Outcome(str(frame["name"]), Path(str(frame["path"])), Stored.of(frame))
-        for frame in frames
-    ]
+    outcomes = []
+    for frame in frames:
+        name, file, text = str(frame["name"]), Path(str(frame["path"])), str(frame["status_text"])
+        if frame["status"] == UNREADABLE:
+            outcomes.append(Outcome(name, file, None, text))
+        else:
+            remark = text.removeprefix(Status(int(frame["status"])).text)
+            outcomes.append(Outcome(name, file, Stored.of(frame), remark))
+    return outcomes

@@ -1,4 +1,4 @@
-"""What a call names - files, globs, folders - as image files, and as videos, bags and stacks of images, in the order of the call."""
+"""What a call names - files, globs, folders - as images, and as videos, bags and stacks of images, in the order of the call."""
 
 import glob
 from collections import Counter

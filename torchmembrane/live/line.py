@@ -4,6 +4,7 @@ import shutil
 import time
 from typing import TextIO
 
+from ..files.levels import too_few_bits
 from ..results.status import Status
 from ..results.store import Mesh
 from .loop import RECENT, Seen, Tally
@@ -52,7 +53,7 @@ def described(seen: Seen, tally: Tally, mesh: Mesh) -> str:
     pace = rate + "{:.0f} ms (95 %: {:.0f}), {} dropped".format(*milliseconds, tally.dropped)
     status = Status(int(seen.frame["status"]))
     if not status.has_surface:
-        return f"{pace} | {status.text}"
+        return f"{pace} | {status.text}{too_few_bits(seen.image)}"
     unit = "relative" if mesh.force_unit == "relative" else mesh.force_unit
     force, moment = (" ".join(f"{value:+.3f}" for value in half) for half in seen.frame["wrench"].reshape(2, 3))
     pressure = f"{seen.frame['pressure_change']:+.2g} {unit}/{mesh.length_unit}²"

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from ..control_flow import can_sync, traced
 from ..errors import MembraneError
+from ..files.levels import too_few_bits
 from ..results.status import Status
 from .locator import Locator, isotropic
 from .placement import FEWEST_MARKERS, PlacedMarkers
@@ -104,6 +105,7 @@ class MarkerObserver(nn.Module):
             raise MembraneError(
                 f"sensor {name!r}: only {int(found.sum())} of {in_view} markers in view are found in the rest image; "
                 "expected most: check the marker file, the polarity and the camera against the image"
+                f"{too_few_bits(image.cpu().numpy())}"
             )
         return torch.where(found[0, :, None], pixels[0], self.measured_rest), covariance[0], found[0]
 

@@ -11,6 +11,7 @@ WORDS = {
         "image_size": "width, height, px",
         "focal": "along u and v, px; fisheye: px / rad",
         "centre": "principal point u, v, px; the top left pixel's centre is 0, 0",
+        "bits": "of the camera, where 16-bit images hold fewer",
         "distortion": "OpenCV's coefficients; `calibrate camera` finds all of these from a checkerboard",
     },
     "membrane": {

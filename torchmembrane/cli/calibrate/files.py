@@ -43,7 +43,7 @@ def write_calibrated(arguments: Namespace, sensor: Sensor, report: Report, drawi
 
 def read_sensor_image(path: str | Path, sensor: Sensor) -> np.ndarray:
     """An image `[H, W]` that must be as large as the sensor's."""
-    return read_image(path, sensor.camera.image_size)
+    return read_image(path, sensor.camera.image_size, sensor.camera.bits)
 
 
 def read_targets(images: Sequence[str], sensor: Sensor, board: Checkerboard | DotBoard) -> np.ndarray:

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion, gaussian_filter
 
 from ...errors import MembraneError
+from ...files.levels import too_few_bits
 from .template import RADIUS
 
 WEAKEST_GRADIENT = 0.01  # grey per px, rms over the patch in its weakest direction: 1 % noise then moves it by 0.05 px
@@ -52,6 +53,7 @@ def choose_patches(image: np.ndarray, mask: np.ndarray, count: int = 1200) -> np
         raise MembraneError(
             f"choose_patches: {len(chosen)} textured places in a mask of {int(mask.sum())} px, expected 30 or more; "
             "give a sharper or brighter rest image, more paint or speckle, or check where the rest surface projects"
+            f"{too_few_bits(image)}"
         )
     return np.array(chosen, float)[:, ::-1].copy()
 
