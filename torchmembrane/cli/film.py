@@ -19,16 +19,17 @@ class FrameImages:
     Args:
         files: of those that there are.
         size: width and height that they must have, px.
+        bits: of the camera, where it is known that 16-bit files hold fewer.
     """
 
-    def __init__(self, files: Mapping[str, Path], size: tuple[int, int]):
-        self.files, self.size = files, size
+    def __init__(self, files: Mapping[str, Path], size: tuple[int, int], bits: int | None = None):
+        self.files, self.size, self.bits = files, size, bits
 
     def of(self, name: str) -> "np.ndarray | None":
         """Grey values `[height, width]` in 0..1, or None."""
         from ..files.images import read_image
 
-        return read_image(self.files[name], self.size) if name in self.files else None
+        return read_image(self.files[name], self.size, self.bits) if name in self.files else None
 
 
 def images_in(folder: Path) -> dict[str, Path]:
@@ -46,7 +47,7 @@ def draw_film(results: "Results", images: FrameImages, path: Path, rate: float =
     from ..plot.film import check_film, picture_of, write_film
     from ..plot.frames import figure
 
-    check_film(path)
+    check_film(path, rate)
     named = zip(results.names, tqdm(results, unit="frame", desc="draw"), strict=True)
     count = 4 if any(bool(frame["traction"].any()) for frame in results) else 3
     drawn = (figure(frame, results.mesh, images.of(name), name, count) for name, frame in named)

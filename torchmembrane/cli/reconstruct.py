@@ -113,7 +113,8 @@ def run(arguments: Namespace) -> int:
         print(f"messages of {write_bag(bag, inputs, arguments.out)} frames in {arguments.bag}")
     if arguments.video_out is not None:
         files = {frame_name(path): path for path in inputs.images}
-        draw_film(read_results(arguments.out), FrameImages(files, reconstructor.image_size), arguments.video_out)
+        images = FrameImages(files, sensor.camera.image_size, sensor.camera.bits)
+        draw_film(read_results(arguments.out), images, arguments.video_out)
     print(f"frames: {_said(counts)}; results in {arguments.out}")
     return 1 if counts.failed else 0
 

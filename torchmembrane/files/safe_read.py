@@ -36,6 +36,10 @@ DAMAGE = (
 """What zipfile, zlib, numpy and Pillow raise of damaged files."""
 
 
+class LackingArray(MembraneError):
+    """A whole file of arrays without one that was asked for."""
+
+
 def read_bytes(path: Path, most: int, expected: str) -> bytes:
     """A file's content.
 
@@ -137,7 +141,7 @@ def read_arrays(
             members = {member.filename.removesuffix(".npy"): member for member in file.infolist()}
             if missing := [name for name in names or () if name not in members]:
                 said = f"{missing[0]} is missing, the file holds {in_one_line(', '.join(members)) if members else 'nothing'}"
-                raise MembraneError(f"{path}: {said}; expected {', '.join(names or ())}: add it")
+                raise LackingArray(f"{path}: {said}; expected {', '.join(names or ())}: add it")
             wanted = members if names is None else {name: members[name] for name in names}
             _refuse_large(sum(member.file_size for member in wanted.values()))
             return {

@@ -146,23 +146,27 @@ def _loads(path: Path, topic: str | None, reconstructor: "Reconstructor") -> Ite
     if is_bag(path):
         yield from (partial(_bag_image, image.message) for image in messages(path, image_topic(path, topic)[0]))
         return
-    camera = reconstructor.sensor.camera
+    size = reconstructor.sensor.camera.image_size
     of_stack = picture_count(path, 1) > 0
-    for picture in stack_images(path, camera.image_size, camera.bits) if of_stack else video_pictures(path, camera.image_size):
+    for picture in stack_images(path, size, _bits(reconstructor)) if of_stack else video_pictures(path, size):
         yield partial(_refuse, str(picture)) if isinstance(picture, MembraneError) else partial(_image, picture)
 
 
 def _bag_image(message: Any, reconstructor: "Reconstructor") -> Tensor:
-    camera = reconstructor.sensor.camera
-    grey = grey_of(message, camera.image_size, camera.bits)
+    grey = grey_of(message, reconstructor.sensor.camera.image_size, _bits(reconstructor))
     return torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels)
 
 
 def _image(picture: Any, reconstructor: "Reconstructor") -> Tensor:
     """The image of a picture: grey values, or what PyAV gives."""
     of_stack = isinstance(picture, np.ndarray)
-    grey = picture if of_stack else to_grey(picture_values(picture, reconstructor.sensor.camera.bits))
+    grey = picture if of_stack else to_grey(picture_values(picture, _bits(reconstructor)))
     return torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels)
+
+
+def _bits(reconstructor: "Reconstructor") -> int | None:
+    """Of the camera's values; None where it does not say, as that of another kind of reconstructor may not."""
+    return getattr(reconstructor.sensor.camera, "bits", None)
 
 
 def _refuse(reason: str, reconstructor: "Reconstructor") -> NoReturn:

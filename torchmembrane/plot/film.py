@@ -18,6 +18,8 @@ from ..files.video import ffmpeg_name
 VIDEOS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
 COLOURS = 64
 """Of a GIF."""
+RATES, GIF_RATES = (0.001, 1000.0), (0.002, 50.0)
+"""Hz, least and greatest, that the formats hold and viewers keep; a GIF counts hundredths of a second, up to 655.35 s."""
 
 
 def picture_of(drawing: Figure) -> np.ndarray:
@@ -32,15 +34,19 @@ def picture_of(drawing: Figure) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def check_film(path: Path) -> None:
-    """Refuse a name that is neither a video's nor a GIF's, or a video that cannot be written for want of PyAV.
+def check_film(path: Path, rate: float = 1.0) -> None:
+    """Refuse a name that is neither a video's nor a GIF's, a rate that it cannot have, and a video for want of PyAV.
 
     Raises:
-        MembraneError: another ending, or PyAV is not installed.
+        MembraneError: another ending or rate, or PyAV is not installed.
     """
-    if path.suffix.lower() not in (".gif", *VIDEOS):
+    is_gif = path.suffix.lower() == ".gif"
+    if not is_gif and path.suffix.lower() not in VIDEOS:
         raise MembraneError(f"{path}: expected a film's name, ending in .gif, {', '.join(VIDEOS)}")
-    if path.suffix.lower() != ".gif":
+    least, most = GIF_RATES if is_gif else RATES
+    if not least <= rate <= most:
+        raise MembraneError(f"{path}: {rate:g} pictures a second; expected {least:g} to {most:g} of a {path.suffix.lower()[1:]}")
+    if not is_gif:
         load_pyav()
 
 
@@ -54,7 +60,7 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], rate: float, la
         last: seconds for which the last one stays longer, in a GIF, before it begins again.
 
     Raises:
-        MembraneError: another ending, no picture, one of another size, or PyAV is not installed.
+        MembraneError: another ending or rate, no picture, one of another size, or PyAV is not installed.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -64,7 +70,7 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], rate: float, la
         3
     """
     path = Path(path)
-    check_film(path)
+    check_film(path, rate)
     path.parent.mkdir(parents=True, exist_ok=True)
     checked = _checked(path, iter(pictures))
     with whole_file(path) as partial:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from ..errors import MembraneError
-from ..files.safe_read import DAMAGE, read_arrays
+from ..files.safe_read import DAMAGE, LackingArray, read_arrays
 from .frame_table import FrameTable
 from .npz import Stored, load_frame, load_stored, save_frame
 from .reconstruction import Frame
@@ -51,7 +51,7 @@ class FrameFiles:
         mesh: what the frames share.
 
     Attributes:
-        damaged: files that could not be read, as far as `stored` has come.
+        damaged: files that could not be read, of which `names` or `stored` told last.
     """
 
     def __init__(self, folder: Path, mesh: Mesh):
@@ -59,11 +59,13 @@ class FrameFiles:
         self.damaged: list[Path] = []
 
     def names(self) -> set[str]:
-        """Of all frames stored; files that hold no result are left out."""
-        return {path.stem for path in self._files() if _holds_status(path)}
+        """Of all frames stored, damaged ones among them; files of other arrays are left out."""
+        self.damaged = []
+        return {path.stem for path in self._files() if self._is_result(path)}
 
     def stored(self, wanted: Callable[[str], bool]) -> Iterator[tuple[str, Stored]]:
         """All frames whose names are wanted, each read whole; `damaged` then lists what could not be."""
+        self.damaged = []
         for path in self._files():
             if wanted(path.stem):
                 try:
@@ -96,12 +98,14 @@ class FrameFiles:
     def _files(self) -> list[Path]:
         return sorted(path for path in self.folder.glob("*.npz") if path.name != MESH)
 
+    def _is_result(self, path: Path) -> bool:
+        try:
+            return int(read_arrays(path, ["status"])["status"]) >= 0
+        except LackingArray:
+            return False
+        except DAMAGE:
+            self.damaged.append(path)
+            return True
+
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}.npz"
-
-
-def _holds_status(path: Path) -> bool:
-    try:
-        return int(read_arrays(path, ["status"])["status"]) >= 0
-    except DAMAGE:
-        return False

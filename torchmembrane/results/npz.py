@@ -13,6 +13,7 @@ from ..files.provenance import Origin
 from ..files.safe_read import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays
 from .frame_shapes import shape_of
 from .reconstruction import Frame, Reconstruction
+from .status import Status
 
 ADDED = (
     *("wrench", "contact_force", "contact_normal", "contact_area", "contact_slip", "contact_curvature", "contact_at_rim"),
@@ -112,7 +113,11 @@ def completed(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
     Raises:
         KeyError: it lacks one that there always was.
+        MembraneError: a status that this version does not know.
     """
+    if unknown := set(np.ravel(frame["status"]).tolist()) - set(Status):
+        known = f"one from {min(Status):d} to {max(Status):d}"
+        raise MembraneError(f"status is {unknown.pop()}; expected {known}: it is damaged, or of a later version")
     sizes = {"P": len(frame["contact_points"])}
     added = {key: np.full(shape_of(key, sizes), np.nan, np.float32) for key in ADDED if key not in frame}
     return {key: added[key] if key in added else frame[key] for key in Reconstruction._fields}

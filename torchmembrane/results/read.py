@@ -1,5 +1,6 @@
 """Results read back: a folder of `torchmembrane reconstruct` as a sequence of frames that are loaded one by one."""
 
+import warnings
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -15,12 +16,16 @@ from .reconstruction import Frame, Reconstruction
 from .store import MESH, Mesh
 
 
+AGAIN = "the same reconstruct command again does its frame again, or delete it"
+
+
 def read_results(folder: str | Path) -> "Results":
     """The results in a folder, of either format.
 
     Only names and `mesh.npz` are read now; frames are read where they are asked for. Frames that failed are among them, NaN,
     with their status; images that could not be read have no frame (`summary.csv` lists them). Frames that are written to the
-    folder later are not included.
+    folder later are not included. Damaged results are named in a warning; they are among the frames, and reading one of them is
+    an error.
 
     Args:
         folder: what `torchmembrane reconstruct --out` was given.
@@ -110,6 +115,9 @@ class Results:
         self.mesh = Mesh.load(folder / MESH)
         self._frames = frames_of(folder, self.mesh)
         self.names = sorted(self._frames.names(), key=in_order)
+        if damaged := self._frames.damaged:
+            more = f" and {len(damaged) - 1} more" if damaged[1:] else ""
+            warnings.warn(f"{damaged[0]}{more}: damaged, and refused when read; {AGAIN}", stacklevel=3)
         self._known = frozenset(self.names)
         if not self.names:
             raise MembraneError(f"{folder}: no frames; expected results of `torchmembrane reconstruct`")
