@@ -61,6 +61,7 @@ class Tracker:
         self.time: float | None = None
         self._before: Reconstruction | None = None
         self._latest: Tensor | None = None
+        self._latest_result: Reconstruction | None = None
         self._rest_pixels: Tensor | None = None
         self._watch_from(reconstructor.observer.rest_covariance)
 
@@ -84,7 +85,7 @@ class Tracker:
         self.time = time
         with torch.no_grad():
             result: Reconstruction = self.reconstructor(images, self._before, self._rest_pixels, pressure)
-        self._latest = images
+        self._latest, self._latest_result = images, result
         self._before = result if Status(int(result.status[0])).has_surface else None
         if int(result.status[0]) in (Status.OK, Status.UNEXPLAINED):  # a camera that moved may leave it unexplained
             self._look_for_drift(result)
@@ -99,21 +100,28 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget the frames before, what `rezero` took for rest, the drift and the time."""
-        self._before = self._latest = self._rest_pixels = self.time = None
+        self._before = self._latest = self._latest_result = self._rest_pixels = self.time = None
         self._watch_from(self.reconstructor.observer.rest_covariance)
 
     def rezero(self, frame: Tensor | np.ndarray | None = None) -> None:
         """Take a frame without contact, default the latest, for the rest state: what drifted since the rest image is nulled.
 
-        Markers that are not found in it keep their places in the sensor's rest image.
+        Markers that are not found in it keep their places in the sensor's rest image. Where a contact is found in the frame, it
+        is taken for rest all the same, as a drift may look like a contact, and a warning says with what force.
 
         Raises:
             MembraneError: there is no frame yet, or too few of its markers are found.
         """
-        images = self._latest if frame is None else self._one(frame)
-        if images is None:
+        images, result = self._latest, self._latest_result
+        if frame is not None:
+            images = self._one(frame)
+            with torch.no_grad():
+                result = self.reconstructor(images, None, self._rest_pixels)
+        if images is None or result is None:
             raise MembraneError("Tracker.rezero: no frame yet; pass one without contact")
         rest = self.reconstructor.observer.rest_of(images)
+        if self._is_pressed(result):
+            warnings.warn(self._press_in_words(result), stacklevel=2)
         self._rest_pixels, self._before = rest.pixels, None
         self._watch_from(rest.covariance)
 
@@ -123,10 +131,27 @@ class Tracker:
         rest = r.rest_pixels, rest_covariance, r.observer.seen_at_rest, r.image_size
         self._watch, self._steady, self._said = DriftWatch(*rest), DriftWatch(*rest), False
 
-    def _look_for_drift(self, result: Reconstruction) -> None:
-        moved = result.pixels[0] - self.reconstructor.rest_pixels, result.confidence[0]
+    def _is_pressed(self, result: Reconstruction) -> bool:
+        """Whether a contact is found that is neither a moved camera's nor lies where frames without one did."""
+        moved = self._moved(result)
         touched = bool(result.contact_points.isfinite().any()) and not self._watch.is_rigid(*moved)
-        if not touched or self._watch.is_near(*moved):
+        return touched and not self._watch.is_near(*moved)
+
+    def _moved(self, result: Reconstruction) -> tuple[Tensor, Tensor]:
+        """How far the markers are off their rest, `[D, 2]` px, and their confidence `[D]`."""
+        return result.pixels[0] - self.reconstructor.rest_pixels, result.confidence[0]
+
+    def _press_in_words(self, result: Reconstruction) -> str:
+        force, unit = float(result.force[0].norm()), self.reconstructor.sensor.force_unit
+        said = f" of {force:.3g} {unit}" if np.isfinite(force) and self.reconstructor.finds_tractions else ""
+        return (
+            f"Tracker.rezero: a contact{said} is found in the frame that is taken for rest, and reads as none from now on. If "
+            "something touches, call rezero() again in a frame without contact, or reset(), which takes the sensor's rest image"
+        )
+
+    def _look_for_drift(self, result: Reconstruction) -> None:
+        moved = self._moved(result)
+        if not self._is_pressed(result):
             self._watch.add(*moved)
             self._steady.forget()
         else:

@@ -10,6 +10,7 @@ from pathlib import Path
 from threading import Event, Thread, current_thread, main_thread
 from typing import TYPE_CHECKING, Any
 
+from ..live.background import Background
 from .arguments import (
     add_command,
     add_device,
@@ -19,7 +20,7 @@ from .arguments import (
     camera,
     check_device,
     count,
-    positive,
+    number_from,
     wants_rerun,
 )
 
@@ -59,7 +60,7 @@ def add_parser(commands: Any) -> None:
     add("--camera", metavar="NUMBER|PATH", type=camera, help=opened)
     add("--video", metavar="FILE", type=Path, help="a video, as if it came from a camera")
     add("--images", metavar="FOLDER", type=Path, help="the images of a folder in name order, likewise")
-    add("--rate", metavar="HZ", type=positive, help="pace of files (default: a video's own; of images 30)")
+    add("--rate", metavar="HZ", type=number_from(0.001, 1e6), help="pace of files (default: a video's own; of images 30)")
     add("--grid", metavar=("M", "N"), nargs=2, type=count, help="solver grid (default: the sensor file's)")
     add_estimator(add)
     model = "compute by onnxruntime with a model of torchmembrane export; needs torchmembrane-edge"
@@ -84,16 +85,19 @@ def run(arguments: Namespace) -> int:
     images, stream = _images(arguments, sensor.camera), _stream(arguments, sensor)
     line = Line(stream.mesh, sys.stdout)
     warnings.showwarning = lambda message, *_: line.say(f"torchmembrane: warning: {message}")  # main restores it
-    with ExitStack() as stack:
-        watchers, said = _watchers(arguments, stream, stack)
-        stop, rezero = stack.enter_context(_stopped_by_signals()), _rezero_by_key()
-        mailbox, tally = stack.enter_context(capture(images)), Tally()
-        try:
-            follow(stream, mailbox, tally, [line, *watchers], stop, rezero, line.say)
-        finally:
-            line.say(summary(tally))
-    for each in said:
-        print(each())
+    said: list[Callable[[], str]] = []
+    try:
+        with ExitStack() as stack:
+            watchers = _watchers(arguments, stream, sensor.camera.bits, stack, said)
+            stop, rezero = stack.enter_context(_stopped_by_signals()), _rezero_by_key()
+            mailbox, tally = stack.enter_context(capture(images)), Tally()
+            try:
+                follow(stream, mailbox, tally, [line, *watchers], stop, rezero, line.say)
+            finally:
+                line.say(summary(tally))
+    finally:
+        for each in said:
+            line.say(each())
     return 0
 
 
@@ -142,27 +146,35 @@ def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
 
 
 def _watchers(
-    arguments: Namespace, stream: "Stream", stack: ExitStack
-) -> "tuple[list[Callable[[Seen, Tally], None]], list[Callable[[], str]]]":
-    """What else is given the frames, and what is to be said of it in the end."""
+    arguments: Namespace, stream: "Stream", bits: int | None, stack: ExitStack, said: "list[Callable[[], str]]"
+) -> "list[Callable[[Seen, Tally], None]]":
+    """What else is given the frames; to `said` is added what tells of it in the end."""
     from ..integrations.rerun import RerunLog
-    from ..live.background import Background
     from ..live.recording import Recording
 
     watchers: list[Callable[[Seen, Tally], None]] = []
-    said: list[Callable[[], str]] = []
-    if arguments.record is not None:
-        recording = stack.enter_context(Recording(arguments.record, stream.mesh))
-        later = stack.enter_context(Background(recording.keep))
+
+    def add(keep: "Callable[[Seen], None]", done: str) -> None:
+        later = stack.enter_context(Background(keep, tell=_warn))
         watchers.append(lambda seen, _: later(seen))
-        said.append(lambda: f"recorded in {arguments.record}; {later.dropped} frames left out, for want of time")
+        said.append(lambda: f"{done}; {_left_out(later)}")
+
+    if arguments.record is not None:
+        recording = stack.enter_context(Recording(arguments.record, stream.mesh, bits))
+        add(recording.keep, f"recorded in {arguments.record}")
     if wants_rerun(arguments):
         log = stack.enter_context(RerunLog(stream.mesh, arguments.save))
-        logged: Background[Seen] = Background(lambda seen: log.add(seen.number, seen.frame, seen.image, seen.time))
-        stack.enter_context(logged)
-        watchers.append(lambda seen, _: logged(seen))
-        said.append(lambda: f"shown in Rerun; {logged.dropped} frames left out, for want of time")
-    return watchers, said
+        add(lambda seen: log.add(seen.number, seen.frame, seen.image, seen.time), "shown in Rerun")
+    return watchers
+
+
+def _warn(error: BaseException) -> None:
+    warnings.warn(f"{error}; frames that cannot be kept are left out and counted", stacklevel=1)
+
+
+def _left_out(later: "Background[Seen]") -> str:
+    failed = f", {later.failed} frames that could not be kept" if later.failed else ""
+    return f"{later.late} frames left out, for want of time{failed}"
 
 
 @contextmanager

@@ -14,16 +14,19 @@ DEPTH = 64
 class Background(Generic[Item]):
     """Does something to items in a thread of its own: `with Background(keep) as later`, then `later(item)`, which never waits.
 
-    An item for which the queue has no room is dropped and counted; so is all that comes after an error, which is raised when
-    the block ends. Leaving the block waits until the queue is empty.
+    An item for which the queue has no room is dropped and counted, and so is one of which `keep` raises an error. The first
+    error is told at once, and raised when the block ends; the items after it are tried all the same. Leaving the block waits
+    until the queue is empty.
 
     Args:
         keep: what is done to each item, in their order.
         depth: items that wait at most.
+        tell: called, from the other thread, with the first error.
 
     Attributes:
-        dropped: items that were not kept.
-        error: what `keep` raised.
+        late: items for which there was no room.
+        failed: items of which `keep` raised an error.
+        error: the first of these.
 
     Example:
         >>> kept = []
@@ -34,11 +37,18 @@ class Background(Generic[Item]):
         ([0, 1, 2], 0)
     """
 
-    def __init__(self, keep: Callable[[Item], None], depth: int = DEPTH):
-        self.keep, self.dropped = keep, 0
+    def __init__(
+        self, keep: Callable[[Item], None], depth: int = DEPTH, tell: Callable[[BaseException], None] = lambda error: None
+    ):
+        self.keep, self.tell, self.late, self.failed = keep, tell, 0, 0
         self.error: BaseException | None = None
         self._waiting: Queue[Item | None] = Queue(depth)
         self._thread = Thread(target=self._work, name="background", daemon=True)
+
+    @property
+    def dropped(self) -> int:
+        """Items that were not kept."""
+        return self.late + self.failed
 
     def __enter__(self) -> "Background[Item]":
         self._thread.start()
@@ -55,15 +65,14 @@ class Background(Generic[Item]):
         try:
             self._waiting.put_nowait(item)
         except Full:
-            self.dropped += 1
+            self.late += 1
 
     def _work(self) -> None:
         while (item := self._waiting.get()) is not None:
-            if self.error is not None:
-                self.dropped += 1
-                continue
             try:
                 self.keep(item)
             except BaseException as error:  # whatever it is, the block raises it when it ends
-                self.error = error
-                self.dropped += 1
+                self.failed += 1
+                if self.error is None:
+                    self.error = error
+                    self.tell(error)

@@ -1,6 +1,7 @@
 """What a stream showed, kept: images as they were captured, results as `torchmembrane reconstruct` writes them, times."""
 
 import csv
+import warnings
 from pathlib import Path
 from types import TracebackType
 
@@ -31,15 +32,17 @@ class Recording:
     Args:
         folder: new or empty.
         mesh: what the frames share.
+        bits: of the camera, where 16 hold fewer.
 
     Raises:
-        MembraneError: the folder holds something.
+        MembraneError: the folder holds something; of `keep`, and when the block ends: it cannot be written to. Where the block
+            ends in another error, that is a warning.
     """
 
-    def __init__(self, folder: Path, mesh: Mesh):
+    def __init__(self, folder: Path, mesh: Mesh, bits: int | None = None):
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise MembraneError(f"--record {folder}: holds something already; expected a new folder, one per recording")
-        self.folder = folder
+        self.folder, self.bits = folder, bits
         self._results = ResultFolder(folder, mesh, Inputs([], []), WHOLE, False, print)
 
     def __enter__(self) -> "Recording":
@@ -50,15 +53,27 @@ class Recording:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        self._times.close()
-        self._results.__exit__(kind, error, traceback)
+        try:
+            try:
+                self._times.close()
+            finally:
+                self._results.__exit__(kind, error, traceback)
+        except OSError as failure:
+            said = f"--record {self.folder}: cannot be finished ({failure.strerror or failure}); what was written before is kept"
+            if error is None:
+                raise MembraneError(said) from failure
+            warnings.warn(said, stacklevel=2)
 
     def keep(self, seen: Seen) -> None:
         """Write a frame."""
-        path = write_as_taken(self.folder / IMAGES / seen.name, seen.image)
-        stored = Stored(seen.frame, Origin.of(path), seen.latency)
-        self._results.keep(Outcome(seen.name, path, stored))
-        csv.writer(self._times).writerow((seen.name, f"{seen.time:.6f}", f"{seen.latency:.6f}"))
+        try:
+            path = write_as_taken(self.folder / IMAGES / seen.name, seen.image, self.bits)
+            stored = Stored(seen.frame, Origin.of(path), seen.latency)
+            self._results.keep(Outcome(seen.name, path, stored))
+            csv.writer(self._times).writerow((seen.name, f"{seen.time:.6f}", f"{seen.latency:.6f}"))
+        except OSError as error:
+            cause = error.strerror or error
+            raise MembraneError(f"--record {self.folder}: frame {seen.name} cannot be written ({cause})") from error
 
 
 def times_of(folder: Path) -> dict[str, float]:

@@ -45,7 +45,9 @@ def check_film(path: Path, rate: float = 1.0) -> None:
         raise MembraneError(f"{path}: expected a film's name, ending in .gif, {', '.join(VIDEOS)}")
     least, most = GIF_RATES if is_gif else RATES
     if not least <= rate <= most:
-        raise MembraneError(f"{path}: {rate:g} pictures a second; expected {least:g} to {most:g} of a {path.suffix.lower()[1:]}")
+        raise MembraneError(
+            f"{path}: {rate:g} pictures a second; expected {least:g} to {most:g} of a {path.suffix.lower()[1:]}"
+        )
     if not is_gif:
         load_pyav()
 

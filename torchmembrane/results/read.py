@@ -15,7 +15,6 @@ from .npz import load_frame, stack_frames
 from .reconstruction import Frame, Reconstruction
 from .store import MESH, Mesh
 
-
 AGAIN = "the same reconstruct command again does its frame again, or delete it"
 
 

@@ -7,6 +7,7 @@ a gas, `pressure`, with the image's header. A frame without a surface is logged 
 (std_srvs/Trigger) takes the latest image for the rest state.
 """
 
+import warnings
 from array import array
 
 import rclpy
@@ -64,8 +65,10 @@ class TrackerNode(Node):
     def rezero(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Take the latest image for the rest state."""
         try:
-            self.tracker.rezero()
-            response.success = True
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                self.tracker.rezero()
+            response.success, response.message = True, "; ".join(str(each.message) for each in said)
         except tm.MembraneError as error:
             response.success, response.message = False, str(error)
         return response
