@@ -15,6 +15,9 @@ from .views import placed_dots
 CELL = 24  # px: over such squares depths are averaged
 FEWEST = 8  # depths in a square
 NEAR = 0.1  # of the surface's size: depths farther from the design are of something else
+FEWEST_SQUARES = 12
+UNITS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
+"""By how much depths in another unit are off."""
 
 
 class DepthFit(NamedTuple):
@@ -41,7 +44,7 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, pro
 
     Args:
         sensor: the design.
-        depth: `[H, W]` z along the camera's axis, length unit; NaN or 0 where there is none.
+        depth: `[H, W]` z along the camera's axis, length unit; NaN, infinity or 0 where there is none.
         image: `[H, W]` the membrane at rest, grey in 0..1.
         progress: is told how far it is.
 
@@ -81,6 +84,8 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, pro
     projection = SurfaceProjection(*(values[near] for values in projection))
     square = np.unique(cells[near], return_inverse=True)[1]
     counts = np.bincount(square)
+    if (counts >= FEWEST).sum() < FEWEST_SQUARES:
+        raise MembraneError(_too_few(sensor, depth, int((counts >= FEWEST).sum())))
 
     def square_mean(values: np.ndarray) -> np.ndarray:
         return np.stack([np.bincount(square, column) for column in values.T], -1) / counts[:, None]
@@ -100,9 +105,30 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, pro
     return DepthFit(moved, change, projection, deviations)
 
 
+def _too_few(sensor: Sensor, depth: np.ndarray, squares: int) -> str:
+    """What is wrong where so few squares of depths are near the designed surface."""
+    within, designed = depth[_measured(sensor, depth)], float(sensor.membrane.rest[:, 2].median())
+    said = (
+        f"calibrate depth: {squares} squares of {CELL} px have depths near the designed surface; expected {FEWEST_SQUARES} or "
+        f"more, registered to the camera and within {NEAR:g} of the surface's size"
+    )
+    if not len(within):
+        return f"{said}: there is none within the rim"
+    found = float(np.median(within))
+    factor = next((factor for factor in UNITS if 0.5 < factor * found / designed < 2), None)
+    remedy = "" if factor is None else f"; --unit {factor:g} times as large brings them there"
+    return f"{said}: the median within the rim is {found:.4g} {sensor.length_unit}, the design's {designed:.4g}{remedy}"
+
+
+def _measured(sensor: Sensor, depth: np.ndarray) -> np.ndarray:
+    """Pixels `[H, W]` within the rim's outline that have a depth."""
+    mask: np.ndarray = rim_mask(sensor, sensor.camera.point_to_pixel(sensor.membrane.rest)) & np.isfinite(depth) & (depth > 0)
+    return mask
+
+
 def _points(sensor: Sensor, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points `[N, 3]` of every other pixel within the rim's outline, and the square that each is in `[N]`."""
-    mask = rim_mask(sensor, sensor.camera.point_to_pixel(sensor.membrane.rest)) & np.isfinite(depth) & (depth > 0)
+    mask = _measured(sensor, depth)
     mask[1::2] = mask[:, 1::2] = False
     v, u = np.nonzero(mask)
     origin, direction = (a.numpy() for a in sensor.camera.pixel_to_ray(torch.from_numpy(np.stack([u, v], -1).astype(float))))

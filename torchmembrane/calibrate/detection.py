@@ -13,6 +13,7 @@ from ..markers.dots.pattern import find_dots
 
 WINDOW = 0.35  # of the shortest side of a square, in which a corner is fitted
 FAR_OFF = 10**6
+FEWEST_CORNERS = 3  # in a row and in a column
 STEP_ERROR = 0.35  # of a lattice step, by which a neighbour may be off its prediction
 
 
@@ -44,13 +45,12 @@ def find_target(image: np.ndarray, board: Checkerboard | DotBoard) -> np.ndarray
 
 def _find_corners(image: np.ndarray, board: Checkerboard) -> np.ndarray:
     cv2 = load_opencv()
-    grey = np.rint(255 * image).astype(np.uint8)
-    flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
+    grey, flags = np.rint(255 * image).astype(np.uint8), cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
     found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=flags)
     if not found:
         raise MembraneError(
             f"no checkerboard of {board.columns} x {board.rows} inner corners found; expected all of it in the image, sharp, "
-            f"with a light margin{too_few_bits(image)}"
+            f"with a light margin{_other_board(grey, board)}{too_few_bits(image)}"
         )
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
     lattice = corners.reshape(board.rows, board.columns, 2)
@@ -58,6 +58,23 @@ def _find_corners(image: np.ndarray, board: Checkerboard) -> np.ndarray:
     reach = int(np.clip(WINDOW * gap, 2, 10))
     corners = cv2.cornerSubPix(grey, np.ascontiguousarray(corners), (reach, reach), (-1, -1), criteria)
     return corners[:, 0].astype(float)
+
+
+def _other_board(grey: np.ndarray, board: Checkerboard) -> str:
+    """What to add where another board is in the image: it may have as many squares as corners were asked for."""
+    cv2, columns, rows = load_opencv(), board.columns - 1, board.rows - 1
+    if min(columns, rows) < FEWEST_CORNERS:
+        return ""
+    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
+    found, _, lattice = cv2.findChessboardCornersSBWithMeta(grey, (columns, rows), flags)
+    if not found:
+        return ""
+    seen = lattice.shape[::-1] if lattice.shape == (rows, columns) else lattice.shape
+    squares = f", that is {board.columns} x {board.rows} squares," if sorted(seen) == sorted((columns, rows)) else ""
+    return (
+        f"; one of {seen[0]} x {seen[1]} inner corners{squares} is there: count corners at which four squares meet, --corners "
+        f"{seen[0]},{seen[1]}"
+    )
 
 
 def _find_board_dots(image: np.ndarray, board: DotBoard) -> np.ndarray:

@@ -112,6 +112,17 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
     return inputs
 
 
+def single_images(inputs: Inputs) -> list[Path]:
+    """The image files, where only images are meant that have a file each.
+
+    Raises:
+        MembraneError: there are files of several pictures among the inputs.
+    """
+    if inputs.videos:
+        raise MembraneError(f"{inputs.videos[0]}: holds several pictures; expected images here, each as a file of its own")
+    return inputs.images
+
+
 def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
     path = Path(argument)
     if path.is_dir():

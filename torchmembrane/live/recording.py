@@ -59,7 +59,8 @@ class Recording:
             finally:
                 self._results.__exit__(kind, error, traceback)
         except OSError as failure:
-            said = f"--record {self.folder}: cannot be finished ({failure.strerror or failure}); what was written before is kept"
+            cause = failure.strerror or failure
+            said = f"--record {self.folder}: cannot be finished ({cause}); what was written before is kept"
             if error is None:
                 raise MembraneError(said) from failure
             warnings.warn(said, stacklevel=2)

@@ -86,7 +86,8 @@ def _views_options(add: Add) -> None:
 
 
 def _depth_options(add: Add) -> None:
-    add("depth", metavar="DEPTH", type=Path, help=".npy or 16-bit PNG, registered to the camera: z along the axis, 0 none")
+    where = ".npy, TIFF or 16-bit PNG, registered to the camera: z along the axis; 0, NaN or infinite where there is none"
+    add("depth", metavar="DEPTH", type=Path, help=where)
     add("--unit", metavar="LENGTH", type=positive, default=1.0, help="of one step of its values (default: %(default)s)")
     add("--image", metavar="REST.png", required=True, help="the membrane at rest, to find the dots in")
 

@@ -12,9 +12,9 @@ from ...calibrate.detection import find_target
 from ...calibrate.report import Report
 from ...camera.targets import Checkerboard, DotBoard
 from ...errors import MembraneError
-from ...files.images import read_image
+from ...files.images import read_image, read_pixels
 from ...files.safe_read import read_array, read_text
-from ...jobs.inputs import find_inputs
+from ...jobs.inputs import find_inputs, single_images
 from ...plot.drawing import save
 from ...presets import sensor_file
 from ...sensor.sensor import Sensor
@@ -48,15 +48,16 @@ def read_sensor_image(path: str | Path, sensor: Sensor) -> np.ndarray:
 
 def read_targets(images: Sequence[str], sensor: Sensor, board: Checkerboard | DotBoard) -> np.ndarray:
     """The board's points in every image that shows it, `[P, D, 2]`; an image that shows none is reported and left out."""
-    found = []
-    for path in find_inputs(images).images:
+    found, reason = [], ""
+    for path in single_images(find_inputs(images)):
         image = read_sensor_image(path, sensor)
         try:
             found.append(find_target(image, board))
         except MembraneError as error:
+            reason = str(error)
             print(f"{path} left out: {error}")
     if not found:
-        raise MembraneError(f"calibrate: no image of {len(images)} shows {board}")
+        raise MembraneError(f"calibrate: no image of {len(images)} shows {board}: {reason}")
     return np.stack(found)
 
 
@@ -95,9 +96,18 @@ def read_forces(path: Path, images: Sequence[Path]) -> np.ndarray:
 
 
 def read_depth(path: Path, unit: float) -> np.ndarray:
-    """A depth image `[H, W]` in the sensor's length unit; `unit`: of one step of the file's values."""
-    values = read_array(path) if path.suffix == ".npy" else read_image(path).astype(float) * 65535
-    depth: np.ndarray = values.astype(float) * unit
+    """A depth image `[H, W]` in the sensor's length unit, NaN where there is none; `unit`: of one step of the file's values.
+
+    As ROS has them: 16 bits, 0 where there is none, or float, NaN and infinities there.
+    """
+    values = read_array(path) if path.suffix == ".npy" else read_pixels(path)
+    expected = "[H, W] of float or of 16 bits or more, z along the camera's axis"
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if values.ndim != 2 or values.dtype.itemsize < 2:
+        raise MembraneError(f"{path}: an array {list(values.shape)} of {values.dtype}; expected {expected}")
+    depth = values.astype(float) * unit
+    depth[~np.isfinite(depth)] = np.nan
     if (np.abs(depth) > FARTHEST).any():
         raise MembraneError(f"{path}: depths up to {np.nanmax(depth):g}; expected at most {FARTHEST:g}: check --unit {unit:g}")
     return depth

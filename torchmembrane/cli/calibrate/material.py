@@ -9,7 +9,7 @@ from ...calibrate.material import STRETCHES, KnownPressures, material_from_image
 from ...calibrate.report import Report
 from ...calibrate.weight import WeightFit, material_from_weight
 from ...errors import MembraneError
-from ...jobs.inputs import Inputs, find_inputs
+from ...jobs.inputs import Inputs, find_inputs, single_images
 from ...jobs.pressure import read_pressures
 from ...plot.calibration import material_figure
 from ...progress import Progress
@@ -21,7 +21,7 @@ from .files import read_forces, read_sensor, read_sensor_image, write_calibrated
 def material(arguments: Namespace) -> int:
     """`torchmembrane calibrate material`"""
     sensor, inputs = read_sensor(arguments), find_inputs(arguments.images)
-    paths = inputs.images
+    paths = single_images(inputs)
     forces = read_forces(arguments.forces, paths) if arguments.forces else None
     pressures = _pressures(arguments, inputs, sensor) if arguments.pressure else None
     images = torch.from_numpy(np.stack([read_sensor_image(path, sensor) for path in paths]))[:, None]
