@@ -27,6 +27,7 @@ from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
 from torchmembrane.camera.targets import Checkerboard, DotBoard
 from torchmembrane.cli import main as cli
+from torchmembrane.cli.calibrate.files import read_depth
 from torchmembrane.files.images import read_image, to_grey
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
@@ -350,6 +351,50 @@ def test_rest_surface_and_dots_are_found_from_a_depth_image(design, truth, image
     assert cKDTree(truth.markers.positions).query(found.sensor.markers.positions)[0].max() < 0.06
 
 
+@pytest.mark.parametrize("kind", ["float32.npy", "float16.npy", "float.tiff", "16UC1.png", "16UC1.npy", "[H, W, 1].npy"])
+def test_depth_images_are_read_as_ros_has_them(tmp_path, kind):
+    """Metres with NaN and infinities where there is no depth, or whole millimetres with 0 there; the sensor is in mm."""
+    true = np.array([[21.0, 22.0, 23.0, 24.0], [0.0, 0.0, 0.0, 30.0]])
+    metres, path = np.where(true > 0, true / 1000, [[0, 0, 0, 0], [np.nan, np.inf, -np.inf, 0]]), tmp_path / kind
+    if "16UC1" in kind:
+        values, unit = true.astype(np.uint16), 1.0
+    else:
+        values, unit = metres.astype(np.float16 if "16" in kind else np.float32), 1000.0
+    if "H, W" in kind:
+        values = values[..., None]
+    Image.fromarray(values).save(path) if path.suffix != ".npy" else np.save(path, values)
+    found = read_depth(path, unit)
+    assert found.shape == (2, 4) and found.dtype == np.float64
+    seen = true > 0
+    np.testing.assert_allclose(found[seen], true[seen], rtol=1e-3 if "16" in kind and unit > 1 else 1e-6)
+    assert not (found[~seen] > 0).any()
+
+
+@pytest.mark.parametrize("values", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros(4), np.zeros((4, 4, 2))])
+def test_what_is_no_depth_image_is_refused(tmp_path, values):
+    np.save(tmp_path / "a.npy", values)
+    with pytest.raises(
+        MembraneError, match=r"a.npy: an array \[4.*\] of (uint8|float64); expected \[H, W\] of float or of 16 bits"
+    ):
+        read_depth(tmp_path / "a.npy", 1.0)
+    if values.dtype == np.uint8:
+        Image.fromarray(values).save(tmp_path / "a.png")
+        with pytest.raises(MembraneError, match=r"a.png: an array \[4, 4\] of uint8"):
+            read_depth(tmp_path / "a.png", 1.0)
+
+
+@pytest.mark.parametrize("factor, said", [(0.001, "--unit 1000 times as large"), (10.0, "--unit 0.1 times as large")])
+def test_depths_in_another_unit_are_refused_with_the_unit(design, truth, image, factor, said):
+    simulator = simulator_of(truth)
+    depth = simulator.renderer.depth(simulator.membrane.rest).numpy()
+    with pytest.raises(
+        MembraneError, match=r"squares of 24 px have depths near the designed surface; expected 12 or .*" + said
+    ):
+        rest_from_depth(design, factor * depth, image)
+    with pytest.raises(MembraneError, match="there is none within the rim"):
+        rest_from_depth(design, np.full(depth.shape, np.inf), image)
+
+
 # fabrication layout
 
 
@@ -411,6 +456,34 @@ def test_command_camera_leaves_out_images_without_a_board(design, tmp_path, caps
     assert code == 0 and "empty.png left out" in said and "4 images" in said
     found = Sensor.from_file(tmp_path / "out" / "sensor.toml").camera
     assert np.abs(found.focal.numpy() - 150).max() < 1 and len(found.ports) == 1
+
+
+@pytest.mark.parametrize(
+    "asked, said",
+    [
+        ((10, 7), "one of 9 x 6 inner corners, that is 10 x 7 squares, is there: count corners .*, --corners 9,6"),
+        ((7, 10), "one of 6 x 9 inner corners, that is 7 x 10 squares, is there"),
+        ((7, 5), "one of . x . inner corners is there"),
+        ((12, 9), "with a light margin$"),
+    ],
+)
+def test_squares_that_were_counted_for_corners_are_said(asked, said):
+    camera, rng = Camera("pinhole", SIZE, (150.0, 150.0), (160.4, 119.2)), np.random.default_rng(5)
+    R, t = next(iter(poses(CHECKERS, 1, (17, 24), rng)))
+    image = TargetRenderer.for_camera(camera).image(CHECKERS, R, t, NOISE, rng=rng) / 255
+    assert find_target(image, CHECKERS).shape == (54, 2)
+    with pytest.raises(MembraneError, match=f"no checkerboard of {asked[0]} x {asked[1]} inner corners found; .*{said}"):
+        find_target(image, Checkerboard(*asked, 3.0))
+
+
+def test_command_camera_says_why_no_image_shows_the_board(design, tmp_path, capsys):
+    camera = Camera("pinhole", SIZE, (150.0, 150.0), (160.4, 119.2))
+    photograph, rng = TargetRenderer.for_camera(camera), np.random.default_rng(5)
+    for k, (R, t) in enumerate(poses(CHECKERS, 3, (17, 24), rng)):
+        Image.fromarray(photograph.image(CHECKERS, R, t, NOISE, rng=rng)).save(tmp_path / f"{k}.png")
+    options = ("--corners", "10,7", "--square", "3", "--out", tmp_path / "out")
+    code, _, errors = run(capsys, "camera", design.to_file(tmp_path / "design"), tmp_path, *options)
+    assert code == 2 and "no image of 3 shows" in errors and "--corners 9,6" in errors
 
 
 def test_command_layout_writes_for_machine_and_eye(design, tmp_path, capsys):

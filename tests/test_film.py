@@ -15,7 +15,7 @@ from torchmembrane.integrations.rerun import LONGER, LONGEST_FORCE, RerunLog
 from torchmembrane.live.loop import Seen
 from torchmembrane.live.recording import Recording
 from torchmembrane.live.streams import TrackedStream
-from torchmembrane.plot.film import write_film
+from torchmembrane.plot.film import GIF_RATES, RATES, write_film
 
 
 def pictures(count: int, shape=(31, 42)) -> list[np.ndarray]:
@@ -70,6 +70,34 @@ def test_films_that_cannot_be_are_said_and_leave_nothing(tmp_path):
         with pytest.raises(tm.MembraneError, match=said):
             write_film(tmp_path / name, shown, 10)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("ending", ["gif", "mp4"])
+@pytest.mark.parametrize("rate", [1e-300, 0.0005, 0.001, 0.01, 12.5, 50, 60, 1000, 1e4, 1e300, float("inf"), float("nan")])
+def test_a_film_has_a_rate_that_its_format_holds(tmp_path, ending, rate):
+    path, (least, most) = tmp_path / f"film.{ending}", GIF_RATES if ending == "gif" else RATES
+    if not least <= rate <= most:
+        with pytest.raises(tm.MembraneError, match=rf"film.{ending}: .* pictures a second; expected {least:g} to {most:g}"):
+            write_film(path, pictures(3), rate)
+        assert not list(tmp_path.iterdir())
+        return
+    write_film(path, pictures(3), rate)
+    if ending == "gif":
+        film = Image.open(path)
+        film.seek(1)
+        assert film.n_frames == 3 and film.info["duration"] == pytest.approx(1000 / rate, abs=10)
+    else:
+        import av
+
+        with av.open(str(path)) as container:
+            assert float(container.streams.video[0].average_rate) == pytest.approx(rate)
+            assert len(list(container.decode(video=0))) == 3
+
+
+@pytest.mark.parametrize("name, rate", [("day.gif", "0.001"), ("day.mp4", "1e300")])
+def test_the_command_refuses_a_rate_before_it_draws(recording, tmp_path, capsys, name, rate):
+    assert main(["view", str(recording), "--video-out", str(tmp_path / name), "--rate", rate]) == 2
+    assert f"{name}: {float(rate):g} pictures a second; expected" in capsys.readouterr().err
 
 
 def test_all_frames_of_a_folder_are_drawn_as_a_film_also_one_without_surface(recording, tmp_path, capsys):

@@ -1,13 +1,15 @@
 """One grey everywhere: 0.299 R + 0.587 G + 0.114 B in floating point, whatever the file or array."""
 
+import re
 import tracemalloc
 
 import numpy as np
 import pytest
+from image_files import jpeg, packed_12_bits, tiff
 from PIL import Image
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.files.images import read_image, to_grey, write_image
+from torchmembrane.files.images import decode_image, read_image, read_pixels, to_grey, write_as_taken, write_image
 
 RGB = np.random.default_rng(0).integers(0, 256, (7, 9, 3), dtype=np.uint8)
 GREY_OF_RGB = (RGB.astype(np.float64) @ [0.299, 0.587, 0.114]) / 255
@@ -182,3 +184,124 @@ def test_a_webp_is_as_long_as_its_chunks_say(tmp_path, options):
         path.write_bytes(content)
         with pytest.raises(MembraneError, match="not readable as an image"):
             read_image(path)
+
+
+JPEGS = [
+    ("L", {}),
+    ("RGB", {}),
+    ("RGB", dict(subsampling=0)),
+    ("L", dict(progressive=True)),
+    ("L", dict(restart_marker_blocks=7)),
+    ("RGB", dict(restart_marker_blocks=40)),
+    ("RGB", dict(restart_marker_rows=1)),
+]
+every_jpeg = pytest.mark.parametrize("mode, options", JPEGS, ids=str)
+
+
+@every_jpeg
+@pytest.mark.parametrize("padding", [bytes(1), bytes(8), bytes(16), bytes(700), b"\x55" * 9, b"\xff" * 9, bytes(range(5, 15))])
+def test_padding_before_the_end_of_a_jpeg_is_no_damage(photograph, mode, options, padding):
+    whole = jpeg(photograph.convert(mode), **options)
+    padded = decode_image(whole[:-2] + padding + whole[-2:], "a.jpg")
+    np.testing.assert_array_equal(padded, decode_image(whole, "b.jpg"))
+
+
+@pytest.mark.parametrize("mode, options", JPEGS[4:], ids=str)
+def test_padding_before_restart_markers_is_no_damage(photograph, mode, options):
+    whole, rng = jpeg(photograph.convert(mode), **options), np.random.default_rng(0)
+    padded = re.sub(rb"\xff[\xd0-\xd7]", lambda marker: bytes(int(rng.integers(0, 4))) + marker.group(), whole)
+    padded = padded[:-2] + bytes(12) + padded[-2:]
+    assert len(padded) > len(whole) + 30
+    np.testing.assert_array_equal(decode_image(padded, "a.jpg"), decode_image(whole, "b.jpg"))
+
+
+@every_jpeg
+@pytest.mark.parametrize("end", [b"", b"\xff\xd9", bytes(5000) + b"\xff\xd9", b"\xff" * 5000 + b"\xff\xd9"], ids=len)
+def test_a_jpeg_that_ends_early_is_refused_however_it_is_filled_up(photograph, mode, options, end):
+    whole = jpeg(photograph.convert(mode), **options)
+    for share in (0.4, 0.9):
+        with pytest.raises(MembraneError, match="a.jpg: not readable as an image"):
+            decode_image(whole[: int(share * len(whole))] + end, "a.jpg")
+
+
+@pytest.mark.parametrize("mode, options", JPEGS[:2] + JPEGS[4:5], ids=str)
+def test_data_that_are_left_over_are_no_padding(photograph, mode, options):
+    """A part of the data is there twice: the decoder ends early, and what is left is much and not alike."""
+    whole = jpeg(photograph.convert(mode), **options)
+    at = len(whole) // 2
+    with pytest.raises(MembraneError, match="corrupt JPEG data"):
+        decode_image(whole[:at] + whole[at - 600 :], "a.jpg")
+
+
+SIXTEEN = RGB[..., 0].astype(np.uint16) * 255 + RGB[..., 1]
+DEEP = [
+    ("white is zero", tiff([(65535 - SIXTEEN, {262: 0})]), SIXTEEN / 65535),
+    ("white is zero, float", tiff([((1 - RGB[..., 0] / 255).astype(np.float32), {262: 0})]), RGB[..., 0] / 255),
+    ("float", tiff([((RGB[..., 0] / 255).astype(np.float32), {})]), RGB[..., 0] / 255),
+    ("whole, of 32 bits", tiff([(SIXTEEN.astype(np.int32), {339: 2})]), SIXTEEN / 65535),
+    ("unsigned, of 32 bits", tiff([(SIXTEEN.astype(np.uint32), {})]), SIXTEEN / 65535),
+    ("of 12 bits", tiff([(packed_12_bits(SIXTEEN[:, :8] // 16), {256: 8, 258: 12})]), (SIXTEEN[:, :8] // 16) / 4095),
+]
+
+
+@pytest.mark.parametrize("content, expected", [each[1:] for each in DEEP], ids=[each[0] for each in DEEP])
+def test_a_tiff_is_read_as_its_tags_say(content, expected):
+    assert np.abs(decode_image(content, "a.tif") - expected).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    "values, said",
+    [
+        (np.full((4, 4), 70000, np.int32), "32-bit values from 70000 to 70000; 8 or 16 bits are read, or float in 0..1"),
+        (np.full((4, 4), -1, np.int32), "32-bit values from -1 to -1"),
+        (np.full((4, 4), 255, np.float32), "float values from 255.0 to 255.0; expected finite, in 0..1: divide by white"),
+        (np.full((4, 4), np.nan, np.float32), "float values from nan"),
+    ],
+)
+def test_a_tiff_of_other_values_is_refused_in_words(values, said):
+    with pytest.raises(MembraneError, match=re.escape(said)):
+        decode_image(tiff([(values, {339: 2 if values.dtype.kind == "i" else 3})]), "a.tif")
+
+
+@pytest.mark.parametrize("bits", range(8, 17))
+def test_values_of_a_camera_of_fewer_bits_are_fractions_of_its_white(tmp_path, bits):
+    white = 2**bits - 1
+    values = np.random.default_rng(bits).integers(0, white, (7, 9), endpoint=True, dtype=np.uint16)
+    values[0, :2] = 0, white
+    Image.fromarray(values).save(tmp_path / "a.png")
+    for grey in (read_image(tmp_path / "a.png", bits=bits), to_grey(values, bits)):
+        assert np.abs(grey - values / white).max() < 1e-7
+    assert np.array_equal(to_grey(RGB, bits), to_grey(RGB))  # of 8 bits as before
+    for write in (write_image, write_as_taken):
+        grey = read_image(tmp_path / "a.png", bits=bits)
+        assert np.array_equal(read_image(write(tmp_path / "b", grey, bits), bits=bits), grey)
+    taken = write_as_taken(tmp_path / "c", values, bits)
+    assert np.array_equal(read_pixels(taken), values)
+    if bits < 16:
+        values[3, 3] = white + 1
+        Image.fromarray(values).save(tmp_path / "a.png")
+        with pytest.raises(
+            MembraneError, match=rf"a.png: values up to {white + 1}; expected at most {white}, as bits = {bits} in"
+        ):
+            read_image(tmp_path / "a.png", bits=bits)
+
+
+def test_bits_of_a_file_itself_go_before_the_camera_s_and_colour_of_16_is_refused():
+    content, expected = DEEP[-1][1:]
+    assert np.abs(decode_image(content, "a.tif", bits=10) - expected).max() < 1e-6
+    colour = tiff([(np.full((4, 12), 9, np.uint16), {256: 4, 262: 2, 277: 3})])
+    decode_image(colour, "a.tif")
+    with pytest.raises(MembraneError, match="a.tif: .*colour of 16 bits, of which 8 are read, so bits = 12 is lost"):
+        decode_image(colour, "a.tif", bits=12)
+
+
+def test_a_write_that_fails_leaves_no_part_of_a_file(tmp_path, monkeypatch):
+    def full(self, file, *_, **__):
+        with open(file, "wb") as begun:
+            begun.write(b"\x89PNG")
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Image.Image, "save", full)
+    with pytest.raises(OSError, match="no space"):
+        write_as_taken(tmp_path / "a", RGB)
+    assert not list(tmp_path.iterdir())

@@ -5,10 +5,12 @@ Cameras are played by a class with the interface of `cv2.VideoCapture`.
 
 import csv
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -170,6 +172,96 @@ def test_an_error_in_the_background_is_raised_in_the_end_and_the_rest_is_dropped
         for item in range(3):
             later(item)
     assert later.dropped == 3
+
+
+def test_items_after_an_error_in_the_background_are_tried_and_the_first_error_is_told_at_once():
+    kept, told, go = [], [], Event()
+
+    def keep(item):
+        if item in (1, 3):
+            raise OSError(f"no space for {item}")
+        kept.append(item)
+
+    with (
+        pytest.raises(OSError, match="no space for 1"),
+        Background(keep, tell=lambda error: (told.append(error), go.set())) as later,
+    ):
+        for item in range(3):
+            later(item)
+        assert go.wait(5.0) and str(told[0]) == "no space for 1"  # before the block ends
+        later(3)
+        later(4)
+    assert kept == [0, 2, 4] and len(told) == 1 and later.failed == later.dropped == 2 and later.late == 0
+
+
+@pytest.mark.parametrize("source", ["ends", "breaks off"])
+def test_a_recording_that_cannot_be_written_is_told_at_once_and_counted(
+    small_sensor, small_images, camera, capsys, tmp_path, monkeypatch, source
+):
+    """The folder of images goes away amid the recording: said while it goes on, and what else ends the command as well."""
+    monkeypatch.setattr("torchmembrane.live.sources.BREATH", 0.0)
+    monkeypatch.setattr(sys, "stdin", [])
+    record, images = tmp_path / "kept", [np.array(Image.open(path).convert("RGB")) for path in small_images]
+
+    class Slow(Capture):
+        def read(self):
+            time.sleep(0.2)
+            if len(self.images) == 5:
+                shutil.rmtree(record / "images")
+            if len(self.images) == 1 and source == "ends":
+                signal.raise_signal(signal.SIGINT)
+            return super().read()
+
+    played = Slow(images * 3)
+    monkeypatch.setattr("cv2.VideoCapture", lambda number: played)
+    assert main(["live", str(small_sensor / "sensor.toml"), "--camera", "0", "--grid", "7", "7", "--record", str(record)]) == 2
+    out, err = capsys.readouterr()
+    told = re.search(r"warning: --record .*kept: frame (\d+) cannot be written \(No such file or directory\); frames that", out)
+    counted = re.search(r"recorded in .*kept; 0 frames left out, for want of time, (\d+) frames that could not be kept", out)
+    assert told and counted and told.start() < out.index("captured") < counted.start()
+    results = tm.read_results(record)
+    assert int(told[1]) not in map(int, results.names) and int(counted[1]) >= 1
+    assert ("--camera 0: no image in" if source == "breaks off" else "cannot be written") in err
+
+
+def test_a_recording_that_cannot_be_closed_says_so_beside_another_error(stream, small_images, tmp_path):
+    image = read_image(small_images[0])
+    for error in (None, tm.MembraneError("the source broke off")):
+        folder = tmp_path / f"day{error is None}"
+        expected = pytest.raises(tm.MembraneError, match="cannot be finished" if error is None else "the source broke off")
+        with warnings.catch_warnings(record=True) as said, expected:
+            warnings.simplefilter("always")
+            with Recording(folder, stream.mesh) as recording:
+                recording.keep(Seen(0, 0.0, image, stream(image, 0.0), 0.0))
+                stream.tracker.reset()
+                shutil.rmtree(folder)
+                folder.touch()
+                if error is not None:
+                    raise error
+        assert (len(said) == 1) == (error is not None) and all("cannot be finished" in str(each.message) for each in said)
+
+
+def test_rezero_of_live_says_that_a_contact_was_found(stream, small_images, recwarn):
+    asked, said = Event(), []
+    image = read_image(small_images[2])
+
+    def pressed():
+        yield image
+        time.sleep(0.5)
+        asked.set()
+        yield image
+
+    with capture(pressed()) as mailbox:
+        follow(stream, mailbox, Tally(), [], Event(), asked, said.append)
+    assert said == ["the latest frame is taken for rest"]
+    assert any("a contact of" in str(each.message) and "reads as none from now on" in str(each.message) for each in recwarn)
+
+
+@pytest.mark.parametrize("rate", ["0", "1e-300", "1e300", "nan", "-1"])
+def test_a_rate_at_which_nothing_can_be_played_is_refused(small_sensor, tmp_path, capsys, rate):
+    with pytest.raises(SystemExit) as ended:
+        main(["live", str(small_sensor / "sensor.toml"), "--images", str(tmp_path), "--rate", rate])
+    assert ended.value.code == 2 and "expected a number from 0.001 to 1e+06" in capsys.readouterr().err
 
 
 class Capture:

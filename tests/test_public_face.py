@@ -1,5 +1,6 @@
 """What `import torchmembrane as tm` gives: images as cameras give them, streams, results that move; wrong calls in words."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -198,6 +199,27 @@ def test_a_tracker_gives_what_frames_with_their_previous_give(reconstructor, pho
     torch.testing.assert_close(tracker(photographs[0]).vertices, first.vertices)
     with pytest.raises(tm.MembraneError, match="2 frames; expected one"):
         tracker(photographs[:2])
+
+
+def test_rezero_in_a_press_warns_with_its_force(sensor):
+    """Taken for rest all the same: a drift may look like a contact. In a frame without contact nothing is said."""
+    made = tm.Reconstructor(sensor)
+    rest, press = made.read(EXAMPLES / "rest.png", EXAMPLES / "press_on_axis.png").split(1)
+    tracker = tm.Tracker(made)
+    force = float(tracker(press).force.norm())
+    for frame in (None, press):
+        with pytest.warns(
+            UserWarning, match=rf"Tracker.rezero: a contact of {force:.3g} N is found .* reads as none from now on"
+        ):
+            tracker.rezero(frame)
+        assert not tracker(press).contact_points.isfinite().any()
+        tracker.reset()
+        tracker(press)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tracker.rezero(rest)
+        tracker(rest)
+        tracker.rezero()
 
 
 def test_rezero_nulls_what_has_drifted_since_the_rest_image(sensor):

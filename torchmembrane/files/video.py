@@ -16,6 +16,8 @@ from .video_end import missing_end
 GREY_OF_16 = ("gray16le", "gray16be")
 """Formats of pictures, as FFmpeg calls them."""
 NOT_WHOLE = "it, or one that it is coded by, is not whole"
+TIMED = "matroska"
+"""The format, as FFmpeg calls it, that tells a film's duration at its beginning, and no number of frames."""
 WHOLE = 0.01
 """By how much duration times rate may be off a number of frames."""
 
@@ -139,7 +141,7 @@ def _refuse_size(pictures: Any, size: tuple[int, int]) -> None:
 def _of_how_many(found: int, container: Any, stream: Any) -> str:
     """How many pictures a video should have, in words, if it says that it has more than were found."""
     told = stream.frames
-    if not told and container.duration and stream.average_rate:
+    if not told and TIMED in container.format.name and container.duration and stream.average_rate:
         told = container.duration / 1e6 * float(stream.average_rate)
     about = "" if abs(told - round(told)) < WHOLE else "about "
     return f" of {about}{round(told)}" if told > found else ""

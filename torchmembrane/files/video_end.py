@@ -7,7 +7,8 @@ EBML, SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
 """Identifiers of a Matroska file's header, and of the part behind it that is all the rest."""
 BOXES = (b"ftyp", b"moov", b"moof", b"mdat", b"wide", b"free", b"skip")
 """That an MP4 or MOV file may begin with."""
-INDEX = (b"moov", b"moof")
+FRAGMENT = b"moof"
+INDEX = (b"moov", FRAGMENT)
 MOST_BOXES = 2**16
 """That are looked at."""
 LONGEST_TAIL = 1024
@@ -26,7 +27,7 @@ def missing_end(path: Path) -> str:
         ...     path = Path(folder) / "cut.avi"
         ...     _ = path.write_bytes(b"RIFF" + (1000).to_bytes(4, "little") + b"AVI " + bytes(88))
         ...     missing_end(path)
-        '100 of its 1008 bytes'
+        '100 of at least 1008 bytes'
     """
     held = path.stat().st_size
     with open(path, "rb") as file:
@@ -42,9 +43,11 @@ def missing_end(path: Path) -> str:
             declared, kinds = _end_of_boxes(file, held)
             if declared <= held and not kinds.intersection(INDEX):
                 return "no index (moov), as where a recording was not closed"
+            if declared > held and FRAGMENT in kinds:
+                return "cut off in one of its fragments"
         else:
             return ""
-    return f"{held} of its {declared} bytes" if declared > held else ""
+    return f"{held} of at least {declared} bytes" if declared > held else ""
 
 
 def _end_of_matroska(file: BinaryIO) -> int:

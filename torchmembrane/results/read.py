@@ -15,7 +15,7 @@ from .npz import load_frame, stack_frames
 from .reconstruction import Frame, Reconstruction
 from .store import MESH, Mesh
 
-AGAIN = "the same reconstruct command again does its frame again, or delete it"
+AGAIN = "run the same reconstruct command again, which does its frame again, or delete it"
 
 
 def read_results(folder: str | Path) -> "Results":

@@ -48,8 +48,8 @@ def read_sensor_image(path: str | Path, sensor: Sensor) -> np.ndarray:
 
 def read_targets(images: Sequence[str], sensor: Sensor, board: Checkerboard | DotBoard) -> np.ndarray:
     """The board's points in every image that shows it, `[P, D, 2]`; an image that shows none is reported and left out."""
-    found, reason = [], ""
-    for path in single_images(find_inputs(images)):
+    found, reason, paths = [], "", single_images(find_inputs(images))
+    for path in paths:
         image = read_sensor_image(path, sensor)
         try:
             found.append(find_target(image, board))
@@ -57,7 +57,7 @@ def read_targets(images: Sequence[str], sensor: Sensor, board: Checkerboard | Do
             reason = str(error)
             print(f"{path} left out: {error}")
     if not found:
-        raise MembraneError(f"calibrate: no image of {len(images)} shows {board}: {reason}")
+        raise MembraneError(f"calibrate: no image of {len(paths)} shows {board}: {reason}")
     return np.stack(found)
 
 
