@@ -121,7 +121,8 @@ class Tracker:
             raise MembraneError("Tracker.rezero: no frame yet; pass one without contact")
         rest = self.reconstructor.observer.rest_of(images)
         if self._is_pressed(result):
-            warnings.warn(self._press_in_words(result), stacklevel=2)
+            force = float(result.force[0].norm()) if self.reconstructor.finds_tractions else float("nan")
+            warnings.warn(press_in_words(force, self.reconstructor.sensor.force_unit), stacklevel=2)
         self._rest_pixels, self._before = rest.pixels, None
         self._watch_from(rest.covariance)
 
@@ -140,14 +141,6 @@ class Tracker:
     def _moved(self, result: Reconstruction) -> tuple[Tensor, Tensor]:
         """How far the markers are off their rest, `[D, 2]` px, and their confidence `[D]`."""
         return result.pixels[0] - self.reconstructor.rest_pixels, result.confidence[0]
-
-    def _press_in_words(self, result: Reconstruction) -> str:
-        force, unit = float(result.force[0].norm()), self.reconstructor.sensor.force_unit
-        said = f" of {force:.3g} {unit}" if np.isfinite(force) and self.reconstructor.finds_tractions else ""
-        return (
-            f"Tracker.rezero: a contact{said} is found in the frame that is taken for rest, and reads as none from now on. If "
-            "something touches, call rezero() again in a frame without contact, or reset(), which takes the sensor's rest image"
-        )
 
     def _look_for_drift(self, result: Reconstruction) -> None:
         moved = self._moved(result)
@@ -178,6 +171,20 @@ class Tracker:
         if len(images) != 1:
             raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
         return images
+
+
+def press_in_words(force: float, unit: str) -> str:
+    """A contact in what is taken for rest, and the remedy.
+
+    Args:
+        force: of the contact; NaN where it is not known.
+        unit: of the force.
+    """
+    known = f"of {force:.3g} {unit} " if np.isfinite(force) else ""
+    return (
+        f"Tracker.rezero: a contact {known}is found in the frame that is taken for rest, and reads as none from now on. If "
+        "something touches, call rezero() again in a frame without contact, or reset(), which takes the sensor's rest image"
+    )
 
 
 def drift_in_words(size: float, camera_motion: Tensor | None = None, is_steady: bool = False) -> str:

@@ -27,10 +27,10 @@ DIR then holds
   mesh.npz       rest surface, triangles, units
   summary.csv    one row per frame
   NAME.png       its figure (--figures)
-Frames of a video or bag are called STEM_000000, STEM_000001 ... The same command again continues after an
-interruption: finished frames are skipped, failed ones, those of damaged results and those whose image
-has changed are done again. In Python,
-torchmembrane.read_results(DIR) gives the frames one by one, by name, or as one batch.
+Frames of a video, of a bag and of an image file that holds several pictures (TIFF, MPO, animated PNG, WebP
+or GIF) are called STEM_000000, STEM_000001 ... The same command again continues after an interruption:
+finished frames are skipped, failed ones, those of damaged results and those whose image has changed are
+done again. In Python, torchmembrane.read_results(DIR) gives the frames one by one, by name, or as one batch.
 
 exit code: 0 all well, 1 some frames failed (see stderr and summary.csv), 2 wrong usage or sensor file"""
 
@@ -50,7 +50,7 @@ def add_parser(commands: Any) -> None:
     add("--engine", choices=ENGINES, default=ENGINES[0], help=where)
     part = "do the I-th of N disjoint parts of the frames; others may do theirs in the same DIR at the same time"
     add("--shard", metavar="I/N", type=share, default=(1, 1), help=part)
-    add("--video", action="store_true", help="treat every input as a video (mp4, mov, avi, mkv, webm always are)")
+    add("--video", action="store_true", help="treat every input as a video (mp4, mov, avi, mkv, webm, gif always are)")
     add("--topic", metavar="TOPIC", help="of the images in bags of ROS 2 (default: the only one; needs the extra ros)")
     messages = "also a bag of their results, a folder: wrenches, tractions, of a gas pressures, in N, N m, m and Pa"
     add("--bag", metavar="BAG", type=Path, help=messages)

@@ -59,11 +59,10 @@ class Recording:
             finally:
                 self._results.__exit__(kind, error, traceback)
         except OSError as failure:
-            cause = failure.strerror or failure
-            said = f"--record {self.folder}: cannot be finished ({cause}); what was written before is kept"
+            said = f"--record {self.folder}: {failure.strerror or failure}"
             if error is None:
-                raise MembraneError(said) from failure
-            warnings.warn(said, stacklevel=2)
+                raise MembraneError(f"{said}; the recording cannot be finished, what was written before is kept") from failure
+            warnings.warn(f"{said}; the recording cannot be finished", stacklevel=2)
 
     def keep(self, seen: Seen) -> None:
         """Write a frame."""

@@ -96,7 +96,7 @@ def video_images(path: Path, size: tuple[int, int], rate: float | None, bits: in
     try:
         for number, picture in enumerate(video_pictures(path, size)):
             if isinstance(picture, MembraneError):
-                warnings.warn(f"--video {path}: frame {number}: {picture}; left out", stacklevel=2)
+                _leave_out(f"--video {path}: frame {number}: {picture}")
                 continue
             due = number / (rate or IMAGE_RATE) if rate or picture.time is None else picture.time
             yield Timed(due, picture_values(picture, bits))
@@ -123,13 +123,17 @@ def _of_files(paths: Iterable[Path], size: tuple[int, int], rate: float, bits: i
         try:
             for image in stack_images(path, size, bits):
                 if isinstance(image, MembraneError):
-                    warnings.warn(f"{path}: {image}; left out", stacklevel=3)
+                    _leave_out(f"{path}: {image}")
                 else:
                     yield Timed(number / rate, image)
                 number += 1
         except MembraneError as error:
-            warnings.warn(f"{error}; left out", stacklevel=3)
+            _leave_out(error)
             number += 1
+
+
+def _leave_out(said: object) -> None:
+    warnings.warn(f"{said}; left out", stacklevel=4)
 
 
 def paced(images: Iterable[Timed]) -> Iterator[np.ndarray]:

@@ -104,6 +104,8 @@ class FrameFiles:
         except LackingArray:
             return False
         except DAMAGE:
+            if not path.is_file():  # a device, or a pipe
+                return False
             self.damaged.append(path)
             return True
 
