@@ -158,6 +158,17 @@ def test_frames_come_of_every_kind_of_stack_and_also_by_the_option_video(run, tm
         assert pressures(out) == pytest.approx([60, 100, 140], abs=2)
 
 
+def test_a_gif_is_a_video_and_no_image(run, tmp_path):
+    path = saved(tmp_path / "run.gif", [Image.new("L", (WIDTH, HEIGHT), 60 + 40 * k) for k in range(3)], duration=100)
+    run.unlink()
+    assert find_inputs([path]).videos == [path] and find_inputs([path]).need_pyav
+    reconstruct([path], tmp_path / "out")
+    assert pressures(tmp_path / "out") == pytest.approx([60, 100, 140], abs=2)
+    assert [due for due, _ in video_images(path, (WIDTH, HEIGHT), None)] == pytest.approx([0.0, 0.1, 0.2])
+    with pytest.raises(MembraneError, match="run.gif: not readable as an image"):
+        read_image(path)
+
+
 def test_a_damaged_end_of_a_stack_is_a_failed_frame_and_the_batch_goes_on(run, tmp_path):
     run.write_bytes(run.read_bytes()[:-20])
     outcome, lines, _ = reconstruct([run, grey_image(tmp_path / "one.png", 99)], tmp_path / "out")

@@ -84,7 +84,7 @@ def too_few_bits(image: np.ndarray) -> str:
 
     Example:
         >>> too_few_bits(np.array([[90, 612]], np.uint16))
-        '; its values go up to 612 of 65535, as of a camera of 10 bits: say bits = 10 in the file\'s [camera] (init: --bits)'
+        "; its values go up to 612 of 65535, as of a camera of 10 bits: say bits = 10 in the file's [camera] (init: --bits)"
         >>> too_few_bits(np.array([[90, 61200]], np.uint16)), too_few_bits(np.array([[1, 3]], np.uint8) / 255)
         ('', '')
     """
