@@ -45,7 +45,7 @@ class Denting:
 
     def __init__(self, fingerprint="a" * 64):
         membrane = spherical_cap(12.0, 9.0, 3.0, grid=(5, 5))
-        camera = SimpleNamespace(image_size=(WIDTH, HEIGHT))
+        camera = SimpleNamespace(image_size=(WIDTH, HEIGHT), bits=None)
         known = dict(name="cap", length_unit="mm", force_unit="N", fingerprint=fingerprint, camera=camera, tool=None)
         self.sensor = SimpleNamespace(**known)
         self.estimator = SimpleNamespace(membrane=membrane, must_compile=False)

@@ -4,8 +4,10 @@ import json
 import re
 import types
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from PIL import Image
@@ -26,6 +28,7 @@ from torchmembrane.onnx.export import metadata_of
 from torchmembrane.results.read import read_results
 from torchmembrane.sensor.sensor import Sensor
 
+ROOT = Path(__file__).parents[1]
 BITS = (10, 12, 14)
 
 
@@ -165,18 +168,42 @@ def test_a_sensor_is_written_and_read_with_its_bits(folder, tmp_path, bits):
         assert other.bits == bits
 
 
-def test_an_exported_model_says_the_bits_and_live_scales_before_it(folder, monkeypatch):
+def test_an_exported_model_says_the_bits(folder):
     models = [tm.Reconstructor.from_file(folder / f"sensor{bits}.toml") for bits in (8, 12)]
     assert [metadata_of(model).get("bits") for model in models] == [None, "12"]
     assert json.loads(metadata_of(models[1])["mesh"])["name"] == "cap"
-    stream, given = ModelStream.__new__(ModelStream), []
-    stream._before, stream._bits = None, 12
+
+
+@pytest.fixture
+def model12(folder, tmp_path):
+    """A model that gives back its image, with the metadata of a sensor of 12 bits."""
+    made = tm.Reconstructor.from_file(folder / "sensor12.toml")
+    width, height = made.image_size
+    ends = [onnx.helper.make_tensor_value_info(name, 1, ["batch", 1, height, width]) for name in ("image", "seen")]
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Identity", ["image"], ["seen"])], "seen", ends[:1], ends[1:])
+    model = onnx.helper.make_model(graph, ir_version=8, opset_imports=[onnx.helper.make_opsetid("", 18)])
+    onnx.helper.set_model_props(model, metadata_of(made))
+    onnx.save(model, tmp_path / "model.onnx")
+    return tmp_path / "model.onnx", made.sensor.fingerprint, (height, width)
+
+
+def test_the_edge_package_and_live_scale_by_the_bits_of_a_model(model12, monkeypatch):
+    path, sensor, shape = model12
+    monkeypatch.syspath_prepend(ROOT / "export")
     monkeypatch.setattr("torchmembrane.live.streams.completed", lambda frame: frame)
-    stream._session = types.SimpleNamespace(run=lambda images, _: given.append(images) or {"status": np.zeros(1)})
-    values = np.array([[0, 4095]], np.uint16)
+    from torchmembrane_edge import Session
+
+    session, stream = Session(path), ModelStream(path, sensor)
+    assert session.bits == 12
+    values = np.linspace(0, 4095, shape[0] * shape[1]).astype(np.uint16).reshape(shape)
     for image in (values, to_grey(values, 12)):
-        stream(image, 0.0)
-        np.testing.assert_allclose(given[-1], [[[0.0, 1.0]]])
+        np.testing.assert_array_equal(session.run(image)["seen"][0, 0], to_grey(values, 12))
+        np.testing.assert_array_equal(stream(image, 0.0)["seen"][0], to_grey(values, 12))
+    colour = np.repeat(values[..., None], 3, -1)
+    np.testing.assert_allclose(session.run(colour[None])["seen"][0, 0], to_grey(values, 12), atol=1e-6)
+    values[3, 4] = 4096
+    with pytest.raises(tm.MembraneError, match="--model: values up to 4096; expected at most 4095, as .* 12 bits"):
+        stream(values, 0.0)
 
 
 def test_a_recording_of_such_a_camera_is_read_as_it_was_followed(folder, tmp_path):

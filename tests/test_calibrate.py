@@ -27,7 +27,6 @@ from torchmembrane.calibrate.views import rest_from_views
 from torchmembrane.camera.model import Camera
 from torchmembrane.camera.targets import Checkerboard, DotBoard
 from torchmembrane.cli import main as cli
-from torchmembrane.cli.calibrate.files import read_depth
 from torchmembrane.files.images import read_image, to_grey
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
@@ -349,38 +348,6 @@ def test_rest_surface_and_dots_are_found_from_a_depth_image(design, truth, image
     assert (gap < 3 * found.surface.deviations)[radius < 8].mean() > 0.97
     assert gap[radius < 8].mean() < 0.02 < 0.15 < np.abs(found.projection.signed_distance).mean()
     assert cKDTree(truth.markers.positions).query(found.sensor.markers.positions)[0].max() < 0.06
-
-
-@pytest.mark.parametrize("kind", ["float32.npy", "float16.npy", "float.tiff", "16UC1.png", "16UC1.npy", "[H, W, 1].npy"])
-def test_depth_images_are_read_as_ros_has_them(tmp_path, kind):
-    """Metres with NaN and infinities where there is no depth, or whole millimetres with 0 there; the sensor is in mm."""
-    true = np.array([[21.0, 22.0, 23.0, 24.0], [0.0, 0.0, 0.0, 30.0]])
-    metres, path = np.where(true > 0, true / 1000, [[0, 0, 0, 0], [np.nan, np.inf, -np.inf, 0]]), tmp_path / kind
-    if "16UC1" in kind:
-        values, unit = true.astype(np.uint16), 1.0
-    else:
-        values, unit = metres.astype(np.float16 if "16" in kind else np.float32), 1000.0
-    if "H, W" in kind:
-        values = values[..., None]
-    Image.fromarray(values).save(path) if path.suffix != ".npy" else np.save(path, values)
-    found = read_depth(path, unit)
-    assert found.shape == (2, 4) and found.dtype == np.float64
-    seen = true > 0
-    np.testing.assert_allclose(found[seen], true[seen], rtol=1e-3 if "16" in kind and unit > 1 else 1e-6)
-    assert not (found[~seen] > 0).any()
-
-
-@pytest.mark.parametrize("values", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros(4), np.zeros((4, 4, 2))])
-def test_what_is_no_depth_image_is_refused(tmp_path, values):
-    np.save(tmp_path / "a.npy", values)
-    with pytest.raises(
-        MembraneError, match=r"a.npy: an array \[4.*\] of (uint8|float64); expected \[H, W\] of float or of 16 bits"
-    ):
-        read_depth(tmp_path / "a.npy", 1.0)
-    if values.dtype == np.uint8:
-        Image.fromarray(values).save(tmp_path / "a.png")
-        with pytest.raises(MembraneError, match=r"a.png: an array \[4, 4\] of uint8"):
-            read_depth(tmp_path / "a.png", 1.0)
 
 
 @pytest.mark.parametrize("factor, said", [(0.001, "--unit 1000 times as large"), (10.0, "--unit 0.1 times as large")])

@@ -164,7 +164,7 @@ def test_background_work_never_holds_up_and_counts_what_it_drops():
     assert kept == list(range(len(kept))) and 4 <= len(kept) <= 5 and later.dropped == 50 - len(kept)
 
 
-def test_an_error_in_the_background_is_raised_in_the_end_and_the_rest_is_dropped():
+def test_an_error_in_the_background_is_raised_in_the_end_and_what_failed_is_counted():
     def keep(item):
         raise OSError("no space left")
 

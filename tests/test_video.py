@@ -241,3 +241,10 @@ def test_a_video_of_another_size_is_refused_once(tmp_path):
     path = video(tmp_path / "film.mp4", 4)
     outcome, lines, _ = reconstruct([path], tmp_path / "out", reconstructor=Denting())
     assert outcome[4] == len(lines) == 1 and "images of 64 x 48 px; expected the sensor's 16 x 12" in lines[0]
+
+
+def test_a_video_without_times_is_played_at_its_own_pace(tmp_path):
+    """A bare H.264 stream: its pictures have no times, and its header says 25 Hz."""
+    path = video(tmp_path / "film.h264", 5, image=level, size=(WIDTH, HEIGHT), format="h264")
+    due = [each.due for each in video_images(path, (WIDTH, HEIGHT), None)]
+    np.testing.assert_allclose(due, np.arange(5) / 25)

@@ -59,7 +59,7 @@ def reconstruct(session: Session, paths: list, out: Path, batch: int) -> int:
         frames = []
         for path in paths[begin : begin + batch]:
             try:
-                frames.append((path, _read(path, session.image_size)))
+                frames.append((path, _read(path, session.image_size, session.bits)))
             except EdgeError as error:
                 failed += 1
                 print(f"{path}: {error}", file=sys.stderr)
@@ -122,7 +122,7 @@ def _line(session: Session, result: dict) -> str:
     return f"moved by at most {moved:.2f} {session.length_unit}, force {force:.3g} {session.force_unit}"
 
 
-def _read(path: Path, size) -> np.ndarray:
+def _read(path: Path, size, bits: int | None = None) -> np.ndarray:
     """An image file as grey values `[1, height, width]`."""
     from PIL import Image
 
@@ -133,7 +133,7 @@ def _read(path: Path, size) -> np.ndarray:
             array = np.asarray(image if wide else image.convert("L" if plain else "RGB"))
     except (OSError, SyntaxError, ValueError) as error:
         raise EdgeError(f"not readable as an image ({error})") from error
-    values = grey(array[None])
+    values = grey(array[None], bits)
     if values.shape[:0:-1] != tuple(size):
         raise EdgeError(f"the image is {values.shape[2]} x {values.shape[1]} px, the sensor's are {size[0]} x {size[1]}")
     return values

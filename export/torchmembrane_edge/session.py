@@ -23,7 +23,8 @@ class Session:
     `providers`, onnxruntime's, in order of preference.
 
     Attributes: `name` of the sensor, `length_unit`, `force_unit`, `status_texts` (code to text), `mesh` (what `mesh.npz`
-    holds: rest_vertices, triangles, fixed ...), `image_size` (width, height), `tracks`: whether it follows dots.
+    holds: rest_vertices, triangles, fixed ...), `image_size` (width, height), `bits` of the camera, where its images of 16 bits
+    hold fewer, else None, `tracks`: whether it follows dots.
     """
 
     def __init__(self, model: str | Path, threads: int = 1, providers: Sequence[str] = ("CPUExecutionProvider",)):
@@ -43,6 +44,7 @@ class Session:
         self.status_texts = {int(code): text for code, text in json.loads(known["status_texts"]).items()}
         self.mesh = {key: _array(key, value) for key, value in json.loads(known["mesh"]).items()}
         self.image_size = tuple(self.mesh["image_size"].tolist())
+        self.bits = int(known["bits"]) if "bits" in known else None
         inputs = [given.name for given in self._session.get_inputs()]
         self._state = [name.removeprefix("previous_") for name in inputs if name.startswith("previous_")]
         self.tracks = bool(self._state)
@@ -51,11 +53,11 @@ class Session:
     def run(self, images, previous: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
         """Results of a batch, by name, one row per frame: vertices `[B, V, 3]`, ..., status `[B]`.
 
-        `images`: `[height, width]` or `[B, height, width]` grey, or `[B, height, width, 3]` RGB; uint8, uint16 or float in
-        0..1. A frame that cannot be reconstructed has a status and NaN.
+        `images`: `[height, width]` or `[B, height, width]` grey, or `[B, height, width, 3]` RGB; uint8, uint16 (of
+        `bits`) or float in 0..1. A frame that cannot be reconstructed has a status and NaN.
         `previous`, for a model that tracks: the results of the frames before, where its dots are looked for first.
         """
-        images = grey(images)
+        images = grey(images, self.bits)
         width, height = self.image_size
         if images.shape[1:] != (height, width):
             raise EdgeError(
@@ -97,15 +99,20 @@ class Session:
         return {key: np.full((batch, *shapes[f"previous_{key}"]), np.nan, np.float32) for key in self._state}
 
 
-def grey(images) -> np.ndarray:
-    """Grey values `[B, height, width]`, float32 in 0..1: 0.299 R + 0.587 G + 0.114 B."""
+def grey(images, bits: int | None = None) -> np.ndarray:
+    """Grey values `[B, height, width]`, float32 in 0..1: 0.299 R + 0.587 G + 0.114 B.
+
+    `bits`: of the camera, where uint16 images hold fewer; white is then `2^bits - 1`, and values beyond are refused.
+    """
     images = np.asarray(images)
     if images.ndim == 2:
         images = images[None]
     if images.ndim not in (3, 4) or images.shape[3:] not in ((), (3,)):
         raise EdgeError(f"images of shape {list(images.shape)}; expected [B, height, width] or [B, height, width, 3]")
     if images.dtype.kind == "u" and images.dtype.itemsize <= 2:
-        white = np.iinfo(images.dtype).max
+        white = np.iinfo(images.dtype).max if bits is None or images.dtype.itemsize == 1 else 2**bits - 1
+        if images.max(initial=0) > white:
+            raise EdgeError(f"values up to {images.max()}; expected at most {white}, as the model's camera has {bits} bits")
     elif images.dtype.kind == "f":
         white = 1.0
     else:

@@ -138,7 +138,7 @@ def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
     from .build import build_reconstructor
 
     if arguments.model is not None:
-        return ModelStream(arguments.model, sensor.fingerprint, arguments.threads, sensor.camera.bits)
+        return ModelStream(arguments.model, sensor.fingerprint, arguments.threads)
     torch.set_num_threads(arguments.threads)
     if arguments.grid is not None:
         sensor = replace(sensor, membrane=sensor.surface.membrane(tuple(arguments.grid)))

@@ -1,8 +1,8 @@
 """Levels of grey: which of them is white where a camera has fewer bits than its images are stored in."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,9 @@ USUAL_BITS = (8, 10, 12, 14)
 MOST_AVERAGED = 16
 """Pixels or images whose mean is still recognised as one of whole levels."""
 HIGHEST = 2**16 - 1
+
+P = ParamSpec("P")
+Found = TypeVar("Found")
 
 
 def check_bits(bits: int | None) -> None:
@@ -66,13 +69,17 @@ def refuse_beyond(highest: Any, white: int) -> None:
         )
 
 
-@contextmanager
-def telling_bits(image: np.ndarray) -> Iterator[None]:
-    """Add to the refusal of an image, inside the block, what `too_few_bits` says of it."""
-    try:
-        yield
-    except MembraneError as error:
-        raise MembraneError(f"{error}{too_few_bits(image)}") from error
+def telling_bits(find: Callable[Concatenate[np.ndarray, P], Found]) -> Callable[Concatenate[np.ndarray, P], Found]:
+    """The function `find`, whose refusals of an image, its first argument, end in what `too_few_bits` says of it."""
+
+    @wraps(find)
+    def found(image: np.ndarray, /, *args: P.args, **kwargs: P.kwargs) -> Found:
+        try:
+            return find(image, *args, **kwargs)
+        except MembraneError as error:
+            raise MembraneError(f"{error}{too_few_bits(image)}") from error
+
+    return found
 
 
 def too_few_bits(image: np.ndarray) -> str:

@@ -89,6 +89,20 @@ def picture_values(picture: Any, bits: int | None = None) -> np.ndarray:
     return values
 
 
+def picture_rate(path: Path) -> float | None:
+    """The pictures a second that a video says it has, on average; None where it does not say, or is none.
+
+    Raises:
+        MembraneError: PyAV is not installed.
+    """
+    load_pyav()
+    try:
+        with _opened(path) as (_, stream):
+            return float(stream.average_rate or 0) or None
+    except MembraneError:
+        return None
+
+
 def picture_total(path: Path) -> int | None:
     """The number of pictures that a video says it has; None where it does not say, or is none.
 

@@ -148,25 +148,20 @@ def _loads(path: Path, topic: str | None, reconstructor: "Reconstructor") -> Ite
         return
     size = reconstructor.sensor.camera.image_size
     of_stack = picture_count(path, 1) > 0
-    for picture in stack_images(path, size, _bits(reconstructor)) if of_stack else video_pictures(path, size):
+    for picture in stack_images(path, size, reconstructor.sensor.camera.bits) if of_stack else video_pictures(path, size):
         yield partial(_refuse, str(picture)) if isinstance(picture, MembraneError) else partial(_image, picture)
 
 
 def _bag_image(message: Any, reconstructor: "Reconstructor") -> Tensor:
-    grey = grey_of(message, reconstructor.sensor.camera.image_size, _bits(reconstructor))
+    grey = grey_of(message, reconstructor.sensor.camera.image_size, reconstructor.sensor.camera.bits)
     return torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels)
 
 
 def _image(picture: Any, reconstructor: "Reconstructor") -> Tensor:
     """The image of a picture: grey values, or what PyAV gives."""
     of_stack = isinstance(picture, np.ndarray)
-    grey = picture if of_stack else to_grey(picture_values(picture, _bits(reconstructor)))
+    grey = picture if of_stack else to_grey(picture_values(picture, reconstructor.sensor.camera.bits))
     return torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels)
-
-
-def _bits(reconstructor: "Reconstructor") -> int | None:
-    """Of the camera's values; None where it does not say, as that of another kind of reconstructor may not."""
-    return getattr(reconstructor.sensor.camera, "bits", None)
 
 
 def _refuse(reason: str, reconstructor: "Reconstructor") -> NoReturn:

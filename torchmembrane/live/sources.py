@@ -12,17 +12,15 @@ from ..errors import MembraneError
 from ..files.images import picture_count, stack_images
 from ..files.optional import load_opencv
 from ..files.order import in_order
-from ..files.video import picture_values, video_pictures
+from ..files.video import picture_rate, picture_values, video_pictures
 from ..jobs.inputs import find_inputs
 
 MOST_MISSED = 100
 """Reads of a camera that fail in a row before it is given up."""
 BREATH = 0.01
 """Seconds between them."""
-
-
 IMAGE_RATE = 30.0
-"""Hz, of what has no pace of its own."""
+"""Hz, of images, and of a video that says nothing of its pace."""
 
 
 class Timed(NamedTuple):
@@ -93,12 +91,13 @@ def video_images(path: Path, size: tuple[int, int], rate: float | None, bits: in
     if picture_count(path, 1):
         yield from _of_files([path], size, rate or IMAGE_RATE, bits)
         return
+    own = rate or picture_rate(path) or IMAGE_RATE
     try:
         for number, picture in enumerate(video_pictures(path, size)):
             if isinstance(picture, MembraneError):
                 _leave_out(f"--video {path}: frame {number}: {picture}")
                 continue
-            due = number / (rate or IMAGE_RATE) if rate or picture.time is None else picture.time
+            due = number / own if rate or picture.time is None else picture.time
             yield Timed(due, picture_values(picture, bits))
     except MembraneError as error:
         raise MembraneError(f"--video {path}: {error}") from error

@@ -6,7 +6,6 @@ from typing import Protocol
 import numpy as np
 
 from ..errors import MembraneError
-from ..files.images import to_grey
 from ..files.optional import load_edge
 from ..reconstruct import Reconstructor
 from ..results.npz import completed
@@ -65,14 +64,14 @@ class ModelStream:
         path: of the model.
         sensor: the fingerprint that it must have been exported from.
         threads: of onnxruntime.
-        bits: of the camera, where images of 16 hold fewer.
 
     Raises:
-        MembraneError: torchmembrane-edge is missing; no model, or that of another sensor.
+        MembraneError: torchmembrane-edge is missing; no model, or that of another sensor; of a call: an image that the
+            model does not take, such as one with values beyond the camera's bits.
     """
 
-    def __init__(self, path: Path, sensor: str, threads: int = 1, bits: int | None = None):
-        edge = load_edge()
+    def __init__(self, path: Path, sensor: str, threads: int = 1):
+        self._edge = edge = load_edge()
         try:
             self._session = edge.Session(path, threads)
         except edge.EdgeError as error:
@@ -85,11 +84,12 @@ class ModelStream:
             )
         self.mesh = Mesh(**{key: value for key, value in known.items() if key in Mesh._fields})
         self._before: dict[str, np.ndarray] | None = None
-        self._bits = bits
 
     def __call__(self, image: np.ndarray, time: float) -> Frame:
-        grey = to_grey(image, self._bits) if image.dtype.kind == "u" else image
-        self._before = self._session.run(grey[None], self._before)
+        try:
+            self._before = self._session.run(image[None], self._before)
+        except self._edge.EdgeError as error:
+            raise MembraneError(f"--model: {error}") from error
         return completed({key: values[0] for key, values in self._before.items()})
 
     def rezero(self) -> None:

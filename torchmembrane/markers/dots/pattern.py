@@ -70,6 +70,7 @@ def size_classes(pixels: np.ndarray, shapes: np.ndarray) -> np.ndarray:
     return large.astype(int) if bimodal else np.ones(len(x), int)
 
 
+@telling_bits
 def find_dots(image: np.ndarray, polarity: str, mask: np.ndarray | None = None) -> DotPattern:
     """Find all dots of the pattern in the rest image, any arrangement, one size or two.
 
@@ -95,21 +96,21 @@ def find_dots(image: np.ndarray, polarity: str, mask: np.ndarray | None = None) 
         >>> len(pattern.pixels), bool(np.abs(np.sort(pattern.pixels, 0) - np.sort(drawn, 0)).max() < 0.05)
         (12, True)
     """
-    with telling_bits(image):
-        dark = _dark(image, polarity)
-        pixels, shapes, contrasts = find_blobs(dark, mask)
-        keep = population(pixels, shapes, contrasts)
-        check_count(int(keep.sum()))
-        pixels, shapes, contrasts = pixels[keep], shapes[keep], contrasts[keep]
-        pixels, growth, quality = refine(dark, pixels, shapes)
-        shapes = shapes * (1 + growth / rms_half_axes(shapes))[:, None, None]
-        keep = population(pixels, shapes, contrasts) & (quality > 0.3)
-        check_count(int(keep.sum()))
-        pixels, shapes = pixels[keep], shapes[keep]
-        order = np.lexsort((pixels[:, 0], pixels[:, 1]))
-        return DotPattern(pixels[order], shapes[order], size_classes(pixels, shapes)[order])
+    dark = _dark(image, polarity)
+    pixels, shapes, contrasts = find_blobs(dark, mask)
+    keep = population(pixels, shapes, contrasts)
+    check_count(int(keep.sum()))
+    pixels, shapes, contrasts = pixels[keep], shapes[keep], contrasts[keep]
+    pixels, growth, quality = refine(dark, pixels, shapes)
+    shapes = shapes * (1 + growth / rms_half_axes(shapes))[:, None, None]
+    keep = population(pixels, shapes, contrasts) & (quality > 0.3)
+    check_count(int(keep.sum()))
+    pixels, shapes = pixels[keep], shapes[keep]
+    order = np.lexsort((pixels[:, 0], pixels[:, 1]))
+    return DotPattern(pixels[order], shapes[order], size_classes(pixels, shapes)[order])
 
 
+@telling_bits
 def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, sizes: np.ndarray, polarity: str) -> DotPattern:
     """Measure the listed dots in the rest image.
 
@@ -136,32 +137,31 @@ def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, size
         >>> bool(np.abs(pattern.pixels - drawn).max() < 0.05), round(float(pattern.shapes[0, 0, 0]), 1)
         (True, 4.0)
     """
-    with telling_bits(image):
-        dark = _dark(image, polarity)
-        pixels, shapes, sizes = np.asarray(pixels, float), np.asarray(shapes, float), np.asarray(sizes, int)
-        found, outlines, contrasts = find_blobs(dark)
-        keep = population(found, outlines, contrasts)
-        check_count(int(keep.sum()))
-        found, outlines = found[keep], outlines[keep]
-        unit, log_radius = log_radii(shapes), log_radii(outlines)
-        nearest = cKDTree(found).query(pixels)[1]
-        back = np.asarray(cKDTree(pixels).query(found)[1])
-        own = back[nearest] == np.arange(len(pixels))  # not of dots out of view, or cut by its border
-        own |= ~np.isin(sizes, sizes[own])
-        radius = {size: np.median((log_radius[nearest] - unit)[own & (sizes == size)]) for size in np.unique(sizes)}
-        expected = unit + np.array([radius[size] for size in sizes])
-        scaled = shapes * np.exp(expected - unit)[:, None, None]
-        tolerance = size_tolerance(scaled, sizes)
-        match = DotMatcher(pixels, expected, tolerance)
-        blob_radius = torch.as_tensor(log_radius)[None]
-        position, certainty, strain = match(torch.as_tensor(found)[None], blob_radius, torch.ones_like(blob_radius))
-        centre, growth, quality = refine(dark, position[0].numpy(), scaled, tolerance)
-        deviation = _deviation(match, certainty * torch.as_tensor(quality), centre - pixels, strain)
-        visible = (quality > 0.3) & (deviation < OUTLIER * match.nearest.numpy())
-        check_count(int(visible.sum()))
-        for size in np.unique(sizes[visible]):
-            scaled[sizes == size] *= 1 + np.median((growth / np.exp(expected))[visible & (sizes == size)])
-        return DotPattern(np.where(visible[:, None], centre, np.nan), scaled, sizes)
+    dark = _dark(image, polarity)
+    pixels, shapes, sizes = np.asarray(pixels, float), np.asarray(shapes, float), np.asarray(sizes, int)
+    found, outlines, contrasts = find_blobs(dark)
+    keep = population(found, outlines, contrasts)
+    check_count(int(keep.sum()))
+    found, outlines = found[keep], outlines[keep]
+    unit, log_radius = log_radii(shapes), log_radii(outlines)
+    nearest = cKDTree(found).query(pixels)[1]
+    back = np.asarray(cKDTree(pixels).query(found)[1])
+    own = back[nearest] == np.arange(len(pixels))  # not of dots out of view, or cut by its border
+    own |= ~np.isin(sizes, sizes[own])
+    radius = {size: np.median((log_radius[nearest] - unit)[own & (sizes == size)]) for size in np.unique(sizes)}
+    expected = unit + np.array([radius[size] for size in sizes])
+    scaled = shapes * np.exp(expected - unit)[:, None, None]
+    tolerance = size_tolerance(scaled, sizes)
+    match = DotMatcher(pixels, expected, tolerance)
+    blob_radius = torch.as_tensor(log_radius)[None]
+    position, certainty, strain = match(torch.as_tensor(found)[None], blob_radius, torch.ones_like(blob_radius))
+    centre, growth, quality = refine(dark, position[0].numpy(), scaled, tolerance)
+    deviation = _deviation(match, certainty * torch.as_tensor(quality), centre - pixels, strain)
+    visible = (quality > 0.3) & (deviation < OUTLIER * match.nearest.numpy())
+    check_count(int(visible.sum()))
+    for size in np.unique(sizes[visible]):
+        scaled[sizes == size] *= 1 + np.median((growth / np.exp(expected))[visible & (sizes == size)])
+    return DotPattern(np.where(visible[:, None], centre, np.nan), scaled, sizes)
 
 
 def _dark(image: np.ndarray, polarity: str) -> np.ndarray:
