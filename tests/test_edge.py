@@ -464,7 +464,6 @@ FILES = {
     "bits a word": (model_of(metadata(bits="twelve")), "metadata are not readable"),
     "bits many": (model_of(metadata(bits="32")), "bits is 32, not 8 to 16"),
     "other inputs": (model_of(metadata(), size=(4, 4)), "its image is ['batch', 1, 4, 4], not [batch, 1, 6, 8]"),
-    "no status": (model_of(metadata(), status="stasis"), "it gives no status"),
 }
 
 
@@ -479,6 +478,13 @@ def test_a_file_that_is_no_model_is_refused_in_words(kind, call, images, tmp_pat
     code, _, err = call(path, images("a.png", GREY), "--out", tmp_path / "r")
     assert code == 2 and err.startswith(f"torchmembrane-edge: error: {path}: ") and reason in err, err
     assert "torchmembrane export" in err and len(err.splitlines()) == 1 and not (tmp_path / "r").exists()
+
+
+def test_a_model_without_a_status_is_refused(call, images, tmp_path):
+    model = tmp_path / "model.onnx"
+    model.write_bytes(model_of(metadata(), status="stasis"))
+    code, _, err = call(model, images("a.png", GREY), "--out", tmp_path / "r")
+    assert code == 2 and "the model of 'by hand' gives no status; expected a model from `torchmembrane export`" in err
 
 
 @pytest.mark.parametrize("seed", range(12))

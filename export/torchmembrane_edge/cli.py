@@ -33,6 +33,9 @@ SECONDS_PER_MB = 4
 def main(argv=None) -> int:
     """Run the command with these arguments; returns the exit code."""
     arguments = _parser().parse_args(argv)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")  # of names that a terminal's encoding lacks
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(f"torchmembrane-edge: warning: {message}", file=sys.stderr)
         try:
@@ -46,8 +49,8 @@ def main(argv=None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    paths = _checked(arguments)
     model = model_file(arguments.model)
+    paths = _checked(arguments)
     megabytes = Path(model).stat().st_size / 1e6
     seconds = f"{max(1.0, SECONDS_PER_MB * megabytes):.0f}"
     said = f"loading {printable(model)}, {megabytes:.1f} MB; on one core this takes some {seconds} s"

@@ -14,7 +14,7 @@ GREY = (0.299, 0.587, 0.114)
 SHAPES = "[H, W], [H, W, 3], [B, H, W], [B, 1 | 3, H, W] or [B, H, W, 1 | 3]"
 TYPES = {"tensor(float)": np.float32, "tensor(int32)": np.int32}
 NEEDED = ("vertices", "displacement", "force", "status")
-"""Outputs without which a model is none of this package's."""
+"""Outputs without which there is no result."""
 PREVIOUS = "previous_"
 MOST_THREADS = 256
 
@@ -65,6 +65,8 @@ class Session:
 
         Raises `EdgeError`: images of another shape, size or type, or results of other frames.
         """
+        if missing := [name for name in NEEDED if name not in self._outputs]:
+            raise EdgeError(f"the model of {self.name!r} gives no {missing[0]}; expected {EXPECTED}")
         images = grey(_arranged(_array(images), self.image_size), self.bits)
         if not len(images):
             return {name: np.zeros((0, *shape), dtype) for name, (dtype, shape) in self._outputs.items()}
@@ -115,8 +117,6 @@ class Session:
         width, height = self.image_size
         if list(image[1:]) != [1, height, width]:
             return f"its image is {image or 'missing'}, not [batch, 1, {height}, {width}] as its mesh says"
-        if missing := [name for name in NEEDED if name not in self._outputs]:
-            return f"it gives no {missing[0]}"
         for name, (dtype, shape) in self._outputs.items():
             if dtype is None or not all(isinstance(size, int) for size in shape):
                 return f"its output {name!r} is {dtype} {list(shape)}"
