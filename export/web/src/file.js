@@ -15,6 +15,9 @@ export function picturesIn(bytes) {
   return isJpeg(bytes) ? picturesInJpeg(bytes) : 1;
 }
 
+/** Whether it is a TIFF, of which the browsers that read one take the first page, and 8 bits. */
+export const isTiff = (bytes) => ["II*\0", "MM\0*", "II+\0", "MM\0+"].includes(text(bytes, 0, 4));
+
 /** Width and height that a PNG or JPEG states; null of other files. */
 export function sizeIn(bytes) {
   if (isPng(bytes) && bytes.length > 24) return [viewOf(bytes).getUint32(16), viewOf(bytes).getUint32(20)];

@@ -1,5 +1,5 @@
 // Image files as grey values, the same as Python reads.
-import { depthIn, picturesIn, sizeIn, unturned, valuesOf16 } from "./file.js";
+import { depthIn, isTiff, picturesIn, sizeIn, unturned, valuesOf16 } from "./file.js";
 
 /**
  * An image file of the sensor's `size` [width, height]: `pixels` as stored, without colour management or rotation, an
@@ -7,7 +7,8 @@ import { depthIn, picturesIn, sizeIn, unturned, valuesOf16 } from "./file.js";
  * Not as Python reads them: colour of 16 bits arrives as 8.
  */
 export async function imageOf(file, size, bits) {
-  let bytes = new Uint8Array(await file.arrayBuffer());
+  const bytes = new Uint8Array(await file.arrayBuffer());
+  if (isTiff(bytes)) throw new Error("not readable as an image (a TIFF); expected a whole PNG or JPEG");
   refuseSize(sizeIn(bytes), size); // before pixels are decoded
   const pictures = picturesIn(bytes);
   if (pictures > 1) throw new Error(`the file holds ${pictures} pictures; expected one: save each as a file of its own`);
