@@ -179,8 +179,10 @@ def model12(folder, tmp_path):
     """A model that gives back its image, with the metadata of a sensor of 12 bits."""
     made = tm.Reconstructor.from_file(folder / "sensor12.toml")
     width, height = made.image_size
-    ends = [onnx.helper.make_tensor_value_info(name, 1, ["batch", 1, height, width]) for name in ("image", "seen")]
-    graph = onnx.helper.make_graph([onnx.helper.make_node("Identity", ["image"], ["seen"])], "seen", ends[:1], ends[1:])
+    outputs = ("seen", "vertices", "displacement", "force", "status")
+    ends = {name: onnx.helper.make_tensor_value_info(name, 1, ["batch", 1, height, width]) for name in ("image", *outputs)}
+    nodes = [onnx.helper.make_node("Identity", ["image"], [name]) for name in outputs]
+    graph = onnx.helper.make_graph(nodes, "seen", [ends["image"]], [ends[name] for name in outputs])
     model = onnx.helper.make_model(graph, ir_version=8, opset_imports=[onnx.helper.make_opsetid("", 18)])
     onnx.helper.set_model_props(model, metadata_of(made))
     onnx.save(model, tmp_path / "model.onnx")
@@ -202,7 +204,7 @@ def test_the_edge_package_and_live_scale_by_the_bits_of_a_model(model12, monkeyp
     colour = np.repeat(values[..., None], 3, -1)
     np.testing.assert_allclose(session.run(colour[None])["seen"][0, 0], to_grey(values, 12), atol=1e-6)
     values[3, 4] = 4096
-    with pytest.raises(tm.MembraneError, match="--model: values up to 4096; expected at most 4095, as .* 12 bits"):
+    with pytest.raises(tm.MembraneError, match="--model: values up to 4096; expected at most 4095, of the 12 bits"):
         stream(values, 0.0)
 
 

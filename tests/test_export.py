@@ -242,12 +242,12 @@ def test_edge_runs_without_torch(edge_calls, reconstructor, images, bare_python)
 
 
 def test_edge_opens_a_model_in_the_format_of_onnxruntime(model_file, ort_file, images, edge):
-    from torchmembrane_edge.cli import _read
+    from torchmembrane_edge.images import frames
 
     plain, converted = edge.Session(model_file), edge.Session(ort_file)
     assert converted.status_texts == plain.status_texts and converted.mesh["sensor"] == plain.mesh["sensor"]
-    image = _read(images[2], plain.image_size)
-    expected, found = plain.run(image), converted.run(image)
+    (frame,) = frames(images[2], plain.image_size)
+    expected, found = plain.run(frame.image), converted.run(frame.image)
     for name, values in expected.items():
         np.testing.assert_array_equal(found[name], values, name)
 

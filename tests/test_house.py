@@ -214,3 +214,20 @@ def test_public_names_have_an_example(face):
 @pytest.mark.parametrize("page, at_least", [("conventions.md", 9), ("mathematics.md", 20), ("force_balance.md", 9)])
 def test_the_pages_that_state_limits_quote_them(page, at_least):
     assert len(QUOTED.findall((ROOT / "docs" / page).read_text())) >= at_least
+
+
+def test_the_lowest_constraints_are_the_bounds_of_the_dependencies():
+    """Each dependency's, and no others; of the extras no bound is below the one that they share with the package."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    pins = dict(re.findall(r"^([\w-]+)==([\d.]+)$", (ROOT / "constraints-lowest.txt").read_text(), re.MULTILINE))
+
+    def number(version):
+        parts = [int(part) for part in version.split(".")]
+        return parts + [0] * (3 - len(parts))
+
+    bounds = dict(re.fullmatch(r"([\w-]+)>=([\d.]+)", each).groups() for each in project["dependencies"])
+    assert {name: number(pin) for name, pin in pins.items()} == {name: number(bound) for name, bound in bounds.items()}
+    shared = re.findall(r"\b([\w-]+)>=([\d.]+)", " ".join(sum(project["optional-dependencies"].values(), [])))
+    assert not [(name, bound) for name, bound in shared if name in bounds and number(bound) < number(bounds[name])]
+    edge = tomllib.loads((ROOT / "export" / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert f"pillow>={bounds['pillow']}" in edge["images"]

@@ -223,6 +223,34 @@ def test_a_name_that_a_spreadsheet_takes_for_a_formula_is_quoted(images, tmp_pat
     assert all(float(row["deepest"]) < 0 for row in rows if row["status"] == "0")
 
 
+@pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1", "-1", "@SUM(1)", "\t=1", " =1", "＝1", "'=1"])
+def test_what_a_result_says_of_its_file_is_no_formula_of_the_summary(text, images, tmp_path):
+    reconstruct(images, tmp_path / "out")
+    result = tmp_path / "out" / "i1.npz"
+    with np.load(result) as file:
+        arrays = dict(file)
+    np.savez(result, **arrays | {"content_hash": text, "path": text})
+    for _ in range(2):
+        reconstruct([images[0]], tmp_path / "out")
+        row = summary_of(tmp_path / "out")["i1"]
+        assert row["content_hash"] == row["file"] == f"'{text}"
+
+
+@pytest.mark.parametrize("column", ["residual_px", "force_z", "seconds", "status"])
+def test_a_row_of_another_shard_without_a_number_where_one_belongs_is_left_out(column, images, tmp_path):
+    for shard in (Shard(1, 2), Shard(2, 2)):
+        reconstruct(images, tmp_path / "out", shard=shard)
+    rows = list(summary_of(tmp_path / "out").values())
+    other = next(row for row in rows if Shard(2, 2).holds(row["name"]))
+    other[column] = "=1+1"
+    with open(tmp_path / "out" / "summary.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(other))
+        writer.writeheader()
+        writer.writerows(rows)
+    reconstruct(images, tmp_path / "out", shard=Shard(1, 2))
+    assert set(summary_of(tmp_path / "out")) == {row["name"] for row in rows} - {other["name"]}
+
+
 def test_a_claimed_folder_is_refused_until_the_other_job_ends(images, tmp_path):
     with Claim(tmp_path / "out", WHOLE):
         for shard in (WHOLE, Shard(2, 2)):

@@ -1,12 +1,14 @@
 """The command `torchmembrane simulate` as a person uses it, its data sets, and the sensors that come with the package."""
 
 import json
+import sys
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 from torchmembrane import MembraneError
@@ -325,6 +327,49 @@ def test_a_damaged_mesh_is_refused_in_one_line(tmp_path, kind, content):
     with pytest.raises(MembraneError) as caught:
         MeshIndenter.read(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value) and "expected a closed mesh" in str(caught.value)
+
+
+def of_icosahedron(kind, **options):
+    content = trimesh.creation.icosahedron().export(file_type=kind, **options)
+    return content.encode() if isinstance(content, str) else content
+
+
+MESHES = {
+    "lying.stl": (
+        of_icosahedron("stl")[:80] + b"\7\0\0\0" + of_icosahedron("stl")[84:],
+        "it states 7 triangles, which take 434 bytes",
+    ),
+    "endless.stl": (
+        of_icosahedron("stl")[:80] + b"\xff" * 4 + of_icosahedron("stl")[84:],
+        "and holds 1084; as text it has no facet",
+    ),
+    "cut.stl": (of_icosahedron("stl")[:-30], "it states 20 triangles, which take 1084 bytes, and holds 1054"),
+    "longer.stl": (of_icosahedron("stl") + b"\xff\0", "and holds 1086"),
+    "short.stl": (b"solid \xe9", "it holds 7 bytes and no facet"),
+    "random.stl": (np.random.default_rng(0).bytes(3000), "as text it has no facet"),
+    "random.obj": (np.random.default_rng(0).bytes(3000), "0 triangles"),
+    "comment.ply": (of_icosahedron("ply").replace(b"ply\n", b"ply\ncomment \xe9\n", 1), "codec can't decode"),
+    "binary.stl": (of_icosahedron("stl"), ""),
+    "text.stl": (of_icosahedron("stl_ascii").replace(b"solid", b"solid caf\xe9", 1), ""),
+    "capital.stl": (of_icosahedron("stl_ascii").upper(), ""),
+    "comment.obj": (b"# caf\xe9\n" + of_icosahedron("obj"), ""),
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_a_mesh_is_read_or_refused_whatever_guesses_encodings(name, tmp_path, monkeypatch):
+    """trimesh imports a package that is not installed with it where text is not UTF-8."""
+    for package in ("charset_normalizer", "chardet"):
+        monkeypatch.setitem(sys.modules, package, None)
+    content, reason = MESHES[name]
+    path = tmp_path / name
+    path.write_bytes(content)
+    if not reason:
+        assert len(MeshIndenter.read(path).triangles) == 20
+        return
+    with pytest.raises(MembraneError, match=r"expected a closed mesh as STL, OBJ or PLY") as caught:
+        MeshIndenter.read(path)
+    assert str(path) in str(caught.value) and reason in str(caught.value) and "module" not in str(caught.value)
 
 
 def test_dots_may_be_as_large_as_do_not_overlap():

@@ -55,6 +55,7 @@ class Model {
         if (session_.GetInputCount() != 1)
             throw std::runtime_error(path + ": starts from the frame before; expected one exported without --tracking");
         size_ = session_.GetInputTypeInfo(0).GetTensorTypeAndShapeInfo().GetShape();  // batch, 1, height, width
+        if (size_.size() != 4) throw std::runtime_error(path + ": takes no images; expected a model of `torchmembrane export`");
     }
 
     void run(Image& image) {
@@ -75,6 +76,12 @@ class Model {
         throw std::logic_error(name + " was not asked for");
     }
 
+    int64_t contacts() const {
+        for (size_t i = 0; i < names_.size(); ++i)
+            if (names_[i] == std::string("contact_points")) return results_[i].GetTensorTypeAndShapeInfo().GetShape().at(1);
+        return 0;
+    }
+
     std::string known(const char* key) {
         const auto value = known_.LookupCustomMetadataMapAllocated(key, allocator_);
         return value ? value.get() : "";
@@ -83,7 +90,8 @@ class Model {
     // The text of a status: the entry `"CODE": "TEXT"` of the JSON in `status_texts`, which holds no escapes.
     std::string status_text(int32_t code) {
         const std::string texts = known("status_texts"), key = '"' + std::to_string(code) + "\": \"";
-        const size_t begin = texts.find(key) + key.size();
+        const size_t found = texts.find(key), begin = found + key.size();
+        if (found == std::string::npos) return "no text in the model";
         return texts.substr(begin, texts.find('"', begin) - begin);
     }
 
@@ -119,10 +127,10 @@ bool say(Model& model) {
     print(", moment", wrench + 3, " " + force + " " + length + "\n");
     std::printf("pressure: %.6g %s/%s^2, change since rest %.6g\n", *model.result("pressure"), force.c_str(), length.c_str(),
                 *model.result("pressure_change"));
-    for (int i = 0; i < 4; ++i) {
+    for (int64_t i = 0; i < model.contacts(); ++i) {
         const float* point = model.result("contact_points") + 3 * i;
         if (std::isnan(point[0])) break;
-        std::printf("contact %d:", i + 1);
+        std::printf("contact %d:", static_cast<int>(i + 1));
         print(" at", point, " " + length);
         print(", force", model.result("contact_force") + 3 * i, " " + force);
         print(", normal", model.result("contact_normal") + 3 * i, "");

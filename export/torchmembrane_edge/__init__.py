@@ -1,6 +1,7 @@
 """Runs the models that `torchmembrane export` writes, with numpy and onnxruntime alone."""
 
-from .session import EdgeError, Session
+from .errors import EdgeError
+from .session import Session
 
 __all__ = ["EdgeError", "Session"]
 __version__ = "0.1.0"

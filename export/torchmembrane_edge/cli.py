@@ -1,87 +1,165 @@
-"""The command `torchmembrane-edge`. Exit codes: 0 all well, 1 some frames failed, 2 wrong usage."""
+"""The command `torchmembrane-edge`. Exit codes: 0 all well, 1 some frames failed, 2 wrong usage or model, 130 interrupted."""
 
 import argparse
+import glob
 import re
 import sys
 import time
+import warnings
+from collections import Counter
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from .session import EdgeError, Session, grey
+from . import results
+from .errors import EdgeError, printable
+from .images import frame_name, frames, pictures
+from .session import MOST_THREADS, Session, model_file
 
-FINISHED = (0, 3, 7, 8)  # ok; not converged, unexplained, partly hidden: the answer is kept
-MESH = "mesh.npz"
+FINISHED = (0, 3, 7, 8, 9)  # ok; not converged, unexplained, partly hidden, out of range: the answer is kept
+UNREADABLE = -1
+"""Status of a frame that gave no image."""
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".pgm", ".ppm")
+"""Of the files that are taken from a folder."""
+OF_SYSTEM = re.compile(r"\._.*|\.DS_Store|(eh)?thumbs\.db|desktop\.ini|icon\r", re.IGNORECASE)
+MOST_BATCH, MOST_NUMBER = 256, 10**9 - 1
+SECONDS_PER_MB = 4
+"""That a core of a PC takes to load a model."""
 
 
 def main(argv=None) -> int:
     """Run the command with these arguments; returns the exit code."""
     arguments = _parser().parse_args(argv)
-    try:
-        session = Session(arguments.model, arguments.threads, arguments.providers)
-        if arguments.camera is not None:
-            return watch(session, arguments.camera, arguments.frames)
-        if not arguments.images or not arguments.out:
-            raise EdgeError("nothing to do; expected IMAGES and --out DIR, or --camera NUMBER")
-        if arguments.batch < 1:
-            raise EdgeError(f"--batch {arguments.batch}; expected at least 1")
-        return reconstruct(session, in_order(arguments.images), arguments.out, 1 if session.tracks else arguments.batch)
-    except (EdgeError, OSError) as error:
-        print(f"torchmembrane-edge: error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 0
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")  # of names that a terminal's encoding lacks
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_: print(f"torchmembrane-edge: warning: {message}", file=sys.stderr)
+        try:
+            return _run(arguments)
+        except (EdgeError, OSError) as error:
+            print(f"torchmembrane-edge: error: {printable(error)}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            print("torchmembrane-edge: interrupted; what is done so far is kept", file=sys.stderr)
+            return 130
 
 
-def in_order(paths: list) -> list:
-    """The paths as they are given; in the order of the numbers in their names where they come as shells expand a pattern."""
+def _run(arguments: argparse.Namespace) -> int:
+    model = model_file(arguments.model)
+    paths = _checked(arguments)
+    megabytes = Path(model).stat().st_size / 1e6
+    seconds = f"{max(1.0, SECONDS_PER_MB * megabytes):.0f}"
+    said = f"loading {printable(model)}, {megabytes:.1f} MB; on one core this takes some {seconds} s"
+    print(f"torchmembrane-edge: {said}", file=sys.stderr, flush=True)
+    session = Session(model, arguments.threads, arguments.providers)
+    if arguments.camera is not None:
+        return watch(session, arguments.camera, arguments.frames)
+    return reconstruct(session, paths, arguments.out, 1 if session.tracks else arguments.batch)
 
-    def numbered(path):
-        parts = re.split("([0-9]+)", str(path))  # texts at even places, numbers at odd ones
-        digits = [part.lstrip("0") for part in parts]
-        return [(len(digits[k]), digits[k]) if k % 2 else (-1, part) for k, part in enumerate(parts)], str(path)
 
-    return sorted(paths, key=numbered) if paths == sorted(paths) else paths
-
-
-def reconstruct(session: Session, paths: list, out: Path, batch: int) -> int:
-    """Every image's result as `NAME.npz` in the folder `out`, with `mesh.npz`; a model that tracks takes them for a video."""
+def _checked(arguments: argparse.Namespace) -> list[Path]:
+    """The image files, after everything that is known without the model."""
+    if arguments.camera is not None:
+        if arguments.images or arguments.out:
+            raise EdgeError("--camera with images or --out; a camera's results are printed: expected one or the other")
+        if find_spec("cv2") is None:
+            raise EdgeError('a camera needs OpenCV, which is not installed: pip install "torchmembrane-edge[camera]"')
+        return []
+    if arguments.frames is not None:
+        raise EdgeError(f"--frames {arguments.frames} without --camera; expected --camera NUMBER with it")
+    if not arguments.images or not arguments.out:
+        raise EdgeError("nothing to do; expected IMAGES and --out DIR, or --camera NUMBER")
     if find_spec("PIL") is None:
         raise EdgeError('image files need Pillow, which is not installed: pip install "torchmembrane-edge[images]"')
-    if len({path.stem for path in paths}) < len(paths):
-        raise EdgeError("two images of one name; results bear it: rename, or use two calls")
-    if any(path.stem == Path(MESH).stem for path in paths):
-        raise EdgeError(f"an image's result would be {MESH}, which holds the mesh: rename the image")
-    _write_mesh(out, session.mesh)
-    failed, results = 0, None
-    for begin in range(0, len(paths), batch):
-        frames = []
-        for path in paths[begin : begin + batch]:
-            try:
-                frames.append((path, _read(path, session.image_size, session.bits)))
-            except EdgeError as error:
-                failed += 1
-                print(f"{path}: {error}", file=sys.stderr)
-        if not frames:
-            continue
-        results = session.run(np.concatenate([image for _, image in frames]), results)
-        for i, (path, _) in enumerate(frames):
-            _save(out / f"{path.stem}.npz", {key: values[i] for key, values in results.items()})
-            status = int(results["status"][i])
+    results.refuse_file(arguments.out)
+    return image_files(arguments.images)
+
+
+def image_files(arguments: Sequence[str]) -> list[Path]:
+    """Files, patterns and folders as files, in the order of the call; names as shells sort them, by the numbers in them.
+
+    Raises:
+        EdgeError: an argument names no file, or two frames would have one name.
+    """
+    paths = in_order(without_system_files([path for argument in arguments for path in _expanded(argument)]))
+    files = {frame_name(path): path for path in paths}
+    for name, uses in Counter(map(frame_name, paths)).items():
+        if uses > 1:
+            twins = printable(", ".join(str(path) for path in paths if frame_name(path) == name))
+            raise EdgeError(f"two images of the name {name!r} ({twins}); results bear it: rename, or use two calls")
+    for name, path in files.items():
+        if name == "mesh":
+            raise EdgeError(f"{printable(path)}: its result would be mesh.npz, which holds the mesh: rename the image")
+        stem, _, number = name.rpartition("_")
+        if stem in files and re.fullmatch("[0-9]{6,12}", number) and 1 < pictures(files[stem]) > int(number):
+            raise EdgeError(f"{printable(path)}: a picture of {printable(files[stem])} has the same name; use two calls")
+    return paths
+
+
+def in_order(paths: list[Path]) -> list[Path]:
+    """The paths as they are given; in the order of the numbers in their names where they come as shells expand a pattern."""
+    return sorted(paths, key=_numbered) if paths == sorted(paths) else paths
+
+
+def without_system_files(paths: list[Path]) -> list[Path]:
+    """The paths without files that macOS and Windows leave in folders, which a shell's pattern may give too."""
+    return [path for path in paths if not OF_SYSTEM.fullmatch(path.name)] or paths
+
+
+def _expanded(argument: str) -> list[Path]:
+    path = Path(argument)
+    if path.is_dir():
+        files = (p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file() and not p.name.startswith("."))
+        found = sorted(files, key=_numbered)
+        if not found:
+            raise EdgeError(f"{printable(path)}: the folder holds no files {' '.join(SUFFIXES)}; expected one or more")
+        return found
+    if path.exists():
+        return [path]
+    found = [p for p in map(Path, sorted(glob.glob(argument, recursive=True), key=_numbered)) if p.is_file()]
+    if not found:
+        raise EdgeError(f"{printable(argument)}: no such file, no pattern that matches one; expected images, patterns, folders")
+    return found
+
+
+def _numbered(path: str | Path) -> tuple[list[tuple[int, str]], str]:
+    parts = re.split("([0-9]+)", str(path))  # texts at even places, numbers at odd ones
+    digits = [part.lstrip("0") for part in parts]
+    return [(len(digits[k]), digits[k]) if k % 2 else (-1, part) for k, part in enumerate(parts)], str(path)
+
+
+def reconstruct(session: Session, paths: list[Path], out: Path, batch: int) -> int:
+    """Every frame's result as `NAME.npz` in the folder `out`, with `mesh.npz`; a model that tracks takes them for a video."""
+    results.begin(out, session.mesh)
+    waiting = (frame for path in paths for frame in frames(path, session.image_size, session.bits))
+    done, found = Counter(), None
+    while group := list(islice(waiting, batch)):
+        images = [frame.image for frame in group if frame.image is not None]
+        if images:
+            found = session.run(np.concatenate(images), found)
+        row = -1
+        for frame in group:
+            status, said = UNREADABLE, frame.reason
+            if frame.image is not None:
+                row += 1
+                results.save(out / f"{frame.name}.npz", {key: values[row] for key, values in found.items()})
+                status = int(found["status"][row])
+                said = session.status_text(status)
             if status:
-                print(f"{path}: {session.status_texts[status]}", file=sys.stderr)
-            failed += status not in FINISHED
-    print(f"frames: {len(paths) - failed} reconstructed, {failed} failed; results in {out}")
-    return 1 if failed else 0
+                print(frame.says(said), file=sys.stderr)
+            done[status in FINISHED] += 1
+    print(f"frames: {done[True]} reconstructed, {done[False]} failed; results in {printable(out)}")
+    return 1 if done[False] else 0
 
 
 def watch(session: Session, camera: int, frames: int | None) -> int:
-    """Images of a camera, a line each: what was found and how long it took."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise EdgeError("a camera needs OpenCV, which is not installed: pip install opencv-python-headless") from error
+    """Images of a camera, a line each: what was found and how long it took; Ctrl-C ends it."""
+    import cv2
+
     width, height = session.image_size
     capture = cv2.VideoCapture(camera)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
@@ -92,12 +170,17 @@ def watch(session: Session, camera: int, frames: int | None) -> int:
         while frames is None or number < frames:
             taken, image = capture.read()
             if not taken:
-                raise EdgeError(f"camera {camera} gives no image; expected one of {width} x {height} px")
+                raise EdgeError(
+                    f"camera {camera} gives no image; expected one of {width} x {height} px: check its number, and that no "
+                    "other program uses it"
+                )
             start = time.perf_counter()
-            result = session.run(_red_first(image)[None], result)
+            result = session.run(_red_first(image), result)
             milliseconds = 1000 * (time.perf_counter() - start)
             print(f"{number}: {_line(session, result)}, {milliseconds:.1f} ms", flush=True)
             number += 1
+    except KeyboardInterrupt:
+        pass
     finally:
         capture.release()
     return 0
@@ -116,59 +199,39 @@ def _red_first(image: np.ndarray) -> np.ndarray:
 def _line(session: Session, result: dict) -> str:
     status = int(result["status"][0])
     if status not in FINISHED:
-        return session.status_texts[status]
+        return session.status_text(status)
     moved = np.linalg.norm(result["displacement"][0], axis=-1).max()
     force = np.linalg.norm(result["force"][0])
-    return f"moved by at most {moved:.2f} {session.length_unit}, force {force:.3g} {session.force_unit}"
+    return f"moved by at most {moved:.3g} {session.length_unit}, force {force:.3g} {session.force_unit}"
 
 
-def _read(path: Path, size, bits: int | None = None) -> np.ndarray:
-    """An image file as grey values `[1, height, width]`."""
-    from PIL import Image
+def _whole(least: int, most: int) -> Callable[[str], int]:
+    """The type of a whole number within bounds."""
 
-    try:
-        with Image.open(path) as image:
-            plain = image.mode in ("1", "L", "LA", "La")
-            wide = image.mode == "F" or image.mode.startswith("I;16")
-            array = np.asarray(image if wide else image.convert("L" if plain else "RGB"))
-    except (OSError, SyntaxError, ValueError) as error:
-        raise EdgeError(f"not readable as an image ({error})") from error
-    values = grey(array[None], bits)
-    if values.shape[:0:-1] != tuple(size):
-        raise EdgeError(f"the image is {values.shape[2]} x {values.shape[1]} px, the sensor's are {size[0]} x {size[1]}")
-    return values
+    def number(text: str) -> int:
+        if not re.fullmatch("[0-9]{1,9}", text) or not least <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"{text!r}; expected a whole number from {least} to {most}")
+        return int(text)
 
-
-def _write_mesh(out: Path, mesh: dict) -> None:
-    out.mkdir(parents=True, exist_ok=True)
-    if (out / MESH).exists():
-        with np.load(out / MESH) as there:
-            for key in ("sensor", "estimator", "energy", "element"):
-                if str(there[key]) != mesh[key]:
-                    raise EdgeError(f"{out} holds results of another {key} ({there[key]}, not {mesh[key]}); choose another")
-    _save(out / MESH, mesh)
-
-
-def _save(path: Path, arrays: dict) -> None:
-    """Whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    with open(partial, "wb") as file:
-        np.savez(file, **arrays)
-    partial.replace(path)
+    return number
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="torchmembrane-edge", description="Images to surfaces with a model from `torchmembrane export`.",
-        epilog="exit code: 0 all well, 1 some frames failed, 2 wrong usage or model",
+        epilog="exit code: 0 all well, 1 some frames failed, 2 wrong usage or model, 130 interrupted", allow_abbrev=False,
     )  # fmt: skip
     add = parser.add_argument
     add("model", metavar="MODEL.onnx", help="the exported model of the sensor")
-    add("images", metavar="IMAGES", nargs="*", type=Path, help="image files; to a model that tracks, a video's in order")
+    images = "image files, patterns, folders; several pictures in a file are frames of it; to a model that tracks, a video's"
+    add("images", metavar="IMAGES", nargs="*", help=images)
     add("--out", metavar="DIR", type=Path, help="folder of the results: NAME.npz and mesh.npz")
-    add("--batch", metavar="N", type=int, default=1, help="images computed at once (default: %(default)s; tracking: 1)")
-    add("--threads", metavar="N", type=int, default=1, help="of onnxruntime (default: %(default)s)")
+    batch = "images computed at once (default: %(default)s; tracking: 1)"
+    add("--batch", metavar="N", type=_whole(1, MOST_BATCH), default=1, help=batch)
+    threads = "of onnxruntime (default: %(default)s)"
+    add("--threads", metavar="N", type=_whole(1, MOST_THREADS), default=1, help=threads)
     add("--providers", metavar="NAME", nargs="+", default=["CPUExecutionProvider"], help="of onnxruntime, in order")
-    add("--camera", metavar="NUMBER", type=int, help="instead of images: a camera's, a line printed for each (OpenCV)")
-    add("--frames", metavar="N", type=int, help="stop the camera after so many")
+    camera = "instead of images: a camera's, a line printed for each (OpenCV)"
+    add("--camera", metavar="NUMBER", type=_whole(0, MOST_NUMBER), help=camera)
+    add("--frames", metavar="N", type=_whole(1, MOST_NUMBER), help="stop the camera after so many")
     return parser

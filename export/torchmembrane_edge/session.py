@@ -1,129 +1,215 @@
-"""A model, what it says of its sensor, and images to results."""
+"""A model, and images to results."""
 
-import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
 
-FORMAT = "1"
+from .errors import EdgeError, in_one_line, printable
+from .metadata import EXPECTED, Metadata
+
 GREY = (0.299, 0.587, 0.114)
-WHOLE, FLAGS = ("triangles", "grid", "image_size"), ("fixed",)  # of the mesh; other arrays are float32
-
-
-class EdgeError(ValueError):
-    """What came, and what was expected."""
+SHAPES = "[H, W], [H, W, 3], [B, H, W], [B, 1 | 3, H, W] or [B, H, W, 1 | 3]"
+TYPES = {"tensor(float)": np.float32, "tensor(int32)": np.int32}
+NEEDED = ("vertices", "displacement", "force", "status")
+"""Outputs without which there is no result."""
+PREVIOUS = "previous_"
+MOST_THREADS = 256
 
 
 class Session:
-    """A model ready to run.
+    """A model ready to run. Making one takes long, some 4 s for each MB of the file on one core: onnxruntime optimises it.
 
     Arguments: `model`, the path of a file from `torchmembrane export`; `threads`, of which one is best for single frames;
     `providers`, onnxruntime's, in order of preference.
 
     Attributes: `name` of the sensor, `length_unit`, `force_unit`, `status_texts` (code to text), `mesh` (what `mesh.npz`
-    holds: rest_vertices, triangles, fixed ...), `image_size` (width, height), `bits` of the camera, where its images of 16 bits
-    hold fewer, else None, `tracks`: whether it follows dots.
+    holds: rest_vertices, triangles, fixed ...), `image_size` (width, height), `tracks`: whether it follows dots; `bits` of the
+    camera, where images of 16 bits hold fewer, else None.
+
+    Raises: `EdgeError`: no such file, no model of `torchmembrane export`, or a provider that onnxruntime lacks.
     """
 
     def __init__(self, model: str | Path, threads: int = 1, providers: Sequence[str] = ("CPUExecutionProvider",)):
+        _refuse_providers(providers)
+        if not isinstance(threads, int) or not 1 <= threads <= MOST_THREADS:
+            raise EdgeError(f"threads {threads!r}; expected a whole number from 1 to {MOST_THREADS}")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
-        options.log_severity_level = 3
-        if not Path(model).is_file():
-            raise EdgeError(f"{model}: no such file; expected a model from `torchmembrane export`")
+        options.log_severity_level = 4  # what is wrong is raised
+        model = model_file(model)
         try:
-            self._session = onnxruntime.InferenceSession(str(model), options, providers=list(providers))
+            self._session = onnxruntime.InferenceSession(model, options, providers=list(providers))
+            known = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:  # onnxruntime's errors have no common base
-            raise EdgeError(f"{model}: onnxruntime {onnxruntime.__version__} cannot load it: {error}") from error
-        known = self._session.get_modelmeta().custom_metadata_map
-        if known.get("format") != FORMAT:
-            raise EdgeError(f"{model}: format {known.get('format')!r}; expected {FORMAT!r}, from `torchmembrane export`")
-        self.name, self.length_unit, self.force_unit = known["name"], known["length_unit"], known["force_unit"]
-        self.status_texts = {int(code): text for code, text in json.loads(known["status_texts"]).items()}
-        self.mesh = {key: _array(key, value) for key, value in json.loads(known["mesh"]).items()}
+            cause = f"onnxruntime {onnxruntime.__version__}: {in_one_line(error)}"
+            raise EdgeError(f"{model}: not readable as a model ({cause}); expected {EXPECTED}") from error
+        said = Metadata.of(known, model)
+        self.name, self.length_unit, self.force_unit, self.status_texts, self.mesh, self.bits = said
         self.image_size = tuple(self.mesh["image_size"].tolist())
-        self.bits = int(known["bits"]) if "bits" in known else None
-        inputs = [given.name for given in self._session.get_inputs()]
-        self._state = [name.removeprefix("previous_") for name in inputs if name.startswith("previous_")]
+        self._outputs = {given.name: (TYPES.get(given.type), given.shape[1:]) for given in self._session.get_outputs()}
+        inputs = {given.name: given.shape for given in self._session.get_inputs()}
+        self._state = {name: shape[1:] for name, shape in inputs.items() if name != "image"}
         self.tracks = bool(self._state)
-        self._outputs = [output.name for output in self._session.get_outputs()]
+        if wrong := self._unlike(inputs.get("image", [])):
+            raise EdgeError(f"{model}: {wrong}; expected {EXPECTED}")
 
-    def run(self, images, previous: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
+    def run(self, images: Any, previous: Mapping[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
         """Results of a batch, by name, one row per frame: vertices `[B, V, 3]`, ..., status `[B]`.
 
-        `images`: `[height, width]` or `[B, height, width]` grey, or `[B, height, width, 3]` RGB; uint8, uint16 (of
+        `images`: `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or `[B, H, W, 1 | 3]`, grey or RGB; uint8, uint16 (of
         `bits`) or float in 0..1. A frame that cannot be reconstructed has a status and NaN.
         `previous`, for a model that tracks: the results of the frames before, where its dots are looked for first.
-        """
-        images = grey(images, self.bits)
-        width, height = self.image_size
-        if images.shape[1:] != (height, width):
-            raise EdgeError(
-                f"images of {images.shape[2]} x {images.shape[1]} px; sensor {self.name!r} expects {width} x {height}"
-            )
-        feed = {"image": images[:, None]}
-        if not self.tracks:
-            return dict(zip(self._outputs, self._session.run(None, feed), strict=True))
-        state = self._rest(len(images)) if previous is None else previous
-        if (count := len(state[self._state[0]])) != len(images):
-            raise EdgeError(f"{len(images)} images after results of {count}; expected as many")
-        feed |= {f"previous_{key}": state[key] for key in self._state}
-        return dict(zip(self._outputs, self._session.run(None, feed), strict=True))
 
-    def track(self, images):
+        Raises `EdgeError`: images of another shape, size or type, or results of other frames.
+        """
+        if missing := [name for name in NEEDED if name not in self._outputs]:
+            raise EdgeError(f"the model of {self.name!r} gives no {missing[0]}; expected {EXPECTED}")
+        images = grey(_arranged(_array(images), self.image_size), self.bits)
+        if not len(images):
+            return {name: np.zeros((0, *shape), dtype) for name, (dtype, shape) in self._outputs.items()}
+        feed = {"image": images[:, None]}
+        for key, shape in self._state.items():
+            feed[key] = _state(key.removeprefix(PREVIOUS), (len(images), *shape), previous)
+        try:
+            results = dict(zip(self._outputs, self._session.run(None, feed), strict=True))
+        except Exception as error:  # as above
+            raise EdgeError(f"onnxruntime cannot run the model on {len(images)} images ({in_one_line(error)})") from error
+        if any(values.shape[:1] != (len(images),) for values in results.values()):
+            raise EdgeError(f"the model of {self.name!r} gives other than a row for each image; expected {EXPECTED}")
+        return results
+
+    def track(self, images: Any) -> Iterator[dict[str, np.ndarray]]:
         """Results of a video's images, one after another, dots followed from each to the next (a generator)."""
         if not self.tracks:
             raise EdgeError(
                 f"the model of {self.name!r} does not track; expected one of dots from `torchmembrane export --tracking`"
             )
+        if not hasattr(images, "__iter__"):
+            raise EdgeError(f"track: {type(images).__name__}; expected a video's images, one after another")
         previous = None
         for image in images:
-            previous = self.run(np.asarray(image)[None], previous)
+            previous = self.run(_array(image)[None], previous)
             yield previous
 
-    def wrench_in_tool(self, results: dict[str, np.ndarray]) -> np.ndarray:
+    def status_text(self, code: int) -> str:
+        """What a status says, also one that the model has no text for."""
+        return self.status_texts.get(int(code), f"status {int(code)}")
+
+    def wrench_in_tool(self, results: Mapping[str, np.ndarray]) -> np.ndarray:
         """The wrench of results `[B, 6]` in the frame of the sensor's tool: force, and moment about that frame's origin."""
-        pose = self.mesh.get("camera_in_tool", ())
+        pose = self.mesh["camera_in_tool"]
         if not len(pose):
             raise EdgeError(
                 f"the model of {self.name!r} knows no tool; expected one of a sensor file with [tool]: export it again"
             )
+        wrench = np.asarray(results.get("wrench") if isinstance(results, Mapping) else results)
+        if wrench.ndim != 2 or wrench.shape[1] != 6 or wrench.dtype.kind != "f":
+            raise EdgeError(f"a wrench of {wrench.dtype} {list(wrench.shape)}; expected results of `run`, with wrench [B, 6]")
         rotation, translation = pose[:, :3], pose[:, 3]
-        force, moment = results["wrench"][:, :3] @ rotation.T, results["wrench"][:, 3:] @ rotation.T
+        force, moment = wrench[:, :3] @ rotation.T, wrench[:, 3:] @ rotation.T
         return np.concatenate([force, moment + np.cross(translation, force)], -1)
 
-    def _rest(self, batch: int) -> dict[str, np.ndarray]:
-        shapes = {given.name: given.shape[1:] for given in self._session.get_inputs()}
-        return {key: np.full((batch, *shapes[f"previous_{key}"]), np.nan, np.float32) for key in self._state}
+    def _unlike(self, image: Sequence[Any]) -> str:
+        """What its inputs and outputs are not; "" of a model of `torchmembrane export`."""
+        width, height = self.image_size
+        if list(image[1:]) != [1, height, width]:
+            return f"its image is {image or 'missing'}, not [batch, 1, {height}, {width}] as its mesh says"
+        for name, (dtype, shape) in self._outputs.items():
+            if dtype is None or not all(isinstance(size, int) for size in shape):
+                return f"its output {name!r} is {dtype} {list(shape)}"
+        for name, shape in self._state.items():
+            if not name.startswith(PREVIOUS) or self._outputs.get(name.removeprefix(PREVIOUS)) != (np.float32, shape):
+                return f"its input {name!r} {list(shape)} is none of its outputs"
+        return ""
 
 
-def grey(images, bits: int | None = None) -> np.ndarray:
+def model_file(model: str | Path) -> str:
+    """The path of a model as onnxruntime takes it.
+
+    Raises:
+        EdgeError: there is no such file.
+    """
+    if not isinstance(model, str | Path):
+        raise EdgeError(f"model {type(model).__name__}; expected the path of a model from `torchmembrane export`")
+    path = Path(model)
+    if not path.is_file():
+        cause = "a folder" if path.is_dir() else "no regular file" if path.exists() else "no such file"
+        raise EdgeError(f"{printable(path)}: {cause}; expected a model from `torchmembrane export`, check the path")
+    return str(path)
+
+
+def grey(images: Any, bits: int | None = None) -> np.ndarray:
     """Grey values `[B, height, width]`, float32 in 0..1: 0.299 R + 0.587 G + 0.114 B.
 
-    `bits`: of the camera, where uint16 images hold fewer; white is then `2^bits - 1`, and values beyond are refused.
+    Arguments: `images`, `[height, width]`, `[B, height, width]` or `[B, height, width, 3]`; uint8, uint16 or float in 0..1;
+    `bits` that those of uint16 hold (default: 16).
     """
-    images = np.asarray(images)
+    images = _array(images)
     if images.ndim == 2:
         images = images[None]
     if images.ndim not in (3, 4) or images.shape[3:] not in ((), (3,)):
-        raise EdgeError(f"images of shape {list(images.shape)}; expected [B, height, width] or [B, height, width, 3]")
+        raise EdgeError(f"images {list(images.shape)}; expected {SHAPES}")
+    white = 1.0
     if images.dtype.kind == "u" and images.dtype.itemsize <= 2:
-        white = np.iinfo(images.dtype).max if bits is None or images.dtype.itemsize == 1 else 2**bits - 1
-        if images.max(initial=0) > white:
-            raise EdgeError(f"values up to {images.max()}; expected at most {white}, as the model's camera has {bits} bits")
-    elif images.dtype.kind == "f":
-        white = 1.0
-    else:
+        white = np.iinfo(images.dtype).max
+        if bits and images.dtype.itemsize == 2:
+            white = 2**bits - 1
+            if (most := images.max(initial=0)) > white:
+                raise EdgeError(f"values up to {most}; expected at most {white}, of the {bits} bits that the model states")
+    elif images.dtype.kind != "f":
         raise EdgeError(f"images of type {images.dtype}; expected uint8, uint16 or float in 0..1")
     if images.ndim == 4:
         images = sum(weight * images[..., c].astype(np.float64) for c, weight in enumerate(GREY))
     return (images.astype(np.float64) / white).astype(np.float32)
 
 
-def _array(key: str, value):
-    if not isinstance(value, list):
-        return value
-    array = np.array(value, np.int64 if key in WHOLE else bool if key in FLAGS else np.float32)
-    return array.reshape(-1, 4) if key == "camera_in_tool" else array  # none is `[]` in JSON, whatever its shape
+def _refuse_providers(providers: Sequence[str]) -> None:
+    there = onnxruntime.get_available_providers()
+    if isinstance(providers, str) or not all(isinstance(name, str) and name in there for name in providers):
+        raise EdgeError(f"providers {providers!r}; expected a list of some of those that this onnxruntime has, {there}")
+
+
+def _array(images: Any) -> np.ndarray:
+    try:
+        return np.asarray(images)
+    except ValueError as error:  # rows of different lengths
+        raise EdgeError(f"images are no array ({in_one_line(error)}); expected {SHAPES}") from error
+
+
+def _arranged(images: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Images as `[B, H, W]` or `[B, H, W, 3]`, where `size` is width and height."""
+    (width, height), shape = size, images.shape
+    if shape[-2:] == (height, width) and images.ndim in (2, 3):
+        return images.reshape(-1, height, width)
+    if shape[-2:] == (height, width) and images.ndim == 4 and shape[1] in (1, 3):
+        images = np.moveaxis(images, 1, -1)
+    elif shape[-3:-1] != (height, width) or images.ndim not in (3, 4) or shape[-1] not in (1, 3):
+        raise EdgeError(_refusal(shape, size))
+    return images[..., 0].reshape(-1, height, width) if images.shape[-1] == 1 else images.reshape(-1, height, width, 3)
+
+
+def _refusal(shape: tuple[int, ...], size: tuple[int, int]) -> str:
+    width, height = size
+    said = f"images {list(shape)}; expected {SHAPES} with H = {height}, W = {width}"
+    given = shape[-3:-1] if shape[-1:] in ((1,), (3,)) else shape[-2:]
+    if len(given) < 2:
+        return said
+    if (height, width) in (shape[-2:], shape[-3:-1]):
+        return f"{said}: give grey or colour, without alpha"
+    return f"the image is {given[1]} x {given[0]} px, expected {width} x {height} ({said}): use images of this sensor's camera"
+
+
+def _state(key: str, shape: tuple[int, ...], previous: Mapping[str, np.ndarray] | None) -> np.ndarray:
+    """What a model that tracks is given of the frames before: NaN where there are none."""
+    if previous is None:
+        return np.full(shape, np.nan, np.float32)
+    values = np.asarray(previous.get(key) if isinstance(previous, Mapping) else previous)
+    if values.shape != shape or values.dtype.kind != "f":
+        raise EdgeError(
+            f"{shape[0]} images after results with {key} {values.dtype} {list(values.shape)}; expected {list(shape)}, the "
+            "results of `run` for as many images"
+        )
+    return values.astype(np.float32)

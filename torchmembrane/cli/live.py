@@ -138,6 +138,7 @@ def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
     from .build import build_reconstructor
 
     if arguments.model is not None:
+        print(f"torchmembrane: loading {arguments.model}; this takes some seconds for each MB", file=sys.stderr)
         return ModelStream(arguments.model, sensor.fingerprint, arguments.threads)
     torch.set_num_threads(arguments.threads)
     if arguments.grid is not None:

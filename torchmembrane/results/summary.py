@@ -31,9 +31,10 @@ OF_FRAME = (
 )
 UNITS = ("length_unit", "force_unit")
 COLUMNS = (*OF_FILE, *OF_FRAME, *UNITS)
-TEXT = ("name", "file", "status_text")
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What a spreadsheet takes for a formula when a cell begins with it: such a text gets a ' before it."""
+TEXT = ("name", "file", "status_text", "content_hash", *UNITS)
+"""Columns of text, which the names of files, damaged images, results and `mesh.npz` give."""
+FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
+"""What a spreadsheet takes for a formula when a cell begins with it, spaces aside: such a text gets a ' before it."""
 
 
 class Summary:
@@ -92,18 +93,30 @@ def _rows(path: Path) -> list[dict[str, str]]:
         regular_size(path, MOST_BYTES, EXPECTED)
         with open(path, newline="", encoding="utf-8", errors="replace") as file:
             lines = (line.replace("\0", "") for line in iter(partial(file.readline, LONGEST_LINE), ""))
-            found = [row for row in csv.DictReader(lines) if tuple(row) == COLUMNS and None not in row.values()]
+            found = [row for row in csv.DictReader(lines) if tuple(row) == COLUMNS and _is_whole(row)]
     except (FileNotFoundError, csv.Error):
         return []
     return [{key: _unescaped(key, cell) for key, cell in row.items()} for row in found]
 
 
+def _is_whole(row: dict[str, Any]) -> bool:
+    """Whether a row has all its cells, and numbers where they belong."""
+    try:
+        return None not in row.values() and all(key in TEXT or not cell or float(cell) is not None for key, cell in row.items())
+    except ValueError:
+        return False
+
+
 def _escaped(key: str, cell: str) -> str:
-    return f"'{cell}" if key in TEXT and cell.lstrip("'").startswith(FORMULA) else cell
+    return f"'{cell}" if key in TEXT and _is_formula(cell) else cell
 
 
 def _unescaped(key: str, cell: str) -> str:
-    return cell[1:] if key in TEXT and cell.startswith("'") and cell.lstrip("'").startswith(FORMULA) else cell
+    return cell[1:] if key in TEXT and cell.startswith("'") and _is_formula(cell) else cell
+
+
+def _is_formula(cell: str) -> bool:
+    return cell.lstrip("' ").startswith(FORMULA)
 
 
 def _number(value: np.ndarray | float) -> str:

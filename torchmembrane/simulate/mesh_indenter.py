@@ -77,9 +77,11 @@ class MeshIndenter(Indenter):
             raise MembraneError(f"{path}: no mesh by its name; expected {expected}")
         content = read_bytes(path, MOST_BYTES, expected)
         try:
+            if kind != "ply":
+                content = _whole_stl(content) if kind == "stl" else _in_utf8(content)
             body = trimesh.load_mesh(io.BytesIO(content), file_type=kind)
             vertices, faces = np.asarray(body.vertices, float), np.asarray(body.faces)
-        except (*DAMAGE, ImportError) as error:  # of text that is no UTF-8 trimesh asks another package
+        except DAMAGE as error:
             raise MembraneError(f"{path}: not readable ({in_one_line(error)}); expected {expected}") from error
         if not 0 < len(faces) <= MOST_TRIANGLES or not np.isfinite(vertices).all():
             raise MembraneError(f"{path}: {len(faces)} triangles, or corners that are not finite; expected {expected}")
@@ -117,6 +119,32 @@ def _feature_normals(body: Any) -> np.ndarray:
         [faces[:, None], edges[np.roll(body.faces_unique_edges, -1, 1)], body.vertex_normals[body.faces]], axis=1
     )
     return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+def _whole_stl(content: bytes) -> bytes:
+    """An STL, binary as it is, text in UTF-8.
+
+    Raises:
+        ValueError: it is neither: trimesh would take a binary one of another length for text.
+    """
+    triangles = int.from_bytes(content[80:84], "little")
+    if len(content) == 84 + 50 * triangles:
+        return content
+    if b"facet" in content.lower():
+        return _in_utf8(content)
+    if len(content) < 84:
+        raise ValueError(f"it holds {len(content)} bytes and no facet")
+    stated = f"as a binary STL it states {triangles} triangles, which take {84 + 50 * triangles} bytes"
+    raise ValueError(f"{stated}, and holds {len(content)}; as text it has no facet")
+
+
+def _in_utf8(content: bytes) -> bytes:
+    """Text in UTF-8; names and comments alone can have been in another encoding."""
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        return content.decode("latin-1").encode()
+    return content
 
 
 def _trimesh() -> ModuleType:

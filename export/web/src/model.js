@@ -18,13 +18,15 @@ export class Model {
     return model;
   }
 
-  /** The result of one image `{ grey, width, height }`: `frame`, the outputs by name, and `milliseconds`. */
-  async run(image) {
+  /** The result of an image's grey values [width * height]: `frame`, the outputs by name, and `milliseconds`. */
+  run(grey) {
     const [width, height] = this.sensor.mesh.image_size;
-    if (image.width !== width || image.height !== height) {
-      throw new Error(`the image is ${image.width} x ${image.height} px, the sensor's are ${width} x ${height}`);
-    }
-    return this.#ask({ image });
+    return this.#ask({ image: { grey, width, height } });
+  }
+
+  /** What a status says, also one that the model has no text for. */
+  statusText(code) {
+    return this.sensor.statusTexts[code] ?? `status ${code}`;
   }
 
   /** The next frame starts from rest. */

@@ -1,16 +1,26 @@
 // The page: a model and an image in; the surface, and the traction on it, out.
-import { greyOf, pixelsOf } from "./image.js";
+import { imageOf } from "./image.js";
 import { Model } from "./model.js";
 import { npz } from "./npz.js";
 import { COLOURS, Surface } from "./surface.js";
 
+const SECONDS_PER_MB = 4; // that a core of a PC takes to load a model
 const READINGS = ["force", "pressure", "volume", "displacement", "markers", "time"];
 const at = (id) => document.getElementById(id);
 const surface = new Surface(at("surface"));
 let model, result;
 
 async function openModel(file) {
-  const next = await Model.open(new Uint8Array(await file.arrayBuffer()));
+  const [before, megabytes] = [at("status").textContent, file.size / 1e6];
+  const seconds = Math.max(1, SECONDS_PER_MB * megabytes).toFixed(0);
+  at("status").textContent = `loading a model of ${megabytes.toFixed(1)} MB; this takes some ${seconds} s`;
+  let next;
+  try {
+    next = await Model.open(new Uint8Array(await file.arrayBuffer()));
+  } catch (error) {
+    at("status").textContent = model ? before : "no model";
+    throw error;
+  }
   model?.close();
   model = next;
   result = null;
@@ -26,9 +36,10 @@ async function openModel(file) {
 
 async function openImage(file, name) {
   if (!model) throw new Error("there is no model yet; open one first");
-  const pixels = await pixelsOf(file);
-  const { width, height } = pixels;
-  const { frame, milliseconds } = await model.run({ grey: greyOf(pixels.data), width, height });
+  const { mesh, bits } = model.sensor;
+  const { pixels, grey } = await imageOf(file, mesh.image_size, bits);
+  const [width, height] = mesh.image_size;
+  const { frame, milliseconds } = await model.run(grey);
   Object.assign(at("image"), { width, height });
   at("image").setAttribute("aria-label", name);
   at("image").getContext("2d", { willReadFrequently: true }).putImageData(pixels, 0, 0);
@@ -40,7 +51,7 @@ async function openImage(file, name) {
 }
 
 function showReadings(frame, milliseconds) {
-  const { statusTexts, lengthUnit, forceUnit } = model.sensor;
+  const { lengthUnit, forceUnit } = model.sensor;
   const [force, stress] = forceUnit === "relative" ? ["(relative)", "(relative)"] : [forceUnit, `${forceUnit}/${lengthUnit}²`];
   const [pressure, change, volume] = ["pressure", "pressure_change", "volume_error"].map((name) => frame[name].data[0]);
   const components = [...frame.force.data];
@@ -53,7 +64,7 @@ function showReadings(frame, milliseconds) {
   const confidence = frame.confidence.data;
   at("markers").textContent = `${confidence.filter((value) => value > 0).length} of ${confidence.length}`;
   at("time").textContent = `${milliseconds.toFixed(0)} ms`;
-  at("status").textContent = statusTexts[frame.status.data[0]];
+  at("status").textContent = model.statusText(frame.status.data[0]);
 }
 
 /** The surface with the inward traction on it; of a model that finds no forces, with the depth. */
@@ -122,11 +133,13 @@ function inTurn(name, job) {
   });
 }
 
+const isModel = (file) => /\.(onnx|ort)$/i.test(file.name);
+
 /** Files as they are given; several at once in the order of their names, for a model that tracks takes them for a video. */
 function open(files) {
   const order = new Intl.Collator("en", { numeric: true });
-  files.sort((one, other) => other.name.endsWith(".onnx") - one.name.endsWith(".onnx") || order.compare(one.name, other.name));
-  for (const file of files) inTurn(file.name, () => (file.name.endsWith(".onnx") ? openModel(file) : openImage(file, file.name)));
+  files.sort((one, other) => isModel(other) - isModel(one) || order.compare(one.name, other.name));
+  for (const file of files) inTurn(file.name, () => (isModel(file) ? openModel(file) : openImage(file, file.name)));
 }
 
 // EXAMPLES: the names of the files given to build.js

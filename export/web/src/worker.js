@@ -6,12 +6,22 @@ ort.env.wasm.wasmPaths = { wasm: new URL(wasm, import.meta.url).href };
 ort.env.wasm.numThreads = 1; // more need cross-origin isolation, and a single frame gains nothing by them
 
 const PREVIOUS = "previous_";
+const NEEDED = [
+  ...["vertices", "displacement", "normals", "confidence", "traction", "contact_points"],
+  ...["force", "pressure", "pressure_change", "volume_error", "status"],
+];
 
 let session, given, state;
 
 /** A model of images `width` x `height`, run once, as browsers compile what they run more slowly than they run it. */
 async function open({ bytes, width, height }) {
-  session = await ort.InferenceSession.create(bytes, { executionProviders: ["wasm"], logSeverityLevel: 3 });
+  try {
+    session = await ort.InferenceSession.create(bytes, { executionProviders: ["wasm"], logSeverityLevel: 3 });
+  } catch (error) {
+    throw new Error(`onnxruntime cannot load it (${error.message}); expected a model from "torchmembrane export"`);
+  }
+  const missing = NEEDED.find((name) => !session.outputNames.includes(name));
+  if (missing) throw new Error(`it gives no ${missing}; expected a model from "torchmembrane export"`);
   given = session.inputMetadata.filter(({ name }) => name.startsWith(PREVIOUS));
   forget();
   await session.run({ image: imageOf({ grey: new Float32Array(width * height), width, height }), ...state });

@@ -126,7 +126,7 @@ test("the surface turns by itself, by keys, and stands still", async () => {
 test("an image of another size is refused in words, and what was shown stays", async () => {
   await example("Two contacts");
   await drop(reference("narrow.png"));
-  assert.equal(await text("#message"), "narrow.png: the image is 320 x 480 px, the sensor's are 640 x 480");
+  assert.equal(await text("#message"), "narrow.png: the image is 320 x 480 px, expected 640 x 480: use images of this sensor's camera");
   agree(await compared("two_contacts"));
   await example("Flat plate");
   assert.equal(await page.locator("#message").isHidden(), true);
@@ -144,8 +144,48 @@ test("a blank image has a status and no surface", async () => {
   assert.equal(await text("#force"), "–");
 });
 
+test("of a file of several pictures none is taken for all", async () => {
+  await example("Two contacts");
+  for (const name of ["sequence.png", "sequence.gif", "sequence.webp", "sequence.jpg"]) {
+    await drop(reference(name));
+    assert.equal(await text("#message"), `${name}: the file holds 3 pictures; expected one: save each as a file of its own`);
+  }
+  await drop(reference("preview.jpg"));
+  assert.equal(await page.locator("#message").isHidden(), true);
+  assert.equal(await text("#name"), "preview.jpg");
+});
+
+test("what is no image, or too large, is refused in words", async () => {
+  await example("Two contacts");
+  for (const name of ["text.png", "empty.png", "cut.png"]) {
+    await drop(reference(name));
+    assert.equal(await text("#message"), `${name}: not readable as an image; expected a whole PNG or JPEG`);
+  }
+  for (const [name, side] of [["huge.png", 20000], ["huge.jpg", 20000]]) {
+    await drop(reference(name));
+    assert.match(await text("#message"), new RegExp(`${name}: the image is ${side} x ${side} px, expected 640 x 480`));
+  }
+  agree(await compared("two_contacts"));
+});
+
+test("grey of 16 bits is read as it is, also of a camera of fewer", async () => {
+  const cases = [["another.onnx", "sixteen.png"], ["twelve.onnx", "twelve.png"]];
+  for (const [model, image] of cases) {
+    await drop(reference(model), reference(image));
+    assert.equal(await page.locator("#message").isHidden(), true);
+    const { vertices, force } = await compared(image.replace(".png", ""), "two_contacts");
+    assert.ok(vertices <= 2e-3 && force <= 2e-3, `${image}: vertices differ by ${vertices} mm, forces by ${force}`);
+  }
+  await drop(reference("sixteen.png"));
+  assert.match(await text("#message"), /sixteen.png: values up to \d+; expected at most 4095, of the 12 bits that the model states/);
+  await drop(reference("colour_16.png"));
+  assert.match(await text("#message"), /colour_16.png: colour, alpha or interlacing of 16 bits is read as 8 bits/);
+  await page.reload();
+  await idle();
+});
+
 test("pixels are those that Python reads", async () => {
-  for (const name of ["linear.png", "colour.png", "upside_down.jpg"]) {
+  for (const name of ["linear.png", "colour.png", "upside_down.jpg", "upside_down.png"]) {
     await page.locator("#pick-image").setInputFiles(reference(name));
     await idle();
     assert.equal(await text("#name"), name);
@@ -194,6 +234,20 @@ test("another model takes its place, what is none is refused in words", async ()
   await drop(reference("foreign.onnx"));
   assert.match(await text("#message"), /foreign.onnx: not a model of format 1 from "torchmembrane export"/);
   assert.equal(await text("#sensor"), "finger_fisheye_nh130");
+  for (const [name, said] of Object.entries({
+    "no_mesh.onnx": "its metadata lack mesh",
+    "no_size.onnx": "its metadata are damaged (image_size)",
+    "no_vertices.onnx": "its metadata are damaged (rest_vertices)",
+    "no_texts.onnx": "its metadata are damaged (status_texts)",
+    "cut.onnx": "onnxruntime cannot load it",
+    "text.onnx": "not readable as an ONNX model",
+    "empty.onnx": "not a model of format 1",
+  })) {
+    await drop(reference(name));
+    assert.ok((await text("#message")).startsWith(`${name}: ${said}`), await text("#message"));
+    assert.doesNotMatch(await text("#status"), /loading/);
+    assert.equal(await text("#sensor"), "finger_fisheye_nh130");
+  }
   await drop(reference("another.onnx"), reference("blank.png"));
   assert.equal(await text("#sensor"), "another sensor");
   assert.equal(await text("#name"), "blank.png");

@@ -4,10 +4,12 @@ python export/web/test/reference.py SENSOR.toml MODEL.onnx EXAMPLE.png... --trac
 """
 
 import argparse
+import json
 import shutil
 import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
 import onnx
 import torch
@@ -52,19 +54,53 @@ def images(example: Path, out: Path) -> None:
     upside_down = Image.Exif()
     upside_down[0x0112] = 3  # orientation: turned by 180 degrees
     grey.save(out / "upside_down.jpg", exif=upside_down)
-    for name in ("linear.png", "colour.png", "upside_down.jpg"):
+    grey.save(out / "upside_down.png", exif=upside_down)
+    for name in ("linear.png", "colour.png", "upside_down.jpg", "upside_down.png"):
         read_image(out / name).tofile(out / f"{name}.f32")
     grey.crop((0, 0, 320, 480)).save(out / "narrow.png")
     Image.new("L", grey.size, 128).save(out / "blank.png")
     Image.new("LA", grey.size, (128, 100)).save(out / "transparent.png")
+    values = np.asarray(grey).astype(np.uint16)
+    Image.fromarray(values * 257).save(out / "sixteen.png")
+    Image.fromarray(np.rint(values / 255 * 4095).astype(np.uint16)).save(out / "twelve.png")
+    cv2.imwrite(str(out / "colour_16.png"), np.stack([values * 257] * 3, -1))
+    sequences(grey.convert("RGB"), out)
+    (out / "text.png").write_text("no image")
+    (out / "empty.png").write_bytes(b"")
+    (out / "cut.png").write_bytes((out / "colour.png").read_bytes()[:5000])
+    for name in ("huge.png", "huge.jpg"):
+        Image.new("L", (20_000, 20_000)).save(out / name)
+
+
+def sequences(picture: Image.Image, out: Path) -> None:
+    """Files of three pictures, and one of a picture with a preview."""
+    others = [Image.eval(picture, lambda value: 255 - value), picture]
+    for name, kind in {"png": "PNG", "gif": "GIF", "webp": "WEBP", "jpg": "MPO"}.items():
+        picture.save(out / f"sequence.{name}", kind, save_all=True, append_images=others)
+    picture.save(out / "preview.jpg", "MPO", save_all=True, append_images=[picture.resize((160, 120))])
 
 
 def models(path: Path, out: Path) -> None:
-    """The model under another name, and one that no `torchmembrane export` wrote."""
+    """The model under another name, with what it says of its sensor damaged, and what no `torchmembrane export` wrote."""
     model = onnx.load(path)
-    name = next(entry for entry in model.metadata_props if entry.key == "name")
-    name.value = "another sensor"
-    onnx.save(model, out / "another.onnx")
+    known = {entry.key: entry.value for entry in model.metadata_props}
+    mesh = json.loads(known["mesh"])
+    for name, changed in {
+        "another": {"name": "another sensor"},
+        "twelve": {"bits": "12"},
+        "no_mesh": {"mesh": ""},
+        "no_size": {"mesh": json.dumps({key: value for key, value in mesh.items() if key != "image_size"})},
+        "no_vertices": {"mesh": json.dumps(mesh | {"rest_vertices": [[0, 0], [1]]})},
+        "no_texts": {"status_texts": "[ok"},
+    }.items():
+        del model.metadata_props[:]
+        onnx.helper.set_model_props(model, known | changed)
+        onnx.save(model, out / f"{name}.onnx")
+    entries = onnx.ModelProto()
+    onnx.helper.set_model_props(entries, known)
+    (out / "cut.onnx").write_bytes(entries.SerializeToString() + path.read_bytes()[:10_000])
+    (out / "text.onnx").write_text("no model")
+    (out / "empty.onnx").write_bytes(b"")
     del model.metadata_props[:]
     onnx.save(model, out / "foreign.onnx")
 

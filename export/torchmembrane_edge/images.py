@@ -1,0 +1,223 @@
+"""Image files as grey frames, read by Pillow: one frame of an image, one of each picture of a file that holds several."""
+
+import io
+import re
+import struct
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from itertools import count
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .errors import EdgeError, in_one_line, printable
+from .session import grey
+
+FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "GIF", "PPM")
+MOST_BYTES = 2**28
+LONGEST_NAME = 251
+"""Bytes of a frame's name, so that there can be a file NAME.npz."""
+EXPECTED = "a whole PNG, JPEG or TIFF"
+KIND, OLD_KIND, BITS, PHOTOMETRIC, DESCRIPTION, SAMPLE = 254, 255, 258, 262, 270, 339
+"""Tags of a TIFF's page."""
+REDUCED_OR_MASK, OLD_REDUCED, WHITE_IS_ZERO, SIGNED = 0b101, 2, 0, 2
+"""Values of the first, second, fourth and last of these."""
+IMAGEJ = re.compile(r"ImageJ=.*^images=(\d+)", re.DOTALL | re.MULTILINE)
+
+
+class Frame(NamedTuple):
+    """A frame to compute: `image [1, height, width]`, grey in 0..1, or the reason why there is none."""
+
+    name: str
+    path: Path
+    image: np.ndarray | None
+    reason: str = ""
+
+    def says(self, message: str) -> str:
+        """A line of a message about this frame."""
+        picture = "" if self.name == frame_name(self.path) else f", {self.name}"
+        return printable(f"{self.path}{picture}: {message}")
+
+
+def frames(path: Path, size: tuple[int, int], bits: int | None = None) -> Iterator[Frame]:
+    """The frames of a file: of an image NAME, of a file that holds several pictures NAME_000000, NAME_000001 ...
+
+    Arguments: `size`, width and height that they must have; `bits` of the sensor, where files of 16 bits hold fewer.
+    Whatever is wrong with one of them is its `reason`. Reduced copies in a TIFF (thumbnails) are passed over.
+    """
+    name = frame_name(path)
+    if len(name.encode()) > LONGEST_NAME:
+        reason = f"its name has {len(name.encode())} bytes; expected {LONGEST_NAME} at most: rename it"
+        yield Frame(name, path, None, reason)
+        return
+    try:
+        with _opened(path) as (image, content):
+            _refuse_size(image, size)
+            numbers, cut = _numbers(image, content)
+            names = [f"{name}_{place:06d}" for place in range(len(numbers) + cut)]
+            for number, each in zip(numbers, names if len(names) > 1 else [name], strict=False):
+                try:
+                    yield Frame(each, path, _grey(image, number, size, bits))
+                except EdgeError as error:
+                    yield Frame(each, path, None, str(error))
+            if cut:
+                yield Frame(names[-1], path, None, f"the file ends early; whole pictures: {len(numbers)}")
+    except EdgeError as error:
+        yield Frame(name, path, None, str(error))
+
+
+def frame_name(path: Path) -> str:
+    """The name of a file's frame: the file's, without its ending, in UTF-8."""
+    return printable(path.stem)
+
+
+def pictures(path: Path) -> int:
+    """How many pictures a file holds; none where it is not readable."""
+    try:
+        with _opened(path) as (image, content):
+            return len(_numbers(image, content)[0])
+    except EdgeError:
+        return 0
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, bytes]]:
+    """An image whose header is read, and its file's content; whatever Pillow finds wrong inside is an `EdgeError`."""
+    from PIL import Image
+
+    Image.MAX_IMAGE_PIXELS = None  # sizes are compared with the sensor's before pixels are decoded
+    with _refused():
+        if not path.is_file():
+            raise ValueError("it is not a regular file")
+        if path.stat().st_size > MOST_BYTES:
+            raise ValueError(f"it holds {path.stat().st_size} bytes; at most {MOST_BYTES} are read")
+        content = path.read_bytes()
+        with warnings.catch_warnings():  # where the list of its pictures is damaged, its first is taken for the only one
+            warnings.filterwarnings("error", "Image appears to be a malformed MPO")
+            opened = Image.open(io.BytesIO(content), formats=FORMATS)
+        with opened as image:
+            if image.format == "PNG":
+                with Image.open(io.BytesIO(content), formats=FORMATS) as twin:
+                    twin.verify()  # its checksums
+            yield image, content
+
+
+@contextmanager
+def _refused() -> Iterator[None]:
+    """Whatever Pillow raises of damaged files, which has no common base, as an `EdgeError`."""
+    try:
+        yield
+    except EdgeError:
+        raise
+    except Exception as error:
+        unknown = type(error).__name__ == "UnidentifiedImageError"
+        cause = "cannot identify image file" if unknown else getattr(error, "strerror", None) or in_one_line(error)
+        raise EdgeError(f"not readable as an image ({cause}); expected {EXPECTED}") from error
+
+
+def _numbers(image: Any, content: bytes) -> tuple[list[int], bool]:
+    """Numbers of the pictures, in order, and whether the file is cut behind the last, where Pillow takes it for whole.
+
+    What belongs to a picture is passed over: previews and masks of a TIFF, pictures of other sizes of an MPO.
+    """
+    if image.format != "TIFF":
+        cut = image.format == "GIF" and not content.rstrip(b"\0").endswith(b";")
+        numbers = list(_sought(image)) if cut else list(range(getattr(image, "n_frames", 1)))
+        if image.format == "MPO":
+            size = image.size
+            numbers = [number for number in numbers if not _is_preview(image, number, size)]
+        return numbers, cut
+    directories, cut = _directories(content)
+    whole = []
+    for number in range(max(directories, 1)):
+        image.seek(number)
+        if not image.tag_v2.get(KIND, 0) & REDUCED_OR_MASK and image.tag_v2.get(OLD_KIND) != OLD_REDUCED:
+            whole.append(number)
+    image.seek(0)
+    told = IMAGEJ.match(str(image.tag_v2.get(DESCRIPTION, "")))
+    if told and int(told[1]) > max(len(whole), 1) and not cut:  # of large files ImageJ leaves the pages out
+        raise EdgeError(f"holds {told[1]} pictures as ImageJ says there, but {len(whole)} pages; expected a page for each")
+    return whole or [0], cut
+
+
+def _is_preview(image: Any, number: int, size: tuple[int, int]) -> bool:
+    """Whether a picture of an MPO is of another size than the first; of one that is cut this is not known."""
+    with suppress(Exception):
+        image.seek(number)
+        return image.size != size
+    return False
+
+
+def _sought(image: Any) -> Iterator[int]:
+    """Numbers of the pictures that can be reached."""
+    with suppress(Exception):  # Pillow raises what it likes where a file is cut
+        for number in count():
+            image.seek(number)
+            yield number
+
+
+def _directories(tiff: bytes) -> tuple[int, bool]:
+    """How many whole directories, one for each picture, a TIFF has, and whether another should follow."""
+    order, big = "<" if tiff.startswith(b"II") else ">", b"+" in tiff[2:4]
+    (number, entry, place), at = ("Q", 20, "Q") if big else ("H", 12, "L"), 8 if big else 4
+    seen: set[int] = set()
+    try:
+        (offset,) = struct.unpack_from(order + place, tiff, at)
+        while offset and offset not in seen:
+            (entries,) = struct.unpack_from(order + number, tiff, offset)
+            (following,) = struct.unpack_from(order + place, tiff, offset + struct.calcsize(order + number) + entries * entry)
+            seen.add(offset)
+            offset = following
+    except struct.error:
+        return len(seen), True
+    return len(seen), False
+
+
+def _refuse_size(image: Any, size: tuple[int, int]) -> None:
+    if image.size != tuple(size):
+        came = f"the image is {image.width} x {image.height} px"
+        raise EdgeError(f"{came}, expected {size[0]} x {size[1]}: use images of this sensor's camera")
+
+
+def _grey(image: Any, number: int, size: tuple[int, int], bits: int | None) -> np.ndarray:
+    """One of the pictures of an opened image as grey values `[1, height, width]`."""
+    with _refused():
+        image.seek(number)
+        _refuse_size(image, size)
+        tags = image.tag_v2 if image.format == "TIFF" else {}
+        depth = max(tags.get(BITS, (8,)))
+        if SIGNED in tags.get(SAMPLE, ()) and depth <= 16:
+            raise EdgeError("its values have signs; expected whole numbers from 0 to white, or float in 0..1")
+        if image.mode in ("F", "I") or image.mode.startswith("I;16"):
+            return _grey_of_more_bits(image, tags, bits)
+        wide = "16" in _layout(image)
+        if (bits and wide) or (depth > 8 and not wide):
+            raise EdgeError("colour or alpha of more than 8 bits is not read as it is; expected grey of 16 bits, or 8 bits")
+        values = np.asarray(image.convert("L" if image.mode in ("1", "L", "LA", "La") else "RGB"))  # alpha is ignored
+        return grey(values[None])
+
+
+def _grey_of_more_bits(image: Any, tags: Mapping[int, Any], bits: int | None) -> np.ndarray:
+    """Grey values of whole numbers of more than 8 bits, or of float."""
+    if tuple(tags.get(BITS, ())) == (12,):
+        bits = 12
+    elif image.tile and image.tile[0][0] == "ppm":  # Pillow multiplies what a PGM says is white to 65535
+        bits = None
+    values = np.asarray(image)
+    low, high = values.min(), values.max()
+    if image.mode == "F" and not (low >= 0 and high <= 1):
+        raise EdgeError(f"float values from {low} to {high}; expected finite, in 0..1: divide by white")
+    if image.mode == "I":  # also grey of 16 bits, as Pillow before 10.3 opens it
+        if low < 0 or high > 65535:
+            raise EdgeError(f"32-bit values from {low} to {high}; 8 or 16 bits are read")
+        values = values.astype(np.uint16)
+    seen = grey(values[None], bits)
+    return 1 - seen if tags.get(PHOTOMETRIC) == WHITE_IS_ZERO else seen
+
+
+def _layout(image: Any) -> str:
+    """How Pillow unpacks a file's values, as "RGB;16B"."""
+    given = image.tile[0][3] if image.tile else ""
+    return str(given if isinstance(given, str) else given[0])

@@ -1,0 +1,84 @@
+"""The folder of a call's results: `NAME.npz` of each frame and, once, `mesh.npz`."""
+
+import io
+import os
+from collections.abc import Mapping
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import EdgeError, in_one_line, printable
+
+MESH = "mesh.npz"
+SETTINGS = ("estimator", "energy", "element", "format", "volume", "flow", "smoothing", "locator", "rest", "pressure",
+            "pressure_noise")  # fmt: skip
+"""Of the mesh: what all results of a folder share beside the sensor. Files written earlier lack some."""
+
+
+def refuse_file(out: Path) -> None:
+    """Refuse a folder for results that is a file."""
+    if out.exists() and not out.is_dir():
+        raise EdgeError(f"--out {printable(out)}: is a file; expected a folder, new or of earlier results of this sensor")
+
+
+def begin(out: Path, mesh: Mapping[str, Any]) -> None:
+    """Write `mesh.npz`, in a folder that is new or holds results of the same sensor and settings.
+
+    Raises:
+        EdgeError: it holds others, or cannot be written.
+    """
+    said = f"--out {printable(out)}"
+    refuse_file(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        others = any(out.glob("*.npz")) or (out / "frames").exists()
+    except OSError as error:
+        raise EdgeError(f"{said}: cannot be made ({error.strerror}); expected a folder: choose another") from error
+    if not (out / MESH).exists():
+        if others:
+            raise EdgeError(f"{said}: holds .npz files or frames/ but no {MESH}; choose another folder")
+    else:
+        there = _read(out / MESH)
+        if there["sensor"] != mesh["sensor"]:
+            other = f"{in_one_line(repr(there['name']))} ({in_one_line(there['sensor'])[:12]}, here {mesh['sensor'][:12]})"
+            raise EdgeError(f"{said}: holds results of another sensor, {other}; choose another folder")
+        for key in SETTINGS:
+            if key in there and key in mesh and there[key] != mesh[key]:
+                before = in_one_line(there[key])
+                raise EdgeError(f"{said}: was made with {key} {before}, the model has {mesh[key]}; choose another folder")
+    save(out / MESH, mesh)
+
+
+def save(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write a file, whole or not at all.
+
+    Raises:
+        EdgeError: it cannot be written.
+    """
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    partial = path.with_name(f".{blake2b(os.fsencode(path.name), digest_size=8).hexdigest()}-{os.getpid()}.partial")
+    try:
+        try:
+            partial.write_bytes(content.getbuffer())
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        cause = f"{printable(path)}: cannot be written ({error.strerror})"
+        raise EdgeError(f"{cause}; expected a folder with space that can be written: what is done so far is kept") from error
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The texts and numbers of an earlier `mesh.npz`."""
+    try:
+        with np.load(path) as file:
+            found = {key: file[key].item() for key in ("name", "sensor", *SETTINGS) if key in file.files}
+        if missing := [key for key in ("name", "sensor") if not isinstance(found.get(key), str)]:
+            raise ValueError(f"it has no {missing[0]}")
+    except Exception as error:  # numpy and zipfile raise what they like of damaged files
+        cause = f"{printable(path)}: not a {MESH} of torchmembrane ({in_one_line(error)})"
+        raise EdgeError(f"{cause}; expected the {MESH} that is written beside results: choose another folder") from error
+    return found
