@@ -1,6 +1,7 @@
 """What a call names - files, globs, folders - as image files, videos and bags, in the order of the call."""
 
 import glob
+import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -53,7 +54,7 @@ def frame_name(path: Path) -> str:
         >>> frame_name(Path("day/caf\udce9.png"))
         'caf\\xe9'
     """
-    return printable(path.parent.name if path.name == METADATA else path.stem)
+    return printable(Path(os.path.abspath(path.parent)).name if path.name == METADATA else path.stem)
 
 
 def picture_name(path: Path, number: int) -> str:
@@ -111,7 +112,7 @@ def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
         files = (p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
         found = metadata_of(path) or sorted(files, key=in_order)
         if not found:
-            raise MembraneError(f"{path}: the folder holds no files {' '.join(suffixes)}; expected one or more")
+            raise MembraneError(f"{path}: the folder holds no files {' '.join(suffixes)}; {_remedy(path)}")
         return found
     if path.exists():
         return [path]
@@ -119,3 +120,10 @@ def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
     if not any(p.is_file() for p in found):
         raise MembraneError(f"{argument}: no such file, no pattern that matches one; expected images, globs, folders")
     return [p for p in found if p.is_file()]
+
+
+def _remedy(folder: Path) -> str:
+    """What to give in place of a folder that holds no images."""
+    if any(path.suffix.lower() in BAGS for path in folder.iterdir()):
+        return f"a bag's folder has a {METADATA}: `ros2 bag reindex {folder.name}` makes it, or give the files of the bag"
+    return "expected one or more"
