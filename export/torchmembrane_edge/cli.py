@@ -26,7 +26,8 @@ def main(argv=None) -> int:
             raise EdgeError("nothing to do; expected IMAGES and --out DIR, or --camera NUMBER")
         if arguments.batch < 1:
             raise EdgeError(f"--batch {arguments.batch}; expected at least 1")
-        return reconstruct(session, in_order(arguments.images), arguments.out, 1 if session.tracks else arguments.batch)
+        images = in_order(without_system_files(arguments.images))
+        return reconstruct(session, images, arguments.out, 1 if session.tracks else arguments.batch)
     except (EdgeError, OSError) as error:
         print(f"torchmembrane-edge: error: {error}", file=sys.stderr)
         return 2
@@ -43,6 +44,12 @@ def in_order(paths: list) -> list:
         return [(len(digits[k]), digits[k]) if k % 2 else (-1, part) for k, part in enumerate(parts)], str(path)
 
     return sorted(paths, key=numbered) if paths == sorted(paths) else paths
+
+
+def without_system_files(paths: list) -> list:
+    """The paths without files that macOS and Windows leave in folders, which a shell's pattern may give too."""
+    names = re.compile(r"\._.*|\.DS_Store|(eh)?thumbs\.db|desktop\.ini|icon\r", re.IGNORECASE)
+    return [path for path in paths if not names.fullmatch(path.name)] or paths
 
 
 def reconstruct(session: Session, paths: list, out: Path, batch: int) -> int:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from ..errors import MembraneError
 from ..files.order import in_order
 from ..files.provenance import printable
+from ..files.system_files import is_hidden, is_of_system
 from ..integrations.rosbag import BAGS, METADATA, is_bag, metadata_of
 from ..results.store import MESH
 
@@ -72,7 +73,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
 
     Args:
         arguments: paths of files, folders (their images in name order, or the bag that it is) and glob patterns. Numbers in
-            names count as numbers: 2 before 10.
+            names count as numbers: 2 before 10. Hidden files, and those that systems leave in folders, are passed over.
         video: take every file for a video.
         topic: of the bags' images.
 
@@ -88,6 +89,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
         ['flat_plate.png', 'press_on_axis.png', 'two_contacts.png']
     """
     paths = [path for argument in arguments for path in _expanded(str(argument), VIDEOS if video else IMAGES)]
+    paths = [path for path in paths if not is_of_system(path)] or paths  # a shell's pattern may give them
     if paths == sorted(paths):  # as a shell expands a pattern
         paths.sort(key=in_order)
     is_video = {path: video or path.suffix.lower() in VIDEOS or is_bag(path) for path in paths}
@@ -109,17 +111,18 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
 def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
     path = Path(argument)
     if path.is_dir():
-        files = (p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
+        files = (p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not is_hidden(p))
         found = metadata_of(path) or sorted(files, key=in_order)
         if not found:
             raise MembraneError(f"{path}: the folder holds no files {' '.join(suffixes)}; {_remedy(path)}")
         return found
     if path.exists():
         return [path]
-    found = [Path(match) for match in sorted(glob.glob(argument, recursive=True), key=in_order)]
-    if not any(p.is_file() for p in found):
+    matches = map(Path, sorted(glob.glob(argument, recursive=True), key=in_order))
+    found = [path for path in matches if path.is_file() and not is_of_system(path)]
+    if not found:
         raise MembraneError(f"{argument}: no such file, no pattern that matches one; expected images, globs, folders")
-    return [p for p in found if p.is_file()]
+    return found
 
 
 def _remedy(folder: Path) -> str:
