@@ -70,6 +70,24 @@ def test_the_state_of_another_grid_or_sensor_is_refused_in_words(sensor, reconst
         reconstructor.load_state_dict(moved)
 
 
+def test_the_state_of_another_modulus_is_refused_and_of_another_prestretch_or_camera_is_said(sensor, reconstructor, recwarn):
+    state = reconstructor.state_dict()
+    stiffer = replace(sensor, material=replace(sensor.material, shear_modulus=2 * sensor.material.shear_modulus))
+    with pytest.raises(tm.MembraneError, match="of another shear modulus or thickness than this sensor's"):
+        tm.Reconstructor(stiffer).load_state_dict(state)
+    with pytest.raises(tm.MembraneError, match="of another shear modulus"):  # as a part of a model
+        nn.ModuleDict({"eye": tm.Reconstructor(stiffer)}).load_state_dict({f"eye.{key}": each for key, each in state.items()})
+    tm.Reconstructor(sensor).load_state_dict(state)
+    assert not recwarn
+    fresh = tm.Reconstructor(sensor)
+    fresh.estimator.set_prestretch(torch.tensor(1.31))
+    fresh.camera.centre += 1.0
+    with pytest.warns(
+        UserWarning, match=r"camera.centre, .*prestretch differ from this sensor's; the state's are used from now"
+    ):
+        tm.Reconstructor(sensor).load_state_dict(fresh.state_dict())
+
+
 def test_a_part_of_a_larger_model_keeps_its_parameters_and_a_small_state(reconstructor):
     model = nn.ModuleDict({"eye": reconstructor, "head": nn.Linear(6, 1)})
     names = set(model.state_dict())

@@ -37,7 +37,13 @@ class FakeNode:
         return SimpleNamespace(publish=self.published[topic].append)
 
     def create_subscription(self, kind, topic, callback, quality):
-        self.callback, self.kind = callback, kind
+        if topic == "image":
+            self.callback, self.kind = callback, kind
+        else:
+            self.info_topic, self.info_callback = topic, callback
+
+    def resolve_topic_name(self, topic):
+        return f"/finger/{topic}"
 
     def create_service(self, kind, name, callback):
         self.service = callback
@@ -49,7 +55,7 @@ class FakeNode:
 @pytest.fixture
 def node_of(monkeypatch):
     """The node of a sensor file."""
-    types = "Vector3 Wrench WrenchStamped CompressedImage FluidPressure Image PointCloud2 PointField".split()
+    types = "Vector3 Wrench WrenchStamped CameraInfo CompressedImage FluidPressure Image PointCloud2 PointField".split()
     messages = dict.fromkeys(types, Message)
     modules = {"rclpy": {}, "rclpy.node": {"Node": FakeNode}, "std_srvs": {}, "std_srvs.srv": {"Trigger": MagicMock()}}
     modules |= {"geometry_msgs": {}, "geometry_msgs.msg": messages, "sensor_msgs": {}, "sensor_msgs.msg": messages}
@@ -129,3 +135,43 @@ def test_rezero_takes_the_latest_image(node, small_images):
     node.callback(message(levels))
     wrench = node.published["wrench"][-1].wrench
     assert max(abs(getattr(wrench.force, axis)) for axis in "xyz") < 0.01
+
+
+@pytest.mark.parametrize("binning", [0, 1, 2, 3])
+def test_the_first_camera_info_is_compared_as_its_binning_says(node, small_sensor, binning):
+    camera, b = tm.Sensor.from_file(small_sensor / "sensor.toml").camera, max(binning, 1)
+    (width, height), (f, g), (u, v) = camera.image_size, camera.focal.tolist(), camera.centre.tolist()
+    chip = {"width": b * width, "height": b * height, "distortion_model": "plumb_bob", "d": []}
+    k = [b * f, 0, b * u + (b - 1) / 2, 0, b * g, b * v + (b - 1) / 2, 0, 0, 1]
+    roi = Message(x_offset=0, y_offset=0, width=0, height=0, do_rectify=False)
+    info = Message(**chip, k=k, binning_x=binning, binning_y=binning, roi=roi)
+    assert node.info_topic == "/finger/camera_info"
+    node.info_callback(info)
+    assert node.warnings == []
+    node.compared, info.k = False, [*k[:2], k[2] + 3 * b, *k[3:]]
+    for _ in range(2):
+        node.info_callback(info)
+    (said,) = node.warnings
+    assert "3.0 px off" in said
+
+
+def test_a_camera_info_of_another_size_is_logged(node):
+    roi = Message(x_offset=0, y_offset=0, width=0, height=0, do_rectify=False)
+    info = Message(width=640, height=480, distortion_model="plumb_bob", d=[], k=[0.0] * 9, binning_x=1, binning_y=1, roi=roi)
+    node.info_callback(info)
+    assert "CameraInfo is of 640 x 480 px images, the sensor file of 160 x 120" in node.warnings[0]
+
+
+@pytest.mark.parametrize("encoding", ["yuv422_yuy2", "yuv422", "nv12"])
+def test_images_of_usb_cameras_are_followed(node, small_sensor, small_images, encoding):
+    levels = np.asarray(Image.open(small_images[2]))
+    grey = np.full_like(levels, 128)
+    packed = {"yuv422_yuy2": np.stack([levels, grey], -1), "yuv422": np.stack([grey, levels], -1)}
+    content = packed.get(encoding, np.concatenate([levels, grey[: len(grey) // 2]]))
+    sent = message(levels)
+    sent.encoding, sent.data = encoding, content.tobytes()
+    sent.step = levels.shape[1] * (2 if encoding in packed else 1)
+    node.callback(sent)
+    node.callback(message(levels))
+    first, second = (each.wrench.force.z for each in node.published["wrench"])
+    assert first == pytest.approx(second, abs=1e-4) and node.warnings == []

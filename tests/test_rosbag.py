@@ -52,13 +52,14 @@ def compressed(number, levels):
     return kind, TYPES[kind](header(number), "png", np.frombuffer(content.getvalue(), np.uint8))
 
 
-def camera_info(camera, focal=None, centre=None, distortion=None, lens=None):
+def camera_info(camera, focal=None, centre=None, distortion=None, lens=None, region=(0, 0, 0, 0), binning=0):
     kind, names = "sensor_msgs/msg/CameraInfo", {"pinhole": "plumb_bob", "fisheye": "equidistant"}
     (f, g), (u, v), (width, height) = focal or camera.focal, centre or camera.centre, camera.image_size
     k = np.array([f, 0, u, 0, g, v, 0, 0, 1], float)
-    region = TYPES["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    left, top, columns, rows = region
+    roi = TYPES["sensor_msgs/msg/RegionOfInterest"](left, top, rows, columns, False)
     d = np.asarray(camera.distortion if distortion is None else distortion, float)
-    rest = d, k, np.eye(3).ravel(), np.zeros(12), 0, 0, region
+    rest = d, k, np.eye(3).ravel(), np.zeros(12), binning, binning, roi
     return kind, TYPES[kind](header(0), height, width, lens or names[camera.model], *rest)
 
 
@@ -224,7 +225,7 @@ def test_channels_and_byte_order_are_obeyed():
 @pytest.mark.parametrize(
     "change, said",
     [
-        ({"encoding": "bayer_rggb8"}, "encoding 'bayer_rggb8'; expected one of mono8"),
+        ({"encoding": "32FC1"}, "encoding '32FC1'; expected one of mono8"),
         ({"width": 11}, "11 x 6 px, the sensor's 10 x 6"),
         ({"data": np.zeros(5, np.uint8)}, "5 bytes in lines of 18; expected 6 of 10"),
         ({"step": 9}, "in lines of 9"),
@@ -302,6 +303,65 @@ def test_a_camera_info_is_beside_the_topic_of_compressed_images_too(tmp_path, sm
     ]
     bag = write_bag(tmp_path / "run", StoragePlugin.MCAP, messages) / "metadata.yaml"
     assert "px off" in camera_remark(bag, f"{TOPIC}/compressed", camera)
+
+
+def widened(camera, factor, margin):
+    """The camera whose images, cropped by a margin and binned by a factor, are this one's."""
+    (width, height), (f, g), (u, v) = camera.image_size, camera.focal.tolist(), camera.centre.tolist()
+    size = width * factor + 2 * margin, height * factor + 2 * margin
+    centre = tuple(factor * c + (factor - 1) / 2 + margin for c in (u, v))
+    return Camera(camera.model, size, (factor * f, factor * g), centre, camera.distortion.tolist())
+
+
+@pytest.mark.parametrize("factor, margin", [(2, 0), (1, 40), (2, 30)])
+def test_a_bag_of_a_mode_s_images_is_read_with_the_camera_info_of_the_whole_chip(
+    tmp_path, gas_sensor, pictures, factor, margin, capsys
+):
+    camera = Sensor.from_file(gas_sensor).camera
+    chip, (width, height) = widened(camera, factor, margin), camera.image_size
+    region = (margin, margin, factor * width, factor * height) if margin else (0, 0, 0, 0)
+    info = camera_info(chip, region=region, binning=factor)
+    run = write_bag(
+        tmp_path / "run", StoragePlugin.MCAP, [("/finger/camera_info", info), (TOPIC, raw(0, pictures[0], "mono8"))]
+    )
+    assert main(["reconstruct", str(gas_sensor), str(run), "--out", str(tmp_path / "out")]) == 0
+    assert "CameraInfo" not in capsys.readouterr().err
+
+
+def test_where_images_are_of_the_file_s_size_a_camera_info_of_another_is_said(tmp_path, small_sensor, pictures):
+    camera = Sensor.from_file(small_sensor / "sensor.toml").camera
+    info = "/finger/camera_info", camera_info(camera, binning=2)  # by drivers whose sizes are those of the mode already
+    for form in (raw, lambda k, levels, _: compressed(k, levels)):
+        bag = write_bag(tmp_path / form.__name__, StoragePlugin.MCAP, [info, (TOPIC, form(0, pictures[0], "mono8"))])
+        remark = camera_remark(bag / "metadata.yaml", TOPIC, camera)
+        assert "CameraInfo is of 80 x 60 px images" in remark and "CameraInfo is not compared" in remark
+    bag = write_bag(tmp_path / "small", StoragePlugin.MCAP, [info, (TOPIC, raw(0, pictures[0][::2, ::2], "mono8"))])
+    with pytest.raises(MembraneError, match="metadata.yaml, /finger/camera_info: CameraInfo is of 80 x 60 px images"):
+        camera_remark(bag / "metadata.yaml", TOPIC, camera)
+
+
+def test_a_frame_that_is_refused_stops_no_other(tmp_path, gas_sensor, pictures, capsys):
+    """One of each: an encoding without a grey value, data that are too short, a damaged file."""
+    odd = raw(1, pictures[0], "mono8")[1]
+    short, spoiled = raw(2, pictures[0], "mono8")[1], compressed(3, pictures[0])[1]
+    odd.encoding, short.data, spoiled.data = "32FC1", short.data[:100], spoiled.data[:300]
+    kinds = [raw(0, pictures[0], "mono8"), (odd.__msgtype__, odd), (short.__msgtype__, short), raw(3, pictures[2], "mono8")]
+    run = write_bag(tmp_path / "run", StoragePlugin.MCAP, [(TOPIC, each) for each in kinds])
+    packed = write_bag(
+        tmp_path / "packed", StoragePlugin.MCAP, [(TOPIC, (spoiled.__msgtype__, spoiled)), (TOPIC, compressed(1, pictures[0]))]
+    )
+    assert main(["reconstruct", str(gas_sensor), str(run), str(packed), "--out", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr()
+    assert "3 reconstructed, 3 failed" in said.out
+    for text in ("run_000001: image of encoding '32FC1'", "run_000002: the image has 100 bytes", "packed_000000: "):
+        assert text in said.err
+
+
+def test_a_bag_in_the_working_folder_names_its_frames_by_that_folder(tmp_path, gas_sensor, pictures, monkeypatch):
+    run = write_bag(tmp_path / "run", StoragePlugin.MCAP, [(TOPIC, raw(0, pictures[0], "mono8"))])
+    monkeypatch.chdir(run)
+    assert main(["reconstruct", str(gas_sensor), ".", "--out", str(tmp_path / "out")]) == 0
+    assert read_results(tmp_path / "out").names == ["run_000000"]
 
 
 def test_what_cannot_be_is_refused_in_one_line(tmp_path, gas_sensor, small_images, pictures, capsys):

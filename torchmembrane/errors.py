@@ -1,4 +1,21 @@
-"""The one exception family of torchmembrane, and the check that raises it."""
+"""The one exception family of torchmembrane, and the checks that raise it."""
+
+import functools
+import inspect
+import os
+import reprlib
+import typing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, TypeVar
+
+Checked = TypeVar("Checked", bound=Callable[..., Any])
+WORDS: dict[Any, str] = {
+    **{float: "a number", int: "a whole number", bool: "True or False", str: "text", Path: "a path", NoneType: "None"},
+    **{"Tensor": "a tensor or an array of numbers", "ndarray": "an array of numbers", "dtype": "a torch.dtype"},
+}
+"""What messages call a type, by itself or by its name."""
 
 
 class MembraneError(ValueError):
@@ -34,3 +51,151 @@ def expect(right: bool, name: str, value: object, expected: str) -> None:
     """
     if not right:
         raise MembraneError(f"{name} is {value!r}; expected {expected}")
+
+
+def check_arguments(target: Checked) -> Checked:
+    """A public function, or a class that is made, whose arguments are compared with their annotations before they are used.
+
+    A number is whatever Python takes for one; a list any sequence; an array whatever numpy makes an array of numbers of. An
+    argument that is missing, or has another name, is Python's own error.
+
+    Args:
+        target: the function or class.
+
+    Returns:
+        The function, which raises `MembraneError` for an argument of another type; the same class.
+
+    Example:
+        >>> @check_arguments
+        ... def scaled(values: list[float], factor: float = 1.0) -> list[float]:
+        ...     return [factor * value for value in values]
+        >>> scaled([1, 2.5], 2)
+        [2, 5.0]
+        >>> scaled([1, "b"])
+        Traceback (most recent call last):
+        ...
+        torchmembrane.errors.MembraneError: scaled: values is [1, 'b']; expected a list of numbers
+    """
+    if isinstance(target, type):
+        target.__init__ = check_arguments(target.__init__)  # type: ignore[misc]
+        return target
+    signature, title = inspect.signature(target), target.__qualname__.removesuffix(".__init__")
+
+    @functools.cache
+    def hints() -> dict[str, Any]:
+        try:
+            return typing.get_type_hints(target)
+        except NameError:  # of what is imported for types only
+            return {name: hint for name, hint in target.__annotations__.items() if not isinstance(hint, str)}
+
+    @functools.wraps(target)
+    def called(*arguments: Any, **options: Any) -> Any:
+        for name, value in _given(signature, arguments, options):
+            if name in hints() and not _fits(value, hints()[name]):
+                raise MembraneError(f"{title}: {name} is {_shown(value)}; expected {_in_words(hints()[name])}")
+        return target(*arguments, **options)
+
+    return typing.cast(Checked, called)
+
+
+def _given(signature: inspect.Signature, arguments: tuple[Any, ...], options: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Names and values of the arguments of a call, but for those that are the default; none where Python refuses the call."""
+    try:
+        bound = signature.bind(*arguments, **options).arguments
+    except TypeError:
+        return
+    for name, value in bound.items():
+        parameter = signature.parameters[name]
+        if parameter.kind is parameter.VAR_POSITIONAL:
+            yield from ((name, each) for each in value)
+        elif parameter.kind is not parameter.VAR_KEYWORD and value is not parameter.default:
+            yield name, value
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of an annotation's type, or can be taken for it."""
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return True
+    if origin in (typing.Union, UnionType):
+        return any(_fits(value, each) for each in inner)
+    if origin is type:
+        return isinstance(value, type)
+    if origin is tuple and Ellipsis not in inner:
+        return _is_list(value) and len(value) == len(inner) and all(map(_fits, value, inner))
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return isinstance(value, Mapping)
+    if isinstance(origin, type) and issubclass(origin, Iterable):
+        return _is_list(value) and all(_fits(each, inner[0]) for each in value)
+    if origin is typing.Literal:
+        return any(value is each or (type(value) is type(each) and value == each) for each in inner)
+    if origin is not None or not isinstance(hint, type) or getattr(hint, "_is_protocol", False):
+        return callable(value) or origin is not Callable
+    return _is_plain(value, hint)
+
+
+def _is_plain(value: Any, kind: type) -> bool:
+    if kind is float:
+        return is_number(value)
+    if kind is int:
+        return is_number(value) and float(value).is_integer()
+    if kind is bool:
+        return type(value).__name__ == "bool"  # numpy's too
+    if kind is Path:
+        return isinstance(value, os.PathLike)
+    if kind.__name__ in ("ndarray", "Tensor"):
+        return is_array(value)
+    return isinstance(value, kind)
+
+
+def _is_list(value: Any) -> bool:
+    is_sized = isinstance(value, Iterable) and hasattr(value, "__len__") and getattr(value, "shape", None) != ()
+    return is_sized and not isinstance(value, str | bytes | Mapping)
+
+
+def is_number(value: Any) -> bool:
+    """Whether Python takes a value for a real number, as it does an array or a tensor without axes."""
+    if getattr(value, "shape", None) not in (None, ()) or isinstance(value, str | bytes):
+        return False
+    try:
+        float(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return False
+    return True
+
+
+def is_array(value: Any) -> bool:
+    """Whether a value is a tensor of real numbers, or numpy makes an array of real numbers of it."""
+    import numpy as np
+
+    if hasattr(value, "is_complex"):
+        return not value.is_complex()
+    try:
+        return np.asarray(value).dtype.kind in "biuf"
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return False
+
+
+def _shown(value: Any) -> str:
+    """A value, short and in one line: arrays by their shape, objects by their type."""
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{type(value).__name__} {list(value.shape)} of {value.dtype}"
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes | list | tuple | dict):
+        return " ".join(reprlib.repr(value).split())
+    return f"a {type(value).__name__}"
+
+
+def _in_words(hint: Any) -> str:
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, UnionType):
+        return " or ".join(dict.fromkeys(map(_in_words, inner)))
+    if origin is typing.Literal:
+        return " or ".join(map(repr, inner))
+    if origin is tuple and Ellipsis not in inner:
+        return f"{len(inner)} values, {', '.join(map(_in_words, inner))}"
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return "a dict"
+    if isinstance(origin, type) and issubclass(origin, Iterable):
+        return f"a list of {_in_words(inner[0]).removeprefix('a ').removeprefix('an ')}s"
+    name = getattr(hint, "__name__", str(hint))
+    return WORDS.get(hint) or WORDS.get(name) or f"a {name}"

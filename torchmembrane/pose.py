@@ -1,11 +1,11 @@
 """Where one frame is in another: points, vectors and wrenches from the camera's frame to a tool's."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from .errors import expect
+from .errors import MembraneError, check_arguments, expect, is_array
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -15,6 +15,7 @@ Values = TypeVar("Values", "Tensor", np.ndarray)
 ORTHOGONAL = 1e-3  # largest entry of R^T R - 1: rotations are written with three decimals or more
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Pose:
     """The pose of a frame in another one, from the first to the other: `p_other = rotation p + translation`.
@@ -73,6 +74,7 @@ class Pose:
         Returns:
             `[..., 3]`.
         """
+        points = _checked("Pose.points", points, 3)
         moved: Values = self.vectors(points) + _like(points, self.translation)
         return moved
 
@@ -85,6 +87,7 @@ class Pose:
         Returns:
             `[..., 3]`.
         """
+        vectors = _checked("Pose.vectors", vectors, 3)
         turned: Values = vectors @ _like(vectors, self.rotation.T)
         return turned
 
@@ -97,11 +100,24 @@ class Pose:
         Returns:
             `[..., 6]`.
         """
+        wrench = _checked("Pose.wrench", wrench, 6)
         x, y, z = self.translation
         lever = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ self.rotation
         adjoint = np.block([[self.rotation, np.zeros((3, 3))], [lever, self.rotation]])
         moved: Values = wrench @ _like(wrench, adjoint.T)
         return moved
+
+
+def _checked(name: str, values: Any, count: int) -> Any:
+    """Values `[..., count]` as a tensor or an array of floating point."""
+    if not is_array(values):
+        raise MembraneError(f"{name}: a {type(values).__name__}; expected a tensor or an array [..., {count}]")
+    given = values if hasattr(values, "new_tensor") else np.asarray(values)
+    if given.shape[-1:] != (count,):
+        raise MembraneError(f"{name}: {list(given.shape)}; expected [..., {count}]")
+    if isinstance(given, np.ndarray):
+        return given if given.dtype.kind == "f" else given.astype(float)
+    return given if given.is_floating_point() else given.double()
 
 
 def _like(values: Values, constant: np.ndarray) -> Values:

@@ -10,13 +10,14 @@ from torch import Tensor, nn
 
 from .camera.motion import in_pixels, in_words, shift_of
 from .control_flow import in_inference_mode, traced
-from .errors import MembraneError
+from .errors import MembraneError, check_arguments, expect
 from .estimators.base import Equilibrium, Estimator, Observation, Problem, StandardDeviations
 from .estimators.contacts import Contacts
 from .estimators.precision import PRECISIONS, check_precision, full_precision
 from .estimators.registry import built_estimator, estimator_kind
 from .files.grayscale import CHANNELS, Channels, grey_batch
 from .files.images import read_image
+from .files.tensors import tensor_of
 from .markers.coverage import LEAST_COVERAGE, Coverage, facings
 from .markers.observer import FOUND, MarkerFlow, MarkerObserver
 from .markers.placement import imaged_vertices, place_markers
@@ -65,6 +66,7 @@ class Reconstructor(nn.Module):
     rest_markers: Tensor
     marker_shares: Tensor
 
+    @check_arguments
     def __init__(
         self,
         sensor: Sensor,
@@ -104,7 +106,7 @@ class Reconstructor(nn.Module):
             positions=positions,
             rest_pixels=model_pixels,
             vertex_pixels=vertex_pixels,
-            rest_covariance=2 * self.observer.rest_covariance.double() + LEAST_ERROR**2 * torch.eye(2),
+            rest_covariance=2 * self.observer.rest_covariance.double() + LEAST_ERROR**2 * torch.eye(2).double(),
         )
         self.register_buffer("vertex_pixels", vertex_pixels)
         self.register_buffer("rest_markers", positions)
@@ -122,6 +124,7 @@ class Reconstructor(nn.Module):
             self.observer.locator.be_exact()
 
     @classmethod
+    @check_arguments
     def from_file(cls, path: str | Path, estimator: str | type[Estimator] = "force-balance", **options: Any) -> "Reconstructor":
         """The reconstructor of a sensor file; options as for the class."""
         sensor = Sensor.from_file(path)
@@ -145,8 +148,10 @@ class Reconstructor(nn.Module):
         """Whether tractions and standard deviations are found."""
         return self.estimator.finds_tractions
 
+    @check_arguments
     def read(self, *paths: str | Path) -> Tensor:
-        """Image files as a batch `[B, 1, height, width]` in 0..1, in this module's precision and on its device."""
+        """Image files, one or more, as a batch `[B, 1, height, width]` in 0..1, of this module's precision and device."""
+        expect(len(paths) > 0, "Reconstructor.read: paths", list(paths), "one image file or more")
         images = [read_image(path, self.image_size, self.camera.bits) for path in paths]
         return torch.cat([grey_batch(image, self.image_size, "rgb", self.rest_pixels) for image in images])
 
@@ -177,7 +182,9 @@ class Reconstructor(nn.Module):
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
             grey = self.grey(images)
-            return self.reconstruct_grey(grey, self._before(previous, len(grey)), rest_pixels, pressure)
+            before = None if previous is None else self.observer.before(previous, len(grey))
+            rest = None if rest_pixels is None else self.observer.rest_given(rest_pixels)
+            return self.reconstruct_grey(grey, before, rest, pressure)
 
     def grey(self, images: Tensor | np.ndarray) -> Tensor:
         """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
@@ -297,7 +304,7 @@ class Reconstructor(nn.Module):
 
     def _gauged(self, observation: Observation, pressure: Tensor | float | None) -> Observation:
         """The observation with what a gauge reads, if one does."""
-        return observation if pressure is None else self.estimator.gauged(observation, pressure)
+        return observation if pressure is None else self.estimator.gauged(observation, tensor_of("pressure", pressure))
 
     def standard_deviations(self, result: Reconstruction, pressure: Tensor | float | None = None) -> StandardDeviations:
         """Of vertices, total force and pressure of `result`, caused by the locator's noise, and by that of a gauge where its
@@ -306,6 +313,8 @@ class Reconstructor(nn.Module):
         Raises:
             MembraneError: the estimator knows none.
         """
+        if not isinstance(result, Reconstruction):
+            raise MembraneError(f"standard_deviations: result is a {type(result).__name__}; expected a tm.Reconstruction")
         pixels = torch.where(result.pixels.isfinite(), result.pixels, self.rest_pixels)
         origins, directions = self.camera.pixel_to_ray(pixels)
         distance = torch.linalg.vector_norm(result.markers - origins, dim=-1)[..., None, None]
@@ -319,17 +328,6 @@ class Reconstructor(nn.Module):
         moved = in_pixels(result.camera_motion, self.image_size).nan_to_num()
         found = self.estimator.standard_deviations(vertices, pressure, moved, observation, noise)
         return found.known(result.vertices.flatten(1).isfinite().all(1))
-
-    def _before(self, previous: Reconstruction | None, frames: int) -> Tensor | None:
-        """Pixels `[B, D, 2]` of a previous result, refused where it cannot be one of these frames'."""
-        if previous is None:
-            return None
-        given, expected = list(previous.pixels.shape), [frames, *self.rest_pixels.shape]
-        if given != expected:
-            raise MembraneError(
-                f"Reconstructor: previous has pixels {given}; expected {expected}: an earlier result for each image"
-            )
-        return previous.pixels.to(self.rest_pixels)
 
 
 def broken_down(status: Tensor, vertices: Tensor) -> Tensor | None:

@@ -1,5 +1,6 @@
 """What a `state_dict` keeps: the camera, the material and what follows from it; all else is rebuilt from the sensor."""
 
+import warnings
 from typing import Any
 
 import torch
@@ -9,6 +10,8 @@ from .camera.model import Camera
 from .errors import MembraneError
 
 OF_MATERIAL = ("prestretch", "c1", "c2", "rest_pressure", "rest_load")
+STIFFNESS, FOLLOWING = ("c1", "c2"), ("rest_pressure", "rest_load")
+"""Of these: what another sensor's has otherwise, which is refused; what follows from the others."""
 IDENTITY = "rest_markers"
 """The markers' rest positions `[D, 3]`: those of another sensor are refused."""
 ALIKE = 1e-4  # largest distance of rest markers of one sensor, over their extent
@@ -17,10 +20,11 @@ ALIKE = 1e-4  # largest distance of rest markers of one sensor, over their exten
 def keep_small(module: nn.Module) -> None:
     """Leave constants that are rebuilt from the sensor out of a module's state; parameters that were added stay.
 
-    States that hold all constants can still be loaded: those are checked for their shapes and left out.
+    States that hold all constants can still be loaded: those are checked for their shapes and left out. A state with another
+    prestretch or camera, which may have been learned, is loaded with a warning.
 
     Raises:
-        MembraneError: later, when a state is loaded that is another sensor's, or another grid's.
+        MembraneError: later, when a state is loaded that is another sensor's, another material's or another grid's.
     """
     module.register_state_dict_post_hook(_leave_out)
     module.register_load_state_dict_pre_hook(_complete)
@@ -46,7 +50,7 @@ def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) ->
 
 def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
     """Check a state and put the constants in that it lacks, so that those are as they are."""
-    kept = _kept(module)
+    kept, others = _kept(module), []
     first = {id(buffer): name for name, buffer in reversed(list(module.named_buffers()))}
     for name, buffer in module.named_buffers(remove_duplicate=False):
         given = state.get(prefix + name)
@@ -57,10 +61,28 @@ def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) ->
             )
         if name == IDENTITY and given is not None:
             _check_identity(given, buffer)
+        elif given is not None and name in kept and not torch.allclose(given.to(buffer), buffer, rtol=ALIKE, atol=ALIKE**2):
+            others.append(name)
         if first[id(buffer)] not in kept:
             state[prefix + name] = buffer
         elif name not in kept and prefix + first[id(buffer)] in state:
             state[prefix + name] = state[prefix + first[id(buffer)]]
+    _check_others(others)
+
+
+def _check_others(names: list[str]) -> None:
+    """Refuse another stiffness, and warn of another prestretch or camera; names of the buffers that differ."""
+    last = [name.rpartition(".")[2] for name in names]
+    if any(name in STIFFNESS for name in last):
+        raise MembraneError(
+            "Reconstructor.load_state_dict: the state is of another shear modulus or thickness than this sensor's; expected "
+            "the state of this sensor: build the Reconstructor from that sensor's file"
+        )
+    if said := [name for name, end in zip(names, last, strict=True) if end not in FOLLOWING]:
+        warnings.warn(
+            f"Reconstructor.load_state_dict: {', '.join(said)} differ from this sensor's; the state's are used from now on",
+            stacklevel=2,
+        )
 
 
 def _check_identity(given: Tensor, own: Tensor) -> None:

@@ -1,13 +1,14 @@
 """One stream of images: dots are followed from frame to frame, and a rest state that has aged is noticed."""
 
 import warnings
+from math import isfinite
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .camera.motion import in_pixels, shift_of
-from .errors import MembraneError
+from .errors import MembraneError, expect, is_number
 from .markers.drift import ENOUGH, DriftWatch
 from .reconstruct import Reconstructor
 from .results.reconstruction import Reconstruction
@@ -57,6 +58,8 @@ class Tracker:
     """
 
     def __init__(self, reconstructor: Reconstructor):
+        if not hasattr(reconstructor, "observer"):
+            raise MembraneError(f"Tracker: reconstructor is a {type(reconstructor).__name__}; expected a tm.Reconstructor")
         self.reconstructor = reconstructor
         self.time: float | None = None
         self._before: Reconstruction | None = None
@@ -74,18 +77,20 @@ class Tracker:
             time: when the frame was taken, seconds of any clock; kept in `time`, later than that of the frame before.
 
         Raises:
-            MembraneError: more than one frame, another size, shape or type; a time not after that of the frame before.
+            MembraneError: more than one frame, another size, shape or type; a time that is no finite number, or not after that
+                of the frame before.
         """
         images = self._one(frame)
+        expected = "seconds of any clock, a finite number"
+        expect(time is None or (is_number(time) and isfinite(time)), "Tracker: time", time, expected)
         if time is not None and self.time is not None and not time > self.time:
             raise MembraneError(
                 f"Tracker: a frame of time {time} after one of {self.time}; expected frames in order: call reset() where "
                 "another recording begins"
             )
-        self.time = time
         with torch.no_grad():
             result: Reconstruction = self.reconstructor(images, self._before, self._rest_pixels, pressure)
-        self._latest, self._latest_result = images, result
+        self.time, self._latest, self._latest_result = time, images, result
         self._before = result if Status(int(result.status[0])).has_surface else None
         if int(result.status[0]) in (Status.OK, Status.UNEXPLAINED):  # a camera that moved may leave it unexplained
             self._look_for_drift(result)
@@ -169,7 +174,8 @@ class Tracker:
     def _one(self, frame: Tensor | np.ndarray) -> Tensor:
         images = self.reconstructor.grey(frame)
         if len(images) != 1:
-            raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
+            colours = "; a colour image [3, H, W] is given as frame[None]" if len(images) == 3 else ""
+            raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream{colours}")
         return images
 
 

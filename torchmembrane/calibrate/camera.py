@@ -10,7 +10,7 @@ from torch.func import functional_call, jacfwd, vmap
 
 from ..camera.model import Camera
 from ..camera.targets import Checkerboard, DotBoard
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
 from .fit import Fit, fit, outliers, outline_centres, rotations
 from .poses import lens_and_poses, port_pose
 
@@ -53,6 +53,7 @@ class CameraFit(NamedTuple):
     residuals: np.ndarray
 
 
+@check_arguments
 def lens_from_views(camera: Camera, board: Checkerboard, views: Views) -> CameraFit:
     """Focal lengths, centre and distortion, all coefficients of the camera's model, from views of a board in air.
 
@@ -88,6 +89,7 @@ def lens_from_views(camera: Camera, board: Checkerboard, views: Views) -> Camera
     return found._replace(camera=Camera(camera.model, camera.image_size, **values, **known))
 
 
+@check_arguments
 def ports_from_views(camera: Camera, board: DotBoard, views: Views, held: Sequence[str] = ()) -> CameraFit:
     """Distance, thickness and index of every port, and the medium's index, from views of a dot board through them.
 

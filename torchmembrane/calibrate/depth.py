@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
+from ..files.grayscale import check_image
 from ..markers.placement import rim_mask
 from ..progress import Progress, silent
 from ..sensor.sensor import Sensor
@@ -36,6 +37,7 @@ class DepthFit(NamedTuple):
     deviations: np.ndarray
 
 
+@check_arguments
 def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, progress: Progress = silent) -> DepthFit:
     """Rest surface from a depth image, and the dots on it from the rest image.
 
@@ -71,11 +73,8 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, pro
         >>> bool(np.abs(found.surface.offsets).max() < 0.1), len(found.sensor.markers.positions)
         (True, 121)
     """
-    width, height = sensor.camera.image_size
-    if depth.shape != (height, width):
-        raise MembraneError(
-            f"calibrate depth: the depth image is {list(depth.shape)}; expected [{height}, {width}], the camera's"
-        )
+    depth = check_image("calibrate depth: the depth image", depth, sensor.camera.image_size)
+    image = check_image("calibrate depth: the image", image, sensor.camera.image_size)
     progress(0.0, "depths on the designed surface")
     surface = fine_surface(sensor)
     points, cells = _points(sensor, depth)

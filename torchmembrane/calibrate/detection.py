@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from ..camera.targets import LARGE, MARKS, Checkerboard, DotBoard
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
+from ..files.grayscale import check_image
 from ..files.levels import too_few_bits
 from ..files.optional import load_opencv
 from ..markers.dots.pattern import find_dots
@@ -17,6 +18,7 @@ FEWEST_CORNERS = 3  # in a row and in a column
 STEP_ERROR = 0.35  # of a lattice step, by which a neighbour may be off its prediction
 
 
+@check_arguments
 def find_target(image: np.ndarray, board: Checkerboard | DotBoard) -> np.ndarray:
     """The board's points in an image.
 
@@ -40,6 +42,7 @@ def find_target(image: np.ndarray, board: Checkerboard | DotBoard) -> np.ndarray
                [135.,  68.],
                [ 93.,  96.]])
     """
+    image = check_image("find_target: image", image)
     return _find_corners(image, board) if isinstance(board, Checkerboard) else _find_board_dots(image, board)
 
 

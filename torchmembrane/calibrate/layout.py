@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments, expect
 from ..files.safe_read import read_text
 from ..markers.placement import rim_mask
 from ..sensor.sensor import Sensor
@@ -44,6 +44,7 @@ class FabricationLayout(NamedTuple):
     pixels: np.ndarray
 
 
+@check_arguments
 def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
     """A square lattice in the image about the principal point, within the rim, of large and small dots in turns.
 
@@ -81,6 +82,7 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
     return pixels[kept], np.where((i + j) % 2 == 0, "large", "small")[kept].tolist()
 
 
+@check_arguments
 def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> FabricationLayout:
     """Dots on the rest surface whose outlines are seen, through the ports, with their centres at `pixels`.
 
@@ -105,8 +107,12 @@ def layout_for_pixels(sensor: Sensor, pixels: np.ndarray, sizes: list[str]) -> F
                [360., 240.]])
     """
     wanted = aimed = np.asarray(pixels, float)
+    right = wanted.ndim == 2 and wanted.shape[1] == 2
+    expect(right, "calibrate layout: pixels", f"an array {list(wanted.shape)}", "[D, 2], u and v of each dot")
     if not 1 <= len(wanted) <= MOST_DOTS:
         raise MembraneError(f"calibrate layout: {len(wanted)} dots; expected at most {MOST_DOTS}, as a sensor file lists")
+    right = len(sizes) == len(wanted) and set(sizes) <= set(RADIUS)
+    expect(right, "calibrate layout: sizes", sizes, f"{len(wanted)} times {' or '.join(map(repr, RADIUS))}")
     surface = fine_surface(sensor)
     spacing = (float(surface.rest_area.sum()) / len(wanted)) ** 0.5
     radii = spacing * np.array([RADIUS[size] for size in sizes])

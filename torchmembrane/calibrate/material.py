@@ -9,8 +9,9 @@ import torch
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments, expect
 from ..estimators.force_balance.estimator import ForceBalance
+from ..files.tensors import tensor_of
 from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
 from ..results.status import Status
@@ -85,6 +86,7 @@ class KnownPressures(NamedTuple):
     since_rest: bool = False
 
 
+@check_arguments
 def material_from_images(
     sensor: Sensor,
     images: Tensor,
@@ -108,10 +110,11 @@ def material_from_images(
     Raises:
         MembraneError: an image shows too few markers, or as of `material_from_pixels`.
     """
-    progress(0.0, f"markers of {len(images)} images")
     reconstructor = _reconstructor(sensor)
+    grey = reconstructor.grey(images)
+    progress(0.0, f"markers of {len(grey)} images")
     with torch.no_grad():
-        flow = reconstructor.observer.judge(*reconstructor.observer(images.double()))
+        flow = reconstructor.observer.judge(*reconstructor.observer(grey))
     displacement, confidence, _, status = flow
     for i in np.flatnonzero(status != Status.OK):
         raise MembraneError(f"calibrate material: image {i + 1}: {Status(int(status[i])).text}; leave it out")
@@ -119,6 +122,7 @@ def material_from_images(
     return _material(sensor, reconstructor, known, within(progress, IMAGES_SHARE, 1.0))
 
 
+@check_arguments
 def material_from_pixels(
     sensor: Sensor,
     pixels: Tensor,
@@ -159,7 +163,10 @@ def material_from_pixels(
         end.
     """
     reconstructor = _reconstructor(sensor)
-    pixels = torch.as_tensor(pixels).to(reconstructor.rest_pixels)
+    pixels = tensor_of("calibrate material: pixels", pixels).to(reconstructor.rest_pixels)
+    known = pixels.ndim == 3 and pixels.shape[1:] == reconstructor.rest_pixels.shape
+    expected = f"[B, {len(reconstructor.rest_pixels)}, 2], one for each marker"
+    expect(known, "calibrate material: pixels", f"a tensor {list(pixels.shape)}", expected)
     lost = ~pixels.isfinite().all(-1)
     displacement = torch.where(lost[..., None], 0.0, pixels - reconstructor.rest_pixels)
     return _material(sensor, reconstructor, MeasuredPresses(displacement, (~lost).to(pixels), forces, pressures), progress)

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd, vmap
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
+from ..files.grayscale import check_image
 from ..markers.dots.pattern import measure_dots
 from ..markers.spacing import neighbours
 from ..progress import Progress, silent
@@ -45,6 +46,7 @@ class RestFit(NamedTuple):
     shifts: np.ndarray
 
 
+@check_arguments
 def rest_from_image(sensor: Sensor, image: np.ndarray, *, progress: Progress = silent) -> RestFit:
     """Pose of the rest surface, then each dot's position on it, from a rest image of listed dots.
 
@@ -79,6 +81,7 @@ def rest_from_image(sensor: Sensor, image: np.ndarray, *, progress: Progress = s
     """
     if sensor.markers.positions is None:
         raise MembraneError("calibrate rest: the sensor lists no dots; expected [markers] file, or use views or depth")
+    image = check_image("calibrate rest: the image", image, sensor.camera.image_size)
     progress(0.0, "dots of the image")
     surface, X = fine_surface(sensor), sensor.markers.positions
     sizes = np.array([int(size == "large") for size in sensor.markers.sizes or ()])

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
+from ..files.grayscale import check_image
 from ..markers.dots.pattern import find_dots
 from ..markers.placement import rim_mask
 from ..progress import Progress, silent, within
@@ -54,6 +55,7 @@ def placed_dots(sensor: Sensor, image: np.ndarray) -> tuple[np.ndarray, list[str
     return positions[met], ["large" if size else "small" for size in pattern.sizes[met]]
 
 
+@check_arguments
 def rest_from_views(
     sensor: Sensor,
     images: Sequence[np.ndarray],
@@ -83,6 +85,8 @@ def rest_from_views(
     Limitations:
         What moves the surface within itself, and its rim outside the dots, is not observed. At least two views must differ.
     """
+    motions = np.asarray(motions, float)
+    images = [check_image("calibrate views: an image", image, sensor.camera.image_size) for image in images]
     if len(images) < 2 or motions.shape != (len(images), 6) or np.abs(motions[0]).max() > 0:
         raise MembraneError(
             f"calibrate views: {len(images)} images, motions {list(motions.shape)}; expected 2 or more, [P, 6], first zeros"

@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments, expect
+from ..files.grayscale import grey_batch
 from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
 from ..results.reconstruction import Reconstruction
@@ -38,6 +39,7 @@ class WeightFit(NamedTuple):
     deviation: float
 
 
+@check_arguments
 def material_from_weight(sensor: Sensor, images: Tensor, weight: float, *, progress: Progress = silent) -> WeightFit:
     """Prestretch and modulus from images of presses by one known force.
 
@@ -62,6 +64,8 @@ def material_from_weight(sensor: Sensor, images: Tensor, weight: float, *, progr
         The scale is that of presses such as these: pushed by the same weight elsewhere, or ten times as hard, the grid's and
         the material's errors are others (docs/recipes.md).
     """
+    expect(0 < weight < np.inf, "calibrate material: weight", weight, "a positive force, N")
+    images = grey_batch(images, sensor.camera.image_size, "rgb", torch.zeros((), dtype=torch.float64))
     known = np.full((len(images), 1), weight)
     material = material_from_images(sensor, images, known, progress=within(progress, 0.0, MATERIAL_SHARE))
     progress(MATERIAL_SHARE, "modulus from the weight")

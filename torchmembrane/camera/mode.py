@@ -42,8 +42,8 @@ class Mode(NamedTuple):
         image_size: tuple[int, int],
         focal: Sequence[float],
         centre: Sequence[float],
-        crop: Sequence[int],
-        binning: Sequence[int],
+        crop: Sequence[float],
+        binning: Sequence[float],
     ) -> "Mode":
         """The mode with these values, checked.
 

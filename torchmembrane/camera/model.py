@@ -6,12 +6,12 @@ with centres at integers. What a camera cannot see (behind it, where its lens fo
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from ..errors import expect
+from ..errors import MembraneError, check_arguments, expect, is_number
 from ..files.decoder import MOST_PIXELS
 from ..files.levels import check_bits
 from .distortion import fisheye_direction, fisheye_image, pinhole_direction, pinhole_image
@@ -45,6 +45,7 @@ class Rays(NamedTuple):
     direction: Tensor
 
 
+@check_arguments
 class Camera(nn.Module):
     """A pinhole or fisheye camera, central in air or looking through flat layers into a medium.
 
@@ -132,7 +133,8 @@ class Camera(nn.Module):
         rows = torch.stack([self.port_distance, self.port_thickness, self.port_index], -1)
         return [Port(*row) for row in rows.tolist()]
 
-    def in_mode(self, crop: Sequence[int] | None = None, binning: int | Sequence[int] = 1) -> "Camera":
+    @check_arguments
+    def in_mode(self, crop: Sequence[float] | None = None, binning: float | Sequence[float] = 1) -> "Camera":
         """The camera whose images are cropped, then binned: the same rays at the mode's pixels.
 
         Args:
@@ -151,7 +153,7 @@ class Camera(nn.Module):
             ((240, 240), [200.0, 200.0], [119.75, 119.75])
         """
         part = (0, 0, *self.image_size) if crop is None else crop
-        blocks = (binning, binning) if isinstance(binning, int) else binning
+        blocks: Any = (binning, binning) if is_number(binning) else binning
         mode = Mode.of(self.image_size, self.focal.tolist(), self.centre.tolist(), part, blocks)
         lens = mode.size, mode.binned_focal, mode.binned_centre, self.distortion.tolist()
         made = Camera(self.model, *lens, ports=self.ports, medium_index=self.medium_index.item(), bits=self.bits)
@@ -175,6 +177,7 @@ class Camera(nn.Module):
             >>> camera.pixel_to_ray(torch.tensor([320.0, 240.0])).direction.tolist()
             [0.0, 0.0, 1.0]
         """
+        _check_vectors("Camera.pixel_to_ray: pixels", pixels, 2)
         image = (pixels - self.centre) / self.focal
         lens = pinhole_direction if self.model == "pinhole" else fisheye_direction
         direction = lens(image, self.distortion)
@@ -197,6 +200,7 @@ class Camera(nn.Module):
             >>> camera.point_to_pixel(torch.tensor([[1.0, -2.0, 8.0], [1.0, -2.0, -8.0]])).tolist()
             [[370.0, 140.0], [nan, nan]]
         """
+        _check_vectors("Camera.point_to_pixel: points", points, 3)
         if len(self.port_index):
             points = apparent_points(points, self._layers(), self.medium_index)
         lens = pinhole_image if self.model == "pinhole" else fisheye_image
@@ -215,6 +219,12 @@ class Camera(nn.Module):
 
     def _layers(self) -> Layers:
         return layers_of(self.port_distance, self.port_thickness, self.port_index)
+
+
+def _check_vectors(name: str, vectors: Tensor, count: int) -> None:
+    if not isinstance(vectors, Tensor) or vectors.shape[-1:] != (count,):
+        came = f"[{', '.join(map(str, vectors.shape))}]" if isinstance(vectors, Tensor) else f"a {type(vectors).__name__}"
+        raise MembraneError(f"{name}: {came}; expected a tensor [..., {count}]")
 
 
 def _check_lens(

@@ -5,13 +5,14 @@ from functools import cached_property
 
 import numpy as np
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
 
 OUTLINE = 8  # points of a dot's outline
 MARKS = ((0, 0), (3, 0), (0, 2))  # large dots, in steps from the middle one: they mark place and turn, also in part of a board
 LARGE = 1.7  # radius of a large dot over that of the others
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Checkerboard:
     """A checkerboard; the corner before the first inner one belongs to a dark square.
@@ -60,6 +61,7 @@ class Checkerboard:
         return np.full(2, -2.0 * self.square), self.square * np.array([self.columns + 1, self.rows + 1.0])
 
 
+@check_arguments
 @dataclass(frozen=True)
 class DotBoard:
     """A board of dots; three larger ones mark place and turn.

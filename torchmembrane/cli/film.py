@@ -34,10 +34,11 @@ class FrameImages:
 
 def images_in(folder: Path) -> dict[str, Path]:
     """The image files of a folder by the names of their frames; none if there is no such folder."""
+    from ..files.system_files import is_hidden
     from ..jobs.inputs import IMAGES, frame_name
 
     found = folder.iterdir() if folder.is_dir() else ()
-    return {frame_name(path): path for path in found if path.suffix.lower() in IMAGES}
+    return {frame_name(path): path for path in found if path.suffix.lower() in IMAGES and not is_hidden(path)}
 
 
 def draw_film(results: "Results", images: FrameImages, path: Path, rate: float = DEFAULT_RATE) -> None:

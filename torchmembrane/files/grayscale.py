@@ -1,5 +1,6 @@
 """Images as cameras give them, as one grey batch."""
 
+import warnings
 from typing import Literal
 
 import numpy as np
@@ -15,6 +16,10 @@ Channels = Literal["rgb", "bgr"]
 CHANNELS = ("rgb", "bgr")
 SHAPES = "[H, W], [H, W, 3], [B, H, W], [B, 1 | 3, H, W] or [B, H, W, 1 | 3]"
 STORED_BITS = {torch.uint8: 8, torch.uint16: 16}
+THREE_FRAMES = (
+    "images [3, H, W] are taken for three grey frames. If they are the red, green and blue of one image, give image[None]; if "
+    "they are three frames, images[:, None] says so"
+)
 
 
 def grey_batch(
@@ -24,7 +29,8 @@ def grey_batch(
 
     Args:
         images: torch or numpy, `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or `[B, H, W, 1 | 3]`; uint8, uint16 or
-            float in 0..1. Grey is 0.299 R + 0.587 G + 0.114 B.
+            float in 0..1. Grey is 0.299 R + 0.587 G + 0.114 B. Three grey frames `[3, H, W]` might be the colours of one image,
+            and are warned of.
         size: width and height, px.
         channels: order of the three channels, "rgb" or "bgr".
         like: a tensor.
@@ -55,12 +61,34 @@ def grey_batch(
     return (GREY[0] * red + GREY[1] * green + GREY[2] * blue)[:, None]
 
 
+def check_image(name: str, image: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
+    """An image's array `[H, W]`.
+
+    Args:
+        name: what an error calls it.
+        image: an array or a tensor.
+        size: width and height that it must have, px; None: any.
+
+    Raises:
+        MembraneError: another shape.
+
+    Example:
+        >>> check_image("depth", np.zeros((3, 4)), (4, 3)).shape
+        (3, 4)
+    """
+    array = np.asarray(image)
+    if array.ndim != 2 or array.size == 0 or size not in (None, array.shape[::-1]):
+        expected = "[H, W]" if size is None else f"[{size[1]}, {size[0]}], the camera's"
+        raise MembraneError(f"{name} is {list(array.shape)}; expected {expected}")
+    return array
+
+
 def _tensor(images: Tensor | np.ndarray) -> Tensor:
     if isinstance(images, Tensor):
         return images
     array = np.asarray(images)
     try:
-        return torch.from_numpy(np.ascontiguousarray(array, array.dtype.newbyteorder("=")))
+        return torch.from_numpy(np.require(array, array.dtype.newbyteorder("="), ["C", "W"]))
     except TypeError as error:
         raise MembraneError(f"images of type {array.dtype}; expected uint8, uint16, or float in 0..1") from error
 
@@ -71,6 +99,8 @@ def _planes(pixels: Tensor, size: tuple[int, int]) -> list[Tensor]:
     if shape[-2:] == size and len(shape) == 2:
         return [pixels[None]]
     if shape[-2:] == size and len(shape) == 3:
+        if not torch.compiler.is_compiling() and shape[0] == 3:
+            warnings.warn(THREE_FRAMES, stacklevel=2)
         return [pixels]
     if shape[-2:] == size and len(shape) == 4 and shape[1] in (1, 3):
         return list(pixels.unbind(1))
@@ -82,6 +112,8 @@ def _planes(pixels: Tensor, size: tuple[int, int]) -> list[Tensor]:
 def _refusal(shape: tuple[int, ...], size: tuple[int, int]) -> str:
     height, width = size
     said = f"images {list(shape)}; expected {SHAPES} with H = {height}, W = {width}"
+    if len(shape) < 2:
+        return f"{said}: give an image's array"
     if size[::-1] in (shape[-2:], shape[-3:-1]):
         return f"{said}: rows and columns are exchanged; swap them, images.swapaxes(-1, -2), or (-2, -3) with channels last"
     if shape[-2:] == size or shape[-3:-1] == size:

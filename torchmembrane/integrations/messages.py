@@ -10,21 +10,30 @@ import numpy as np
 import torch
 from numpy.polynomial.polynomial import polyval
 
+from ..camera.mode import Mode
 from ..camera.model import Camera
 from ..errors import MembraneError
-from ..files.images import decode_image, to_grey
+from ..files.bayer import PATTERNS, demosaiced
+from ..files.images import decode_image, read_pixels, to_grey
 from ..results.reconstruction import Frame
 from ..results.status import Status
 from ..results.store import Mesh
 from ..sensor.parts import METRE
 
-CHANNELS = {
+CHANNELS: dict[str, tuple[type[np.unsignedinteger[Any]], int, list[int]]] = {
     **{"mono8": (np.uint8, 1, [0]), "8UC1": (np.uint8, 1, [0]), "mono16": (np.uint16, 1, [0]), "16UC1": (np.uint16, 1, [0])},
     **{"rgb8": (np.uint8, 3, [0, 1, 2]), "bgr8": (np.uint8, 3, [2, 1, 0]), "8UC3": (np.uint8, 3, [2, 1, 0])},
-    **{"rgba8": (np.uint8, 4, [0, 1, 2]), "bgra8": (np.uint8, 4, [2, 1, 0]), "rgb16": (np.uint16, 3, [0, 1, 2])},
-    **{"bgr16": (np.uint16, 3, [2, 1, 0])},
+    **{"rgba8": (np.uint8, 4, [0, 1, 2]), "bgra8": (np.uint8, 4, [2, 1, 0]), "8UC4": (np.uint8, 4, [2, 1, 0])},
+    **{"rgb16": (np.uint16, 3, [0, 1, 2]), "bgr16": (np.uint16, 3, [2, 1, 0]), "16UC3": (np.uint16, 3, [2, 1, 0])},
+    **{"rgba16": (np.uint16, 4, [0, 1, 2]), "bgra16": (np.uint16, 4, [2, 1, 0]), "16UC4": (np.uint16, 4, [2, 1, 0])},
+    **{"yuv422_yuy2": (np.uint8, 2, [0]), "yuyv": (np.uint8, 2, [0])},
+    **{"yuv422": (np.uint8, 2, [1]), "uyvy": (np.uint8, 2, [1])},
 }
 """Of an image's encoding: the type of a value, values of a pixel, and which of them are grey, or red, green and blue."""
+PLANES = {"nv12": 1.5, "nv21": 1.5, "nv24": 3.0}
+"""Encodings that hold the grey values of all pixels first, then the colours: bytes for each pixel."""
+MOSAICS = {f"bayer_{pattern}{bits}": pattern for pattern in PATTERNS for bits in (8, 16)}
+"""Encodings of cameras that see one colour in each pixel: the colours of 2 x 2 pixels."""
 POINT_FIELDS = ("x", "y", "z", "normal_traction", "shear_x", "shear_y", "shear_z")
 """Of a vertex, each float32: place, m; compressive normal traction and shear traction on the membrane, Pa."""
 SAME = 1.0
@@ -37,6 +46,8 @@ LENSES = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant
 def grey_of(message: Any, size: tuple[int, int], bits: int | None = None) -> np.ndarray:
     """Grey values `[height, width]` in 0..1 of a `sensor_msgs/Image` or `CompressedImage`.
 
+    Of YUV the grey value is Y, as `cv_bridge` has it; of a Bayer pattern the colours are interpolated first.
+
     Args:
         message: the message.
         size: width and height that it must have, px.
@@ -47,19 +58,78 @@ def grey_of(message: Any, size: tuple[int, int], bits: int | None = None) -> np.
             damaged image.
     """
     if not hasattr(message, "encoding"):
-        return decode_image(bytes(message.data), f"an image of format {message.format!r}", size, bits)
-    if message.encoding not in CHANNELS:
-        raise MembraneError(f"image of encoding {message.encoding!r}; expected one of {', '.join(CHANNELS)}")
-    kind, values, colours = CHANNELS[message.encoding]
+        return _grey_of_file(bytes(message.data), message.format, size, bits)
+    encoding = message.encoding
+    if not (encoding in CHANNELS or encoding in PLANES or encoding in MOSAICS):
+        raise MembraneError(f"image of encoding {encoding!r}; expected one of {', '.join([*CHANNELS, *PLANES, *MOSAICS])}")
     if (message.width, message.height) != size:
         raise MembraneError(f"the image is {message.width} x {message.height} px, the sensor's {size[0]} x {size[1]}")
+    kind, values, colours = CHANNELS.get(encoding, CHANNELS["mono16" if encoding.endswith("16") else "mono8"])
+    pixels = _pixels(message, kind, values)
+    grey = to_grey(pixels[..., colours[0] if len(colours) == 1 else colours], bits)
+    return _grey_of_mosaic(grey, encoding) if encoding in MOSAICS else grey
+
+
+def _pixels(message: Any, kind: type[np.unsignedinteger[Any]], values: int) -> np.ndarray:
+    """The values `[height, width, values]` of an Image."""
+    content, height, step = np.frombuffer(bytes(message.data), np.uint8), message.height, message.step
     item = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    rows, line = np.frombuffer(bytes(message.data), np.uint8), message.width * values * item.itemsize
-    if message.step < line or len(rows) < message.step * message.height:
-        raise MembraneError(f"the image has {len(rows)} bytes in lines of {message.step}; expected {message.height} of {line}")
-    lines = rows[: message.step * message.height].reshape(message.height, message.step)[:, :line]
-    pixels = np.ascontiguousarray(lines).view(item).reshape(message.height, message.width, values).astype(kind)
-    return to_grey(pixels[..., 0] if len(colours) == 1 else pixels[..., colours], bits)
+    line, planes = message.width * values * item.itemsize, PLANES.get(message.encoding, 1.0)
+    if planes > 1 and step > line and len(content) == planes * height * line:
+        step = line  # of lines whose colours lie elsewhere, drivers count these or not
+    if step < line or len(content) < planes * height * step:
+        more = "" if planes == 1 else f", {planes} times that with the colours"
+        raise MembraneError(f"the image has {len(content)} bytes in lines of {step}; expected {height} of {line}{more}")
+    lines = content[: step * height].reshape(height, step)[:, :line]
+    return np.ascontiguousarray(lines).view(item).reshape(height, message.width, values).astype(kind)
+
+
+def _grey_of_file(content: bytes, form: str, size: tuple[int, int], bits: int | None) -> np.ndarray:
+    """Grey values of a CompressedImage, whose format is "jpeg", "png", or "ENCODING; jpeg compressed ENCODING"."""
+    encoding, _, packing = form.partition(";")
+    if "compresseddepth" in form.lower():
+        raise MembraneError(f"format {form!r} holds depths; expected an image: name the topic of the camera's images")
+    grey = decode_image(content, f"an image of format {form!r}", size, bits)
+    is_mosaic = encoding in MOSAICS and "bgr" not in packing and "rgb" not in packing
+    return _grey_of_mosaic(grey, encoding) if is_mosaic else grey
+
+
+def _grey_of_mosaic(mosaic: np.ndarray, encoding: str) -> np.ndarray:
+    return to_grey(demosaiced(mosaic, MOSAICS[encoding]))
+
+
+def size_of(message: Any) -> tuple[int, int]:
+    """Width and height of a `sensor_msgs/Image` or `CompressedImage`, px.
+
+    Raises:
+        MembraneError: a damaged image.
+    """
+    if hasattr(message, "encoding"):
+        return message.width, message.height
+    height, width = read_pixels(f"an image of format {message.format!r}", bytes(message.data)).shape[:2]
+    return width, height
+
+
+def info_topic(topic: str) -> str:
+    """The topic of the CameraInfo beside a topic of images.
+
+    Example:
+        >>> info_topic("/finger/image_raw/compressed")
+        '/finger/camera_info'
+    """
+    return f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+
+
+def mode_of(info: Any) -> Mode:
+    """What the images of a `sensor_msgs/CameraInfo` are of the calibrated ones: `roi`, where it is not all 0, then `binning`.
+
+    `width`, `height` and `k` are of the calibration (REP 104).
+    """
+    roi, binning = getattr(info, "roi", None), (getattr(info, "binning_x", 0) or 1, getattr(info, "binning_y", 0) or 1)
+    left, top, width, height = (roi.x_offset, roi.y_offset, roi.width, roi.height) if roi is not None else (0, 0, 0, 0)
+    crop = left, top, width or info.width - left, height or info.height - top
+    (f, _, u), (_, g, v) = np.asarray(info.k, float).reshape(3, 3)[:2]
+    return Mode((info.width, info.height), (f, g), (u, v), crop, binning)
 
 
 def unlike(info: Any, camera: Camera) -> str | None:
@@ -71,8 +141,15 @@ def unlike(info: Any, camera: Camera) -> str | None:
         MembraneError: it is of images of another size.
     """
     width, height = camera.image_size
-    if (info.width, info.height) != (width, height):
-        raise MembraneError(f"CameraInfo is of {info.width} x {info.height} px images, the sensor file of {width} x {height}")
+    mode = mode_of(info)
+    if mode.size != (width, height):
+        said = "{} x {} px images".format(*mode.size)
+        if mode.size != mode.image_size:
+            said += " (roi and binning of {} x {})".format(*mode.image_size)
+        raise MembraneError(
+            f"CameraInfo is of {said}, the sensor file of {width} x {height}: use the file of this camera; where its mode "
+            "crops or bins, say so in the file's [camera]"
+        )
     if info.k[0] == 0:
         return None
     if info.distortion_model not in LENSES:
@@ -93,8 +170,9 @@ def unlike(info: Any, camera: Camera) -> str | None:
 
 
 def projected(info: Any, rays: np.ndarray) -> np.ndarray:
-    """Where the lens of a CameraInfo sees `rays [..., 3]`, `[..., 2]` px; NaN behind a pinhole."""
-    (f, _, u), (_, g, v) = np.asarray(info.k, float).reshape(3, 3)[:2]
+    """Where the lens of a CameraInfo sees `rays [..., 3]`, `[..., 2]` px of its mode; NaN behind a pinhole."""
+    mode = mode_of(info)
+    (f, g), (u, v) = mode.binned_focal, mode.binned_centre
     k = np.concatenate([np.asarray(info.d, float), np.zeros(8)])[:8]
     x, y, z = np.moveaxis(rays, -1, 0)
     if LENSES[info.distortion_model] == "fisheye":

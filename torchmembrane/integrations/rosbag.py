@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from os import SEEK_END
 from pathlib import Path
 from shutil import rmtree
 from tempfile import TemporaryDirectory
@@ -14,12 +15,17 @@ import numpy as np
 from ..camera.model import Camera
 from ..errors import MembraneError
 from ..files.optional import load_rosbags
-from ..files.safe_read import in_one_line, read_text
+from ..files.safe_read import in_one_line, read_text, regular_size
 from ..results.reconstruction import Frame
-from .messages import POINT_FIELDS, SiUnits, cloud_layout, unlike
+from .bounded_rosbags import bounded_rosbags, refuse_large
+from .messages import POINT_FIELDS, SiUnits, cloud_layout, info_topic, size_of, unlike
 
-BAGS, METADATA = (".mcap", ".db3"), "metadata.yaml"
-MOST_METADATA_BYTES = 2**24
+BAGS, ROS_1, METADATA = (".mcap", ".db3"), ".bag", "metadata.yaml"
+MOST_METADATA_BYTES = 2**20
+MOST_BYTES = 2**50
+"""Of a storage file, which is never read whole."""
+MCAP_MARK, SQLITE_MARK, ROS_1_MARK = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#ROSBAG"
+"""The first bytes of a storage file; those of MCAP are its last ones, too."""
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 TOPICS = {
@@ -42,8 +48,8 @@ class StampedMessage(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Whether it is a bag's `metadata.yaml`, which stands for its folder, or a storage file."""
-    return path.name == METADATA or path.suffix.lower() in BAGS
+    """Whether it is a bag's `metadata.yaml`, which stands for its folder, or a storage file; of ROS 1 too, which is refused."""
+    return path.name == METADATA or path.suffix.lower() in (*BAGS, ROS_1)
 
 
 def metadata_of(folder: Path) -> list[Path]:
@@ -72,11 +78,15 @@ def image_topic(bag: Path, topic: str | None) -> tuple[str, int]:
         MembraneError: there is none, or there are several and none is named; or the bag cannot be read.
     """
     with _opened(bag) as reader:
-        topics = Counter[str]()
+        topics, others = Counter[str](), set[str]()
         for each in reader.connections:
             if each.msgtype in IMAGE_TYPES:
                 topics[each.topic] += each.msgcount
-    named = ", ".join(sorted(topics)) or "none"
+            else:
+                others.add(each.topic)
+    if not topics:
+        raise MembraneError(f"{bag}: no topic of images; its topics: {', '.join(sorted(others)) or 'none'}")
+    named = ", ".join(sorted(topics))
     if topic is None and len(topics) != 1:
         raise MembraneError(f"{bag}: image topics: {named}; expected one: name it by --topic")
     found = topic or next(iter(topics))
@@ -101,14 +111,16 @@ def camera_remark(bag: Path, topic: str, camera: Camera) -> str | None:
     """What the CameraInfo beside an image topic says otherwise than the sensor file, in words; None: nothing.
 
     Raises:
-        MembraneError: it is of images of another size.
+        MembraneError: it is of images of another size, and so are the images.
     """
-    camera_topic = f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
-    first = next(messages(bag, camera_topic, (INFO_TYPE,)), None)
+    first = next(messages(bag, info_topic(topic), (INFO_TYPE,)), None)
     try:
         return None if first is None else unlike(first.message, camera)
     except MembraneError as error:
-        raise MembraneError(f"{bag}, {camera_topic}: {error}") from error
+        image = next(messages(bag, topic), None)
+        if image is not None and size_of(image.message) == camera.image_size:
+            return f"{error}; the images are of the file's size, and CameraInfo is not compared"
+        raise MembraneError(f"{bag}, {info_topic(topic)}: {error}") from error
 
 
 class BagWriter:
@@ -193,13 +205,46 @@ class BagWriter:
 @contextmanager
 def _opened(bag: Path) -> Iterator[Any]:
     """A reader of a bag."""
-    highlevel, path = load_rosbags(), bag.parent if bag.name == METADATA else bag
+    if bag.suffix.lower() == ROS_1:
+        raise MembraneError(f"{bag}: {_of_ros_1(bag)}")
+    if bag.name == METADATA:
+        _metadata(bag)
+    else:
+        regular_size(bag, MOST_BYTES, "a bag of ROS 2")
+    highlevel, path = bounded_rosbags(), bag.parent if bag.name == METADATA else bag
     from rosbags.typesys import Stores, get_typestore
 
     try:
         with highlevel.AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+            refuse_large(reader)
             yield reader
     except MembraneError:
         raise
     except Exception as error:  # of a damaged file, of whatever kind
-        raise MembraneError(f"{bag}: not readable as a bag of ROS 2 ({in_one_line(error)})") from error
+        cause = _damage(bag) or f"({in_one_line(error)})"
+        raise MembraneError(f"{bag}: not readable as a bag of ROS 2 {cause}") from error
+
+
+def _damage(bag: Path) -> str | None:
+    """What is wrong with the files of a bag and the remedy, where their first and last bytes tell it."""
+    files = [each for each in bag.parent.iterdir() if each.suffix in BAGS and each.is_file()] if bag.name == METADATA else [bag]
+    for path in files:
+        with open(path, "rb") as file:
+            begin, size = file.read(32), file.seek(0, SEEK_END)
+            file.seek(max(0, size - len(MCAP_MARK)))
+            end = file.read()
+        pages = int.from_bytes(begin[28:32], "big") * int.from_bytes(begin[16:18], "big")
+        early = f"({path.name} ends early, as of a recording or a copy that was cut off)"
+        if not begin:
+            return f"({path.name} is empty): was it recorded, or copied, to its end?"
+        if begin.startswith(ROS_1_MARK):
+            return f"({path.name}): {_of_ros_1(path)}"
+        if begin.startswith(MCAP_MARK) and end != MCAP_MARK:
+            return f"{early}: `mcap recover {path.name} -o whole.mcap` keeps what is in it; give whole.mcap"
+        if begin.startswith(SQLITE_MARK) and size < pages:
+            return f"{early}: `sqlite3 {path.name} .recover | sqlite3 whole.db3` keeps what is in it; give whole.db3"
+    return None
+
+
+def _of_ros_1(path: Path) -> str:
+    return f"a bag of ROS 1; expected one of ROS 2: `rosbags-convert --src {path.name} --dst {path.stem}`, then give the folder"

@@ -1,7 +1,7 @@
 """Frames in, rows of results out: the state of one worker, whatever hands out the work."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import MembraneError
+from ..errors import MembraneError, expect
 from ..files.levels import too_few_bits
 from ..files.provenance import Origin, printable
+from ..files.safe_read import in_one_line
 from ..results.npz import Stored
 from ..results.reconstruction import Frame, Reconstruction
 from ..results.status import Status
@@ -70,6 +71,8 @@ class FrameReconstructor:
         rest_pixels: Tensor | None = None,
         pressure: Mapping[str, float] | None = None,
     ):
+        if not hasattr(reconstructor, "rest_pixels"):
+            raise MembraneError(f"FrameReconstructor: reconstructor is a {_kind(reconstructor)}; expected a tm.Reconstructor")
         self.reconstructor, self.rest_pixels, self.pressure = reconstructor, rest_pixels, pressure
 
     def on(self, device: str) -> "FrameReconstructor":
@@ -77,23 +80,26 @@ class FrameReconstructor:
         rest_pixels = None if self.rest_pixels is None else self.rest_pixels.to(device)
         return FrameReconstructor(self.reconstructor.to(device), rest_pixels, self.pressure)
 
-    def __call__(self, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def __call__(self, rows: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Reconstruct a batch of rows.
 
         Args:
-            rows: `path [B]`, the image files, which also name the frames. They are read here, unless `image [B, ...]` holds
-                decoded images as `Reconstructor` takes them, or `bytes [B]` what is in the files.
+            rows: columns of a dict or a `pandas.DataFrame`: `path [B]`, the image files, which also name the frames. They are
+                read here, unless `image [B, ...]` holds decoded images, one a row, as `Reconstructor` takes them, or
+                `bytes [B]` what is in the files.
 
         Returns:
             Columns of B rows: `name`, `path`, `status`, `status_text`, the arrays of `Reconstruction`, `content_hash`, size
             and time of the file, `seconds`. A file that gave no image has status -1, the reason as text, and NaN.
+
+        Raises:
+            MembraneError: `rows` has no column `path`, columns of several lengths, or is neither a dict nor a DataFrame.
         """
-        columns = [rows.get(key, [None] * len(rows["path"])) for key in ("image", "bytes")]
-        outcomes = self.outcomes([self._frame(*row) for row in zip(rows["path"], *columns, strict=True)])
+        outcomes = self.outcomes([self._frame(*row) for row in _rows(rows)])
         stored = [outcome.stored or Stored(self._blank, Origin(printable(str(outcome.file)))) for outcome in outcomes]
-        arrays = [each.arrays() for each in stored]
-        found = {key: np.stack([row[key] for row in arrays]) for key in arrays[0]}
-        words = {key: np.array([getattr(outcome, key) for outcome in outcomes]) for key in ("name", "status_text")}
+        arrays = [each.arrays() for each in stored or [Stored(self._blank)]]
+        found = {key: np.stack([row[key] for row in arrays])[: len(stored)] for key in arrays[0]}
+        words = {key: np.array([getattr(outcome, key) for outcome in outcomes], str) for key in ("name", "status_text")}
         return words | found
 
     def outcomes(self, group: list[DecodedFrame]) -> list[Outcome]:
@@ -109,19 +115,29 @@ class FrameReconstructor:
             for frame in group
         ]
 
-    def _frame(self, path: str, image: np.ndarray | None, content: bytes | None) -> DecodedFrame:
+    def _frame(self, path: object, image: Any, content: Any) -> DecodedFrame:
         file = Path(str(path))
         if image is None and content is None:
             return self.decoded(source_of(file))
         frame = DecodedFrame(frame_name(file), file, None)
         try:
             if content is None:
-                data, grey = np.ascontiguousarray(image).tobytes(), self.reconstructor.grey(np.asarray(image))
+                image = _array(image)
+                data, grey = np.ascontiguousarray(image).tobytes(), self._grey(image)
             else:
-                data, grey = content, self._read(content)
+                if not isinstance(content, bytes | bytearray | memoryview):
+                    raise MembraneError(f"bytes are a {_kind(content)}; expected bytes, what is in the file")
+                data = bytes(content)
+                grey = self._read(data)
             return frame._replace(image=grey, origin=Origin.of_bytes(file, data))
         except MembraneError as error:
             return frame.but(error)
+
+    def _grey(self, image: np.ndarray) -> Tensor:
+        """The grey image of a row's, whose first axis may be that of the colours."""
+        grey = self.reconstructor.grey(image[None] if image.ndim == 3 else image)
+        expect(len(grey) == 1, "image", list(image.shape), "one image a row")
+        return grey
 
     def _read(self, content: bytes) -> Tensor:
         with NamedTemporaryFile() as file:
@@ -159,6 +175,47 @@ class FrameReconstructor:
 def _outcome(frame: DecodedFrame, image: Tensor, stored: Stored) -> Outcome:
     shows_nothing = not Status(int(stored.frame["status"])).has_surface
     return Outcome(frame.name, frame.file, stored, too_few_bits(image.cpu().numpy()) if shows_nothing else "")
+
+
+def _rows(columns: Any) -> Iterator[tuple[Any, Any, Any]]:
+    """Path, image and content of every row, None of a column that is missing."""
+    if not (isinstance(columns, Mapping) or (hasattr(columns, "iloc") and hasattr(columns, "columns"))):
+        raise MembraneError(
+            f"FrameReconstructor: rows are a {_kind(columns)}; expected a dict of arrays or a pandas.DataFrame: in Ray, "
+            'map_batches(..., batch_format="numpy")'
+        )
+    if alone := [key for key in columns if not _is_column(columns[key])]:
+        raise MembraneError(
+            f"FrameReconstructor: column {alone[0]} is a {_kind(columns[alone[0]])}; expected a list or an array of one value "
+            "a row: in Ray, map_batches in place of map"
+        )
+    lengths = {str(key): len(columns[key]) for key in columns}
+    count = max(lengths.values(), default=0)
+    if count and "path" not in lengths:
+        raise MembraneError(
+            f"FrameReconstructor: columns {', '.join(lengths)}; expected a column path, which names the frames: in Ray, "
+            "read_images(..., include_paths=True)"
+        )
+    if min(lengths.values(), default=0) < count:
+        raise MembraneError(f"FrameReconstructor: columns of different lengths, {lengths}; expected a value a row in each")
+    none = [None] * count
+    return zip(*(columns[key] if key in columns else none for key in ("path", "image", "bytes")), strict=True)
+
+
+def _kind(value: Any) -> str:
+    return f"{type(value).__module__}.{type(value).__qualname__}".removeprefix("builtins.")
+
+
+def _is_column(value: Any) -> bool:
+    return hasattr(value, "__len__") and not isinstance(value, str | bytes) and getattr(value, "shape", None) != ()
+
+
+def _array(image: Any) -> np.ndarray:
+    """A row's image as an array."""
+    try:
+        return np.asarray(image)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise MembraneError(f"image is a {_kind(image)} and no array ({in_one_line(error)})") from error
 
 
 def outcomes_of(rows: dict[str, np.ndarray]) -> list[Outcome]:

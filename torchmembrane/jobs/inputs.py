@@ -1,6 +1,7 @@
 """What a call names - files, globs, folders - as images, and as videos, bags and stacks of images, in the order of the call."""
 
 import glob
+import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from ..errors import MembraneError
 from ..files.images import picture_count
 from ..files.order import in_order
 from ..files.provenance import printable
+from ..files.system_files import is_hidden, is_of_system
 from ..integrations.rosbag import BAGS, METADATA, is_bag, metadata_of
 from ..results.store import MESH
 
@@ -60,7 +62,7 @@ def frame_name(path: Path) -> str:
         >>> frame_name(Path("day/caf\udce9.png"))
         'caf\\xe9'
     """
-    return printable(path.parent.name if path.name == METADATA else path.stem)
+    return printable(Path(os.path.abspath(path.parent)).name if path.name == METADATA else path.stem)
 
 
 def picture_name(path: Path, number: int) -> str:
@@ -78,7 +80,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
 
     Args:
         arguments: paths of files, folders (their images in name order, or the bag that it is) and glob patterns. Numbers in
-            names count as numbers: 2 before 10.
+            names count as numbers: 2 before 10. Hidden files, and those that systems leave in folders, are passed over.
         video: take every file for a video.
         topic: of the bags' images.
 
@@ -94,6 +96,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
         ['flat_plate.png', 'press_on_axis.png', 'two_contacts.png']
     """
     paths = [path for argument in arguments for path in _expanded(str(argument), VIDEOS if video else IMAGES)]
+    paths = [path for path in paths if not is_of_system(path)] or paths  # a shell's pattern may give them
     if paths == sorted(paths):  # as a shell expands a pattern
         paths.sort(key=in_order)
     is_video = {path: video or path.suffix.lower() in VIDEOS or is_bag(path) or picture_count(path, 2) > 1 for path in paths}
@@ -126,14 +129,22 @@ def single_images(inputs: Inputs) -> list[Path]:
 def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
     path = Path(argument)
     if path.is_dir():
-        files = (p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
+        files = (p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not is_hidden(p))
         found = metadata_of(path) or sorted(files, key=in_order)
         if not found:
-            raise MembraneError(f"{path}: the folder holds no files {' '.join(suffixes)}; expected one or more")
+            raise MembraneError(f"{path}: the folder holds no files {' '.join(suffixes)}; {_remedy(path)}")
         return found
     if path.exists():
         return [path]
-    found = [Path(match) for match in sorted(glob.glob(argument, recursive=True), key=in_order)]
-    if not any(p.is_file() for p in found):
+    matches = map(Path, sorted(glob.glob(argument, recursive=True), key=in_order))
+    found = [path for path in matches if path.is_file() and not is_of_system(path)]
+    if not found:
         raise MembraneError(f"{argument}: no such file, no pattern that matches one; expected images, globs, folders")
-    return [p for p in found if p.is_file()]
+    return found
+
+
+def _remedy(folder: Path) -> str:
+    """What to give in place of a folder that holds no images."""
+    if any(path.suffix.lower() in BAGS for path in folder.iterdir()):
+        return f"a bag's folder has a {METADATA}: `ros2 bag reindex {folder.name}` makes it, or give the files of the bag"
+    return "expected one or more"

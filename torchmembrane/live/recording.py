@@ -10,6 +10,7 @@ from ..files.folder_lock import WHOLE
 from ..files.images import write_as_taken
 from ..files.provenance import Origin
 from ..files.safe_read import in_one_line, read_text
+from ..files.system_files import is_of_system
 from ..jobs.frame_reconstructor import Outcome
 from ..jobs.inputs import Inputs
 from ..jobs.result_folder import ResultFolder
@@ -40,7 +41,7 @@ class Recording:
     """
 
     def __init__(self, folder: Path, mesh: Mesh, bits: int | None = None):
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and (not folder.is_dir() or not all(map(is_of_system, folder.iterdir()))):
             raise MembraneError(f"--record {folder}: holds something already; expected a new folder, one per recording")
         self.folder, self.bits = folder, bits
         self._results = ResultFolder(folder, mesh, Inputs([], []), WHOLE, False, print)

@@ -1,6 +1,6 @@
 """What the markers show in a batch of images: displacements, confidence, and a status for every frame."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from ..control_flow import can_sync, traced
 from ..errors import MembraneError
 from ..files.levels import too_few_bits
+from ..files.tensors import tensor_of
 from ..results.status import Status
 from .locator import Locator, isotropic
 from .placement import FEWEST_MARKERS, PlacedMarkers
@@ -193,15 +194,13 @@ class MarkerObserver(nn.Module):
 
         Arguments and errors as for `Reconstructor.from_pixels`.
         """
-        pixels = torch.as_tensor(pixels).to(self.rest_pixels)
+        pixels = tensor_of("from_pixels: pixels", pixels).to(self.rest_pixels)
         pixels = pixels[None] if pixels.ndim == 2 else pixels
         if pixels.shape[1:] != self.rest_pixels.shape:
             raise MembraneError(
                 f"from_pixels: pixels {list(pixels.shape)}; expected [B, {len(self.rest_pixels)}, 2], one for each marker"
             )
-        rest = self.rest_pixels if rest_pixels is None else torch.as_tensor(rest_pixels).to(pixels)
-        if rest.shape != self.rest_pixels.shape:
-            raise MembraneError(f"from_pixels: rest_pixels {list(rest.shape)}; expected {list(self.rest_pixels.shape)}")
+        rest = self.rest_pixels if rest_pixels is None else self.rest_given(rest_pixels)
         finite = pixels.isfinite().all(-1)
         confidence = torch.where(finite, _checked_confidence(confidence, pixels), 0.0)
         displacement = torch.where(finite[..., None], pixels - rest, 0.0)
@@ -209,11 +208,26 @@ class MarkerObserver(nn.Module):
         covariance = self.rest_covariance + isotropic(confidence, NOISE)
         return MarkerFlow(displacement, self.screen(displacement, confidence), covariance, status)
 
+    def rest_given(self, rest_pixels: Any) -> Tensor:
+        """The markers at rest as a caller gives them, `[D, 2]` px."""
+        rest = tensor_of("rest_pixels", rest_pixels).to(self.rest_pixels)
+        if rest.shape != self.rest_pixels.shape:
+            raise MembraneError(f"rest_pixels {list(rest.shape)}; expected {list(self.rest_pixels.shape)}, one for each marker")
+        return rest
+
+    def before(self, previous: Any, frames: int) -> Tensor:
+        """Pixels `[B, D, 2]` of a previous result, refused where it cannot be one of these frames'."""
+        given, expected = getattr(previous, "pixels", None), [frames, *self.rest_pixels.shape]
+        came = f"pixels {list(given.shape)}" if isinstance(given, Tensor) else f"no pixels, it is a {type(previous).__name__}"
+        if not isinstance(given, Tensor) or list(given.shape) != expected:
+            raise MembraneError(f"Reconstructor: previous has {came}; expected {expected}: an earlier result for each image")
+        return given.to(self.rest_pixels)
+
     @traced
     def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
         """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""
         found = confidence > FOUND
-        count, D = found.sum(-1), self.seen_at_rest.sum()
+        count, D = found.sum(-1), self.seen_at_rest.sum().float()
         unlike = Status.UNLIKE_REST.value * (count < ALIKE_SHARE * D).to(torch.int64)
         few = count < (FEWEST_SHARE * D).clamp_min(FEWEST_MARKERS)
         status = torch.where(status == Status.OK.value, unlike.masked_fill(few, Status.TOO_FEW_MARKERS.value), status)
@@ -224,7 +238,7 @@ class MarkerObserver(nn.Module):
 def _checked_confidence(confidence: Tensor | None, pixels: Tensor) -> Tensor:
     if confidence is None:
         return torch.ones_like(pixels[..., 0])
-    confidence, shape = torch.as_tensor(confidence).to(pixels), pixels.shape[:2]
+    confidence, shape = tensor_of("from_pixels: confidence", confidence).to(pixels), pixels.shape[:2]
     if confidence.shape not in (shape, shape[1:]):
         raise MembraneError(f"from_pixels: confidence {list(confidence.shape)}; expected {list(shape)}, one for each marker")
     if can_sync(confidence) and not ((confidence >= 0) & (confidence <= 1)).all():

@@ -17,7 +17,7 @@ from onnx import TensorProto, helper
 from torch import Tensor, nn
 
 from ..control_flow import FUNCTIONS, Value
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
 from ..files.atomic import whole_file
 from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
@@ -161,6 +161,7 @@ def _kind(example: Tensor) -> int:
     return helper.np_dtype_to_tensor_dtype(example.numpy().dtype)
 
 
+@check_arguments
 def export(
     reconstructor: Reconstructor,
     path: str | Path,

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
 from ..sensor.sensor import Sensor
 
 NAMES = ("fingertip", "bubble", "half_cylinder")
@@ -27,6 +27,7 @@ def preset_file(name: str) -> Path:
     return Path(__file__).parent / name / "sensor.toml"
 
 
+@check_arguments
 def preset(name: str) -> Sensor:
     """A sensor that comes with the package.
 

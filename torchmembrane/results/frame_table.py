@@ -12,6 +12,7 @@ import numpy as np
 
 from ..files.atomic import whole_file
 from ..files.optional import load_pyarrow
+from ..files.order import in_order
 from ..files.parquet import read_table, refusal
 from ..files.provenance import Origin
 from ..files.safe_read import DAMAGE
@@ -167,7 +168,7 @@ class FrameTable:
             self._put(table.filter(self.arrow.array([name not in names for name in _names(table, part)])), part)
 
     def _parts(self) -> list[Path]:
-        return sorted(path for path in self.folder.glob("part-*.parquet") if PART.fullmatch(path.stem))
+        return sorted((path for path in self.folder.glob("part-*.parquet") if PART.fullmatch(path.stem)), key=in_order)
 
     def _index(self) -> dict[Path, frozenset[str]]:
         """The names in each part; those of parts that have not changed are not read again."""

@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 from ..errors import MembraneError
 from ..files.safe_read import DAMAGE, LackingArray, read_arrays
+from ..files.system_files import is_of_system
 from .frame_table import FrameTable
 from .npz import Stored, load_frame, load_stored, save_frame
 from .reconstruction import Frame
@@ -96,7 +97,7 @@ class FrameFiles:
         """Nothing is held back."""
 
     def _files(self) -> list[Path]:
-        return sorted(path for path in self.folder.glob("*.npz") if path.name != MESH)
+        return sorted(path for path in self.folder.glob("*.npz") if path.name != MESH and not is_of_system(path))
 
     def _is_result(self, path: Path) -> bool:
         try:

@@ -6,7 +6,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..errors import MembraneError, expect
+from ..errors import MembraneError, check_arguments, expect
 from ..files.optional import load_pandas
 from ..files.order import in_order
 from .frame_table import PART_ROWS, read_part
@@ -18,6 +18,7 @@ from .store import MESH, Mesh
 AGAIN = "run the same reconstruct command again, which does its frame again, or delete it"
 
 
+@check_arguments
 def read_results(folder: str | Path) -> "Results":
     """The results in a folder, of either format.
 
@@ -64,7 +65,8 @@ class FoundFrame(NamedTuple):
     home: Path
 
 
-def read_frame(path: Path, name: str | None = None) -> FoundFrame:
+@check_arguments
+def read_frame(path: str | Path, name: str | None = None) -> FoundFrame:
     """One frame of whatever holds results.
 
     Args:
@@ -74,6 +76,7 @@ def read_frame(path: Path, name: str | None = None) -> FoundFrame:
     Raises:
         MembraneError: it holds no results, or none of this name.
     """
+    path = Path(path)
     if path.is_dir():
         results = read_results(path)
         chosen = results.names[0] if name is None else name
@@ -125,10 +128,10 @@ class Results:
         return len(self.names)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._known
+        return isinstance(name, str) and name in self._known
 
     def __getitem__(self, name: str) -> Frame:
-        if name not in self._known:
+        if name not in self:
             raise MembraneError(f"{self.folder}: no frame {name!r}; expected one of {len(self)}, {self.names[0]!r} the first")
         return self._read([name])[0]
 

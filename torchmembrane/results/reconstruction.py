@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import expect
+from ..errors import MembraneError, expect, is_number
 from ..pose import Pose
 
 Frame: TypeAlias = dict[str, np.ndarray]
@@ -103,12 +103,18 @@ class Reconstruction(NamedTuple):
     def frame(self, index: int) -> dict[str, np.ndarray]:
         """One frame as numpy arrays, float32 (status int32), by the names above.
 
+        Raises:
+            MembraneError: there is no such frame.
+
         Example:
             >>> batch = Reconstruction(*torch.zeros(26, 2, 3))  # two frames; arrays of other shapes in a real one
             >>> frame = batch.frame(1)
             >>> frame["force"].tolist(), str(frame["status"].dtype)
             ([0.0, 0.0, 0.0], 'int32')
         """
+        count = len(self.status)
+        is_there = is_number(index) and hasattr(index, "__index__") and -count <= index < count
+        expect(is_there, "Reconstruction.frame: index", index, f"the number of one of {count} frames, from 0")
         arrays = {key: value[index].detach().cpu().numpy() for key, value in self._asdict().items()}
         return {key: value.astype(np.int32 if key == "status" else np.float32) for key, value in arrays.items()}
 
@@ -130,6 +136,7 @@ class Reconstruction(NamedTuple):
             Not the depth of an object below the rest surface: where the membrane slides along itself, or bulges beside a
             contact (negative), it moves without one.
         """
+        expect(hasattr(rest, "rest_normals"), "Reconstruction: rest", rest, "the sensor's `membrane`, on this result's grid")
         count, expected = len(rest.rest_normals), self.displacement.shape[-2]
         expect(count == expected, "Reconstruction.indentation: vertices of rest", count, f"{expected}, the result's")
         moved = -(self.displacement * rest.rest_normals.to(self.displacement)).sum(-1)
@@ -177,8 +184,16 @@ class Reconstruction(NamedTuple):
         return pose.wrench(self.wrench)
 
     def to(self, *args: Any, **kwargs: Any) -> "Reconstruction":
-        """All arrays as `torch.Tensor.to` gives them: another device or precision; the status stays an integer."""
-        moved = {key: value.to(*args, **kwargs) for key, value in self._asdict().items()}
+        """All arrays as `torch.Tensor.to` gives them: another device or precision; the status stays an integer.
+
+        Raises:
+            MembraneError: no such device or precision.
+        """
+        try:
+            moved = {key: value.to(*args, **kwargs) for key, value in self._asdict().items()}
+        except (TypeError, ValueError, RuntimeError, AssertionError, OverflowError) as error:
+            said = ", ".join(map(repr, (*args, *kwargs.values())))
+            raise MembraneError(f"Reconstruction.to: {said}; expected a device that there is, or a torch.dtype") from error
         return Reconstruction(**(moved | {"status": moved["status"].to(self.status.dtype)}))
 
     def cpu(self) -> "Reconstruction":

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..files.safe_read import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays
+from ..files.system_files import is_of_system
 from ..pose import Pose
 from .frame_shapes import unlike
 from .npz import save_frame
@@ -213,7 +214,7 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
     if folder.exists() and not folder.is_dir():
         raise MembraneError(f"--out {folder}: is a file; expected a folder, new or of earlier results of this sensor")
     if not (folder / MESH).exists():
-        if any(folder.glob("*.npz")) or (folder / "frames").exists():
+        if not all(map(is_of_system, folder.glob("*.npz"))) or (folder / "frames").exists():
             raise MembraneError(f"--out {folder}: holds .npz files or frames/ but no {MESH}; choose another folder")
         return
     mesh = Mesh.load(folder / MESH)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..camera.model import Camera
-from ..errors import MembraneError, expect
+from ..errors import MembraneError, check_arguments, expect
 from ..files.images import read_image, to_grey
 from ..pose import Pose
 from ..surface import shapes
@@ -36,6 +36,7 @@ SHAPES_BY_NUMBERS = {
 SHAPES_BY_ARRAYS = {"grid": ("vertices", "fixed"), "heightfield": ("x", "y", "z")}
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Material:
     """The membrane's elastic energy, its prestretch, and its stiffness where known.
@@ -80,6 +81,7 @@ class Material:
         return 1.0 if self.shear_modulus is None or self.thickness is None else self.shear_modulus * self.thickness
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Cavity:
     """What presses from inside.
@@ -110,6 +112,7 @@ class Cavity:
         _expect_positive(pressure=self.pressure, volume=self.volume)
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Markers:
     """What the camera follows.
@@ -161,6 +164,7 @@ class Markers:
         object.__setattr__(self, "sizes", sizes)
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Surface:
     """The rest surface as the file describes it, before it is brought on the solver grid.
@@ -178,6 +182,14 @@ class Surface:
     shape: str
     values: Mapping[str, Any]
 
+    def __post_init__(self) -> None:
+        known = SHAPES_BY_NUMBERS | SHAPES_BY_ARRAYS
+        expect(self.shape in known, "Surface: shape", self.shape, f"one of {', '.join(known)}")
+        keys = known[self.shape]
+        right = set(self.values) in (set(keys), set(keys) - {"fixed"})
+        expect(right, f"Surface: values of a {self.shape}", list(self.values), ", ".join(keys))
+
+    @check_arguments
     def membrane(self, grid: tuple[int, int]) -> Membrane:
         """The surface on a solver grid; what lies in arrays is interpolated unless it has that grid already.
 
@@ -197,6 +209,7 @@ class Surface:
         return source if source.grid == tuple(grid) else source.resampled((grid[0], grid[1]))
 
     @classmethod
+    @check_arguments
     def of(cls, membrane: Membrane) -> "Surface":
         """The surface that a membrane's own grid describes.
 

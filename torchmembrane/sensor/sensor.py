@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..camera.model import Camera
-from ..errors import MembraneError, expect
+from ..errors import MembraneError, check_arguments, expect
 from ..pose import Pose
 from ..surface.membrane import Membrane
 from .parts import (
@@ -28,6 +28,7 @@ from .parts import (
 from .toml import read_sensor, tables_of, write_sensor
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Sensor:
     """All that is known of one sensor; checked at construction.
@@ -107,6 +108,7 @@ class Sensor:
         return digest.hexdigest()
 
     @classmethod
+    @check_arguments
     def from_file(cls, path: str | Path) -> "Sensor":
         """The sensor that a `sensor.toml` describes, with the files named in it (paths relative to it).
 
@@ -129,6 +131,7 @@ class Sensor:
         except MembraneError as error:
             raise MembraneError(f"{path}: {error}") from error
 
+    @check_arguments
     def to_file(self, path: str | Path) -> Path:
         """Write the sensor, its arrays beside it: `sensor_grid.npz`, `sensor_dots.csv`, `sensor_rest.png`.
 

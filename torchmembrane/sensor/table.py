@@ -16,6 +16,7 @@ import numpy as np
 
 from ..errors import MembraneError
 from ..files.safe_read import lies_within, printable, read_text, shortened
+from ..files.system_files import is_of_system
 from .synonyms import did_you_mean
 
 MOST_BYTES, LONGEST_LINE = 2**15, 2000
@@ -167,7 +168,8 @@ class Table:
         for name in names:
             if not lies_within(name):
                 raise self.refuse(key, "a path relative to the sensor file, of a file in its folder or below: copy it there")
-            found = sorted(map(Path, glob.glob(f"{glob.escape(str(folder))}/{name}"))) if "*" in name else [folder / name]
+            matches = map(Path, glob.glob(f"{glob.escape(str(folder))}/{name}"))
+            found = sorted(path for path in matches if not is_of_system(path)) if "*" in name else [folder / name]
             if not found or not all(map(_is_file, found)):
                 raise self.refuse(
                     key, f"a file; there is none at {printable(folder / name)}: paths are relative to the sensor file"

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..camera.model import Camera
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
 from ..surface.membrane import Membrane
 
 LIGHTS, LIGHT_RADIUS = 4, 0.3  # default lights around the camera's centre, radius over the rim's mean distance from the axis
@@ -27,6 +27,7 @@ RANGES = {
 }
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Appearance:
     """Light, lens and chip of a rendered image.

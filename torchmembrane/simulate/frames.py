@@ -14,8 +14,10 @@ from ..errors import MembraneError
 from ..files.atomic import whole_file
 from ..files.images import read_pixels
 from ..files.optional import load_pyarrow, load_pyav
+from ..files.order import in_order
 from ..files.parquet import read_table, refusal
 from ..files.safe_read import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays, read_text
+from ..files.system_files import is_of_system
 from ..results.npz import save_frame
 from ..sensor.sensor import Sensor
 from .simulator import SimulatedFrame, Simulator
@@ -41,7 +43,7 @@ class SimulatedFrames:
 
     def names(self) -> set[str]:
         """The frames that are there."""
-        found = {path.name.removesuffix("_truth.npz") for path in self.folder.glob("*_truth.npz")}
+        found = {path.name.removesuffix("_truth.npz") for path in self.folder.glob("*_truth.npz") if not is_of_system(path)}
         return {name for name in found if (self.folder / f"{name}.png").exists()}
 
     def write(self, name: str, frame: SimulatedFrame) -> None:
@@ -58,7 +60,7 @@ class SimulatedFrames:
 
     def __iter__(self) -> Iterator[tuple[str, SimulatedFrame]]:
         """Names and frames in name order."""
-        for name in sorted(self.names()):
+        for name in sorted(self.names(), key=in_order):
             image = self.folder / f"{name}.png"
             truth = read_arrays(self.folder / f"{name}_truth.npz", None, A_TRUTH, NUMBERS + TEXT)
             yield name, SimulatedFrame(read_pixels(image), {key: array.copy() for key, array in truth.items()})
@@ -122,7 +124,7 @@ class SimulatedFrameTable(SimulatedFrames):
                 yield name, SimulatedFrame(image, truth | constant)
 
     def _parts(self) -> list[Path]:
-        return sorted((self.folder / "frames").glob("part-*.parquet"))
+        return sorted((self.folder / "frames").glob("part-*.parquet"), key=in_order)
 
 
 def _truth(row: dict[str, Any], shapes: dict[str, list[int]]) -> dict[str, np.ndarray]:
@@ -207,7 +209,7 @@ def _check(folder: Path, settings: dict[str, Any]) -> None:
     if folder.exists() and not folder.is_dir():
         raise MembraneError(f"--out {folder}: is a file; expected a folder, new or of earlier simulations of this sensor")
     if not (folder / SETTINGS).exists():
-        if any(folder.glob("*.npz")) or (folder / SENSOR).exists():
+        if not all(map(is_of_system, folder.glob("*.npz"))) or (folder / SENSOR).exists():
             raise MembraneError(f"--out {folder}: holds other files (.npz, {SENSOR}) and no {SETTINGS}; choose another folder")
         return
     try:

@@ -12,7 +12,8 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
+from ..files.tensors import tensor_of
 from ..surface.membrane import Membrane
 
 APPROACH_STEPS = 10_000
@@ -20,6 +21,7 @@ APPROACH_STEPS = 10_000
 Vector = Tensor | np.ndarray | Sequence[float]
 
 
+@check_arguments
 def facing(direction: Vector) -> Tensor:
     """A rotation that turns a body's +z to a direction.
 
@@ -33,12 +35,13 @@ def facing(direction: Vector) -> Tensor:
         >>> facing((0, 0, -2.0))[:, 2].tolist()
         [0.0, 0.0, -1.0]
     """
-    z = torch.nn.functional.normalize(torch.as_tensor(direction, dtype=torch.float64), dim=-1)
+    z = torch.nn.functional.normalize(_vector("facing: direction", direction), dim=-1)
     x = torch.tensor([1.0, 0, 0] if abs(float(z[0])) < 0.9 else [0, 1.0, 0], dtype=torch.float64)
     x = torch.nn.functional.normalize(x - (x @ z) * z, dim=-1)
     return torch.stack([x, torch.linalg.cross(z, x), z], -1)
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Indenter:
     """A rigid body; subclasses give `local_distance(points [..., 3]) -> [...]` in the body's own frame.
@@ -97,21 +100,25 @@ class Indenter:
             (normal,) = torch.autograd.grad(distance.sum(), points, create_graph=True)
         return distance, normal
 
+    @check_arguments
     def at(self, translation: Vector, rotation: Tensor | None = None) -> "Indenter":
         """The same body at another place, `translation [3]`, turned by `rotation [3, 3]` (default: as before)."""
-        place = torch.as_tensor(translation, dtype=torch.float64)
+        place = _vector(f"{type(self).__name__}.at: translation", translation)
         return replace(self, translation=place, rotation=self.rotation if rotation is None else rotation)
 
+    @check_arguments
     def moved(self, offset: Vector) -> "Indenter":
         """The same body, translated by `offset [3]`."""
-        return self.at(self.translation + torch.as_tensor(offset, dtype=torch.float64))
+        return self.at(self.translation + _vector(f"{type(self).__name__}.moved: offset", offset))
 
+    @check_arguments
     def between(self, other: "Indenter", share: float) -> "Indenter":
         """The pose after `share` of the way to `other`: straight, and turning evenly about one axis."""
         turns = Rotation.from_matrix(np.stack([self.rotation.detach(), other.rotation.detach()]))
         rotation = torch.from_numpy(Slerp([0, 1], turns)(share).as_matrix().copy())
         return self.at(torch.lerp(self.translation, other.translation, share), rotation)
 
+    @check_arguments
     def touching(self, membrane: Membrane, direction: Vector) -> "Indenter":
         """The body moved from far outside until it just touches the rest surface's vertices.
 
@@ -124,7 +131,8 @@ class Indenter:
         Raises:
             MembraneError: it passes by, or faces away.
         """
-        d = torch.nn.functional.normalize(torch.as_tensor(direction, dtype=torch.float64), dim=-1)
+        direction = _vector(f"{type(self).__name__}.touching: direction", direction)
+        d = torch.nn.functional.normalize(direction, dim=-1)
         far = float((membrane.rest - self.translation).norm(dim=-1).max()) + membrane.size
         body = self.moved(-2 * far * d)
         for _ in range(APPROACH_STEPS):
@@ -145,6 +153,7 @@ class Indenter:
                 raise MembraneError(f"{type(self).__name__}: {name} = {value}; expected a positive length")
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Sphere(Indenter):
     """A ball around the origin.
@@ -167,6 +176,7 @@ class Sphere(Indenter):
         return norm(points) - self.radius
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Plane(Indenter):
     """The half space `z <= 0`: a plate that presses along its outward normal, the third axis of its rotation.
@@ -180,6 +190,7 @@ class Plane(Indenter):
         return points[..., 2]
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Cylinder(Indenter):
     """A cylinder about an axis through the origin.
@@ -214,6 +225,7 @@ class Cylinder(Indenter):
         return box_distance(torch.stack([across, along.squeeze(-1).abs() - self.length / 2], -1))
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Wedge(Indenter):
     """A straight edge along x, its tip at the origin pointing to +z.
@@ -243,6 +255,7 @@ class Wedge(Indenter):
         return torch.where(on_flank, y * half.cos() + z * half.sin(), norm(torch.stack([y, z], -1))) - self.radius
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Box(Indenter):
     """A box around the origin, its edges and corners rounded.
@@ -270,6 +283,7 @@ class Box(Indenter):
         return box_distance(points.abs() - (self.sides / 2 - self.radius)) - self.radius
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Union(Indenter):
     """Several bodies joined to one rigid body.
@@ -292,6 +306,13 @@ class Union(Indenter):
 
     def local_distance(self, points: Tensor) -> Tensor:
         return torch.stack([part.distance(points) for part in self.parts], -1).amin(-1)
+
+
+def _vector(name: str, values: Vector) -> Tensor:
+    vector = tensor_of(name, values).double()
+    if vector.shape != (3,):
+        raise MembraneError(f"{name} {list(vector.shape)}; expected [3], x, y and z")
+    return vector
 
 
 def norm(vectors: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments, expect
 from ..files.safe_read import DAMAGE, in_one_line, read_bytes
 from .indenters import Indenter, box_distance
 
@@ -19,6 +19,7 @@ MOST_TRIANGLES, MOST_BYTES = 200_000, 2**25
 """Of a file."""
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class MeshIndenter(Indenter):
     """A body with the surface of a closed triangle mesh.
@@ -51,7 +52,14 @@ class MeshIndenter(Indenter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        body = _trimesh().Trimesh(np.asarray(self.vertices, float), np.asarray(self.triangles), process=True)
+        vertices, triangles = np.asarray(self.vertices, float), np.asarray(self.triangles)
+        for name, array, corners in (("vertices", vertices, "finite"), ("triangles", triangles, "numbers of vertices")):
+            right = array.ndim == 2 and array.shape[1] == 3 and len(array) > 0
+            right = right and bool(
+                np.isfinite(array).all() if name == "vertices" else np.isin(array, range(len(vertices))).all()
+            )
+            expect(right, f"MeshIndenter: {name}", f"an array {list(array.shape)}", f"[N, 3], {corners}")
+        body = _trimesh().Trimesh(vertices, triangles, process=True)
         if not body.is_volume:
             raise MembraneError(
                 f"MeshIndenter: {len(body.vertices)} vertices, {len(body.faces)} triangles, watertight: {body.is_watertight}; "

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments, expect
 from ..sensor.sensor import Sensor
 
 DOT_RADIUS = {"small": 0.16, "large": 0.27}  # over the dots' spacing
@@ -31,6 +31,7 @@ class Canvas(NamedTuple):
     white: Tensor
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Dots:
     """Discs of `ink` on a ground, both as reflectances in 0..1.
@@ -62,6 +63,8 @@ class Dots:
     def __post_init__(self) -> None:
         object.__setattr__(self, "positions", np.asarray(self.positions, float))
         object.__setattr__(self, "radii", np.asarray(self.radii, float))
+        right = self.positions.ndim == 2 and self.positions.shape[1] == 3
+        expect(right, "Dots: positions", f"an array {list(self.positions.shape)}", "[D, 3]")
         count = len(self.positions)
         if self.radii.shape != (count,) or not (self.radii > 0).all():
             raise MembraneError(f"Dots: radii {self.radii.tolist()}; expected {count} positive lengths, one for each dot")
@@ -71,14 +74,17 @@ class Dots:
             raise MembraneError(f"Dots: missing = {list(self.missing)}; expected numbers of dots, 0 to {count - 1}")
 
     @classmethod
+    @check_arguments
     def of(cls, sensor: Sensor, radii: Sequence[float] | None = None, missing: Sequence[int] = ()) -> "Dots":
         """The dots that a sensor lists; `radii` of small and large ones, default 0.16 and 0.27 of their spacing."""
         positions, sizes = sensor.markers.positions, sensor.markers.sizes
         if positions is None or sizes is None:
             raise MembraneError(f"sensor {sensor.name!r} lists no dots; expected markers.file with their rest positions")
         spacing = (float(sensor.membrane.rest_area.sum()) / len(positions)) ** 0.5
+        right = radii is None or len(radii) == len(DOT_RADIUS)
+        expect(right, "Dots: radii", radii, f"{len(DOT_RADIUS)} lengths, of {' and '.join(DOT_RADIUS)} dots")
         default = [share * spacing for share in DOT_RADIUS.values()]
-        radius = dict(zip(DOT_RADIUS, radii or default, strict=True))
+        radius = dict(zip(DOT_RADIUS, default if radii is None else radii, strict=True))
         tones = {"dark": (0.12, 1.0), "light": (1.0, 0.2)}[sensor.markers.polarity]
         made = cls(positions, np.array([radius[size] for size in sizes]), tuple(missing), *tones)
         if radii is not None:
@@ -106,6 +112,7 @@ def _refuse_overlap(dots: Dots) -> None:
         )
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Speckle:
     """Random grains, the same for the same `seed`.
@@ -147,6 +154,7 @@ class Speckle:
         return self.dark + (1 - self.dark) * (1 + torch.tanh(2 * wave)) / 2
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Painted:
     """What a rest image shows, taken onto the rest surface and freed of the light that falls on it.

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
 from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..surface.membrane import Membrane
@@ -53,6 +53,7 @@ class Press(NamedTuple):
     iterations: int
 
 
+@check_arguments
 def press(membrane: Membrane, elasticity: ElasticEnergy, paths: Sequence[Sequence[Indenter]], **options: Any) -> Press:
     """The last state of `presses`, which takes the same arguments.
 
@@ -81,6 +82,7 @@ def press(membrane: Membrane, elasticity: ElasticEnergy, paths: Sequence[Sequenc
     return last
 
 
+@check_arguments
 def presses(
     membrane: Membrane,
     elasticity: ElasticEnergy,

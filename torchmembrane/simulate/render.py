@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from scipy.interpolate import make_interp_spline
 from torch import Tensor, nn
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
 from ..sensor.sensor import Sensor
 from .appearance import BRIGHT, DEFAULT_APPEARANCE, Appearance, blurred, diffuse_light, specular_light, vignette
 from .pattern import Canvas, Dots, Painted, Speckle, dot_coordinates, inside_unit_disc, pattern_of
@@ -37,6 +37,7 @@ class RenderedDots(NamedTuple):
     visible: Tensor
 
 
+@check_arguments
 class Renderer(nn.Module):
     """Images of one sensor.
 
@@ -187,8 +188,9 @@ class Renderer(nn.Module):
         sample = torch.nonzero(visible.view(-1) >= 0).squeeze(-1)
         place = torch.stack([sample % visible.shape[1], sample // visible.shape[1]], -1).float()
         linear = LinearOnTriangles.of(corners, x[self.surface.triangles][..., 2:])
-        image = torch.full(visible.shape, torch.nan, device=visible.device)
-        image.view(-1)[sample] = linear.at(visible.view(-1)[sample], place).squeeze(-1)
+        depth = linear.at(visible.view(-1)[sample], place).squeeze(-1)
+        image = torch.full(visible.shape, torch.nan, dtype=depth.dtype, device=visible.device)
+        image.view(-1)[sample] = depth
         return image
 
     def _light(self, x: Tensor) -> Tensor:
@@ -233,7 +235,7 @@ class Renderer(nn.Module):
             row = self.dot_row.index_select(0, triangle.index_select(0, near))
             covered = inside_unit_disc(linear.at(row, place.index_select(0, near)), linear.slope.index_select(0, row))
             grey[near] *= 1 + (self.ink - 1) * covered
-        image = torch.full(visible.shape, self.appearance.outside, device=visible.device)
+        image = torch.full(visible.shape, self.appearance.outside, dtype=grey.dtype, device=visible.device)
         image.view(-1)[sample] = grey + shine
         return F.avg_pool2d(image[None, None], self.samples)[0, 0]
 

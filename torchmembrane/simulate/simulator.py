@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
 from ..files.images import to_grey
 from ..sensor.factories import cavity_filling, elastic_energy
 from ..sensor.sensor import Sensor
@@ -88,6 +88,7 @@ class SimulatedFrame(NamedTuple):
     truth: dict[str, np.ndarray]
 
 
+@check_arguments
 class Simulator:
     """Presses and images of one sensor.
 

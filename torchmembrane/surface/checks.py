@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import MembraneError
+from ..errors import MembraneError, is_array
 
 FARTHEST = 1e6
 """Coordinate, length unit."""
@@ -23,6 +23,8 @@ def checked_grid(vertices: ArrayLike, fixed: ArrayLike | None) -> tuple[np.ndarr
     Raises:
         MembraneError: another shape, a vertex that is not finite, a free border, no free vertex.
     """
+    if not is_array(vertices):
+        raise MembraneError(f"Membrane: vertices are a {type(vertices).__name__}; expected an array [m, n, 3] of numbers")
     X = np.asarray(vertices, dtype=np.float64)
     if X.ndim != 3 or X.shape[2] != 3 or min(X.shape[:2]) < 3:
         raise MembraneError(f"Membrane: vertices of shape {list(X.shape)}; expected [m, n, 3] with m, n >= 3")

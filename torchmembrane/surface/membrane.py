@@ -8,7 +8,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
 from ..solve.stencil import apply_stencil, stencil_kernels
 from . import projection
 from .checks import checked_grid, checked_orientation
@@ -226,6 +226,7 @@ class Membrane(nn.Module):
         fan = np.cross(rim, np.roll(rim, -1, 0)) @ rim.mean(0)
         return float(self.rest_volume) - abs(float(fan.sum())) / 6
 
+    @check_arguments
     def resampled(self, grid: tuple[int, int]) -> "Membrane":
         """The same rest surface on another grid whose lines are equally spaced along the surface.
 

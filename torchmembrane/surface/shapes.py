@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import MembraneError
+from ..errors import MembraneError, check_arguments
 from .checks import FARTHEST
 from .membrane import Membrane
 
@@ -35,6 +35,7 @@ def disc_grid(m: int, n: int) -> tuple[np.ndarray, np.ndarray]:
     return u * np.sqrt(1 - v**2 / 2), v * np.sqrt(1 - u**2 / 2)
 
 
+@check_arguments
 def spherical_cap(rim_radius: float, height: float, base_z: float, grid: tuple[int, int] = (17, 17)) -> Membrane:
     """The cap of a sphere over its circular rim, bulging away from the camera.
 
@@ -60,6 +61,7 @@ def spherical_cap(rim_radius: float, height: float, base_z: float, grid: tuple[i
     return _dome(grid, (radius, radius, radius), opening, base_z)
 
 
+@check_arguments
 def ellipsoid_cap(semi_axes: Sequence[float], base_z: float, grid: tuple[int, int] = (17, 17)) -> Membrane:
     """The upper half of an ellipsoid over its elliptic rim, bulging away from the camera.
 
@@ -83,6 +85,7 @@ def ellipsoid_cap(semi_axes: Sequence[float], base_z: float, grid: tuple[int, in
     return _dome(grid, (a, b, c), np.pi / 2, base_z)
 
 
+@check_arguments
 def half_cylinder(radius: float, length: float, half_angle: float, base_z: float, grid: tuple[int, int] = (17, 17)) -> Membrane:
     """A cylinder along x, bulging away from the camera.
 
@@ -113,6 +116,7 @@ def half_cylinder(radius: float, length: float, half_angle: float, base_z: float
     return Membrane(np.stack([x, radius * np.sin(angle), z], -1))
 
 
+@check_arguments
 def heightfield(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Membrane:
     """A surface of heights over a rectangle; its border is the rim.
 

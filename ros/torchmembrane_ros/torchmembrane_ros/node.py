@@ -3,8 +3,9 @@
 ros2 run torchmembrane_ros tracker --ros-args -p sensor:=sensor.toml -r image:=/finger/image_raw
 
 Parameters: `sensor`, the sensor file; `compressed`, whether `image` is a CompressedImage. Publishes `wrench`, `points` and, of
-a gas, `pressure`, with the image's header. A frame without a surface is logged and nothing is published. The service `rezero`
-(std_srvs/Trigger) takes the latest image for the rest state.
+a gas, `pressure`, with the image's header. A frame without a surface is logged and nothing is published. The first CameraInfo
+beside the images is compared with the sensor file, and what disagrees is logged. The service `rezero` (std_srvs/Trigger) takes
+the latest image for the rest state.
 """
 
 import warnings
@@ -15,11 +16,11 @@ import torch
 from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CompressedImage, FluidPressure, Image, PointCloud2, PointField
+from sensor_msgs.msg import CameraInfo, CompressedImage, FluidPressure, Image, PointCloud2, PointField
 from std_srvs.srv import Trigger
 
 import torchmembrane as tm
-from torchmembrane.integrations.messages import POINT_FIELDS, SiUnits, cloud_layout, grey_of, has_wrench
+from torchmembrane.integrations.messages import POINT_FIELDS, SiUnits, cloud_layout, grey_of, has_wrench, info_topic, unlike
 from torchmembrane.results.store import Mesh, Settings
 
 FIELDS = [PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, name in enumerate(POINT_FIELDS)]
@@ -34,12 +35,14 @@ class TrackerNode(Node):
         reconstructor = tm.Reconstructor.from_file(self.declare_parameter("sensor", "sensor.toml").value)
         self.tracker = tm.Tracker(reconstructor)
         self.camera = reconstructor.sensor.camera
+        self.compared = False
         mesh = Mesh.of(reconstructor, Settings.of(reconstructor, "npz"))
         self.units = SiUnits(mesh, reconstructor.sensor.gas_pressure)
         kind = CompressedImage if self.declare_parameter("compressed", False).value else Image
         self.wrenches = self.create_publisher(WrenchStamped, "wrench", 1)
         self.clouds = self.create_publisher(PointCloud2, "points", 1)
         self.pressures = self.create_publisher(FluidPressure, "pressure", 1)
+        self.create_subscription(CameraInfo, info_topic(self.resolve_topic_name("image")), self.compare, NEWEST)
         self.create_subscription(kind, "image", self.follow, NEWEST)
         self.create_service(Trigger, "rezero", self.rezero)
 
@@ -61,6 +64,17 @@ class TrackerNode(Node):
         pressure = self.units.pressure(frame)
         if pressure is not None:
             self.pressures.publish(FluidPressure(header=message.header, fluid_pressure=pressure, variance=0.0))
+
+    def compare(self, info: CameraInfo) -> None:
+        """Say what the first CameraInfo has otherwise than the sensor file."""
+        if not self.compared:
+            self.compared = True
+            try:
+                remark = unlike(info, self.camera)
+            except tm.MembraneError as error:
+                remark = str(error)
+            if remark:
+                self.get_logger().warning(remark)
 
     def rezero(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Take the latest image for the rest state."""

@@ -99,7 +99,8 @@ class EllipseFit(nn.Module):
         self.register_buffer("ridge", torch.as_tensor(ridge))
         self.register_buffer("unit_loads", torch.eye(7, dtype=torch.float64)[:, 4:6])
         self.register_buffer("least", torch.tensor(1e-12, dtype=torch.float64))
-        self.register_buffer("farthest", torch.tensor([[-2.0, -2.0, -1.0], [2.0, 2.0, 1.6]])[..., None, None])
+        farthest = torch.tensor([[-2.0, -2.0, -1.0], [2.0, 2.0, 1.6]], dtype=torch.float32)
+        self.register_buffer("farthest", farthest[..., None, None])
 
     def _register_levels(self, level: np.ndarray, offset: np.ndarray, sizes: np.ndarray) -> None:
         """Which dots are fitted on which level, and where in it the pixels of a window are."""

@@ -41,8 +41,10 @@ class FlowAverages(nn.Module):
         self.register_buffer("moments", torch.as_tensor(moments_of_dots.reshape(count, -1).copy()))
         self.register_buffer("first_moments", torch.as_tensor(moments_of_dots[:, :3].reshape(count, -1).copy()))
         still = torch.as_tensor(moments[:, count:].sum(1))
-        self.register_buffer("still", still[:3] * torch.tensor([[1.0], [2.0], [2.0]]))  # anchors take the dot's gradient
-        self.register_buffer("raised", still + torch.tensor([1e-3, 0, 0, RIDGE, 0, 0, RIDGE])[:, None])
+        twice = torch.tensor([[1.0], [2.0], [2.0]], dtype=torch.float32)  # anchors take the dot's gradient
+        ridge = torch.tensor([1e-3, 0, 0, RIDGE, 0, 0, RIDGE], dtype=torch.float32)
+        self.register_buffer("still", still[:3] * twice)
+        self.register_buffer("raised", still + ridge[:, None])
         self.register_buffer("pull", torch.as_tensor(RIDGE * h))
         self.register_buffer("h", torch.as_tensor(h))
 

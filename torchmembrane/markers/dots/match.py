@@ -108,7 +108,7 @@ class DotMatcher(nn.Module):
             Certainty `[B, D]`, the flow to the blob `[B, 2, D]` (the prediction where lost), its strain `[B, 2, 2, D]`.
         """
         expected = self.pixels.mT + predicted
-        alone = (expected * expected).sum(1) * self.stiffness + FAR * (support < SUPPORT)
+        alone = (expected * expected).sum(1) * self.stiffness + FAR * (support < SUPPORT).to(support.dtype)
         cost = torch.cat([alone[:, None], self.slope * expected], 1).mT @ blobs[:, :3] + base
         best = cost.amin(-1)
         chosen = (cost <= best[..., None]).to(cost.dtype)

@@ -38,7 +38,7 @@ def refine(
     """Centres `[D, 2]` fitted to sub-pixel accuracy, the outline's growth `[D]` px, quality `[D]` in 0..1."""
     fit = EllipseFit(pixels, shapes, dark.shape[::-1], tolerance)
     levels = mean_pyramid(torch.as_tensor(dark)[None, None])
-    found = fit(levels, torch.as_tensor(pixels)[None], torch.as_tensor(shapes)[None], torch.zeros(1), 8)
+    found = fit(levels, torch.as_tensor(pixels)[None], torch.as_tensor(shapes)[None], torch.zeros(1, dtype=torch.float32), 8)
     return found.centre[0].numpy(), found.growth[0].numpy(), found.quality[0].numpy()
 
 

@@ -91,7 +91,7 @@ class SoftTextureLocator(PatchLocator):
         self.stages = nn.ModuleList(
             PatchCorrelation(levels[k], self.rest_pixels / 2**k, RADIUS[k], reach) for k, reach, _ in STAGES
         )
-        self.to(torch.get_default_dtype())
+        self.to(torch.float32)
 
     @traced
     def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:

@@ -123,7 +123,7 @@ class TextureLocator(PatchLocator):
         templates = [Template(rest, self.rest_pixels / 2**level, RADIUS[level]) for level, rest in levels]
         self.templates = nn.ModuleList(templates)
         self.search = Search(templates[-1])
-        self.to(torch.get_default_dtype())
+        self.to(torch.float32)
 
     @traced
     def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:

@@ -64,11 +64,11 @@ class Template(nn.Module):
         slope = torch.cat([slope, (slope[:, :, None] * offset.T / radius).flatten(1, 2)], 1)
         slope = slope - (weight * slope).sum(-1, keepdim=True)
         slope = slope - (weight * slope * unit).sum(-1, keepdim=True) * unit
-        damping = torch.diag(torch.tensor([1e-8] * 2 + [WARP_DAMPING] * 4).to(rest))
+        damping = torch.diag(rest.new_tensor([1e-8] * 2 + [WARP_DAMPING] * 4))
         newton = torch.linalg.solve((weight * slope) @ slope.mT + damping, weight * slope) * contrast[:, None]
         self.register_buffer("centre", centre.clone())
         self.register_buffer("offset", offset)
-        self.register_buffer("radius", torch.tensor(float(radius)))
+        self.register_buffer("radius", torch.tensor(float(radius), dtype=torch.float32))
         self.register_buffer("weight", weight)
         self.register_buffer("unit", weight * unit[:, 0])
         self.register_buffer("rows", torch.cat([weight.expand_as(unit), weight * unit, newton], 1))  # [D, 8, N]
