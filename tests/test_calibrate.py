@@ -446,7 +446,7 @@ def test_command_layout_writes_for_machine_and_eye(design, tmp_path, capsys):
         (
             "views",
             ("rest.png", "rest.png", "--motions", "far.motions"),
-            "largest 1e+300; expected six finite numbers up to 10000",
+            "far.motions, line 3: x = 1e300; expected a coordinate up to 1e+06",
         ),
         ("depth", ("far.npy", "--image", "rest.png"), "far.npy: depths up to 1e+300; expected at most 1e+06: check --unit 1"),
         ("depth", ("text.npy", "--image", "rest.png"), "text.npy: not readable"),

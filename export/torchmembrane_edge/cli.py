@@ -119,7 +119,7 @@ def _line(session: Session, result: dict) -> str:
         return session.status_texts[status]
     moved = np.linalg.norm(result["displacement"][0], axis=-1).max()
     force = np.linalg.norm(result["force"][0])
-    return f"moved by at most {moved:.2f} {session.length_unit}, force {force:.3g} {session.force_unit}"
+    return f"moved by at most {moved:.3g} {session.length_unit}, force {force:.3g} {session.force_unit}"
 
 
 def _read(path: Path, size) -> np.ndarray:

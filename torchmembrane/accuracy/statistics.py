@@ -25,7 +25,7 @@ def spread(values: Sequence[float]) -> Spread:
         Spread(median=nan, most=nan)
     """
     finite = [value for value in values if np.isfinite(value)]
-    return Spread(*(round(float(q), 12) for q in np.percentile(finite, (50, 90)))) if finite else Spread(np.nan, np.nan)
+    return Spread(*(float(f"{q:.12g}") for q in np.percentile(finite, (50, 90)))) if finite else Spread(np.nan, np.nan)
 
 
 def rest_floor(trials: Sequence[RestTrial]) -> RestFloor:

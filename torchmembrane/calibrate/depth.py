@@ -78,6 +78,13 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, pro
     points, cells = _points(sensor, depth)
     projection = surface_projection(surface, points)
     near = np.abs(projection.signed_distance) < NEAR * surface.size
+    if len(near) and not near.any():
+        unit, depths, design = sensor.length_unit, points[:, 2], surface.rest[:, 2]
+        raise MembraneError(
+            f"calibrate depth: depths from {depths.min():.4g} to {depths.max():.4g} {unit}, none near the designed surface at "
+            f"{design.min():.4g} to {design.max():.4g} {unit}; expected depths along the camera's axis: check the unit of the "
+            "image's values (--unit)"
+        )
     projection = SurfaceProjection(*(values[near] for values in projection))
     square = np.unique(cells[near], return_inverse=True)[1]
     counts = np.bincount(square)
