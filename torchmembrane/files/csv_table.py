@@ -63,7 +63,7 @@ class Limit(NamedTuple):
     unit: str = ""
 
 
-ANY = Limit()
+ANY, ANGLE = Limit(), Limit(360.0, "an angle", "degrees")
 
 
 class Row(NamedTuple):

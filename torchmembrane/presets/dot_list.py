@@ -7,15 +7,17 @@ import torch
 
 from ..camera.model import Camera
 from ..errors import MembraneError
-from ..files.csv_table import Columns, read_table
+from ..files.csv_table import ANGLE, ANY, Columns, read_table
 from ..files.digits import rounded
 from ..markers.placement import FEWEST_MARKERS
 from ..sensor.parts import OFF_SURFACE, Surface
-from ..sensor.toml import MOST_DOTS, MOST_DOTS_BYTES, SIZES
+from ..sensor.toml import COORDINATE, MOST_DOTS, MOST_DOTS_BYTES, SIZES
 
 FINE = (97, 97)  # vertices of the surface on which dots are put
 RAYS = (("x", "y"), ("angle", "azimuth"), ("u", "v"))  # columns of dots that a ray puts on the surface
 POINTS = (("x", "y", "z"), ("x", "y", "h"))
+LIMITS = {"x": COORDINATE, "angle": ANGLE, "u": ANY}
+"""Of the numbers of a form, by its first column."""
 SIZE = "size"
 DOTS = Columns((*POINTS, *RAYS), "dot", SIZE, least=FEWEST_MARKERS, most=MOST_DOTS)
 
@@ -39,7 +41,7 @@ def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.
         MembraneError: the file cannot be read, has another header, or a dot whose ray misses the membrane: the line is named.
     """
     form, rows = read_table(path, DOTS, MOST_DOTS_BYTES)
-    values = np.array([row.numbers(form) for row in rows])
+    values = np.array([row.numbers(form, LIMITS[form[0]]) for row in rows])
     sizes = [row.choice(SIZE, SIZES) if SIZE in row.places else SIZES[0] for row in rows]
     base_z = surface.values["base_z"]
     if form == ("x", "y", "z"):

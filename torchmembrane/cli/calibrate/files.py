@@ -11,7 +11,7 @@ from ...calibrate.detection import find_target
 from ...calibrate.report import Report
 from ...camera.targets import Checkerboard, DotBoard
 from ...errors import MembraneError
-from ...files.csv_table import Columns, Limit, read_table
+from ...files.csv_table import ANGLE, Columns, read_table
 from ...files.images import read_image
 from ...files.safe_read import read_array
 from ...jobs.inputs import Inputs, find_inputs, frame_name
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 MOST_TABLE_BYTES = 2**20
 PLACES, TURNS = ("x", "y", "z"), ("turn_x", "turn_y", "turn_z")
-ANGLE = Limit(360.0, "an angle", "degrees")
 MOTIONS = Columns([(*PLACES, *TURNS)], "image", unit="length unit and degrees")
 FORCES = Columns([("image", "fx", "fy", "fz"), ("image", "force")], "force", unit="N")
 
