@@ -21,6 +21,8 @@ def spread(values: Sequence[float]) -> Spread:
     Example:
         >>> spread([3.0, 1.0, 2.0, float("inf")])
         Spread(median=2.0, most=2.8)
+        >>> spread([3e-13, 1e-13, 2e-13])
+        Spread(median=2e-13, most=2.8e-13)
         >>> spread([])
         Spread(median=nan, most=nan)
     """
