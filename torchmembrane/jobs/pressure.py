@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 MOST_BYTES = 2**26
 ACROSS, SINCE_REST = "pressure", "pressure_change"
-PRESSURES = Columns([("name", ACROSS), ("name", SINCE_REST)], "reading", unit="hPa")
+PRESSURES = Columns([("name", ACROSS), ("name", SINCE_REST)], "reading", unit="hPa, across the membrane or since rest")
 UNKNOWN = ("", "nan")
 """Cells of frames that have no reading."""
 KINDS = {"name": "frames", "image": "images"}

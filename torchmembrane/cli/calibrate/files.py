@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 MOST_TABLE_BYTES = 2**20
 PLACES, TURNS = ("x", "y", "z"), ("turn_x", "turn_y", "turn_z")
 MOTIONS = Columns([(*PLACES, *TURNS)], "image", unit="length unit and degrees")
-FORCES = Columns([("image", "fx", "fy", "fz"), ("image", "force")], "force", unit="N")
+FORCES = Columns([("image", "fx", "fy", "fz"), ("image", "force")], "force", unit="N, on the membrane, in the camera's frame")
 
 
 def read_sensor(arguments: Namespace) -> Sensor:
