@@ -25,7 +25,7 @@ torch.set_num_threads(1)
 gc.set_threshold(100_000, 50, 100)  # tracing makes millions of objects that stay
 LONG = ["test_export", "test_export_sensors", "test_drift", "test_compile", "test_learning_stack", "test_jobs", "test_learning",
         "test_fuzz", "test_material", "test_deviations", "test_calibrate", "test_tutorial", "test_gauge_modulus",
-        "test_export_choices", "test_open_estimators", "test_weight"]  # fmt: skip
+        "test_export_choices", "test_open_estimators", "test_weight", "test_units"]  # fmt: skip
 
 
 def pytest_collection_modifyitems(items):

@@ -314,12 +314,21 @@ def test_misplaced_dots_are_nulled(design):
     assert (np.linalg.norm(found.shifts, axis=1) > 0.1).nonzero()[0].tolist() == wrong
 
 
-def test_unlisted_dots_are_found_from_several_views(design, truth, image):
-    motions = np.array([[0.0, 0, 0, 0, 0, 0], [1.5, 0, 0, 0, -3, 0], [0, -1.5, 0, -3, 0, 0]])
+MOTIONS = np.array([[0.0, 0, 0, 0, 0, 0], [1.5, 0, 0, 0, -3, 0], [0, -1.5, 0, -3, 0, 0]])
+
+
+@pytest.fixture(scope="module")
+def views(truth, image):
+    """Images by a camera that moves by `MOTIONS`."""
     images = [image]
-    for motion in motions[1:]:
+    for motion in MOTIONS[1:]:
         back = Rotation.from_rotvec(np.deg2rad(motion[3:])).inv()
         images.append(simulator_of(moved(truth, back, -back.apply(motion[:3]))).rest_image())
+    return images
+
+
+def test_unlisted_dots_are_found_from_several_views(design, truth, image, views):
+    motions, images = MOTIONS, views
     rough = motions + [[0] * 6, [0, 0, 0, 0.3, -0.2, 0.3], [0.03, 0, -0.05, 0.2, 0.3, -0.3]]
     unlisted = replace(design, markers=Markers("dots", "dark", rest_image=image))
     found = rest_from_views(unlisted, images, rough, 0.005)
@@ -331,6 +340,19 @@ def test_unlisted_dots_are_found_from_several_views(design, truth, image):
     assert (error < 3 * found.deviations).mean() > 0.98
     inner = np.linalg.norm(found.dots[:, :2], axis=1) < 6
     assert error[inner].max() < 0.1 and found.sensor.markers.sizes == [truth.markers.sizes[k] for k in partner]
+
+
+@pytest.mark.parametrize("travel, error", [(1.5, 0.2), (1.5, np.inf), (0.05, None), (0.0, None)])
+def test_views_whose_travel_tells_no_scale_are_refused(design, views, travel, error):
+    motions = MOTIONS * [travel / 1.5, 1, 1, 1, 1, 1]
+    with pytest.raises(MembraneError, match=rf"travelled by {travel:g} mm, known to .* expected to a tenth at least"):
+        rest_from_views(design, views, motions, error)
+
+
+@pytest.mark.parametrize("scale", [0.3, 2.54, 1000.0])
+def test_motions_in_another_unit_are_refused(design, views, scale):
+    with pytest.raises(MembraneError, match="calibrate views: the (surface would be moved|dots lie)|dots found"):
+        rest_from_views(design, views, MOTIONS * [*[scale] * 3, 1, 1, 1])
 
 
 def test_rest_surface_and_dots_are_found_from_a_depth_image(design, truth, image):
@@ -453,8 +475,18 @@ def test_command_camera_says_why_no_image_shows_the_board(design, tmp_path, caps
     assert code == 2 and "no image of 3 shows" in errors and "--corners 9,6" in errors
 
 
-def test_command_layout_writes_for_machine_and_eye(design, tmp_path, capsys):
+def test_command_views_takes_one_motion_for_each_image(design, image, tmp_path, capsys):
     path = design.to_file(tmp_path / "design")
+    for k in range(3):
+        Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(tmp_path / f"view{k}.png")
+    (tmp_path / "motions.csv").write_text("x,y,z,turn_x,turn_y,turn_z\n0,0,0,0,0,0\n1,0,0,0,0,0\n")
+    given = tmp_path / "view*.png", "--motions", tmp_path / "motions.csv", "--out", tmp_path / "out"
+    code, _, errors = run(capsys, "views", path, *given)
+    assert code == 2 and f"{tmp_path / 'motions.csv'}: 2 lines of motions; expected 3, one for each image" in errors
+
+
+def test_command_layout_writes_for_machine_and_eye(design, tmp_path, capsys):
+    path = replace(design, name="<a & b>").to_file(tmp_path / "design")
     code, said, _ = run(capsys, "layout", path, "--pitch", 25, "--out", tmp_path / "out")
     assert code == 0 and "layout.csv" in said
     made = Sensor.from_file(tmp_path / "out" / "sensor.toml")
@@ -486,7 +518,7 @@ def test_command_layout_writes_for_machine_and_eye(design, tmp_path, capsys):
         (
             "views",
             ("rest.png", "rest.png", "--motions", "far.motions"),
-            "largest 1e+300; expected six finite numbers up to 10000",
+            "far.motions, line 3: x = 1e300; expected a coordinate up to 1e+06",
         ),
         ("depth", ("far.npy", "--image", "rest.png"), "far.npy: depths up to 1e+300; expected at most 1e+06: check --unit 1"),
         ("depth", ("text.npy", "--image", "rest.png"), "text.npy: not readable"),

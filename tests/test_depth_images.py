@@ -20,11 +20,22 @@ def test_depth_images_are_read_as_ros_has_them(tmp_path, kind):
     if "H, W" in kind:
         values = values[..., None]
     Image.fromarray(values).save(path) if path.suffix != ".npy" else np.save(path, values)
-    found = read_depth(path, unit)
+    found = read_depth(path, unit, "mm")
     assert found.shape == (2, 4) and found.dtype == np.float64
     seen = true > 0
     np.testing.assert_allclose(found[seen], true[seen], rtol=1e-3 if "16" in kind and unit > 1 else 1e-6)
     assert not (found[~seen] > 0).any()
+
+
+@pytest.mark.parametrize("unit, millimetre", [("mm", 1.0), ("cm", 0.1), ("m", 1e-3), ("um", 1e3), ("inch", 1 / 25.4)])
+def test_steps_of_16_bits_are_millimetres_and_other_depths_of_the_sensors_unit(tmp_path, unit, millimetre):
+    depth = np.array([[21.0, 22.0], [23.0, 0.0]])
+    for name in ("a.npy", "a.tiff"):
+        path, stored = tmp_path / name, (millimetre * depth).astype(np.float32)
+        Image.fromarray(stored).save(path) if name.endswith("tiff") else np.save(path, stored)
+        np.testing.assert_allclose(read_depth(path, None, unit), millimetre * depth, rtol=1e-6)
+    Image.fromarray(depth.astype(np.uint16)).save(tmp_path / "a.png")
+    np.testing.assert_allclose(read_depth(tmp_path / "a.png", None, unit), millimetre * depth)
 
 
 @pytest.mark.parametrize("values", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros(4), np.zeros((4, 4, 2))])
@@ -33,8 +44,8 @@ def test_what_is_no_depth_image_is_refused(tmp_path, values):
     with pytest.raises(
         MembraneError, match=r"a.npy: an array \[4.*\] of (uint8|float64); expected \[H, W\] of float or of 16 bits"
     ):
-        read_depth(tmp_path / "a.npy", 1.0)
+        read_depth(tmp_path / "a.npy", 1.0, "mm")
     if values.dtype == np.uint8:
         Image.fromarray(values).save(tmp_path / "a.png")
         with pytest.raises(MembraneError, match=r"a.png: an array \[4, 4\] of uint8"):
-            read_depth(tmp_path / "a.png", 1.0)
+            read_depth(tmp_path / "a.png", 1.0, "mm")

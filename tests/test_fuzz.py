@@ -7,8 +7,18 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FEW = ["sensors=40", "images=40", "npz=20", "parquet=20", "readings=35", "dots=35", "videos=15"]
-MORE = ["sensors=120", "images=120", "npz=60", "parquet=60", "readings=100", "dots=100", "videos=30"]
+FEW = ["sensors=40", "images=40", "npz=20", "parquet=20", "readings=35", "dots=35", "motions=35", "forces=35", "videos=15"]
+MORE = [
+    "sensors=120",
+    "images=120",
+    "npz=60",
+    "parquet=60",
+    "readings=100",
+    "dots=100",
+    "motions=100",
+    "forces=100",
+    "videos=30",
+]
 
 
 @pytest.mark.parametrize("counts, lines", [(FEW, ["--lines", "9"]), pytest.param(MORE, [], marks=pytest.mark.full)])

@@ -145,9 +145,14 @@ def test_command_finds_the_material_of_the_example_images(tmp_path):
 
 @pytest.mark.parametrize(
     "text, message",
-    [("image,f\na.png,1\n", "header"), ("image,force\nb.png,1\n", "none of the images"), ("image,force\na.png,x\n", "readable"),
-     ("image,fx,fy,fz\nflat_plate.png,1,2\n", "3 finite"), ("image,force\n", "no forces")],
-)  # fmt: skip
+    [
+        ("image,f\na.png,1\n", "header"),
+        ("image,force\nb.png,1\n", "none of the images"),
+        ("image,force\nflat_plate.png,x\n", "line 2: force = 'x'; expected a number"),
+        ("image,fx,fy,fz\nflat_plate.png,1,2\n", "line 2: 3 values, flat_plate.png,1,2; expected four, image,fx,fy,fz"),
+        ("image,force\n", "no forces"),
+    ],
+)
 def test_bad_forces_are_refused(tmp_path, capsys, text, message):
     (tmp_path / "forces.csv").write_text(text)
     arguments = [str(EXAMPLES / "sensor.toml"), str(EXAMPLES / "flat_plate.png"), "--forces", str(tmp_path / "forces.csv")]

@@ -134,6 +134,16 @@ def test_a_mesh_file_presses_like_the_ball_it_approximates(sensor_path, tmp_path
     assert forces[1] == pytest.approx(forces[0], rel=0.05)
 
 
+@pytest.mark.parametrize("radius", [3000.0, 0.003])
+def test_a_mesh_in_another_unit_is_refused(sensor_path, tmp_path, capsys, radius):
+    import trimesh
+
+    ball = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(1, radius).export(ball)
+    code, _, errors = run(capsys, "simulate", sensor_path, "--indenter", ball, "--depth", "0.5", "--out", tmp_path / "out")
+    assert code == 2 and f"its longest side is {2 * radius:g}; expected" in errors and "give the mesh in mm" in errors
+
+
 def test_a_path_gives_frames_and_a_video(sensor_path, tmp_path, capsys):
     path = ("--slide", "0.3,0,0", "--friction", "0.4", "--path", "push,slide,release", "--frames", "2")
     for video in ((), ("--video",)):

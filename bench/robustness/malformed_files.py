@@ -48,6 +48,14 @@ a.b.c.d.e.f.g.h.i.j = 1
 "\\n" = 1
 x = 1
 """.splitlines()
+DRESSES: list[Callable[[str], bytes]] = [
+    *(lambda text: text.replace(",", ";").encode(), lambda text: re.sub(r"([0-9])\.([0-9])", r"\1,\2", text).encode()),
+    *(lambda text: text.replace("\n", "\r\n").encode("utf-8-sig"), lambda text: text.encode("utf-16")),
+    *(lambda text: text.partition("\n")[2].encode(), lambda text: text.replace("\n", ",\n").encode()),
+    *(lambda text: re.sub("[^,\n]+", r'"\g<0>"', text).encode(), lambda text: f"# by hand\n{text}\n\n".encode()),
+    lambda text: "\n".join(",".join(reversed(line.split(","))) for line in text.splitlines()).encode(),
+]
+"""How else a table may be written: some of these mean the same, some are refused."""
 CELLS = ["small", "large", "1_0", "٣", "1e-5", '"', "", *VALUES]
 Case = dict[str, bytes | str]
 
@@ -165,7 +173,8 @@ def changed(draw: st.DrawFn, A: np.ndarray) -> np.ndarray:
 
 @st.composite
 def table(draw: st.DrawFn, text: str) -> bytes:
-    """A CSV file with lines removed, doubled or moved, cells replaced, ten thousand lines alike; or damaged as bytes."""
+    """A CSV file with lines removed, doubled or moved, cells replaced, ten thousand lines alike; or damaged as bytes. One in
+    three is written otherwise, with semicolons, decimal commas, quotes and the like."""
     header, *lines = text.splitlines()
     i, j = (draw(st.integers(0, len(lines) - 1)) for _ in range(2))
     cells = lines[i].split(",")
@@ -181,7 +190,10 @@ def table(draw: st.DrawFn, text: str) -> bytes:
         *(lambda: [re.sub(r"\d\.\d+", lambda number: f"{float(number[0]) + rng.normal():.4f}", line) for line in lines],),
     ]
     way = draw(st.integers(0, len(ways)))
-    return draw(damaged(text.encode())) if way == len(ways) else "\n".join([header, *ways[way]()]).encode()
+    if way == len(ways):
+        return draw(damaged(text.encode()))
+    dress = draw(st.sampled_from([*[str.encode] * 2 * len(DRESSES), *DRESSES]))
+    return dress("\n".join([header, *ways[way]()]))
 
 
 @st.composite

@@ -223,7 +223,7 @@ class SpecSheet(NamedTuple):
 
     Attributes:
         name: of the sensor.
-        length_unit: "mm" | "cm" | "m".
+        length_unit: the sensor's.
         force_unit: "N" | "relative".
         noise: of the images, white over its standard deviation, dB.
         seed: of presses and noise.

@@ -21,11 +21,13 @@ def spread(values: Sequence[float]) -> Spread:
     Example:
         >>> spread([3.0, 1.0, 2.0, float("inf")])
         Spread(median=2.0, most=2.8)
+        >>> spread([3e-13, 1e-13, 2e-13])
+        Spread(median=2e-13, most=2.8e-13)
         >>> spread([])
         Spread(median=nan, most=nan)
     """
     finite = [value for value in values if np.isfinite(value)]
-    return Spread(*(round(float(q), 12) for q in np.percentile(finite, (50, 90)))) if finite else Spread(np.nan, np.nan)
+    return Spread(*(float(f"{q:.12g}") for q in np.percentile(finite, (50, 90)))) if finite else Spread(np.nan, np.nan)
 
 
 def rest_floor(trials: Sequence[RestTrial]) -> RestFloor:

@@ -3,7 +3,7 @@
 So the paper made its sensor (section 5.2).
 """
 
-import csv
+from html import escape
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,10 +11,12 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError, check_arguments, expect
-from ..files.safe_read import read_text
+from ..files.csv_table import Columns, read_table
+from ..files.digits import STORED, decimals
 from ..markers.placement import rim_mask
+from ..sensor.parts import millimetre
 from ..sensor.sensor import Sensor
-from ..sensor.toml import MOST_DOTS
+from ..sensor.toml import MOST_DOTS, SIZES
 from ..surface.membrane import Membrane
 from ..surface.topology import rim_loop
 from .fit import outline_centres
@@ -23,7 +25,10 @@ from .surface import dot_outlines, fine_surface, surface_projection
 RADIUS = {"small": 0.16, "large": 0.27}  # of dots, over their spacing
 MARGIN = 0.6  # of a pitch, that a lattice keeps from the rim's outline
 NEWTON_STEPS, AIMS = 3, 2
+BORDER, STROKE = 0.08, 0.006  # of a drawing, over the rim's extent: what is around the rim, and the rim's line
+DRAWN = 5  # digits of the rim's extent in a drawing
 MOST_BYTES = 2**20  # of a file of wanted pixels
+PIXELS = Columns([("u", "v", "size")], "dot", unit="px", most=MOST_DOTS)
 
 
 class FabricationLayout(NamedTuple):
@@ -164,20 +169,8 @@ def read_pixels(path: Path) -> tuple[np.ndarray, list[str]]:
         >>> pixels.tolist(), sizes
         ([[320.0, 240.0], [360.0, 240.0]], ['large', 'small'])
     """
-    text = read_text(path, MOST_BYTES, "CSV with the header u,v,size")
-    try:
-        rows = [row for row in csv.reader(text.splitlines()) if row]
-        header, *body = rows
-        right = [cell.strip() for cell in header] == ["u", "v", "size"]
-        pixels = np.array([[float(u), float(v)] for u, v, _ in body])
-        sizes = [size.strip() for _, _, size in body]
-    except (ValueError, csv.Error) as error:
-        raise MembraneError(
-            f"{path}: not readable ({error}); expected CSV with the header u,v,size and one line per dot"
-        ) from error
-    if not right or not sizes or not set(sizes) <= set(RADIUS) or not np.isfinite(pixels).all():
-        raise MembraneError(f"{path}: expected the header u,v,size, finite pixels, and sizes small or large")
-    return pixels, sizes
+    rows = read_table(path, PIXELS, MOST_BYTES).rows
+    return np.array([row.numbers("uv") for row in rows]), [row.choice("size", SIZES) for row in rows]
 
 
 def write_layout(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
@@ -202,27 +195,35 @@ def write_layout(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
         'dot,x,y,z,nx,ny,nz,radius,size'
     """
     rim = sensor.membrane.rest[sensor.membrane.fixed].mean(0).numpy()
-    lines = ["dot,x,y,z,nx,ny,nz,radius,size"]
+    lines, places = ["dot,x,y,z,nx,ny,nz,radius,size"], decimals(sensor.membrane.size, STORED)
     rows = zip(dots.positions - rim, dots.normals, dots.radii, dots.sizes, strict=True)
     for d, (x, n, radius, size) in enumerate(rows):
-        lines.append(",".join([str(d), *(f"{value:.5f}" for value in (*x, *n, radius)), size]))
+        lengths, normal = ([f"{value:.{count}f}" for value in values] for values, count in (((*x, radius), places), (n, 5)))
+        lines.append(",".join([str(d), *lengths[:3], *normal, lengths[3], size]))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def write_svg(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
-    """A drawing of the dots and the rim along the axis, true to size, for printing or looking at."""
-    rim = sensor.membrane.rest.numpy()[rim_loop(sensor.membrane.grid), :2]
-    low, size = rim.min(0) - 2, np.ptp(rim, 0) + 4
-    unit = sensor.length_unit
-    outline = " ".join(f"{x:.3f},{y:.3f}" for x, y in rim)
+    """A drawing of the dots and the rim along the axis, true to size, for printing or looking at; in mm in any unit."""
+    one = millimetre(sensor.length_unit)
+    rim = sensor.membrane.rest.numpy()[rim_loop(sensor.membrane.grid), :2] / one
+    extent = float(np.ptp(rim, 0).max())
+    low, size = rim.min(0) - BORDER * extent, np.ptp(rim, 0) + 2 * BORDER * extent
+    places = decimals(extent, DRAWN)
+
+    def shown(*lengths: float) -> str:
+        return " ".join(f"{length:.{places}f}" for length in lengths)
+
     lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{size[0]:.2f}{unit}" height="{size[1]:.2f}{unit}" '
-        f'viewBox="{low[0]:.3f} {low[1]:.3f} {size[0]:.3f} {size[1]:.3f}">',
-        f"<title>{sensor.name}: {len(dots.radii)} dots on the rest surface, seen along the camera's axis</title>",
-        f'<polygon points="{outline}" fill="none" stroke="#0072B2" stroke-width="0.15"/>',
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{shown(size[0])}mm" height="{shown(size[1])}mm" '
+        f'viewBox="{shown(*low, *size)}">',
+        f"<title>{escape(sensor.name)}: {len(dots.radii)} dots on the rest surface, seen along the camera's axis</title>",
+        f'<polygon points="{shown(*rim.ravel())}" fill="none" stroke="#0072B2" stroke-width="{shown(STROKE * extent)}"/>',
     ]
-    for (x, y, _), normal, radius in zip(dots.positions, dots.normals, dots.radii, strict=True):
+    for (x, y, _), normal, radius in zip(dots.positions / one, dots.normals, dots.radii / one, strict=True):
         short, angle = radius * abs(normal[2]), np.degrees(np.arctan2(normal[1], normal[0]))
-        rotation = f"rotate({angle:.2f} {x:.3f} {y:.3f})"
-        lines.append(f'<ellipse cx="{x:.3f}" cy="{y:.3f}" rx="{short:.3f}" ry="{radius:.3f}" transform="{rotation}"/>')
+        rotation = f"rotate({angle:.2f} {shown(x, y)})"
+        lines.append(
+            f'<ellipse cx="{shown(x)}" cy="{shown(y)}" rx="{shown(short)}" ry="{shown(radius)}" transform="{rotation}"/>'
+        )
     path.write_text("\n".join([*lines, "</svg>"]) + "\n", encoding="utf-8")

@@ -8,6 +8,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..files.digits import decimals
+
+FINEST = 1e-6  # of a value: smaller deviations give it no more digits
 HIGH_CORRELATION = 0.95  # above it two parameters are said to be hard to identify separately
 
 
@@ -57,7 +60,7 @@ class Report(NamedTuple):
         >>> found = Report("lens", ["fx"], ["px"], *numbers, np.eye(1), none, none, 0.0, [])
         >>> print("\\n".join(found.lines))
         lens
-          fx                 385.30000 ± 0.2       px      (before: 380)
+          fx                    385.30 ± 0.2       px      (before: 380)
     """
 
     title: str
@@ -119,7 +122,10 @@ class Report(NamedTuple):
     def lines(self) -> list[str]:
         """The report as text."""
         rows = zip(self.names, self.values, self.deviations, self.units, self.design, strict=True)
-        lines = [f"  {name:<16}{value:>12.5f} ± {sd:<10.2g}{unit:<7} (before: {old:g})" for name, value, sd, unit, old in rows]
+        lines = [
+            f"  {name:<16}{value:>z12.{decimals(max(sd, FINEST * abs(value)), 2)}f} ± {sd:<10.2g}{unit:<7} (before: {old:g})"
+            for name, value, sd, unit, old in rows
+        ]
         if len(self.residuals):
             rms = float(np.sqrt((self.residuals**2).mean()))
             lines.append(

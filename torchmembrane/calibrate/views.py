@@ -11,12 +11,17 @@ from ..files.grayscale import check_image
 from ..markers.dots.pattern import find_dots
 from ..markers.placement import rim_mask
 from ..progress import Progress, silent, within
+from ..sensor.parts import millimetre
 from ..sensor.sensor import Sensor
 from .bundle import Bundle, bundle_adjusted
 from .fit import Fit, rotations, with_common_errors
 from .rest import measured_outlines, shading_bias
 from .surface import Correction, correction, fine_surface, recalibrated, surface_projection
 
+TRAVEL_ERROR = 0.01  # mm
+OBSERVED = 0.1  # of the travel, that its standard deviation is at most: beyond, nothing tells the scale
+MOST_MOVED = 0.1  # of the surface's size, rms: a surface that is moved farther is of another scale than the design
+LARGEST_NOISE = 1e-3  # of the image's diagonal: noise of located dots is a tenth of it, and less
 SIDEWAYS = 0.015  # px: a turned view is shaded to one side, and its located dots share a shift (0.024 px at 4 degrees)
 
 
@@ -60,7 +65,7 @@ def rest_from_views(
     sensor: Sensor,
     images: Sequence[np.ndarray],
     motions: np.ndarray,
-    travel_error: float,
+    travel_error: float | None = None,
     *,
     progress: Progress = silent,
 ) -> ViewsFit:
@@ -73,14 +78,17 @@ def rest_from_views(
         images: P views `[H, W]` of the membrane at rest, grey in 0..1.
         motions: `[P, 6]` where the camera was, roughly: its position (length unit) and rotation (rotation vector, degrees) in
             the first camera's frame, the first row zeros. Dots must be predicted to half their pitch.
-        travel_error: standard deviation of the second view's travel. Images do not show the scale; this length sets it.
+        travel_error: standard deviation of the second view's travel, length unit; default: `TRAVEL_ERROR`, 0.01 mm. Images do
+            not show the scale; this length sets it.
         progress: is told how far it is.
 
     Returns:
         The sensor with surface and dots found, and the fit.
 
     Raises:
-        MembraneError: fewer than two views, motions of another shape, no travel, or too few dots.
+        MembraneError: fewer than two views, motions of another shape, no travel or one that is known too badly to set the
+            scale, too few dots, images that no motions near these explain, or a surface so far from the design that its scale
+            is wrong.
 
     Limitations:
         What moves the surface within itself, and its rim outside the dots, is not observed. At least two views must differ.
@@ -91,13 +99,15 @@ def rest_from_views(
         raise MembraneError(
             f"calibrate views: {len(images)} images, motions {list(motions.shape)}; expected 2 or more, [P, 6], first zeros"
         )
-    if not np.linalg.norm(motions[1, :3]) > 0:
-        raise MembraneError("calibrate views: the second view did not travel; expected that its travel sets the scale")
+    if travel_error is None:
+        travel_error = TRAVEL_ERROR * millimetre(sensor.length_unit)
+    _refuse_unknown_scale(float(np.linalg.norm(motions[1, :3])), travel_error, sensor.length_unit)
     bundle, sizes = _measured(sensor, images, motions, within(progress, 0.0, 0.6))
     progress(0.6, "bundle adjustment")
     bundle, kept = bundle.in_two_views()
     sizes = [size for size, keep in zip(sizes, kept, strict=True) if keep]
     problem, found = bundle_adjusted(sensor.camera, bundle, travel_error)
+    _refuse_misfit(sensor, found.noise)
     found = with_common_errors(found, problem.jacobian(found.values), _shared_errors(sensor, bundle.pixels, problem.used))
     dots, residuals = found.values[problem.own :].reshape(-1, 3), problem.pixel_residuals(found.values)
     progress(0.8, "rest surface through the dots")
@@ -105,11 +115,39 @@ def rest_from_views(
     projection, n = surface_projection(surface, dots), problem.own
     blocks = np.stack([found.covariance[d : d + 3, d : d + 3] for d in range(n, len(found.values), 3)])
     change = correction(surface, projection, np.einsum("di,dij,dj->d", projection.normals, blocks, projection.normals))
+    _refuse_other_scale(change, surface.size, sensor.length_unit)
     moved = recalibrated(sensor, surface, change.vertices, dots, sizes, images[0])
     numbers = ("turn_x", "turn_y", "turn_z", "place_x", "place_y", "place_z")
     names = [f"{name}[{p}]" for p in range(1, len(images)) for name in numbers]
     found = found.in_degrees(len(images) - 1)
     return ViewsFit(moved, names, found, dots, found.deviations[n:].reshape(-1, 3), change, residuals)
+
+
+def _refuse_unknown_scale(travel: float, error: float, unit: str) -> None:
+    if not error <= OBSERVED * travel:
+        raise MembraneError(
+            f"calibrate views: the second view travelled by {travel:.4g} {unit}, known to {error:.4g} {unit}; expected to a "
+            "tenth at least, as nothing else tells the scale: move the camera farther, or measure its travel (--travel-error)"
+        )
+
+
+def _refuse_misfit(sensor: Sensor, noise: float) -> None:
+    limit = LARGEST_NOISE * float(np.hypot(*sensor.camera.image_size))
+    if not noise <= limit:
+        raise MembraneError(
+            f"calibrate views: the dots lie {noise:.2f} px (rms) off the best motions found; expected at most {limit:.2f}: "
+            f"check that the motions are in the order of the images and in {sensor.length_unit} and degrees, and the lens"
+        )
+
+
+def _refuse_other_scale(change: Correction, size: float, unit: str) -> None:
+    moved = float(np.sqrt((change.offsets**2).mean()))
+    if not moved <= MOST_MOVED * size:
+        raise MembraneError(
+            f"calibrate views: the surface would be moved by {moved:.4g} {unit} rms, its size is {size:.4g} {unit}; expected "
+            f"at most {MOST_MOVED * size:.4g} {unit}: check that the motions are in {unit}, as the sensor file is, and the "
+            "travel of the second view, which sets the scale"
+        )
 
 
 def _measured(

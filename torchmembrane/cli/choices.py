@@ -11,7 +11,7 @@ ENGINES = ("local", "ray")
 RESULT_FORMATS = ("npz", "parquet")
 
 DRAFTS = ("dome", "cap", "bubble", "fingertip", "half_cylinder")
-LENGTH_UNITS = ("mm", "cm", "m")
+LENGTH_UNITS = ("mm", "cm", "m", "um", "inch")
 LENSES = ("pinhole", "fisheye")
 LONGEST_SIDE = 16384
 FILLINGS = ("liquid", "gas", "open")

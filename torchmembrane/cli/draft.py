@@ -64,7 +64,7 @@ def write_draft(arguments: Namespace) -> list[str]:
     sensor = Sensor(arguments.name or arguments.sensor.stem, unit, camera, membrane, material, cavity, markers, surface)
     found = _dots_in_words(sensor)
     path = sensor.to_file(arguments.sensor)
-    annotate(path, said, sensor.force_unit == "relative")
+    annotate(path, said, sensor.force_unit == "relative", unit)
     return [f"sensor file: {path}", *seen, *found, *said, f"next: torchmembrane check {path} --out {path.with_suffix('.png')}"]
 
 

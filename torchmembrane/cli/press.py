@@ -120,7 +120,7 @@ def _stroke(arguments: Namespace, simulator: Simulator) -> Stroke:
         )
     slide = np.zeros(3) if arguments.slide is None else np.array(arguments.slide)
     turn, friction = np.deg2rad(arguments.turn), arguments.friction
-    stroke = stroke_to(simulator, _body(arguments), aim, -direction, arguments.depth, turn, slide, friction)
+    stroke = stroke_to(simulator, _body(arguments, simulator), aim, -direction, arguments.depth, turn, slide, friction)
     touched = int(stroke.indenter.distance(membrane.rest).argmin())
     if float(membrane.rest_normals[touched] @ torch.from_numpy(stroke.travel)) > OUTWARDS:
         raise MembraneError(
@@ -130,7 +130,7 @@ def _stroke(arguments: Namespace, simulator: Simulator) -> Stroke:
     return stroke
 
 
-def _body(arguments: Namespace) -> Indenter:
+def _body(arguments: Namespace, simulator: Simulator) -> Indenter:
     kind = arguments.indenter
     if kind == "sphere":
         return Sphere(_needed(arguments, "radius"))
@@ -144,7 +144,14 @@ def _body(arguments: Namespace) -> Indenter:
         return Box(torch.tensor(_needed(arguments, "sides"), dtype=torch.float64), _needed(arguments, "radius"))
     if not Path(kind).is_file():
         raise MembraneError(f"--indenter {kind!r}: neither a file nor one of {', '.join(KINDS)}")
-    return MeshIndenter.read(kind)
+    mesh = MeshIndenter.read(kind)
+    size, side = simulator.membrane.size, float(np.ptp(mesh.vertices, 0).max())
+    least, most = (share * size for share in LENGTHS["sides"])
+    if not least <= side <= most:
+        unit = simulator.sensor.length_unit
+        expected = f"{least:.3g} to {most:.3g} {unit}, as the surface's size is {size:.3g} {unit}: give the mesh in {unit}"
+        raise MembraneError(f"--indenter {kind}: its longest side is {side:.4g}; expected {expected}")
+    return mesh
 
 
 def _listed(values: Iterable[float]) -> str:

@@ -1,12 +1,11 @@
 """A recording's pressure readings: a table of a gauge's values, by the frames' names."""
 
-import csv
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import MembraneError
-from ..files.safe_read import in_one_line, read_text, shortened
+from ..files.csv_table import Columns, Row, Table, read_table
+from ..files.safe_read import shortened
 from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
 from .inputs import Inputs, frame_name
@@ -15,8 +14,12 @@ if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
 
 MOST_BYTES = 2**26
-HEADERS = (["name", "pressure"], ["name", "pressure_change"])
-EXPECTED = "CSV with the header name,pressure (across the membrane) or name,pressure_change (since rest), hPa, a line per frame"
+ACROSS, SINCE_REST = "pressure", "pressure_change"
+PRESSURES = Columns([("name", ACROSS), ("name", SINCE_REST)], "reading", unit="hPa, across the membrane or since rest")
+UNKNOWN = ("", "nan")
+"""Cells of frames that have no reading."""
+KINDS = {"name": "frames", "image": "images"}
+"""What a table's first column names."""
 
 
 class PressureReadings(NamedTuple):
@@ -67,43 +70,40 @@ def read_pressures(path: Path, inputs: Inputs, sensor: Sensor) -> PressureReadin
     Raises:
         MembraneError: the table cannot be read, or has another header, a name that is no frame's, a name twice, no number.
     """
-    try:
-        header, *rows = csv.reader(read_text(path, MOST_BYTES, EXPECTED).splitlines())
-    except MembraneError:
-        raise
-    except (csv.Error, ValueError) as error:
-        raise MembraneError(f"{path}: not readable ({in_one_line(error)}); expected {EXPECTED}") from error
-    if header not in HEADERS:
-        raise MembraneError(f"{path}: the header is {shortened(repr(','.join(header)))}; expected {EXPECTED}")
+    table = read_table(path, PRESSURES, MOST_BYTES)
+    name, column = table.form
+    hectopascal = 100 / METRE[sensor.length_unit] ** 2
+    given = {frame: row for frame, row in by_frame(table, inputs).items() if row.text(column).lower() not in UNKNOWN}
+    if not given:
+        raise MembraneError(f"{path}: no readings after the header but empty ones; expected {PRESSURES.expected}")
+    return PressureReadings({frame: row.number(column) * hectopascal for frame, row in given.items()}, column == SINCE_REST)
+
+
+def by_frame(table: Table, inputs: Inputs) -> dict[str, Row]:
+    """The lines of a table by the names of the frames that they tell of.
+
+    Args:
+        table: whose first column holds names of frames, or of their image files.
+        inputs: the frames.
+
+    Raises:
+        MembraneError: a name that is no frame's, or that stands there twice.
+    """
+    column = table.form[0]
     names = [(image.name, frame_name(image)) for image in inputs.images]
-    stems = dict(names) | {name: name for _, name in names}
-    readings: dict[str, float] = {}
-    for line, row in enumerate(rows, 2):
-        where = f"{path}, line {line}"
-        if len(row) != 2:
-            raise MembraneError(f"{where}: {len(row)} values; expected two, {','.join(header)}")
-        name = stems.get(row[0], row[0])
-        if row[0] not in stems and inputs.video_of(name) is None:
-            raise MembraneError(f"{where}: {shortened(repr(row[0]))} is none of the frames; expected {_known(inputs)}")
-        if name in readings:
-            raise MembraneError(f"{where}: {shortened(repr(row[0]))} stands there twice; expected one reading for each frame")
-        readings[name] = _number(row[1], where)
-    known = {name: value * 100 / METRE[sensor.length_unit] ** 2 for name, value in readings.items() if not math.isnan(value)}
-    if not known:
-        raise MembraneError(f"{path}: no readings after the header; expected {EXPECTED}")
-    return PressureReadings(known, header == HEADERS[1])
-
-
-def _number(text: str, where: str) -> float:
-    try:
-        value = float(text) if text.strip() else math.nan
-    except ValueError:
-        value = math.inf
-    if math.isinf(value):
-        raise MembraneError(f"{where}: {shortened(repr(text))}; expected hPa, or nothing where there is no reading")
-    return value
+    frames = dict(names) | {name: name for _, name in names}
+    found: dict[str, Row] = {}
+    for row in table.rows:
+        said = row.text(column)
+        name, quoted = frames.get(said, said), shortened(repr(said))
+        if said not in frames and inputs.video_of(name) is None:
+            raise MembraneError(f"{row.where}: {quoted} is none of the {KINDS[column]}; expected {_known(inputs)}")
+        if name in found:
+            raise MembraneError(f"{row.where}: {quoted} stands there twice, also in line {found[name].line}; expected it once")
+        found[name] = row
+    return found
 
 
 def _known(inputs: Inputs) -> str:
-    names = [frame_name(image) for image in inputs.images[:1]] + [f"{frame_name(video)}_000000" for video in inputs.videos[:1]]
+    names = [image.name for image in inputs.images[:1]] + [f"{frame_name(video)}_000000" for video in inputs.videos[:1]]
     return f"their names, as {' or '.join(names)}"

@@ -4,6 +4,7 @@ import shutil
 import time
 from typing import TextIO
 
+from ..files.digits import together
 from ..files.levels import too_few_bits
 from ..results.status import Status
 from ..results.store import Mesh
@@ -11,6 +12,7 @@ from .loop import RECENT, Seen, Tally
 
 TERMINAL_SECONDS, PLAIN_SECONDS = 0.1, 1.0
 """Between two lines, at least."""
+DIGITS = 4  # of the largest component of force and moment
 
 
 class Line:
@@ -55,7 +57,7 @@ def described(seen: Seen, tally: Tally, mesh: Mesh) -> str:
     if not status.has_surface:
         return f"{pace} | {status.text}{too_few_bits(seen.image)}"
     unit = "relative" if mesh.force_unit == "relative" else mesh.force_unit
-    force, moment = (" ".join(f"{value:+.3f}" for value in half) for half in seen.frame["wrench"].reshape(2, 3))
+    force, moment = (together(half, DIGITS) for half in seen.frame["wrench"].reshape(2, 3))
     pressure = f"{seen.frame['pressure_change']:+.2g} {unit}/{mesh.length_unit}²"
     words = status.text.partition(":")[0]
     return f"{pace} | {words} | force {force} {unit} | moment {moment} {unit} {mesh.length_unit} | pressure {pressure}"

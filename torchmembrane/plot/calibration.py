@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from ..calibrate.report import Report
 from ..sensor.sensor import Sensor
-from .drawing import BLUE, GREY, VERMILION
+from .drawing import BLUE, GREY, SHORT, VERMILION
 
 PARAMETERS_DRAWN = 24
 GAINS = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000])
@@ -99,6 +99,7 @@ def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarr
     for ax, values, title, options in maps:
         shown = ax.tripcolor(places[:, 0], places[:, 1], values, shading="gouraud", **options)
         ax.set(aspect="equal", xlabel=f"x, {unit}", ylabel=f"y, {unit}", title=f"{title}, {unit}")
+        ax.ticklabel_format(scilimits=SHORT)
         ax.invert_yaxis()
         drawing.colorbar(shown, ax=ax, shrink=0.8)
     return drawing
@@ -180,5 +181,6 @@ def layout_figure(title: str, sensor: Sensor, dots: Any) -> Figure:
         ax.plot(rest[:, a], rest[:, b], ".", ms=1.5, color=GREY)
         ax.scatter(dots.positions[:, a], dots.positions[:, b], s=area, color=BLUE)
         ax.set(aspect="equal", xlabel=f"{'xyz'[a]}, {unit}", ylabel=f"{'xyz'[b]}, {unit}", title=title)
+        ax.ticklabel_format(scilimits=SHORT)
     axes[1].invert_yaxis()
     return drawing

@@ -23,6 +23,7 @@ readable = rc_context({"font.size": 13, "axes.titlesize": 14.5, "axes.titlepad":
 ROW = 6.0  # inches, of a row of panels
 ABOVE, UNDER = 0.9, 1.3  # of it: the headline and titles of two lines; labels and a legend of two rows
 TITLE = 0.6  # inches, of the titles of a further row
+SHORT = (-2, 3)  # powers of ten of lengths whose ticks are written in full: a membrane in um or m has its power beside the axis
 LINES = 16  # of a grid that are drawn each way, at most about
 
 
@@ -82,6 +83,7 @@ def side_axes(axes: Axes, letter: str, unit: str) -> None:
     axes.set_aspect("equal", anchor="N")
     axes.margins(0.06)
     axes.set(xlabel=f"{letter} [{unit}]", ylabel=f"z, away from the camera [{unit}]")
+    axes.ticklabel_format(scilimits=SHORT)
     axes.grid(lw=0.3, alpha=0.5)
 
 

@@ -20,6 +20,7 @@ from .drawing import (
     BLUE,
     GREY,
     LINES,
+    SHORT,
     VERMILION,
     closed_rim,
     image_axes,
@@ -111,6 +112,7 @@ def _draw_space(axes: Any, X: np.ndarray, grid: tuple[int, int], markers: np.nda
     axes.set_box_aspect(axes.get_box_aspect(), zoom=0.85)
     for axis, extent in zip((axes.xaxis, axes.yaxis, axes.zaxis), np.ptp(X, 0) / np.ptp(X, 0).max(), strict=True):
         axis.set_major_locator(MaxNLocator(max(1, round(TICKS * extent))))  # as many as a short side has room for
+        axis.get_major_formatter().set_powerlimits(SHORT)
     axes.set(xlabel=f"x [{unit}]", ylabel=f"y [{unit}]", zlabel=f"z [{unit}]")
     axes.xaxis.labelpad = axes.yaxis.labelpad = 8
     axes.view_init(elev=22, azim=-60)

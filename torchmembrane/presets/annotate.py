@@ -4,8 +4,14 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..sensor.parts import METRE, millimetre
+
 WORDS = {
-    "": {"format": "of this file", "name": "any text", "length_unit": "mm | cm | m: of all lengths here and in results"},
+    "": {
+        "format": "of this file",
+        "name": "any text",
+        "length_unit": f"{' | '.join(METRE)}: of all lengths here and in results",
+    },
     "camera": {
         "model": "pinhole (OpenCV's k1 k2 p1 p2 k3) | fisheye (k1 to k4)",
         "image_size": "width, height, px",
@@ -45,12 +51,12 @@ WORDS = {
 }
 """By table and key, what stands behind a key's value."""
 RELATIVE = """\
-# shear_modulus = 0.3  # N / length unit^2; without it and thickness forces are relative. From one known weight:
-# thickness = 0.5      # torchmembrane calibrate material sensor.toml press.png --weight 200g --out material"""
+# shear_modulus = {modulus:<6g} # N / length unit^2; without it and thickness forces are relative. From one known weight:
+# thickness = {thickness:<10g} # torchmembrane calibrate material sensor.toml press.png --weight 200g --out material"""
 FURTHER = """\
 # [[camera.ports]]     # flat windows, in order from the camera; what is behind the last one is the medium
-# distance = 2.0       # from the centre of projection to the near face
-# thickness = 3.0
+# distance = {distance:<11g} # from the centre of projection to the near face
+# thickness = {window:g}
 # index = 1.49
 # [camera.medium]
 # index = 1.33
@@ -58,16 +64,21 @@ FURTHER = """\
 # [tool]               # the camera's pose on a robot: p_tool = rotation p_camera + translation
 # rotation = [0, 0, 0] # rotation vector, degrees; or three rows of three
 # translation = [0.0, 0.0, 0.0]"""
+OF_EXAMPLES = {"thickness": 0.5, "distance": 2.0, "window": 3.0}  # mm, of the keys that are commented out
+MODULUS = 0.3  # N / mm^2
 
 
-def annotate(path: Path, said: Sequence[str], relative: bool) -> None:
+def annotate(path: Path, said: Sequence[str], relative: bool, unit: str) -> None:
     """Put words behind the keys of a sensor file, and what else may stand there at the end, commented out.
 
     Args:
         path: what `Sensor.to_file` wrote.
         said: sentences for its top: what was assumed or derived.
         relative: whether its forces are, so that it shows the keys that give newtons.
+        unit: of its lengths, in which the examples of further keys are.
     """
+    one = millimetre(unit)
+    examples = {name: length * one for name, length in OF_EXAMPLES.items()} | {"modulus": MODULUS / one**2}
     table, lines = "", [f"# {sentence}" for sentence in said]
     for line in path.read_text(encoding="utf-8").splitlines():
         if head := re.fullmatch(r"\[+([\w.]+)\]+", line):
@@ -76,5 +87,5 @@ def annotate(path: Path, said: Sequence[str], relative: bool) -> None:
         word = WORDS.get(table, {}).get(key)
         lines.append(f"{line}  # {word}" if word else line)
         if table == "material" and key == "prestretch" and relative:
-            lines.append(RELATIVE)
-    path.write_text("\n".join([*lines, "", FURTHER]) + "\n", encoding="utf-8")
+            lines.append(RELATIVE.format(**examples))
+    path.write_text("\n".join([*lines, "", FURTHER.format(**examples)]) + "\n", encoding="utf-8")

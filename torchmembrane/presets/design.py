@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..camera.model import Camera
+from ..files.digits import rounded
 from ..files.images import to_grey
 from ..mechanics.cavity import rest_balance
 from ..sensor.factories import elastic_energy
@@ -102,7 +103,7 @@ def dome_dots(semi_axes: Sequence[float], opening: float, base_z: float, spacing
     scale = np.sinc(angle / np.pi)
     points = np.stack([a * scale * x, b * scale * y, base_z + c * (np.cos(angle) - np.cos(opening))], -1)
     kept = angle < MARGIN * opening
-    return points[kept].round(5), _sizes((i + j)[kept])
+    return rounded(points[kept]), _sizes((i + j)[kept])
 
 
 def cylinder_dots(
@@ -113,7 +114,7 @@ def cylinder_dots(
     x, angle = i * spacing, j * spacing / radius
     points = np.stack([x, radius * np.sin(angle), base_z + radius * (np.cos(angle) - np.cos(half_angle))], -1)
     kept = (np.abs(x) < length / 2 - spacing / 2) & (np.abs(angle) < half_angle - spacing / radius / 2)
-    return points[kept].round(5), _sizes((i + j)[kept])
+    return rounded(points[kept]), _sizes((i + j)[kept])
 
 
 def _lattice(reach: float) -> tuple[np.ndarray, np.ndarray]:

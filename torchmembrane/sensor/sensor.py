@@ -35,7 +35,7 @@ class Sensor:
 
     Args:
         name: any text.
-        length_unit: "mm" | "cm" | "m".
+        length_unit: "mm" | "cm" | "m" | "um" | "inch".
         camera: the calibrated `Camera`.
         membrane: the rest surface on the solver grid, in the camera's frame.
         material: its elastic energy and stiffness.
@@ -66,7 +66,7 @@ class Sensor:
     tool: Pose | None = None
 
     def __post_init__(self) -> None:
-        expect(self.length_unit in METRE, "length_unit", self.length_unit, "'mm', 'cm' or 'm'")
+        expect(self.length_unit in METRE, "length_unit", self.length_unit, f"one of {', '.join(METRE)}")
         if self.surface is None or not _same_surface(self.surface.membrane(self.membrane.grid), self.membrane):
             object.__setattr__(self, "surface", Surface.of(self.membrane))
         if self.markers.rest_image is not None:

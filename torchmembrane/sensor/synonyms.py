@@ -29,6 +29,11 @@ MEANT = {
     "shear_modulus": ("modulus", "mu", "youngs_modulus", "stiffness"),
     "prestretch": ("stretch", "pretension", "prestrain"),
     "image_size": ("resolution", "size", "width", "height"),
+    "mm": ("millimetre", "millimetres", "millimeter", "millimeters"),
+    "cm": ("centimetre", "centimetres", "centimeter", "centimeters"),
+    "m": ("metre", "metres", "meter", "meters"),
+    "um": ("\u00b5m", "\u03bcm", "micron", "microns", "micrometre", "micrometres", "micrometer", "micrometers"),
+    "inch": ("in", "inches"),
     "focal": ("focal_length", "fx", "fy", "f"),
     "centre": ("center", "principal_point", "cx", "cy"),
     # of the command

@@ -1,8 +1,6 @@
 """Reading and writing `sensor.toml` and the arrays named in it."""
 
-import csv
 import math
-import re
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +10,9 @@ import numpy as np
 from ..camera.model import Camera
 from ..camera.ports import Port
 from ..errors import MembraneError
+from ..files.csv_table import Columns, Limit, read_table
 from ..files.images import image_size, mean_image, write_image
-from ..files.safe_read import in_one_line, read_arrays, read_text, shortened
+from ..files.safe_read import read_arrays
 from ..pose import Pose
 from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
@@ -38,7 +37,10 @@ FEWEST_LINES, MOST_LINES = 5, 65  # of a solver grid: beyond, a frame takes more
 MOST_VERTICES = 2**18
 """Of a rest surface in a file of arrays."""
 MOST_DOTS, MOST_DOTS_BYTES = 2000, 2**20
-DOTS_HEADER = ["x", "y", "z", "size"]
+SIZES = ("small", "large")
+DOTS_HEADER = ("x", "y", "z", "size")
+COORDINATE = Limit(FARTHEST, "a coordinate", "the length unit")
+DOTS = Columns([DOTS_HEADER], "dot", most=MOST_DOTS)
 
 
 def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
@@ -236,46 +238,9 @@ def _dots_to_come(table: Table) -> Markers:
 
 def _read_dots(path: Path) -> tuple[np.ndarray, list[str], list[str]]:
     """Positions `[D, 3]`, sizes, and where each dot stands."""
-    text = read_text(path, MOST_DOTS_BYTES, "CSV with a line x,y,z,size for each dot")
-    try:
-        rows = list(enumerate(csv.reader(text.splitlines()), 1))
-    except csv.Error as error:
-        raise MembraneError(f"{path}: not readable as CSV ({error}); expected UTF-8 text with x,y,z,size") from error
-    rows = [(i, [cell.strip() for cell in row]) for i, row in rows if row]
-    if not rows or rows[0][1] != DOTS_HEADER:
-        raise MembraneError(f"{path}, line 1: the header is {_header(rows)}; expected x,y,z,size: correct it")
-    if len(rows) - 1 > MOST_DOTS:
-        raise MembraneError(f"{path}: {len(rows) - 1} dots; expected at most {MOST_DOTS}, one line x,y,z,size for each")
-    if len(rows) == 1:
-        raise MembraneError(f"{path}: no dots after the header; expected a line x,y,z,size for each")
-    dots = [_dot(f"{path}, line {i}", row) for i, row in rows[1:]]
-    return np.array([dot[0] for dot in dots]), [dot[1] for dot in dots], [f"{path}, line {i}" for i, _ in rows[1:]]
-
-
-def _header(rows: list[tuple[int, list[str]]]) -> str:
-    """A list's first line for a message; of what is no list of columns only its length, as it may be anything."""
-    found = ",".join(rows[0][1]) if rows else "nothing"
-    return repr(found) if re.fullmatch(r"[\w.,+ -]{0,60}", found) else f"{len(found)} characters that name no columns"
-
-
-def _dot(line: str, row: list[str]) -> tuple[list[float], str]:
-    if len(row) != 4:
-        raise MembraneError(f"{line}: {len(row)} values, {in_one_line(','.join(row))}; expected four, x,y,z,size")
-    position = []
-    for key, cell in zip("xyz", row, strict=False):
-        try:
-            position.append(float(cell))
-        except ValueError:
-            raise MembraneError(f"{line}: {key} = {shortened(cell)!r}; expected a number with a decimal point") from None
-        if not math.isfinite(position[-1]):
-            raise MembraneError(f"{line}: {key} = {cell}; expected a finite number: leave unknown dots out")
-        if abs(position[-1]) > FARTHEST:
-            raise MembraneError(
-                f"{line}: {key} = {shortened(cell)}; expected a coordinate up to {FARTHEST:g}, in the length unit"
-            )
-    if row[3] not in ("small", "large"):
-        raise MembraneError(f"{line}: size = {shortened(row[3])!r}; expected small or large")
-    return position, row[3]
+    rows = read_table(path, DOTS, MOST_DOTS_BYTES).rows
+    positions = np.array([row.numbers("xyz", COORDINATE) for row in rows])
+    return positions, [row.choice("size", SIZES) for row in rows], [row.where for row in rows]
 
 
 def _write_dots(path: Path, positions: np.ndarray, sizes: list[str]) -> None:

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from .symmetric_2x2 import symmetric_solution
@@ -77,8 +78,10 @@ def border_unknowns(
     """`lambda` and `r` of `solve_bordered`, `[...]` each, from the products of the loads (rows) with their solutions, `[..., 3,
     3]`, and the other arguments."""
     nMn, nMg, nMm, _, _, _, _, mMg, mMm = products.flatten(-2).unbind(-1)
-    rise, multiplier = symmetric_solution(corner - mMm, compliance - nMm, -nMn, load + mMg, target + nMg)
-    return multiplier, rise
+    scale = nMn.clamp_min(torch.finfo(nMn.dtype).tiny).rsqrt()  # of the multiplier: the determinant goes with length^10
+    border, of_border = scale * (compliance - nMm), scale * (target + nMg)
+    rise, multiplier = symmetric_solution(corner - mMm, border, -scale * scale * nMn, load + mMg, of_border)
+    return scale * multiplier, rise
 
 
 def _dot(p: Tensor, q: Tensor) -> Tensor:

@@ -26,13 +26,14 @@ def convert(folders: list[Path], root: Path, repo_id: str, name: str, fps: int, 
         The data set, read again.
 
     Raises:
-        MembraneError: a folder holds no results, or the runs are of different grids.
+        MembraneError: a folder holds no results, or the runs are of different grids or units.
     """
     runs = [tm.read_results(folder) for folder in folders]
-    sizes = {len(run.mesh.rest_vertices) for run in runs}
-    if len(sizes) != 1:
-        raise tm.MembraneError(f"runs with {sorted(sizes)} vertices; expected results of one sensor and grid")
-    (vertices,) = sizes
+    kinds = {(len(run.mesh.rest_vertices), run.mesh.length_unit, run.mesh.force_unit) for run in runs}
+    if len(kinds) != 1:
+        came = " and ".join(f"{vertices} vertices in {length}, {force}" for vertices, length, force in sorted(kinds))
+        raise tm.MembraneError(f"runs with {came}; expected results of one sensor, grid and unit")
+    ((vertices, _, _),) = kinds
     dataset = LeRobotDataset.create(repo_id, fps, features(name, vertices), root=root, use_videos=False)
     for run in runs:
         area = vertex_areas(run.mesh.rest_vertices, run.mesh.triangles)

@@ -81,14 +81,15 @@ def _views_options(add: Add) -> None:
     add("images", metavar="IMAGES", nargs="+", help="of the membrane at rest; the first by the camera as it is in the sensor")
     where = "CSV x,y,z,turn_x,turn_y,turn_z: where the camera was for each image, roughly, in its first frame; degrees"
     add("--motions", metavar="FILE.csv", type=Path, required=True, help=where)
-    scale = "standard deviation of the second image's travel, which sets the scale (default: %(default)s)"
-    add("--travel-error", metavar="LENGTH", type=positive, default=0.01, help=scale)
+    scale = "standard deviation of the second image's travel, which sets the scale, in the sensor's unit (default: 0.01 mm)"
+    add("--travel-error", metavar="LENGTH", type=positive, help=scale)
 
 
 def _depth_options(add: Add) -> None:
     where = ".npy, TIFF or 16-bit PNG, registered to the camera: z along the axis; 0, NaN or infinite where there is none"
     add("depth", metavar="DEPTH", type=Path, help=where)
-    add("--unit", metavar="LENGTH", type=positive, default=1.0, help="of one step of its values (default: %(default)s)")
+    step = "of one step of its values, in the sensor's unit (default: of images of 16 bits 1 mm, else that unit)"
+    add("--unit", metavar="LENGTH", type=positive, help=step)
     add("--image", metavar="REST.png", required=True, help="the membrane at rest, to find the dots in")
 
 

@@ -1,6 +1,5 @@
 """What the steps of `torchmembrane calibrate` read and write: sensors, boards in images, tables, reports."""
 
-import csv
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,19 +11,25 @@ from ...calibrate.detection import find_target
 from ...calibrate.report import Report
 from ...camera.targets import Checkerboard, DotBoard
 from ...errors import MembraneError
+from ...files.csv_table import ANGLE, Columns, read_table
 from ...files.images import read_image, read_pixels
-from ...files.safe_read import read_array, read_text
-from ...jobs.inputs import find_inputs, single_images
+from ...files.safe_read import read_array
+from ...jobs.inputs import Inputs, find_inputs, frame_name, single_images
+from ...jobs.pressure import by_frame
 from ...plot.drawing import save
 from ...presets import sensor_file
+from ...sensor.parts import millimetre
 from ...sensor.sensor import Sensor
+from ...sensor.toml import COORDINATE
 from ...surface.checks import FARTHEST
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_TABLE_BYTES = 2**20
-LARGEST_MOTION = 1e4  # length unit, and degrees
+PLACES, TURNS = ("x", "y", "z"), ("turn_x", "turn_y", "turn_z")
+MOTIONS = Columns([(*PLACES, *TURNS)], "image", unit="length unit and degrees")
+FORCES = Columns([("image", "fx", "fy", "fz"), ("image", "force")], "force", unit="N, on the membrane, in the camera's frame")
 
 
 def read_sensor(arguments: Namespace) -> Sensor:
@@ -62,50 +67,64 @@ def read_targets(images: Sequence[str], sensor: Sensor, board: Checkerboard | Do
 
 
 def read_motions(path: Path) -> np.ndarray:
-    """Where the camera was, `[P, 6]`: position (length unit) and rotation vector (degrees) of each view."""
-    expected = "CSV with the header x,y,z,turn_x,turn_y,turn_z and one line per image"
-    text = read_text(path, MOST_TABLE_BYTES, expected)
-    try:
-        rows = np.loadtxt(text.splitlines(), delimiter=",", skiprows=1, ndmin=2)
-    except ValueError as error:
-        raise MembraneError(f"{path}: not readable ({error}); expected {expected}") from error
-    if rows.shape[1] != 6 or not (np.abs(rows) <= LARGEST_MOTION).all():
-        limit = f"six finite numbers up to {LARGEST_MOTION:g}, x,y,z,turn_x,turn_y,turn_z"
-        raise MembraneError(f"{path}: {rows.shape[1]} columns, largest {np.abs(rows).max(initial=0):g}; expected {limit}")
-    return rows
+    """Where the camera was, `[P, 6]`: position (length unit) and rotation vector (degrees) of each view, the first one zeros.
+
+    Args:
+        path: of a table with a line for each image, in their order.
+
+    Raises:
+        MembraneError: another table, or a first line that is not zeros.
+    """
+    rows = read_table(path, MOTIONS, MOST_TABLE_BYTES).rows
+    values = np.array([[*row.numbers(PLACES, COORDINATE), *row.numbers(TURNS, ANGLE)] for row in rows])
+    for column, value in zip((*PLACES, *TURNS), values[0], strict=True):
+        if value != 0:
+            raise rows[0].refusal(column, "0: the first image is the sensor's own, from which all motions are counted")
+    return values
 
 
-def read_forces(path: Path, images: Sequence[Path]) -> np.ndarray:
-    """Forces of the images `[B, 3]`, or magnitudes `[B, 1]`, N, NaN where the file has none."""
-    expected = "CSV with the header image,fx,fy,fz or image,force and one line per image, N"
-    text = read_text(path, MOST_TABLE_BYTES, expected)
-    try:
-        header, *rows = csv.reader(text.splitlines())
-        known = {name: [float(value) for value in values] for name, *values in rows}
-    except (csv.Error, ValueError) as error:
-        raise MembraneError(f"{path}: not readable ({error}); expected {expected}") from error
-    if header not in (["image", "fx", "fy", "fz"], ["image", "force"]):
-        raise MembraneError(f"{path}: the header is {','.join(header)!r}; expected {expected}")
-    if wrong := [name for name, values in known.items() if len(values) != len(header) - 1 or not np.isfinite(values).all()]:
-        raise MembraneError(f"{path}: {wrong[0]} has {known[wrong[0]]}; expected {len(header) - 1} finite numbers")
-    if unknown := known.keys() - {image.name for image in images}:
-        raise MembraneError(f"{path}: {min(unknown)} is none of the images given; expected their names, as {images[0].name}")
-    if not known:
-        raise MembraneError(f"{path}: no forces after the header; expected {expected}")
-    return np.array([known.get(image.name, [np.nan] * (len(header) - 1)) for image in images])
+def read_forces(path: Path, inputs: Inputs) -> np.ndarray:
+    """Forces of the images `[B, 3]`, or magnitudes `[B, 1]`, N, NaN where the file has none.
+
+    Args:
+        path: of a table of forces by the names of images.
+        inputs: the B images.
+
+    Raises:
+        MembraneError: another table, a name that is no image's, or a force of zero.
+    """
+    table = read_table(path, FORCES, MOST_TABLE_BYTES)
+    columns = table.form[1:]
+    known = {}
+    for name, row in by_frame(table, inputs).items():
+        known[name] = row.numbers(columns)
+        if not any(known[name]):
+            raise row.refusal(columns[-1], "a force that is not zero: leave out images in which nothing presses")
+    return np.array([known.get(frame_name(image), [np.nan] * len(columns)) for image in inputs.images])
 
 
-def read_depth(path: Path, unit: float) -> np.ndarray:
-    """A depth image `[H, W]` in the sensor's length unit, NaN where there is none; `unit`: of one step of the file's values.
+def read_depth(path: Path, unit: float | None, length_unit: str) -> np.ndarray:
+    """A depth image `[H, W]` in a length unit, NaN where there is none.
 
     As ROS has them: 16 bits, 0 where there is none, or float, NaN and infinities there.
+
+    Args:
+        path: of an array, or of an image with 16 bits or float.
+        unit: of one step of the file's values; default: of an image with 16 bits 1 mm, else the length unit.
+        length_unit: of the sensor.
+
+    Raises:
+        MembraneError: the file cannot be read, or its depths are none of this world.
     """
-    values = read_array(path) if path.suffix == ".npy" else read_pixels(path)
+    is_array = path.suffix == ".npy"
+    values = read_array(path) if is_array else read_pixels(path)
     expected = "[H, W] of float or of 16 bits or more, z along the camera's axis"
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim != 2 or values.dtype.itemsize < 2:
         raise MembraneError(f"{path}: an array {list(values.shape)} of {values.dtype}; expected {expected}")
+    if unit is None:
+        unit = 1.0 if is_array or values.dtype.kind == "f" else millimetre(length_unit)
     depth = values.astype(float) * unit
     depth[~np.isfinite(depth)] = np.nan
     if (np.abs(depth) > FARTHEST).any():

@@ -9,7 +9,7 @@ from ...calibrate.material import STRETCHES, KnownPressures, material_from_image
 from ...calibrate.report import Report
 from ...calibrate.weight import WeightFit, material_from_weight
 from ...errors import MembraneError
-from ...jobs.inputs import Inputs, find_inputs, single_images
+from ...jobs.inputs import Inputs, find_inputs, frame_name, single_images
 from ...jobs.pressure import read_pressures
 from ...plot.calibration import material_figure
 from ...progress import Progress
@@ -22,7 +22,7 @@ def material(arguments: Namespace) -> int:
     """`torchmembrane calibrate material`"""
     sensor, inputs = read_sensor(arguments), find_inputs(arguments.images)
     paths = single_images(inputs)
-    forces = read_forces(arguments.forces, paths) if arguments.forces else None
+    forces = read_forces(arguments.forces, inputs) if arguments.forces else None
     pressures = _pressures(arguments, inputs, sensor) if arguments.pressure else None
     images = torch.from_numpy(np.stack([read_sensor_image(path, sensor) for path in paths]))[:, None]
     with ProgressDisplay("calibrate material") as progress:
@@ -66,4 +66,4 @@ def _weighed(arguments: Namespace, sensor: Sensor, images: torch.Tensor, progres
 
 def _pressures(arguments: Namespace, inputs: Inputs, sensor: Sensor) -> KnownPressures:
     values, since_rest = read_pressures(arguments.pressure, inputs, sensor)
-    return KnownPressures(np.array([values.get(path.stem, np.nan) for path in inputs.images]), since_rest)
+    return KnownPressures(np.array([values.get(frame_name(path), np.nan) for path in inputs.images]), since_rest)

@@ -11,6 +11,8 @@ from ...calibrate.report import Report
 from ...calibrate.rest import rest_from_image
 from ...calibrate.surface import Correction, fine_surface
 from ...calibrate.views import rest_from_views
+from ...errors import MembraneError
+from ...jobs.inputs import find_inputs, single_images
 from ...plot.calibration import fit_figure, surface_figure
 from ...sensor.sensor import Sensor
 from ..progress import ProgressDisplay
@@ -30,7 +32,7 @@ def rest(arguments: Namespace) -> int:
     shifts = np.linalg.norm(found.shifts, axis=1)
     notes = [
         f"{np.isfinite(found.pixels).all(1).sum()} of {len(shifts)} dots found; moved along the surface to null what is left: "
-        f"{np.sqrt((shifts**2).mean()):.4f} {sensor.length_unit} rms, at most {shifts.max():.4f}"
+        f"{np.sqrt((shifts**2).mean()):.3g} {sensor.length_unit} rms, at most {shifts.max():.3g}"
     ]
     title = "rest surface from one image"
     report = Report.of(title, found.names, units, np.zeros(6), found.fit, found.pixels, found.residuals, notes)
@@ -40,14 +42,17 @@ def rest(arguments: Namespace) -> int:
 def views(arguments: Namespace) -> int:
     """`torchmembrane calibrate views`"""
     sensor, motions = read_sensor(arguments), read_motions(arguments.motions)
-    images = [read_sensor_image(path, sensor) for path in arguments.images]
+    paths = single_images(find_inputs(arguments.images))
+    if len(paths) != len(motions):
+        raise MembraneError(f"{arguments.motions}: {len(motions)} lines of motions; expected {len(paths)}, one for each image")
+    images = [read_sensor_image(path, sensor) for path in paths]
     with ProgressDisplay("calibrate views") as progress:
         found = rest_from_views(sensor, images, motions, arguments.travel_error, progress=progress)
     unit, P = sensor.length_unit, len(motions)
     design = np.concatenate([motions[1:, 3:], motions[1:, :3]], 1).ravel()
     rms = np.sqrt((found.deviations**2).mean(0))
     notes = [
-        f"{len(found.dots)} dots, standard deviations along x, y, z {rms[0]:.4f}, {rms[1]:.4f}, {rms[2]:.4f} {unit}",
+        f"{len(found.dots)} dots, standard deviations along x, y, z {rms[0]:.3g}, {rms[1]:.3g}, {rms[2]:.3g} {unit}",
         _moved(found.surface, unit),
     ]
     units = (["degrees"] * 3 + [unit] * 3) * (P - 1)
@@ -60,12 +65,13 @@ def views(arguments: Namespace) -> int:
 def depth(arguments: Namespace) -> int:
     """`torchmembrane calibrate depth`"""
     sensor = read_sensor(arguments)
-    values, image = read_depth(arguments.depth, arguments.unit), read_sensor_image(arguments.image, sensor)
+    values = read_depth(arguments.depth, arguments.unit, sensor.length_unit)
+    image = read_sensor_image(arguments.image, sensor)
     with ProgressDisplay("calibrate depth") as progress:
         found = rest_from_depth(sensor, values, image, progress=progress)
     unit = sensor.length_unit
     notes = [
-        f"{len(found.deviations)} squares of depths, each known to {np.median(found.deviations):.4f} {unit}",
+        f"{len(found.deviations)} squares of depths, each known to {np.median(found.deviations):.3g} {unit}",
         _moved(found.surface, unit),
         f"{len(found.sensor.markers.sizes or ())} dots placed on the surface",
     ]
@@ -80,4 +86,4 @@ def _drawn(sensor: Sensor, report: Report, surface: Correction) -> "Figure":
 
 def _moved(surface: Correction, unit: str) -> str:
     rms, sd = (float(np.sqrt((a**2).mean())) for a in (surface.offsets, surface.deviations))
-    return f"surface moved along its normals by {rms:.4f} {unit} rms, known to {sd:.4f} {unit} rms"
+    return f"surface moved along its normals by {rms:.3g} {unit} rms, known to {sd:.3g} {unit} rms"

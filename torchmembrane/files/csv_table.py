@@ -1,0 +1,233 @@
+"""Tables that people make, as CSV: one reader, which finds columns by their names, and one set of messages.
+
+What spreadsheets, editors and numpy leave in a file is passed over: a byte order mark, Windows' line ends, blank lines, lines
+of commas alone, commas and blanks at the ends of lines, quotes, capitals in names, comments after `#` and a blank. What may
+mean one thing or another is refused: semicolons, decimal commas, separators of thousands, a column twice, one too many.
+"""
+
+import csv
+import io
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from ..errors import MembraneError
+from .safe_read import in_one_line, printable, read_text, shortened
+
+NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+COMMENT = re.compile(r"\s*#+(\s|$)")
+QUOTED = re.compile(r"[\w.,;+ ()\[\]-]{0,60}")
+"""A first line that a message quotes; of another one it tells the length alone, as the file may be anything."""
+MINUS = str.maketrans({"\N{MINUS SIGN}": "-"})
+COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven")
+
+
+class Columns(NamedTuple):
+    """What a table holds.
+
+    Attributes:
+        forms: the names of columns that belong together; a table has those of one form, in any order.
+        of: what a line is about, in one word.
+        optional: a further column, which may be left out; empty: there is none.
+        unit: what the numbers are in, for messages.
+        least: lines.
+        most: lines; None: as many as there are.
+    """
+
+    forms: Sequence[tuple[str, ...]]
+    of: str
+    optional: str = ""
+    unit: str = ""
+    least: int = 1
+    most: int | None = None
+
+    @property
+    def expected(self) -> str:
+        """The columns in words."""
+        heads = " or ".join(map(",".join, self.forms)) + (f", each with ,{self.optional} or without" if self.optional else "")
+        return f"{heads}, a line for each {self.of}" + (f", {self.unit}" if self.unit else "")
+
+    def form_of(self, names: Sequence[str]) -> tuple[str, ...] | None:
+        """The form whose columns these are, in any order."""
+        given = sorted(name for name in names if name != self.optional or names.count(name) > 1)
+        return next((form for form in self.forms if sorted(form) == given), None)
+
+
+class Limit(NamedTuple):
+    """How large a number may be, either way, and what it is, for messages."""
+
+    most: float = math.inf
+    what: str = "a number"
+    unit: str = ""
+
+
+ANY, ANGLE = Limit(), Limit(360.0, "an angle", "degrees")
+
+
+class Row(NamedTuple):
+    """A line of a table.
+
+    Attributes:
+        path: the file.
+        line: its number, from 1.
+        places: of the columns among the cells, by name.
+        cells: the line's.
+    """
+
+    path: Path
+    line: int
+    places: Mapping[str, int]
+    cells: list[str]
+
+    @property
+    def where(self) -> str:
+        """File and line, as messages begin."""
+        return f"{self.path}, line {self.line}"
+
+    def text(self, column: str) -> str:
+        """A cell as it is, without blanks around it."""
+        return self.cells[self.places[column]]
+
+    def number(self, column: str, limit: Limit = ANY) -> float:
+        """A finite number within its limit; else a `MembraneError` that names file, line and column."""
+        try:
+            value = float(cell := self.text(column).translate(MINUS))
+        except ValueError:
+            raise self.refusal(column, "a number with a decimal point") from None
+        if not math.isfinite(value):
+            raise self.refusal(column, "a finite number: leave the line out where it is unknown")
+        if not NUMBER.fullmatch(cell):  # Python takes 1_000, and digits of other scripts
+            raise self.refusal(column, "a number with a decimal point")
+        if abs(value) > limit.most:
+            raise self.refusal(column, f"{limit.what} up to {limit.most:g}, in {limit.unit}")
+        return value
+
+    def numbers(self, columns: Iterable[str], limit: Limit = ANY) -> list[float]:
+        """The finite numbers of several columns."""
+        return [self.number(column, limit) for column in columns]
+
+    def choice(self, column: str, choices: Sequence[str]) -> str:
+        """One of some words, in capitals or not."""
+        word = self.text(column).lower()
+        if word not in choices:
+            raise self.refusal(column, " or ".join(choices))
+        return word
+
+    def refusal(self, column: str, expected: str) -> MembraneError:
+        """The error for a cell that is not what was expected."""
+        cell = shortened(printable(self.text(column)))
+        return MembraneError(f"{self.where}: {column} = {cell if _is_number(cell) else repr(cell)}; expected {expected}")
+
+
+class Table(NamedTuple):
+    """A table as it was read.
+
+    Attributes:
+        form: that of the expected ones whose columns it has.
+        rows: its lines below the header.
+    """
+
+    form: tuple[str, ...]
+    rows: list[Row]
+
+
+def read_table(path: Path, columns: Columns, most_bytes: int) -> Table:
+    """The lines of a table; cells are looked at when they are asked for.
+
+    Args:
+        path: of the file, CSV.
+        columns: that it may have.
+        most_bytes: that it may hold.
+
+    Raises:
+        MembraneError: no such file, no text, no CSV, other columns, a line of more or fewer cells than columns, too few or too
+            many lines; names file and line, what came, what was expected, and the remedy.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "dots.csv"
+        ...     _ = path.write_text("# measured by hand\\n Y , X ,\\n2.5,+1,\\n\\n")
+        ...     form, rows = read_table(path, Columns([("x", "y")], "dot"), 1000)
+        >>> form, rows[0].numbers(form)
+        (('x', 'y'), [1.0, 2.5])
+    """
+    text = read_text(path, most_bytes, f"CSV with {columns.expected}")
+    lines = io.StringIO(text, newline="").readlines()
+    rows, damage = _rows(lines)
+    names, body = _header(path, columns, rows, lines) if rows or not damage else ([], [])
+    if damage:
+        raise MembraneError(f"{path}, {damage}; expected {columns.expected}")
+    form = columns.form_of(names)
+    assert form is not None  # or the header has been refused
+    _refuse_count(path, columns, len(body))
+    places = {name: k for k, name in enumerate(names)}
+    return Table(form, [Row(path, line, places, _cells(path, line, cells, names)) for line, cells in body])
+
+
+def _rows(lines: list[str]) -> tuple[list[tuple[int, list[str]]], str]:
+    """Lines that are not empty, each with its number and cells, and what ended them early, if anything did."""
+    reader = csv.reader(("\n" if COMMENT.match(line) else line for line in lines), strict=True, skipinitialspace=True)
+    rows = []
+    try:
+        for row in reader:
+            cells = [cell.strip() for cell in row]
+            if any(cells):
+                rows.append((reader.line_num, cells))
+    except csv.Error as error:
+        return rows, f"line {reader.line_num}: not readable as CSV ({in_one_line(error)})"
+    return rows, ""
+
+
+def _header(
+    path: Path, columns: Columns, rows: list[tuple[int, list[str]]], lines: list[str]
+) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The names of the columns, and the lines below them; a comment may name them, as numpy writes it."""
+    line, first = rows[0] if rows else (1, ["nothing"])
+    if columns.form_of(names := _names(first)):
+        return names, rows[1:]
+    comments = [_names(text.lstrip("# \t").split(",")) for text in lines[: line - 1] if COMMENT.match(text)]
+    for commented in reversed(comments):
+        if columns.form_of(commented):
+            return commented, rows
+    known = {columns.optional, *(name for form in columns.forms for name in form)}
+    if twice := [name for name in names if name and name in known and names.count(name) > 1]:
+        raise MembraneError(f"{path}, line {line}: the header names {twice[0]} twice; expected {columns.expected}: remove one")
+    came = ",".join(first)
+    came = repr(came) if QUOTED.fullmatch(came) else f"{len(came)} characters that name no columns"
+    remedy = "put these names in the first line, commas between them, and numbers with a decimal point"
+    raise MembraneError(f"{path}, line {line}: the header is {came}; expected {columns.expected}: {remedy}")
+
+
+def _names(cells: Sequence[str]) -> list[str]:
+    """The names in a header, as they are compared; empty ones at its end are left out."""
+    names = [re.sub(r"[\s-]+", "_", cell.strip().lower()) for cell in cells]
+    while names and not names[-1]:
+        names.pop()
+    return names
+
+
+def _cells(path: Path, line: int, cells: list[str], names: list[str]) -> list[str]:
+    if len(cells) < len(names) or any(cells[len(names) :]):
+        wanted = f"{COUNTS[len(names)]}, {','.join(names)}: commas between columns alone, numbers with a decimal point"
+        raise MembraneError(f"{path}, line {line}: {len(cells)} values, {in_one_line(','.join(cells))}; expected {wanted}")
+    return cells[: len(names)]
+
+
+def _refuse_count(path: Path, columns: Columns, count: int) -> None:
+    of, least, most = f"{columns.of}s", columns.least, columns.most
+    if count == 0 and least == 1:
+        raise MembraneError(f"{path}: no {of} after the header; expected {columns.expected}")
+    if count < least or (most is not None and count > most):
+        bounds = f"{least} to {most}" if least > 1 else f"at most {most}"
+        raise MembraneError(f"{path}: {count} {of}; expected {bounds}, a line for each")
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
