@@ -14,6 +14,11 @@ HEAD = """\
 Made by `python docs/reference.py` from the command's own parsers; `torchmembrane COMMAND --help` says the same, with examples.
 `SENSOR.toml` may be `preset:NAME` ([which](presets.md)). Exit codes: 0 all well, 1 some frames failed, 2 wrong usage, 130
 interrupted.
+
+No command writes over a file that it reads. Another file that is there already is written over with `--force` only, but for
+the results of a folder in which `reconstruct` goes on, the frames of a folder that `simulate` made, and figures that the same
+command drew (their files say so). A symbolic link in a file's place is replaced; what it points to is left alone. Files are
+written whole or not at all.
 """
 
 

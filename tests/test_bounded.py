@@ -171,6 +171,7 @@ OTHERS_FILES = {
     "results/summary.py": "line by line, as long as it likes, of a regular file",
     "files/provenance.py": "hashed piece by piece, of a regular file",
     "sensor/table.py": "tomllib, of text",
+    "plot/drawing.py": "Image.open, of a PNG's text alone",
     "cli/calibrate/files.py": "np.loadtxt, of text",
     "simulate/frames.py": "JSON, of text, and of a table's metadata",
     "accuracy/finished.py": "JSON, of text",
@@ -188,6 +189,7 @@ OWN_FILES = {
     "integrations/rosbag.py": "written",
     "simulate/mesh_indenter.py": "load_mesh, of bytes",
     "machine_code.py": "this package's own source",
+    "files/atomic.py": "written",
 }
 
 

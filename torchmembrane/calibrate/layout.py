@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
+from ..files.atomic import write_text
 from ..files.safe_read import read_text
 from ..markers.placement import rim_mask
 from ..sensor.sensor import Sensor
@@ -200,7 +201,7 @@ def write_layout(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
     rows = zip(dots.positions - rim, dots.normals, dots.radii, dots.sizes, strict=True)
     for d, (x, n, radius, size) in enumerate(rows):
         lines.append(",".join([str(d), *(f"{value:.5f}" for value in (*x, *n, radius)), size]))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def write_svg(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
@@ -219,4 +220,4 @@ def write_svg(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
         short, angle = radius * abs(normal[2]), np.degrees(np.arctan2(normal[1], normal[0]))
         rotation = f"rotate({angle:.2f} {x:.3f} {y:.3f})"
         lines.append(f'<ellipse cx="{x:.3f}" cy="{y:.3f}" rx="{short:.3f}" ry="{radius:.3f}" transform="{rotation}"/>')
-    path.write_text("\n".join([*lines, "</svg>"]) + "\n", encoding="utf-8")
+    write_text(path, "\n".join([*lines, "</svg>"]) + "\n")

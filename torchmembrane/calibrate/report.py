@@ -8,6 +8,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..files.atomic import make_folder, write_text
+
 HIGH_CORRELATION = 0.95  # above it two parameters are said to be hard to identify separately
 
 
@@ -140,5 +142,4 @@ class Report(NamedTuple):
             "noise_px": self.noise,
             "notes": self.notes,
         }
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "report.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+        write_text(make_folder(folder) / "report.json", json.dumps(content, indent=1))

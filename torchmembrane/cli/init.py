@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MembraneError
-from .arguments import Add, add_command, count_pair, positive, positive_pair, vector
+from .arguments import Add, add_command, add_force, count_pair, positive, positive_pair, vector
 from .choices import DRAFTS, FILLINGS, FROM_IMAGE, LENGTH_UNITS, LENSES, LONGEST_SIDE, POLARITIES
 
-COMPANIONS = ("_dots.csv", "_grid.npz", "_rest.png", "_rest.tiff")
-"""Ends of the names of the files that are written beside a sensor file."""
 PURPOSE = "write a sensor file, with a word on every key, from a few numbers"
 EXAMPLES = """\
 examples:
@@ -76,7 +74,7 @@ def add_parser(commands: Any) -> None:
     add("sensor", metavar="SENSOR.toml", type=Path, help="the file to write")
     add("--name", help="of the sensor (default: the file's)")
     add("--unit", choices=LENGTH_UNITS, default=LENGTH_UNITS[0], help="of all lengths (default: %(default)s)")
-    add("--force", action="store_true", help="write over an existing file")
+    add_force(add)
     _add_membrane(add)
     _add_camera(add)
     _add_material(add)
@@ -143,16 +141,14 @@ def run(arguments: Namespace) -> int:
     path: Path = arguments.sensor
     if path.suffix != ".toml":
         raise MembraneError(f"init {path}: expected a file that ends with .toml, as sensor.toml")
-    read = [Path(file).resolve() for file in (arguments.rest, arguments.dots) if file is not None]
-    for file in (path, *(path.with_name(path.stem + ending) for ending in COMPANIONS)):
-        if file.resolve() in read:
-            raise MembraneError(f"init {path}: would write over {file}, which it reads; choose another name")
-        if file.exists() and not arguments.force:
-            raise MembraneError(f"init {path}: {file} is there already; choose another name, or pass --force to write over it")
-    if arguments.shape is None:
-        arguments.shape = _asked("shape", *QUESTIONS["shape"])
+    from ..files.targets import refuse_overwriting
+    from ..sensor.companions import companions_of
     from .draft import needed, refuse_foreign, write_draft
 
+    read = [file for file in (arguments.rest, arguments.dots) if file is not None]
+    refuse_overwriting(f"init {path}", companions_of(path), read, arguments.force)
+    if arguments.shape is None:
+        arguments.shape = _asked("shape", *QUESTIONS["shape"])
     refuse_foreign(arguments)
     for name in needed(arguments):
         setattr(arguments, name, _asked(name, *QUESTIONS[name]))

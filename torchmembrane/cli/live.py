@@ -14,6 +14,7 @@ from .arguments import (
     add_command,
     add_device,
     add_estimator,
+    add_force,
     add_rerun,
     add_sensor,
     camera,
@@ -69,6 +70,7 @@ def add_parser(commands: Any) -> None:
     kept = "keep images, results and times in a new folder; what the disk is too slow for is dropped and counted"
     add("--record", metavar="DIR", type=Path, help=kept)
     add_rerun(add)
+    add_force(add)
 
 
 def run(arguments: Namespace) -> int:
@@ -80,6 +82,7 @@ def run(arguments: Namespace) -> int:
     from ..sensor.sensor import Sensor
 
     _check(arguments)
+    _spare_files(arguments)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     images, stream = _images(arguments, sensor.camera.image_size), _stream(arguments, sensor)
     line = Line(stream.mesh, sys.stdout)
@@ -111,6 +114,17 @@ def _check(arguments: Namespace) -> None:
     if arguments.model is not None and foreign:
         raise MembraneError(f"live: --{foreign[0]} with --model; a model has its own: export it with that")
     check_device(arguments.device)
+
+
+def _spare_files(arguments: Namespace) -> None:
+    """Refuse to write the recording of Rerun over a file."""
+    from ..files.targets import refuse_overwriting
+    from ..presets import sensor_file
+    from ..sensor.companions import files_of
+
+    if wants_rerun(arguments) and arguments.save is not None:
+        read = [*files_of(sensor_file(arguments.sensor)), *filter(None, [arguments.video, arguments.model])]
+        refuse_overwriting("live --save", [arguments.save], read, arguments.force)
 
 
 def _images(arguments: Namespace, size: tuple[int, int]) -> "Iterator[np.ndarray]":

@@ -28,7 +28,8 @@ def main(argv: list[str] | None = None) -> int:
             with _terminated_as_interrupted():
                 return int(arguments.run(arguments))
         except (MembraneError, OSError) as error:
-            print(f"torchmembrane: error: {error}", file=sys.stderr)
+            nameless = isinstance(error, OSError) and error.filename is None and error.errno is not None
+            print(f"torchmembrane: error: {'standard output: ' if nameless else ''}{error}", file=sys.stderr)
             return 2
         except KeyboardInterrupt:
             print("torchmembrane: interrupted; what is done so far is kept", file=sys.stderr)

@@ -9,9 +9,11 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from ..errors import MembraneError
+from .atomic import whole_file
 from .safe_read import DAMAGE, in_one_line, read_bytes
 
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
+WRITTEN = {".png": "PNG", ".tiff": "TIFF"}
 MOST_PIXELS, MOST_IMAGE_BYTES = 2**25, 2**28
 GREY = (0.299, 0.587, 0.114)
 
@@ -235,12 +237,8 @@ def write_image(stem: str | Path, grey: np.ndarray) -> Path:
     for depth in (np.uint8, np.uint16):
         levels = np.rint(grey.astype(np.float64) * np.iinfo(depth).max).astype(depth)
         if np.array_equal(to_grey(levels), grey):
-            path = stem.with_name(stem.name + ".png")
-            Image.fromarray(levels).save(path)
-            return path
-    path = stem.with_name(stem.name + ".tiff")
-    Image.fromarray(grey).save(path)
-    return path
+            return _save(stem.with_name(stem.name + ".png"), levels)
+    return _save(stem.with_name(stem.name + ".tiff"), grey)
 
 
 def write_as_taken(stem: str | Path, image: np.ndarray) -> Path:
@@ -265,8 +263,13 @@ def write_as_taken(stem: str | Path, image: np.ndarray) -> Path:
         image = to_grey(image)
     if image.dtype.kind == "f":
         return write_image(stem, image)
-    path = Path(f"{stem}.png")
-    Image.fromarray(np.ascontiguousarray(image)).save(path, compress_level=1)
+    return _save(Path(f"{stem}.png"), image, compress_level=1)
+
+
+def _save(path: Path, image: np.ndarray, **options: int) -> Path:
+    """Write an image, whole or not at all, in the format that the ending says."""
+    with whole_file(path) as partial:
+        Image.fromarray(np.ascontiguousarray(image)).save(partial, format=WRITTEN[path.suffix], **options)
     return path
 
 

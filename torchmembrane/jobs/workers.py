@@ -43,6 +43,10 @@ MEMORY_SHARE = 0.25
 """Of the machine's memory, for all frames in computation."""
 
 
+DRAWS = "reconstruct"
+"""The command that the figures' files name."""
+
+
 class Work(NamedTuple):
     """What is done with a batch of frames.
 
@@ -68,7 +72,7 @@ class Work(NamedTuple):
             for outcome, frame in zip(found, group, strict=True):
                 if outcome.stored is not None and frame.image is not None:
                     image = frame.image[0, 0].cpu().numpy()
-                    save(figure(outcome.stored.frame, mesh, image, frame.name), folder / f"{frame.name}.png")
+                    save(figure(outcome.stored.frame, mesh, image, frame.name), folder / f"{frame.name}.png", DRAWS)
         return found
 
 

@@ -4,6 +4,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..files.atomic import write_text
+
 WORDS = {
     "": {"format": "of this file", "name": "any text", "length_unit": "mm | cm | m: of all lengths here and in results"},
     "camera": {
@@ -76,4 +78,4 @@ def annotate(path: Path, said: Sequence[str], relative: bool) -> None:
         lines.append(f"{line}  # {word}" if word else line)
         if table == "material" and key == "prestretch" and relative:
             lines.append(RELATIVE)
-    path.write_text("\n".join([*lines, "", FURTHER]) + "\n", encoding="utf-8")
+    write_text(path, "\n".join([*lines, "", FURTHER]) + "\n")

@@ -1,6 +1,7 @@
 """Reading and writing `sensor.toml` and the arrays named in it."""
 
 import csv
+import io
 import math
 import re
 from dataclasses import asdict, replace
@@ -12,6 +13,7 @@ import numpy as np
 from ..camera.model import Camera
 from ..camera.ports import Port
 from ..errors import MembraneError
+from ..files.atomic import make_folder, write_bytes, write_text
 from ..files.images import image_size, mean_image, write_image
 from ..files.safe_read import in_one_line, read_arrays, read_text, shortened
 from ..pose import Pose
@@ -91,12 +93,14 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
     Returns:
         The path.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     tables, surface, markers = tables_of(parts), parts.surface, parts.markers
     tables["camera"] |= _calibrated(parts.camera)
     if surface.shape in SHAPES_BY_ARRAYS:
         tables["membrane"]["file"] = f"{path.stem}_{surface.shape}.npz"
-        np.savez_compressed(path.with_name(tables["membrane"]["file"]), **surface.values)
+        content = io.BytesIO()
+        np.savez_compressed(content, **surface.values)
+        write_bytes(path.with_name(tables["membrane"]["file"]), content.getbuffer())
     if markers.positions is not None:
         tables["markers"]["file"] = f"{path.stem}_dots.csv"
         _write_dots(path.with_name(tables["markers"]["file"]), markers.positions, markers.sizes or [])
@@ -108,7 +112,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
         blocks["camera"] += toml_lines("camera.ports", port, repeated=True)
     if ports:
         blocks["camera"] += toml_lines("camera.medium", medium)
-    path.write_text("\n\n".join("\n".join(lines) for lines in blocks.values()) + "\n", encoding="utf-8")
+    write_text(path, "\n\n".join("\n".join(lines) for lines in blocks.values()) + "\n")
     return path
 
 
@@ -276,7 +280,7 @@ def _dot(line: str, row: list[str]) -> tuple[list[float], str]:
 
 def _write_dots(path: Path, positions: np.ndarray, sizes: list[str]) -> None:
     rows = [[*map(repr, position), size] for position, size in zip(positions.tolist(), sizes, strict=True)]
-    path.write_text("\n".join(map(",".join, [DOTS_HEADER, *rows])) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(map(",".join, [DOTS_HEADER, *rows])) + "\n")
 
 
 def _read_membrane(table: Table, markers: Markers) -> tuple[Surface, Membrane]:

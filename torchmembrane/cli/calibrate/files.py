@@ -3,6 +3,7 @@
 import csv
 from argparse import Namespace
 from collections.abc import Sequence
+from glob import glob
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,9 +15,11 @@ from ...camera.targets import Checkerboard, DotBoard
 from ...errors import MembraneError
 from ...files.images import read_image
 from ...files.safe_read import read_array, read_text
+from ...files.targets import refuse_overwriting
 from ...jobs.inputs import find_inputs
 from ...plot.drawing import save
 from ...presets import sensor_file
+from ...sensor.companions import companions_of, files_of
 from ...sensor.sensor import Sensor
 from ...surface.checks import FARTHEST
 
@@ -25,6 +28,9 @@ if TYPE_CHECKING:
 
 MOST_TABLE_BYTES = 2**20
 LARGEST_MOTION = 1e4  # length unit, and degrees
+LISTS = ("images", "air", "medium")
+FILES = ("image", "depth", "motions", "forces", "pressure", "pixels")
+"""Arguments of the steps that name files to read: images, and single files."""
 
 
 def read_sensor(arguments: Namespace) -> Sensor:
@@ -32,11 +38,26 @@ def read_sensor(arguments: Namespace) -> Sensor:
     return Sensor.from_file(sensor_file(arguments.sensor))
 
 
+def spare_files(step: str, arguments: Namespace) -> None:
+    """Refuse a folder in which files would be written over, or that of the sensor that is calibrated.
+
+    Args:
+        step: of the calibration.
+        arguments: of the command.
+    """
+    given = vars(arguments)
+    read = [*files_of(sensor_file(arguments.sensor)), *(given[name] for name in FILES if given.get(name) is not None)]
+    read += [path for name in LISTS for text in given.get(name, ()) for path in (text, *glob(text), *Path(text).glob("*"))]
+    names = ("report.png", "layout.csv", "layout.svg") if step == "layout" else ("report.png", "report.json")
+    targets = [*companions_of(arguments.out / "sensor.toml"), *(arguments.out / name for name in names)]
+    refuse_overwriting(f"calibrate {step} --out {arguments.out}", targets, read, arguments.force)
+
+
 def write_calibrated(arguments: Namespace, sensor: Sensor, report: Report, drawing: "Figure") -> int:
     """Write the calibrated sensor and its report, print what was found; returns the exit code."""
     path = sensor.to_file(arguments.out)
     report.write(arguments.out)
-    save(drawing, arguments.out / "report.png")
+    save(drawing, arguments.out / "report.png", "calibrate")
     print("\n".join([*report.lines, f"calibrated sensor: {path}; report.json and report.png beside it"]))
     return 0
 
