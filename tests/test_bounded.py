@@ -180,9 +180,8 @@ OTHERS_FILES = {
 }
 """Modules that call a reader themselves, and why that is within bounds."""
 OWN_FILES = {
-    "jobs/workers.py": "what its parent process wrote",
-    "simulate/dataset.py": "what its parent process gave",
-    "accuracy/measure.py": "what its parent process gave",
+    "processes.py": "what its parent process wrote",
+    "jobs/workers.py": "the container's bound of memory",
     "presets/annotate.py": "what Sensor.to_file wrote just now",
     "plot/film.py": "written",
     "live/recording.py": "written",

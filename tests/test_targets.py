@@ -18,9 +18,10 @@ from torchmembrane.calibrate.layout import FabricationLayout, write_layout, writ
 from torchmembrane.calibrate.report import Report
 from torchmembrane.cli.main import main
 from torchmembrane.errors import MembraneError
-from torchmembrane.files.atomic import make_folder, make_subfolder, remove_unfinished, unfinished, whole_file, write_text
+from torchmembrane.files.atomic import make_folder, make_subfolder, whole_file, write_text
 from torchmembrane.files.images import write_as_taken, write_image
 from torchmembrane.files.targets import refuse_overwriting
+from torchmembrane.interruption import remove_unfinished, unfinished
 from torchmembrane.plot.drawing import save
 from torchmembrane.plot.film import write_film
 from torchmembrane.reconstruct import Reconstructor

@@ -75,6 +75,7 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: Namespace) -> int:
     """Follow the source until it ends or is stopped; returns the exit code."""
+    from ..interruption import answer
     from ..live.line import Line, summary
     from ..live.loop import Tally, follow
     from ..live.mailbox import capture
@@ -94,6 +95,8 @@ def run(arguments: Namespace) -> int:
         try:
             follow(stream, mailbox, tally, [line, *watchers], stop, rezero, line.say)
         finally:
+            if stop.is_set():
+                answer()
             line.say(summary(tally))
     for each in said:
         print(each())
@@ -180,12 +183,14 @@ def _watchers(
 
 @contextmanager
 def _stopped_by_signals() -> Iterator[Event]:
-    """An event that the first SIGINT or SIGTERM sets; the second ends the command as ever."""
-    stop, before = Event(), {}
+    """An event that the first SIGINT or SIGTERM sets; the second, or a frame that takes too long, ends the command as ever."""
+    stop = Event()
+    before: dict[signal.Signals, Any] = {}
 
     def on_signal(number: int, _: object) -> None:
         stop.set()
-        signal.signal(number, signal.default_int_handler)
+        handler = before[signal.Signals(number)]
+        signal.signal(number, handler if callable(handler) else signal.default_int_handler)
 
     if current_thread() is main_thread():
         before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -2,14 +2,14 @@
 
 import errno
 import os
-import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
 
 from ..errors import MembraneError
+from ..interruption import unfinished
 
 PARTIAL = ".[0-9a-f]*-[0-9]*.partial"
 """Pattern of what killed processes leave behind."""
@@ -25,9 +25,6 @@ REMEDIES = {
     errno.ENAMETOOLONG: "a shorter name",
 }
 """What is expected instead, by the error's number."""
-
-_unfinished: set[Path] = set()
-"""What this process is writing now: files, and folders of its own."""
 
 
 @contextmanager
@@ -68,6 +65,17 @@ def whole_file(path: str | Path) -> Iterator[Path]:
         os.close(os.open(partial, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield partial
         partial.replace(path)
+
+
+def remove_partials(folder: Path, processes: Iterable[int | None]) -> None:
+    """Remove what processes that were ended had begun to write in a folder.
+
+    Args:
+        folder: any.
+        processes: their numbers.
+    """
+    for left in [path for process in processes for path in folder.glob(f".*-{process}.partial")]:
+        left.unlink(missing_ok=True)
 
 
 def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
@@ -116,23 +124,6 @@ some, or choose another place
             raise
         expected = REMEDIES.get(error.errno, WRITABLE)
         raise MembraneError(f"{path}: not written ({os.strerror(error.errno)}); expected {expected}") from error
-
-
-@contextmanager
-def unfinished(path: Path) -> Iterator[None]:
-    """Within, a file or folder is work that `remove_unfinished` takes away; so is what is left of it in the end."""
-    _unfinished.add(path)
-    try:
-        yield
-    finally:
-        _remove(path)
-        _unfinished.discard(path)
-
-
-def remove_unfinished() -> None:
-    """Remove what this process has begun to write, as it is about to end in the midst of it."""
-    for path in list(_unfinished):
-        _remove(path)
 
 
 def make_folder(path: str | Path) -> Path:
@@ -188,10 +179,3 @@ def kind_of(mode: int) -> str:
     """What is no regular file, in a word, by its mode as `os.stat` gives it."""
     kinds = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket"}
     return kinds.get(stat.S_IFMT(mode), "device")
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:  # a folder, or in one that may not be changed
-        shutil.rmtree(path, ignore_errors=True)

@@ -13,9 +13,10 @@ import numpy as np
 
 from ..camera.model import Camera
 from ..errors import MembraneError
-from ..files.atomic import ROOM, make_folder, unfinished, writing
+from ..files.atomic import ROOM, make_folder, writing
 from ..files.optional import load_rosbags
 from ..files.safe_read import in_one_line, read_text
+from ..interruption import unfinished
 from ..results.reconstruction import Frame
 from .messages import POINT_FIELDS, SiUnits, cloud_layout, unlike
 
