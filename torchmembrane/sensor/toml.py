@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..camera.folds import refuse_folds
 from ..camera.model import Camera
 from ..camera.ports import Port
 from ..errors import MembraneError
@@ -79,6 +80,8 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
         names = [f"{line}: the dot" for line in lines]
         refuse_off_surface(membrane, markers.positions, names)
         refuse_coincident(membrane, markers.positions, names)
+    with file.table("camera").naming("distortion"):
+        refuse_folds(camera, membrane.rest)
     tool = _read_tool(file.table("tool")) if "tool" in file else None
     return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool)
 
