@@ -1,5 +1,6 @@
 """No command writes over the user's files unless told to, nor over what it reads; files are written whole or not at all."""
 
+import ast
 import errno
 import io
 import os
@@ -467,3 +468,34 @@ def test_a_full_standard_output_is_named(monkeypatch, capsys):
         patched.setattr("sys.stdout", Full())
         assert main(["check", str(EXAMPLES / "sensor.toml")]) == 2
     assert "error: standard output: [Errno 28] No space left" in capsys.readouterr().err
+
+
+WRITES = {"savefig", "write_table", "mkdir", "touch", "savetxt"}
+WITHIN = {
+    "files/atomic.py": "the one place",
+    "plot/drawing.py": "within whole_file",
+    "plot/film.py": "within whole_file",
+    "results/frame_table.py": "within whole_file",
+    "results/summary.py": "within whole_file",
+    "simulate/frames.py": "within whole_file",
+    "integrations/rosbag.py": "a folder of its own, renamed when it is whole",
+    "live/recording.py": "a list that grows line by line, in a new folder",
+    "processes.py": "a file of its own, for its workers",
+    "machine_code.py": "a mark in the cache of machine code",
+}
+"""Modules that write files themselves, and how these are whole."""
+
+
+def test_files_are_written_in_one_place():
+    """Every call of a writer in the package, but of `write_text` and `write_bytes` as functions of atomic."""
+    package, found = Path(__file__).parents[1] / "torchmembrane", set()
+    for path in package.rglob("*.py"):
+        for node in (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)):
+            method, function = getattr(node.func, "attr", ""), getattr(node.func, "id", "")
+            given = [
+                part.value for part in (*node.args, *(key.value for key in node.keywords)) if isinstance(part, ast.Constant)
+            ]
+            mode = any(isinstance(value, str) and value.strip("bt+") in ("w", "x", "a") for value in given)
+            if method in WRITES | {"write_text", "write_bytes"} or ("open" in (method, function) and mode):
+                found.add(path.relative_to(package).as_posix())
+    assert found == WITHIN.keys(), found ^ WITHIN.keys()
