@@ -13,7 +13,15 @@ HEAD = """\
 
 Made by `python docs/reference.py` from the command's own parsers; `torchmembrane COMMAND --help` says the same, with examples.
 `SENSOR.toml` may be `preset:NAME` ([which](presets.md)). Exit codes: 0 all well, 1 some frames failed, 2 wrong usage, 130
-interrupted.
+ended by Ctrl-C, 143 by SIGTERM.
+
+Ctrl-C and SIGTERM end a command within some two seconds, or with the frame in work; what is done so far is kept. A second one
+ends it at once: files are whole all the same, and the same command goes on from there where it can.
+
+No command writes over a file that it reads. Another file that is there already is written over with `--force` only, but for
+the results of a folder in which `reconstruct` goes on, the frames of a folder that `simulate` made, and figures that the same
+command drew (their files say so). A symbolic link in a file's place is replaced; what it points to is left alone. Files are
+written whole or not at all.
 """
 
 

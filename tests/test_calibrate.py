@@ -40,6 +40,7 @@ LENSES = {
     "pinhole": ((132.0, 133.0), (161.2, 118.5), (-0.05, 0.01, 5e-4, -3e-4, 0.0)),
     "fisheye": ((90.0, 90.3), (160.8, 119.1), (-0.012, 0.002, 0.0, 0.0)),
 }
+RATIONAL = (-0.1, 0.06, 5e-4, -3e-4, 0.01, 0.1, 0.03, 0.005)
 PORT, GUESS = (4.0, 3.0, 1.49, 1.33), (4.3, 2.8, 1.53, 1.36)
 CHECKERS, DOTS = Checkerboard(9, 6, 3.0), DotBoard(11, 8, 2.4)
 TILT, OFFSET = Rotation.from_rotvec(np.deg2rad([0.8, 0.6, 0.0])), np.array([0.05, -0.05, 0.3])  # 1 degree, 0.3 mm
@@ -211,6 +212,26 @@ def test_lens_is_found_within_three_deviations(model):
     values, deviations = found.fit.values[: len(found.names)], found.fit.deviations[: len(found.names)]
     assert_within(values, np.concatenate([focal, centre, distortion]), deviations, [0.3] * 4 + [np.inf] * len(distortion))
     assert found.camera.ports == guess.ports and found.camera.focal.tolist() == values[:2].tolist()
+
+
+def test_eight_coefficients_are_found_where_the_design_has_eight():
+    """One by one they are hardly known; the lens that they make is, as OpenCV projects it."""
+    cv2 = pytest.importorskip("cv2")
+    rng, focal, centre = np.random.default_rng(0), (132.0, 133.0), (161.2, 118.5)
+    camera = Camera("pinhole", SIZE, focal, centre, RATIONAL)
+    points = torch.from_numpy(CHECKERS.points - [12.0, 7.5, 0.0])
+    turns = torch.from_numpy(rng.uniform(-0.5, 0.5, (12, 3)))
+    where = torch.from_numpy(np.column_stack([rng.uniform(-6, 6, (12, 2)), rng.uniform(13, 20, 12)]))
+    pixels = camera.point_to_pixel(points @ rotations(turns).mT + where[:, None]).numpy()
+    pixels += rng.normal(scale=0.02, size=pixels.shape)
+    guess = Camera("pinhole", SIZE, (120, 120), (160, 120), [0.0] * 8)
+    found = lens_from_views(guess, CHECKERS, Views(pixels, np.zeros(12, bool))).camera
+    assert len(found.distortion) == 8 and found.distortion[5:].abs().max() > 1e-3
+    u, v = np.meshgrid(np.linspace(20, 300, 15), np.linspace(20, 220, 11))
+    rays = camera.pixel_to_ray(torch.from_numpy(np.stack([u, v], -1).reshape(-1, 2))).direction
+    K = np.array([[found.focal[0], 0, found.centre[0]], [0, found.focal[1], found.centre[1]], [0, 0, 1]])
+    seen, _ = cv2.projectPoints(rays.numpy(), np.zeros(3), np.zeros(3), K, found.distortion.numpy())
+    assert np.abs(seen[:, 0] - np.stack([u, v], -1).reshape(-1, 2)).max() < 0.3
 
 
 def test_ports_are_found_from_images_in_air_and_in_the_medium():

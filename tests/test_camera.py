@@ -9,6 +9,7 @@ from scipy.optimize import minimize, minimize_scalar
 from torch.func import functional_call
 
 from torchmembrane.camera.distortion import distort
+from torchmembrane.camera.folds import fold_in_image, refuse_folds
 from torchmembrane.camera.model import Camera
 from torchmembrane.errors import MembraneError
 
@@ -17,6 +18,7 @@ LENSES = {
     "pinhole": ("pinhole", (400.0, 404.0), ()),
     "pinhole k1": ("pinhole", (400.0, 404.0), (-0.2,)),
     "pinhole k1-k3": ("pinhole", (400.0, 404.0), (-0.3, 0.1, 1e-3, -2e-3, -0.01)),
+    "pinhole k1-k6": ("pinhole", (400.0, 404.0), (3.6, 2.6, 1e-3, -2e-3, 0.13, 3.9, 4.2, 0.74)),
     "fisheye": ("fisheye", (170.0, 172.0), ()),
     "fisheye k1-k4": ("fisheye", (170.0, 172.0), (-0.02, 0.004, -0.003, 0.0005)),
 }
@@ -84,6 +86,133 @@ def test_pinhole_distortion_is_opencvs():
     assert np.allclose(camera.point_to_pixel(torch.tensor([x, y, z], dtype=torch.float64)).numpy(), [u, v], atol=1e-10)
 
 
+RATIONAL = {
+    "wide": (3.6, 2.6, 1e-3, -2e-3, 0.13, 3.9, 4.2, 0.74),
+    "strong": (10.2, 5.1, 1e-4, 2e-4, 0.2, 10.6, 8.6, 1.2),
+    "mild": (-0.2, 0.05, 1e-3, -1e-3, 0.01, 0.15, 0.03, 0.002),
+    "no divisor": (-0.2, 0.05, 1e-3, -1e-3, 0.01, 0.0, 0.0, 0.0),
+    "divisor alone": (0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("distortion", RATIONAL.values(), ids=RATIONAL)
+def test_eight_coefficients_are_opencvs_rational_model(distortion):
+    cv2 = pytest.importorskip("cv2")
+    camera = Camera("pinhole", (640, 480), (300.0, 303.0), (320.3, 238.8), distortion)
+    points = torch.from_numpy(np.random.default_rng(0).uniform([-20, -15, 12], [20, 15, 30], (500, 3)))
+    K = np.array([[300.0, 0, 320.3], [0, 303.0, 238.8], [0, 0, 1]])
+    expected, _ = cv2.projectPoints(points.numpy(), np.zeros(3), np.zeros(3), K, np.array(distortion))
+    pixels = camera.point_to_pixel(points)
+    assert_close(pixels, torch.from_numpy(expected[:, 0]), 1e-9)
+    assert_close(camera.pixel_to_ray(pixels).direction, points / points.norm(dim=-1, keepdim=True), 1e-9)
+
+
+@pytest.mark.parametrize("count", [12, 14])
+def test_opencvs_longer_vectors_are_the_eight_where_the_others_are_zero(count):
+    eight = RATIONAL["mild"]
+    longer = camera_of("pinhole", distortion=[*eight, *[0.0] * (count - 8)])
+    assert longer.distortion.tolist() == list(eight)
+
+
+def test_the_divisor_s_zero_is_a_fold():
+    """1 - 0.5 r^2 is zero at r = 1.414: the image runs away before, and comes back from the other side behind it."""
+    camera = camera_of("pinhole", distortion=(0.0, 0.0, 0.0, 0.0, 0.0, -0.5, 0.0, 0.0), centre=(0.0, 0.0), focal=(1.0, 1.0))
+    points = torch.tensor([[1.0, 0.0, 1.0], [1.38, 0.0, 1.0], [1.43, 0.0, 1.0], [3.0, 0.0, 1.0]], dtype=torch.float64)
+    pixels = camera.point_to_pixel(points)
+    assert pixels.isnan().all(-1).tolist() == [False, False, True, True]
+    near = camera.point_to_pixel(torch.tensor([0.5, 0.0, 1.0], dtype=torch.float64))
+    assert_close(near[0], 0.5 / 0.875, 1e-12)
+    assert_close(camera.pixel_to_ray(near).direction[0], math.sin(math.atan(0.5)), 1e-9)
+
+
+FOLDS = {
+    "pinhole k1": ("pinhole", [-0.5], (2 / 3) * (2 / 3) ** 0.5),
+    "pinhole, as reported": ("pinhole", [-5.0, 2.0, -1.0, 3.0], None),
+    "pinhole k3": ("pinhole", [0.0, 0.0, 0.0, 0.0, -3.0], (6 / 7) * (1 / 21) ** (1 / 6)),
+    "pinhole, tangential": ("pinhole", [0.0, 0.0, 0.9, 0.0], None),
+    "pinhole, divisor": ("pinhole", [0.0, 0.0, 0.0, 0.0, 0.0, 1.5, 0.0, 0.0], 0.5 / 1.5**0.5),
+    "fisheye k1": ("fisheye", [-0.5], (2 / 3) * (2 / 3) ** 0.5),
+    "fisheye, as reported": ("fisheye", [-5.0, 2.0, -1.0, 3.0], None),
+    "fisheye k4": ("fisheye", [0.0, 0.0, 0.0, -1.0], (8 / 9) * (1 / 9) ** (1 / 8)),
+}
+
+
+@pytest.mark.parametrize("model, distortion, radius", FOLDS.values(), ids=FOLDS)
+def test_a_fold_within_the_image_is_found_where_it_is(model, distortion, radius):
+    """By the closed form of the radius at which `r (1 + k r^(2n))`, or `r / (1 + k r^2)`, turns."""
+    camera = Camera(model, (640, 480), (300.0, 300.0), (320.0, 240.0), distortion)
+    found = fold_in_image(camera)
+    assert found == pytest.approx(300 * radius, abs=3) if radius else 0 < found < 200
+    with pytest.raises(MembraneError, match=rf"folds back {found:.0f} px from the centre, within the image"):
+        refuse_folds(camera, torch.tensor([[0.0, 0.0, 9.0]]))
+
+
+@pytest.mark.parametrize(
+    "model, distortion",
+    [
+        ("pinhole", []),
+        ("pinhole", [-0.28, 0.07]),
+        ("pinhole", [-0.2, 0.1, 1e-3, 1e-3]),
+        ("pinhole", RATIONAL["wide"]),
+        ("pinhole", RATIONAL["mild"]),
+        ("fisheye", []),
+        ("fisheye", [0.0034, 0.0007, -0.002, 0.0002]),
+        ("fisheye", [-0.012, 0.002]),
+    ],
+)
+def test_lenses_that_do_not_fold_in_the_image_are_taken(model, distortion):
+    camera = Camera(model, (640, 480), (300.0, 300.0), (320.0, 240.0), distortion)
+    assert fold_in_image(camera) == math.inf
+    refuse_folds(camera, torch.tensor([[0.0, 0.0, 9.0]]))
+
+
+def test_a_fisheye_may_fold_beyond_its_circle_where_it_shows_all_of_the_membrane():
+    camera = Camera("fisheye", (640, 480), (160.0, 160.0), (320.0, 240.0), [-0.06, 0.0, 0.0, 0.0])
+    assert 240 < fold_in_image(camera) < 320
+    refuse_folds(camera, torch.tensor([[5.0, 0.0, 1.0]], dtype=torch.float64))
+    with pytest.raises(MembraneError, match="within the image"):
+        refuse_folds(camera, torch.tensor([[3.0, 0.0, -5.0]], dtype=torch.float64))
+
+
+def test_a_fold_that_is_cropped_away_is_none():
+    camera = Camera("pinhole", (640, 480), (400.0, 400.0), (320.0, 240.0), [-0.3])
+    assert fold_in_image(camera) < math.inf
+    assert fold_in_image(camera.in_mode((160, 120, 320, 240))) == math.inf
+
+
+def test_eight_coefficients_are_written_as_onnx():
+    """The lens by itself, in batches, as the runtime of exported models computes it."""
+    from onnxruntime import InferenceSession
+
+    from torchmembrane.onnx.export import Piece
+    from torchmembrane.onnx.trace import traced_model
+
+    camera = camera_of("pinhole k1-k6").float()
+
+    class Lens(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.camera = camera
+
+        def ray(self, pixels):
+            return self.camera.pixel_to_ray(pixels).direction
+
+    pixels = pixels_near((3, 50), 230.0).float()
+    model = traced_model(Piece(Lens(), Lens.ray), {"pixels": pixels}, ["direction"])
+    (found,) = InferenceSession(model.SerializeToString()).run(["direction"], {"pixels": pixels.numpy()})
+    assert_close(torch.from_numpy(found), camera.pixel_to_ray(pixels).direction, 1e-5)
+    assert "Loop" not in {node.op_type for node in model.graph.node}
+
+
+def test_what_a_lens_can_image():
+    points = torch.tensor([[0.0, 0.0, 9.0], [9.0, 0.0, 0.0], [9.0, 0.0, -2.0], [0.0, 0.0, 0.0], [0.0, 0.0, 4.0]])
+    lenses = [(model, behind) for model in ("pinhole", "fisheye") for behind in ("air", "port")]
+    can = {lens: camera_of(*lens).can_image(points).tolist() for lens in lenses}
+    assert can["pinhole", "air"] == [True, False, False, False, True]
+    assert can["fisheye", "air"] == [True, True, True, False, True]
+    assert can["pinhole", "port"] == can["fisheye", "port"] == [True, False, False, False, False]
+
+
 def test_derivative_of_the_distortion_is_its_derivative():
     """Newton converges with a slightly wrong one too, only slower."""
     k1, k2, p1, p2, k3 = torch.tensor(LENSES["pinhole k1-k3"][2], dtype=torch.float64)
@@ -109,7 +238,8 @@ def test_fisheye_distortion_is_opencvs_also_behind_the_image_plane(z):
 def test_a_shorter_distortion_is_padded_with_zeros(lens):
     model, _, distortion = LENSES[lens]
     if distortion:
-        longer = camera_of(lens, distortion=[*distortion, 0.0, 0.0, 0.0, 0.0][: 5 if model == "pinhole" else 4])
+        count = 4 if model == "fisheye" else 8 if len(distortion) > 5 else 5
+        longer = camera_of(lens, distortion=[*distortion, 0.0, 0.0, 0.0, 0.0][:count])
         assert torch.equal(longer.distortion, camera_of(lens).distortion)
 
 
@@ -245,7 +375,7 @@ class RayPoint(torch.nn.Module):
         return origin + 20 * direction
 
 
-@pytest.mark.parametrize("lens", ["pinhole k1-k3", "fisheye k1-k4"])
+@pytest.mark.parametrize("lens", ["pinhole k1-k3", "pinhole k1-k6", "fisheye k1-k4"])
 def test_gradients_reach_every_parameter(lens):
     camera = camera_of(lens, "stack")
     points = torch.tensor([[3.0, -2.0, 11.0], [-7.0, 1.0, 12.0]], dtype=torch.float64)
@@ -353,6 +483,12 @@ def test_state_dict_carries_the_parameters(lens, ports):
         ({"focal": (400.0, -400.0)}, "focal is [400.0, -400.0]; expected positive"),
         ({"centre": (1.0, math.nan)}, "centre is [1.0, nan]; expected finite"),
         ({"distortion": [0.1] * 6}, "at most k1 k2 p1 p2 k3"),
+        ({"distortion": [0.1] * 7}, "at most k1 k2 p1 p2 k3, or these and k4 k5 k6"),
+        ({"distortion": [0.1] * 9}, "at most k1 k2 p1 p2 k3, or these and k4 k5 k6"),
+        ({"distortion": [0.0] * 11 + [1e-3]}, "thin prisms and tilt are not modelled"),
+        ({"distortion": [0.0] * 12 + [0.0, 1e-3]}, "thin prisms and tilt are not modelled"),
+        ({"distortion": [0.0] * 13}, "at most k1 k2 p1 p2 k3, or these and k4 k5 k6"),
+        ({"model": "fisheye", "distortion": [0.1] * 8}, "at most k1 k2 k3 k4"),
         ({"model": "fisheye", "distortion": [0.1] * 5}, "at most k1 k2 k3 k4"),
         ({"distortion": [math.inf]}, "distortion is [inf]; expected finite"),
         ({"medium_index": 0.9}, "medium_index is 0.9; expected 1 (air) or more"),

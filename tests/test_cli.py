@@ -33,6 +33,7 @@ from torchmembrane.results import store
 from torchmembrane.sensor import parts
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate import appearance, dataset, frames, simulator
+from torchmembrane.surface import checks
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SENSOR = str(EXAMPLES / "sensor.toml")
@@ -299,6 +300,7 @@ def test_the_options_choices_are_what_the_package_has():
     assert choices.LOCATORS == placement.LOCATORS
     assert choices.DRAFTS == tuple(draft.SHAPES) and choices.LENGTH_UNITS == tuple(parts.METRE)
     assert choices.LENSES == tuple(model.COEFFICIENTS) and choices.LONGEST_SIDE == model.LONGEST_SIDE
+    assert choices.FARTHEST == checks.FARTHEST
     assert choices.FILLINGS == parts.FILLINGS
     assert choices.PRESETS == presets.NAMES and choices.INDENTERS == dataset.KINDS and choices.LEGS == simulator.LEGS
     assert choices.SIMULATION_FORMATS == frames.FORMATS and choices.PORTS == camera.PORTS

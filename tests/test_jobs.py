@@ -365,7 +365,7 @@ def test_a_killed_command_keeps_what_is_done(small_sensor, small_images, tmp_pat
         wait_for(lambda: done() > 0 or process.poll() is not None)
         process.send_signal(end)
         said = process.communicate()[1]
-    assert process.returncode == (130 if end == signal.SIGTERM else -signal.SIGKILL), said
+    assert process.returncode == (143 if end == signal.SIGTERM else -signal.SIGKILL), said
     kept = done()
     assert 0 < kept < FRAMES
     main([*command, "1"])

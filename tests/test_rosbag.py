@@ -277,6 +277,31 @@ def test_a_camera_info_s_distortion_is_compared_without_the_ports(lens, distorti
     assert "px off" in unlike(camera_info(camera, distortion=stronger)[1], camera)
 
 
+RATIONAL = [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, -0.02, 0.004]
+
+
+@pytest.mark.parametrize("zeros", [0, 4, 6])
+def test_a_sensor_s_eight_coefficients_are_compared_with_a_camera_info_s(zeros):
+    camera = Camera(*PINHOLE, RATIONAL)
+    info = camera_info(camera, distortion=[*RATIONAL, *[0.0] * zeros], lens="rational_polynomial")[1]
+    assert unlike(info, camera) is None
+    five = camera_info(camera, distortion=RATIONAL[:5], lens="rational_polynomial")[1]
+    assert "px off" in unlike(five, camera)
+
+
+@pytest.mark.parametrize(
+    "lens, model, distortion, known",
+    [
+        ("rational_polynomial", PINHOLE, [*RATIONAL, 1e-3, 0.0, 0.0, 0.0], 8),
+        ("rational_polynomial", PINHOLE, [*RATIONAL, 0.0, 0.0, 0.0, 0.0, 0.0, 1e-2], 8),
+        ("equidistant", FISHEYE, [0.01, 0.0, 0.0, 0.0, 1e-3], 4),
+    ],
+)
+def test_a_camera_info_with_more_coefficients_than_are_modelled_is_not_compared(lens, model, distortion, known):
+    said = unlike(camera_info(Camera(*model), distortion=distortion, lens=lens)[1], Camera(*model))
+    assert f"{lens} with coefficients after the first {known} (thin prisms, tilt) is not compared" in said
+
+
 def test_a_rational_lens_is_projected_as_opencv_does():
     cv2 = pytest.importorskip("cv2")
     camera, d = Camera(*PINHOLE), np.array([-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, -0.02, 0.004])

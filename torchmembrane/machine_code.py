@@ -8,7 +8,7 @@ import hashlib
 import logging
 import platform
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from pathlib import Path
 from threading import Lock
@@ -17,6 +17,8 @@ from typing import Any
 import numba
 import numpy as np
 from llvmlite.binding import get_host_cpu_name
+
+from .interruption import unstoppable
 
 SECONDS = 30
 """Compiling for one precision takes about this long: a frame of `examples/`, no cache yet, a core with AVX-512."""
@@ -104,7 +106,8 @@ class Kept:
             logging.getLogger("torchmembrane").warning(
                 "torchmembrane: compiling machine code for %s, about %d s, once", dtype.name, SECONDS
             )
-        yield
+        with unstoppable() if is_new else nullcontext():
+            yield
         if dtype.name not in self.known:
             self.known.add(dtype.name)
             if self.folder and self.folder.exists():

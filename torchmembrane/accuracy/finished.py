@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import MembraneError
-from ..files.atomic import whole_file
+from ..files.atomic import make_folder, write_text
 from ..files.safe_read import read_text
 from ..sensor.sensor import Sensor
 from .spec_sheet import Effort, Outcome, PairTrial, PressTrial, RestTrial
@@ -57,11 +57,10 @@ class FinishedSeries(NamedTuple):
         """
         self.outcomes[number] = outcome
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with whole_file(self.path) as partial:
-                partial.write_text(json.dumps(self.outcomes), encoding="utf-8")
-        except OSError as error:
-            warnings.warn(f"{self.path}: not written ({error.strerror}); an interruption loses what is done", stacklevel=2)
+            make_folder(self.path.parent)
+            write_text(self.path, json.dumps(self.outcomes))
+        except MembraneError as error:
+            warnings.warn(f"{error}; an interruption loses what is done", stacklevel=2)
 
     def remove(self) -> None:
         """Remove the file, as the sheet is done."""

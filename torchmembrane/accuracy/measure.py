@@ -1,14 +1,11 @@
 """A sensor's spec sheet: presses simulated on it, reconstructed from their images, summed up."""
 
-import multiprocessing
-import pickle
-import signal
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
-import torch
-
 from ..errors import MembraneError
+from ..processes import begin_worker, spawned_pool
 from ..progress import Progress, silent
 from ..sensor.sensor import Sensor
 from . import statistics
@@ -149,21 +146,17 @@ def _in_processes(rig: Rig, series: Sequence[tuple[int, Series]], jobs: int) -> 
     if jobs <= 1:
         yield from ((k, outcome_of(rig, each)) for k, each in series)
         return
-    sensor = pickle.dumps(rig.simulator.sensor)  # as bytes: torch would move tensors whose memory arrays look at
-    arguments = sensor, rig.simulator.appearance.noise
-    with multiprocessing.get_context("spawn").Pool(jobs, _begin, arguments) as pool:
+    with spawned_pool(jobs, _begin, (rig.simulator.sensor, rig.simulator.appearance.noise)) as pool:
         yield from pool.imap_unordered(_work, series)
 
 
 _rig: Rig
 
 
-def _begin(sensor: bytes, noise: float) -> None:
+def _begin(path: Path) -> None:
     """Start a worker process: what `_work` needs, once."""
     global _rig
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
-    torch.set_num_threads(1)
-    _rig = Rig(pickle.loads(sensor), noise)
+    _rig = Rig(*begin_worker(path))
 
 
 def _work(numbered: tuple[int, Series]) -> tuple[int, Outcome]:

@@ -11,7 +11,7 @@ from ..errors import MembraneError
 from ..simulate.dataset import OFF_RIM, Plan, random_stroke, stroke_to
 from ..simulate.indenters import Sphere
 from ..simulate.quasi_static import Press, presses
-from ..simulate.simulator import Simulator
+from ..simulate.simulator import BEHIND, Simulator
 
 BODIES = ("sphere", "sphere", "box")
 FRICTIONS = (0.0, 0.4)
@@ -142,8 +142,8 @@ def _followed(simulator: Simulator, paths: Sequence[Sequence], friction: float) 
     options = dict(friction=friction, increment=INCREMENT * simulator.membrane.size, **simulator.cavity)
     try:
         for state in islice(presses(simulator.membrane, simulator.elasticity, paths, **options), 1, None):
-            if bool((state.vertices[:, 2] <= 0).any()):
-                return states, "the press takes the membrane behind the camera"
+            if simulator.leaves_camera(state.vertices):
+                return states, BEHIND
             states.append(state)
             if state.iterations > STEPS:
                 return states, "no equilibrium in reasonable time"

@@ -57,6 +57,8 @@ class CameraFit(NamedTuple):
 def lens_from_views(camera: Camera, board: Checkerboard, views: Views) -> CameraFit:
     """Focal lengths, centre and distortion, all coefficients of the camera's model, from views of a board in air.
 
+    Of a pinhole these are five, or eight where the first guess has eight, zeros for example.
+
     OpenCV gives the start, Gauss-Newton on this package's own camera the answer and its uncertainty. Ports of `camera` are
     taken as not yet mounted; they are in the camera that is returned.
 
@@ -81,7 +83,8 @@ def lens_from_views(camera: Camera, board: Checkerboard, views: Views) -> Camera
         >>> lens_from_views(guess, board, views).camera.focal.numpy().round(3)
         array([150., 151.])
     """
-    bare = Camera(camera.model, camera.image_size, camera.focal.tolist(), camera.centre.tolist())
+    none = [0.0] * len(camera.distortion)
+    bare = Camera(camera.model, camera.image_size, camera.focal.tolist(), camera.centre.tolist(), none)
     start, poses = lens_and_poses(bare, board, views.pixels)
     found = _fit_camera(_BoardProblem(start, board, views, LENS, {}), poses, "calibrate camera")
     values = {name: getattr(found.camera, name).tolist() for name in LENS}

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError, check_arguments, expect
+from ..files.atomic import write_text
 from ..files.csv_table import Columns, read_table
 from ..files.digits import STORED, decimals
 from ..markers.placement import rim_mask
@@ -200,7 +201,7 @@ def write_layout(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
     for d, (x, n, radius, size) in enumerate(rows):
         lengths, normal = ([f"{value:.{count}f}" for value in values] for values, count in (((*x, radius), places), (n, 5)))
         lines.append(",".join([str(d), *lengths[:3], *normal, lengths[3], size]))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def write_svg(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
@@ -226,4 +227,4 @@ def write_svg(path: Path, sensor: Sensor, dots: FabricationLayout) -> None:
         lines.append(
             f'<ellipse cx="{shown(x)}" cy="{shown(y)}" rx="{shown(short)}" ry="{shown(radius)}" transform="{rotation}"/>'
         )
-    path.write_text("\n".join([*lines, "</svg>"]) + "\n", encoding="utf-8")
+    write_text(path, "\n".join([*lines, "</svg>"]) + "\n")

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd
 
-from ..camera.model import COEFFICIENTS, Camera
+from ..camera.model import COEFFICIENTS, RATIONAL, Camera
 from ..camera.targets import Checkerboard, DotBoard
 from ..errors import MembraneError
 from ..files.optional import load_opencv
@@ -14,6 +14,8 @@ from .fit import Fit, fit, rotations
 
 def lens_and_poses(camera: Camera, board: Checkerboard, pixels: np.ndarray) -> tuple[Camera, np.ndarray]:
     """A first lens, and poses `[P, 6]` (rotation vectors and translations), from the board's `pixels [P, D, 2]` in air.
+
+    It has as many coefficients as the camera, or all of its model's.
 
     Raises:
         MembraneError: fewer than 3 images, or OpenCV finds no lens of the camera's model.
@@ -25,11 +27,11 @@ def lens_and_poses(camera: Camera, board: Checkerboard, pixels: np.ndarray) -> t
     K, size = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), camera.image_size
     points = [board.points[:, None].astype(np.float32)] * len(pixels)
     imaged = [p[:, None].astype(np.float32) for p in pixels]
+    count = max(COEFFICIENTS[camera.model], len(camera.distortion))
     try:
         if camera.model == "pinhole":
-            _, K, k, rotation_vectors, translations = cv2.calibrateCamera(
-                points, imaged, size, K, np.zeros(5), flags=cv2.CALIB_USE_INTRINSIC_GUESS
-            )
+            flags = cv2.CALIB_USE_INTRINSIC_GUESS | (cv2.CALIB_RATIONAL_MODEL if count == RATIONAL else 0)
+            _, K, k, rotation_vectors, translations = cv2.calibrateCamera(points, imaged, size, K, np.zeros(count), flags=flags)
         else:
             flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
             exact = [[a.astype(np.float64) for a in arrays] for arrays in (points, imaged)]
@@ -37,7 +39,7 @@ def lens_and_poses(camera: Camera, board: Checkerboard, pixels: np.ndarray) -> t
     except cv2.error as error:
         raise MembraneError(f"calibrate camera: OpenCV finds no {camera.model} lens for these images ({error})") from error
     poses = np.concatenate([np.reshape(rotation_vectors, (-1, 3)), np.reshape(translations, (-1, 3))], 1)
-    k = np.ravel(k)[: COEFFICIENTS[camera.model]]
+    k = np.ravel(k)[:count]
     return Camera(camera.model, size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), k.tolist()), poses
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..files.atomic import make_folder, write_text
 from ..files.digits import decimals
 
 FINEST = 1e-6  # of a value: smaller deviations give it no more digits
@@ -146,5 +147,4 @@ class Report(NamedTuple):
             "noise_px": self.noise,
             "notes": self.notes,
         }
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "report.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+        write_text(make_folder(folder) / "report.json", json.dumps(content, indent=1))

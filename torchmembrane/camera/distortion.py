@@ -21,7 +21,7 @@ def pinhole_direction(image: Tensor, distortion: Tensor) -> Tensor:
 
     Args:
         image: `[..., 2]`, pixels less the centre, over the focal length.
-        distortion: k1 k2 p1 p2 k3, or empty.
+        distortion: k1 k2 p1 p2 k3, these and k4 k5 k6, or empty.
 
     Returns:
         Unit directions `[..., 3]`; NaN where the distortion folds back, and beyond.
@@ -34,7 +34,7 @@ def pinhole_direction(image: Tensor, distortion: Tensor) -> Tensor:
     xy = image
     if len(distortion):
         radial, p1, p2, fold = _pinhole_terms(distortion)
-        within = (image * image).sum(-1, keepdim=True) <= (fold * _radial(fold**2, radial)[0]) ** 2
+        within = (image * image).sum(-1, keepdim=True) <= (fold * _ratio(fold**2, radial)[0]) ** 2
         target = xy = torch.where(within, image, 0.0)
         for _ in range(LENS_STEPS):
             xy = xy * (fold**2 / (xy * xy).sum(-1, keepdim=True).clamp(min=fold**2)).sqrt()
@@ -54,7 +54,7 @@ def pinhole_image(points: Tensor, distortion: Tensor) -> Tensor:
 
     Args:
         points: `[..., 3]`, length unit.
-        distortion: k1 k2 p1 p2 k3, or empty.
+        distortion: k1 k2 p1 p2 k3, these and k4 k5 k6, or empty.
 
     Returns:
         `[..., 2]`, in focal lengths; NaN behind the camera and where the distortion folds back.
@@ -74,10 +74,11 @@ def pinhole_image(points: Tensor, distortion: Tensor) -> Tensor:
 
 
 def _pinhole_terms(distortion: Tensor) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
-    """Radial k1 k2 k3, tangential p1, p2, and the radius (tan of the angle) at which the radial part folds."""
-    k1, k2, p1, p2, k3 = distortion.unbind()
+    """Radial k1 k2 k3 and, of eight, k4 k5 k6; tangential p1, p2; the radius (tan of the angle) at which the former fold."""
+    k1, k2, p1, p2, *others = distortion.unbind()
+    radial = [k1, k2, *others]
     angles = torch.linspace(0, math.radians(89.9), FOLD_SAMPLES, dtype=distortion.dtype, device=distortion.device)
-    return [k1, k2, k3], p1, p2, _fold(angles.tan(), [k1, k2, k3])
+    return radial, p1, p2, _fold(angles.tan(), radial[:3], radial[3:])
 
 
 def distort(xy: Tensor, radial: list[Tensor], p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -85,7 +86,7 @@ def distort(xy: Tensor, radial: list[Tensor], p1: Tensor, p2: Tensor) -> tuple[T
 
     Args:
         xy: `[..., 2]`, undistorted, in focal lengths.
-        radial: k1 k2 k3.
+        radial: up to three, k1 k2 k3, or k1 to k6 of the rational model.
         p1: first tangential coefficient.
         p2: second tangential coefficient.
 
@@ -98,7 +99,7 @@ def distort(xy: Tensor, radial: list[Tensor], p1: Tensor, p2: Tensor) -> tuple[T
     """
     x, y = xy.unbind(-1)
     r_squared = x * x + y * y
-    factor, rate = _radial(r_squared, radial)
+    factor, rate = _ratio(r_squared, radial)
     u = x * factor + 2 * p1 * x * y + p2 * (r_squared + 2 * x * x)
     v = y * factor + 2 * p2 * x * y + p1 * (r_squared + 2 * y * y)
     a = factor + 2 * rate * x * x + 2 * p1 * y + 6 * p2 * x
@@ -127,7 +128,7 @@ def fisheye_direction(image: Tensor, distortion: Tensor) -> Tensor:
     theta = target = torch.where(off_axis, radius, 0.0)
     within = target < math.pi
     if len(distortion):
-        fold = _fisheye_fold(distortion)
+        fold = fisheye_fold(distortion)
         within = target <= fold * _radial(fold**2, distortion.unbind())[0]
         theta = target = torch.where(within, target, 0.0)
         for _ in range(LENS_STEPS):
@@ -162,12 +163,24 @@ def fisheye_image(points: Tensor, distortion: Tensor) -> Tensor:
     scale = torch.where(off_axis, theta / rho, 1 / torch.where(z > 0, z, 1.0))
     visible = off_axis | (z > 0)
     if len(distortion):
-        visible = visible & (theta <= _fisheye_fold(distortion))
+        visible = visible & (theta <= fisheye_fold(distortion))
         scale = scale * _radial(theta * theta, distortion.unbind())[0]
     return torch.where(visible, xy * scale, math.nan)
 
 
-def _fisheye_fold(distortion: Tensor) -> Tensor:
+def fisheye_fold(distortion: Tensor) -> Tensor:
+    """The angle from the axis, rad, up to which a fisheye images more and more; pi where it does not fold back.
+
+    Args:
+        distortion: k1 k2 k3 k4.
+
+    Returns:
+        `[]`.
+
+    Example:
+        >>> [round(float(fisheye_fold(torch.tensor([k1, 0.0, 0.0, 0.0]))), 2) for k1 in (-0.3, 0.0)]
+        [1.05, 3.14]
+    """
     angles = torch.linspace(0, math.pi, FOLD_SAMPLES + 1, dtype=distortion.dtype, device=distortion.device)
     return _fold(angles, distortion.unbind())
 
@@ -181,10 +194,22 @@ def _radial(r_squared: Tensor, coefficients: Sequence[Tensor]) -> tuple[Tensor, 
     return factor, rate
 
 
-def _fold(radii: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
-    """The last of the increasing `radii [S]` up to which the distorted radius increases."""
-    factor, rate = _radial(radii * radii, coefficients)
-    first = torch.where(factor + 2 * radii * radii * rate > 0, math.inf, radii).amin(-1)
+def _ratio(r_squared: Tensor, radial: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """`(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)` and its derivative in r^2; of three, k4 to k6 are 0."""
+    factor, rate = _radial(r_squared, radial[:3])
+    if len(radial) > 3:
+        divisor, slope = _radial(r_squared, radial[3:])
+        factor = factor / divisor
+        rate = (rate - factor * slope) / divisor
+    return factor, rate
+
+
+def _fold(radii: Tensor, coefficients: Sequence[Tensor], below: Sequence[Tensor] = ()) -> Tensor:
+    """The last of the increasing `radii [S]` up to which the distorted radius increases, and its divisor is positive."""
+    squared = radii * radii
+    factor, rate = _ratio(squared, [*coefficients, *below]) if below else _radial(squared, coefficients)
+    increases = (factor + 2 * squared * rate > 0) & (_radial(squared, below)[0] > 0)
+    first = torch.where(increases, math.inf, radii).amin(-1)
     return torch.where(radii < first, radii, 0.0).amax(-1)
 
 

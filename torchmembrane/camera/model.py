@@ -19,6 +19,8 @@ from .mode import Mode
 from .ports import MOST_INDEX, Layers, Port, apparent_points, check_ports, layers_of, refract
 
 COEFFICIENTS = {"pinhole": 5, "fisheye": 4}  # k1 k2 p1 p2 k3 | k1 k2 k3 k4
+RATIONAL = 8  # of a pinhole: k1 k2 p1 p2 k3 k4 k5 k6
+FURTHER = (12, 14)  # OpenCV's, with thin prisms s1 to s4 and a tilted chip, which are not modelled
 LONGEST_SIDE = 16384
 """Of an image, px."""
 FOCAL = (1.0, 1e6)
@@ -53,7 +55,8 @@ class Camera(nn.Module):
     differentiate with respect to any of them.
 
     Args:
-        model: "pinhole" (OpenCV's k1 k2 p1 p2 k3) or "fisheye" (OpenCV's, Kannala-Brandt, k1 k2 k3 k4).
+        model: "pinhole" (OpenCV's k1 k2 p1 p2 k3, or eight, with k4 k5 k6) or "fisheye" (OpenCV's, Kannala-Brandt, k1 k2 k3
+            k4; ROS calls it equidistant).
         image_size: width and height, px.
         focal: along u and v, px (fisheye: px / rad).
         centre: the principal point, px.
@@ -65,7 +68,7 @@ class Camera(nn.Module):
     Attributes:
         focal: `[2]`, as all others a float64 tensor.
         centre: `[2]`.
-        distortion: `[0, 4 or 5]`.
+        distortion: `[0, 4, 5 or 8]`.
         port_distance: `[P]`.
         port_thickness: `[P]`.
         port_index: `[P]`.
@@ -113,10 +116,11 @@ class Camera(nn.Module):
         check_bits(bits)
         self.model = model
         self.image_size = (int(image_size[0]), int(image_size[1]))
-        padding = [0.0] * (COEFFICIENTS[model] - len(distortion)) if len(distortion) else []
+        modelled = list(distortion[:RATIONAL])
+        padding = [0.0] * (COEFFICIENTS[model] - len(modelled)) if modelled else []
         self._parameter("focal", list(focal))
         self._parameter("centre", list(centre))
-        self._parameter("distortion", [*distortion, *padding])
+        self._parameter("distortion", [*modelled, *padding])
         self._parameter("port_distance", [port[0] for port in ports])
         self._parameter("port_thickness", [port[1] for port in ports])
         self._parameter("port_index", [port[2] for port in ports])
@@ -206,6 +210,26 @@ class Camera(nn.Module):
         lens = pinhole_image if self.model == "pinhole" else fisheye_image
         return lens(points, self.distortion) * self.focal + self.centre
 
+    def can_image(self, points: Tensor) -> Tensor:
+        """Whether points lie where the lens can image something: before a pinhole, beyond the last port, around a fisheye.
+
+        Args:
+            points: `[..., 3]`, length unit, camera frame.
+
+        Returns:
+            `[...]` bool; where it is true a point may still be out of view, or beyond the angle at which the lens folds.
+
+        Example:
+            >>> point = torch.tensor([9.0, 0.0, -1.0])
+            >>> [Camera(model, (640, 480), (125, 125), (320, 240)).can_image(point).item() for model in COEFFICIENTS]
+            [False, True]
+        """
+        if len(self.port_index):
+            return points[..., 2] > self._layers().far
+        if self.model == "pinhole":
+            return points[..., 2] > 0
+        return (points != 0).any(-1)
+
     def forward(self, points: Tensor) -> Tensor:
         """The same as `point_to_pixel`.
 
@@ -237,8 +261,7 @@ def _check_lens(
     small = whole and max(image_size) <= LONGEST_SIDE and image_size[0] * image_size[1] <= MOST_PIXELS
     expected = f"width and height, whole pixels, 1 or more, each at most {LONGEST_SIDE}, together at most {MOST_PIXELS} px"
     expect(small, "Camera: image_size", list(image_size), expected)
-    most = "k1 k2 p1 p2 k3" if model == "pinhole" else "k1 k2 k3 k4"
-    expect(len(distortion) <= COEFFICIENTS[model], "Camera: distortion", list(distortion), f"for a {model} at most {most}")
+    _check_count(model, list(distortion))
     for name, values in (("focal", focal), ("centre", centre), ("distortion", distortion)):
         expect(all(map(math.isfinite, values)), f"Camera: {name}", list(values), "finite numbers")
     least, most_focal = FOCAL
@@ -248,3 +271,13 @@ def _check_lens(
     expect(alike, "Camera: focal", list(focal), f"two values, the larger at most {MOST_ASPECT:g} times the smaller")
     for name, values, limit in (("centre", centre, FARTHEST_CENTRE), ("distortion", distortion, MOST_DISTORTION)):
         expect(max(map(abs, values), default=0) <= limit, f"Camera: {name}", list(values), f"values up to {limit:g}")
+
+
+def _check_count(model: str, distortion: list[float]) -> None:
+    most, count = "k1 k2 k3 k4", len(distortion)
+    if model == "pinhole":
+        most = "k1 k2 p1 p2 k3, or these and k4 k5 k6"
+        expected = "0 after the eighth: thin prisms and tilt are not modelled, calibrate without them"
+        expect(count not in FURTHER or not any(distortion[RATIONAL:]), "Camera: distortion", distortion, expected)
+    fits = count <= COEFFICIENTS[model] or (model == "pinhole" and count in (RATIONAL, *FURTHER))
+    expect(fits, "Camera: distortion", distortion, f"for a {model} at most {most}")

@@ -57,6 +57,11 @@ def add_estimator(add: Add) -> None:
     add("--locator", choices=LOCATORS, help=how)
 
 
+def add_force(add: Add) -> None:
+    """Whether files that are there may be written over."""
+    add("--force", action="store_true", help="write over files that are there; never over those that the command reads")
+
+
 def add_device(add: Add) -> None:
     """Where torch computes."""
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: %(default)s)")

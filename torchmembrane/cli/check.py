@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from ..errors import MembraneError
-from .arguments import add_command, add_sensor, count, number_from, seed
+from .arguments import add_command, add_force, add_sensor, count, number_from, seed
 from .choices import MOST_DECIBEL
 from .progress import ProgressDisplay, announce
 
@@ -38,6 +38,7 @@ def add_parser(commands: Any) -> None:
     add = add_command(commands, "check", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     add("--out", metavar="FIGURE.png", type=Path, help="draw it: side view with rays, rest surface, rest image, accuracy")
+    add_force(add)
     add("--accuracy", action="store_true", help="also what to expect of it, from simulated presses")
     add("--seed", type=seed, help="of presses and noise of --accuracy (default: 0)")
     noise = "of images of --accuracy, white over the noise's standard deviation (default: as in the rest image, else 40)"
@@ -57,6 +58,8 @@ def run(arguments: Namespace) -> int:
     from ..sensor.sensor import Sensor
     from .describe import described, rest_frame
 
+    if arguments.out:
+        _spare_files(arguments, sensor_file(arguments.sensor))
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     reconstructor, problem = None, None
     try:
@@ -72,13 +75,24 @@ def run(arguments: Namespace) -> int:
         from ..plot.drawing import save
         from ..plot.sensor import sensor_figure
 
-        save(sensor_figure(sensor, reconstructor, frame, sheet), arguments.out)
+        save(sensor_figure(sensor, reconstructor, frame, sheet), arguments.out, "check")
         print(f"drawn in {arguments.out}")
     if finished:
         finished.remove()
     if problem:
         raise problem
     return 0
+
+
+def _spare_files(arguments: Namespace, sensor: Path) -> None:
+    """Refuse a figure in the place of another file than an earlier figure of a sensor."""
+    from functools import partial
+
+    from ..files.targets import refuse_overwriting
+    from ..plot.drawing import drawn_by
+    from ..sensor.companions import files_of
+
+    refuse_overwriting("check --out", [arguments.out], files_of(sensor), arguments.force, partial(drawn_by, "check"))
 
 
 def _finished(sensor: "Sensor", arguments: Namespace) -> "FinishedSeries":

@@ -14,6 +14,7 @@ DRAFTS = ("dome", "cap", "bubble", "fingertip", "half_cylinder")
 LENGTH_UNITS = ("mm", "cm", "m", "um", "inch")
 LENSES = ("pinhole", "fisheye")
 LONGEST_SIDE = 16384
+FARTHEST = 1e6
 FILLINGS = ("liquid", "gas", "open")
 POLARITIES = ("dark", "light")
 FROM_IMAGE = "auto"  # of --rim: the circle is found in the rest image

@@ -95,8 +95,13 @@ def _optics(arguments: Namespace, rest: np.ndarray | None) -> Optics:
     if arguments.rim is not None:
         u, v, pixels = arguments.rim
         circle, centre = RimCircle(arguments.radius, pixels, arguments.lens), arguments.centre or [u, v]
-        distance = distance or circle.distance(focal)
+        distance = circle.distance(focal) if distance is None else distance
         focal = focal or circle.focal(distance)
+    if arguments.lens == "pinhole" and not distance > 0:
+        raise MembraneError(
+            f"init: --distance {distance:g}: the rim behind a pinhole, which sees nothing there; expected a positive distance, "
+            "or --lens fisheye"
+        )
     camera = Camera(arguments.lens, tuple(size), (round(focal, 3),) * 2, centre, bits=arguments.bits)
     return Optics(camera, float(f"{distance:.7g}"))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from .arguments import add_command, add_estimator, add_sensor
+from .arguments import add_command, add_estimator, add_force, add_sensor
 from .progress import ProgressDisplay, announce
 
 PURPOSE = "write image to result as one ONNX model"
@@ -27,6 +27,7 @@ def add_parser(commands: Any) -> None:
     add = add_command(commands, "export", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     add("-o", "--out", metavar="MODEL.onnx", type=Path, required=True, help="the model's file")
+    add_force(add)
     add_estimator(add)
     add("--tracking", action="store_true", help="follow the dots of the frame before, given with the image")
 
@@ -35,7 +36,9 @@ def run(arguments: Namespace) -> int:
     """Write the model; returns the exit code."""
     announce("export")
     from ..errors import MembraneError
+    from ..files.targets import refuse_overwriting
     from ..presets import sensor_file
+    from ..sensor.companions import files_of
     from ..sensor.sensor import Sensor
     from .build import build_reconstructor
 
@@ -45,6 +48,7 @@ def run(arguments: Namespace) -> int:
         raise MembraneError(
             f'export needs {error.name}, which is not installed: pip install "torchmembrane[export]"'
         ) from error
+    refuse_overwriting("export", [arguments.out], files_of(sensor_file(arguments.sensor)), arguments.force)
     sensor, start = Sensor.from_file(sensor_file(arguments.sensor)), monotonic()
     with ProgressDisplay("export") as progress:
         progress(0.0, "sensor")

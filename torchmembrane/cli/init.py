@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MembraneError
-from .arguments import Add, add_command, count, count_pair, positive, positive_pair, vector
-from .choices import DRAFTS, FILLINGS, FROM_IMAGE, LENGTH_UNITS, LENSES, LONGEST_SIDE, POLARITIES
+from .arguments import Add, add_command, add_force, count, count_pair, number_from, positive, positive_pair, vector
+from .choices import DRAFTS, FARTHEST, FILLINGS, FROM_IMAGE, LENGTH_UNITS, LENSES, LONGEST_SIDE, POLARITIES
 
-COMPANIONS = ("_dots.csv", "_grid.npz", "_rest.png", "_rest.tiff")
-"""Ends of the names of the files that are written beside a sensor file."""
 PURPOSE = "write a sensor file, with a word on every key, from a few numbers"
 EXAMPLES = """\
 examples:
@@ -23,7 +21,7 @@ examples:
   torchmembrane init sensor.toml            # on a terminal: asks
 
 What is needed: the shape and its lengths, the image's size (--image-size, or --rest), a focal length (--focal or --view),
-and how far the rim is from the camera (--distance), which --rim, the rim's circle in the image, gives as well; or with
+and how far the rim is before the camera (--distance), which --rim, the rim's circle in the image, gives as well; or with
 --distance and --rim the focal length. What is missing is asked for on a terminal.
 The camera looks along the membrane's axis, in the file's frame: origin at the camera's centre of projection, +z towards
 the membrane. Dots are a list (--dots), those found in the rest image (--rest), or a pattern to make (--pitch).
@@ -53,6 +51,8 @@ def _shape(text: str) -> str:
     raise ArgumentTypeError(f"{text!r}; expected one of {', '.join(DRAFTS)}; {remedy}")
 
 
+_distance = number_from(-FARTHEST, FARTHEST)
+
 QUESTIONS = {
     "shape": (f"shape, {' | '.join(DRAFTS)}", _shape),
     "radius": ("radius of the dome, of the cap's rim, or of the cylinder", positive),
@@ -61,7 +61,7 @@ QUESTIONS = {
     "length": ("length of the half cylinder", positive),
     "image_size": ("size of the camera's image, WIDTH,HEIGHT, px", count_pair("WIDTH,HEIGHT", LONGEST_SIDE)),
     "view": ("field of view across the image's width, degrees", positive),
-    "distance": ("distance from the camera's pinhole to the rim's plane", positive),
+    "distance": ("distance from the camera's pinhole to the rim's plane", _distance),
 }
 """What is asked for on a terminal, and the type of the answer."""
 INSTEAD = {
@@ -76,7 +76,7 @@ def add_parser(commands: Any) -> None:
     add("sensor", metavar="SENSOR.toml", type=Path, help="the file to write")
     add("--name", help="of the sensor (default: the file's)")
     add("--unit", choices=LENGTH_UNITS, default=LENGTH_UNITS[0], help="of all lengths (default: %(default)s)")
-    add("--force", action="store_true", help="write over an existing file")
+    add_force(add)
     _add_membrane(add)
     _add_camera(add)
     _add_material(add)
@@ -98,7 +98,8 @@ def _add_membrane(add: Add) -> None:
 
 
 def _add_camera(add: Add) -> None:
-    add("--distance", metavar="Z", type=positive, help="from the camera's centre of projection to the rim's plane")
+    depth = "from the camera's centre of projection to the rim's plane; 0 or less of a fisheye that stands within the membrane"
+    add("--distance", metavar="Z", type=_distance, help=depth)
     add("--lens", choices=LENSES, default=LENSES[0], help="(default: %(default)s)")
     size = count_pair("two counts, WIDTH,HEIGHT", LONGEST_SIDE)
     add("--image-size", metavar="WIDTH,HEIGHT", type=size, help="px (default: the rest image's)")
@@ -145,16 +146,14 @@ def run(arguments: Namespace) -> int:
     path: Path = arguments.sensor
     if path.suffix != ".toml":
         raise MembraneError(f"init {path}: expected a file that ends with .toml, as sensor.toml")
-    read = [Path(file).resolve() for file in (arguments.rest, arguments.dots) if file is not None]
-    for file in (path, *(path.with_name(path.stem + ending) for ending in COMPANIONS)):
-        if file.resolve() in read:
-            raise MembraneError(f"init {path}: would write over {file}, which it reads; choose another name")
-        if file.exists() and not arguments.force:
-            raise MembraneError(f"init {path}: {file} is there already; choose another name, or pass --force to write over it")
-    if arguments.shape is None:
-        arguments.shape = _asked("shape", *QUESTIONS["shape"])
+    from ..files.targets import refuse_overwriting
+    from ..sensor.companions import companions_of
     from .draft import needed, refuse_foreign, write_draft
 
+    read = [file for file in (arguments.rest, arguments.dots) if file is not None]
+    refuse_overwriting(f"init {path}", companions_of(path), read, arguments.force)
+    if arguments.shape is None:
+        arguments.shape = _asked("shape", *QUESTIONS["shape"])
     refuse_foreign(arguments)
     for name in needed(arguments):
         setattr(arguments, name, _asked(name, *QUESTIONS[name]))

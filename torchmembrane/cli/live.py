@@ -15,6 +15,7 @@ from .arguments import (
     add_command,
     add_device,
     add_estimator,
+    add_force,
     add_rerun,
     add_sensor,
     camera,
@@ -70,10 +71,12 @@ def add_parser(commands: Any) -> None:
     kept = "keep images, results and times in a new folder; what the disk is too slow for is dropped and counted"
     add("--record", metavar="DIR", type=Path, help=kept)
     add_rerun(add)
+    add_force(add)
 
 
 def run(arguments: Namespace) -> int:
     """Follow the source until it ends or is stopped; returns the exit code."""
+    from ..interruption import answer
     from ..live.line import Line, summary
     from ..live.loop import Tally, follow
     from ..live.mailbox import capture
@@ -81,6 +84,7 @@ def run(arguments: Namespace) -> int:
     from ..sensor.sensor import Sensor
 
     _check(arguments)
+    _spare_files(arguments)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     images, stream = _images(arguments, sensor.camera), _stream(arguments, sensor)
     line = Line(stream.mesh, sys.stdout)
@@ -94,6 +98,8 @@ def run(arguments: Namespace) -> int:
             try:
                 follow(stream, mailbox, tally, [line, *watchers], stop, rezero, line.say)
             finally:
+                if stop.is_set():
+                    answer()
                 line.say(summary(tally))
     finally:
         for each in said:
@@ -115,6 +121,17 @@ def _check(arguments: Namespace) -> None:
     if arguments.model is not None and foreign:
         raise MembraneError(f"live: --{foreign[0]} with --model; a model has its own: export it with that")
     check_device(arguments.device)
+
+
+def _spare_files(arguments: Namespace) -> None:
+    """Refuse to write the recording of Rerun over a file."""
+    from ..files.targets import refuse_overwriting
+    from ..presets import sensor_file
+    from ..sensor.companions import files_of
+
+    if wants_rerun(arguments) and arguments.save is not None:
+        read = [*files_of(sensor_file(arguments.sensor)), *filter(None, [arguments.video, arguments.model])]
+        refuse_overwriting("live --save", [arguments.save], read, arguments.force)
 
 
 def _images(arguments: Namespace, camera: "Camera") -> "Iterator[np.ndarray]":
@@ -180,12 +197,14 @@ def _left_out(later: "Background[Seen]") -> str:
 
 @contextmanager
 def _stopped_by_signals() -> Iterator[Event]:
-    """An event that the first SIGINT or SIGTERM sets; the second ends the command as ever."""
-    stop, before = Event(), {}
+    """An event that the first SIGINT or SIGTERM sets; the second, or a frame that takes too long, ends the command as ever."""
+    stop = Event()
+    before: dict[signal.Signals, Any] = {}
 
     def on_signal(number: int, _: object) -> None:
         stop.set()
-        signal.signal(number, signal.default_int_handler)
+        handler = before[signal.Signals(number)]
+        signal.signal(number, handler if callable(handler) else signal.default_int_handler)
 
     if current_thread() is main_thread():
         before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -1,18 +1,18 @@
-"""The command `torchmembrane`. Exit codes: 0 all well, 1 some frames failed, 2 wrong usage, 130 interrupted.
+"""The command `torchmembrane`. Exit codes: 0 all well, 1 some frames failed, 2 wrong usage, 130 interrupted, 143 by SIGTERM.
 
 Each command has a module of its own, with its parser, which loads nothing heavy, and `run`, which loads what it needs.
 """
 
-import signal
+import atexit
 import sys
 import warnings
 from argparse import ArgumentParser
-from collections.abc import Iterator
-from contextlib import contextmanager
-from threading import current_thread, main_thread
+from contextlib import suppress
+from signal import SIGINT
 
 from .. import __version__
 from ..errors import MembraneError
+from ..interruption import SAID, end_process, ended_by_signals
 from . import calibrate, check, export, init, live, reconstruct, simulate, view
 from .parser import CommandParser
 
@@ -21,31 +21,35 @@ COMMANDS = (init, check, reconstruct, live, view, calibrate, simulate, export)
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command with these arguments (default: the process's); returns the exit code."""
-    arguments = command_parser().parse_args(argv)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), ended_by_signals() as interrupted_by:
         warnings.showwarning = lambda message, *_: print(f"torchmembrane: warning: {message}", file=sys.stderr)
         try:
-            with _terminated_as_interrupted():
-                return int(arguments.run(arguments))
-        except (MembraneError, OSError) as error:
-            print(f"torchmembrane: error: {error}", file=sys.stderr)
-            return 2
+            arguments = command_parser().parse_args(argv)
+            return int(arguments.run(arguments))
         except KeyboardInterrupt:
-            print("torchmembrane: interrupted; what is done so far is kept", file=sys.stderr)
-            return 130
+            pass
+        except Exception as error:
+            if interrupted_by():  # the interruption has become another error on its way
+                pass
+            elif isinstance(error, MembraneError | OSError):
+                print(f"torchmembrane: error: {_said(error)}", file=sys.stderr)
+                return 2
+            else:
+                raise
+        number = interrupted_by() or SIGINT
+        if argv is None:
+            with suppress(OSError):
+                sys.stdout.flush()
+            atexit._run_exitfuncs()
+            end_process(number)
+        print(SAID, file=sys.stderr)
+        return 128 + number
 
 
-@contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """SIGTERM, as schedulers send it, ends the command as Ctrl-C does."""
-    if current_thread() is not main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+def _said(error: MembraneError | OSError) -> str:
+    """What an error says; of files all name theirs, so that one without a name is of the standard output."""
+    nameless = isinstance(error, OSError) and error.filename is None and error.errno is not None
+    return f"standard output: {error}" if nameless else str(error)
 
 
 def command_parser() -> ArgumentParser:

@@ -12,11 +12,13 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
+from ..files.targets import refuse_overwriting
 from ..presets import sensor_file
+from ..sensor.companions import companions_of, files_of
 from ..sensor.sensor import Sensor
 from ..simulate.appearance import Appearance
 from ..simulate.dataset import KINDS, DatasetOutcome, Plan, make_frames, stroke_to
-from ..simulate.frames import Video, open_frames
+from ..simulate.frames import SENSOR, SETTINGS, open_frames, video_file
 from ..simulate.indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge
 from ..simulate.mesh_indenter import MeshIndenter
 from ..simulate.simulator import Simulator, Stroke
@@ -39,6 +41,7 @@ OUTWARDS = 0.3
 def simulate(arguments: Namespace) -> int:
     """Simulate what the arguments ask for; returns the exit code."""
     torch.set_num_threads(1)
+    _spare_files(arguments)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     appearance = Appearance(noise=arguments.noise, highlight=arguments.highlight, blur=arguments.blur)
     options = arguments.grid, appearance, arguments.dots, arguments.missing
@@ -49,6 +52,31 @@ def simulate(arguments: Namespace) -> int:
         outcome = _random(arguments, Simulator(sensor, *options), progress)
     print(f"presses: {outcome.made} made, {outcome.failed} failed, {outcome.skipped} there before; in {arguments.out}")
     return 1 if outcome.failed else 0
+
+
+def _spare_files(arguments: Namespace) -> None:
+    """Refuse a folder in which files would be lost; a frame of an earlier simulation in it is made anew."""
+    out, read = arguments.out, files_of(sensor_file(arguments.sensor))
+    is_known = (out / SETTINGS).exists()
+    targets = [] if is_known or (out / SENSOR).exists() else [out / SETTINGS, *companions_of(out / SENSOR)]
+    names = [] if arguments.random else [arguments.name]
+    if arguments.path:
+        names = [_numbered(arguments.name, number) for number in range(len(arguments.path) * arguments.frames)]
+    truths = [out / f"{name}_truth.npz" for name in names]
+    targets += truths + [out / f"{name}.png" for name in names if not arguments.video]
+    if arguments.video:
+        targets.append(out / f"{arguments.name}.mp4")
+    if arguments.random and not is_known:
+        targets += out.glob(f"s{arguments.seed}_*")
+    if arguments.indenter and not arguments.random:
+        read.append(Path(arguments.indenter))
+    made = is_known and all(path.exists() for path in truths)
+    refuse_overwriting(f"simulate --out {out}", targets, read, arguments.force, lambda path: made)
+
+
+def _numbered(name: str, number: int) -> str:
+    """The name of a frame of a path."""
+    return f"{name}_{number:06d}"
 
 
 def _random(arguments: Namespace, simulator: Simulator, progress: ProgressDisplay) -> DatasetOutcome:
@@ -86,11 +114,11 @@ def _film(arguments: Namespace, simulator: Simulator, stroke: Stroke) -> int:
     states = simulator.presses(stroke, arguments.path, arguments.frames, arguments.increment)
     states = chain([next(states)], states)  # a press that cannot begin leaves no folder
     frames = open_frames(arguments.out, simulator, {})
-    with Video(arguments.out / f"{arguments.name}.mp4") if arguments.video else nullcontext() as video:
+    with video_file(arguments.out / f"{arguments.name}.mp4") if arguments.video else nullcontext() as add_picture:
         for number, state in enumerate(tqdm(states, total=total, desc="simulate", unit="frame")):
-            name, frame = f"{arguments.name}_{number:06d}", simulator.frame(state, stroke, rng)
-            if video is not None:
-                video.add(frame.image)
+            name, frame = _numbered(arguments.name, number), simulator.frame(state, stroke, rng)
+            if add_picture is not None:
+                add_picture(frame.image)
                 frames.write_truth(name, frame)
             else:
                 frames.write(name, frame)

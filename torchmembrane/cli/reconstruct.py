@@ -5,11 +5,23 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .arguments import add_command, add_device, add_estimator, add_sensor, check_device, count, count_or_auto, positive, share
+from .arguments import (
+    add_command,
+    add_device,
+    add_estimator,
+    add_force,
+    add_sensor,
+    check_device,
+    count,
+    count_or_auto,
+    positive,
+    share,
+)
 from .choices import ENGINES, RESULT_FORMATS
 from .film import FrameImages, draw_film
 
 if TYPE_CHECKING:
+    from ..jobs.inputs import Inputs
     from ..jobs.local import FrameCounts
 
 PURPOSE = "reconstruct surfaces from images or a video of one sensor"
@@ -41,6 +53,7 @@ def add_parser(commands: Any) -> None:
     add_sensor(add)
     add("images", metavar="IMAGES", nargs="+", help="image files, globs (quoted or not), folders, videos, or bags")
     add("--out", metavar="DIR", type=Path, required=True, help="folder of the results: new, or of the same sensor")
+    add_force(add)
     add_estimator(add)
     add_device(add)
     add("--batch", metavar="N", type=count_or_auto, help="frames computed at once (default: auto, by the memory there is)")
@@ -85,6 +98,7 @@ def run(arguments: Namespace) -> int:
     _check(arguments)
     by_ray = arguments.engine == "ray"
     inputs = find_inputs(arguments.images, arguments.video, arguments.topic)
+    _spare_files(arguments, inputs)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = recording_pressures(reconstructor, arguments.pressure, inputs) if arguments.pressure else None
@@ -130,6 +144,23 @@ def _check(arguments: Namespace) -> None:
         raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
     if arguments.video_out is not None:
         check_film(arguments.video_out)
+
+
+def _spare_files(arguments: Namespace, inputs: "Inputs") -> None:
+    """Refuse to write over files other than those of the results that this call continues."""
+    from functools import partial
+
+    from ..files.targets import refuse_overwriting
+    from ..jobs.result_folder import files_at_risk
+    from ..jobs.workers import DRAWS
+    from ..plot.drawing import drawn_by
+    from ..presets import sensor_file
+    from ..sensor.companions import files_of
+
+    given = [path for path in (arguments.pressure, *map(Path, arguments.rest)) if path is not None]
+    read = [*files_of(sensor_file(arguments.sensor)), *inputs.images, *inputs.videos, *given]
+    targets = [*files_at_risk(arguments.out, inputs, arguments.figures), *filter(None, [arguments.video_out])]
+    refuse_overwriting("reconstruct", targets, read, arguments.force, partial(drawn_by, DRAWS))
 
 
 def _said(counts: "FrameCounts") -> str:

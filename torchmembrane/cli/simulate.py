@@ -9,6 +9,7 @@ from ..errors import MembraneError
 from .arguments import (
     Add,
     add_command,
+    add_force,
     add_sensor,
     count,
     count_pair,
@@ -63,6 +64,7 @@ def add_parser(commands: Any) -> None:
     add = add_command(commands, "simulate", run, PURPOSE, EXAMPLES)
     add_sensor(add)
     add("--out", metavar="DIR", type=Path, required=True, help="folder of frames: new, or of the same sensor and appearance")
+    add_force(add)
     add("--name", type=file_name, default="press", help="of a single press' files (default: %(default)s)")
     _add_press(add)
     _add_sequence(add)

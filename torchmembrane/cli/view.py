@@ -6,7 +6,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .arguments import add_command, add_rerun, positive, wants_rerun
+from .arguments import add_command, add_force, add_rerun, positive, wants_rerun
 from .film import DEFAULT_RATE, FrameImages, draw_film, images_in
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def add_parser(commands: Any) -> None:
     add("--images", metavar="FOLDER", type=Path, help=pictures)
     add_rerun(add)
     add("--ply", metavar="FILE.ply", type=Path, help="write the touched vertices as a point cloud, and draw nothing")
+    add_force(add)
 
 
 def run(arguments: Namespace) -> int:
@@ -48,6 +49,7 @@ def run(arguments: Namespace) -> int:
     from ..results.read import read_results
 
     rerun = wants_rerun(arguments)
+    _spare_files(arguments, arguments.out, arguments.video_out, arguments.save, arguments.ply)
     if not rerun and arguments.video_out is None:
         return _draw(arguments)
     results = read_results(arguments.result)
@@ -58,6 +60,21 @@ def run(arguments: Namespace) -> int:
     if rerun:
         _show(results, images, arguments.save)
     return 0
+
+
+def _spare_files(arguments: Namespace, *targets: Path | None) -> None:
+    """Refuse to write over files, those of earlier drawings excepted."""
+    from functools import partial
+
+    from ..files.targets import refuse_overwriting
+    from ..plot.drawing import drawn_by
+
+    result, images = arguments.result, arguments.images or arguments.result / "images"
+    read = [path for pattern in ("*.npz", "frames/*.parquet", "*.csv") for path in result.glob(pattern)]
+    read += [path for path in (result, arguments.mesh, arguments.image) if path is not None]
+    read += images_in(images).values()
+    written = [path for path in targets if path is not None]
+    refuse_overwriting("view", written, read, arguments.force, partial(drawn_by, "view"))
 
 
 def _show(results: "Results", images: FrameImages, save: Path | None) -> None:
@@ -91,7 +108,8 @@ def _draw(arguments: Namespace) -> int:
         show(drawing)
         return 0
     out = arguments.out or home / f"{name}_view.png"
-    save(drawing, out)
+    _spare_files(arguments, out)
+    save(drawing, out, "view")
     print(f"{name} drawn in {out}")
     return 0
 

@@ -1,13 +1,30 @@
-"""Files that are there whole or not at all."""
+"""Files that are there whole or not at all, and what is said of one that cannot be written."""
 
+import errno
 import os
-from collections.abc import Iterator
+import stat
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
 
-PARTIAL = ".*.partial"
+from ..errors import MembraneError
+from ..interruption import unfinished
+
+PARTIAL = ".[0-9a-f]*-[0-9]*.partial"
 """Pattern of what killed processes leave behind."""
+ROOM = "room on the disk: free some, or choose another place"
+LIMITS = "a file system, and a limit of files' size (ulimit -f), that take so large a file"
+WRITABLE = "a place where this user may write"
+FOLDER = "a folder that exists"
+REMEDIES = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), ROOM),
+    errno.EFBIG: LIMITS,
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), WRITABLE),
+    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR), FOLDER),
+    errno.ENAMETOOLONG: "a shorter name",
+}
+"""What is expected instead, by the error's number."""
 
 
 @contextmanager
@@ -15,13 +32,18 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     """A path beside `path` to write to; what is written there replaces `path` when the block ends well.
 
     An interrupted or failing block leaves `path` as it was. The path to write to is hidden (`.*.partial`), so that readers of a
-    folder pass over it, and short, so that it exists wherever `path` can; each process has its own.
+    folder pass over it, and short, so that it exists wherever `path` can; each process has its own. A symbolic link at `path`
+    is replaced, not followed.
 
     Args:
         path: the file to write, in a folder that exists.
 
     Yields:
         The path to write to.
+
+    Raises:
+        MembraneError: the file cannot be written: no room, no permission, no such folder, too long a name, or a folder or a
+            device at `path`.
 
     Limitations:
         Of two processes that write one file at the same time, the last one wins. After a loss of power, as opposed to a killed
@@ -37,8 +59,124 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     partial = path.with_name(f".{blake2b(os.fsencode(path.name), digest_size=8).hexdigest()}-{os.getpid()}.partial")
-    try:
+    with writing(path, partial), unfinished(partial):
+        refuse_other_kind(path)
+        partial.unlink(missing_ok=True)
+        os.close(os.open(partial, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield partial
         partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+
+
+def remove_partials(folder: Path, processes: Iterable[int | None]) -> None:
+    """Remove what processes that were ended had begun to write in a folder.
+
+    Args:
+        folder: any.
+        processes: their numbers.
+    """
+    for left in [path for process in processes for path in folder.glob(f".*-{process}.partial")]:
+        left.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
+    """Write a file, whole or not at all.
+
+    Args:
+        path: the file, in a folder that exists.
+        content: what it shall hold.
+
+    Raises:
+        MembraneError: as `whole_file`.
+    """
+    with whole_file(path) as partial:
+        partial.write_bytes(content)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write text in UTF-8, whole or not at all; else as `write_bytes`."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+@contextmanager
+def writing(path: Path, *others: Path) -> Iterator[None]:
+    """Within, an error of the system on writing names the file.
+
+    Args:
+        path: that is written.
+        *others: names under which the system knows it meanwhile.
+
+    Raises:
+        MembraneError: in place of an `OSError` that names no file, or one of these.
+
+    Example:
+        >>> with writing(Path("press.npz")):
+        ...     raise OSError(errno.ENOSPC, "No space left on device")
+        Traceback (most recent call last):
+        ...
+        torchmembrane.errors.MembraneError: press.npz: not written (No space left on device); expected room on the disk: free \
+some, or choose another place
+    """
+    try:
+        yield
+    except OSError as error:
+        named = None if error.filename is None else os.fsdecode(error.filename).removeprefix("file:")  # FFmpeg's
+        ours = named is None or os.path.abspath(named) in map(os.path.abspath, (path, *others))
+        if not ours or error.errno is None:
+            raise
+        expected = REMEDIES.get(error.errno, WRITABLE)
+        raise MembraneError(f"{path}: not written ({os.strerror(error.errno)}); expected {expected}") from error
+
+
+def make_folder(path: str | Path) -> Path:
+    """Make a folder, and those above it, where they are missing.
+
+    Args:
+        path: the folder.
+
+    Returns:
+        The path.
+
+    Raises:
+        MembraneError: it cannot be made, or there is a file of its name.
+    """
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if error.errno == errno.EEXIST:
+            raise MembraneError(f"{path}: is a file; expected a folder, or none yet") from error
+        expected = REMEDIES.get(error.errno or 0, WRITABLE)
+        raise MembraneError(f"{path}: folder not made ({error.strerror}); expected {expected}") from error
+    return path
+
+
+def make_subfolder(path: Path) -> Path:
+    """Make a folder within a folder of results; one that a symbolic link puts elsewhere is refused.
+
+    Raises:
+        MembraneError: as `make_folder`; or the folder is a symbolic link.
+    """
+    if path.is_symlink():
+        raise MembraneError(f"{path}: is a symbolic link to {os.readlink(path)}; expected a folder of its own: remove the link")
+    return make_folder(path)
+
+
+def refuse_other_kind(path: Path) -> None:
+    """Refuse to put a file in the place of a folder or a device.
+
+    Raises:
+        MembraneError: there is one.
+        OSError: the path cannot be looked at, as its name is too long.
+    """
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return
+    if not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+        raise MembraneError(f"{path}: is a {kind_of(mode)}; expected the name of a file")
+
+
+def kind_of(mode: int) -> str:
+    """What is no regular file, in a word, by its mode as `os.stat` gives it."""
+    kinds = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket"}
+    return kinds.get(stat.S_IFMT(mode), "device")

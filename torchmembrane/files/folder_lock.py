@@ -9,6 +9,7 @@ from typing import NamedTuple
 from filelock import BaseFileLock, FileLock, Timeout
 
 from ..errors import MembraneError
+from .atomic import make_folder, writing
 
 GATE = ".gate.lock"
 PATIENCE = 600.0
@@ -59,13 +60,13 @@ class Claim:
 
     def __init__(self, folder: Path, shard: Shard):
         self.folder, self.shard = folder, shard
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         self.gate = FileLock(folder / GATE, timeout=PATIENCE)
         self.alone = True
         self._own = FileLock(folder / _lock_name(shard), timeout=0)
 
     def __enter__(self) -> "Claim":
-        with self.gate:
+        with writing(self.folder, self.folder / GATE, self.folder / _lock_name(self.shard)), self.gate:
             held = [path.name for path in self.folder.glob(".shard-*.lock") if _is_held(path)]
             self.alone = not held
             division = f"-of-{self.shard.total}.lock"

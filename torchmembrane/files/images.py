@@ -324,10 +324,11 @@ def write_as_taken(stem: str | Path, image: np.ndarray, bits: int | None = None)
         image = to_grey(image, bits)
     if image.dtype.kind == "f":
         return write_image(stem, image, bits)
-    return _written(Path(f"{stem}.png"), np.ascontiguousarray(image), compress_level=1)
+    return _written(Path(f"{stem}.png"), image, compress_level=1)
 
 
 def _written(path: Path, values: np.ndarray, **options: int) -> Path:
+    """Write an image, whole or not at all, in the format that the ending says."""
     with whole_file(path) as partial:
-        Image.fromarray(values).save(partial, "TIFF" if path.suffix == ".tiff" else "PNG", **options)
+        Image.fromarray(np.ascontiguousarray(values)).save(partial, "TIFF" if path.suffix == ".tiff" else "PNG", **options)
     return path

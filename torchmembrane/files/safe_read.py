@@ -19,6 +19,7 @@ from typing import IO, Any
 import numpy as np
 
 from ..errors import MembraneError
+from .atomic import kind_of
 
 MOST_ARRAY_BYTES = 2**26
 """Of a file of arrays, and of the arrays that are read from it together."""
@@ -89,7 +90,7 @@ def regular_size(path: Path, most: int, expected: str) -> int:
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         raise MembraneError(f"{path}: not readable ({_cause(error)}); expected {expected}") from error
     if not stat.S_ISREG(found.st_mode):
-        raise MembraneError(f"{path}: not readable (it is a {_kind(found.st_mode)}); expected {expected}, a regular file")
+        raise MembraneError(f"{path}: not readable (it is a {kind_of(found.st_mode)}); expected {expected}, a regular file")
     if found.st_size > most:
         raise MembraneError(f"{path}: holds {found.st_size} bytes; expected {expected}, at most {most} bytes")
     return found.st_size
@@ -217,11 +218,6 @@ def printable(text: object) -> str:
 
 def _cause(error: BaseException) -> str:
     return getattr(error, "strerror", None) or in_one_line(error)
-
-
-def _kind(mode: int) -> str:
-    kinds = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket"}
-    return kinds.get(stat.S_IFMT(mode), "device")
 
 
 def _refuse_large(size: int) -> None:

@@ -154,6 +154,11 @@ def unlike(info: Any, camera: Camera) -> str | None:
         return None
     if info.distortion_model not in LENSES:
         return f"CameraInfo: distortion_model {info.distortion_model!r} is not compared; expected one of {', '.join(LENSES)}"
+    known = {"pinhole": 8, "fisheye": 4}[LENSES[info.distortion_model]]
+    if any(info.d[known:]):
+        return (
+            f"CameraInfo: {info.distortion_model} with coefficients after the first {known} (thin prisms, tilt) is not compared"
+        )
     pixels = np.stack(np.meshgrid(np.linspace(0, width - 1, SAMPLES), np.linspace(0, height - 1, SAMPLES)), -1)
     focal, centre, distortion = (each.tolist() for each in (camera.focal, camera.centre, camera.distortion))
     lens = Camera(camera.model, camera.image_size, focal, centre, distortion)

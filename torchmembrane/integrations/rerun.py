@@ -1,11 +1,13 @@
 """Frames in the viewer Rerun: image with the markers' motion, surface with traction, contacts, wrench and pressure."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 
+from ..files.atomic import whole_file
 from ..files.optional import load_rerun
 from ..results.reconstruction import Frame
 from ..results.status import Status
@@ -46,10 +48,11 @@ class RerunLog:
         self._extent = float(np.ptp(mesh.rest_vertices, 0).max())
         self._largest = {"traction": 0.0, "force": 0.0}
         self._recording = self._rr.RecordingStream("torchmembrane", recording_id=None)
+        self._file = ExitStack()
         if save is None:
             self._recording.spawn(default_blueprint=self._blueprint())
         else:
-            self._recording.save(save, default_blueprint=self._blueprint())
+            self._recording.save(self._file.enter_context(whole_file(save)), default_blueprint=self._blueprint())
         self._add_rest()
 
     def __enter__(self) -> "RerunLog":
@@ -58,6 +61,7 @@ class RerunLog:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
         self._recording.flush()
         self._recording.disconnect()
+        self._file.close()  # whatever ended the block: the frames so far are whole
 
     def add(self, number: int, frame: Frame, image: np.ndarray | None = None, time: float | None = None) -> None:
         """Log a frame.

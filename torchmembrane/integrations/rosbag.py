@@ -1,12 +1,12 @@
 """Bags of ROS 2 (rosbag2: MCAP and sqlite3) by the package rosbags: images read; wrenches, tractions and pressures written."""
 
+import os
+import sqlite3
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from os import SEEK_END
 from pathlib import Path
-from shutil import rmtree
-from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -14,8 +14,10 @@ import numpy as np
 
 from ..camera.model import Camera
 from ..errors import MembraneError
+from ..files.atomic import ROOM, make_folder, writing
 from ..files.optional import load_rosbags
 from ..files.safe_read import in_one_line, read_text, regular_size
+from ..interruption import unfinished
 from ..results.reconstruction import Frame
 from .bounded_rosbags import bounded_rosbags, refuse_large
 from .messages import POINT_FIELDS, SiUnits, cloud_layout, info_topic, size_of, unlike
@@ -141,8 +143,8 @@ class BagWriter:
     def __init__(self, path: str | Path, units: SiUnits, mcap: bool):
         self.path, self.units, self.mcap = Path(path), units, mcap
         self.written = 0
-        if self.path.exists() and not any(OURS in _metadata(found) for found in metadata_of(self.path)):
-            raise MembraneError(f"{path}: exists already, and is no bag of results; expected a new folder")
+        if os.path.lexists(self.path) and not _is_ours(self.path):
+            raise MembraneError(f"{path}: exists already, and is no bag of results alone; expected a new folder")
         load_rosbags()
 
     def __enter__(self) -> "BagWriter":
@@ -151,20 +153,23 @@ class BagWriter:
 
         self._store = get_typestore(Stores.ROS2_JAZZY)
         plugin = StoragePlugin.MCAP if self.mcap else StoragePlugin.SQLITE3
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._work = TemporaryDirectory(prefix=".bag-", dir=self.path.parent)
-        self._writer = Writer(Path(self._work.name) / self.path.name, version=9, storage_plugin=plugin)
+        self._folder = make_folder(self.path.parent) / f".bag-{os.getpid()}"
+        self._ending = ExitStack()
+        self._ending.enter_context(unfinished(self._folder))
+        with writing(self.path, self._folder):
+            self._folder.mkdir()
+        self._writer = Writer(self._folder / self.path.name, version=9, storage_plugin=plugin)
         self._writer.set_custom_data("made by", OURS)
         self._writer.open()
         self._connections: dict[str, Any] = {}
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        with self._work:
+        with self._ending, _writing_bag(self.path):
             self._writer.close()
             if kind is None:
                 if self.path.exists():
-                    rmtree(self.path)
+                    self.path.rename(self._folder / ".before")
                 self._writer.path.rename(self.path)
 
     def add(self, image: StampedMessage, frame: Frame) -> None:
@@ -174,6 +179,11 @@ class BagWriter:
             image: that it was reconstructed from.
             frame: its result, which has a surface.
         """
+        with _writing_bag(self.path):
+            self._add(image, frame)
+        self.written += 1
+
+    def _add(self, image: StampedMessage, frame: Frame) -> None:
         header = self._header(image.message.header)
         wrench = self.units.wrench(frame)
         vectors = (self._new("geometry_msgs/msg/Vector3", *each.tolist()) for each in wrench)
@@ -185,7 +195,6 @@ class BagWriter:
         pressure = self.units.pressure(frame)
         if pressure is not None:
             self._write("pressure", image, header, pressure, 0.0)
-        self.written += 1
 
     def _header(self, header: Any) -> Any:
         stamp = self._new("builtin_interfaces/msg/Time", header.stamp.sec, header.stamp.nanosec)
@@ -200,6 +209,23 @@ class BagWriter:
             self._connections[name] = self._writer.add_connection(topic, kind, typestore=self._store)
         content = self._store.serialize_cdr(self._new(kind, *fields, **named), kind)
         self._writer.write(self._connections[name], image.received, content)
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a path is a bag of results, and nothing else is in its folder."""
+    if path.is_symlink() or not any(OURS in _metadata(found) for found in metadata_of(path)):
+        return False
+    return all(found.name == METADATA or found.suffix in BAGS for found in path.iterdir())
+
+
+@contextmanager
+def _writing_bag(path: Path) -> Iterator[None]:
+    """Within, what goes wrong with the disk names the bag."""
+    with writing(path):
+        try:
+            yield
+        except sqlite3.OperationalError as error:
+            raise MembraneError(f"{path}: not written ({error}); expected {ROOM}") from error
 
 
 @contextmanager

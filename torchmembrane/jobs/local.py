@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from torch import Tensor
 
-from ..errors import MembraneError
 from ..files.folder_lock import WHOLE, Shard
 from ..files.optional import load_pyav
 from ..files.provenance import printable
+from ..files.targets import refuse_overwriting
 from ..machine_code import SECONDS
 from ..results.status import Status
 from ..results.store import FINISHED, Mesh, Settings
 from .decode import Source, length_of, sources
 from .frame_reconstructor import FrameReconstructor, Outcome
 from .inputs import Inputs, frame_name
-from .result_folder import ResultFolder
+from .result_folder import ResultFolder, files_at_risk
 from .workers import Work, batch_for, outcomes_by, outcomes_here, workers_for
 
 if TYPE_CHECKING:
@@ -100,8 +100,7 @@ def reconstruct_files(
     """
     out, report = Path(out), report or _write_line
     mesh = Mesh.of(reconstructor, settings)
-    if figures and (shadowed := [path for path in inputs.images if path.parent.resolve() == out.resolve()]):
-        raise MembraneError(f"--out {out}: figures would overwrite images there ({shadowed[0]}); choose another")
+    refuse_overwriting(f"--out {out}", files_at_risk(out, inputs, figures), [*inputs.images, *inputs.videos], force=True)
     if inputs.need_pyav:
         load_pyav()
     done: Counter[int] = Counter()

@@ -11,10 +11,25 @@ from ..files.optional import load_pyarrow
 from ..files.order import in_order
 from ..files.provenance import Origin, printable
 from ..results.frames import open_folder
-from ..results.store import FINISHED, Mesh, check_folder
-from ..results.summary import UNREADABLE, Summary
+from ..results.store import FINISHED, MESH, Mesh, check_folder
+from ..results.summary import SUMMARY, UNREADABLE, Summary
 from .frame_reconstructor import Outcome
 from .inputs import Inputs, frame_name
+
+
+def files_at_risk(folder: Path, inputs: Inputs, figures: bool) -> list[Path]:
+    """Files that are in a folder and that a job would write over, if they are none of its own earlier results.
+
+    Args:
+        folder: of the results.
+        inputs: of the job.
+        figures: whether every frame has a figure.
+    """
+    found = [folder / SUMMARY] if (folder / SUMMARY).exists() and not (folder / MESH).exists() else []
+    if figures:
+        names = set(map(frame_name, inputs.images))
+        found += [path for path in folder.glob("*.png") if path.stem in names or inputs.video_of(path.stem)]
+    return found
 
 
 class ResultFolder:

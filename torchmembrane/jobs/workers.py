@@ -1,8 +1,6 @@
 """Frames computed in this process, decoded a batch ahead, or by worker processes with one thread each."""
 
 import os
-import pickle
-import signal
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -10,17 +8,18 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from threading import Thread
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..files.atomic import remove_partials
+from ..interruption import frame_in_work, starting_processes
 from ..machine_code import using
+from ..processes import begin_worker, handed_over
 from ..results.store import Mesh
 from .decode import DecodedFrame, Source, decoded, read_ahead
 from .frame_reconstructor import FrameReconstructor, Outcome
@@ -43,6 +42,10 @@ MEMORY_SHARE = 0.25
 """Of the machine's memory, for all frames in computation."""
 
 
+DRAWS = "reconstruct"
+"""The command that the figures' files name."""
+
+
 class Work(NamedTuple):
     """What is done with a batch of frames.
 
@@ -58,7 +61,7 @@ class Work(NamedTuple):
 
     def outcomes(self, group: list[DecodedFrame]) -> list[Outcome]:
         """What becomes of decoded frames."""
-        with using(self.machine_code):
+        with using(self.machine_code), frame_in_work():
             found = self.reconstructor.outcomes(group)
         if self.figures:
             from ..plot.drawing import save
@@ -68,7 +71,7 @@ class Work(NamedTuple):
             for outcome, frame in zip(found, group, strict=True):
                 if outcome.stored is not None and frame.image is not None:
                     image = frame.image[0, 0].cpu().numpy()
-                    save(figure(outcome.stored.frame, mesh, image, frame.name), folder / f"{frame.name}.png")
+                    save(figure(outcome.stored.frame, mesh, image, frame.name), folder / f"{frame.name}.png", DRAWS)
         return found
 
 
@@ -89,7 +92,8 @@ def outcomes_by(workers: int, work: Work, sources: Iterator[Source], batch: int)
         waiting: deque[Future[list[Outcome]]] = deque()
         try:
             while group := [_portable(source, reconstructor) for source in islice(sources, batch)]:
-                waiting.append(pool.submit(_outcomes, group))
+                with starting_processes():
+                    waiting.append(pool.submit(_outcomes, group))
                 if len(waiting) >= AHEAD * workers:
                     yield waiting.popleft().result()
             while waiting:
@@ -152,20 +156,18 @@ def _given(reason: str, image: object, reconstructor: "Reconstructor") -> Tensor
 
 @contextmanager
 def _pool(workers: int, work: Work) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes; when the block ends early, what they are doing is abandoned.
-
-    They read their work from a file: through a pipe, one would have to be up before the next one starts.
-    """
-    with TemporaryDirectory() as folder:
-        state = Path(folder) / "work"
-        state.write_bytes(pickle.dumps(work))
-        pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (state,))
+    """Worker processes; when the block ends early, what they are doing is abandoned."""
+    with handed_over(work) as path:
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (path,))
         try:
             yield pool
         except BaseException:
-            for process in list((pool._processes or {}).values()):
+            ended = list((pool._processes or {}).values())
+            for process in ended:
                 process.terminate()
             pool.shutdown(wait=True, cancel_futures=True)
+            if work.figures:
+                remove_partials(work.figures[0], [process.pid for process in ended])
             raise
         pool.shutdown()
 
@@ -174,21 +176,10 @@ _work: Work
 """Of this worker process."""
 
 
-def _start(state: Path) -> None:
-    """Make ready a worker process: one thread, interrupted and ended by its parent alone, and with it."""
+def _start(path: Path) -> None:
+    """Start a worker process: its work, once."""
     global _work
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    torch.set_num_threads(1)
-    Thread(target=_end_with_parent, daemon=True).start()
-    _work = pickle.loads(state.read_bytes())
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    _work = begin_worker(path)
 
 
 def _outcomes(group: list[Source]) -> list[Outcome]:

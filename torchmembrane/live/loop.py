@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import MembraneError
+from ..interruption import frame_in_work
 from ..results.reconstruction import Frame
 from ..results.status import Status
 from .mailbox import Mailbox, now
@@ -128,7 +129,8 @@ def follow(
             if mailbox.ended:
                 break
             continue
-        frame = stream(picture.image, picture.time)
+        with frame_in_work():
+            frame = stream(picture.image, picture.time)
         seen = Seen(picture.number, picture.time, picture.image, frame, now() - picture.time)
         tally.add(seen)
         for watcher in watchers:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 EPOCH = time.time() - time.perf_counter()
-ENDING = 2.0
+ENDING = 1.0
 """Seconds for a camera to give its last picture before its thread is left behind."""
 
 

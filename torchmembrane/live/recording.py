@@ -6,6 +6,7 @@ from pathlib import Path
 from types import TracebackType
 
 from ..errors import MembraneError
+from ..files.atomic import make_subfolder, writing
 from ..files.folder_lock import WHOLE
 from ..files.images import write_as_taken
 from ..files.provenance import Origin
@@ -48,7 +49,7 @@ class Recording:
 
     def __enter__(self) -> "Recording":
         self._results.__enter__()
-        (self.folder / IMAGES).mkdir()
+        make_subfolder(self.folder / IMAGES)
         self._times = open(self.folder / TIMES, "w", newline="", encoding="utf-8", buffering=1)
         csv.writer(self._times).writerow(COLUMNS)
         return self
@@ -67,14 +68,11 @@ class Recording:
 
     def keep(self, seen: Seen) -> None:
         """Write a frame."""
-        try:
-            path = write_as_taken(self.folder / IMAGES / seen.name, seen.image, self.bits)
-            stored = Stored(seen.frame, Origin.of(path), seen.latency)
-            self._results.keep(Outcome(seen.name, path, stored))
+        path = write_as_taken(self.folder / IMAGES / seen.name, seen.image, self.bits)
+        stored = Stored(seen.frame, Origin.of(path), seen.latency)
+        self._results.keep(Outcome(seen.name, path, stored))
+        with writing(self.folder / TIMES):
             csv.writer(self._times).writerow((seen.name, f"{seen.time:.6f}", f"{seen.latency:.6f}"))
-        except OSError as error:
-            cause = error.strerror or error
-            raise MembraneError(f"--record {self.folder}: frame {seen.name} cannot be written ({cause})") from error
 
 
 def times_of(folder: Path) -> dict[str, float]:

@@ -11,8 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
+from PIL import Image
 
-from ..files.atomic import whole_file
+from ..files.atomic import make_folder, whole_file
+from ..files.safe_read import DAMAGE
 from ..surface.topology import rim_loop
 
 BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "#B8B8B8"  # distinct with any colour vision
@@ -27,12 +29,13 @@ SHORT = (-2, 3)  # powers of ten of lengths whose ticks are written in full: a m
 LINES = 16  # of a grid that are drawn each way, at most about
 
 
-def save(drawing: Figure, path: str | Path) -> None:
+def save(drawing: Figure, path: str | Path, command: str = "") -> None:
     """Write a figure as PNG, whole or not at all.
 
     Args:
         drawing: the figure.
         path: the file; its folder is made if need be.
+        command: that draws it; the file says so, and `drawn_by` reads it.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -42,9 +45,31 @@ def save(drawing: Figure, path: str | Path) -> None:
         ['empty.png']
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     with whole_file(path) as partial:
-        drawing.savefig(partial, format="png")
+        drawing.savefig(partial, format="png", metadata={"Software": _software(command)})
+
+
+def drawn_by(command: str, path: Path) -> bool:
+    """Whether a file is a figure that a command of torchmembrane drew, which may draw it anew.
+
+    Args:
+        command: as `save` was told.
+        path: any file.
+
+    Example:
+        >>> drawn_by("check", Path("examples/rest.png"))
+        False
+    """
+    try:
+        with Image.open(path, formats=["PNG"]) as image:
+            return image.info.get("Software") == _software(command)
+    except DAMAGE:
+        return False
+
+
+def _software(command: str) -> str:
+    return f"torchmembrane {command}".rstrip()
 
 
 def show(drawing: Figure) -> None:

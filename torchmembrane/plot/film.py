@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ..errors import MembraneError
-from ..files.atomic import whole_file
+from ..files.atomic import make_folder, whole_file
 from ..files.optional import load_pyav
 from ..files.video import ffmpeg_name
 
@@ -73,7 +73,7 @@ def write_film(path: str | Path, pictures: Iterable[np.ndarray], rate: float, la
     """
     path = Path(path)
     check_film(path, rate)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     checked = _checked(path, iter(pictures))
     with whole_file(path) as partial:
         if path.suffix.lower() == ".gif":

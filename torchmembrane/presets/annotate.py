@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..files.atomic import write_text
 from ..sensor.parts import METRE, millimetre
 
 WORDS = {
@@ -13,7 +14,7 @@ WORDS = {
         "length_unit": f"{' | '.join(METRE)}: of all lengths here and in results",
     },
     "camera": {
-        "model": "pinhole (OpenCV's k1 k2 p1 p2 k3) | fisheye (k1 to k4)",
+        "model": "pinhole (OpenCV's k1 k2 p1 p2 k3, or with k4 k5 k6) | fisheye (k1 to k4; ROS: equidistant)",
         "image_size": "width, height, px",
         "focal": "along u and v, px; fisheye: px / rad",
         "centre": "principal point u, v, px; the top left pixel's centre is 0, 0",
@@ -25,7 +26,7 @@ WORDS = {
         "grid": "vertices of the solver; leave the line out for the default",
         "rim_radius": "of the fixed circle",
         "height": "of the pole over the rim's plane",
-        "base_z": "the rim's plane, from the camera's centre of projection along its axis",
+        "base_z": "the rim's plane, from the camera's centre of projection along its axis; less than 0: behind a fisheye",
         "semi_axes": "along x, y, z",
         "radius": "of the cylinder",
         "length": "along x, the image's u",
@@ -88,4 +89,4 @@ def annotate(path: Path, said: Sequence[str], relative: bool, unit: str) -> None
         lines.append(f"{line}  # {word}" if word else line)
         if table == "material" and key == "prestretch" and relative:
             lines.append(RELATIVE.format(**examples))
-    path.write_text("\n".join([*lines, "", FURTHER.format(**examples)]) + "\n", encoding="utf-8")
+    write_text(path, "\n".join([*lines, "", FURTHER.format(**examples)]) + "\n")

@@ -27,6 +27,7 @@ SHAPES: dict[str, tuple[str, ...]] = {
 ASSUMED_PRESTRETCH = 1.2
 DISAGREEMENT = 0.1  # between the overpressure stated and the one that the material holds, relative: above, it is said
 LARGEST_STRETCH = 4.0
+DECIMALS = 9  # of a distance
 PITCHES = 11  # of dots across the square root of the area, where nothing else is said
 PRESSURE_UNITS = {"Pa": 0.01, "hPa": 1.0, "mbar": 1.0, "kPa": 10.0, "bar": 1000.0, "psi": 68.94757}  # in hPa
 
@@ -75,9 +76,20 @@ class RimCircle:
     model: str
 
     def distance(self, focal: float) -> float:
-        """The rim's distance from the camera, by the focal length (px; fisheye: px / rad)."""
+        """The rim's distance before the camera, by the focal length (px; fisheye: px / rad); less than 0 behind a fisheye.
+
+        Raises:
+            MembraneError: the rim is more than 180 degrees from the axis of a fisheye.
+        """
         angle = self.pixels / focal
-        return self.radius / (angle if self.model == "pinhole" else math.tan(angle))
+        if self.model == "pinhole":
+            return self.radius / angle
+        if not angle < math.pi:
+            raise MembraneError(
+                f"a rim of {self.pixels:g} px at {focal:.4g} px / rad lies {math.degrees(angle):.0f} degrees from the axis; "
+                "expected less than 180: check --rim, and --focal or --view"
+            )
+        return round(self.radius * math.cos(angle) / math.sin(angle), DECIMALS)
 
     def focal(self, distance: float) -> float:
         """The focal length, by the rim's distance."""
@@ -94,6 +106,8 @@ def focal_of_view(model: str, width: int, degrees: float) -> float:
     half = math.radians(degrees) / 2
     if model == "pinhole" and not degrees < 180:
         raise MembraneError(f"field of view {degrees:g} degrees; expected less than 180 of a pinhole lens: a fisheye sees more")
+    if not degrees <= 360:
+        raise MembraneError(f"field of view {degrees:g} degrees; expected at most 360")
     return width / 2 / (math.tan(half) if model == "pinhole" else half)
 
 

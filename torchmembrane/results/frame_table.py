@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..files.atomic import whole_file
+from ..files.atomic import make_subfolder, whole_file
 from ..files.optional import load_pyarrow
 from ..files.order import in_order
 from ..files.parquet import read_table, refusal
@@ -130,7 +130,7 @@ class FrameTable:
         if not self._waiting:
             return
         with self.gate:
-            self.folder.mkdir(exist_ok=True)
+            make_subfolder(self.folder)
             self._drop(self._waiting)
             last = max((int(part.stem.rpartition("-")[2]) for part in self._parts()), default=-1)
             self._put(self._table_of(self._waiting), self.folder / f"part-{last + 1:05d}.parquet")

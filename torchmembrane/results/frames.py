@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from ..errors import MembraneError
+from ..files.atomic import make_folder
 from ..files.safe_read import DAMAGE, LackingArray, read_arrays
 from ..files.system_files import is_of_system
 from .frame_table import FrameTable
@@ -32,8 +33,7 @@ def open_folder(folder: str | Path, mesh: Mesh, gate: AbstractContextManager[Any
     with gate:
         check_folder(folder, mesh.sensor, mesh.settings)
         if not (folder / MESH).exists():
-            folder.mkdir(parents=True, exist_ok=True)
-            mesh.save(folder / MESH)
+            mesh.save(make_folder(folder) / MESH)
     return frames_of(folder, mesh, gate)
 
 
@@ -82,8 +82,12 @@ class FrameFiles:
         return [load_frame(self._path(name)) for name in names]
 
     def write(self, name: str, stored: Stored) -> None:
-        """Store a frame, in place of an earlier one of its name."""
-        save_frame(self._path(name), stored.arrays())
+        """Store a frame, in place of an earlier one of its name; what is no frame is renamed."""
+        path = self._path(name)
+        if path in self.damaged:
+            path.replace(path.with_suffix(".damaged"))
+            self.damaged.remove(path)
+        save_frame(path, stored.arrays())
 
     def forget(self, name: str) -> None:
         """Take a frame away, if it is there."""

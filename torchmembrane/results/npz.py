@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ..errors import MembraneError
-from ..files.atomic import whole_file
+from ..files.atomic import write_bytes
 from ..files.provenance import Origin
 from ..files.safe_read import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays
 from .frame_shapes import shape_of
@@ -76,8 +76,7 @@ def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
         if isinstance(error.__context__, KeyboardInterrupt):  # amid an entry, which zipfile then cannot close
             raise error.__context__ from None
         raise
-    with whole_file(path) as partial:
-        partial.write_bytes(content.getbuffer())
+    write_bytes(path, content.getbuffer())
 
 
 def load_frame(path: str | Path) -> dict[str, np.ndarray]:

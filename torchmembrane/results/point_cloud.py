@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..files.atomic import whole_file
+from ..files.atomic import write_text
 from .reconstruction import Frame
 
 TOUCHED = 0.5
@@ -36,6 +36,5 @@ def save_contact_cloud(path: str | Path, frame: Frame) -> int:
     properties = [f"property float {name}" for name in names]
     header = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", *properties, "end_header"]
     lines = [" ".join(f"{value:.7g}" for value in row) for row in rows]
-    with whole_file(path) as partial:
-        Path(partial).write_text("\n".join(header + lines) + "\n")
+    write_text(path, "\n".join(header + lines) + "\n")
     return len(rows)

@@ -19,7 +19,7 @@ MEANT = {
     "texture": ("speckle", "paint", "pattern", "random"),
     "dark": ("black", "dark_on_light"),
     "light": ("white", "bright", "light_on_dark"),
-    "pinhole": ("perspective", "opencv", "rectilinear"),
+    "pinhole": ("perspective", "opencv", "rectilinear", "plumb_bob", "rational_polynomial", "radtan"),
     "fisheye": ("kannala_brandt", "equidistant", "omnidirectional", "wide"),
     "rim_radius": ("radius", "rim", "base_radius", "diameter"),
     "base_z": ("distance", "z", "rim_z", "offset"),

@@ -6,6 +6,7 @@ Every message names the file, the table and key, the value that came and what wa
 import glob
 import json
 import math
+import os
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -163,6 +164,12 @@ class Table:
         names = self._get(key, _is_names, "a file, or a list of files, in quotes")
         return self._named(key, [names] if isinstance(names, str) else names)
 
+    def named_files(self) -> list[Path]:
+        """The files there are of all names within this table and the ones below it."""
+        names = [name for name in _texts(self.values) if lies_within(name)]
+        patterns = [f"{glob.escape(str(self.path.parent))}/{name if '*' in name else glob.escape(name)}" for name in names]
+        return [Path(match) for pattern in patterns for match in sorted(glob.glob(pattern)) if os.path.isfile(match)]
+
     def _named(self, key: str, names: Iterable[str]) -> list[Path]:
         folder, paths = self.path.parent, []
         for name in names:
@@ -247,6 +254,15 @@ def _is_file(path: Path) -> bool:
         return path.exists()
     except OSError:
         return False
+
+
+def _texts(value: object) -> Iterator[str]:
+    """All text within tables and lists."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from _texts(each)
 
 
 def _finite(value: object) -> bool:

@@ -1,5 +1,6 @@
 """Reading and writing `sensor.toml` and the arrays named in it."""
 
+import io
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -7,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from ..camera.folds import refuse_folds
 from ..camera.model import Camera
 from ..camera.ports import Port
 from ..errors import MembraneError
+from ..files.atomic import make_folder, write_bytes, write_text
 from ..files.csv_table import Columns, Limit, read_table
 from ..files.images import image_size, mean_image, write_image
 from ..files.safe_read import read_arrays
@@ -79,6 +82,8 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
         names = [f"{line}: the dot" for line in lines]
         refuse_off_surface(membrane, markers.positions, names)
         refuse_coincident(membrane, markers.positions, names)
+    with file.table("camera").naming("distortion"):
+        refuse_folds(camera, membrane.rest)
     tool = _read_tool(file.table("tool")) if "tool" in file else None
     return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool)
 
@@ -93,12 +98,14 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
     Returns:
         The path.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     tables, surface, markers = tables_of(parts), parts.surface, parts.markers
     tables["camera"] |= _calibrated(parts.camera)
     if surface.shape in SHAPES_BY_ARRAYS:
         tables["membrane"]["file"] = f"{path.stem}_{surface.shape}.npz"
-        np.savez_compressed(path.with_name(tables["membrane"]["file"]), **surface.values)
+        content = io.BytesIO()
+        np.savez_compressed(content, **surface.values)
+        write_bytes(path.with_name(tables["membrane"]["file"]), content.getbuffer())
     if markers.positions is not None:
         tables["markers"]["file"] = f"{path.stem}_dots.csv"
         _write_dots(path.with_name(tables["markers"]["file"]), markers.positions, markers.sizes or [])
@@ -112,7 +119,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
         blocks["camera"] += toml_lines("camera.ports", port, repeated=True)
     if ports:
         blocks["camera"] += toml_lines("camera.medium", medium)
-    path.write_text("\n\n".join("\n".join(lines) for lines in blocks.values()) + "\n", encoding="utf-8")
+    write_text(path, "\n\n".join("\n".join(lines) for lines in blocks.values()) + "\n")
     return path
 
 
@@ -245,7 +252,7 @@ def _read_dots(path: Path) -> tuple[np.ndarray, list[str], list[str]]:
 
 def _write_dots(path: Path, positions: np.ndarray, sizes: list[str]) -> None:
     rows = [[*map(repr, position), size] for position, size in zip(positions.tolist(), sizes, strict=True)]
-    path.write_text("\n".join(map(",".join, [DOTS_HEADER, *rows])) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(map(",".join, [DOTS_HEADER, *rows])) + "\n")
 
 
 def _read_membrane(table: Table, markers: Markers) -> tuple[Surface, Membrane]:

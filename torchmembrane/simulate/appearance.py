@@ -14,6 +14,7 @@ from ..errors import MembraneError, check_arguments
 from ..surface.membrane import Membrane
 
 LIGHTS, LIGHT_RADIUS = 4, 0.3  # default lights around the camera's centre, radius over the rim's mean distance from the axis
+LIGHT_WITHIN = 0.5  # at most so far from the camera, over the membrane's least distance from it
 BRIGHT = 0.95  # the quantile of the rest surface that is exposed as asked
 RANGES = {
     "exposure": (0, math.inf),
@@ -33,7 +34,8 @@ class Appearance:
     """Light, lens and chip of a rendered image.
 
     Args:
-        lights: positions `(x, y, z)` of point lights, length unit, camera frame; default: four around the camera.
+        lights: positions `(x, y, z)` of point lights, length unit, camera frame; default: four around the camera, within the
+            membrane.
         exposure: grey of the white membrane at rest where it is bright (95 % of it is darker).
         ambient: share of the light that comes from everywhere.
         highlight: specular over diffuse light (Blinn-Phong), 0 for a mat membrane.
@@ -71,7 +73,9 @@ class Appearance:
         """Positions `[L, 3]` of the lights in a sensor with this membrane."""
         if self.lights is not None:
             return torch.from_numpy(np.array(self.lights, dtype=float).reshape(-1, 3))
-        radius = LIGHT_RADIUS * float(membrane.rest[membrane.fixed, :2].norm(dim=-1).mean())
+        rest = membrane.rest
+        radius = LIGHT_RADIUS * float(rest[membrane.fixed, :2].norm(dim=-1).mean())
+        radius = min(radius, LIGHT_WITHIN * float(rest.norm(dim=-1).min()))
         angle = 2 * math.pi * (torch.arange(LIGHTS, dtype=torch.float64) + 0.5) / LIGHTS
         return torch.stack([radius * angle.cos(), radius * angle.sin(), 0 * angle], -1)
 

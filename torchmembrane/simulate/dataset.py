@@ -1,16 +1,15 @@
 """Random presses of one sensor: the same for the same seed and number, on all cores, continued where they were interrupted."""
 
-import multiprocessing
-import pickle
-import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from ..errors import MembraneError
+from ..processes import begin_worker, spawned_pool
 from ..progress import Progress, silent
 from .frames import SimulatedFrames
 from .indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge, facing
@@ -214,9 +213,7 @@ def _in_processes(
             tell(done)
             yield made
         return
-    context = multiprocessing.get_context("spawn")
-    shared = pickle.dumps((simulator, plan))  # as bytes: torch would move tensors whose memory the sensor's arrays look at
-    with context.Pool(jobs, _begin, (shared,)) as pool:
+    with spawned_pool(jobs, _begin, (simulator, plan)) as pool:
         early: dict[int, SimulatedFrame | str] = {}
         waiting = iter(numbers)
         due = next(waiting)
@@ -232,12 +229,10 @@ _simulator: Simulator
 _plan: Plan
 
 
-def _begin(shared: bytes) -> None:
+def _begin(path: Path) -> None:
     """Start a worker process: what `_work` needs, once."""
     global _simulator, _plan
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
-    torch.set_num_threads(1)
-    _simulator, _plan = pickle.loads(shared)
+    _simulator, _plan = begin_worker(path)
 
 
 def _work(number: int) -> tuple[int, SimulatedFrame | str]:

@@ -2,7 +2,8 @@
 
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import MembraneError
-from ..files.atomic import whole_file
+from ..files.atomic import make_folder, make_subfolder, whole_file, write_bytes
 from ..files.images import read_pixels
 from ..files.optional import load_pyarrow, load_pyav
 from ..files.order import in_order
@@ -48,7 +49,7 @@ class SimulatedFrames:
 
     def write(self, name: str, frame: SimulatedFrame) -> None:
         """Write a frame's image and truth."""
-        _write(self.folder / f"{name}.png", png(frame.image))
+        write_bytes(self.folder / f"{name}.png", png(frame.image))
         self.write_truth(name, frame)
 
     def write_truth(self, name: str, frame: SimulatedFrame) -> None:
@@ -95,7 +96,7 @@ class SimulatedFrameTable(SimulatedFrames):
     def flush(self) -> None:
         if not self.waiting:
             return
-        (self.folder / "frames").mkdir(exist_ok=True)
+        make_subfolder(self.folder / "frames")
         columns = {"name": list(self.waiting), "image": [png(frame.image) for frame in self.waiting.values()]}
         shapes = {}
         for key in next(iter(self.waiting.values())).truth.keys() - set(CONSTANT):
@@ -132,36 +133,31 @@ def _truth(row: dict[str, Any], shapes: dict[str, list[int]]) -> dict[str, np.nd
     return {key: a.astype(np.float32) if a.dtype.kind == "f" else a for key, a in truth.items()}
 
 
-class Video:
-    """An H.264 video, written image by image in a `with` block.
+@contextmanager
+def video_file(path: Path, rate: int = 25) -> Iterator[Callable[[np.ndarray], None]]:
+    """An H.264 video that is written image by image, whole or not at all.
 
     Args:
-        path: of the file.
+        path: of the file, `.mp4`.
         rate: images a second.
+
+    Yields:
+        What takes the next image, `[H, W]` uint8, all of one size; one at least.
     """
+    av = load_pyav()
+    stream: Any = None
+    with whole_file(path) as partial, av.open(str(partial), "w", format="mp4") as container:
 
-    def __init__(self, path: Path, rate: int = 25) -> None:
-        self.path, self.rate = path, rate
-        self.container: Any = None
+        def add(image: np.ndarray) -> None:
+            nonlocal stream
+            if stream is None:
+                stream = container.add_stream("libx264", rate=rate, options={"crf": "10"})
+                stream.height, stream.width = image.shape
+                stream.pix_fmt = "yuv420p" if all(side % 2 == 0 for side in image.shape) else "yuv444p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray")))
 
-    def __enter__(self) -> "Video":
-        self.av = load_pyav()
-        return self
-
-    def add(self, image: np.ndarray) -> None:
-        """The next image `[H, W]` uint8."""
-        if self.container is None:
-            self.container = self.av.open(str(self.path), "w")
-            even = all(side % 2 == 0 for side in image.shape)
-            self.stream = self.container.add_stream("libx264", rate=self.rate, options={"crf": "10"})
-            self.stream.height, self.stream.width = image.shape
-            self.stream.pix_fmt = "yuv420p" if even else "yuv444p"
-        self.container.mux(self.stream.encode(self.av.VideoFrame.from_ndarray(image, format="gray")))
-
-    def __exit__(self, *_: object) -> None:
-        if self.container is not None:
-            self.container.mux(self.stream.encode())
-            self.container.close()
+        yield add
+        container.mux(stream.encode())
 
 
 def open_frames(folder: Path, simulator: Simulator, settings: dict[str, Any], format: str = "png") -> SimulatedFrames:
@@ -180,9 +176,9 @@ def open_frames(folder: Path, simulator: Simulator, settings: dict[str, Any], fo
     settings = json.loads(json.dumps(settings | asdict(simulator.appearance) | simulator.pattern.described()))
     _check(folder, settings)
     if not (folder / SETTINGS).exists():
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         simulated(simulator).to_file(folder / SENSOR)
-        _write(folder / SETTINGS, json.dumps(settings, indent=1).encode())
+        write_bytes(folder / SETTINGS, json.dumps(settings, indent=1).encode())
     return SimulatedFrameTable(folder) if format == "parquet" else SimulatedFrames(folder)
 
 
@@ -214,6 +210,8 @@ def _check(folder: Path, settings: dict[str, Any]) -> None:
         return
     try:
         before = dict(json.loads(read_text(folder / SETTINGS, MOST_SETTINGS_BYTES, "settings of `torchmembrane simulate`")))
+        if missing := {"sensor", "grid"} - before.keys():
+            raise ValueError(f"it does not say the {min(missing)}")
     except DAMAGE as error:
         said = in_one_line(str(error).removeprefix(f"{folder / SETTINGS}: "))
         raise MembraneError(f"{folder / SETTINGS}: not readable ({said}); expected another folder") from error
@@ -222,9 +220,3 @@ def _check(folder: Path, settings: dict[str, Any]) -> None:
             raise MembraneError(
                 f"--out {folder}: was made with {key} {in_one_line(before[key])}, this call has {value}; choose another folder"
             )
-
-
-def _write(path: Path, content: bytes) -> None:
-    """A file, whole or not at all."""
-    with whole_file(path) as partial:
-        partial.write_bytes(content)

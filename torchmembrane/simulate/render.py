@@ -267,8 +267,8 @@ def render(
 def _fine_grid(sensor: Sensor, cell: float) -> tuple[int, int]:
     """The grid whose lines at rest are crossed by others every `cell` px at most, where they are longest."""
     m, n = sensor.membrane.grid
-    pixels = sensor.camera.point_to_pixel(sensor.membrane.rest).unflatten(0, (m, n)).nan_to_num(0.0)
-    steps = [pixels.diff(dim=axis).norm(dim=-1).amax(1 - axis).sum() for axis in (0, 1)]
+    pixels = sensor.camera.point_to_pixel(sensor.membrane.rest).unflatten(0, (m, n))
+    steps = [pixels.diff(dim=axis).norm(dim=-1).nan_to_num(0.0).amax(1 - axis).sum() for axis in (0, 1)]
     fine = [int(np.clip(float(length) / cell, size, FINEST_GRID)) + 1 for length, size in zip(steps, (m, n), strict=True)]
     return fine[0], fine[1]
 

@@ -1,6 +1,7 @@
 """A sensor in silico: presses on its membrane, on a grid finer than its solver's, their images and the truth about them."""
 
 import json
+import math
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from math import gcd
@@ -21,6 +22,7 @@ from .render import Renderer
 
 LEGS = ("push", "slide", "release")
 REST_NOISE = 2**31 - 1  # its seed, unlike those of frames
+BEHIND = "the press takes the membrane behind the camera"
 LIFT = 0.05  # above the first touch, over the surface's size, where a release ends
 
 
@@ -164,11 +166,23 @@ class Simulator:
         touched = False
         for state in islice(states, 1, None):
             touched = touched or bool(state.contact.any())
-            if bool((state.vertices[:, 2] <= 0).any()):
-                raise MembraneError("simulate: the press takes the membrane behind the camera; expected a smaller depth")
+            if self.leaves_camera(state.vertices):
+                raise MembraneError(f"simulate: {BEHIND}; expected a smaller depth")
             yield state
         if not touched:
             raise MembraneError("simulate: the indenter never touches the membrane; expected a depth that presses it in")
+
+    def leaves_camera(self, vertices: torch.Tensor) -> bool:
+        """Whether the membrane is no more before its camera: vertices are where the lens images nothing, or it has passed the
+        centre of projection, so that the solid angle that it takes there, which the rim fixes, is another one.
+
+        Args:
+            vertices: on the grid, `[V, 3]`.
+        """
+        camera, membrane = self.sensor.camera, self.membrane
+        lost = camera.can_image(membrane.rest) & ~camera.can_image(vertices)
+        angles = [solid_angle(x[membrane.triangles]) for x in (membrane.rest, vertices)]
+        return bool(lost.any()) or abs(angles[1] - angles[0]) > 2 * math.pi
 
     def frame(self, state: Press, stroke: Stroke, rng: np.random.Generator) -> SimulatedFrame:
         """The image of an equilibrium and its truth.
@@ -207,6 +221,27 @@ class Simulator:
         arrays = {key: np.asarray(value) for key, value in truth.items()}
         arrays = {key: a.astype(np.float32) if a.dtype.kind == "f" else a for key, a in arrays.items()}
         return SimulatedFrame(self.image(state.vertices, rng), arrays | {"stroke": np.array(json.dumps(stroke.described()))})
+
+
+def solid_angle(corners: torch.Tensor) -> float:
+    """The solid angle of triangles as seen from the origin, positive where they turn their outer sides away from it.
+
+    With a, b, c a triangle's corners, `tan(W / 2) = det(a b c) / (|a||b||c| + a.b |c| + b.c |a| + c.a |b|)`.
+
+    Args:
+        corners: `[T, 3, 3]`.
+
+    Returns:
+        The sum over the triangles, sr.
+
+    Example:
+        >>> round(solid_angle(torch.eye(3)[None]) / (4 * math.pi), 6)  # one of eight octants
+        0.125
+    """
+    a, b, c = corners.unbind(1)
+    A, B, C = (corner.norm(dim=-1) for corner in (a, b, c))
+    below = A * B * C + (a * b).sum(-1) * C + (b * c).sum(-1) * A + (c * a).sum(-1) * B
+    return float(2 * torch.atan2(torch.linalg.det(corners), below).sum())
 
 
 def _finer(count: int) -> int:

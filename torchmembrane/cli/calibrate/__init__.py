@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..arguments import Add, add_command, count_pair, positive, weight
+from ..arguments import Add, add_command, add_force, count_pair, positive, weight
 from ..choices import PORTS
 from ..progress import announce
 
@@ -47,11 +47,15 @@ def add_parser(commands: Any) -> None:
         add = add_command(steps, name, partial(_run, step.module, name), step.purpose, example, *step.aliases)
         add("sensor", metavar="SENSOR.toml", help="the design, or the sensor file of the step before")
         step.add_options(add)
-        add("--out", metavar="DIR", type=Path, required=True, help="folder of the calibrated sensor")
+        add("--out", metavar="DIR", type=Path, required=True, help="folder of the calibrated sensor; not that of SENSOR.toml")
+        add_force(add)
 
 
 def _run(module: str, step: str, arguments: Namespace) -> int:
     announce(f"calibrate {step}")
+    from .files import spare_files
+
+    spare_files(step, arguments)
     return int(getattr(import_module(f".{module}", __name__), step)(arguments))
 
 

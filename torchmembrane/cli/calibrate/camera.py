@@ -7,6 +7,7 @@ import numpy as np
 
 from ...calibrate.camera import CameraFit, Views, lens_from_views, ports_from_views
 from ...calibrate.report import Report
+from ...camera.folds import refuse_folds
 from ...camera.model import Camera
 from ...camera.targets import Checkerboard, DotBoard
 from ...errors import MembraneError
@@ -21,6 +22,10 @@ def camera(arguments: Namespace) -> int:
     board = Checkerboard(columns, rows, arguments.square)
     pixels = read_targets(arguments.images, sensor, board)
     found = lens_from_views(sensor.camera, board, Views(pixels, np.zeros(len(pixels), bool)))
+    try:
+        refuse_folds(found.camera, sensor.membrane.rest)
+    except MembraneError as error:
+        raise MembraneError(f"calibrate camera: of the lens found {error}") from error
     units = [{"focal": "px", "centre": "px"}.get(name.split("[")[0], "") for name in found.names]
     return _write(arguments, sensor, found, pixels, units, f"lens: {sensor.camera.model}, {len(pixels)} images")
 

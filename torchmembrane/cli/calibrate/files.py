@@ -2,6 +2,7 @@
 
 from argparse import Namespace
 from collections.abc import Sequence
+from glob import glob
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,10 +15,12 @@ from ...errors import MembraneError
 from ...files.csv_table import ANGLE, Columns, read_table
 from ...files.images import read_image, read_pixels
 from ...files.safe_read import read_array
+from ...files.targets import refuse_overwriting
 from ...jobs.inputs import Inputs, find_inputs, frame_name, single_images
 from ...jobs.pressure import by_frame
 from ...plot.drawing import save
 from ...presets import sensor_file
+from ...sensor.companions import companions_of, files_of
 from ...sensor.parts import millimetre
 from ...sensor.sensor import Sensor
 from ...sensor.toml import COORDINATE
@@ -30,6 +33,9 @@ MOST_TABLE_BYTES = 2**20
 PLACES, TURNS = ("x", "y", "z"), ("turn_x", "turn_y", "turn_z")
 MOTIONS = Columns([(*PLACES, *TURNS)], "image", unit="length unit and degrees")
 FORCES = Columns([("image", "fx", "fy", "fz"), ("image", "force")], "force", unit="N, on the membrane, in the camera's frame")
+LISTS = ("images", "air", "medium")
+FILES = ("image", "depth", "motions", "forces", "pressure", "pixels")
+"""Arguments of the steps that name files to read: images, and single files."""
 
 
 def read_sensor(arguments: Namespace) -> Sensor:
@@ -37,11 +43,26 @@ def read_sensor(arguments: Namespace) -> Sensor:
     return Sensor.from_file(sensor_file(arguments.sensor))
 
 
+def spare_files(step: str, arguments: Namespace) -> None:
+    """Refuse a folder in which files would be written over, or that of the sensor that is calibrated.
+
+    Args:
+        step: of the calibration.
+        arguments: of the command.
+    """
+    given = vars(arguments)
+    read = [*files_of(sensor_file(arguments.sensor)), *(given[name] for name in FILES if given.get(name) is not None)]
+    read += [path for name in LISTS for text in given.get(name, ()) for path in (text, *glob(text), *Path(text).glob("*"))]
+    names = ("report.png", "layout.csv", "layout.svg") if step == "layout" else ("report.png", "report.json")
+    targets = [*companions_of(arguments.out / "sensor.toml"), *(arguments.out / name for name in names)]
+    refuse_overwriting(f"calibrate {step} --out {arguments.out}", targets, read, arguments.force)
+
+
 def write_calibrated(arguments: Namespace, sensor: Sensor, report: Report, drawing: "Figure") -> int:
     """Write the calibrated sensor and its report, print what was found; returns the exit code."""
     path = sensor.to_file(arguments.out)
     report.write(arguments.out)
-    save(drawing, arguments.out / "report.png")
+    save(drawing, arguments.out / "report.png", "calibrate")
     print("\n".join([*report.lines, f"calibrated sensor: {path}; report.json and report.png beside it"]))
     return 0
 

@@ -25,6 +25,6 @@ def layout(arguments: Namespace) -> int:
     write_layout(arguments.out / "layout.csv", sensor, dots)
     write_svg(arguments.out / "layout.svg", sensor, dots)
     title = f"{len(dots.radii)} dots, radii {dots.radii.min():.3g} to {dots.radii.max():.3g} {sensor.length_unit}"
-    save(layout_figure(title, sensor, dots), arguments.out / "report.png")
+    save(layout_figure(title, sensor, dots), arguments.out / "report.png", "calibrate")
     print(f"{title}\n{arguments.out / 'layout.csv'} to fabricate, layout.svg to look at, and the sensor that has them: {path}")
     return 0

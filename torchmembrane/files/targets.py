@@ -1,0 +1,65 @@
+"""The one rule by which commands spare the user's files: what is there already is written over only where that was said."""
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from ..errors import MembraneError
+from .atomic import refuse_other_kind, writing
+
+
+def refuse_overwriting(
+    command: str,
+    targets: Iterable[str | Path],
+    read: Iterable[str | Path] = (),
+    force: bool = False,
+    is_own: Callable[[Path], bool] = lambda path: False,
+) -> None:
+    """Refuse to write over files that are there.
+
+    A file that the command reads is never written over. One that an earlier run of the same command made, as far as `is_own`
+    tells, is; all others are with `force` alone. A symbolic link counts as the file that it names, where that is read, else as
+    a file of its own.
+
+    Args:
+        command: as messages begin.
+        targets: the files that the command is going to write.
+        read: the files that it reads.
+        force: whether the user has said that others may be written over.
+        is_own: whether a file that is there is one that this command may make anew without being told.
+
+    Raises:
+        MembraneError: names the first file that would be lost, or cannot be written at all, and the remedy.
+
+    Example:
+        >>> refuse_overwriting("export", ["examples/sensor.toml"], read=["examples/sensor.toml"], force=True)
+        Traceback (most recent call last):
+        ...
+        torchmembrane.errors.MembraneError: export: would write over examples/sensor.toml, which it reads; choose another name
+    """
+    there = [path for path in map(Path, targets) if _is_there(path)]
+    known = {_identity(Path(path)) for path in read} if there else set()
+    for path in there:
+        refuse_other_kind(path)
+        if _identity(path) in known:
+            raise MembraneError(f"{command}: would write over {path}, which it reads; choose another name")
+        if not force and not is_own(path):
+            raise MembraneError(f"{command}: {path} is there already; choose another name, or pass --force to write over it")
+
+
+def _is_there(path: Path) -> bool:
+    with writing(path):
+        try:
+            path.lstat()
+        except FileNotFoundError:
+            return False
+    return True
+
+
+def _identity(path: Path) -> object:
+    """The same for all names of one file."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return os.path.realpath(path)
+    return found.st_dev, found.st_ino

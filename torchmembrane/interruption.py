@@ -1,0 +1,233 @@
+"""Ctrl-C and SIGTERM end a command soon, wherever it is.
+
+The first signal raises `Interrupted` in the main thread, as Python does for Ctrl-C. A thread sees to it that this ends the
+command: where the exception is lost in a callback, it is raised again; where the main thread is in compiled code that does not
+return, or a second signal comes, the process is ended, what it was writing is removed, and processes that it started are ended.
+"""
+
+import os
+import shutil
+import signal
+import socket
+import sys
+from _thread import interrupt_main
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from select import select
+from threading import Thread, current_thread, main_thread
+from time import monotonic
+from typing import Any, NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SAID = "torchmembrane: interrupted; what is done so far is kept"
+PATIENCE = 1.5
+"""Seconds after which the process is ended, if the main thread has not answered."""
+LONGER = 10.0
+"""The same where a frame is computed, and for what is closed after the exception."""
+AGAIN = 0.5
+"""Of these times, after which the exception is asked for once more."""
+APART = 0.3
+"""Seconds within which several signals are one: groups of processes may be sent it twice."""
+LOOK = 0.05
+"""Seconds between two looks at what became of a signal."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal has come.
+
+    Attributes:
+        number: of the signal.
+    """
+
+    def __init__(self, number: int):
+        super().__init__()
+        self.number = number
+
+
+class _State:
+    """Of the signals of one command, and of what they find.
+
+    Attributes:
+        number: of the first signal; 0: none yet.
+        answered: whether the main thread has it, and ends.
+        raised: whether it has it as an exception.
+        lost: whether its exception went nowhere.
+        held: how often `starting_processes` holds it back.
+    """
+
+    def __init__(self) -> None:
+        self.number, self.held = 0, 0
+        self.answered = self.raised = self.lost = False
+
+    def on_signal(self, number: int, _: object) -> None:
+        """Raise once: later signals must not disturb what is closed because of the first."""
+        self.number = self.number or number
+        if not self.answered and not self.held:
+            self.answered = self.raised = True
+            raise Interrupted(self.number)
+
+    def patience(self) -> float:
+        """Seconds from the signal after which the process is ended."""
+        return LONGER if not _unstoppable and (self.answered or _frames) else PATIENCE
+
+
+_state = _State()
+_unstoppable: set[object] = set()
+_frames: set[object] = set()
+_unfinished: set[Path] = set()
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[Callable[[], int]]:
+    """Within, SIGINT and SIGTERM raise `Interrupted` in the main thread, or end the process. In other threads: nothing.
+
+    Yields:
+        A function that gives the number of the signal whose exception was raised; 0: none.
+    """
+    global _state
+    state = _state = _State()
+    if current_thread() is not main_thread():
+        yield lambda: 0
+        return
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    hook, before = sys.unraisablehook, {number: signal.signal(number, state.on_signal) for number in SIGNALS}
+    fd = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+
+    def on_unraisable(unraisable: Any) -> None:
+        if issubclass(unraisable.exc_type, Interrupted):
+            state.answered, state.lost = False, True
+        else:
+            hook(unraisable)
+
+    sys.unraisablehook = on_unraisable
+    Thread(target=_watch, args=(state, reader), name="signals", daemon=True).start()
+    try:
+        yield lambda: state.number if state.raised else 0
+    finally:
+        signal.set_wakeup_fd(fd)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        sys.unraisablehook = hook
+        writer.close()
+
+
+def answer() -> None:
+    """Say that the main thread has got the signal by other means and ends: it is not disturbed by its exception any more."""
+    _state.answered = True
+
+
+@contextmanager
+def unstoppable() -> Iterator[None]:
+    """Around code that does not return to Python for long, in any thread: a signal ends the process there."""
+    with _within(_unstoppable):
+        yield
+
+
+@contextmanager
+def frame_in_work() -> Iterator[None]:
+    """Around the computation of frames, which may take longer than `PATIENCE` and is waited for."""
+    with _within(_frames):
+        yield
+
+
+@contextmanager
+def unfinished(path: Path) -> Iterator[None]:
+    """Within, a file or folder is work that is removed in the end, also when the process is ended in the midst of it."""
+    _unfinished.add(path)
+    try:
+        yield
+    finally:
+        _remove(path)
+        _unfinished.discard(path)
+
+
+def remove_unfinished() -> None:
+    """Remove what this process has begun to write."""
+    for path in list(_unfinished):
+        _remove(path)
+
+
+@contextmanager
+def starting_processes() -> Iterator[None]:
+    """Around the start of processes: a signal is raised when they have started, and Ctrl-C does not reach them.
+
+    A process that is interrupted while it starts would print a traceback; one that its parent does not know yet would stay.
+    """
+    state = _state
+    state.held += 1
+    try:
+        with _blocked() if hasattr(signal, "pthread_sigmask") else nullcontext():
+            yield
+    finally:
+        state.held -= 1
+    if state.number and current_thread() is main_thread():
+        state.on_signal(state.number, None)
+
+
+def end_process(number: int) -> NoReturn:
+    """Say so, and end this process and those that it has started, without what else Python does at the end, which takes long.
+
+    Args:
+        number: of the signal that has come.
+    """
+    os.write(2, f"{SAID}\n".encode())
+    if "multiprocessing" in sys.modules:
+        for process in sys.modules["multiprocessing"].active_children():
+            process.kill()
+    remove_unfinished()
+    os._exit(128 + number)
+
+
+def _watch(state: _State, reader: socket.socket) -> None:
+    """End the process if the main thread does not, or is told a second time to."""
+    with reader:
+        number = 0
+        while number not in SIGNALS:  # others have handlers of their own
+            if not (come := reader.recv(1)):
+                return
+            number = come[0]
+        begun = latest = monotonic()
+        while True:
+            if select([reader], [], [], LOOK)[0]:
+                if not reader.recv(64):
+                    return
+                if monotonic() - latest > APART:
+                    end_process(number)
+            after = monotonic() - begun
+            if after > state.patience():
+                end_process(number)
+            elif state.lost or (after > AGAIN * state.patience() and not state.answered):
+                state.lost, latest = False, monotonic()
+                interrupt_main(signal.Signals(number))
+
+
+@contextmanager
+def _blocked() -> Iterator[None]:
+    """Within, processes are started that Ctrl-C does not reach: they inherit that this thread does not take its signal."""
+    from multiprocessing.resource_tracker import ensure_running
+
+    ensure_running()  # it would let the signal in again
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+@contextmanager
+def _within(those: set[object]) -> Iterator[None]:
+    mark = object()
+    those.add(mark)
+    try:
+        yield
+    finally:
+        those.discard(mark)
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:  # a folder, or in one that may not be changed
+        shutil.rmtree(path, ignore_errors=True)

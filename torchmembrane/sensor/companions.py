@@ -1,0 +1,33 @@
+"""The files of a sensor on disk: its `.toml`, and the arrays, dots and images beside it."""
+
+from pathlib import Path
+
+from .parts import SHAPES_BY_ARRAYS
+from .table import Table
+
+
+def files_of(path: Path) -> list[Path]:
+    """A sensor's file, and those beside it that it names.
+
+    Args:
+        path: of the `.toml` file.
+
+    Raises:
+        MembraneError: it cannot be read as TOML.
+
+    Example:
+        >>> [file.name for file in files_of(Path("examples/sensor.toml"))]
+        ['sensor.toml', 'rest_grid.npz', 'dots.csv', 'rest.png']
+    """
+    return [path, *Table.from_file(path).named_files()]
+
+
+def companions_of(path: Path) -> list[Path]:
+    """The sensor's file, and all that `write_sensor` may write beside it.
+
+    Example:
+        >>> [file.name for file in companions_of(Path("a.toml"))]
+        ['a.toml', 'a_grid.npz', 'a_heightfield.npz', 'a_dots.csv', 'a_rest.png', 'a_rest.tiff']
+    """
+    endings = *(f"_{shape}.npz" for shape in SHAPES_BY_ARRAYS), "_dots.csv", "_rest.png", "_rest.tiff"
+    return [path, *(path.with_name(path.stem + ending) for ending in endings)]
