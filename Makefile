@@ -1,12 +1,14 @@
 # make demo | make test | make lint (style, types, layers) | make bench | make figures: each sets itself up on a machine with Python 3.11+ only.
 # make test-all: every test, those that `make test` leaves out for their length as well; weekly and before a release.
 # make soak SOAK=HOURS PRESSES=10000 KILLS=10: damaged files for so many hours, jobs killed, random sensors pressed; all hours long.
+# make fuzz FUZZ=HOURS SEED=N: damaged files of every kind, models and bags as well, for so many hours.
 # make test-lowest: the quick start with the lowest versions that pyproject.toml allows, in .venv-lowest.
 # make docs: the site in out/site, links checked.
 # make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
 # make test-cpp | make test-arm: the C++ example (needs cmake); the edge package on an emulated aarch64. On Debian.
 PYTHON ?= python3
 SOAK ?= 1
+FUZZ ?= 1
 PRESSES ?= 10000
 KILLS ?= 10
 SEED ?= $(shell date +%s)
@@ -24,7 +26,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxpro
 	--durations=8
 IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
 
-.PHONY: demo test test-all checked test-lowest lint style types layers bench soak figures docs web test-web test-cpp test-arm clean
+.PHONY: demo test test-all checked test-lowest lint style types layers bench fuzz soak figures docs web test-web test-cpp test-arm clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -72,8 +74,11 @@ layers: $(READY)
 bench: $(READY)
 	$(BIN)/python -m bench.speed.speed --json out/bench/speed.json
 
+fuzz: $(READY)
+	PYTHONPATH=export $(BIN)/python -m bench.robustness.fuzz --hours $(FUZZ) --seed $(SEED) --json out/bench/fuzz.json
+
 soak: $(READY)
-	$(BIN)/python -m bench.robustness.fuzz --hours $(SOAK) --seed $(SEED) --json out/bench/fuzz.json
+	$(MAKE) fuzz FUZZ=$(SOAK) SEED=$(SEED)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[ray]"
 	for way in --format=npz --format=parquet --engine=ray; do $(BIN)/python -m bench.robustness.crash_recovery --kills $(KILLS) $$way || exit 1; done
 	$(BIN)/python -m bench.data.random_sensors out/bench/random --sensors $$(( ($(PRESSES) + 3) / 4 )) --presses 4

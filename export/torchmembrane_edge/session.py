@@ -1,6 +1,7 @@
 """A model, and images to results."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ NEEDED = ("vertices", "displacement", "force", "status")
 """Outputs without which there is no result."""
 PREVIOUS = "previous_"
 MOST_THREADS = 256
+SEAL, DIGEST = b"2ISHA-256: ", 64  # the `doc_string` with which an exported file ends, and the characters that follow
 
 
 class Session:
@@ -40,6 +42,7 @@ class Session:
         options.intra_op_num_threads = threads
         options.log_severity_level = 4  # what is wrong is raised
         model = model_file(model)
+        _refuse_damaged(Path(model))
         try:
             self._session = onnxruntime.InferenceSession(model, options, providers=list(providers))
             known = self._session.get_modelmeta().custom_metadata_map
@@ -139,6 +142,14 @@ def model_file(model: str | Path) -> str:
         cause = "a folder" if path.is_dir() else "no regular file" if path.exists() else "no such file"
         raise EdgeError(f"{printable(path)}: {cause}; expected a model from `torchmembrane export`, check the path")
     return str(path)
+
+
+def _refuse_damaged(model: Path) -> None:
+    """Refuse a file whose content is not that of the digest at its end; a file without a digest is not checked."""
+    content, seal, digest = model.read_bytes().rpartition(SEAL)
+    if len(digest) == DIGEST and seal and sha256(content).hexdigest().encode() != digest:
+        cause = "the file is damaged (its SHA-256 digest is wrong); copy it again, or export it again"
+        raise EdgeError(f"{printable(model)}: {cause}")
 
 
 def grey(images: Any, bits: int | None = None) -> np.ndarray:

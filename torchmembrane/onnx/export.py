@@ -5,6 +5,7 @@ The reconstructor is called with `Value`s: what it and its parts mark as `traced
 
 import json
 from collections.abc import Callable, Sequence
+from hashlib import sha256
 from inspect import unwrap
 from pathlib import Path
 from types import MethodType
@@ -29,6 +30,7 @@ from .torch_internals import tree_flatten, tree_leaves, tree_map, tree_unflatten
 from .trace import traced_model
 
 FORMAT = 1
+SEAL = "SHA-256: "
 CHECK, NODES = 0.65, 11_500  # share of the time before the check, and how many nodes are traced, of the default estimator
 EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
 
@@ -174,7 +176,8 @@ def export(
     Standard operators only, batch free, float32, but for the solve of slack sheets, float64. Run on the sensor at rest and
     pressed, both simulated, it must give torch's statuses, and vertices within 3e-5 of the surface's size. The model's metadata
     hold `format`, `status_texts` and `mesh` (the fields of `Mesh`) as JSON, and `bits` where the sensor's camera states them:
-    images of 16 bits are then divided by `2^bits - 1` before they are given to the model.
+    images of 16 bits are then divided by `2^bits - 1` before they are given to the model. The file ends in its digest
+    (`sealed`).
 
     Args:
         reconstructor: the sensor's.
@@ -207,8 +210,22 @@ def export(
     progress(CHECK, "check against torch")
     checked(model.SerializeToString(), reconstructor)
     with whole_file(path) as partial:
-        onnx.save(model, partial)
+        partial.write_bytes(sealed(model.SerializeToString()))
     return model
+
+
+def sealed(content: bytes) -> bytes:
+    """A model's bytes, followed by its `doc_string`, which holds the SHA-256 digest of the bytes before it.
+
+    The fields of a protocol buffer may come in any order, so this is the same model. A damaged weight is found before the model
+    is run. Programs that write the model anew put the `doc_string` before the graph; their files are not checked.
+
+    Example:
+        >>> onnx.ModelProto.FromString(sealed(b"")).doc_string[:20]
+        'SHA-256: e3b0c44298f'
+    """
+    seal: bytes = onnx.ModelProto(doc_string=f"{SEAL}{sha256(content).hexdigest()}").SerializeToString()
+    return content + seal
 
 
 def _finished(tracer: Tracer, inputs: list[Known], result: Any, reconstructor: Reconstructor) -> onnx.ModelProto:
