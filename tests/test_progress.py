@@ -130,7 +130,11 @@ def heavy(*_, **__):
         (lambda sensor, told: rest.rest_from_image(sensor, IMAGE, progress=told), rest, "fine_surface"),
         (lambda sensor, told: views.rest_from_views(sensor, [IMAGE] * 2, MOTIONS, 0.01, progress=told), views, "fine_surface"),
         (lambda sensor, told: depth.rest_from_depth(sensor, IMAGE, IMAGE, progress=told), depth, "fine_surface"),
-        (lambda sensor, told: material.material_from_images(sensor, IMAGE, progress=told), material, "_reconstructor"),
+        (
+            lambda sensor, told: material.material_from_images(sensor, IMAGE[None, None], progress=told),
+            material,
+            "_reconstructor",
+        ),
         (lambda sensor, told: spec_sheet(sensor, noise=40.0, progress=told), measure, "Rig"),
         (lambda sensor, told: export.export(Reconstructor(sensor), "a", progress=told), Reconstructor, "reconstruct_grey"),
         (lambda sensor, told: dataset.make_frames(None, dataset.Plan(), 3, FRAMES, progress=told), dataset, "_in_processes"),

@@ -126,6 +126,10 @@ def words_of_warnings() -> list[str]:
             worded = call.args[0]
             if isinstance(worded, ast.Call):
                 worded = functions[ast.unparse(worded.func)]
+            if isinstance(worded, ast.Name):
+                worded = next(
+                    node.value for node in tree.body if isinstance(node, ast.Assign) and node.targets[0].id == worded.id
+                )
             constants = [node.value for node in ast.walk(worded) if isinstance(node, ast.Constant)]
             found.append("\n".join(text for text in constants if isinstance(text, str)))
     return found

@@ -66,7 +66,7 @@ def told(monkeypatch):
     monkeypatch.setattr(weight_module, "Reconstructor", Made)
     material = weight_module.MaterialFit(made, *[np.zeros(2)] * 6)
     monkeypatch.setattr(weight_module, "material_from_images", lambda *_, **__: material)
-    return change, lambda weight: weight_module.material_from_weight(sensor, torch.zeros(3, 1, 2, 2), weight)
+    return change, lambda weight: weight_module.material_from_weight(sensor, torch.zeros(3, 1, 480, 640), weight)
 
 
 def test_the_modulus_is_in_proportion_to_the_weight(told):

@@ -197,5 +197,7 @@ def _in_words(hint: Any) -> str:
         return "a dict"
     if isinstance(origin, type) and issubclass(origin, Iterable):
         return f"a list of {_in_words(inner[0]).removeprefix('a ').removeprefix('an ')}s"
+    if origin is type:
+        return f"a subclass of {inner[0].__name__}"
     name = getattr(hint, "__name__", str(hint))
     return WORDS.get(hint) or WORDS.get(name) or f"a {name}"

@@ -110,9 +110,9 @@ def material_from_images(
     Raises:
         MembraneError: an image shows too few markers, or as of `material_from_pixels`.
     """
+    progress(0.0, f"markers of {len(images)} images")
     reconstructor = _reconstructor(sensor)
     grey = reconstructor.grey(images)
-    progress(0.0, f"markers of {len(grey)} images")
     with torch.no_grad():
         flow = reconstructor.observer.judge(*reconstructor.observer(grey))
     displacement, confidence, _, status = flow

@@ -14,6 +14,7 @@ from ..errors import MembraneError
 from .jpeg import is_whole
 from .levels import HIGHEST
 from .safe_read import DAMAGE, in_one_line
+from .tiff import refuse_damaged_page, refuse_displaced
 
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 MOST_PIXELS = 2**25
@@ -136,7 +137,7 @@ def stored(image: Image.Image, size: tuple[int, int] | None = None) -> Stored:
 
 
 def refuse_damaged(image: Image.Image, content: bytes) -> None:
-    """Refuse what decoding passes over: wrong checksums of a PNG, what libjpeg remarks of a JPEG, lengths of a WebP.
+    """Refuse what decoding passes over: wrong checksums of PNG and TIFF, what libjpeg remarks of a JPEG, lengths of a WebP.
 
     Args:
         image: that was loaded.
@@ -148,6 +149,9 @@ def refuse_damaged(image: Image.Image, content: bytes) -> None:
     if image.format == "PNG":
         with Image.open(BytesIO(content), formats=FORMATS) as twin:
             twin.verify()
+    if image.format == "TIFF":
+        refuse_damaged_page(image.tag_v2, file := BytesIO(content))  # type: ignore[attr-defined]
+        refuse_displaced(image.tag_v2, file)  # type: ignore[attr-defined]
     if image.format == "WEBP" and not _fills_its_file(content):
         raise ValueError("its chunks do not fill the file")
     if image.format in ("JPEG", "MPO") and image.mode in ("L", "RGB") and not is_whole(content):

@@ -15,6 +15,7 @@ from .atomic import whole_file
 from .decoder import opened, pictures, refuse_damaged, stored
 from .levels import refuse_beyond, white_of
 from .safe_read import DAMAGE, in_one_line, read_bytes, regular_size
+from .tiff import refuse_damaged_page
 
 MOST_IMAGE_BYTES, MOST_STACK_BYTES = 2**28, 2**32
 """Of a file; of a TIFF of several pages, which are read one by one."""
@@ -120,7 +121,7 @@ def picture_count(path: Path, most: int = MOST_PICTURES) -> int:
     """
     found = 0
     try:
-        with _opened_stack(path) as image:
+        with _opened_stack(path) as (image, _):
             for _ in islice(pictures(image), most):
                 found += 1
     except MembraneError:  # reading them says what it is
@@ -143,13 +144,13 @@ def stack_images(path: Path, size: tuple[int, int], bits: int | None = None) -> 
         MembraneError: the file is no image, too large, or damaged so that no further picture is found.
     """
     number = 0
-    with _opened_stack(path) as image:
+    with _opened_stack(path) as (image, file):
         content = b"" if image.format == "TIFF" else _content(path)
         try:
-            if image.format != "MPO":
+            if image.format not in ("MPO", "TIFF"):
                 refuse_damaged(image, content)
             for _ in islice(pictures(image), MOST_PICTURES):
-                yield _picture(image, size, bits, content)
+                yield _picture(image, size, bits, file, content)
                 number += 1
         except DAMAGE as error:
             if isinstance(error, MembraneError):
@@ -157,9 +158,13 @@ def stack_images(path: Path, size: tuple[int, int], bits: int | None = None) -> 
             raise MembraneError(f"damaged, or ends early, after {number} pictures ({in_one_line(error)})") from error
 
 
-def _picture(image: Image.Image, size: tuple[int, int], bits: int | None, content: bytes) -> np.ndarray | MembraneError:
+def _picture(
+    image: Image.Image, size: tuple[int, int], bits: int | None, file: IO[bytes], content: bytes
+) -> np.ndarray | MembraneError:
     try:
         grey = _grey_of(image, size, bits)
+        if image.format == "TIFF":
+            refuse_damaged_page(image.tag_v2, file)  # type: ignore[attr-defined]
         if image.format == "MPO":
             refuse_damaged(image, content[image.offset :])  # type: ignore[attr-defined]
         return grey
@@ -200,8 +205,8 @@ def _opened_single(path: str | Path, content: bytes) -> Iterator[Image.Image]:
 
 
 @contextmanager
-def _opened_stack(path: Path) -> Iterator[Image.Image]:
-    """The image of a file that is read as far as pictures are asked for."""
+def _opened_stack(path: Path) -> Iterator[tuple[Image.Image, IO[bytes]]]:
+    """The image of a file that is read as far as pictures are asked for, and the file."""
     expected = "a readable image file"
     try:
         regular_size(path, MOST_STACK_BYTES, expected)
@@ -209,7 +214,7 @@ def _opened_stack(path: Path) -> Iterator[Image.Image]:
     except OSError as error:
         raise MembraneError(f"{path}: not readable ({in_one_line(error)}); expected {expected}") from error
     with file, opened(path, file) as image:
-        yield image
+        yield image, file
 
 
 def mean_image(paths: Sequence[Path], bits: int | None = None) -> np.ndarray:

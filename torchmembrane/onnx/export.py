@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from ..control_flow import FUNCTIONS, Value
 from ..errors import MembraneError, check_arguments
-from ..files.atomic import whole_file
+from ..files.atomic import write_bytes
 from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
 from ..results.status import Status
@@ -209,8 +209,7 @@ def export(
     model = _finished(tracer, inputs, result, reconstructor)
     progress(CHECK, "check against torch")
     checked(model.SerializeToString(), reconstructor)
-    with whole_file(path) as partial:
-        partial.write_bytes(sealed(model.SerializeToString()))
+    write_bytes(path, sealed(model.SerializeToString()))
     return model
 
 

@@ -78,7 +78,7 @@ def border_unknowns(
     """`lambda` and `r` of `solve_bordered`, `[...]` each, from the products of the loads (rows) with their solutions, `[..., 3,
     3]`, and the other arguments."""
     nMn, nMg, nMm, _, _, _, _, mMg, mMm = products.flatten(-2).unbind(-1)
-    scale = nMn.clamp_min(torch.finfo(nMn.dtype).tiny).rsqrt()  # of the multiplier: the determinant goes with length^10
+    scale = nMn.abs().clamp_min(torch.finfo(nMn.dtype).tiny).rsqrt()  # of the multiplier: the determinant goes with length^10
     border, of_border = scale * (compliance - nMm), scale * (target + nMg)
     rise, multiplier = symmetric_solution(corner - mMm, border, -scale * scale * nMn, load + mMg, of_border)
     return scale * multiplier, rise
