@@ -58,8 +58,10 @@ def test_damaged_results_are_said_when_a_folder_is_opened(images, tmp_path):
     np.savez(tmp_path / "out" / "of_somebody.npz", values=np.ones(3))  # no result, and none that is damaged
     for name in ("i1", "i4"):
         (tmp_path / "out" / f"{name}.npz").write_bytes(b"PK")
-    with pytest.warns(UserWarning, match=r"out/i1.npz and 1 more: damaged, and refused when read; run the same reconstruct"):
+    words = r"out/i1.npz and 1 more: damaged, and refused when read; run the same reconstruct"
+    with pytest.warns(UserWarning, match=words) as said:
         assert len(read_results(tmp_path / "out")) == 5
+    assert said[0].filename == __file__  # the line of the caller
 
 
 def test_a_dataset_with_a_status_of_a_later_version_is_refused_by_its_part(images, tmp_path):

@@ -120,9 +120,7 @@ def words_of_warnings() -> list[str]:
     for path in sorted((ROOT / "torchmembrane").rglob("*.py")):
         tree = ast.parse(path.read_text())
         functions = {node.name: node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
-        for call in (
-            node for node in ast.walk(tree) if isinstance(node, ast.Call) and ast.unparse(node.func) == "warnings.warn"
-        ):
+        for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call) and ast.unparse(node.func) == "warn_user"):
             worded = call.args[0]
             if isinstance(worded, ast.Call):
                 worded = functions[ast.unparse(worded.func)]

@@ -183,8 +183,9 @@ def test_frequent_mistakes_are_answered_in_words(parts, call, said):
 def test_three_planes_without_a_batch_are_not_taken_for_three_frames_without_a_word(parts):
     _, made, image, _ = parts
     planes = np.stack([image] * 3)
-    with pytest.warns(UserWarning, match=r"taken for three grey frames.*give image\[None\]"):
-        assert len(made.grey(planes)) == 3
+    with pytest.warns(UserWarning, match=r"taken for three grey frames.*give image\[None\]") as said:
+        assert len(made.grey(planes)) == len(made(planes).status) == 3
+    assert {warning.filename for warning in said} == {__file__}  # the line of the caller
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(made.grey(planes[None])) == 1 and len(made.grey(planes[:, None])) == 3

@@ -1,6 +1,5 @@
 """What a `state_dict` keeps: the camera, the material and what follows from it; all else is rebuilt from the sensor."""
 
-import warnings
 from typing import Any
 
 import torch
@@ -8,6 +7,7 @@ from torch import Tensor, nn
 
 from .camera.model import Camera
 from .errors import MembraneError
+from .user_warnings import warn_user
 
 OF_MATERIAL = ("prestretch", "c1", "c2", "rest_pressure", "rest_load")
 STIFFNESS, FOLLOWING = ("c1", "c2"), ("rest_pressure", "rest_load")
@@ -79,9 +79,8 @@ def _check_others(names: list[str]) -> None:
             "the state of this sensor: build the Reconstructor from that sensor's file"
         )
     if said := [name for name, end in zip(names, last, strict=True) if end not in FOLLOWING]:
-        warnings.warn(
+        warn_user(
             f"Reconstructor.load_state_dict: {', '.join(said)} differ from this sensor's; the state's are used from now on",
-            stacklevel=2,
         )
 
 

@@ -1,6 +1,5 @@
 """One stream of images: dots are followed from frame to frame, and a rest state that has aged is noticed."""
 
-import warnings
 from math import isfinite
 
 import numpy as np
@@ -13,6 +12,7 @@ from .markers.drift import ENOUGH, DriftWatch
 from .reconstruct import Reconstructor
 from .results.reconstruction import Reconstruction
 from .results.status import Status
+from .user_warnings import warn_user
 
 STEADY = 100
 """Frames in which a contact holds still from the beginning before it is said that it may be a drift."""
@@ -127,7 +127,7 @@ class Tracker:
         rest = self.reconstructor.observer.rest_of(images)
         if self._is_pressed(result):
             force = float(result.force[0].norm()) if self.reconstructor.finds_tractions else float("nan")
-            warnings.warn(press_in_words(force, self.reconstructor.sensor.force_unit), stacklevel=2)
+            warn_user(press_in_words(force, self.reconstructor.sensor.force_unit))
         self._rest_pixels, self._before = rest.pixels, None
         self._watch_from(rest.covariance)
 
@@ -158,7 +158,7 @@ class Tracker:
             self._steady.add(*moved)
         if not self._said and (self._is_steady() or self._watch.drift().is_certain):
             self._said = True
-            warnings.warn(drift_in_words(self.drift, self._camera_motion(result), self._is_steady()), stacklevel=3)
+            warn_user(drift_in_words(self.drift, self._camera_motion(result), self._is_steady()))
 
     def _is_steady(self) -> bool:
         """Whether a contact that was there from the beginning has held still, and moves the markers as a drift does."""

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +9,7 @@ from ..errors import MembraneError
 from ..files.atomic import make_folder, write_text
 from ..files.safe_read import read_text
 from ..sensor.sensor import Sensor
+from ..user_warnings import warn_user
 from .spec_sheet import Effort, Outcome, PairTrial, PressTrial, RestTrial
 
 MOST_BYTES = 2**26
@@ -60,7 +60,7 @@ class FinishedSeries(NamedTuple):
             make_folder(self.path.parent)
             write_text(self.path, json.dumps(self.outcomes))
         except MembraneError as error:
-            warnings.warn(f"{error}; an interruption loses what is done", stacklevel=2)
+            warn_user(f"{error}; an interruption loses what is done")
 
     def remove(self) -> None:
         """Remove the file, as the sheet is done."""

@@ -1,6 +1,5 @@
 """Pose of the rest surface before the camera, and the dots on it, from one rest image (section 5.2)."""
 
-import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ from ..markers.spacing import neighbours
 from ..progress import Progress, silent
 from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
+from ..user_warnings import warn_user
 from .fit import Fit, fit, outliers, outline_centres, rotations, with_common_errors
 from .surface import dot_outlines, fine_surface, frames_at, recalibrated, unit_shapes
 
@@ -140,11 +140,10 @@ def _warn_of_press(sensor: Sensor, pixels: np.ndarray, residuals: np.ndarray) ->
     """Say where residuals are a displacement of the surface, not errors of single dots."""
     common, limit = common_residual(pixels, residuals), PRESSED * float(np.hypot(*sensor.camera.image_size))
     if common > limit:
-        warnings.warn(
+        warn_user(
             f"calibrate rest: neighbouring dots lie off the model together, {common:.2f} px rms; expected at most {limit:.2f}: "
             "something presses the membrane in this image, or its shape is not the designed: give an image without contact, "
             "or use views or depth",
-            stacklevel=3,
         )
 
 

@@ -11,6 +11,7 @@ from threading import Event, Thread, current_thread, main_thread
 from typing import TYPE_CHECKING, Any
 
 from ..live.background import Background
+from ..user_warnings import warn_user
 from .arguments import (
     add_command,
     add_device,
@@ -187,7 +188,7 @@ def _watchers(
 
 
 def _warn(error: BaseException) -> None:
-    warnings.warn(f"{error}; frames that cannot be kept are left out and counted", stacklevel=1)
+    warn_user(f"{error}; frames that cannot be kept are left out and counted")
 
 
 def _left_out(later: "Background[Seen]") -> str:

@@ -1,6 +1,5 @@
 """Images as cameras give them, as one grey batch."""
 
-import warnings
 from typing import Literal
 
 import numpy as np
@@ -9,6 +8,7 @@ from torch import Tensor
 
 from ..control_flow import can_sync
 from ..errors import MembraneError
+from ..user_warnings import warn_user
 from .images import GREY
 from .levels import refuse_beyond, white_of
 
@@ -100,7 +100,7 @@ def _planes(pixels: Tensor, size: tuple[int, int]) -> list[Tensor]:
         return [pixels[None]]
     if shape[-2:] == size and len(shape) == 3:
         if not torch.compiler.is_compiling() and shape[0] == 3:
-            warnings.warn(THREE_FRAMES, stacklevel=2)
+            warn_user(THREE_FRAMES)
         return [pixels]
     if shape[-2:] == size and len(shape) == 4 and shape[1] in (1, 3):
         return list(pixels.unbind(1))

@@ -1,7 +1,6 @@
 """What a stream showed, kept: images as they were captured, results as `torchmembrane reconstruct` writes them, times."""
 
 import csv
-import warnings
 from pathlib import Path
 from types import TracebackType
 
@@ -17,6 +16,7 @@ from ..jobs.inputs import Inputs
 from ..jobs.result_folder import ResultFolder
 from ..results.npz import Stored
 from ..results.store import Mesh
+from ..user_warnings import warn_user
 from .loop import Seen
 
 IMAGES, TIMES = "images", "times.csv"
@@ -64,7 +64,7 @@ class Recording:
             said = f"--record {self.folder}: {failure.strerror or failure}"
             if error is None:
                 raise MembraneError(f"{said}; the recording cannot be finished, what was written before is kept") from failure
-            warnings.warn(f"{said}; the recording cannot be finished", stacklevel=2)
+            warn_user(f"{said}; the recording cannot be finished")
 
     def keep(self, seen: Seen) -> None:
         """Write a frame."""

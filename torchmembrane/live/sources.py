@@ -1,7 +1,6 @@
 """Images as they come: of a camera, or of files at a pace."""
 
 import time
-import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +13,7 @@ from ..files.optional import load_opencv
 from ..files.order import in_order
 from ..files.video import picture_rate, picture_values, video_pictures
 from ..jobs.inputs import find_inputs
+from ..user_warnings import warn_user
 
 MOST_MISSED = 100
 """Reads of a camera that fail in a row before it is given up."""
@@ -132,7 +132,7 @@ def _of_files(paths: Iterable[Path], size: tuple[int, int], rate: float, bits: i
 
 
 def _leave_out(said: object) -> None:
-    warnings.warn(f"{said}; left out", stacklevel=4)
+    warn_user(f"{said}; left out")
 
 
 def paced(images: Iterable[Timed]) -> Iterator[np.ndarray]:

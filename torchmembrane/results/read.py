@@ -1,6 +1,5 @@
 """Results read back: a folder of `torchmembrane reconstruct` as a sequence of frames that are loaded one by one."""
 
-import warnings
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any, NamedTuple
 from ..errors import MembraneError, check_arguments, expect
 from ..files.optional import load_pandas
 from ..files.order import in_order
+from ..user_warnings import warn_user
 from .frame_table import PART_ROWS, read_part
 from .frames import frames_of
 from .npz import load_frame, stack_frames
@@ -119,7 +119,7 @@ class Results:
         self.names = sorted(self._frames.names(), key=in_order)
         if damaged := self._frames.damaged:
             more = f" and {len(damaged) - 1} more" if damaged[1:] else ""
-            warnings.warn(f"{damaged[0]}{more}: damaged, and refused when read; {AGAIN}", stacklevel=3)
+            warn_user(f"{damaged[0]}{more}: damaged, and refused when read; {AGAIN}")
         self._known = frozenset(self.names)
         if not self.names:
             raise MembraneError(f"{folder}: no frames; expected results of `torchmembrane reconstruct`")

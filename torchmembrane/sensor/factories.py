@@ -1,10 +1,10 @@
 """From a sensor to the mechanics of its membrane: elastic energy, cavity."""
 
-import warnings
 from typing import NamedTuple
 
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..surface.membrane import Membrane
+from ..user_warnings import warn_user
 from .sensor import Sensor
 
 
@@ -79,9 +79,8 @@ def cavity_filling(sensor: Sensor, membrane: Membrane, *, warn: bool = False) ->
         return CavityFilling(sensor.cavity.filling)
     if sensor.force_unit == "relative":
         if warn:
-            warnings.warn(
+            warn_user(
                 f"sensor {sensor.name!r}: a gas without shear_modulus and thickness acts as a liquid (volume kept)",
-                stacklevel=3,
             )
         return CavityFilling("liquid")
     return CavityFilling("gas", (sensor.gas_pressure, sensor.cavity.volume or membrane.cavity_volume))

@@ -1,0 +1,26 @@
+"""Warnings that name the line of the caller's program, however deep in this package they arise."""
+
+import sys
+import warnings
+
+INSIDE = ("torchmembrane", "torch")
+"""Packages whose lines tell a caller nothing."""
+
+
+def warn_user(message: str) -> None:
+    """Warn at the innermost line outside this package and torch.
+
+    Args:
+        message: what happened, and the remedy.
+
+    Example:
+        >>> with warnings.catch_warnings(record=True) as said:
+        ...     warnings.simplefilter("always")
+        ...     warn_user("the rest image has aged")
+        >>> str(said[0].message)
+        'the rest image has aged'
+    """
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in INSIDE:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, stacklevel=level)
