@@ -19,6 +19,8 @@ import pytest
 from onnx import TensorProto, helper
 from PIL import Image
 
+from torchmembrane.onnx.export import sealed
+
 ROOT = Path(__file__).parents[1]
 SIZE = WIDTH, HEIGHT = 8, 6
 GREY = (np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) * 5).astype(np.uint8)
@@ -129,6 +131,27 @@ def model(tmp_path):
     path = tmp_path / "model.onnx"
     path.write_bytes(model_of(metadata()))
     return path
+
+
+@pytest.mark.parametrize("place", [0.01, 0.5, 0.8])
+def test_a_model_file_with_a_flipped_bit_is_refused(edge, tmp_path, place):
+    """Most of a file are weights: a wrong one would pass for a right one."""
+    content = bytearray(sealed(model_of(metadata())))
+    content[int(place * len(content))] ^= 64
+    damaged = tmp_path / "model.onnx"
+    damaged.write_bytes(content)
+    with pytest.raises(edge.EdgeError, match=f"{damaged}: the file is damaged .* export it again"):
+        edge.Session(damaged)
+
+
+def test_a_model_that_another_program_has_written_anew_is_not_checked(edge, tmp_path):
+    whole, changed = tmp_path / "whole.onnx", tmp_path / "changed.onnx"
+    whole.write_bytes(sealed(model_of(metadata())))
+    model = onnx.load(whole)
+    assert model.doc_string.startswith("SHA-256: ")
+    helper.set_model_props(model, metadata() | {"checked by": "us"})
+    onnx.save(model, changed)
+    assert edge.Session(changed).name == edge.Session(whole).name == "by hand"
 
 
 @pytest.fixture
