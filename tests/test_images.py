@@ -132,6 +132,18 @@ def test_what_the_decoder_remarks_of_a_jpeg_is_an_error(tmp_path, photograph, mo
         read_image(path)
 
 
+def test_a_quantisation_step_of_zero_is_damage(tmp_path, photograph):
+    """The standard has steps from 1 on; without the lowest frequency along a column, all dots are displaced alike."""
+    photograph.save(tmp_path / "a.jpg")
+    content = bytearray((tmp_path / "a.jpg").read_bytes())
+    at = content.index(b"\xff\xdb") + 7
+    assert content[at] > 0
+    content[at] = 0
+    (tmp_path / "a.jpg").write_bytes(content)
+    with pytest.raises(MembraneError, match="a.jpg: not readable as an image .a quantisation table of the JPEG holds 0"):
+        read_image(tmp_path / "a.jpg")
+
+
 def test_every_format_is_read_and_its_first_half_is_not(tmp_path, photograph):
     written = {"a.png": {}, "a.jpg": {}, "a.bmp": {}, "a.tiff": {}, "a.webp": dict(lossless=True)}
     for name, options in {**written, "b.tiff": dict(compression="tiff_lzw")}.items():

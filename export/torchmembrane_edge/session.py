@@ -148,7 +148,7 @@ def _refuse_damaged(model: Path) -> None:
     """Refuse a file whose content is not that of the digest at its end; a file without a digest is not checked."""
     content, seal, digest = model.read_bytes().rpartition(SEAL)
     if len(digest) == DIGEST and seal and sha256(content).hexdigest().encode() != digest:
-        cause = "the file is damaged (its SHA-256 digest is wrong); copy it again, or export it again"
+        cause = "damaged, its SHA-256 digest is wrong; expected the file as it was exported: copy it again, or export it again"
         raise EdgeError(f"{printable(model)}: {cause}")
 
 

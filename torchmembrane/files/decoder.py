@@ -154,8 +154,11 @@ def refuse_damaged(image: Image.Image, content: bytes) -> None:
         refuse_displaced(image.tag_v2, file)  # type: ignore[attr-defined]
     if image.format == "WEBP" and not _fills_its_file(content):
         raise ValueError("its chunks do not fill the file")
-    if image.format in ("JPEG", "MPO") and image.mode in ("L", "RGB") and not is_whole(content):
-        raise ValueError("corrupt JPEG data")
+    if image.format in ("JPEG", "MPO"):
+        if any(0 in steps for steps in image.quantization.values()):  # type: ignore[attr-defined]
+            raise ValueError("a quantisation table of the JPEG holds 0")
+        if image.mode in ("L", "RGB") and not is_whole(content):
+            raise ValueError("corrupt JPEG data")
 
 
 def _fills_its_file(riff: bytes) -> bool:
