@@ -1,6 +1,8 @@
 """Frames come in the order of the numbers in their names, wherever order counts."""
 
 import csv
+import os
+import warnings
 from collections import namedtuple
 from itertools import pairwise
 from pathlib import Path
@@ -83,6 +85,26 @@ def test_the_first_frames_at_rest_are_those_of_the_lowest_numbers(tmp_path, smal
     )
     recording_rest(reconstructor, ["first:3"], find_inputs([tmp_path]))
     assert [round(float(level)) for level in taken] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("apart, said", [(0.2, False), (3.0, True)])
+def test_times_that_go_against_the_numbers_are_said(tmp_path, small_sensor, monkeypatch, apart, said):
+    """Of the file with the highest number, which is the oldest; of copies, which are made at once, nothing is said."""
+    reconstructor = tm.Reconstructor.from_file(small_sensor / "sensor.toml")
+    paths = written(tmp_path, SERIES["no zeros"], reconstructor.camera.image_size)
+    for k, path in enumerate([paths[-1], *paths[:-1]]):
+        os.utime(path, (1e9 + k * apart / 11, 1e9 + k * apart / 11))
+    monkeypatch.setattr(reconstructor.observer, "rest_of", lambda images: Rest(None))
+    words = (
+        f"{paths[-1].name} follows {paths[-2].name} by the numbers in their names, but is older by 3 s; the order of the names"
+    )
+    for take in (
+        lambda: recording_rest(reconstructor, ["first:3"], find_inputs([tmp_path])),
+        lambda: list(folder_images(tmp_path, reconstructor.camera.image_size, 30.0)),
+    ):
+        with pytest.warns(UserWarning, match=words) if said else warnings.catch_warnings():
+            warnings.simplefilter("always" if said else "error")
+            take()
 
 
 def test_results_and_their_summary_are_in_order(tmp_path, small_sensor):

@@ -46,19 +46,22 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: Namespace) -> int:
     """Draw the results; returns the exit code."""
+    from ..files.order import warn_of_times
+    from ..live.recording import times_of
     from ..results.read import read_results
 
     rerun = wants_rerun(arguments)
     _spare_files(arguments, arguments.out, arguments.video_out, arguments.save, arguments.ply)
     if not rerun and arguments.video_out is None:
         return _draw(arguments)
-    results = read_results(arguments.result)
+    results, times = read_results(arguments.result), times_of(arguments.result)
+    warn_of_times((name, times[name]) for name in results.names if name in times)
     width, height = results.mesh.image_size.tolist()
     images = FrameImages(images_in(arguments.images or arguments.result / "images"), (width, height))
     if arguments.video_out is not None:
         draw_film(results, images, arguments.video_out, arguments.rate)
     if rerun:
-        _show(results, images, arguments.save)
+        _show(results, images, times, arguments.save)
     return 0
 
 
@@ -77,11 +80,9 @@ def _spare_files(arguments: Namespace, *targets: Path | None) -> None:
     refuse_overwriting("view", written, read, arguments.force, partial(drawn_by, "view"))
 
 
-def _show(results: "Results", images: FrameImages, save: Path | None) -> None:
+def _show(results: "Results", images: FrameImages, times: dict[str, float], save: Path | None) -> None:
     from ..integrations.rerun import RerunLog
-    from ..live.recording import times_of
 
-    times = times_of(results.folder)
     with RerunLog(results.mesh, save) as log:
         for number, (name, frame) in enumerate(zip(results.names, results, strict=True)):
             log.add(number, frame, images.of(name), times.get(name))

@@ -1,9 +1,14 @@
-"""The order of frames by their names."""
+"""The order of frames by their names, and whether their times have another one."""
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
+from ..user_warnings import warn_user
+
 NUMBER = re.compile("([0-9]+)")
+APART = 1.0
+"""Seconds: files of which one is older by less may have been written at once, as copies are."""
 
 
 def in_order(name: str | Path) -> tuple[list[tuple[int, str]], str]:
@@ -16,3 +21,29 @@ def in_order(name: str | Path) -> tuple[list[tuple[int, str]], str]:
     parts = NUMBER.split(str(name))  # texts at even places, numbers at odd ones
     digits = [part.lstrip("0") for part in parts]
     return [(len(digits[k]), digits[k]) if k % 2 else (-1, part) for k, part in enumerate(parts)], str(name)
+
+
+def warn_of_times(frames: Iterable[tuple[str, float]]) -> None:
+    """Warn where frames that are taken in the order of their names were made in another order.
+
+    Args:
+        frames: name and time, s, of each, in the order in which they are taken.
+
+    Example:
+        >>> warn_of_times([("f_9", 100.0), ("f_10", 103.0), ("f_11", 102.5)])  # too little apart to tell
+    """
+    latest, at = "", -float("inf")
+    for name, time in frames:
+        if time < at - APART:
+            warn_user(
+                f"{name} follows {latest} by the numbers in their names, but is older by {at - time:.0f} s; the order of the "
+                "names is taken. Where the other one is meant, rename the files"
+            )
+            return
+        if time > at:
+            latest, at = name, time
+
+
+def warn_of_file_times(paths: Iterable[Path]) -> None:
+    """The same by the times at which files were last changed; files that are not there are passed over."""
+    warn_of_times((path.name, path.stat().st_mtime) for path in paths if path.exists())

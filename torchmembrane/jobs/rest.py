@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError
+from ..files.order import warn_of_file_times
 from .decode import Source, sources
 from .inputs import Inputs, find_inputs
 
@@ -33,6 +34,7 @@ def recording_rest(reconstructor: "Reconstructor", arguments: list[str], inputs:
         count = arguments[0].removeprefix(FIRST)
         if len(arguments) > 1 or not count.isdigit() or not int(count):
             raise MembraneError(f"--rest {' '.join(arguments)}: expected images, or first:N with N of at least 1")
+        warn_of_file_times(inputs.images)
         chosen = islice(sources(inputs, reconstructor), int(count))
     else:
         chosen = sources(find_inputs(arguments), reconstructor)

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import MembraneError
 from ..files.images import picture_count, stack_images
 from ..files.optional import load_opencv
-from ..files.order import in_order
+from ..files.order import in_order, warn_of_file_times
 from ..files.video import picture_rate, picture_values, video_pictures
 from ..jobs.inputs import find_inputs
 from ..user_warnings import warn_user
@@ -113,7 +113,9 @@ def folder_images(folder: Path, size: tuple[int, int], rate: float, bits: int | 
         MembraneError: the folder holds no images.
     """
     found = find_inputs([folder])
-    yield from _of_files(sorted([*found.images, *found.videos], key=in_order), size, rate, bits)
+    paths = sorted([*found.images, *found.videos], key=in_order)
+    warn_of_file_times(paths)
+    yield from _of_files(paths, size, rate, bits)
 
 
 def _of_files(paths: Iterable[Path], size: tuple[int, int], rate: float, bits: int | None) -> Iterator[Timed]:
