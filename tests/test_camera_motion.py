@@ -123,6 +123,16 @@ def test_a_bumped_camera_is_found_and_taken_out(fingertip, name):
     assert (got.pixels - clean.pixels).norm(dim=-1).median() > 0.4  # as measured
 
 
+@pytest.mark.parametrize("share, status", [(0.02, Status.OK), (0.05, Status.UNEXPLAINED)])
+def test_an_image_that_is_shifted_farther_than_a_camera_moves_is_doubted(fingertip, share, status):
+    """As one of which bytes are lost, or a packet of its camera: it is kept, as a camera may have come off."""
+    reconstructor, _, frame = fingertip
+    shift = share * np.hypot(*reconstructor.image_size) / 2
+    with torch.no_grad():
+        got = reconstructor(seen(frame.image, shift=(0, shift)))
+    assert got.status.tolist() == [status] and abs(float(got.camera_motion[0, 0]) - shift) < 0.5
+
+
 def test_a_camera_that_stays_is_left_alone(fingertip):
     reconstructor, simulator, frame = fingertip
     images = [simulator.image(simulator.membrane.rest, np.random.default_rng(k)) for k in range(4)] + [frame.image]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .camera.motion import in_pixels, in_words, shift_of
+from .camera.motion import in_pixels, in_words, is_displaced, shift_of
 from .control_flow import in_inference_mode, traced
 from .errors import MembraneError, check_arguments, expect
 from .estimators.base import Equilibrium, Estimator, Observation, Problem, StandardDeviations
@@ -292,11 +292,11 @@ class Reconstructor(nn.Module):
 
     def _judged(self, status: Tensor, found: Equilibrium, residual: Tensor, coverage: Tensor, broken: Tensor) -> Tensor:
         """Statuses `[B]`, of frames that had none before the solve too: of several that hold the last."""
-        ok = status == Status.OK.value
+        ok, displaced = status == Status.OK.value, is_displaced(found.moved, self.image_size)
         for of_this, value in (
             (~self.estimator.is_converged(found), Status.NOT_CONVERGED.value),
             (coverage < LEAST_COVERAGE, Status.HIDDEN.value),
-            (~self.estimator.is_explained(found) | (residual > LARGEST_RESIDUAL), Status.UNEXPLAINED.value),
+            (~self.estimator.is_explained(found) | (residual > LARGEST_RESIDUAL) | displaced, Status.UNEXPLAINED.value),
             (broken, Status.NO_SOLUTION.value),
         ):
             status = torch.where(ok & of_this, value, status)

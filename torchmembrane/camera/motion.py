@@ -5,6 +5,9 @@ import math
 import torch
 from torch import Tensor
 
+LARGEST_SHIFT = 0.03
+"""Of half the image's diagonal: no camera that is fixed to a sensor moves so far; an image that has lost bytes does."""
+
 
 def motion_of_pixels(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
     """Derivatives `[..., 2, 4]` of `pixels [..., 2]` in du, dv, rotation and growth, the latter two in px at half the image's
@@ -33,6 +36,12 @@ def in_pixels(motion: Tensor, image_size: tuple[int, int]) -> Tensor:
     du, dv, rotation, scale = motion.unbind(-1)
     half = _half_diagonal(image_size)
     return torch.stack([du, dv, torch.deg2rad(rotation) * half, (scale - 1) * half], -1)
+
+
+def is_displaced(moved: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """Whether the motion `[B, 4]` shifts the image farther than a camera moves, `[B]` bool."""
+    displaced: Tensor = torch.linalg.vector_norm(moved[..., :2], dim=-1) > LARGEST_SHIFT * _half_diagonal(image_size)
+    return displaced
 
 
 def _half_diagonal(image_size: tuple[int, int]) -> float:

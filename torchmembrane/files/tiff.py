@@ -1,5 +1,6 @@
-"""Damage of TIFF files that decoding passes over: wrong checksums, and bytes pushed into uncompressed pixels."""
+"""Damage of TIFF files that decoding passes over: wrong checksums, pixels pushed aside, compressed data that are too long."""
 
+import re
 import struct
 import zlib
 from collections.abc import Iterator
@@ -7,9 +8,15 @@ from typing import IO, Any, NamedTuple
 
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-COMPRESSION, PLACES, LENGTHS = 259, (273, 324), (279, 325)
-"""Tags: of the data, and of its strips or tiles."""
-UNCOMPRESSED, DEFLATED = 1, (8, 32946)
+WIDTH, HEIGHT, BITS, COMPRESSION, COLOURS, FILL_ORDER, ROWS, PLANES = 256, 257, 258, 259, 262, 266, 278, 284
+PLACES, LENGTHS, TILE = (273, 324), (279, 325), (322, 323)
+"""Tags: of the page, and of its strips or tiles."""
+UNCOMPRESSED, DEFLATED, LZW, PACKBITS, REVERSED, SUBSAMPLED, APART = 1, (8, 32946), 5, 32773, 2, 6, 2
+"""Values of these tags."""
+CLEAR, END, MOST_CODES = 256, 257, 4096
+"""Codes of LZW that begin a new table and end the data, and how many a table has."""
+OLD_LZW = re.compile(b"\0[\x01\x03\x05\x07\x09\x0b\x0d\x0f]")
+"""How data of another order of bits begin, which are not looked at."""
 SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 """Bytes of a value, by its type."""
 FURTHER = {330, 34665, 34853, 40965}
@@ -23,7 +30,7 @@ class _Entry(NamedTuple):
 
 
 def refuse_damaged_page(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
-    """Refuse a page whose compressed data do not have their checksum: decoders stop when they have all pixels.
+    """Refuse a page whose compressed data do not have their checksum, or do not end with its pixels, after which decoders stop.
 
     Args:
         tags: of the page.
@@ -32,13 +39,20 @@ def refuse_damaged_page(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
     Raises:
         ValueError: a strip, or a tile, is damaged.
     """
-    if tags.get(COMPRESSION) not in DEFLATED:
+    compression = tags.get(COMPRESSION)
+    sizes = {LZW: _lzw_size, PACKBITS: _packbits_size}
+    unknown = tags.get(FILL_ORDER) == REVERSED or tags.get(COLOURS) == SUBSAMPLED
+    if compression not in (*DEFLATED, *sizes) or (unknown and compression in sizes):
         return
-    for place, length in _data(tags):
+    for number, (place, length) in enumerate(_data(tags)):
         file.seek(place)
+        data = file.read(length)
         try:
-            zlib.decompress(file.read(length))
-        except zlib.error as error:
+            if compression in DEFLATED:
+                zlib.decompress(data)
+            elif not (compression == LZW and OLD_LZW.match(data)) and sizes[compression](data) not in _sizes(tags, number):
+                raise ValueError("they unpack to another number of pixels")
+        except (zlib.error, ValueError) as error:
             raise ValueError(f"damaged data of a TIFF: {error}") from error
 
 
@@ -56,7 +70,10 @@ def refuse_displaced(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
     """
     if tags.get(COMPRESSION) != UNCOMPRESSED:
         return
-    entries, data = list(_entries(file)), _data(tags)
+    try:
+        entries, data = list(_entries(file)), _data(tags)
+    except struct.error:  # a directory that ends early, or one after the last
+        return
     if not data or FURTHER & {entry.tag for entry in entries}:
         return
     end = max([place + length for place, length in data] + [entry.end for entry in entries])
@@ -71,6 +88,56 @@ def _data(tags: ImageFileDirectory_v2) -> list[tuple[int, int]]:
     """Place and length of each strip or tile; none where the file does not say the lengths."""
     places, lengths = (next((tags[tag] for tag in pair if tag in tags), ()) for pair in (PLACES, LENGTHS))
     return list(zip(places, lengths, strict=False))
+
+
+def _sizes(tags: ImageFileDirectory_v2, number: int) -> tuple[int, ...]:
+    """Bytes that a strip, or a tile, may unpack to: the last strip may be as long as the others."""
+    bits = tags.get(BITS, (1,))[: 1 if tags.get(PLANES) == APART else None]
+    if TILE[0] in tags:
+        width, rows, left = tags[TILE[0]], tags[TILE[1]], tags[TILE[1]]
+    else:
+        width, height = tags[WIDTH], tags[HEIGHT]
+        rows = min(tags.get(ROWS, height), height)
+        left = min(rows, height - number % -(-height // rows) * rows)
+    line = -(-width * sum(bits) // 8)
+    return left * line, rows * line
+
+
+def _lzw_size(data: bytes) -> int:
+    """Bytes that LZW data of a TIFF unpack to, up to their end code."""
+    sizes, before, total, width, held, have = [1] * CLEAR + [0, 0], 0, 0, 9, 0, 0
+    for byte in data:
+        held, have = (held << 8 | byte) & 0xFFFFF, have + 8
+        if have < width:
+            continue
+        have -= width
+        code = held >> have & (1 << width) - 1
+        if code == CLEAR:
+            sizes, before, width = [1] * CLEAR + [0, 0], 0, 9
+            continue
+        if code == END:
+            break
+        if before and len(sizes) < MOST_CODES:
+            sizes.append(before + 1)
+        if code >= len(sizes):
+            raise ValueError("an LZW code that is not known yet")
+        before = sizes[code]
+        total += before
+        if len(sizes) >= (1 << width) - 1 and width < 12:
+            width += 1
+    return total
+
+
+def _packbits_size(data: bytes) -> int:
+    """Bytes that PackBits data unpack to."""
+    at = total = 0
+    while at < len(data):
+        head = data[at]
+        if head < 128:
+            at, total = at + head + 2, total + head + 1
+        else:
+            at, total = at + (2 if head > 128 else 1), total + (257 - head if head > 128 else 0)
+    return total
 
 
 def _entries(file: IO[bytes]) -> Iterator[_Entry]:

@@ -121,7 +121,7 @@ class ForceBalanceSettings:
     largest_volume_error: float = 1e-3
     largest_misfit: float = 1.5
     misfit_of_press: float = 2.0
-    largest_unexplained: float = 2.25
+    largest_unexplained: float = 2.0
     unexplained_of_press: float = 30.0
     largest_shared_misfit: float = 1.35
     largest_pushed: float = 0.85
