@@ -270,6 +270,7 @@ READ = {
     "white_is_0.tif": tiff(255 - GREY, photometric=0, bits=8),
     "white_is_0_16.tif": tiff(65535 - WIDE, photometric=0),
     "packed_12.tif": tiff(packed_12_bits(), bits=12),
+    **{f"turned_{k}.tif": saved(WIDE if k % 2 else GREY, "TIFF", tiffinfo={274: k}) for k in range(2, 9)},
 }
 
 

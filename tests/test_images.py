@@ -9,7 +9,16 @@ from image_files import jpeg, packed_12_bits, tiff
 from PIL import Image
 
 from torchmembrane.errors import MembraneError
-from torchmembrane.files.images import decode_image, read_image, read_pixels, to_grey, write_as_taken, write_image
+from torchmembrane.files.images import (
+    decode_image,
+    image_size,
+    read_image,
+    read_pixels,
+    stack_images,
+    to_grey,
+    write_as_taken,
+    write_image,
+)
 
 RGB = np.random.default_rng(0).integers(0, 256, (7, 9, 3), dtype=np.uint8)
 GREY_OF_RGB = (RGB.astype(np.float64) @ [0.299, 0.587, 0.114]) / 255
@@ -56,6 +65,22 @@ def test_exif_orientation_is_not_applied(tmp_path):
     exif = image.getexif()
     exif[0x0112] = 6  # turned by 90 degrees
     assert saved(tmp_path, image, "image.jpg", exif=exif).shape == (7, 9)
+
+
+KINDS = {"colour": RGB, "8": RGB[..., 0], "16": RGB[..., 0].astype(np.uint16) * 257, "float": RGB[..., 0] / np.float32(255)}
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("values", KINDS.values(), ids=KINDS)
+@pytest.mark.parametrize("code", ["raw", "tiff_lzw"])
+def test_tiff_orientation_is_not_applied(tmp_path, values, orientation, code):
+    """Pillow turns no other file, but these."""
+    path = tmp_path / "a.tif"
+    Image.fromarray(values).save(path, tiffinfo={274: orientation}, compression=code)
+    grey = GREY_OF_RGB if values.ndim == 3 else RGB[..., 0] / 255
+    for found in (read_image(path, (9, 7)), *stack_images(path, (9, 7))):
+        np.testing.assert_allclose(found, grey, atol=1e-6)
+    assert image_size(path) == (9, 7)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import io
 import re
 import struct
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
@@ -20,10 +20,21 @@ MOST_BYTES = 2**28
 LONGEST_NAME = 251
 """Bytes of a frame's name, so that there can be a file NAME.npz."""
 EXPECTED = "a whole PNG, JPEG or TIFF"
-KIND, OLD_KIND, BITS, PHOTOMETRIC, DESCRIPTION, SAMPLE = 254, 255, 258, 262, 270, 339
+KIND, OLD_KIND, WIDTH, HEIGHT, BITS, PHOTOMETRIC = 254, 255, 256, 257, 258, 262
+DESCRIPTION, ORIENTATION, SAMPLE = 270, 274, 339
 """Tags of a TIFF's page."""
 REDUCED_OR_MASK, OLD_REDUCED, WHITE_IS_ZERO, SIGNED = 0b101, 2, 0, 2
-"""Values of the first, second, fourth and last of these."""
+"""Values of the first, second, sixth and last of these."""
+UNTURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    2: lambda values: values[:, ::-1],
+    3: lambda values: values[::-1, ::-1],
+    4: lambda values: values[::-1],
+    5: lambda values: values.swapaxes(0, 1),
+    6: lambda values: np.rot90(values),
+    7: lambda values: values[::-1, ::-1].swapaxes(0, 1),
+    8: lambda values: np.rot90(values, -1),
+}
+"""By a TIFF's orientation, by which Pillow turns it: an image as it is stored. Cameras turn no image of a sensor."""
 IMAGEJ = re.compile(r"ImageJ=.*^images=(\d+)", re.DOTALL | re.MULTILINE)
 
 
@@ -176,8 +187,10 @@ def _directories(tiff: bytes) -> tuple[int, bool]:
 
 
 def _refuse_size(image: Any, size: tuple[int, int]) -> None:
-    if image.size != tuple(size):
-        came = f"the image is {image.width} x {image.height} px"
+    tags = image.tag_v2 if image.format == "TIFF" else {}
+    width, height = tags.get(WIDTH, image.width), tags.get(HEIGHT, image.height)  # Pillow turns a TIFF's by its orientation
+    if (width, height) != tuple(size):
+        came = f"the image is {width} x {height} px"
         raise EdgeError(f"{came}, expected {size[0]} x {size[1]}: use images of this sensor's camera")
 
 
@@ -186,17 +199,23 @@ def _grey(image: Any, number: int, size: tuple[int, int], bits: int | None) -> n
     with _refused():
         image.seek(number)
         _refuse_size(image, size)
-        tags = image.tag_v2 if image.format == "TIFF" else {}
+        tags = dict(image.tag_v2) if image.format == "TIFF" else {}
         depth = max(tags.get(BITS, (8,)))
         if SIGNED in tags.get(SAMPLE, ()) and depth <= 16:
             raise EdgeError("its values have signs; expected whole numbers from 0 to white, or float in 0..1")
         if image.mode in ("F", "I") or image.mode.startswith("I;16"):
-            return _grey_of_more_bits(image, tags, bits)
+            return _as_stored(_grey_of_more_bits(image, tags, bits), tags)
         wide = "16" in _layout(image)
         if (bits and wide) or (depth > 8 and not wide):
             raise EdgeError("colour or alpha of more than 8 bits is not read as it is; expected grey of 16 bits, or 8 bits")
         values = np.asarray(image.convert("L" if image.mode in ("1", "L", "LA", "La") else "RGB"))  # alpha is ignored
-        return grey(values[None])
+        return _as_stored(grey(values[None]), tags)
+
+
+def _as_stored(seen: np.ndarray, tags: Mapping[int, Any]) -> np.ndarray:
+    """Grey values `[1, height, width]` that Pillow has turned, if it has, as their file stores them."""
+    turn = UNTURNED.get(tags.get(ORIENTATION, 1))
+    return seen if turn is None else np.ascontiguousarray(turn(seen[0])[None])
 
 
 def _grey_of_more_bits(image: Any, tags: Mapping[int, Any], bits: int | None) -> np.ndarray:

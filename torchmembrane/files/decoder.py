@@ -1,7 +1,7 @@
 """Image files decoded by Pillow: opened within bounds, values as they are stored, refused where damage shows."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -18,10 +18,21 @@ from .tiff import refuse_damaged_page, refuse_displaced
 
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 MOST_PIXELS = 2**25
-KIND, OLD_KIND, BITS_PER_SAMPLE, PHOTOMETRIC, DESCRIPTION = 254, 255, 258, 262, 270
+KIND, OLD_KIND, WIDTH, HEIGHT, BITS_PER_SAMPLE, PHOTOMETRIC, DESCRIPTION, ORIENTATION = 254, 255, 256, 257, 258, 262, 270, 274
 """Tags of a TIFF's page."""
 REDUCED_OR_MASK, OLD_REDUCED, WHITE_IS_ZERO = 0b101, 2, 0
 """Values of these tags."""
+UNTURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    1: lambda values: values,
+    2: lambda values: values[:, ::-1],
+    3: lambda values: values[::-1, ::-1],
+    4: lambda values: values[::-1],
+    5: lambda values: values.swapaxes(0, 1),
+    6: lambda values: np.rot90(values),
+    7: lambda values: values[::-1, ::-1].swapaxes(0, 1),
+    8: lambda values: np.rot90(values, -1),
+}
+"""By orientation: an image as it is stored, from one that was turned by it. Cameras turn no image of a sensor."""
 IMAGEJ = re.compile(r"ImageJ=.*^images=(\d+)", re.DOTALL | re.MULTILINE)
 
 
@@ -119,14 +130,15 @@ def stored(image: Image.Image, size: tuple[int, int] | None = None) -> Stored:
         MembraneError: another size.
         Exception: of `DAMAGE`, where it is not decodable.
     """
-    if size is not None and image.size != size:
+    found, turned = stored_size(image), _orientation(image)
+    if size is not None and found != size:
         raise MembraneError(
-            f"the image is {image.width} x {image.height} px, expected {size[0]} x {size[1]}: use images of this "
+            f"the image is {found[0]} x {found[1]} px, expected {size[0]} x {size[1]}: use images of this "
             "sensor's camera; where its mode crops or bins them, say so in the file's [camera]"
         )
     halved = any(";16" in str(tile[3]) for tile in getattr(image, "tile", ())) and not image.mode.startswith("I")
     image.load()
-    values, bits = _values(image), None
+    values, bits = UNTURNED[turned](_values(image)), None
     if image.format == "TIFF":
         tags = image.tag_v2  # type: ignore[attr-defined]
         stated = tags.get(BITS_PER_SAMPLE, (16,))[0]
@@ -134,6 +146,18 @@ def stored(image: Image.Image, size: tuple[int, int] | None = None) -> Stored:
         if tags.get(PHOTOMETRIC) == WHITE_IS_ZERO and values.dtype != np.uint8:  # Pillow turns these alone round
             values = (HIGHEST if values.dtype == np.uint16 else 1) - values
     return Stored(values, bits, halved)
+
+
+def stored_size(image: Image.Image) -> tuple[int, int]:
+    """Width and height of an opened image as they are stored, px."""
+    tags = image.tag_v2 if image.format == "TIFF" else {}  # type: ignore[attr-defined]
+    return tags.get(WIDTH, image.width), tags.get(HEIGHT, image.height)
+
+
+def _orientation(image: Image.Image) -> int:
+    """By which orientation Pillow turns the image when it loads it: a TIFF's, and no other's."""
+    stated = image.tag_v2.get(ORIENTATION, 1) if image.format == "TIFF" else 1  # type: ignore[attr-defined]
+    return stated if stated in UNTURNED else 1
 
 
 def refuse_damaged(image: Image.Image, content: bytes) -> None:

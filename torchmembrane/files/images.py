@@ -12,7 +12,7 @@ from PIL import Image
 
 from ..errors import MembraneError
 from .atomic import whole_file
-from .decoder import opened, pictures, refuse_damaged, stored
+from .decoder import opened, pictures, refuse_damaged, stored, stored_size
 from .levels import refuse_beyond, white_of
 from .safe_read import DAMAGE, in_one_line, read_bytes, regular_size
 from .tiff import refuse_damaged_page
@@ -108,7 +108,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
         (640, 480)
     """
     with _opened_single(path, _content(path)) as image:
-        return image.size
+        return stored_size(image)
 
 
 def picture_count(path: Path, most: int = MOST_PICTURES) -> int:
