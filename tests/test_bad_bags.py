@@ -126,7 +126,7 @@ def test_topics_are_listed_where_the_one_that_is_meant_is_not_known(tmp_path):
 def test_a_bag_without_its_metadata_is_told_how_to_get_them(tmp_path):
     bag = write_bag(tmp_path / "run")
     bag.unlink()
-    with pytest.raises(MembraneError, match="`ros2 bag reindex run` makes it, or give the files of the bag"):
+    with pytest.raises(MembraneError, match="`ros2 bag reindex run` makes: or give its files"):
         find_inputs([tmp_path / "run"])
     assert image_topic(storage_of(bag), None) == (TOPIC, 3)
 

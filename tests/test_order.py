@@ -81,7 +81,9 @@ def test_the_first_frames_at_rest_are_those_of_the_lowest_numbers(tmp_path, smal
     written(tmp_path, SERIES["no zeros"], reconstructor.camera.image_size)
     taken = []
     monkeypatch.setattr(
-        reconstructor.observer, "rest_of", lambda images: taken.extend(images.mean((1, 2, 3)) * 255) or Rest(None)
+        reconstructor.observer,
+        "rest_of",
+        lambda images: taken.extend(images.mean((1, 2, 3)) * 255) or Rest(reconstructor.rest_pixels),
     )
     recording_rest(reconstructor, ["first:3"], find_inputs([tmp_path]))
     assert [round(float(level)) for level in taken] == [0, 1, 2]
@@ -94,7 +96,7 @@ def test_times_that_go_against_the_numbers_are_said(tmp_path, small_sensor, monk
     paths = written(tmp_path, SERIES["no zeros"], reconstructor.camera.image_size)
     for k, path in enumerate([paths[-1], *paths[:-1]]):
         os.utime(path, (1e9 + k * apart / 11, 1e9 + k * apart / 11))
-    monkeypatch.setattr(reconstructor.observer, "rest_of", lambda images: Rest(None))
+    monkeypatch.setattr(reconstructor.observer, "rest_of", lambda images: Rest(reconstructor.rest_pixels))
     words = (
         f"{paths[-1].name} follows {paths[-2].name} by the numbers in their names, but is older by 3 s; the order of the names"
     )

@@ -1,5 +1,6 @@
 """Where rest is: a rest image that disagrees, a recording's own; and cameras that see a part of the membrane."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -131,3 +132,27 @@ def test_a_recording_brings_its_own_rest(fingertip, tmp_path, capsys):
     again = ["reconstruct", str(tmp_path / "sensor.toml"), *files, "--out", str(tmp_path / "first")]
     assert main(again) == 2 and "--rest first:3" in capsys.readouterr().err
     assert main([*again, "--rest", "first:none"]) == 2
+
+
+def test_a_rest_that_is_a_press_is_said(fingertip, tmp_path, capsys):
+    """With the force of the press, which then reads as none; of an image without contact nothing is said."""
+    sensor, simulator = fingertip
+    path, frame = sensor.to_file(tmp_path / "sensor.toml"), pressed(simulator)
+    untouched = simulator.image(simulator.membrane.rest, np.random.default_rng(3))
+    said = {}
+    for name, image in {"untouched": untouched, "press": frame.image}.items():
+        Image.fromarray(image).save(tmp_path / f"{name}.png")
+        rest = str(tmp_path / f"{name}.png")
+        assert main(["reconstruct", str(path), rest, "--out", str(tmp_path / name), "--rest", rest]) == 0
+        said[name] = capsys.readouterr().err
+    assert "warning" not in said["untouched"]
+    words = r"--rest .*press.png: a contact of (\S+) .*is found in the images that are taken for rest, and reads as none"
+    force = float(re.search(words, said["press"])[1])
+    assert force == pytest.approx(np.linalg.norm(frame.truth["force"]), rel=0.2)
+
+
+def test_a_rest_image_that_is_not_readable_is_named(small_sensor, small_images, tmp_path, capsys):
+    Image.fromarray(np.zeros((8, 8), np.uint8)).save(tmp_path / "small.png")
+    command = ["reconstruct", str(small_sensor / "sensor.toml"), str(small_images[0]), "--out", str(tmp_path / "out")]
+    assert main([*command, "--rest", str(tmp_path / "small.png")]) == 2
+    assert f"{tmp_path / 'small.png'}: the image is 8 x 8 px" in capsys.readouterr().err

@@ -125,7 +125,7 @@ class Tracker:
         if images is None or result is None:
             raise MembraneError("Tracker.rezero: no frame yet; pass one without contact")
         rest = self.reconstructor.observer.rest_of(images)
-        if self._is_pressed(result):
+        if self.is_pressed(result):
             force = float(result.force[0].norm()) if self.reconstructor.finds_tractions else float("nan")
             warn_user(press_in_words(force, self.reconstructor.sensor.force_unit))
         self._rest_pixels, self._before = rest.pixels, None
@@ -137,8 +137,9 @@ class Tracker:
         rest = r.rest_pixels, rest_covariance, r.observer.seen_at_rest, r.image_size
         self._watch, self._steady, self._said = DriftWatch(*rest), DriftWatch(*rest), False
 
-    def _is_pressed(self, result: Reconstruction) -> bool:
-        """Whether a contact is found that is neither a moved camera's nor lies where frames without one did."""
+    def is_pressed(self, result: Reconstruction) -> bool:
+        """Whether the one frame of a result has a contact that is neither a moved camera's nor a drift that frames without one
+        have shown."""
         moved = self._moved(result)
         touched = bool(result.contact_points.isfinite().any()) and not self._watch.is_rigid(*moved)
         return touched and not self._watch.is_near(*moved)
@@ -149,7 +150,7 @@ class Tracker:
 
     def _look_for_drift(self, result: Reconstruction) -> None:
         moved = self._moved(result)
-        if not self._is_pressed(result):
+        if not self.is_pressed(result):
             self._watch.add(*moved)
             self._steady.forget()
         else:

@@ -146,5 +146,5 @@ def _expanded(argument: str, suffixes: Sequence[str]) -> list[Path]:
 def _remedy(folder: Path) -> str:
     """What to give in place of a folder that holds no images."""
     if any(path.suffix.lower() in BAGS for path in folder.iterdir()):
-        return f"a bag's folder has a {METADATA}: `ros2 bag reindex {folder.name}` makes it, or give the files of the bag"
+        return f"expected images, or a bag with its {METADATA}, which `ros2 bag reindex {folder.name}` makes: or give its files"
     return "expected one or more"

@@ -9,8 +9,10 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..files.order import warn_of_file_times
+from ..track import Tracker
+from ..user_warnings import warn_user
 from .decode import Source, sources
-from .inputs import Inputs, find_inputs
+from .inputs import Inputs, find_inputs, frame_name
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
@@ -38,8 +40,36 @@ def recording_rest(reconstructor: "Reconstructor", arguments: list[str], inputs:
         chosen = islice(sources(inputs, reconstructor), int(count))
     else:
         chosen = sources(find_inputs(arguments), reconstructor)
-    images = [source.load(reconstructor) for source in chosen]
+    said = f"--rest {' '.join(arguments)}"
+    images = [_loaded(source, reconstructor, said) for source in chosen]
     try:
-        return reconstructor.observer.rest_of(torch.cat(images)).pixels
+        rest = reconstructor.observer.rest_of(torch.cat(images)).pixels
     except MembraneError as error:
-        raise MembraneError(f"--rest {' '.join(arguments)}: {error}") from error
+        raise MembraneError(f"{said}: {error}") from error
+    _warn_of_contact(reconstructor, rest, said)
+    return rest
+
+
+def _loaded(source: Source, reconstructor: "Reconstructor", said: str) -> Tensor:
+    try:
+        return source.load(reconstructor)
+    except MembraneError as error:
+        picture = "" if source.name == frame_name(source.file) else f", {source.name}"
+        cause = str(error).removeprefix(f"{source.file}: ")
+        raise MembraneError(f"{said}: {source.file}{picture}: {cause}") from error
+
+
+def _warn_of_contact(reconstructor: "Reconstructor", rest: Tensor, said: str) -> None:
+    """Say where what is taken for rest is a press by the sensor's own rest image, or a drift that looks like one."""
+    with torch.no_grad():
+        result = reconstructor.from_pixels(rest)
+    if Tracker(reconstructor).is_pressed(result):
+        known = (
+            f"of {float(result.force[0].norm()):.3g} {reconstructor.sensor.force_unit} "
+            if reconstructor.finds_tractions
+            else ""
+        )
+        warn_user(
+            f"{said}: a contact {known}is found in the images that are taken for rest, and reads as none in the results. If "
+            "something touches there, name images without contact"
+        )
