@@ -89,7 +89,7 @@ def test_images_are_rendered_and_textures_followed_alike(small_sensor, kind):
         assert one.dtype == other.dtype and torch.equal(one.nan_to_num(), other.nan_to_num())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["float64", *(pytest.param(kind, marks=pytest.mark.full) for kind in ("float16", "bfloat16"))])
 def test_a_default_that_is_set_before_the_import_changes_nothing(small_sensor, small_images, kind):
     script = (
         f"import torch; torch.set_default_dtype(torch.{kind})\n"

@@ -213,8 +213,18 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("number, group", [(signal.SIGINT, True), (signal.SIGTERM, False)], ids=["Ctrl-C", "SIGTERM"])
-@pytest.mark.parametrize("command", STARTS.values(), ids=STARTS)
+ENDS = {"Ctrl-C": (signal.SIGINT, True), "SIGTERM": (signal.SIGTERM, False)}
+QUICK = {("reconstruct", "Ctrl-C"), ("simulate", "SIGTERM"), ("check", "Ctrl-C")}
+
+
+@pytest.mark.parametrize(
+    "command, number, group",
+    [
+        pytest.param(command, *ENDS[end], id=f"{name}, {end}", marks=[] if (name, end) in QUICK else [pytest.mark.full])
+        for name, command in STARTS.items()
+        for end in ENDS
+    ],
+)
 def test_worker_processes_that_start_end_with_the_command(command, number, group, small_sensor, small_images, tmp_path):
     (tmp_path / "images").mkdir()
     for k in range(9):
