@@ -125,10 +125,10 @@ $(PAGE): out/web/model.onnx $(IMAGES) $(PACKAGES) $(WEB)/build.js $(wildcard $(W
 	node $(WEB)/build.js out/web/model.onnx $(IMAGES)
 
 out/web/model.onnx: out/web/sensor.toml $(wildcard torchmembrane/*.py torchmembrane/*/*.py)
-	$(BIN)/torchmembrane export $< --out $@
+	$(BIN)/torchmembrane export $< --out $@ --force
 
 out/web/tracking.onnx: out/web/sensor.toml $(wildcard torchmembrane/*.py torchmembrane/*/*.py)
-	$(BIN)/torchmembrane export $< --tracking --out $@
+	$(BIN)/torchmembrane export $< --tracking --out $@ --force
 
 out/web/sensor.toml: $(SENSOR) | $(READY)
 	mkdir -p out/web
