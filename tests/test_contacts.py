@@ -262,9 +262,8 @@ def test_markers_that_the_press_turns_away_are_not_hidden(fingertip):
     seen = torch.ones(1, len(reconstructor.rest_markers))
     observation = reconstructor.observation(torch.zeros(1, seen.shape[1], 2), seen)
     found = net.equilibrium(u, pressure, moved, u, net.equations.bearings.measured(observation))
-    found = found._replace(
-        volume=net.membrane.rest_volume[None], misfit=0 * pressure, unexplained=0 * pressure, shared_misfit=0 * pressure
-    )
+    none = {name: 0 * pressure for name in ("misfit", "unexplained", "shared_misfit", "pushed")}  # it is no equilibrium
+    found = found._replace(volume=net.membrane.rest_volume[None], **none)
     markers = reconstructor.rest_markers + reconstructor.marker_shares @ u
     moved_by = reconstructor.camera.point_to_pixel(markers) - reconstructor.rest_pixels
     facing = facings(markers, reconstructor.marker_shares @ net.membrane.normals(rest + u))

@@ -74,6 +74,8 @@ class Uses:
         put(dict(self.example), work / "example")
         self.image = np.asarray(Image.open(EXAMPLES / "press_on_axis.png").convert("L"))
         self.reconstructor = tm.Reconstructor.from_file(work / "example" / "sensor.toml")
+        self.reconstructor.double()(self.image)  # compiles machine code for both precisions before anything is timed
+        self.reconstructor.float()(self.image)
         self.dome = tm.preset("fingertip")
         self.presses = find_inputs([EXAMPLES / f"{name}.png" for name in ("press_on_axis", "two_contacts", "flat_plate")])
         self.forms, self.whole = files_of(self.image), {}
