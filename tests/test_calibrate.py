@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+from moved_sensors import moved
 from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -93,15 +94,6 @@ def cap_sensor(camera, spacing=1.9):
     sizes = np.where(np.arange(len(x)) % 3 == 0, "large", "small").tolist()
     material, markers = Material("neo_hookean", 1.3), Markers("dots", "dark", dots, sizes)
     return Sensor("cap", "mm", camera, surface.membrane((17, 17)), material, Cavity("liquid"), markers, surface)
-
-
-def moved(sensor, turn, shift):
-    """The sensor's membrane and dots elsewhere before its camera."""
-    fine = sensor.surface.membrane((81, 81))
-    vertices = (turn.apply(fine.rest.numpy()) + shift).reshape(81, 81, 3)
-    surface = Surface("grid", {"vertices": vertices, "fixed": fine.fixed.numpy().reshape(81, 81)})
-    markers = Markers("dots", "dark", turn.apply(sensor.markers.positions) + shift, sensor.markers.sizes)
-    return replace(sensor, membrane=surface.membrane((17, 17)), surface=surface, markers=markers)
 
 
 def assembled(design):

@@ -3,12 +3,14 @@
 import struct
 import zlib
 from io import BytesIO
+from itertools import islice
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from torchmembrane.errors import MembraneError
+from torchmembrane.files import tiff as tiff_module
 from torchmembrane.files.images import decode_image, read_image, stack_images
 
 PICTURE = np.random.default_rng(5).integers(0, 256, (40, 48), np.uint8)
@@ -106,6 +108,16 @@ def test_bytes_pushed_into_uncompressed_pixels_are_refused(values, big):
 def test_padding_at_the_end_is_no_damage(tmp_path, padding):
     (tmp_path / "a.tif").write_bytes(tiff() + padding)
     np.testing.assert_array_equal(np.rint(255 * read_image(tmp_path / "a.tif")), PICTURE)
+
+
+def test_a_directory_that_leads_to_itself_is_looked_at_once(monkeypatch):
+    content = bytearray(motorola(PICTURE))
+    at = int.from_bytes(content[4:8], "big")
+    end = at + 2 + 12 * int.from_bytes(content[at : at + 2], "big")
+    content[end : end + 4] = content[4:8]
+    entries = list(islice(tiff_module._entries(BytesIO(content)), 1000))
+    assert len(entries) == 11
+    np.testing.assert_array_equal(np.rint(255 * decode_image(bytes(content), "a.tif")), PICTURE)
 
 
 def test_directory_and_values_behind_the_data_belong_to_the_file():

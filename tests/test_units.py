@@ -3,13 +3,13 @@
 import csv
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import torch
+from moved_sensors import moved
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -20,7 +20,7 @@ from torchmembrane.integrations.messages import SiUnits
 from torchmembrane.live.line import described
 from torchmembrane.live.loop import Seen, Tally
 from torchmembrane.machine_code import using
-from torchmembrane.sensor.parts import METRE, Markers, Surface, millimetre
+from torchmembrane.sensor.parts import METRE, millimetre
 from torchmembrane.simulate.render import Renderer
 
 CAP = {"radius": 8.0, "height": 4.0, "distance": 14.0, "pitch": 2.1, "thickness": 0.4}  # mm
@@ -84,7 +84,7 @@ class Tour:
         motions = MOTIONS * [*[self.one] * 3, 1, 1, 1]
         for k, motion in enumerate(motions):
             back = Rotation.from_rotvec(np.deg2rad(motion[3:])).inv()
-            seen = moved(design, back, -back.apply(motion[:3]))
+            seen = moved(design, back, -back.apply(motion[:3]), 49)
             paths.append(self.folder / f"view{k}.png")
             Image.fromarray((255 * Renderer(seen)(seen.membrane.rest)).round().byte().numpy()).save(paths[-1])
         table = self.folder / "motions.csv"
@@ -121,15 +121,6 @@ class Tour:
         rows = re.findall(r"  (\S+) +(\S+) ± (\S+) +(degrees|N/\w+|\w*) +\(before", self.said[step])
         scale = {self.unit: 1 / self.one, f"N/{self.unit}": self.one}
         return {name: (float(value) * scale.get(unit, 1), float(sd) * scale.get(unit, 1)) for name, value, sd, unit in rows}
-
-
-def moved(sensor, turn, shift):
-    """The sensor's membrane and dots elsewhere before its camera."""
-    fine = sensor.surface.membrane((49, 49))
-    vertices = (turn.apply(fine.rest.numpy()) + shift).reshape(49, 49, 3)
-    surface = Surface("grid", {"vertices": vertices, "fixed": fine.fixed.numpy().reshape(49, 49)})
-    markers = Markers("dots", "dark", turn.apply(sensor.markers.positions) + shift, sensor.markers.sizes)
-    return replace(sensor, membrane=surface.membrane((17, 17)), surface=surface, markers=markers)
 
 
 @pytest.fixture(scope="module")

@@ -153,9 +153,9 @@ def _entries(file: IO[bytes]) -> Iterator[_Entry]:
 
     step, inside = struct.calcsize("=" + entry), struct.calcsize("=" + offset)
     (at,) = read(offset, 8 if big else 4)
-    for _ in range(MOST_PAGES):
-        if not at:
-            break
+    seen: set[int] = set()
+    while at and at not in seen and len(seen) < MOST_PAGES:  # the last one of a damaged file may lead to an earlier one
+        seen.add(at)
         (count,) = read(counter, at)
         at += struct.calcsize("=" + counter)
         for _ in range(min(count, MOST_ENTRIES)):

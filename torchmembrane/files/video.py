@@ -1,9 +1,9 @@
 """Videos as PyAV decodes them: whatever their names, and whatever of them is missing."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from .images import to_grey
 from .optional import load_pyav
 from .safe_read import in_one_line
 from .video_end import missing_end
+
+Said = TypeVar("Said", int, float)
 
 GREY_OF_16 = ("gray16le", "gray16be")
 """Formats of pictures, as FFmpeg calls them."""
@@ -95,12 +97,7 @@ def picture_rate(path: Path) -> float | None:
     Raises:
         MembraneError: PyAV is not installed.
     """
-    load_pyav()
-    try:
-        with _opened(path) as (_, stream):
-            return float(stream.average_rate or 0) or None
-    except MembraneError:
-        return None
+    return _said(path, lambda stream: float(stream.average_rate or 0) or None)
 
 
 def picture_total(path: Path) -> int | None:
@@ -109,10 +106,15 @@ def picture_total(path: Path) -> int | None:
     Raises:
         MembraneError: PyAV is not installed.
     """
+    return _said(path, lambda stream: stream.frames or None)
+
+
+def _said(path: Path, of: Callable[[Any], Said | None]) -> Said | None:
+    """What a video says of itself; None of a file that is none."""
     load_pyav()
     try:
         with _opened(path) as (_, stream):
-            return stream.frames or None
+            return of(stream)
     except MembraneError:
         return None
 
