@@ -21,6 +21,7 @@ BROKEN = f"torch {torch.__version__} changed {{}}: mend torchmembrane/onnx/torch
 ATTRIBUTES = [
     ("torch.export._trace", "_export"),
     ("torch.export._trace", "_export_to_aten_ir"),
+    ("torch.export._trace", "_aot_export_joint_with_descriptors"),
     ("torch.fx.config", "do_not_emit_stack_traces"),
     ("torch.onnx._internal.exporter._fx_passes", "decompose_with_registry"),
     ("torch.onnx._internal.exporter._registration", "ONNXRegistry.from_torchlib"),
@@ -90,6 +91,8 @@ INPUTS = {"x": torch.rand(2, 3, generator=torch.Generator().manual_seed(0)), "n"
     ("owner", "name"),
     [
         (torch_internals._trace, "_export_to_aten_ir"),
+        (torch_internals._trace, "_aot_export_joint_with_descriptors"),
+        (torch_internals.OpSignature, "from_op_schema"),
         (torch_internals.ONNXRegistry, "from_torchlib"),
         (torch_internals._TypePromotionInterpreter, "run_node"),
         (torch_internals._fx_passes, "decompose_with_registry"),
