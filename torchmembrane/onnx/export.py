@@ -17,6 +17,7 @@ import torch
 from onnx import TensorProto, helper
 from torch import Tensor, nn
 
+from .. import __version__
 from ..control_flow import FUNCTIONS, Value
 from ..errors import MembraneError, check_arguments
 from ..files.atomic import write_bytes
@@ -175,9 +176,9 @@ def export(
 
     Standard operators only, batch free, float32, but for the solve of slack sheets, float64. Run on the sensor at rest and
     pressed, both simulated, it must give torch's statuses, and vertices within 3e-5 of the surface's size. The model's metadata
-    hold `format`, `status_texts` and `mesh` (the fields of `Mesh`) as JSON, and `bits` where the sensor's camera states them:
-    images of 16 bits are then divided by `2^bits - 1` before they are given to the model. The file ends in its digest
-    (`sealed`).
+    hold `format`, `version` (this package's), `status_texts` and `mesh` (the fields of `Mesh`) as JSON, and `bits` where the
+    sensor's camera states them: images of 16 bits are then divided by `2^bits - 1` before they are given to the model. The file
+    ends in its digest (`sealed`).
 
     Args:
         reconstructor: the sensor's.
@@ -246,7 +247,7 @@ def metadata_of(reconstructor: Reconstructor) -> dict[str, str]:
     mesh = Mesh.of(reconstructor, Settings.of(reconstructor, FORMATS[0]))._asdict()
     plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in mesh.items()}
     texts = {str(status.value): status.text for status in Status}
-    metadata = {"format": str(FORMAT), "name": mesh["name"], "length_unit": mesh["length_unit"]}
+    metadata = {"format": str(FORMAT), "version": __version__, "name": mesh["name"], "length_unit": mesh["length_unit"]}
     bits = reconstructor.sensor.camera.bits
     metadata |= {} if bits is None else {"bits": str(bits)}
     return metadata | {"force_unit": mesh["force_unit"], "status_texts": json.dumps(texts), "mesh": json.dumps(plain)}
