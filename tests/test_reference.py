@@ -50,6 +50,8 @@ file = "dots.csv"
 [tool]
 rotation = [0, 0, 0]
 translation = [0, 0, 0]
+[record]
+serial = "A17"
 """
 SURFACES = {
     "spherical_cap": "rim_radius = 9.0\nheight = 6.0\nbase_z = 20.0",
