@@ -1,6 +1,7 @@
 """What a sensor file means, in words."""
 
 from collections.abc import Iterable
+from datetime import date
 
 import numpy as np
 import torch
@@ -60,6 +61,7 @@ def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame:
         "cavity": _cavity(sensor),
         "markers": _markers(sensor, reconstructor, frame),
         "tool": _tool(sensor),
+        "record": sensor.record.said(date.today()) or ["none: no serial, no calibration is noted in the file"],
     }
     return [f"{key if i == 0 else '':<10}{line}" for key, block in lines.items() for i, line in enumerate(block)]
 

@@ -5,6 +5,7 @@ times as long. Private parts may change with every version of torch: `CHECKED` a
 `tests/test_torch_internals.py` names each one that is missing or works differently.
 """
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache, cached_property, partial
@@ -90,6 +91,7 @@ class TorchExporter:
     def __init__(self, translations: dict[Any, Callable[..., Any]]) -> None:
         self.translations = translations
         self._registries: dict[Any, ONNXRegistry] = {}
+        self._is_at_work = False
         self._from_torchlib = ONNXRegistry.from_torchlib
 
     def _registry(self, **options: Any) -> ONNXRegistry:
@@ -108,23 +110,32 @@ class TorchExporter:
         return _split_decomp_table_to_cia_and_python_decomp(table)
 
     def captured(self, module: nn.Module, examples: tuple[Tensor, ...]) -> torch.export.ExportedProgram:
-        """The module as a program of operators that ONNX has.
+        """The module as a program of operators that ONNX has; to be called within `at_work`.
 
         Torch's exporter captures a program of its own operators first, and decomposes these in a second step.
         """
-        kept, decomposed = self._decompositions
+        _, decomposed = self._decompositions
         at_once = partial(_trace._export_to_aten_ir, decomp_table=decomposed)
         with ExitStack() as stack:
             stack.enter_context(replaced(_trace, "_export_to_aten_ir", at_once))
             stack.enter_context(replaced(_trace, "_aot_export_joint_with_descriptors", _captured_once))
             stack.enter_context(replaced(torch.fx.config, "do_not_emit_stack_traces", True))  # no model holds them
-            stack.enter_context(_override_composite_implicit_decomp(kept))
             return _trace._export(module, examples, strict=False, pre_dispatch=False)
 
     @contextmanager
     def at_work(self) -> Iterator[None]:
-        """Within, `torch.onnx.export` of a program that is `captured` leaves out what it would repeat."""
+        """Within, `torch.onnx.export` of a program that is `captured` leaves out what it would repeat.
+
+        To enter takes a tenth of a second; within another one it takes no time.
+        """
+        if self._is_at_work:
+            yield
+            return
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # of torchvision, which is not needed
         with ExitStack() as stack:
+            self._is_at_work = True
+            stack.callback(setattr, self, "_is_at_work", False)
+            stack.enter_context(_override_composite_implicit_decomp(self._decompositions[0]))
             for owner, name, value in (
                 (ONNXRegistry, "from_torchlib", staticmethod(self._registry)),
                 (_TypePromotionInterpreter, "run_node", _promoted),
@@ -158,7 +169,7 @@ def _captured_once(
     mode = FunctionalTensorMode(export=True)
     tensors = [*(module.get_parameter(name) for name in parameters), *(module.get_buffer(name) for name in buffers), *args]
     with enable_python_dispatcher():
-        graph = make_fx(dispatch_functionalize(function, mode), decomposition_table=decompositions)(*tensors)
+        graph = make_fx(dispatch_functionalize(function, mode), decompositions, _disable_torch_fn_metadata_mode=True)(*tensors)
     graph.graph.eliminate_dead_code()
     graph.recompile()
     *nodes, output = graph.graph.nodes

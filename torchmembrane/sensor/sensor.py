@@ -26,6 +26,7 @@ from .parts import (
     refuse_off_surface,
     refuse_other_size,
 )
+from .record import Record
 from .toml import read_sensor, tables_of, write_sensor
 
 
@@ -44,6 +45,7 @@ class Sensor:
         markers: what the camera follows on it.
         surface: how the file describes the rest surface (default: by the membrane's grid).
         tool: the camera's pose in the frame of the tool (a robot's flange, a fingertip), where it is known.
+        record: serial and calibration of the piece, as `[record]` has them; no part of the fingerprint.
 
     A rest image of the calibrated size is cropped and binned where the camera is `in_mode`.
 
@@ -65,6 +67,7 @@ class Sensor:
     markers: Markers
     surface: Surface = None  # type: ignore[assignment]  # set below where it is left out
     tool: Pose | None = None
+    record: Record = Record()
 
     def __post_init__(self) -> None:
         expect(self.length_unit in METRE, "length_unit", self.length_unit, f"one of {', '.join(METRE)}")

@@ -34,6 +34,7 @@ from .parts import (
     refuse_off_surface,
     refuse_other_size,
 )
+from .record import Record, read_record
 from .table import Table, toml_lines
 
 FORMAT = 1
@@ -67,7 +68,7 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
         ('neo_hookean', (33, 33))
     """
     file = Table.from_file(path)
-    file.allow(("format", "name", "length_unit", "camera", "membrane", "material", "cavity", "markers", "tool"))
+    file.allow(("format", "name", "length_unit", "camera", "membrane", "material", "cavity", "markers", "tool", "record"))
     if file.number("format") != FORMAT:
         raise file.refuse("format", f"{FORMAT}, the one this version reads: update torchmembrane or the file")
     name, length_unit = file.text("name"), file.text("length_unit", METRE)
@@ -87,7 +88,8 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
     with file.table("camera").naming("distortion"):
         refuse_folds(camera, membrane.rest)
     tool = _read_tool(file.table("tool")) if "tool" in file else None
-    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool)
+    record = read_record(file.table("record")) if "record" in file else Record()
+    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool, record)
 
 
 def write_sensor(parts: SensorParts, path: Path) -> Path:
@@ -124,6 +126,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
         blocks["camera"] += toml_lines("camera.ports", port, repeated=True)
     if ports:
         blocks["camera"] += toml_lines("camera.medium", medium)
+    blocks |= {"record": toml_lines("record", parts.record.known)} if parts.record.known else {}
     write_text(path, "\n\n".join("\n".join(lines) for lines in blocks.values()) + "\n")
     return path
 

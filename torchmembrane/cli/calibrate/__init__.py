@@ -56,6 +56,7 @@ def _run(module: str, step: str, arguments: Namespace) -> int:
     from .files import spare_files
 
     spare_files(step, arguments)
+    arguments.step = step
     return int(getattr(import_module(f".{module}", __name__), step)(arguments))
 
 

@@ -41,7 +41,7 @@ def rest(arguments: Namespace) -> int:
         notes += _held(found.sensor, arguments.overpressure)
     title = "rest surface from one image"
     report = Report.of(title, found.names, units, design, found.fit, found.pixels, found.residuals, notes)
-    return write_calibrated(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size))
+    return write_calibrated(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size), 1)
 
 
 def _held(sensor: Sensor, gauge: float | None) -> list[str]:
@@ -75,7 +75,7 @@ def views(arguments: Namespace) -> int:
     modelled = found.sensor.camera.point_to_pixel(torch.from_numpy(found.dots)).numpy()
     pixels = np.broadcast_to(modelled, found.residuals.shape)
     report = Report.of(f"rest surface from {P} views", found.names, units, design, found.fit, pixels, found.residuals, notes)
-    return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface))
+    return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface), P)
 
 
 def depth(arguments: Namespace) -> int:
@@ -92,7 +92,7 @@ def depth(arguments: Namespace) -> int:
         f"{len(found.sensor.markers.sizes or ())} dots placed on the surface",
     ]
     report = Report.without_parameters("rest surface from a depth image", notes)
-    return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface))
+    return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface), 1)
 
 
 def _drawn(sensor: Sensor, report: Report, surface: Correction) -> "Figure":
