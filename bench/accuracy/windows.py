@@ -4,9 +4,9 @@ python -m bench.accuracy.windows [--noise 0.1] [--rims rectangle ...]
 
 A rectangle, an ellipse, a rounded triangle, a bean (concave) and a saddle (not planar), about 50 x 36 mm, neo-Hookean sheets of
 prestretch 1.1 and modulus x thickness 0.05 N/mm, blown up by 12 hPa of gas, pressed by a ball of 8 mm, twice. The truth is
-found on an unstructured mesh (Delaunay) of linear triangles by L-BFGS, with a penalty for contact, without friction. The package
-is told the rim, the height, the gauge and the prestretch, as `init` takes them; the dots' pixels carry Gaussian noise, and the
-dots are placed from those at rest. Printed are the modulus, and of each press depth and force, found over true.
+found on an unstructured mesh (Delaunay) of linear triangles by L-BFGS, with a penalty for contact, without friction. The
+package is told the rim, the height, the gauge and the prestretch, as `init` takes them. The dots' pixels carry Gaussian noise;
+the dots are placed from those at rest. Printed are the modulus, and of each press depth and force, found over true.
 """
 
 import argparse
@@ -200,8 +200,8 @@ def main() -> None:
             ratio = np.linalg.norm(result["force"]) / float(force.norm())
             errors.append([abs(ratio - 1), abs(deepest[1] / deepest[0] - 1)])
             print(
-                f"  {depth:g} mm at {px:g}, {py:g}: force {float(force.norm()):.4f} N x {ratio:.3f}, deepest {deepest[0]:.2f} mm "
-                f"x {deepest[1] / deepest[0]:.3f}, status {int(result['status'])}",
+                f"  {depth:g} mm at {px:g},{py:g}: force {float(force.norm()):.4f} N x {ratio:.3f}, deepest {deepest[0]:.2f} mm"
+                f" x {deepest[1] / deepest[0]:.3f}, status {int(result['status'])}",
                 flush=True,
             )
     print(f"median error of force {np.median(errors, 0)[0]:.1%}, of depth {np.median(errors, 0)[1]:.1%}")
