@@ -61,7 +61,7 @@ def test_another_surface_in_the_same_rim_leaves_forces_over_and_lies_apart(windo
     found, words = rest_shape(wrong), "\n".join(rest_in_words(wrong))
     assert found.left_over > 0.2 and found.nearest.distance > 0.004 * window.membrane.size
     assert found.pressure < 0.85 * found.nearest.pressure
-    assert "expected below 15%" in words and "forces by this file are wrong" in words
+    assert "expected below 15%" in words and "depths and forces by this file are wrong" in words
 
 
 def test_the_gauge_at_rest_is_compared_with_the_model(window):
