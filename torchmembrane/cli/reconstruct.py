@@ -69,7 +69,9 @@ def add_parser(commands: Any) -> None:
     add("--bag", metavar="BAG", type=Path, help=messages)
     own = "images of this recording without contact, or first:N, its first N frames: their mean is rest (default: the sensor's)"
     add("--rest", metavar="IMAGES", nargs="+", default=[], help=own)
-    gauge = "CSV name,pressure (across the membrane) or name,pressure_change (since rest), hPa: a gauge's readings of frames"
+    gauge = (
+        "a gauge's log, CSV: name or time of a frame, and pressure (across the membrane) or pressure_change (since rest), hPa"
+    )
     add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
     noise = "standard deviation of these, over the rest pressure (default: 0.01)"
     add("--pressure-noise", metavar="SHARE", type=positive, help=noise)
@@ -102,6 +104,8 @@ def run(arguments: Namespace) -> int:
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = recording_pressures(reconstructor, arguments.pressure, inputs) if arguments.pressure else None
+    if pressure is not None and pressure.unused:
+        print(f"torchmembrane: {arguments.pressure}: {pressure.unused} readings are of no frame of this call, and not used")
     format = arguments.format or ("parquet" if by_ray else "npz")
     settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""))
     check_folder(arguments.out, sensor.fingerprint, settings)
@@ -121,7 +125,7 @@ def run(arguments: Namespace) -> int:
         shard=shard,
         figures=arguments.figures,
         rest_pixels=rest,
-        pressure=pressure,
+        pressure=None if pressure is None else pressure.at,
     )
     if bag is not None:
         print(f"messages of {write_bag(bag, inputs, arguments.out)} frames in {arguments.bag}")
