@@ -14,6 +14,8 @@ from .results.reconstruction import Reconstruction
 from .results.status import Status
 from .user_warnings import warn_user
 
+LOOKED_AT = (Status.OK, Status.UNEXPLAINED, Status.OUT_OF_RANGE)
+"""Of frames that tell of a drift: a camera that moved may leave them unexplained."""
 STEADY = 100
 """Frames in which a contact holds still from the beginning before it is said that it may be a drift."""
 LARGEST_STEADY = 0.3
@@ -92,7 +94,7 @@ class Tracker:
             result: Reconstruction = self.reconstructor(images, self._before, self._rest_pixels, pressure)
         self.time, self._latest, self._latest_result = time, images, result
         self._before = result if Status(int(result.status[0])).has_surface else None
-        if int(result.status[0]) in (Status.OK, Status.UNEXPLAINED):  # a camera that moved may leave it unexplained
+        if int(result.status[0]) in LOOKED_AT:
             self._look_for_drift(result)
         return result
 

@@ -64,15 +64,15 @@ def add_parser(commands: Any) -> None:
     add("--images", metavar="FOLDER", type=Path, help="the images of a folder in name order, likewise")
     add("--rate", metavar="HZ", type=number_from(0.001, 1e6), help="pace of files (default: a video's own; of images 30)")
     add("--grid", metavar=("M", "N"), nargs=2, type=count, help="solver grid (default: the sensor file's)")
-    add_estimator(add)
     model = "compute by onnxruntime with a model of torchmembrane export; needs torchmembrane-edge"
     add("--model", metavar="MODEL.onnx", type=Path, help=model)
-    add_device(add)
     add("--threads", metavar="N", type=count, default=1, help="that compute (default: %(default)s)")
     kept = "keep images, results and times in a new folder; what the disk is too slow for is dropped and counted"
     add("--record", metavar="DIR", type=Path, help=kept)
     add_rerun(add)
     add_force(add)
+    add_estimator(add)
+    add_device(add)
 
 
 def run(arguments: Namespace) -> int:

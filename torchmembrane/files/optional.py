@@ -1,5 +1,6 @@
 """Packages that may be missing: imported where they are used, with an error that names the extra to install."""
 
+import os
 from importlib import import_module
 from typing import Any
 
@@ -33,7 +34,12 @@ def load_opencv(purpose: str = "calibration from boards needs OpenCV") -> Any:
     Raises:
         MembraneError: OpenCV is not installed.
     """
-    return _load("cv2", purpose, "calibrate")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what goes wrong is said in this package's own words
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    cv2 = _load("cv2", purpose, "calibrate")
+    if hasattr(cv2, "setLogLevel"):
+        cv2.setLogLevel(0)
+    return cv2
 
 
 def load_edge() -> Any:

@@ -103,7 +103,7 @@ def _material_options(add: Add) -> None:
     vectors, lengths = "CSV image,fx,fy,fz (on the membrane, in the camera's frame)", "image,force (magnitude)"
     add("--forces", metavar="FILE.csv", type=Path, help=f"{vectors} or {lengths}, N: total force in some images")
     gauge = (
-        "CSV name,pressure (images at rest and pressed) or name,pressure_change (since rest), hPa: a gauge's readings of some"
+        "a gauge's log, CSV: name or time of an image, and pressure (at rest and pressed) or pressure_change (since rest), hPa"
     )
     add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
     add("--weight", metavar="WEIGHT", type=weight, help="that lies on the membrane in every image, alone, as 200g or 1.96N")
