@@ -21,8 +21,10 @@ from .choices import ENGINES, RESULT_FORMATS
 from .film import FrameImages, draw_film
 
 if TYPE_CHECKING:
+    from ..jobs.frame_reconstructor import Gauge
     from ..jobs.inputs import Inputs
     from ..jobs.local import FrameCounts
+    from ..reconstruct import Reconstructor
 
 PURPOSE = "reconstruct surfaces from images or a video of one sensor"
 EXAMPLES = """\
@@ -88,7 +90,6 @@ def run(arguments: Namespace) -> int:
     from ..jobs.bags import bag_remarks, result_bag, write_bag
     from ..jobs.inputs import find_inputs, frame_name
     from ..jobs.local import reconstruct_files
-    from ..jobs.pressure import recording_pressures
     from ..jobs.ray_engine import RayEngine
     from ..jobs.rest import recording_rest
     from ..presets import sensor_file
@@ -103,9 +104,7 @@ def run(arguments: Namespace) -> int:
     _spare_files(arguments, inputs)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
-    pressure = recording_pressures(reconstructor, arguments.pressure, inputs) if arguments.pressure else None
-    if pressure is not None and pressure.unused:
-        print(f"torchmembrane: {arguments.pressure}: {pressure.unused} readings are of no frame of this call, and not used")
+    pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
     format = arguments.format or ("parquet" if by_ray else "npz")
     settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""))
     check_folder(arguments.out, sensor.fingerprint, settings)
@@ -125,7 +124,7 @@ def run(arguments: Namespace) -> int:
         shard=shard,
         figures=arguments.figures,
         rest_pixels=rest,
-        pressure=None if pressure is None else pressure.at,
+        pressure=pressure,
     )
     if bag is not None:
         print(f"messages of {write_bag(bag, inputs, arguments.out)} frames in {arguments.bag}")
@@ -135,6 +134,16 @@ def run(arguments: Namespace) -> int:
         draw_film(read_results(arguments.out), images, arguments.video_out)
     print(f"frames: {_said(counts)}; results in {arguments.out}")
     return 1 if counts.failed else 0
+
+
+def _pressures(log: Path, reconstructor: "Reconstructor", inputs: "Inputs") -> "Gauge":
+    """What a gauge's log says of the frames; unused readings are counted."""
+    from ..jobs.pressure import recording_pressures
+
+    readings = recording_pressures(reconstructor, log, inputs)
+    if readings.unused:
+        print(f"torchmembrane: {log}: {readings.unused} readings are of no frame of this call, and not used")
+    return readings.at
 
 
 def _check(arguments: Namespace) -> None:
