@@ -333,7 +333,12 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.parametrize(
-    "end, format, workers", [(signal.SIGTERM, "npz", "1"), (signal.SIGTERM, "parquet", "2"), (signal.SIGKILL, "parquet", "1")]
+    "end, format, workers",
+    [
+        pytest.param(signal.SIGTERM, "npz", "1", marks=pytest.mark.full),
+        (signal.SIGTERM, "parquet", "2"),
+        (signal.SIGKILL, "parquet", "1"),
+    ],
 )
 def test_a_killed_command_keeps_what_is_done(small_sensor, small_images, tmp_path, capsys, end, format, workers):
     (tmp_path / "images").mkdir()

@@ -201,6 +201,17 @@ def test_a_tracker_gives_what_frames_with_their_previous_give(reconstructor, pho
         tracker(photographs[:2])
 
 
+def test_a_tracker_takes_one_image_of_every_layout(reconstructor, photographs):
+    """Grey and colour, channels first or last, with or without a batch of one: three planes are colours, never three frames."""
+    colour = np.stack([photographs[0], photographs[1], photographs[0]], -1)
+    for image in (photographs[0][..., None], colour):
+        layouts = image, image[None], np.moveaxis(image, -1, 0), np.moveaxis(image, -1, 0)[None]
+        seen = [tm.Tracker(reconstructor)(layout).pixels for layout in layouts]
+        for pixels in seen[1:]:
+            torch.testing.assert_close(pixels, seen[0], rtol=0, atol=0, equal_nan=True)
+    assert seen[0].isfinite().any()
+
+
 def test_rezero_in_a_press_warns_with_its_force(sensor):
     """Taken for rest all the same: a drift may look like a contact. In a frame without contact nothing is said."""
     made = tm.Reconstructor(sensor)

@@ -224,7 +224,7 @@ def test_the_live_line_shows_digits_in_every_unit(pair):
     assert (np.abs(lines[1] - lines[0]) < 5 * NEAR * sizes).all()
 
 
-@pytest.mark.parametrize("unit", ["cm", "m", "inch", "um"])
+@pytest.mark.parametrize("unit", ["m", "um", *(pytest.param(unit, marks=pytest.mark.full) for unit in ("cm", "inch"))])
 def test_tensor_operations_find_what_machine_code_finds(unit, tours, capsys):
     """On other devices, with gradients, in exported models and until machine code is compiled."""
     tour = tours(unit, capsys)

@@ -1,4 +1,4 @@
-"""One stream of images: dots are followed from frame to frame, and a rest state that has aged is noticed."""
+"""One stream of images: dots are followed from frame to frame, and drift of the rest image is detected."""
 
 from math import isfinite
 
@@ -79,7 +79,7 @@ class Tracker:
         """The frame's result, a batch of one.
 
         Args:
-            frame: `[H, W]`, `[H, W, 3]`, or a batch of one as for `Reconstructor`.
+            frame: `[H, W]`, `[1 | 3, H, W]` or `[H, W, 1 | 3]`, or a batch of one as for `Reconstructor`.
             pressure: that a gauge reads, as for `Reconstructor`.
             time: when the frame was taken, seconds of any clock; kept in `time`, later than that of the frame before.
 
@@ -109,6 +109,14 @@ class Tracker:
         without contact as a smooth field, beyond what noise explains; NaN before there are some. A moved camera's motion is
         in it, as `pixels` have it. Where a contact that holds still is said to be a drift, that one's."""
         return (self._steady if self._is_steady() else self._watch).drift().size
+
+    def warm_up(self) -> None:
+        """Do now what the first frame would wait for: machine code is compiled where there is none yet, which takes a minute or
+        more (`machine_code`). A stream's frames do not wait for it then; what the tracker has seen stays as it was."""
+        width, height = self.reconstructor.image_size
+        with torch.no_grad():
+            self.reconstructor.from_pixels(self.reconstructor.rest_pixels)
+            self.reconstructor(torch.zeros(height, width))
 
     def reset(self) -> None:
         """Forget the frames before, what `rezero` took for rest, the drift and the time."""
@@ -242,10 +250,11 @@ class Tracker:
         return motion[0] if float(shift.square().sum(-1).mean().sqrt()) > self.drift / 2 else None
 
     def _one(self, frame: Tensor | np.ndarray) -> Tensor:
-        images = self.reconstructor.grey(frame)
+        width, height = self.reconstructor.image_size
+        is_colour = np.shape(frame) == (3, height, width)  # of a batch, these would be three grey frames
+        images = self.reconstructor.grey(frame[None] if is_colour else frame)
         if len(images) != 1:
-            colours = "; a colour image [3, H, W] is given as frame[None]" if len(images) == 3 else ""
-            raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream{colours}")
+            raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
         return images
 
 

@@ -28,7 +28,7 @@ from ..results.store import FORMATS, Mesh, Settings
 from .check import checked
 from .graph import Assembly, described, inlined
 from .torch_internals import tree_flatten, tree_leaves, tree_map, tree_unflatten
-from .trace import traced_model
+from .trace import EXPORTER, traced_model
 
 FORMAT = 1
 SEAL = "SHA-256: "
@@ -206,7 +206,8 @@ def export(
     if tracking and reconstructor.observer.locator.follows:
         inputs.append(tracer.given("previous_pixels", reconstructor.rest_pixels.repeat(EXAMPLES, 1, 1)))
     values: Any = inputs  # stand for tensors
-    result: Any = reconstructor.reconstruct_grey(*values)
+    with EXPORTER.at_work():
+        result: Any = reconstructor.reconstruct_grey(*values)
     model = _finished(tracer, inputs, result, reconstructor)
     progress(CHECK, "check against torch")
     checked(model.SerializeToString(), reconstructor)

@@ -14,6 +14,7 @@ from ..camera.model import Camera
 from ..errors import MembraneError, check_arguments, expect
 from ..pose import Pose
 from ..surface.membrane import Membrane
+from .inflated import InflatedSurface
 from .parts import (
     METRE,
     Cavity,
@@ -73,6 +74,8 @@ class Sensor:
 
     def __post_init__(self) -> None:
         expect(self.length_unit in METRE, "length_unit", self.length_unit, f"one of {', '.join(METRE)}")
+        if isinstance(self.surface, InflatedSurface):
+            self._solve_again(self.surface)
         if self.surface is None or not _same_surface(self.surface.membrane(self.membrane.grid), self.membrane):
             object.__setattr__(self, "surface", Surface.of(self.membrane))
         if self.markers.rest_image is not None:
@@ -81,6 +84,16 @@ class Sensor:
             names = [f"Sensor: markers.positions[{i}]" for i in range(len(self.markers.positions))]
             refuse_off_surface(self.membrane, self.markers.positions, names)
             refuse_coincident(self.membrane, self.markers.positions, names)
+
+    def _solve_again(self, surface: InflatedSurface) -> None:
+        """The rest surface of the sensor's own material, where the given one was solved with another."""
+        own = surface.made_of(self.material, self.length_unit)
+        if own is surface:
+            return
+        grid = self.membrane.grid
+        if _same_surface(surface.membrane(grid), self.membrane):
+            object.__setattr__(self, "membrane", own.membrane(grid))
+        object.__setattr__(self, "surface", own)
 
     @property
     def force_unit(self) -> str:
