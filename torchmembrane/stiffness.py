@@ -9,7 +9,7 @@ LEAST_DEVIATION = 0.03
 """Of one comparison, relative, whatever the frame says: that of forces after one weight, in nine of ten (docs/recipes.md)."""
 MEMORY = 4
 """Comparisons that count, the latest."""
-CERTAIN = 3.0
+SURE = 3.0
 """Standard deviations of their mean."""
 
 
@@ -50,15 +50,4 @@ class StiffnessWatch:
     def is_due(self) -> bool:
         """Whether the modulus should be calibrated anew."""
         off = abs(self.ratio - 1)
-        return off > LEAST_OFF and off > CERTAIN * self.deviation
-
-
-def stiffness_in_words(watch: StiffnessWatch) -> str:
-    """A changed modulus and its remedy."""
-    percent, changed = 100 * abs(watch.ratio - 1), "softened" if watch.ratio > 1 else "stiffened"
-    said = "too large" if watch.ratio > 1 else "too small"
-    return (
-        f"Tracker: loads are found {percent:.0f} % {said}, {100 * watch.deviation:.0f} % uncertain: the membrane has {changed} "
-        "since it was calibrated, and all forces are off by as much. A calibration is due: `torchmembrane calibrate material "
-        "--weight`, or --pressure with a gauge"
-    )
+        return off > LEAST_OFF and off > SURE * self.deviation

@@ -12,14 +12,14 @@ from .markers.drift import ENOUGH, DriftWatch
 from .reconstruct import Reconstructor
 from .results.reconstruction import Reconstruction
 from .results.status import Status
-from .stiffness import StiffnessWatch, stiffness_in_words
+from .stiffness import StiffnessWatch
 from .user_warnings import warn_user
 
 LOOKED_AT = (Status.OK, Status.UNEXPLAINED, Status.OUT_OF_RANGE)
 """Of frames that tell of a drift: a camera that moved may leave them unexplained."""
 STEADY = 100
 """Frames in which a contact holds still from the beginning before it is said that it may be a drift."""
-PRESSURE_ERROR = 0.06
+FOUND_PRESSURE_ERROR = 0.06
 """Of a pressure change that is found, relative (docs/calibration.md)."""
 LARGEST_STEADY = 0.3
 """px, rms: how far such a contact moves the markers at most."""
@@ -166,7 +166,7 @@ class Tracker:
         right = is_number(pressure_change) and isfinite(pressure_change) and pressure_change != 0
         expect(right, "Tracker.gauge: pressure_change", pressure_change, "a change since rest, not zero: press the membrane")
         found = float(result.pressure_change[0])
-        return self._compared(found, float(pressure_change), PRESSURE_ERROR * abs(found))
+        return self._compared(found, float(pressure_change), FOUND_PRESSURE_ERROR * abs(found))
 
     def _relied_on(self, name: str) -> Reconstruction:
         result, unit = self._latest_result, self.reconstructor.sensor.force_unit
@@ -288,4 +288,15 @@ def drift_in_words(size: float, camera_motion: Tensor | None = None, is_steady: 
     return (
         f"Tracker: {where} the markers lie {size:.2f} px (rms) off the rest image, more than noise explains: {aged} has aged "
         f"(temperature, creep, swelling, pressure, a moved camera){camera}. Call Tracker.rezero() in a frame without contact"
+    )
+
+
+def stiffness_in_words(watch: StiffnessWatch) -> str:
+    """A changed modulus and its remedy."""
+    percent, changed = 100 * abs(watch.ratio - 1), "softened" if watch.ratio > 1 else "stiffened"
+    said = "too large" if watch.ratio > 1 else "too small"
+    return (
+        f"Tracker: loads are found {percent:.0f} % {said}, {100 * watch.deviation:.0f} % uncertain: the membrane has {changed} "
+        "since it was calibrated, and all forces are off by as much. A calibration is due: `torchmembrane calibrate material "
+        "--weight`, or --pressure with a gauge"
     )

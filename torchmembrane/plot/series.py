@@ -17,7 +17,7 @@ SHADES = ("#F0E442", "#CC79A7", "#56B4E9", "#E69F00", "#999999", "#8C564B")
 """Of the bands of statuses other than ok, in the order in which they appear."""
 WIDTH, HEIGHT = 9.0, 3.1
 """Inches, of a recording's column and of a row."""
-ABOVE, BELOW, BESIDE, GAP = 0.75, 1.35, 1.05, 0.35
+ABOVE, BELOW, LEFT, GAP = 0.75, 1.35, 1.05, 0.35
 """Inches: the title, the axis and legend, labels, between panels."""
 
 
@@ -37,9 +37,9 @@ def series_figure(runs: Mapping[str, Sequence[Mapping[str, str]]]) -> Figure:
         >>> len(series_figure({"day 1": [row, row], "day 2": [row]}).axes)
         6
     """
-    width, height = BESIDE + len(runs) * (WIDTH + GAP), ABOVE + BELOW + 3 * HEIGHT + 2 * GAP
+    width, height = LEFT + len(runs) * (WIDTH + GAP), ABOVE + BELOW + 3 * HEIGHT + 2 * GAP
     drawing = Figure(figsize=(width, height), dpi=100)
-    places = dict(left=BESIDE / width, right=1 - GAP / width, top=1 - ABOVE / height, bottom=BELOW / height)
+    places = dict(left=LEFT / width, right=1 - GAP / width, top=1 - ABOVE / height, bottom=BELOW / height)
     axes = drawing.subplots(
         3, len(runs), sharex="col", sharey="row", squeeze=False, gridspec_kw=places | dict(hspace=0.1, wspace=0.05)
     )
