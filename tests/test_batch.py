@@ -24,6 +24,7 @@ from torchmembrane.results.read import read_results
 from torchmembrane.results.status import Status
 from torchmembrane.results.store import Mesh, Settings
 from torchmembrane.results.summary import UNREADABLE
+from torchmembrane.sensor.record import Record
 from torchmembrane.surface.shapes import spherical_cap
 
 WIDTH, HEIGHT = 16, 12
@@ -37,7 +38,7 @@ CONTRACT = {
     "coverage": (), "camera_motion": (4,),
     "force_deviation": (3,), "depth_deviation": (),
 }  # fmt: skip
-OF_FILE = ("path", "file_size", "file_modified", "content_hash", "seconds")
+OF_FILE = ("path", "file_size", "file_modified", "content_hash", "time", "seconds")
 
 
 class Denting:
@@ -46,7 +47,9 @@ class Denting:
     def __init__(self, fingerprint="a" * 64):
         membrane = spherical_cap(12.0, 9.0, 3.0, grid=(5, 5))
         camera = SimpleNamespace(image_size=(WIDTH, HEIGHT), bits=None)
-        known = dict(name="cap", length_unit="mm", force_unit="N", fingerprint=fingerprint, camera=camera, tool=None)
+        known = dict(
+            name="cap", length_unit="mm", force_unit="N", fingerprint=fingerprint, camera=camera, tool=None, record=Record()
+        )
         self.sensor = SimpleNamespace(**known)
         self.estimator = SimpleNamespace(membrane=membrane, must_compile=False)
         self.vertex_pixels = membrane.rest[:, :2] + 8

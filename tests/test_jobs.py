@@ -181,19 +181,6 @@ def test_the_summary_of_a_killed_job_keeps_its_seconds(images, tmp_path):
     assert all(float(row["seconds"]) > 0 for row in summary_of(tmp_path / "out").values())
 
 
-def test_summary_holds_force_vector_and_the_strongest_contact(images, tmp_path):
-    class Slanting(Denting):
-        def __call__(self, batch):
-            found = super().__call__(batch)
-            return found._replace(force=found.force * torch.tensor([1.0, -2.0, 3.0]))
-
-    made = reconstruct(images, tmp_path / "out", reconstructor=Slanting())[2]
-    row, frame = summary_of(tmp_path / "out")["i2"], made(made.read(images[2])).frame(0)
-    assert np.allclose([float(row[f"force_{axis}"]) for axis in "xyz"], frame["force"], atol=1e-5)
-    assert np.allclose([float(row[f"contact_{axis}"]) for axis in "xyz"], frame["contact_points"][0], atol=1e-5)
-    assert row["contacts"] == "4" and float(row["contact_force"]) > 0
-
-
 @both
 def test_bad_names_do_not_stop_the_run(images, tmp_path, settings):
     folder = images[0].parent
@@ -346,7 +333,12 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.parametrize(
-    "end, format, workers", [(signal.SIGTERM, "npz", "1"), (signal.SIGTERM, "parquet", "2"), (signal.SIGKILL, "parquet", "1")]
+    "end, format, workers",
+    [
+        pytest.param(signal.SIGTERM, "npz", "1", marks=pytest.mark.full),
+        (signal.SIGTERM, "parquet", "2"),
+        (signal.SIGKILL, "parquet", "1"),
+    ],
 )
 def test_a_killed_command_keeps_what_is_done(small_sensor, small_images, tmp_path, capsys, end, format, workers):
     (tmp_path / "images").mkdir()

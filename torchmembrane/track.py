@@ -1,4 +1,4 @@
-"""One stream of images: dots are followed from frame to frame, and a rest state that has aged is noticed."""
+"""One stream of images: dots are followed from frame to frame, and drift of the rest image is detected."""
 
 from math import isfinite
 

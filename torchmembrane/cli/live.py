@@ -1,4 +1,4 @@
-"""`torchmembrane live`: a camera followed as it goes, or a recording as if it were one."""
+"""`torchmembrane live`: reconstruct the frames of a camera, or of a recording played like one, as they come."""
 
 import signal
 import sys
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ..live.streams import Stream
     from ..sensor.sensor import Sensor
 
-PURPOSE = "follow a camera: wrench, status, rate and latency as it goes"
+PURPOSE = "reconstruct a live camera: wrench, status, frame rate and latency"
 EXAMPLES = """\
 examples:
   torchmembrane live sensor.toml --camera 0

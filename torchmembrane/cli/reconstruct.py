@@ -37,7 +37,7 @@ examples:
 DIR then holds
   NAME.npz       the result for the image NAME.png (parquet: the dataset frames/part-*.parquet)
   mesh.npz       rest surface, triangles, units
-  summary.csv    one row per frame
+  summary.csv    one row per frame; summary_columns.csv says what its columns mean
   NAME.png       its figure (--figures)
 Frames of a video, of a bag and of an image file that holds several pictures (TIFF, MPO, animated PNG, WebP
 or GIF) are called STEM_000000, STEM_000001 ... The same command again continues after an interruption:

@@ -41,6 +41,12 @@ class StampedMessage(NamedTuple):
     received: int
     message: Any
 
+    @property
+    def time(self) -> float:
+        """Seconds since 1970 as its header says, or, where that is empty, of its reception."""
+        stamp = self.message.header.stamp
+        return float(stamp.sec + 1e-9 * stamp.nanosec) or 1e-9 * self.received
+
 
 def is_bag(path: Path) -> bool:
     """Whether it is a bag's `metadata.yaml`, which stands for its folder, or a storage file; of ROS 1 too, which is refused."""

@@ -52,7 +52,7 @@ class FrameTable:
     def __init__(self, folder: Path, mesh: Mesh, gate: AbstractContextManager[Any]):
         self.arrow, self.parquet = load_pyarrow()
         self.folder, self.mesh, self.gate = folder, mesh, gate
-        self.metadata = {key: getattr(mesh, key) for key in ("length_unit", "force_unit", "name", "sensor")}
+        self.metadata = {key: getattr(mesh, key) for key in ("length_unit", "force_unit", "name", "sensor", "record")}
         self.damaged: list[Path] = []
         self.part_rows = max(1, min(PART_ROWS, PART_BYTES // (60 * len(mesh.rest_vertices) + 30 * len(mesh.rest_pixels) + 300)))
         self._waiting: dict[str, Stored] = {}

@@ -18,6 +18,7 @@ from ..pose import Pose
 from ..surface import shapes
 from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
+from .record import Record
 from .synonyms import did_you_mean
 
 OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, in the surface's size
@@ -258,6 +259,7 @@ class SensorParts(NamedTuple):
         markers: the `Markers`.
         surface: the rest surface as the file describes it.
         tool: the camera's pose in the tool's frame, where it is known.
+        record: serial and calibration.
     """
 
     name: str
@@ -269,6 +271,7 @@ class SensorParts(NamedTuple):
     markers: Markers
     surface: Surface
     tool: Pose | None = None
+    record: Record = Record()
 
 
 def refuse_other_size(size: tuple[int, int], camera: Camera) -> None:

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..arguments import Add, add_command, add_force, count_pair, positive, weight
+from ..arguments import Add, add_command, add_force, count_pair, positive, pressure, weight
 from ..choices import PORTS
 from ..progress import announce
 
@@ -56,6 +56,7 @@ def _run(module: str, step: str, arguments: Namespace) -> int:
     from .files import spare_files
 
     spare_files(step, arguments)
+    arguments.step = step
     return int(getattr(import_module(f".{module}", __name__), step)(arguments))
 
 
@@ -79,6 +80,8 @@ def _ports_options(add: Add) -> None:
 
 def _rest_options(add: Add) -> None:
     add("image", metavar="REST.png", help="the membrane at rest")
+    gauge = "of an inflated surface: what a gauge reads at rest, inside over outside, with its unit, as 12hPa"
+    add("--overpressure", metavar="P", type=pressure, help=gauge)
 
 
 def _views_options(add: Add) -> None:

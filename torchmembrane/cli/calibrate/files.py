@@ -2,12 +2,15 @@
 
 from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import replace
+from datetime import date
 from glob import glob
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ... import __version__
 from ...calibrate.detection import find_target
 from ...calibrate.report import Report
 from ...camera.targets import Checkerboard, DotBoard
@@ -22,6 +25,7 @@ from ...plot.drawing import save
 from ...presets import sensor_file
 from ...sensor.companions import companions_of, files_of
 from ...sensor.parts import millimetre
+from ...sensor.record import Record
 from ...sensor.sensor import Sensor
 from ...sensor.toml import COORDINATE
 from ...surface.checks import FARTHEST
@@ -58,9 +62,28 @@ def spare_files(step: str, arguments: Namespace) -> None:
     refuse_overwriting(f"calibrate {step} --out {arguments.out}", targets, read, arguments.force)
 
 
-def write_calibrated(arguments: Namespace, sensor: Sensor, report: Report, drawing: "Figure") -> int:
-    """Write the calibrated sensor and its report, print what was found; returns the exit code."""
-    path = sensor.to_file(arguments.out)
+def write_calibrated(
+    arguments: Namespace,
+    sensor: Sensor,
+    report: Report,
+    drawing: "Figure",
+    images: int,
+    uncertainty: float | None = None,
+) -> int:
+    """Write the calibrated sensor with its record, and its report, print what was found; returns the exit code.
+
+    Args:
+        arguments: of the command.
+        sensor: as found.
+        report: of it.
+        drawing: its figure.
+        images: that it was found from.
+        uncertainty: relative standard deviation of forces, where the step tells it; default: the file's, of an earlier step.
+    """
+    uncertainty = sensor.record.uncertainty if uncertainty is None else float(f"{uncertainty:.2g}")
+    by = f"torchmembrane {__version__}, calibrate {arguments.step}"
+    record = Record(sensor.record.serial, date.today(), images, by, uncertainty)
+    path = replace(sensor, record=record).to_file(arguments.out)
     report.write(arguments.out)
     save(drawing, arguments.out / "report.png", "calibrate")
     print("\n".join([*report.lines, f"calibrated sensor: {path}; report.json and report.png beside it"]))

@@ -53,7 +53,10 @@ def material(arguments: Namespace) -> int:
         correlations=found.covariance / np.outer(found.deviations, found.deviations),
     )
     made = found.sensor if weighed is None else weighed.sensor
-    return write_calibrated(arguments, made, report, material_figure(report, found, [path.name for path in paths]))
+    by_forces = found.deviations[1] / found.values[1] if n == 2 else None
+    uncertainty = by_forces if weighed is None else weighed.deviation
+    drawing = material_figure(report, found, [path.name for path in paths])
+    return write_calibrated(arguments, made, report, drawing, len(paths), uncertainty)
 
 
 def _weighed(arguments: Namespace, sensor: Sensor, images: torch.Tensor, progress: Progress) -> WeightFit:
