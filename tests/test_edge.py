@@ -233,6 +233,12 @@ def png_of_16_bits(colour, *planes):
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
+def declared(png, width, height):
+    """A PNG whose header says another size than its data have."""
+    header = b"IHDR" + struct.pack(">LL", width, height) + png[24:29]
+    return png[:12] + header + struct.pack(">L", zlib.crc32(header)) + png[33:]
+
+
 def padded(jpeg):
     """A JPEG with bytes that mean nothing before its first table, as some cameras fill buffers."""
     at = jpeg.index(b"\xff\xdb")
@@ -310,7 +316,7 @@ REFUSED = {
     "flipped.png": (saved(GREY, "PNG").replace(b"IDAT", b"IDAT\x55", 1)[:-1], "not readable as an image ("),
     "small.png": (saved(GREY[:, :4], "PNG"), "the image is 4 x 6 px, expected 8 x 6: use images of this sensor's camera"),
     "turned.png": (saved(GREY.T, "PNG"), "the image is 6 x 8 px, expected 8 x 6"),
-    "huge.png": (saved(np.zeros((20000, 20000), np.uint8), "PNG"), "the image is 20000 x 20000 px, expected 8 x 6"),
+    "huge.png": (declared(saved(GREY, "PNG"), 20000, 20000), "the image is 20000 x 20000 px, expected 8 x 6"),
     "float_255.tif": (saved(GREY.astype(np.float32), "TIFF"), "float values from 0.0 to 235.0; expected finite, in 0..1"),
     "nan.tif": (saved(np.full((6, 8), np.nan, np.float32), "TIFF"), "float values from nan to nan"),
     "large_32.tif": (saved(WIDE.astype(np.int32) * 2, "TIFF"), "32-bit values from 0 to 120790; 8 or 16 bits are read"),

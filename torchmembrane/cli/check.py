@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from ..errors import MembraneError
-from .arguments import add_command, add_force, add_sensor, count, number_from, seed
+from .arguments import add_command, add_force, add_sensor, count, number_from, pressure, seed
 from .choices import MOST_DECIBEL
 from .progress import ProgressDisplay, announce
 
@@ -22,7 +22,11 @@ EXAMPLES = """\
 examples:
   torchmembrane check sensor.toml
   torchmembrane check sensor.toml --out sensor.png
+  torchmembrane check sensor.toml --overpressure 12hPa
   torchmembrane check preset:bubble --accuracy --out bubble.png
+
+The rest surface is tested where it can fail: what tension and pressure leave unbalanced, how far the nearest sheet is that is
+blown up in the same rim, what that holds, what a gauge reads (--overpressure), and what either does to forces.
 
 --accuracy presses the sensor in the simulator, some 150 images, and reconstructs them: noise at rest, the lightest touch found,
 errors of force, depth and place, how near two touches are told apart, how deep a press may be. Some minutes of processor time,
@@ -39,6 +43,8 @@ def add_parser(commands: Any) -> None:
     add_sensor(add)
     add("--out", metavar="FIGURE.png", type=Path, help="draw it: side view with rays, rest surface, rest image, accuracy")
     add_force(add)
+    gauge = "what a gauge reads at rest, inside over outside, with its unit, as 12hPa: compared with the model's"
+    add("--overpressure", metavar="P", type=pressure, help=gauge)
     add("--accuracy", action="store_true", help="also what to expect of it, from simulated presses")
     add("--seed", type=seed, help="of presses and noise of --accuracy (default: 0)")
     noise = "of images of --accuracy, white over the noise's standard deviation (default: as in the rest image, else 40)"
@@ -57,6 +63,7 @@ def run(arguments: Namespace) -> int:
     from ..reconstruct import Reconstructor
     from ..sensor.sensor import Sensor
     from .describe import described, rest_frame
+    from .rest_words import rest_in_words
 
     if arguments.out:
         _spare_files(arguments, sensor_file(arguments.sensor))
@@ -68,7 +75,7 @@ def run(arguments: Namespace) -> int:
     except MembraneError as error:
         problem = MembraneError(f"{arguments.sensor}: {error}")
     frame = None if reconstructor is None else rest_frame(reconstructor)
-    print("\n".join(described(sensor, reconstructor, frame)), flush=True)
+    print("\n".join([*described(sensor, reconstructor, frame), *rest_in_words(sensor, arguments.overpressure)]), flush=True)
     finished = _finished(sensor, arguments) if arguments.accuracy and not problem else None
     sheet = _sheet(sensor, arguments, finished) if finished else None
     if arguments.out:

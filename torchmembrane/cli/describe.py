@@ -173,11 +173,16 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
     model = reconstructor.rest_pixels.cpu().numpy()
     lines += [f"  not found: marker {d} (from 0), expected at pixel {_listed(model[d])}" for d in missing[:LISTED]]
     lines += [f"  and {len(missing) - LISTED} more"] * (len(missing) > LISTED)
+    status = Status(int(frame["status"]))
+    reconstructed = [f"the rest image reconstructed: {status.text}"]
+    if markers.positions is None:  # each lies on its ray, whatever the surface's shape
+        placed = "they were placed from it: that it agrees does not tell whether the rest surface is right"
+        return [*lines, placed, *reconstructed * (status != Status.OK)]
     off = np.linalg.norm(reconstructor.observer.measured_rest.cpu().numpy() - model, axis=1)[found]
     if len(off):
         rms = np.sqrt((off**2).mean())
         lines.append(f"they lie {rms:.2f} px (rms; at most {off.max():.2f} px) from where the model has them")
-    return [*lines, f"the rest image reconstructed: {Status(int(frame['status'])).text}"]
+    return [*lines, *reconstructed]
 
 
 def _tool(sensor: Sensor) -> list[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MembraneError
-from .arguments import Add, add_command, add_force, count, count_pair, number_from, positive, positive_pair, vector
+from .arguments import Add, add_command, add_force, count, count_pair, number_from, positive, positive_pair, pressure, vector
 from .choices import DRAFTS, FARTHEST, FILLINGS, FROM_IMAGE, LENGTH_UNITS, LENSES, LONGEST_SIDE, OUTLINE, POLARITIES
 
 PURPOSE = "write a sensor file, with a word on every key, from a few numbers"
@@ -139,7 +139,7 @@ def _add_camera(add: Add) -> None:
 def _add_material(add: Add) -> None:
     add("--filling", choices=FILLINGS, help="of the cavity (default: of a bubble or a blown up sheet gas, else liquid)")
     prestretch = "of the membrane at rest (default: from the overpressure, else 1.2); of the sheet in its rim (else 1.1)"
-    add("--overpressure", metavar="P", type=_pressure, help="inside over outside, at rest, with its unit: 20hPa, 2kPa, 0.3psi")
+    add("--overpressure", metavar="P", type=pressure, help="inside over outside, at rest, with its unit: 20hPa, 2kPa, 0.3psi")
     add("--prestretch", metavar="L", type=positive, help=prestretch)
     add("--shear-modulus", metavar="G", type=positive, help="N / length unit^2: a third of Young's modulus")
     add(
@@ -159,15 +159,6 @@ def _add_markers(add: Add) -> None:
 
 def _rim(text: str) -> list[float] | str:
     return text if text == FROM_IMAGE else vector(text)
-
-
-def _pressure(text: str) -> float:
-    from ..presets.draft import PRESSURE_UNITS, pressure_in_hectopascal
-
-    try:
-        return pressure_in_hectopascal(text)
-    except ValueError:
-        raise ArgumentTypeError(f"{text!r}; expected a number and its unit, of {', '.join(PRESSURE_UNITS)}, as 20hPa") from None
 
 
 def run(arguments: Namespace) -> int:

@@ -32,8 +32,28 @@ class SheetMaterial(NamedTuple):
     c2_ratio: float = 0.0
 
 
+class Film(NamedTuple):
+    """A sheet in a rim without pressure.
+
+    Attributes:
+        outline: the rim.
+        cells: the grid within it, with its worst cell.
+        vertices: `[m, n, 3]` in the frame of the rim's plane.
+    """
+
+    outline: Outline
+    cells: OutlineGrid
+    vertices: np.ndarray
+
+    @property
+    def area(self) -> float:
+        """Length unit squared."""
+        a, b, c = self.vertices.reshape(-1, 3)[grid_triangles(self.cells.places.shape)].transpose(1, 0, 2)
+        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+
+
 class FormedSurface(NamedTuple):
-    """A rest surface that was found as an equilibrium, in the camera's frame, on `LINES` x `LINES` vertices.
+    """A rest surface that was found as an equilibrium, in the camera's frame.
 
     Attributes:
         vertices: `[m, n, 3]`.
@@ -57,7 +77,11 @@ class FormedSurface(NamedTuple):
 
 
 def formed_surface(
-    rim: np.ndarray, material: SheetMaterial, height: float | None = None, pressure: float | None = None
+    rim: np.ndarray,
+    material: SheetMaterial,
+    height: float | None = None,
+    pressure: float | None = None,
+    lines: int = LINES,
 ) -> FormedSurface:
     """The rest surface on a rim: of a sheet that is stretched in it and blown up to a height, or by a pressure.
 
@@ -68,6 +92,7 @@ def formed_surface(
         material: of the sheet.
         height: of the highest point above the rim's plane, along its normal, which points away from the camera.
         pressure: in place of the height, over shear modulus x thickness of the sheet, 1 / length.
+        lines: of the grid on which it is solved, both ways: 8, 16 or 32 and one.
 
     Returns:
         The `FormedSurface`.
@@ -83,14 +108,28 @@ def formed_surface(
         1.0
     """
     rim = np.ascontiguousarray(rim, float)
-    return _formed(rim.tobytes(), len(rim), material, height, pressure)
+    return _formed(rim.tobytes(), lines, material, height, pressure)
+
+
+def film(rim: np.ndarray, lines: int = LINES) -> Film:
+    """The film of least area in a rim: where a sheet is without pressure.
+
+    Args:
+        rim: `[K, 3]` once around, camera's frame.
+        lines: of its grid, both ways.
+
+    Raises:
+        MembraneError: a rim within which there is no grid, or no film.
+    """
+    outline = outline_of(rim)
+    cells = outline_grid(outline.points, lines)
+    return Film(outline, cells, _film(outline, cells))
 
 
 @lru_cache(maxsize=16)
-def _formed(content: bytes, count: int, material: SheetMaterial, height: float | None, pressure: float | None) -> FormedSurface:
-    outline = outline_of(np.frombuffer(content).reshape(count, 3))
-    cells = outline_grid(outline.points, LINES)
-    sheet = Sheet(_film(outline, cells), *material)
+def _formed(content: bytes, lines: int, material: SheetMaterial, height: float | None, pressure: float | None) -> FormedSurface:
+    outline, cells, vertices = film(np.frombuffer(content).reshape(-1, 3), lines)
+    sheet = Sheet(vertices, *material)
     found = inflated_by(sheet, pressure) if height is None and pressure is not None else inflated_to(sheet, height or 0.0)
     vertices, flat = (outline.camera_frame(x) for x in (found.vertices, sheet.vertices))
     for array in (vertices, flat):
