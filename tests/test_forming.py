@@ -34,6 +34,13 @@ DENSITIES = {  # energy per area of the sheet, of principal stretches a, b over 
 }
 
 
+SHORTLY = "rectangle", "triangle", "bean"  # of the rims
+
+
+def full(value):
+    return pytest.param(value, marks=pytest.mark.full)
+
+
 def around(radius):
     return np.stack([radius * np.cos(ANGLE), radius * np.sin(ANGLE)], -1)
 
@@ -67,7 +74,7 @@ def formed(rim, model="neo_hookean", prestretch=1.1, **goal):
     return formed_surface(raised(RIMS[rim]) if isinstance(rim, str) else rim, SheetMaterial(model, prestretch, c2), **goal)
 
 
-@pytest.mark.parametrize("name", RIMS)
+@pytest.mark.parametrize("name", [name if name in SHORTLY else full(name) for name in RIMS])
 def test_every_cell_of_the_grid_within_a_rim_has_an_area_and_the_border_lies_on_the_rim(name):
     found = formed(name, height=5.0)
     Membrane(found.sheet), Membrane(found.vertices)  # refuse folds
@@ -84,7 +91,7 @@ def test_every_cell_of_the_grid_within_a_rim_has_an_area_and_the_border_lies_on_
     assert area == pytest.approx(0.5 * (p[:, 0] * q[:, 1] - q[:, 0] * p[:, 1]).sum(), rel=5e-3)
 
 
-@pytest.mark.parametrize("model", DENSITIES)
+@pytest.mark.parametrize("model", [full("harmonic"), "neo_hookean", "mooney_rivlin"])
 def test_a_round_sheet_is_that_of_an_axisymmetric_solver(model):
     """One unknown profile, energy in principal stretches, minimised at the pressure found: it is as high and holds as much."""
     found = formed("circle", model, prestretch=1.15, height=9.0)
@@ -156,9 +163,8 @@ def test_an_unstructured_mesh_with_another_solver_is_blown_up_as_high():
 
 
 def test_blown_up_by_the_pressure_of_a_height_it_has_that_height():
-    for name, model in (("bean", "neo_hookean"), ("rectangle", "harmonic")):
-        found = formed(name, model, height=5.0)
-        assert formed(name, model, pressure=found.pressure).height == pytest.approx(5.0, rel=1e-6)
+    found = formed("bean", height=5.0)
+    assert formed("bean", pressure=found.pressure).height == pytest.approx(5.0, rel=1e-6)
 
 
 def test_a_turned_or_larger_rim_has_the_turned_or_larger_surface():
