@@ -3,6 +3,7 @@
 grad U(x) = p grad V(x)  on the free vertices;   p given, or the height of the highest vertex given and p unknown
 """
 
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -95,7 +96,10 @@ class _Inflation:
         self.sheet, self.top = sheet, float(sheet.vertices[..., 2].max())
         lines = min(sheet.vertices.shape[:2])
         strides = [step for step in (4, 2, 1) if (lines - 1) % step == 0 and (lines - 1) // step >= 8] or [1]
-        self.levels = [_Level(sheet._replace(vertices=sheet.vertices[::step, ::step])) for step in strides]
+        self.levels = []
+        for step in strides:
+            with suppress(*([MembraneError] if step > 1 else [])):  # a coarse grid may fold in a rim that bends much
+                self.levels.append(_Level(sheet._replace(vertices=sheet.vertices[::step, ::step])))
         self.size = self.levels[0].size
 
     def to_height(self, height: float) -> Inflated:
