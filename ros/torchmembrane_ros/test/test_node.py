@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from datetime import date, timedelta
 from functools import cache
 from pathlib import Path
 from threading import Thread
@@ -23,6 +24,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, FluidPressure, Image, PointCloud2
 from std_srvs.srv import Trigger
+from torchmembrane_ros.health import Health
 from torchmembrane_ros.node import FAILURE, SUCCESS, TrackerNode
 from torchmembrane_ros.outgoing import quaternion, transform_of
 from torchmembrane_ros.parameters import PARAMETERS
@@ -31,6 +33,7 @@ import torchmembrane as tm
 from torchmembrane.files.images import to_grey
 from torchmembrane.integrations.frame_messages import TOPICS
 from torchmembrane.sensor.parts import Cavity
+from torchmembrane.sensor.record import Record
 
 ROOT, PACKAGE = Path(__file__).parents[3], Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
@@ -271,7 +274,13 @@ def test_images_that_cannot_be_followed_are_said_once_and_counted(system, levels
     system.until(lambda: len(system.got["diagnostics"]) > before + 1)
     told = {each.key: each.value for each in system.got["diagnostics"][-1].status[0].values}
     assert (told["images received"], told["images followed"], told["images refused"]) == ("8", "4", "4")
-    assert told[f"status 4: {tm.Status.BLANK.text}"] == "4" and float(told["age of the sensor file, days"]) < 1
+    assert told[f"status 4: {tm.Status.BLANK.text}"] == "4" and told["age of the sensor file, days"] == "0"
+
+
+def test_the_age_of_a_recorded_calibration_is_told(sensor):
+    dated = replace(tm.Sensor.from_file(sensor), record=Record("A17", date.today() - timedelta(days=40)))
+    told = {each.fields["key"]: each.fields["value"] for each in Health(dated, sensor).message(0, 0.0).fields["values"]}
+    assert (told["serial"], told["age of the calibration, days"]) == ("A17", "40")
 
 
 def test_diagnostics_tell_rate_and_latency(system, levels):

@@ -1,7 +1,8 @@
-"""How the node is doing, once a second on /diagnostics: rate, latency, statuses, drift, age of the sensor file."""
+"""How the node is doing, once a second on /diagnostics: rate, latency, statuses, drift, age of the calibration."""
 
 import time
 from collections import Counter, deque
+from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,12 +29,13 @@ class Health:
     """What is counted while images are followed.
 
     Args:
-        name: of the sensor.
-        sensor: path of its file.
+        sensor: that is followed.
+        path: of its file, whose age is told where the file has no record of its calibration.
     """
 
-    def __init__(self, name: str, sensor: Path):
-        self.name, self.sensor = name, sensor
+    def __init__(self, sensor: tm.Sensor, path: Path):
+        self.name, self.record = sensor.name, sensor.record
+        self.written = date.fromtimestamp(path.stat().st_mtime)
         self.recent: deque[Followed] = deque(maxlen=RECENT)
         self.statuses: Counter[tm.Status] = Counter()
         self.refused = 0
@@ -68,10 +70,16 @@ class Health:
             "images refused": str(self.refused),
             "images displaced by newer ones": str(max(received - followed - self.refused, 0)),
             "drift, px": f"{drift:.3f}",
-            "age of the sensor file, days": f"{(time.time() - self.sensor.stat().st_mtime) / 86400:.1f}",
+            "serial": self.record.serial or "unknown",
+            **self._age(),
         }
         values |= {f"status {int(status)}: {status.text}": str(count) for status, count in sorted(self.statuses.items())}
         return diagnosis(*self._judged(), values)
+
+    def _age(self) -> dict[str, str]:
+        """Of the calibration, in days, or of the sensor file."""
+        what, day = ("calibration", self.record.calibrated) if self.record.calibrated else ("sensor file", self.written)
+        return {f"age of the {what}, days": str((date.today() - day).days)}
 
     def _judged(self) -> tuple[int, str, str]:
         """Level, name and words."""

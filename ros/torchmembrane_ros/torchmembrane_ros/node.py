@@ -168,7 +168,7 @@ class TrackerNode(LifecycleNode):
         self.get_logger().info("compiles machine code where there is none yet, which takes a minute or more")
         self.tracker.warm_up()
         self.get_logger().info(f"configured in {time.monotonic() - began:.0f} s: {path}")
-        self.health = Health(sensor.name, path)
+        self.health = Health(sensor, path)
         for name in self.units.topics():
             self.outputs[name] = self.create_lifecycle_publisher(type_of(TOPICS[name]), f"~/{name}", 5)
         self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 5)

@@ -106,7 +106,7 @@ def _material_options(add: Add) -> None:
     table = f"{vectors} or {lengths}, N: total force in some images; each with a further column deviation or without"
     add("--forces", metavar="FILE.csv", type=Path, help=table)
     gauge = (
-        "CSV name,pressure (images at rest and pressed) or name,pressure_change (since rest), hPa: a gauge's readings of some"
+        "a gauge's log, CSV: name or time of an image, and pressure (at rest and pressed) or pressure_change (since rest), hPa"
     )
     add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
     at_rest = "what a gauge reads at rest, inside over outside, with its unit, as 12hPa; goes with the others"

@@ -21,7 +21,7 @@ from ...files.images import read_image, read_pixels
 from ...files.safe_read import read_array
 from ...files.targets import refuse_overwriting
 from ...jobs.inputs import Inputs, find_inputs, frame_name, single_images
-from ...jobs.pressure import by_frame
+from ...jobs.pressure import by_frame, refusal
 from ...plot.drawing import save
 from ...presets import sensor_file
 from ...sensor.companions import companions_of, files_of
@@ -142,8 +142,10 @@ def read_forces(path: Path, inputs: Inputs) -> KnownForces:
     """
     table = read_table(path, FORCES, MOST_TABLE_BYTES)
     columns = table.form[1:]
-    known, deviations = {}, {}
-    for name, row in by_frame(table, inputs).items():
+    known, deviations, (lines, others) = {}, {}, by_frame(table, inputs)
+    if others:
+        raise refusal(others[0], table, inputs)
+    for name, row in lines.items():
         known[name] = row.numbers(columns)
         if not any(known[name]):
             raise row.refusal(columns[-1], "a force that is not zero: leave out images in which nothing presses")

@@ -11,6 +11,7 @@ from ...calibrate.material import STRETCHES, KnownPressures, material_from_image
 from ...calibrate.report import Report
 from ...calibrate.weight import WeightFit, material_from_weight
 from ...errors import MembraneError
+from ...files.timestamps import time_in
 from ...jobs.inputs import Inputs, find_inputs, frame_name, single_images
 from ...jobs.pressure import read_pressures
 from ...plot.calibration import material_figure
@@ -94,5 +95,8 @@ def _weighed(arguments: Namespace, sensor: Sensor, images: torch.Tensor, progres
 
 
 def _pressures(arguments: Namespace, inputs: Inputs, sensor: Sensor) -> KnownPressures:
-    values, since_rest = read_pressures(arguments.pressure, inputs, sensor)
-    return KnownPressures(np.array([values.get(frame_name(path), np.nan) for path in inputs.images]), since_rest)
+    found = read_pressures(arguments.pressure, inputs, sensor)
+    if found.unused:
+        print(f"{arguments.pressure}: {found.unused} readings are of none of the images, and not used")
+    readings = np.array([found.at(frame_name(path), time_in(path.stem)) for path in inputs.images])
+    return KnownPressures(readings, found.since_rest)
