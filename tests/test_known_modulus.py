@@ -17,17 +17,30 @@ from torchmembrane.sensor.factories import elastic_energy
 
 def test_measurements_that_agree_are_surer_together_and_ones_that_differ_less_sure():
     at_rest, forces = ModulusEvidence("gauge", 0.50, 0.03, 0.0), ModulusEvidence("forces", 0.52, 0.04, 0.0)
-    found, said = joined([at_rest, forces])
-    assert found.modulus == pytest.approx((0.50 / 0.03**2 + 0.52 / 0.04**2) / (1 / 0.03**2 + 1 / 0.04**2)) and not said
-    assert found.deviation == pytest.approx((0.03**-2 + 0.04**-2) ** -0.5)
-    apart, said = joined([at_rest, forces._replace(modulus=0.8)])
-    assert apart.deviation > 0.1 and len(said) == 1 and "gauge and forces contradict one another" in said[0]
-    assert joined([forces]) == (forces, [])
+    found, alone = joined([at_rest, forces]), joined([forces])
+    assert 0.50 < found.modulus < 0.52 and not found.contradictions and found.shift == pytest.approx(0.0)
+    assert found.covariance[1, 1] == pytest.approx(1 / ((0.50 / 0.03) ** 2 + (0.52 / 0.04) ** 2))
+    apart = joined([at_rest, forces._replace(modulus=0.8)])
+    assert apart.covariance[1, 1] > 5 * found.covariance[1, 1] and len(apart.contradictions) == 1
+    assert "gauge and forces contradict one another" in apart.contradictions[0]
+    assert alone.modulus == pytest.approx(0.52) and alone.shift == pytest.approx(0.0)
 
 
-def test_an_error_of_the_prestretch_that_two_share_does_not_average_out():
-    one, other = ModulusEvidence("a", 0.5, 0.01, -0.05), ModulusEvidence("b", 0.5, 0.01, -0.05)
-    assert joined([one, other])[0].change == pytest.approx(-0.05)
+def test_one_measurement_leaves_the_prestretch_and_what_it_does_to_the_modulus():
+    """Covariance `[[1, g], [g, s^2 + g^2]]` of the shift and the modulus' logarithm."""
+    found = joined([ModulusEvidence("forces", 0.5, 0.05, -0.1)])
+    np.testing.assert_allclose(found.covariance, [[1.0, -0.2], [-0.2, 0.1**2 + 0.2**2]])
+
+
+def test_two_measurements_that_depend_on_the_prestretch_in_their_own_way_tell_it():
+    """True: prestretch one deviation larger than the shapes say, modulus 0.5."""
+    at_rest = ModulusEvidence("gauge", 0.5 * np.exp(0.4), 0.01, -0.4 * 0.5 * np.exp(0.4))
+    forces = ModulusEvidence("forces", 0.5 * np.exp(0.1), 0.01, -0.1 * 0.5 * np.exp(0.1))
+    found = joined([at_rest, forces])
+    assert found.shift == pytest.approx(1.0, abs=0.02) and found.modulus == pytest.approx(0.5, rel=0.01)
+    assert found.covariance[0, 0] < 0.02 and not found.contradictions
+    alike = joined([at_rest, at_rest._replace(source="b")])
+    assert alike.shift == pytest.approx(0.0, abs=1e-6) and alike.covariance[0, 0] > 0.99  # an error that both share stays
 
 
 def test_each_force_that_the_others_contradict_is_named():

@@ -33,38 +33,54 @@ class ModulusEvidence(NamedTuple):
     change: float
 
 
-def joined(evidence: Sequence[ModulusEvidence]) -> tuple[ModulusEvidence, list[str]]:
-    """The mean of several, by their deviations, and a sentence for each two that contradict one another.
+class JoinedEvidence(NamedTuple):
+    """Prestretch and modulus by all that is known.
 
-    Where they contradict one another, the deviation grows by their scatter. The prestretch's error, which they share, does not
-    average out.
+    Attributes:
+        shift: of the logarithm of the prestretch, in its standard deviations.
+        modulus: force / length.
+        covariance: `[2, 2]` of the shift and of the logarithm of the modulus.
+        contradictions: a sentence for each two kinds of measurement that contradict one another.
+    """
+
+    shift: float
+    modulus: float
+    covariance: np.ndarray
+    contradictions: list[str]
+
+
+def joined(evidence: Sequence[ModulusEvidence]) -> JoinedEvidence:
+    """The prestretch's shift `t` and the modulus `m` that several measurements agree on, by weighted least squares:
+
+        t^2 + sum_i (log m - log m_i - g_i t)^2 / s_i^2,    s_i = deviation / modulus,  g_i = change / modulus
+
+    What the presses' shapes say of the prestretch is the first term. Each measurement's modulus depends on the prestretch in
+    its own way, so that two of them tell it, too. Where they cannot agree, the covariance grows by their scatter.
 
     Example:
         >>> by_force, at_rest = ModulusEvidence("forces", 0.5, 0.05, 0.0), ModulusEvidence("gauge", 0.3, 0.02, 0.0)
-        >>> found, said = joined([by_force, at_rest])
-        >>> round(found.modulus, 2), said[0].split(":")[0]
-        (0.33, 'forces and gauge contradict one another')
+        >>> found = joined([by_force, at_rest])
+        >>> round(found.modulus, 2), found.contradictions[0].split(":")[0]
+        (0.35, 'forces and gauge contradict one another')
     """
-    if len(evidence) == 1:
-        return evidence[0], []
     modulus, deviation, change = (np.array([one[k] for one in evidence]) for k in (1, 2, 3))
-    weight = deviation**-2.0 / (deviation**-2.0).sum()
-    mean = float((weight * modulus).sum())
-    scatter = (((modulus - mean) / deviation) ** 2).sum() / (len(evidence) - 1)
-    width = float((deviation**-2.0).sum() ** -0.5 * max(1.0, scatter) ** 0.5)
-    said = []
+    s, g = deviation / modulus, change / modulus
+    rows = np.vstack([[1.0, 0.0], np.stack([-g, np.ones(len(s))], 1) / s[:, None]])
+    values = np.concatenate([[0.0], np.log(modulus) / s])
+    covariance = np.linalg.inv(rows.T @ rows)
+    shift, logarithm = covariance @ rows.T @ values
+    scatter = ((rows @ [shift, logarithm] - values) ** 2).sum() / max(len(s) - 1, 1)
+    said, at = [], np.log(modulus) + g * shift
     for i, one in enumerate(evidence):
-        for other in evidence[i + 1 :]:
-            apart = abs(one.modulus - other.modulus) / np.hypot(
-                np.hypot(one.deviation, other.deviation), one.change - other.change
-            )
+        for k in range(i + 1, len(evidence)):
+            apart = abs(at[i] - at[k]) / np.hypot(s[i], s[k])
             if apart > CONTRADICTING:
-                told = (f"{each.modulus:.3g} ± {each.deviation:.1g}" for each in (one, other))
+                told = (f"{np.exp(at[j]):.3g} ± {np.exp(at[j]) * s[j]:.1g}" for j in (i, k))
                 said.append(
-                    f"{one.source} and {other.source} contradict one another: moduli of {' and '.join(told)}, {apart:.1f} "
-                    "standard deviations apart: one of them, or the rest shape, is wrong"
+                    f"{one.source} and {evidence[k].source} contradict one another: moduli of {' and '.join(told)}, "
+                    f"{apart:.1f} standard deviations apart: one of them, or the rest shape, is wrong"
                 )
-    return ModulusEvidence("all", mean, width, float((weight * change).sum())), said
+    return JoinedEvidence(float(shift), float(np.exp(logarithm)), covariance * max(1.0, scatter), said)
 
 
 def odd_ones(ratios: np.ndarray, deviations: np.ndarray) -> list[tuple[int, float, float]]:

@@ -238,7 +238,7 @@ def _material(
     contradiction = ((each[:, 0] - log_stretch) ** 2 / variances).sum() / max(len(each) - 1, 1)
     deviation = np.hypot(deviation * np.sqrt(max(1.0, contradiction)), PRESTRETCH_ERROR)
     prestretch = float(np.exp(log_stretch))
-    values, effects = [prestretch], [[prestretch * deviation, 0.0]]
+    values = [prestretch]
     material = replace(sensor.material, prestretch=prestretch)
     magnitudes, gauged = np.full((2, len(each), 2), np.nan)
     evidence, said = [], []
@@ -254,13 +254,16 @@ def _material(
         evidence.append(ModulusEvidence("the gauge under presses", *told))
     if overpressure is not None:
         evidence.append(modulus_at_rest(sensor, log_stretch, deviation, overpressure))
+    covariance = np.array([[(prestretch * deviation) ** 2]])
     if evidence:
-        found, contradicting = joined(evidence)
-        values, effects, said = [prestretch, found.modulus], [*effects, [found.change, found.deviation]], said + contradicting
+        found = joined(evidence)
+        prestretch, said = float(np.exp(log_stretch + found.shift * deviation)), said + found.contradictions
+        values, scale = [prestretch, found.modulus], np.array([prestretch * deviation, found.modulus])
+        covariance = scale[:, None] * found.covariance * scale
         thickness = material.thickness or 1.0
-        material = replace(material, shear_modulus=found.modulus / thickness, thickness=thickness)
+        modulus = found.modulus / thickness
+        material = replace(material, prestretch=max(1.0, prestretch), shear_modulus=modulus, thickness=thickness)
     alone = np.exp(each[:, :1]) * np.stack([np.ones(len(each)), np.sqrt(variances)], -1)
-    covariance = np.array(effects) @ np.array(effects).T
     made = replace(sensor, material=material)
     if rounds and not _is_settled(sensor, made):
         return _material(made, _reconstructor(made), known, later, rounds - 1)
