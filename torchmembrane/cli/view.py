@@ -120,7 +120,7 @@ def _plot(folders: list[Path], path: Path) -> None:
         said = ", ".join(f"{force} and {length}" for length, force in sorted(units))
         raise MembraneError(f"view --plot: results in {said}; expected folders of the same units")
     save(series_figure(runs), path, "view")
-    print(f"{sum(map(len, runs.values()))} frames of {len(runs)} folders drawn in {path}")
+    print(f"{sum(map(len, runs.values()))} frames of {', '.join(runs)} drawn in {path}")
 
 
 def _show(results: "Results", images: FrameImages, times: dict[str, float], save: Path | None) -> None:
