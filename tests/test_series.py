@@ -89,7 +89,7 @@ def folder(tmp_path_factory):
 def test_the_command_draws_a_plot_and_a_sheet(folder, tmp_path, capsys):
     assert main(["view", str(folder), "--plot", str(tmp_path / "forces.png"), "--sheet", str(tmp_path / "sheet.png")]) == 0
     said = capsys.readouterr().out
-    assert "4 frames of 1 folders" in said and "4 of 4 frames" in said
+    assert f"4 frames of {folder} drawn" in said and "4 of 4 frames" in said
     assert main(["view", str(folder), str(folder), "--plot", str(tmp_path / "forces.png")]) == 0  # its own may be drawn anew
     assert min(Image.open(tmp_path / "forces.png").size) > 1000
     assert main(["view", str(folder), str(folder)]) == 2 and "2 results without --plot" in capsys.readouterr().err

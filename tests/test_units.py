@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import torchmembrane as tm
 from torchmembrane.calibrate import material
 from torchmembrane.cli import main as cli
-from torchmembrane.integrations.messages import SiUnits
+from torchmembrane.integrations.frame_messages import SiUnits
 from torchmembrane.live.line import described
 from torchmembrane.live.loop import Seen, Tally
 from torchmembrane.machine_code import using
@@ -243,7 +243,7 @@ def test_messages_are_in_si_units_whatever_the_sensor_s(pair):
         results, gas = tm.read_results(tour.folder / "press" / "results"), tour.sensor("press").gas_pressure
         units, frame = SiUnits(results.mesh, gas), results["press"]
         points = units.points(frame)
-        si.append([units.wrench(frame).torque, points[:, :3], points[:, 3] / np.abs(points[:, 3]).max(), units.pressure(frame)])
+        si.append([units.moment(frame), points[:, :3], points[:, 3] / np.abs(points[:, 3]).max(), units.pressure(frame)])
     for one, two in zip(*si, strict=True):
         assert np.abs(two - one).max() < 5 * NEAR * np.abs(one).max()
     assert 1.1e5 < si[1][3] < 1.5e5  # Pa, absolute

@@ -24,6 +24,7 @@ examples:
   torchmembrane view results --plot forces.png      # over time; results day2/ --plot: side by side
   torchmembrane view results --sheet sheet.png      # all its frames, small
   torchmembrane view results --rerun                # likewise, in the viewer Rerun; --save press.rrd: in a file
+  torchmembrane view results --dataset press        # a data set as Hugging Face's datasets loads it, with a card
   torchmembrane view results --frame press --ply press.ply   # the contact as a point cloud, nothing drawn
 
 Without --out a window is opened; without a display, NAME_view.png is written beside the results."""
@@ -47,6 +48,12 @@ def add_parser(commands: Any) -> None:
     pictures = "where the images of all frames are, by the frames' names (default: RESULT/images, as live --record has it)"
     add("--images", metavar="FOLDER", type=Path, help=pictures)
     add_rerun(add)
+    add(
+        "--dataset",
+        metavar="FOLDER",
+        type=Path,
+        help="write all frames and their images as a data set of Hugging Face (parquet)",
+    )
     add("--ply", metavar="FILE.ply", type=Path, help="write the touched vertices as a point cloud, and draw nothing")
     add_force(add)
 
@@ -65,16 +72,22 @@ def run(arguments: Namespace) -> int:
     _spare_files(arguments, arguments.out, arguments.video_out, arguments.save, arguments.ply, *drawn)
     if arguments.plot is not None:
         _plot(folders, arguments.plot)
-    if not rerun and arguments.video_out is None and arguments.sheet is None:
+    if not rerun and all(made is None for made in (arguments.video_out, arguments.sheet, arguments.dataset)):
         return 0 if arguments.plot is not None else _draw(arguments)
     results, times = read_results(arguments.result), times_of(arguments.result)
     warn_of_times((name, times[name]) for name in results.names if name in times)
     width, height = results.mesh.image_size.tolist()
-    images = FrameImages(images_in(arguments.images or arguments.result / "images"), (width, height))
+    found = images_in(arguments.images or arguments.result / "images")
+    images = FrameImages(found, (width, height))
     if arguments.sheet is not None:
         draw_sheet(results, images, arguments.sheet)
     if arguments.video_out is not None:
         draw_film(results, images, arguments.video_out, arguments.rate)
+    if arguments.dataset is not None:
+        from ..results.data_set import write_data_set
+
+        write_data_set(results, arguments.dataset, found, times)
+        print(f"{len(results)} frames in {arguments.dataset}")
     if rerun:
         _show(results, images, times, arguments.save)
     return 0
@@ -107,7 +120,7 @@ def _plot(folders: list[Path], path: Path) -> None:
         said = ", ".join(f"{force} and {length}" for length, force in sorted(units))
         raise MembraneError(f"view --plot: results in {said}; expected folders of the same units")
     save(series_figure(runs), path, "view")
-    print(f"{sum(map(len, runs.values()))} frames of {len(runs)} folders drawn in {path}")
+    print(f"{sum(map(len, runs.values()))} frames of {', '.join(runs)} drawn in {path}")
 
 
 def _show(results: "Results", images: FrameImages, times: dict[str, float], save: Path | None) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from ..results.status import Status
 from ..results.summary import UNREADABLE
@@ -55,6 +56,7 @@ def series_figure(runs: Mapping[str, Sequence[Mapping[str, str]]]) -> Figure:
                 panel.set_ylabel(f"{what.replace('_', ' ')} [{unit}]")
         axes[0, column].set_title(name)
         axes[2, column].set_xlabel(label)
+        axes[2, column].xaxis.set_major_locator(MaxNLocator(integer=label == "frame"))
     drawing.align_ylabels(axes[:, 0])
     _legend(drawing, shades)
     return drawing

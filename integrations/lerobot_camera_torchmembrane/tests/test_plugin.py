@@ -201,6 +201,25 @@ def test_recorded_runs_load_as_a_data_set(sensor, tmp_path):
         np.testing.assert_allclose(item["contacts"].reshape(4, 6)[0, 3:], frame["contact_force"][0], rtol=1e-5)
 
 
+def test_a_data_set_folder_is_loaded_by_datasets_offline(sensor, tmp_path):
+    from conftest import EXAMPLES, PRESSES
+    from datasets import load_dataset
+
+    from torchmembrane.cli.main import main
+
+    images, run = [str(EXAMPLES / f"{name}.png") for name in PRESSES], str(tmp_path / "run")
+    assert main(["reconstruct", str(sensor), *images, "--out", run]) == 0
+    assert main(["view", run, "--dataset", str(tmp_path / "set"), "--images", str(EXAMPLES)]) == 0
+    assert main(["view", run, "--dataset", str(tmp_path / "bare")]) == 0
+    for name in ("set", "bare"):
+        loaded = load_dataset(str(tmp_path / name), split="train", cache_dir=str(tmp_path / "cache"))
+        for row, frame in zip(loaded, tm.read_results(run), strict=True):
+            np.testing.assert_allclose(row["wrench"], frame["wrench"], rtol=1e-6)
+            np.testing.assert_allclose(row["vertices"], frame["vertices"], rtol=1e-6)
+            if name == "set":
+                assert np.array_equal(row["image"], cv2.imread(str(EXAMPLES / f"{row['name']}.png"), cv2.IMREAD_UNCHANGED))
+
+
 def test_the_viewer_takes_the_version_that_lerobot_allows(sensor, expected, tmp_path):
     reconstructor = tm.Reconstructor.from_file(sensor)
     with RerunLog(Mesh.of(reconstructor, Settings.of(reconstructor, "npz")), tmp_path / "press.rrd") as log:
