@@ -101,16 +101,17 @@ def run(arguments: Namespace) -> int:
             stop, rezero = stack.enter_context(_stopped_by_signals()), _rezero_by_key()
             mailbox, tally, peaks = stack.enter_context(capture(images)), Tally(), Peaks(stream.mesh)
             watchers.append(lambda seen, _: peaks.add(seen.frame))
+            if arguments.life is not None:
+                peaks.kept_in(arguments.life)  # nothing yet: another sensor's file is refused before the stream begins
             try:
                 follow(stream, mailbox, tally, [line, *watchers], stop, rezero, line.say)
             finally:
                 if stop.is_set():
                     answer()
-                line.say(summary(tally))
-                line.say(peaks.said)
+                line.say(f"{peaks.said}; {MODULUS}")
                 if arguments.life is not None:
                     line.say(peaks.kept_in(arguments.life))
-                line.say(MODULUS)
+                line.say(summary(tally))
     finally:
         for each in said:
             line.say(each())
