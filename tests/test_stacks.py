@@ -137,7 +137,7 @@ def test_frames_of_a_stack_are_named_as_those_of_a_video(run, tmp_path):
     assert outcome[0] == 4 and not lines
     assert read_results(tmp_path / "out").names == ["one", "run_000000", "run_000001", "run_000002"]
     assert pressures(tmp_path / "out") == [99, 60, 100, 140]
-    assert reconstruct([run], tmp_path / "out")[0] == (0, 0, 0, 0, 0, 3)
+    assert reconstruct([run], tmp_path / "out")[0] == (0, 0, 0, 0, 0, 0, 3)
     with pytest.raises(MembraneError, match="run_000001.png: a frame of .*run.tif has the same name"):
         find_inputs([run, grey_image(tmp_path / "run_000001.png", 9)])
 

@@ -134,7 +134,7 @@ def test_a_weight_beside_forces_is_refused(tmp_path, capsys):
     (tmp_path / "forces.csv").write_text("image,force\nflat_plate.png,1\n")
     call = ["calibrate", "material", str(EXAMPLES / "sensor.toml"), str(EXAMPLES / "flat_plate.png"), "--weight", "2N"]
     assert main([*call, "--forces", str(tmp_path / "forces.csv"), "--out", str(tmp_path / "out")]) == 2
-    assert "--weight and --forces" in capsys.readouterr().err
+    assert "--weight with --forces" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("calibration_grids")

@@ -176,6 +176,8 @@ def watch(session: Session, camera: int, frames: int | None) -> int:
     """Images of a camera, a line each: what was found and how long it took; Ctrl-C ends it."""
     import cv2
 
+    if hasattr(cv2, "setLogLevel"):
+        cv2.setLogLevel(0)  # what goes wrong is said in this package's own words
     width, height = session.image_size
     capture = cv2.VideoCapture(camera)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)

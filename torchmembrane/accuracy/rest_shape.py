@@ -64,7 +64,7 @@ def rest_shape(sensor: Sensor) -> RestShape:
     Example:
         >>> from torchmembrane.presets import preset
         >>> found = rest_shape(preset("bubble"))
-        >>> found.left_over < 0.02, found.nearest.distance < 1.0
+        >>> found.left_over < 0.06, found.nearest.distance < 0.2
         (True, True)
     """
     membrane = sensor.membrane

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ..accuracy.finished import FinishedSeries
     from ..accuracy.spec_sheet import SpecSheet
     from ..sensor.sensor import Sensor
+    from ..sensor.working_range import WorkingRange
 
 PURPOSE = "say in words, and draw, what a sensor file means and what to expect of the sensor"
 EXAMPLES = """\
@@ -61,9 +62,10 @@ def run(arguments: Namespace) -> int:
             raise MembraneError(f"--{name} goes with --accuracy only: add it")
     if arguments.accuracy:
         announce("check --accuracy")
-    from ..presets import sensor_file
+    from ..presets import PREFIX, sensor_file
     from ..reconstruct import Reconstructor
     from ..sensor.sensor import Sensor
+    from ..sensor.working_range import range_file
     from .describe import described, rest_frame
     from .rest_words import rest_in_words
 
@@ -85,6 +87,8 @@ def run(arguments: Namespace) -> int:
         print(f"{sensor.name}.urdf, {sensor.name}.xml (MJCF) and their meshes written to {folder}")
     finished = _finished(sensor, arguments) if arguments.accuracy and not problem else None
     sheet = _sheet(sensor, arguments, finished) if finished else None
+    if sheet and sheet.range and not str(arguments.sensor).startswith(PREFIX):
+        _keep(sheet.range, range_file(sensor_file(arguments.sensor)))
     if arguments.out:
         from ..plot.drawing import save
         from ..plot.sensor import sensor_figure
@@ -96,6 +100,15 @@ def run(arguments: Namespace) -> int:
     if problem:
         raise problem
     return 0
+
+
+def _keep(range: "WorkingRange", path: Path) -> None:
+    """Keep the range beside the sensor file, and say so."""
+    try:
+        range.to_file(path)
+        print(f"          kept in {path}: this sensor's results beyond it get status 9")
+    except MembraneError as error:
+        print(f"          not kept: {error}")
 
 
 def _spare_files(arguments: Namespace, sensor: Path) -> None:

@@ -61,9 +61,21 @@ def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame:
         "cavity": _cavity(sensor),
         "markers": _markers(sensor, reconstructor, frame),
         "tool": _tool(sensor),
+        "range": [_range(sensor)],
         "record": sensor.record.said(date.today()) or ["none: no serial, no calibration is noted in the file"],
     }
     return [f"{key if i == 0 else '':<10}{line}" for key, block in lines.items() for i, line in enumerate(block)]
+
+
+def _range(sensor: Sensor) -> str:
+    """The limits of the sensor's answers, and where they come from."""
+    own = sensor.range.of(sensor.fingerprint)
+    size, unit = sensor.membrane.size, sensor.length_unit
+    limits = f"up to {own.depth * size:.3g} {unit} deep, the surface turned by {own.turn:.3g} degrees"
+    if own.sensor:
+        return f"{limits}, {own.force:.3g} {sensor.force_unit}, as `check --accuracy` has shown"
+    stale = "; that of `check --accuracy` is of another state of this file: make it anew" if sensor.range.sensor else ""
+    return f"{limits}, as of all sensors; `check --accuracy` finds this one's{stale}"
 
 
 def _camera(camera: Camera, unit: str) -> list[str]:

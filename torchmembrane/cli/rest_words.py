@@ -42,8 +42,9 @@ def _nearest(shape: RestShape, sheet: NearestSheet | None, sensor: Sensor) -> li
     if sheet.distance > FAR * sensor.membrane.size or not 1 / ALIKE < ratio < ALIKE:
         held, modelled = (pressure_in_words(p, sensor) for p in (sheet.pressure, shape.pressure))
         lines += [
-            f"of the same rubber that sheet holds {held}, this file's membrane {modelled}: if yours is such a sheet, forces",
-            f'by this file\'s modulus are about {1 / ratio:.2f} of the true ones; `init` writes it, shape = "inflated"',
+            f"of the same rubber that sheet holds {held}, this file's membrane {modelled}: if yours is such a sheet,",
+            "depths and forces by this file are wrong, forces by about as much as these differ, either way; `init` writes",
+            'shape = "inflated"',
         ]
     if stretch < sheet.least:
         lines.append(

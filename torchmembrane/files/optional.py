@@ -3,6 +3,7 @@
 Each of these functions raises that error where the package is missing, and another one where it is there and broken.
 """
 
+import os
 from importlib import import_module
 from typing import Any
 
@@ -37,7 +38,12 @@ def load_opencv(purpose: str = "calibration from boards needs OpenCV") -> Any:
     Raises:
         MembraneError: OpenCV is not installed.
     """
-    return _load("cv2", purpose, "calibrate")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what goes wrong is said in this package's own words
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    cv2 = _load("cv2", purpose, "calibrate")
+    if hasattr(cv2, "setLogLevel"):
+        cv2.setLogLevel(0)
+    return cv2
 
 
 def load_edge() -> Any:

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ..errors import MembraneError
 from ..files.atomic import whole_file
 from ..files.order import in_order
 from ..files.provenance import printable
@@ -64,6 +65,21 @@ class Summary:
     def _set(self, name: str, status: int, cells: Mapping[str, str]) -> None:
         known = {"name": name, "status": str(status), "length_unit": self.mesh.length_unit, "force_unit": self.mesh.force_unit}
         self.rows[name] = {**dict.fromkeys(NAMES, ""), **known, **cells}
+
+
+def read_summary(folder: Path) -> list[dict[str, str]]:
+    """The rows of a folder's table, cells by the columns' names.
+
+    Raises:
+        MembraneError: there is none, or one of other columns.
+    """
+    rows = _rows(folder / SUMMARY)
+    if not rows:
+        raise MembraneError(
+            f"{folder / SUMMARY}: no rows with this version's columns; expected a folder of results: the same reconstruct "
+            "command again makes its table anew"
+        )
+    return rows
 
 
 def _write_table(path: Path, header: Iterable[str], rows: Iterable[dict[str, str]]) -> None:

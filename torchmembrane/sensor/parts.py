@@ -20,6 +20,7 @@ from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
 from .record import Record
 from .synonyms import did_you_mean
+from .working_range import GENERAL, WorkingRange
 
 OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, in the surface's size
 METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0, "um": 1e6, "inch": 1 / 0.0254}  # one metre in the length unit
@@ -260,6 +261,7 @@ class SensorParts(NamedTuple):
         surface: the rest surface as the file describes it.
         tool: the camera's pose in the tool's frame, where it is known.
         record: serial and calibration.
+        range: in which its answers were shown right.
     """
 
     name: str
@@ -272,6 +274,7 @@ class SensorParts(NamedTuple):
     surface: Surface
     tool: Pose | None = None
     record: Record = Record()
+    range: WorkingRange = GENERAL
 
 
 def refuse_other_size(size: tuple[int, int], camera: Camera) -> None:

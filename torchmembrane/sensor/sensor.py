@@ -28,6 +28,7 @@ from .parts import (
 )
 from .record import Record
 from .toml import read_sensor, tables_of, write_sensor
+from .working_range import GENERAL, WorkingRange
 
 
 @check_arguments
@@ -46,6 +47,7 @@ class Sensor:
         surface: how the file describes the rest surface (default: by the membrane's grid).
         tool: the camera's pose in the frame of the tool (a robot's flange, a fingertip), where it is known.
         record: serial and calibration of the piece, as `[record]` has them; no part of the fingerprint.
+        range: in which its answers were shown right, of `check --accuracy`; else the general one.
 
     A rest image of the calibrated size is cropped and binned where the camera is `in_mode`.
 
@@ -68,6 +70,7 @@ class Sensor:
     surface: Surface = None  # type: ignore[assignment]  # set below where it is left out
     tool: Pose | None = None
     record: Record = Record()
+    range: WorkingRange = GENERAL
 
     def __post_init__(self) -> None:
         expect(self.length_unit in METRE, "length_unit", self.length_unit, f"one of {', '.join(METRE)}")

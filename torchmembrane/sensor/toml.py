@@ -36,6 +36,7 @@ from .parts import (
 )
 from .record import Record, read_record
 from .table import Table, toml_lines
+from .working_range import GENERAL, WorkingRange, range_file
 
 FORMAT = 1
 COARSEST, FINEST = 25, 33  # solver grids chosen where the file names none
@@ -89,7 +90,9 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
         refuse_folds(camera, membrane.rest)
     tool = _read_tool(file.table("tool")) if "tool" in file else None
     record = read_record(file.table("record")) if "record" in file else Record()
-    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool, record)
+    kept = range_file(path)
+    range = WorkingRange.from_file(kept) if kept.exists() else GENERAL
+    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool, record, range)
 
 
 def write_sensor(parts: SensorParts, path: Path) -> Path:
