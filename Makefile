@@ -5,6 +5,7 @@
 # make test-lowest: the quick start with the lowest versions that pyproject.toml allows, in .venv-lowest.
 # make test-lerobot: the plugin for LeRobot against LeRobot 0.6 in .venv-lerobot; needs Python 3.12 and 6 GB.
 # make test-ros: the node of ROS 2 under rclpy of PyPI in .venv-ros; needs Python 3.11, on Linux.
+# make test-dist: sdists and wheels of the three packages in out/dist, used from empty environments; of what is committed.
 # make docs: the site in out/site, links checked.
 # make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
 # make test-cpp | make test-arm: the C++ example (needs cmake); the edge package on an emulated aarch64. On Debian.
@@ -36,7 +37,7 @@ PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --n
 	--durations=8
 IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
 
-.PHONY: demo test test-all checked test-lowest test-lerobot test-ros lint style types layers bench fuzz soak figures docs web test-web test-cpp test-arm clean
+.PHONY: demo test test-all checked test-lowest test-lerobot test-ros test-dist lint style types layers bench fuzz soak figures docs web test-web test-cpp test-arm clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -87,6 +88,13 @@ $(ROS)/.ready: pyproject.toml constraints.txt
 	$(ROS)/bin/python -m pip install --quiet --constraint constraints.txt "torch" "setuptools"
 	$(ROS)/bin/python -m pip install --quiet ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs ros-geometry-msgs ros-std-srvs ros-diagnostic-msgs
 	$(ROS)/bin/python -m pip install --quiet --constraint constraints.txt pytest --editable ".[ros]"
+	touch $@
+
+test-dist: out/web/model.onnx $(VENV)/.dist
+	$(BIN)/python tests/dist.py out/dist out/web/model.onnx
+
+$(VENV)/.dist: $(READY)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt build
 	touch $@
 
 lint: style types layers

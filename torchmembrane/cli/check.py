@@ -24,6 +24,7 @@ examples:
   torchmembrane check sensor.toml
   torchmembrane check sensor.toml --out sensor.png
   torchmembrane check sensor.toml --overpressure 12hPa
+  torchmembrane check sensor.toml --robot robot      # as URDF and MJCF
   torchmembrane check preset:bubble --accuracy --out bubble.png
 
 The rest surface is tested where it can fail: what tension and pressure leave unbalanced, how far the nearest sheet is that is
@@ -44,6 +45,7 @@ def add_parser(commands: Any) -> None:
     add_sensor(add)
     add("--out", metavar="FIGURE.png", type=Path, help="draw it: side view with rays, rest surface, rest image, accuracy")
     add_force(add)
+    add("--robot", metavar="FOLDER", type=Path, help="write it for simulators of robots: URDF, MJCF, meshes (STL), in metres")
     gauge = "what a gauge reads at rest, inside over outside, with its unit, as 12hPa: compared with the model's"
     add("--overpressure", metavar="P", type=pressure, help=gauge)
     add("--accuracy", action="store_true", help="also what to expect of it, from simulated presses")
@@ -78,6 +80,11 @@ def run(arguments: Namespace) -> int:
         problem = MembraneError(f"{arguments.sensor}: {error}")
     frame = None if reconstructor is None else rest_frame(reconstructor)
     print("\n".join([*described(sensor, reconstructor, frame), *rest_in_words(sensor, arguments.overpressure)]), flush=True)
+    if arguments.robot:
+        from ..integrations.robot_model import write_robot_model
+
+        folder = write_robot_model(sensor, arguments.robot)
+        print(f"{sensor.name}.urdf, {sensor.name}.xml (MJCF) and their meshes written to {folder}")
     finished = _finished(sensor, arguments) if arguments.accuracy and not problem else None
     sheet = _sheet(sensor, arguments, finished) if finished else None
     if sheet and sheet.range and not str(arguments.sensor).startswith(PREFIX):

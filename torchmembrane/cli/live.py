@@ -61,7 +61,7 @@ def add_parser(commands: Any) -> None:
     add_sensor(add)
     opened = "a camera, by OpenCV: its number, 0 the first, or its path or address"
     add("--camera", metavar="NUMBER|PATH", type=camera, help=opened)
-    add("--video", metavar="FILE", type=Path, help="a video, as if it came from a camera")
+    add("--video", metavar="FILE", type=Path, help="a video, as if it came from a camera (extra video)")
     add("--images", metavar="FOLDER", type=Path, help="the images of a folder in name order, likewise")
     add("--rate", metavar="HZ", type=number_from(0.001, 1e6), help="pace of files (default: a video's own; of images 30)")
     add("--grid", metavar=("M", "N"), nargs=2, type=count, help="solver grid (default: the sensor file's)")

@@ -65,7 +65,11 @@ def add_parser(commands: Any) -> None:
     add("--engine", choices=ENGINES, default=ENGINES[0], help=where)
     part = "do the I-th of N disjoint parts of the frames; others may do theirs in the same DIR at the same time"
     add("--shard", metavar="I/N", type=share, default=(1, 1), help=part)
-    add("--video", action="store_true", help="treat every input as a video (mp4, mov, avi, mkv, webm, gif always are)")
+    add(
+        "--video",
+        action="store_true",
+        help="treat every input as a video (mp4, mov, avi, mkv, webm, gif always are); extra video",
+    )
     add("--topic", metavar="TOPIC", help="of the images in bags of ROS 2 (default: the only one; needs the extra ros)")
     messages = "also a bag of their results, a folder: wrenches, tractions, of a gas pressures, in N, N m, m and Pa"
     add("--bag", metavar="BAG", type=Path, help=messages)

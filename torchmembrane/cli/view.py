@@ -52,7 +52,7 @@ def add_parser(commands: Any) -> None:
         "--dataset",
         metavar="FOLDER",
         type=Path,
-        help="write all frames and their images as a data set of Hugging Face (parquet)",
+        help="write all frames and their images as a data set of Hugging Face (extra parquet)",
     )
     add("--ply", metavar="FILE.ply", type=Path, help="write the touched vertices as a point cloud, and draw nothing")
     add_force(add)
