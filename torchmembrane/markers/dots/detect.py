@@ -81,7 +81,7 @@ class BlobDetector(nn.Module):
         radii = np.geomspace(smallest, largest, 1 + int(np.ceil(steps)))
         levels = np.log2(np.maximum(radii / (FINEST_SIGMA * np.sqrt(2)), 1)).astype(int).clip(0, LEVELS - 1)
         height, width = inside.shape[-2:]
-        self.cell = 2 ** (int(levels[0]) + 1)
+        self.cell = min(2 ** (int(levels[0]) + 1), max(1, 2 ** int(np.log2(0.3 * pitch))))
         self.reach, self.count = max(1, int(0.25 * pitch / self.cell)), count
         block = max(self.cell, 2 ** (LEVELS - 1))
         lit = inside[0, 0].numpy() > 0

@@ -24,11 +24,13 @@ DIGITS = 8.0  # float32 has 20 binary ones after the point beside it
 BLOB, SHARE, NOISE, CONFIDENCE = 1 / 8, 1 / 64, 2.0**-18, 1 / 256
 """Steps of the blobs' centres, px, of shares of one, of the noise, in grey, and of the confidence: nothing finer is known of
 what the fit starts from, and without rounding, which is each runtime's own, it starts alike in all."""
+REACH = 2.5  # pitches: how far a dot is looked for from where it is at rest
 FEWEST = 0.2  # mean confidence of a frame that is half trusted
 
 
 def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tuple[int, int]) -> Tensor:
-    """`[1, 1, H, W]` 1 inside the rim and 2 pixels off it, else 0: the short triangles between dots and anchors.
+    """`[1, 1, H, W]` 1 where dots may be, 2 pixels off the rim, else 0: in the short triangles between dots and anchors, and in
+    those of a dot near dots.
 
     Raises:
         MembraneError: all of them lie outside the image.
@@ -42,7 +44,11 @@ def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tu
     longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max(1)
     pitch = np.append(spacing(pixels)[1], np.zeros(len(anchors)))[triangulation.simplices].max(1)
     kept = np.append(longest < 3 * pitch, False)
-    inside = kept[triangulation.find_simplex(np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1))]
+    place = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
+    triangle = triangulation.find_simplex(place)
+    distance, dot = cKDTree(pixels).query(place)
+    of_dot = np.append((triangulation.simplices < len(pixels)).any(1), False)
+    inside = kept[triangle] | (of_dot[triangle] & (distance < REACH * spacing(pixels)[1][dot]))
     inside = ndimage.binary_erosion(ndimage.binary_closing(inside, iterations=2), iterations=2)
     if not inside.any():
         raise MembraneError(
