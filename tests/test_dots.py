@@ -17,6 +17,8 @@ from torchmembrane.markers.dots.bands import bands, blur_rows
 from torchmembrane.markers.dots.blobs import _maxima
 from torchmembrane.markers.dots.coherence import Coherence
 from torchmembrane.markers.dots.deformation import monomial_map
+from torchmembrane.markers.dots.detect import BlobDetector
+from torchmembrane.markers.dots.ellipse import draw_dots
 from torchmembrane.markers.dots.fit import EllipseFit
 from torchmembrane.markers.dots.locator import DotLocator, membrane_mask
 from torchmembrane.markers.dots.pattern import DotPattern, find_dots, measure_dots
@@ -602,3 +604,24 @@ def test_maxima_are_the_values_that_a_maximum_filter_leaves(shape):
     values = np.random.default_rng(0).integers(0, 6, shape) / 5
     expected = (values == ndimage.maximum_filter(values, (3, 3, 3))) & (values > 0.5)
     np.testing.assert_array_equal(_maxima(values, 0.5), np.argwhere(expected))
+
+
+@pytest.mark.parametrize("radius", [5.0, 6.2])
+def test_large_dots_close_together_are_each_found(radius):
+    pixels = 40.0 + 15.3 * np.stack(np.meshgrid(np.arange(12), np.arange(9)), -1).reshape(-1, 2) @ [[1.0, 0.2], [-0.2, 1.0]]
+    shapes, inside = np.tile(radius * np.eye(2), (len(pixels), 1, 1)), torch.ones(1, 1, *SIZE[::-1], dtype=torch.float64)
+    detect = BlobDetector(np.full(len(pixels), radius), 14.0, len(pixels), inside)
+    blobs, _, _ = detect.double()(mean_pyramid(draw_dots(pixels, shapes, SIZE)))
+    within = np.all((pixels > 10) & (pixels < np.array(SIZE) - 11), 1)
+    assert cKDTree(blobs[0].numpy()).query(pixels[within])[0].max() < 1.5
+
+
+def test_dots_are_looked_for_two_pitches_off_also_where_the_rim_is_far():
+    pixels = 120.0 + 14.0 * np.stack(np.meshgrid(np.arange(6), np.arange(5)), -1).reshape(-1, 2)
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    rim = pixels.mean(0) + 105 * np.stack([np.cos(angle), np.sin(angle)], -1)
+    mask = membrane_mask(pixels, rim, SIZE)[0, 0].numpy() > 0
+    for way in ([-28, 0], [28, 0], [0, -28], [0, 28], [20, 20]):
+        u, v = (pixels + way).astype(int).T
+        assert mask[v, u].all()
+    assert not mask[5, 5]
