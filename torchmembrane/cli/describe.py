@@ -8,7 +8,7 @@ import torch
 from ..camera.mode import Mode
 from ..camera.model import Camera
 from ..machine_code import using
-from ..markers.placement import in_view
+from ..markers.spacing import in_view
 from ..reconstruct import Reconstructor
 from ..results.reconstruction import Frame
 from ..results.status import Status

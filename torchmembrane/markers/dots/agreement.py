@@ -12,7 +12,7 @@ CANDIDATES = 24  # blobs among which a dot chooses
 REACH = 2.5  # pitches, of a candidate from where the dot is expected
 PULL = 2.0  # pitches: standard deviation of a dot from where it is expected; wide, it only decides between equals
 STRETCH = 0.3  # standard deviation of a step to a neighbour from the one expected, over its length
-DOUBT = 3.0  # what a dot costs that is lost, and a step that is wrong at most, as half the square of standard deviations
+DOUBT = 5.0  # what a dot costs that is lost, and a step that is wrong at most, as half the square of standard deviations
 SIZE = 4.5  # what a wrong size costs at most
 EXCHANGES = 20
 DAMPING = 0.3  # of the messages
@@ -22,7 +22,7 @@ FAR = 1e3
 
 def edges(pixels: np.ndarray) -> np.ndarray:
     """Pairs `[E, 2]` of the neighbours among `pixels [D, 2]`: the edges of the Delaunay triangles, without the long ones."""
-    corners = Delaunay(pixels).simplices
+    corners = Delaunay(pixels, qhull_options="QJ Pp").simplices  # joggled: dots may be in one row
     pairs = np.unique(np.sort(corners[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), 1), axis=0)
     length, pitch = np.linalg.norm(np.diff(pixels[pairs], axis=1)[:, 0], axis=1), spacing(pixels)[1]
     return np.asarray(pairs[length < LONGEST * pitch[pairs].max(1)])
@@ -32,12 +32,13 @@ class NeighbourAgreement(nn.Module):
     """Assigns blobs to the dots of a pattern so that the steps between neighbours are as expected.
 
     Minimises over every dot's choice `k`, one of its candidates or none, `sum_d c_d(k_d) + sum_(d,e) min(|r_de|^2 / 2 s_de^2,
-    DOUBT)`, where `r_de` is the step from blob `k_d` to blob `k_e` less the one expected and `s_de` = `STRETCH` times the length of
-    that at rest. Loopy min-sum belief propagation (Pearl 1988; Weiss and Freeman 2001): a fixed number of exchanges of
-    messages along the edges. It knows no membrane: any flow does whose steps change by up to about half from one dot to the next.
+    DOUBT)`. `r_de` is the step from blob `k_d` to blob `k_e` less the one expected, `s_de` = `STRETCH` times its length at rest.
+    Loopy min-sum belief propagation (Pearl 1988; Weiss and Freeman 2001): messages along the edges are exchanged a fixed number
+    of times. It knows no membrane: any flow will do whose steps change by up to about half from one dot to the next.
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest, px.
+        seen: `[D]` bool, which of them are in the image at rest: for the others it costs nothing to be lost.
 
     Limitations:
         The choice of least cost is found as a rule, not always. Where the pattern is a lattice, one that has moved by a step
@@ -51,8 +52,9 @@ class NeighbourAgreement(nn.Module):
     narrowness: Tensor
     pull: Tensor
     reach: Tensor
+    lost: Tensor
 
-    def __init__(self, pixels: np.ndarray):
+    def __init__(self, pixels: np.ndarray, seen: np.ndarray):
         super().__init__()
         pairs, pitch = edges(pixels), spacing(pixels)[1]
         count, length = len(pairs), np.linalg.norm(pixels[pairs[:, 0]] - pixels[pairs[:, 1]], axis=1)
@@ -66,6 +68,7 @@ class NeighbourAgreement(nn.Module):
         self.register_buffer("incoming", torch.as_tensor(incoming))
         self.register_buffer("narrowness", torch.as_tensor(0.5 / (STRETCH * np.tile(length, 2)) ** 2)[:, None, None])
         self.register_buffer("pull", torch.as_tensor(0.5 / (PULL * pitch) ** 2)[:, None])
+        self.register_buffer("lost", torch.as_tensor(DOUBT * seen.astype(float))[:, None])
         self.register_buffer("reach", torch.as_tensor((REACH * pitch) ** 2)[:, None])
 
     def forward(self, expected: Tensor, blobs: Tensor, misfit: Tensor) -> tuple[Tensor, Tensor]:
@@ -97,7 +100,7 @@ class NeighbourAgreement(nn.Module):
         one_lost = torch.full_like(pair[..., :1], DOUBT / 2)
         pair = torch.cat([pair.clamp(max=DOUBT), one_lost], -1)
         both_lost = torch.cat([torch.full_like(pair[..., :1, :-1], DOUBT / 2), torch.zeros_like(pair[..., :1, :1])], -1)
-        own = torch.cat([value, torch.full_like(value[..., :1], DOUBT)], -1)
+        own = torch.cat([value, self.lost.expand_as(value[..., :1])], -1)
         return places, own, torch.cat([pair, both_lost], -2), torch.zeros_like(pair[:, :, 0])
 
     @traced

@@ -22,12 +22,13 @@ FAR = 1e3
 class Alignment(nn.Module):
     """Lays a pattern on the blobs of a frame as a whole.
 
-    From where the dots were, and from the rest pattern under the median of the deformation measured at the blobs: every pair of a
-    dot and a blob votes for a shift, and the start with the most votes is brought onto the blobs by an affine map, in a few steps of
-    expectation and maximisation (after Myronenko and Song 2010).
+    There are two starts: where the dots were, and the rest pattern under the median of the deformation measured at the blobs. For
+    each, all pairs of a dot and a blob vote for a shift. The start with the most votes is brought onto the blobs by an affine map,
+    in a few steps of expectation and maximisation (after Myronenko and Song 2010).
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest about their mean, px.
+        seen: `[D]` bool, which of them are in the image at rest: no other has a vote.
     """
 
     pixels: Tensor
@@ -35,14 +36,16 @@ class Alignment(nn.Module):
     shifts: Tensor
     home: Tensor
     ridge: Tensor
+    seen: Tensor
 
-    def __init__(self, pixels: np.ndarray):
+    def __init__(self, pixels: np.ndarray, seen: np.ndarray):
         super().__init__()
         shifts = np.arange(-SHIFTS, SHIFTS + VOTE / 2, VOTE)
         self.register_buffer("pixels", torch.as_tensor(pixels))
         self.register_buffer("unit", torch.as_tensor(np.median(spacing(pixels)[0])))
         self.register_buffer("shifts", torch.as_tensor(shifts))
         self.register_buffer("home", torch.as_tensor(np.exp(-(shifts[:, None] ** 2 + shifts**2) / (2 * HOME**2))))
+        self.register_buffer("seen", torch.as_tensor(seen.astype(float))[:, None])
         self.register_buffer("ridge", torch.diag(torch.tensor([STIFFNESS, STIFFNESS, 1e-3], dtype=torch.float64)))
 
     @traced
@@ -59,7 +62,7 @@ class Alignment(nn.Module):
         Returns:
             `[B, D, 2]`, px.
         """
-        weight = torch.exp(-0.5 * misfit)
+        weight = torch.exp(-0.5 * misfit) * self.seen
         typical = weighted_median(deformation.flatten(1, 2).mT, valid).unflatten(-1, (2, 2))
         before, votes = self.shifted(before, blobs, weight)
         mapped, others = self.shifted(self.pixels @ typical.mT, blobs, weight)

@@ -32,15 +32,16 @@ class DotMatcher(nn.Module):
 
     Nothing is known of the flow but that it is smooth. Dots are followed from where they were, or else, where one cannot be,
     searched for: the pattern is laid on the blobs as a whole (`Alignment`), then neighbours agree on their blobs
-    (`NeighbourAgreement`), a second time about where the first says. Each of a fixed number of steps then predicts every dot from
-    the sure ones around it and the local deformation, takes the blob nearest to the prediction and of its size, and keeps it
-    where the choice is mutual. Where some are lost, those that took another's blob are let go, and may find their own. What is
-    returned follows from which blob is which dot's alone, not from how that was found.
+    (`NeighbourAgreement`), a second time from where the first time says. A few steps then predict every dot from the sure ones
+    around it and the local deformation, take the blob nearest to the prediction and of its size, and keep it where the choice is
+    mutual. Where some are lost, those that took another's blob are let go, and may find their own. What is returned follows from
+    which blob is which dot's alone, not from how that was found.
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest, px.
         log_radius: `[D]`, as the blob detector finds it at rest.
         size_tolerance: standard deviation of a dot's log radius.
+        seen: `[D]` bool, which of them are in the image at rest.
 
     Limitations:
         See `DotLocator`.
@@ -53,16 +54,18 @@ class DotMatcher(nn.Module):
     stiffness: Tensor
     slope: Tensor
     log_radius: Tensor
+    seen: Tensor
 
-    def __init__(self, pixels: np.ndarray, log_radius: np.ndarray, size_tolerance: float):
+    def __init__(self, pixels: np.ndarray, log_radius: np.ndarray, size_tolerance: float, seen: np.ndarray):
         super().__init__()
         self.size_tolerance = size_tolerance
         nearest, _ = spacing(pixels)
-        self.alignment = Alignment(pixels - pixels.mean(0))
-        self.agreement = NeighbourAgreement(pixels)
+        self.alignment = Alignment(pixels - pixels.mean(0), seen)
+        self.agreement = NeighbourAgreement(pixels, seen)
         self.deformation = LocalDeformation(pixels)
         self.averages = FlowAverages(pixels, pixels, WIDTH)
         self.neighbour_steps = NeighbourSteps(pixels)
+        self.register_buffer("seen", torch.as_tensor(seen))
         self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
         self.register_buffer("pixels", torch.as_tensor(pixels - pixels.mean(0)))
         self.register_buffer("square", self.pixels.square().sum(-1))
@@ -130,7 +133,7 @@ class DotMatcher(nn.Module):
         *followed, kept = self.follow(*unstrained, previous)
 
         def searched() -> Sequence[Tensor]:
-            return self.either(kept, *followed, *self.search(blobs, log_radius, valid, previous))
+            return self.better(kept, *followed, *self.search(blobs, log_radius, valid, previous))
 
         weight, flow, strain = cond(kept, followed, searched)
         weight, flow, strain, complete = self.sure(weight, flow, strain, *unstrained)
@@ -156,18 +159,18 @@ class DotMatcher(nn.Module):
     def begin(
         self, blobs: Tensor, log_radius: Tensor, valid: Tensor, previous: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Where the dots were `[B, D, 2]` and the blobs `[B, K, 2]`, px about the pattern's mean at rest, without gradients; how
-        ill the blobs' sizes fit `[B, D, K]`."""
+        """Where the dots were `[B, D, 2]` and the blobs `[B, K, 2]`, px about the pattern's mean at rest, and the misfit of the
+        blobs' sizes `[B, D, K]`; without gradients."""
         flow, found = self.flow_before(previous)
-        place, _ = self.expected((self.pixels + 0 * flow), self.pixels + flow, found.to(flow.dtype))
+        place, _ = self.expected(self.pixels.expand_as(flow), self.pixels + flow, found.to(flow.dtype))
         misfit = self.misfit(log_radius, valid).detach()
         place = torch.where(found[..., None], self.pixels + flow, place)
         return place.expand(len(blobs), -1, -1), (blobs - self.origin).detach(), misfit
 
     @traced
     def expected(self, place: Tensor, blob: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the dots are expected `[B, D, 2]` by those around them that are `found [B, D]` on their `blob [B, D, 2]`, as they
-        are off the `place [B, D, 2]` where they were expected before; and how many these are `[B, D]`."""
+        """Where the dots are expected `[B, D, 2]` by those around them that are `found [B, D]` on their `blob [B, D, 2]`, from
+        how far these are off the `place [B, D, 2]` where they were expected before; and how many these are `[B, D]`."""
         flow = (found[..., None] * (blob - place)).mT
         gradient = self.averages.gradient(found, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1))
         away, support = self.averages.along(found, flow, gradient)
@@ -179,15 +182,15 @@ class DotMatcher(nn.Module):
         return self.choose((place - self.pixels).mT, support, known, base)
 
     def flow_before(self, previous: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Flow `[B, D, 2]` of the dots in the frames before, and which were found `[B, D]`; at rest without these or where half
-        were lost."""
-        found, flow = torch.ones_like(self.nearest[None]) > 0, torch.zeros_like(self.pixels[None])
+        """Flow `[B, D, 2]` of the dots in the frames before, and which were found `[B, D]`; without these or where half were
+        lost, none, and those seen at rest."""
+        found, flow = self.seen[None], torch.zeros_like(self.pixels[None])
         if previous is None:
             return flow, found
         finite = previous.isfinite().all(-1)
         enough = finite.to(flow.dtype).mean(-1, keepdim=True) > 0.5
         flow = torch.where((finite & enough)[..., None], previous - self.pixels - self.origin, flow)
-        return flow, finite | ~enough
+        return flow, torch.where(enough, finite, found)
 
     @traced
     def follow(self, known: Tensor, base: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -207,7 +210,7 @@ class DotMatcher(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What the dots that are found say, the same to the last digit whether they were followed or searched for; and in which
         frames `[B]` all are found, so that none can be on another's blob."""
-        complete = (weight >= KEPT).all(-1)
+        complete = ((weight >= KEPT) | ~self.seen).all(-1)
         weight, flow, strain = self.from_sure(weight, flow, strain, known, base)
         return weight, flow, self.averages.gradient(weight, flow, strain), complete
 
@@ -228,6 +231,11 @@ class DotMatcher(nn.Module):
         """These dots in the frames `kept [B]`, the others in the others."""
         weight, flow, strain = where_rows(kept, (weight, flow, strain), others)
         return weight, flow, strain
+
+    @traced
+    def better(self, kept: Tensor, weight: Tensor, flow: Tensor, strain: Tensor, *others: Tensor) -> State:
+        """These dots in the frames `kept [B]` and where the others are not more or surer, the others elsewhere."""
+        return self.either(kept | (weight.sum(-1) >= others[0].sum(-1)), weight, flow, strain, *others)
 
     @traced
     def scene(self, deformation: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
