@@ -32,7 +32,8 @@ class NeighbourAgreement(nn.Module):
     """Assigns blobs to the dots of a pattern so that the steps between neighbours are as expected.
 
     Minimises over every dot's choice `k`, one of its candidates or none, `sum_d c_d(k_d) + sum_(d,e) min(|r_de|^2 / 2 s_de^2,
-    DOUBT)`. `r_de` is the step from blob `k_d` to blob `k_e` less the one expected, `s_de` = `STRETCH` times its length at rest.
+    DOUBT)`. `r_de` is the step from blob `k_d` to blob `k_e` less the one expected, `s_de` is `STRETCH` times its length at
+    rest.
     Loopy min-sum belief propagation (Pearl 1988; Weiss and Freeman 2001): messages along the edges are exchanged a fixed number
     of times. It knows no membrane: any flow will do whose steps change by up to about half from one dot to the next.
 

@@ -22,9 +22,9 @@ FAR = 1e3
 class Alignment(nn.Module):
     """Lays a pattern on the blobs of a frame as a whole.
 
-    There are two starts: where the dots were, and the rest pattern under the median of the deformation measured at the blobs. For
-    each, all pairs of a dot and a blob vote for a shift. The start with the most votes is brought onto the blobs by an affine map,
-    in a few steps of expectation and maximisation (after Myronenko and Song 2010).
+    There are two starts: where the dots were, and the rest pattern under the median of the deformation measured at the blobs.
+    For each, all pairs of a dot and a blob vote for a shift. The start with the most votes is brought onto the blobs by an
+    affine map, in a few steps of expectation and maximisation (after Myronenko and Song 2010).
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest about their mean, px.

@@ -15,7 +15,7 @@ from .coherence import Coherence
 from .detect import BlobDetector
 from .ellipse import draw_dots, size_tolerance
 from .fit import EllipseFit
-from .match import DotMatcher
+from .match import KEPT, DotMatcher
 from .pattern import OUTLIER, DotPattern
 from .pyramid import mean_pyramid
 
@@ -25,6 +25,7 @@ BLOB, SHARE, NOISE, CONFIDENCE = 1 / 8, 1 / 64, 2.0**-18, 1 / 256
 """Steps of the blobs' centres, px, of shares of one, of the noise, in grey, and of the confidence: nothing finer is known of
 what the fit starts from, and without rounding, which is each runtime's own, it starts alike in all."""
 REACH = 2.5  # pitches: how far a dot is looked for from where it is at rest
+UNSEEN = 7.0  # odds against a dot that is fitted where no blob is
 FEWEST = 0.2  # mean confidence of a frame that is half trusted
 
 
@@ -81,15 +82,15 @@ def rounded(value: Tensor, step: float) -> Tensor:
 class DotLocator(nn.Module):
     """Pixels of the pattern's dots in each frame of a batch, with a confidence.
 
-    Blobs at the pattern's scales, matched from where the dots were or else along the smooth flow inwards from the rim, then
-    a least-squares fit of a blurred ellipse on sloping background. A lost dot has confidence 0 and its predicted pixel.
+    Blobs at the pattern's scales, matched from where the dots were or else by a smooth flow on which neighbours agree, then a
+    least-squares fit of a blurred ellipse on sloping background. A lost dot has confidence 0 and its predicted pixel.
 
     Args:
         pattern: the markers in the rest image.
         image_size: width, height.
         polarity: "dark" or "light".
-        anchors: pixels `[A, 2]` of the rim, where nothing moves, closer together than the dots; without them the pattern's
-            own outline has to do.
+        anchors: pixels `[A, 2]` of the rim, closer together than the dots, beyond which no dot is looked for; default:
+            anywhere in the image.
 
     Attributes:
         follows: True; dots are followed from frame to frame.
@@ -99,12 +100,12 @@ class DotLocator(nn.Module):
 
     Limitations:
         The flow may change by at most about half a pitch from one dot to the next: wrong where the spacing is below about
-        half of that at rest, where the rotation or shear is more than about 25 degrees, or the flow more than two pitches.
-        Most such regions end in a seam and are lost with all that is near it; what is left is confidently a whole pitch
-        off, one-size patterns more often. Without anchors a pattern that moves as a whole by a pitch, two sizes by the
-        pitch of the large ones, looks as at rest: the two cannot be distinguished. A dot that is missing beside a blob of
-        its size may be taken for it. Where many dots are missing (20 %) and as many false ones stand among them, right
-        dots are lost as well.
+        half of that at rest, where the middle of the pattern turns by more than about 30 degrees against its outline, or where
+        a part of it moves by more than two and a half pitches. Most such regions end in a seam and are lost with all that is
+        near it; what is left is confidently a whole pitch off, one-size patterns more often. A lattice that moves as a whole by
+        one of its steps is told from one at rest by its outline: by dots that are lost, and found, there. A dot that is missing
+        beside a blob of its size may be taken for it. Where many dots are missing (20 %) and as many false ones stand among
+        them, right dots are lost as well.
 
     Example:
         >>> rest = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)
@@ -203,6 +204,8 @@ class DotLocator(nn.Module):
         deviation = safe_length(seen - predicted, -1) / self.match.nearest
         confidence = quality * torch.sigmoid(20 * (OUTLIER - deviation))
         confidence = confidence * self.coherence(seen, confidence, strain, predicted, blobs, log_radius, valid)
+        odds = torch.where(certainty < KEPT, UNSEEN, 1.0)
+        confidence = confidence / (confidence + (1 - confidence) * odds)
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
         confidence = self._alike(confidence, CONFIDENCE)
         return LocatedMarkers(torch.where(confidence[..., None] > 0.05, pixels, predicted), confidence, covariance)

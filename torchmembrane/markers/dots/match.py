@@ -32,10 +32,10 @@ class DotMatcher(nn.Module):
 
     Nothing is known of the flow but that it is smooth. Dots are followed from where they were, or else, where one cannot be,
     searched for: the pattern is laid on the blobs as a whole (`Alignment`), then neighbours agree on their blobs
-    (`NeighbourAgreement`), a second time from where the first time says. A few steps then predict every dot from the sure ones
-    around it and the local deformation, take the blob nearest to the prediction and of its size, and keep it where the choice is
-    mutual. Where some are lost, those that took another's blob are let go, and may find their own. What is returned follows from
-    which blob is which dot's alone, not from how that was found.
+    (`NeighbourAgreement`), a second time from where the first time says. A few steps then predict every dot from the sure
+    ones around it and the local deformation, take the blob nearest to the prediction and of its size, and keep it where the
+    choice is mutual. Where some are lost, those that took another's blob are let go, and may find their own. What is returned
+    follows from which blob is which dot's alone, not from how that was found.
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest, px.
@@ -153,7 +153,8 @@ class DotMatcher(nn.Module):
         place = self.alignment(place, blobs, misfit, deformation, valid)
         for _ in range(ROUNDS):
             place, support = self.expected(place, *self.agreement(place, blobs, misfit))
-        return fori_loop(self.settle, SETTLING, self.chosen(place, support, known, base), known, base)
+        weight, flow, strain = fori_loop(self.settle, SETTLING, self.chosen(place, support, known, base), known, base)
+        return weight, flow, strain
 
     @traced
     def begin(
