@@ -201,8 +201,9 @@ def test_a_name_twice_or_of_no_image_is_named(kind, tmp_path):
 
 
 def test_forces_are_of_images_by_either_name_in_any_order(tmp_path):
-    (found,) = read("magnitudes", tmp_path, "force,image\n3,c\n1,a.png\n")
-    np.testing.assert_array_equal(found, [[1.0], [np.nan], [3.0]])
+    forces, deviations = read("magnitudes", tmp_path, "force,image\n3,c\n1,a.png\n")
+    np.testing.assert_array_equal(forces, [[1.0], [np.nan], [3.0]])
+    assert deviations is None
 
 
 def test_a_force_of_zero_is_refused(tmp_path):

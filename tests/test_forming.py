@@ -303,3 +303,15 @@ def test_a_press_on_a_drafted_window_is_found_with_its_force(tmp_path):
     (row,) = csv.DictReader((results / "summary.csv").open())
     force = np.array([float(row[f"force_{c}"]) for c in "xyz"])
     assert row["status_text"] == "ok" and np.linalg.norm(force - truth["force"]) < 0.1 * np.linalg.norm(truth["force"])
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_a_sheet_is_the_same_in_every_unit_of_length(unit):
+    """In a rim of 32 points, in whose corners of the grid many choices are equally good."""
+    turns = np.arange(32) * np.pi / 16
+    rim = np.stack([8 * np.cos(turns), 8 * np.sin(turns), np.full(32, 14.0)], 1)
+    one, other = (
+        formed_surface(rim * scale, SheetMaterial("neo_hookean", 1.05), height=4 * scale, lines=17) for scale in (1, unit)
+    )
+    np.testing.assert_allclose(other.vertices / unit, one.vertices, atol=1e-9)
+    assert other.pressure * unit == pytest.approx(one.pressure, rel=1e-9)

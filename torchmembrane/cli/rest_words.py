@@ -36,7 +36,7 @@ def _nearest(shape: RestShape, sheet: NearestSheet | None, sensor: Sensor) -> li
     if sheet is None:
         return []
     unit, stretch = sensor.length_unit, sensor.material.prestretch
-    off = f"{sheet.distance:.2g} {unit} rms, at most {sheet.most:.2g}"
+    off = f"{sheet.distance:.3g} {unit} rms, at most {sheet.most:.3g}"
     lines = [f"the nearest sheet that is blown up in this rim, {sheet.height:.4g} {unit} high, lies {off} from this surface"]
     ratio = sheet.pressure / shape.pressure
     if sheet.distance > FAR * sensor.membrane.size or not 1 / ALIKE < ratio < ALIKE:

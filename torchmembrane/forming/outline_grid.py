@@ -212,7 +212,7 @@ def _corner_places(points: np.ndarray) -> np.ndarray:
 
     def away(places: np.ndarray) -> np.ndarray:
         found: np.ndarray = (at[1:][None] - places[:, None] + 0.5) % 1 - 0.5
-        return found
+        return found.round(9)  # as all that is compared here: what is equal stays so whatever the unit of length
 
     places = (np.arange(PLACES) + 0.5) / PLACES
     for _ in range(SHIFTS):
@@ -231,6 +231,9 @@ def _corner_places(points: np.ndarray) -> np.ndarray:
     uneven = (np.log(sides[:, :2] / sides[:, 2:]) ** 2).sum(1)
     chosen = sets[int(np.round(lacking + (between**2).sum(1) + uneven, 6).argmin())]  # the first of equal ones
     corners = places[chosen]
-    if int(turn[chosen].argmin()) in (1, 3):  # the diagonals split the first and the third: the flattest of all is one of them
+    if int(np.round(turn[chosen], 6).argmin()) in (
+        1,
+        3,
+    ):  # the diagonals split the first and the third: the flattest of all is one of them
         corners = np.concatenate([corners[1:], corners[:1] + 1])
     return corners
