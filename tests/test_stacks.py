@@ -172,7 +172,7 @@ def test_a_gif_is_a_video_and_no_image(run, tmp_path):
 def test_a_damaged_end_of_a_stack_is_a_failed_frame_and_the_batch_goes_on(run, tmp_path):
     run.write_bytes(run.read_bytes()[:-20])
     outcome, lines, _ = reconstruct([run, grey_image(tmp_path / "one.png", 99)], tmp_path / "out")
-    assert outcome[0] == 3 and outcome[4] == 1 and len(lines) == 1
+    assert outcome[0] == 3 and outcome.failed == 1 and len(lines) == 1
     assert f"{run}, run_000002: not readable as an image" in lines[0]
     assert summary_of(tmp_path / "out")["run_000002"]["status"] == "-1"
 

@@ -141,5 +141,5 @@ def test_frames_out_of_range_are_finished_and_counted(images, tmp_path):  # noqa
             return Reconstruction(**found._asdict() | {"status": torch.full_like(found.status, 9)})
 
     counts, lines, _ = reconstruct(images, tmp_path / "out", reconstructor=Deep())
-    assert counts == FrameCounts(5, 0, 0, 0, 0, 0, out_of_range=5) and lines == []
+    assert counts == FrameCounts(5, 0, 0, 0, 5, 0, 0) and lines == []
     assert reconstruct(images, tmp_path / "out")[0].skipped == 5

@@ -41,9 +41,9 @@ class FrameCounts(NamedTuple):
     not_converged: int
     unexplained: int
     hidden: int
+    out_of_range: int
     failed: int
     skipped: int
-    out_of_range: int
 
 
 def reconstruct_files(
@@ -97,7 +97,7 @@ def reconstruct_files(
         >>> sensor = replace(sensor, markers=replace(sensor.markers, rest_image=None))  # quicker, less accurate
         >>> reconstructor, images = Reconstructor(sensor), find_inputs(["examples/rest.png"])
         >>> reconstruct_files(reconstructor, images, tempfile.mkdtemp(), Settings.of(reconstructor, "npz"))
-        FrameCounts(reconstructed=1, not_converged=0, unexplained=0, hidden=0, failed=0, skipped=0, out_of_range=0)
+        FrameCounts(reconstructed=1, not_converged=0, unexplained=0, hidden=0, out_of_range=0, failed=0, skipped=0)
     """
     out, report = Path(out), report or _write_line
     mesh = Mesh.of(reconstructor, settings)
@@ -117,8 +117,8 @@ def reconstruct_files(
                 folder.save()
                 progress.update(len(group), done)
     good = sum(done[status] for status in FINISHED)
-    doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN]
-    return FrameCounts(good, *doubts, done.total() - good, progress.initial, done[Status.OUT_OF_RANGE])
+    doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN], done[Status.OUT_OF_RANGE]
+    return FrameCounts(good, *doubts, done.total() - good, progress.initial)
 
 
 def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:
