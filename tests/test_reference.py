@@ -13,7 +13,7 @@ import pytest
 import torchmembrane as tm
 from torchmembrane.results.store import Mesh
 from torchmembrane.results.summary_row import NAMES
-from torchmembrane.sensor import parts
+from torchmembrane.sensor import parts, units
 from torchmembrane.sensor.table import Table
 from torchmembrane.sensor.toml import read_sensor
 
@@ -98,7 +98,7 @@ def keys(tmp_path, monkeypatch):
 
 def test_every_key_of_the_sensor_file_and_every_word_is_in_the_reference(keys):
     assert len(keys) > 40
-    words = {*parts.MODELS, *parts.FILLINGS, *SURFACES, *parts.METRE, "pinhole", "fisheye", "dots", "texture", "dark", "light"}
+    words = {*parts.MODELS, *parts.FILLINGS, *SURFACES, *units.METRE, "pinhole", "fisheye", "dots", "texture", "dark", "light"}
     arrays = {name for names in parts.SHAPES_BY_ARRAYS.values() for name in names}
     assert (keys | words | arrays | {"large", "small"}) <= quoted(SENSOR_FILE)
 

@@ -12,6 +12,7 @@ from torchmembrane.calibrate import rest_from_image
 from torchmembrane.presets.blown_up import Stated, blown_up, sheet_dots
 from torchmembrane.sensor.inflated import InflatedSurface
 from torchmembrane.sensor.parts import Cavity, Markers
+from torchmembrane.sensor.units import hectopascal
 from torchmembrane.simulate.appearance import noisy
 from torchmembrane.simulate.render import Renderer
 
@@ -53,7 +54,7 @@ def photograph():
         markers=replace(true.markers, positions=place(true.markers.positions)),
     )
     image = noisy(Renderer(placed)(placed.membrane.rest), 40.0, np.random.default_rng(0)).numpy().astype(np.float32)
-    return image, true.surface.formed.pressure * true.material.modulus / true.surface.hectopascal
+    return image, true.surface.formed.pressure * true.material.modulus / hectopascal("mm")
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +82,7 @@ def test_without_a_gauge_the_prestretch_is_less_sure_and_without_a_modulus_the_g
     unknown = window(5.8, 1.1)
     unknown = replace(unknown, material=replace(unknown.material, shear_modulus=None))
     made = rest_from_image(unknown, image, gauge).sensor
-    held = made.surface.formed.pressure * made.material.modulus / made.surface.hectopascal
+    held = made.surface.formed.pressure * made.material.modulus / hectopascal("mm")
     assert held == pytest.approx(gauge, rel=1e-3) and made.force_unit == "N"
 
 

@@ -1,6 +1,7 @@
 """Pictures of a whole folder: force, moment and pressure over time, and all frames on one sheet."""
 
 import csv
+import shutil
 
 import numpy as np
 import pytest
@@ -92,7 +93,17 @@ def test_the_command_draws_a_plot_and_a_sheet(folder, tmp_path, capsys):
     assert f"4 frames of {folder} drawn" in said and "4 of 4 frames" in said
     assert main(["view", str(folder), str(folder), "--plot", str(tmp_path / "forces.png")]) == 0  # its own may be drawn anew
     assert min(Image.open(tmp_path / "forces.png").size) > 1000
-    assert main(["view", str(folder), str(folder)]) == 2 and "2 results without --plot" in capsys.readouterr().err
+    for more in ([], ["--plot", str(tmp_path / "forces.png"), "--sheet", str(tmp_path / "sheet.png")]):
+        assert main(["view", str(folder), str(folder), *more]) == 2
+        assert "2 results; expected one, or --plot FILE.png alone" in capsys.readouterr().err
+
+
+def test_a_plot_spares_the_tables_of_all_folders(folder, tmp_path, capsys):
+    other = shutil.copytree(folder, tmp_path / "other")
+    table = other / "summary.csv"
+    before = table.read_bytes()
+    assert main(["view", str(folder), str(other), "--plot", str(table), "--force"]) == 2
+    assert str(table) in capsys.readouterr().err and table.read_bytes() == before
 
 
 def test_a_folder_without_a_table_of_this_version_is_refused(folder, tmp_path, capsys):

@@ -16,7 +16,7 @@ from torchmembrane.integrations.rosbag import StampedMessage
 from torchmembrane.results import summary_row
 from torchmembrane.results.read import read_results
 from torchmembrane.results.summary_row import METRE, NAMES
-from torchmembrane.sensor import parts
+from torchmembrane.sensor import units
 
 EDGE = Path(__file__).parents[1] / "export" / "torchmembrane_edge"
 HEADER = (
@@ -125,7 +125,7 @@ def test_relative_pressures_are_not_given_in_hectopascals():
     normals = np.zeros((0, 3))
     assert summary_row.numbers(frame, normals, "m", "N")["pressure_hpa"] == pytest.approx(0.02)
     assert np.isnan(summary_row.numbers(frame, normals, "m", "relative")["pressure_hpa"])
-    assert METRE == parts.METRE
+    assert METRE == units.METRE
 
 
 TIMES = {

@@ -20,7 +20,7 @@ from torchmembrane.integrations.frame_messages import SiUnits
 from torchmembrane.live.line import described
 from torchmembrane.live.loop import Seen, Tally
 from torchmembrane.machine_code import using
-from torchmembrane.sensor.parts import millimetre
+from torchmembrane.sensor.units import millimetre
 from torchmembrane.simulate.render import Renderer
 
 CAP = {"radius": 8.0, "height": 4.0, "distance": 14.0, "pitch": 2.1, "thickness": 0.4}  # mm

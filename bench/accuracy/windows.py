@@ -22,7 +22,7 @@ from torch import Tensor
 
 import torchmembrane as tm
 from torchmembrane.calibrate.material import KnownForces, material_from_pixels
-from torchmembrane.forming.outline import ellipse, outline_of, rectangle
+from torchmembrane.forming.outline import ellipse, encloses, outline_of, rectangle
 from torchmembrane.presets.blown_up import Stated, blown_up
 from torchmembrane.sensor.parts import Cavity, Markers
 
@@ -55,10 +55,10 @@ class Twin:
         i, j = np.meshgrid(*(np.arange(-40, 41),) * 2)
         inner = np.stack([i + 0.5 * (j % 2), j * math.sqrt(0.75)], -1).reshape(-1, 2) * STEP
         far = np.linalg.norm(inner[:, None] - border[None, :, :2], axis=2).min(1) > 0.6 * STEP
-        inner = inner[far & within(border[:, :2], inner)]
+        inner = inner[far & encloses(border[:, :2], inner)]
         flat = np.concatenate([border[:, :2], inner])
         cells = Delaunay(flat).simplices
-        cells = cells[within(border[:, :2], flat[cells].mean(1))]
+        cells = cells[encloses(border[:, :2], flat[cells].mean(1))]
         self.fixed, self.flat, self.cells = len(border), flat, torch.from_numpy(cells.astype(np.int64))
         e = self._edges(torch.from_numpy(np.insert(flat, 2, 0.0, axis=1)))
         turned = torch.linalg.cross(e[..., 0], e[..., 1])[:, 2] < 0
@@ -149,27 +149,18 @@ def least(value, start: Tensor) -> Tensor:
     return torch.from_numpy(minimize(both, start.numpy(), jac=True, method="L-BFGS-B", options=options).x)
 
 
-def within(rim: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Which `points [N, 2]` lie in a polygon."""
-    a, b = rim[None], np.roll(rim, -1, 0)[None]
-    x, y = points[:, :1], points[:, 1:]
-    crosses = (a[..., 1] > y) != (b[..., 1] > y)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at = a[..., 0] + (y - a[..., 1]) / (b[..., 1] - a[..., 1]) * (b[..., 0] - a[..., 0])
-    return (crosses & (at > x)).sum(1) % 2 == 1
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--noise", type=float, default=0.1, help="px")
     parser.add_argument("--material", action="store_true")
-    parser.add_argument("--rims", nargs="+", default=list(rims()))
+    parser.add_argument("--rims", nargs="+", choices=list(rims()), default=list(rims()))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rng, errors = np.random.default_rng(0), []
     camera = tm.Camera("pinhole", (640, 480), (480.0, 480.0), (321.0, 238.0))
-    for name in arguments.rims:
-        rim = rims()[name]
+    for name, rim in rims().items():
+        if name not in arguments.rims:
+            continue
         twin = Twin(rim)
         rest = twin.blown_up()
         outline = outline_of(rim)

@@ -9,8 +9,8 @@ import numpy as np
 from ..mechanics.cavity import rest_balance
 from ..sensor.factories import elastic_energy
 from ..sensor.inflated import InflatedSurface
-from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
+from ..sensor.units import hectopascal
 
 REST_ERROR = 0.05
 """Of the modulus from a gauge at rest, relative: that of the rest shape, whose height enters, and of the reading."""
@@ -117,7 +117,7 @@ def modulus_at_rest(sensor: Sensor, log_stretch: float, deviation: float, overpr
         deviation: its standard deviation.
         overpressure: at rest, hPa.
     """
-    measured = overpressure * 100 / METRE[sensor.length_unit] ** 2
+    measured = overpressure * hectopascal(sensor.length_unit)
 
     def modulus(stretch: float) -> float:
         if isinstance(sensor.surface, InflatedSurface):

@@ -228,7 +228,7 @@ def _material(
     if pressures is not None:
         reconstructor.estimator.check_gauge()
     presses = Presses(reconstructor, displacement, confidence)
-    of_round, later = _shares(sensor, (forces, pressures, overpressure) != (None,) * 3, rounds, progress)
+    of_round, later = _shares(sensor, any(given is not None for given in known[2:]), rounds, progress)
     of_profile = PROFILE_SHARE[0 if pressures is not None else 1 if forces is not None else 2]
     profile = presses.profile(within(of_round, 0.0, of_profile))
     of_modulus = within(of_round, of_profile, 1.0)

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd
 
-from ..errors import MembraneError
 from ..files.grayscale import check_image
 from ..progress import Progress
 from ..sensor.inflated import InflatedSurface
 from ..sensor.parts import Markers
 from ..sensor.sensor import Sensor
+from ..sensor.units import hectopascal
 from .fit import Fit, fit, outliers, outline_centres, rotations, with_common_errors
 from .rest import NAMES, RestFit, measured_outlines, nulling, shading_bias, warn_of_press
 from .surface import fine_surface, frames_at
@@ -92,8 +92,7 @@ def rest_of_sheet(sensor: Sensor, image: np.ndarray, overpressure: float | None,
         MembraneError: as `rest_from_image`; a height or prestretch without an equilibrium.
     """
     sheet, X, sizes = sensor.surface, sensor.markers.positions, sensor.markers.sizes
-    if not isinstance(sheet, InflatedSurface) or X is None:
-        raise MembraneError("calibrate rest: the sensor lists no dots; expected [markers] file, or use views or depth")
+    assert isinstance(sheet, InflatedSurface) and X is not None  # as `rest_from_image` has seen
     image = check_image("calibrate rest: the image", image, sensor.camera.image_size)
     progress(0.0, "dots of the image")
     fine = fine_surface(sensor)
@@ -158,7 +157,7 @@ def _known(sensor: Sensor, linear: _Linear, stated: np.ndarray, overpressure: fl
     rows, values = [np.eye(8)[7] / STRETCH_ERROR], [stated[1] / STRETCH_ERROR]
     surface = sensor.surface
     if overpressure is not None and sensor.force_unit == "N" and isinstance(surface, InflatedSurface):
-        wanted = np.log(overpressure * surface.hectopascal / sensor.material.modulus)
+        wanted = np.log(overpressure * hectopascal(sensor.length_unit) / sensor.material.modulus)
         row = np.concatenate([np.zeros(6), linear.pressure_slopes]) / HELD_ERROR
         rows.append(row)
         values.append((wanted - linear.pressure + linear.pressure_slopes @ linear.at) / HELD_ERROR)
@@ -183,7 +182,7 @@ def _moved(
     values = {"outline": rim, "height": float(result.values[6])}
     material = flat.material
     if overpressure is not None and sensor.force_unit == "relative":
-        product = overpressure * flat.hectopascal / flat.formed.pressure
+        product = overpressure * hectopascal(sensor.length_unit) / flat.formed.pressure
         thickness = material.thickness or 1.0
         material = replace(material, shear_modulus=product / thickness, thickness=thickness)
     surface = InflatedSurface(flat.shape, values, material, flat.length_unit)

@@ -16,8 +16,8 @@ from ..results.reconstruction import Frame
 from ..results.status import Status
 from ..sensor.factories import elastic_energy
 from ..sensor.inflated import InflatedSurface
-from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
+from ..sensor.units import hectopascal
 
 LISTED = 12
 """Missing markers that are named one by one."""
@@ -48,7 +48,7 @@ def pressure_in_words(pressure: float, sensor: Sensor) -> str:
     if sensor.force_unit == "relative":
         return f"{pressure:.4g} (relative)"
     unit = sensor.length_unit
-    return f"{pressure:.4g} N/{unit}² = {pressure * METRE[unit] ** 2 / 100:.4g} hPa"
+    return f"{pressure:.4g} N/{unit}² = {pressure / hectopascal(unit):.4g} hPa"
 
 
 def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame: Frame | None = None) -> list[str]:

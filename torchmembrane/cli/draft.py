@@ -19,9 +19,10 @@ from ..presets.dot_list import read_drafted_dots
 from ..presets.draft import SHAPES, SHEETS, RimCircle, balanced, drafted_dots, drafted_surface, focal_of_view, overpressure
 from ..reconstruct import Reconstructor
 from ..sensor.inflated import read_rim
-from ..sensor.parts import METRE, Cavity, Markers, Surface
+from ..sensor.parts import Cavity, Markers, Surface
 from ..sensor.sensor import Sensor
 from ..sensor.toml import default_grid
+from ..sensor.units import METRE
 from .choices import FROM_IMAGE
 
 ROUND = 0.95  # shorter over longer half axis of a rim, from which on it is taken for a circle

@@ -1,8 +1,8 @@
 """What `check` says of a rest surface: whether it can be at rest, what a gauge says of it, and what either does to forces."""
 
 from ..accuracy.rest_shape import NearestSheet, RestShape, rest_shape
-from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
+from ..sensor.units import hectopascal
 from .describe import pressure_in_words
 
 LEFT_OVER = 0.15  # of the pressure: a sheet that is given as a grid, taken for evenly stretched, has up to 0.13
@@ -56,7 +56,7 @@ def _nearest(shape: RestShape, sheet: NearestSheet | None, sensor: Sensor) -> li
 def _gauge(shape: RestShape, sensor: Sensor, gauge: float | None) -> list[str]:
     if gauge is None:
         return []
-    measured = gauge * 100 / METRE[sensor.length_unit] ** 2
+    measured = gauge * hectopascal(sensor.length_unit)
     ratio = measured / shape.pressure
     if sensor.force_unit == "relative":
         return [

@@ -65,11 +65,12 @@ def run(arguments: Namespace) -> int:
     from ..results.read import read_results
 
     rerun, folders = wants_rerun(arguments), arguments.result
-    if len(folders) > 1 and arguments.plot is None:
-        raise MembraneError(f"view: {len(folders)} results without --plot; expected one, or --plot FILE.png")
+    others = arguments.out, arguments.video_out, arguments.sheet, arguments.save, arguments.ply
+    alone = not rerun and all(made is None for made in (*others, arguments.dataset))
+    if len(folders) > 1 and not (alone and arguments.plot):
+        raise MembraneError(f"view: {len(folders)} results; expected one, or --plot FILE.png alone, which draws several")
+    _spare_files(arguments, folders, arguments.plot, *others)
     arguments.result = folders[0]
-    drawn = arguments.plot, arguments.sheet
-    _spare_files(arguments, arguments.out, arguments.video_out, arguments.save, arguments.ply, *drawn)
     if arguments.plot is not None:
         _plot(folders, arguments.plot)
     if not rerun and all(made is None for made in (arguments.video_out, arguments.sheet, arguments.dataset)):
@@ -93,17 +94,17 @@ def run(arguments: Namespace) -> int:
     return 0
 
 
-def _spare_files(arguments: Namespace, *targets: Path | None) -> None:
+def _spare_files(arguments: Namespace, folders: list[Path], *targets: Path | None) -> None:
     """Refuse to write over files, those of earlier drawings excepted."""
     from functools import partial
 
     from ..files.targets import refuse_overwriting
     from ..plot.drawing import drawn_by
 
-    result, images = arguments.result, arguments.images or arguments.result / "images"
-    read = [path for pattern in ("*.npz", "frames/*.parquet", "*.csv") for path in result.glob(pattern)]
-    read += [path for path in (result, arguments.mesh, arguments.image) if path is not None]
-    read += images_in(images).values()
+    patterns = "*.npz", "frames/*.parquet", "*.csv"
+    read = [path for folder in folders for pattern in patterns for path in folder.glob(pattern)]
+    read += [path for path in (*folders, arguments.mesh, arguments.image) if path is not None]
+    read += images_in(arguments.images or folders[0] / "images").values()
     written = [path for path in targets if path is not None]
     refuse_overwriting("view", written, read, arguments.force, partial(drawn_by, "view"))
 
@@ -152,7 +153,7 @@ def _draw(arguments: Namespace) -> int:
         show(drawing)
         return 0
     out = arguments.out or home / f"{name}_view.png"
-    _spare_files(arguments, out)
+    _spare_files(arguments, [arguments.result], out)
     save(drawing, out, "view")
     print(f"{name} drawn in {out}")
     return 0

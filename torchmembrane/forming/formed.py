@@ -4,11 +4,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
 from ..errors import MembraneError
+from ..surface.resampling import at_equal_steps
 from ..surface.topology import grid_triangles
 from .inflate import Sheet, inflated_by, inflated_to
 from .outline import Outline, outline_of
@@ -170,8 +170,4 @@ def _film(outline: Outline, cells: OutlineGrid) -> np.ndarray:
 
 
 def _on(X: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    m, n = X.shape[:2]
-    if (m, n) == tuple(grid):
-        return X
-    lines = np.linspace(0, m - 1, grid[0]), np.linspace(0, n - 1, grid[1])
-    return np.stack([RectBivariateSpline(np.arange(m), np.arange(n), X[..., c])(*lines) for c in range(3)], -1)
+    return X if X.shape[:2] == tuple(grid) else at_equal_steps(X, grid)

@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.interpolate import RectBivariateSpline
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from ..errors import MembraneError
 from ..surface.membrane import Membrane
+from ..surface.resampling import at_equal_steps
 from ..surface.topology import grid_triangles
 from .sheet_energy import SheetEnergy
 
@@ -110,38 +110,36 @@ class _Inflation:
             )
         first = self.levels[0]
         count = max(2, int(np.ceil((height - self.top) / (RISE * self.size))))
-        x, pressure = first.solved(
-            first.bulged((height - self.top) / count), None, height=self.top + (height - self.top) / count
-        )
-        for k in range(2, count + 1):
-            goal = self.top + (height - self.top) * k / count
-            x, pressure = first.solved(x, pressure, height=goal)
-        return self._refined(x, pressure, height=height)
+        x = first.bulged((height - self.top) / count)
+        p = first.pressure_of(x)
+        for goal in np.linspace(self.top, height, count + 1)[1:].tolist():
+            x, p = first.solved(x, p, goal)
+        return self._refined(x, p, height)
 
     def by_pressure(self, pressure: float) -> Inflated:
-        first, x, found = self.levels[0], None, 0.0
+        first = self.levels[0]
         rise = first.rise_by(pressure)
+        x = first.bulged(rise)
+        x, found = first.solved(x, first.pressure_of(x), self.top + rise)
         while found < pressure:
-            height = self.top + rise
+            rise *= 1.25
             before = found
-            x, found = first.solved(first.bulged(rise) if x is None else x, None if x is None else found, height=height)
+            x, found = first.solved(x, found, self.top + rise)
             if found < before or rise > HIGHEST * self.size:
                 raise MembraneError(
                     f"inflated: a pressure of {pressure:.4g} x modulus x thickness; the sheet holds at most about "
                     f"{max(found, before):.4g} of these: expected a lower pressure or a larger modulus, thickness or prestretch"
                 )
-            rise *= 1.25
-        assert x is not None
-        return self._refined(*first.solved(x, found, pressure=pressure), pressure=pressure)
+        return self._refined(first.solved(x, pressure)[0], pressure)
 
-    def _refined(self, x: Tensor, found: float, **goal: float) -> Inflated:
+    def _refined(self, x: Tensor, p: float, height: float | None = None) -> Inflated:
         level = self.levels[0]
         for finer in self.levels[1:]:
             x = finer.interpolated(level, x)
-            x, found = finer.solved(x, found, **goal)
+            x, p = finer.solved(x, p, height)
             level = finer
         vertices = x.numpy().reshape(*level.membrane.grid, 3) - level.shift
-        return Inflated(vertices, float(found), float(vertices[..., 2].max()))
+        return Inflated(vertices, p, float(vertices[..., 2].max()))
 
 
 class _Level:
@@ -185,19 +183,11 @@ class _Level:
 
     def interpolated(self, coarse: "_Level", x: Tensor) -> Tensor:
         """What a coarser grid found, bicubic in its lines; the rim stays on the sheet."""
-        (m, n), (M, N) = coarse.membrane.grid, self.membrane.grid
-        moved = (x - coarse.sheet).numpy().reshape(m, n, 3)
-        lines = np.linspace(0, m - 1, M), np.linspace(0, n - 1, N)
-        u = np.stack([RectBivariateSpline(np.arange(m), np.arange(n), moved[..., c])(*lines) for c in range(3)], -1)
+        u = at_equal_steps((x - coarse.sheet).numpy().reshape(*coarse.membrane.grid, 3), self.membrane.grid)
         return self.sheet + torch.from_numpy(u.reshape(-1, 3)) * ~self.membrane.fixed[:, None]
 
-    def solved(
-        self, x: Tensor, guess: float | None, *, height: float | None = None, pressure: float | None = None
-    ) -> tuple[Tensor, float]:
-        """The equilibrium near a start, at a height or a pressure."""
-        p = pressure if pressure is not None else guess
-        if p is None:
-            p = self._least_squares_pressure(x)
+    def solved(self, x: Tensor, p: float, height: float | None = None) -> tuple[Tensor, float]:
+        """The equilibrium near a start, at the pressure `p`, or at a height and the pressure near `p` that holds it."""
         for _ in range(STEPS):
             force = self._force(x, p)
             gap = 0.0 if height is None else height - float(x[:, 2].max() - self.shift[2])
@@ -229,7 +219,8 @@ class _Level:
             rise = (gap - y[top]) / g[top]
         return torch.from_numpy((y + rise * g).reshape(-1, 3)), float(rise)
 
-    def _least_squares_pressure(self, x: Tensor) -> float:
+    def pressure_of(self, x: Tensor) -> float:
+        """The pressure that holds a surface best, by least squares of the forces left."""
         u, v = (a[self.free] for a in (self.energy.gradient(x), self.membrane.volume_gradient(x)))
         return float((u * v).sum() / (v * v).sum())
 

@@ -160,6 +160,29 @@ def outline_of(points: ArrayLike) -> Outline:
     return Outline(flat[:, :2] - centre[:2], flat[:, 2] - centre[2], X.mean(0) + centre @ axes, axes)
 
 
+def encloses(rim: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Which points are within a closed polygon, by the number of its sides to their right.
+
+    Args:
+        rim: `[K, 2]` once around, either way.
+        points: `[D, 2]`.
+
+    Returns:
+        `[D]` bool.
+
+    Example:
+        >>> encloses(np.array([[0.0, 0], [4, 0], [4, 4], [2, 1], [0, 4]]), np.array([[1.0, 1], [2, 3], [5, 1]])).tolist()
+        [True, False, False]
+    """
+    a, b = rim[None], np.roll(rim, -1, 0)[None]
+    x, y = points[:, :1], points[:, 1:]
+    crosses = (a[..., 1] > y) != (b[..., 1] > y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = a[..., 0] + (y - a[..., 1]) / (b[..., 1] - a[..., 1]) * (b[..., 0] - a[..., 0])
+    inside: np.ndarray = (crosses & (at > x)).sum(1) % 2 == 1
+    return inside
+
+
 def _axes(normal: np.ndarray) -> np.ndarray:
     """The plane's axes: the first is along x of the camera's frame, as far as it lies in the plane."""
     along = np.eye(3)[0 if abs(normal[0]) < 0.9 else 1]

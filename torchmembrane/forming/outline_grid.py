@@ -231,9 +231,6 @@ def _corner_places(points: np.ndarray) -> np.ndarray:
     uneven = (np.log(sides[:, :2] / sides[:, 2:]) ** 2).sum(1)
     chosen = sets[int(np.round(lacking + (between**2).sum(1) + uneven, 6).argmin())]  # the first of equal ones
     corners = places[chosen]
-    if int(np.round(turn[chosen], 6).argmin()) in (
-        1,
-        3,
-    ):  # the diagonals split the first and the third: the flattest of all is one of them
+    if int(turn[chosen].round(6).argmin()) in (1, 3):  # the diagonals split the first and third: the flattest is one of them
         corners = np.concatenate([corners[1:], corners[:1] + 1])
     return corners

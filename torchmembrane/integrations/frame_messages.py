@@ -12,7 +12,7 @@ from ..errors import MembraneError
 from ..results.reconstruction import Frame
 from ..results.status import Status
 from ..results.store import Mesh
-from ..sensor.parts import METRE
+from ..sensor.units import METRE
 
 TOPICS = {
     "wrench": "geometry_msgs/msg/WrenchStamped",

@@ -7,8 +7,8 @@ import numpy as np
 
 from ..files.atomic import make_folder, write_bytes, write_text
 from ..pose import Pose
-from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
+from ..sensor.units import METRE
 from ..surface.topology import rim_loop
 
 RIM_WIDTH = 0.02

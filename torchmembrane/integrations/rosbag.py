@@ -177,21 +177,20 @@ class BagWriter:
             image: that it was reconstructed from.
             frame: its result.
         """
+        given = image.message.header
         with _writing_bag(self.path):
+            stamp = self._new("builtin_interfaces/msg/Time", sec=given.stamp.sec, nanosec=given.stamp.nanosec)
+            header = self._new("std_msgs/msg/Header", stamp=stamp, frame_id=given.frame_id)
             for topic, message in self.units.messages(frame).items():
-                self._write(topic, image, message)
+                self._write(topic, image.received, message._replace(fields={"header": header, **message.fields}))
         self.written += has_wrench(frame)
 
-    def _write(self, topic: str, image: StampedMessage, message: Message) -> None:
-        stamp = self._new(
-            "builtin_interfaces/msg/Time", sec=image.message.header.stamp.sec, nanosec=image.message.header.stamp.nanosec
-        )
-        header = self._new("std_msgs/msg/Header", stamp=stamp, frame_id=image.message.header.frame_id)
+    def _write(self, topic: str, received: int, message: Message) -> None:
         if topic not in self._connections:
             connection = self._writer.add_connection(f"{NAMESPACE}/{topic}", message.kind, typestore=self._store)
             self._connections[topic] = connection
-        whole = message._replace(fields={"header": header, **message.fields}).built(self._new)
-        self._writer.write(self._connections[topic], image.received, self._store.serialize_cdr(whole, message.kind))
+        content = self._store.serialize_cdr(message.built(self._new), message.kind)
+        self._writer.write(self._connections[topic], received, content)
 
     def _new(self, kind: str, **fields: Any) -> Any:
         return self._store.types[kind](**fields)

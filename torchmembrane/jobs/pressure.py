@@ -9,8 +9,8 @@ from ..errors import MembraneError
 from ..files.csv_table import Columns, Row, Table, read_table
 from ..files.safe_read import shortened
 from ..files.timestamps import time_in
-from ..sensor.parts import METRE
 from ..sensor.sensor import Sensor
+from ..sensor.units import hectopascal
 from .inputs import Inputs, frame_name
 
 if TYPE_CHECKING:
@@ -109,22 +109,22 @@ def read_pressures(path: Path, inputs: Inputs, sensor: Sensor) -> PressureReadin
     known = Table(table.form, [row for row in table.rows if row.text(column).lower() not in UNKNOWN])
     if not known.rows:
         raise MembraneError(f"{path}: no readings after the header but empty ones; expected {PRESSURES.expected}")
-    hectopascal, since_rest = 100 / METRE[sensor.length_unit] ** 2, column == SINCE_REST
+    one, since_rest = hectopascal(sensor.length_unit), column == SINCE_REST
     if key == TIME:
-        return _by_time(path, known, inputs, hectopascal, since_rest)
+        return _by_time(path, known, inputs, one, since_rest)
     given, others = by_frame(known, inputs)
     if not given:
         raise refusal(others[0], known, inputs)
-    values = {frame: row.number(column) * hectopascal for frame, row in given.items()}
+    values = {frame: row.number(column) * one for frame, row in given.items()}
     return PressureReadings(values, since_rest, unused=len(others))
 
 
-def _by_time(path: Path, table: Table, inputs: Inputs, hectopascal: float, since_rest: bool) -> PressureReadings:
+def _by_time(path: Path, table: Table, inputs: Inputs, one: float, since_rest: bool) -> PressureReadings:
     rows = sorted(((_time(row), row) for row in table.rows), key=lambda timed: timed[0])
     times = np.array([time for time, _ in rows])
     if len(twice := np.flatnonzero(np.diff(times) == 0)):
         raise rows[twice[0] + 1][1].refusal(TIME, f"each time once; line {rows[twice[0]][1].line} has it as well")
-    series = np.array([row.number(table.form[1]) for _, row in rows]) * hectopascal
+    series = np.array([row.number(table.form[1]) for _, row in rows]) * one
     readings = PressureReadings({}, since_rest, times, series)
     if inputs.videos:
         return readings

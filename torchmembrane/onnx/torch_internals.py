@@ -126,7 +126,7 @@ class TorchExporter:
     def at_work(self) -> Iterator[None]:
         """Within, `torch.onnx.export` of a program that is `captured` leaves out what it would repeat.
 
-        To enter takes a tenth of a second; within another one it takes no time.
+        It may stand within another one, which has prepared everything then.
         """
         if self._is_at_work:
             yield

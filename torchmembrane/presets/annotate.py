@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..files.atomic import write_text
-from ..sensor.parts import METRE, millimetre
+from ..sensor.units import METRE, millimetre
 
 WORDS = {
     "": {

@@ -10,11 +10,14 @@ from scipy.optimize import brentq
 from ..errors import MembraneError
 from ..files.digits import rounded
 from ..forming.formed import FormedSurface, SheetMaterial, formed_surface
+from ..forming.outline import encloses
 from ..sensor.inflated import SHAPE, InflatedSurface
-from ..sensor.parts import METRE, Material
+from ..sensor.parts import Material
+from ..sensor.units import hectopascal
 
 ASSUMED_PRESTRETCH = 1.1
-DISAGREEMENT = 0.1  # between the overpressure stated and the one that height and material hold, relative: above, it is said
+ASSUMED = f"prestretch {ASSUMED_PRESTRETCH:g} of the sheet in its rim is assumed; --prestretch states it"
+DISAGREEMENT = 0.1  # between the overpressure stated and the one that the other numbers hold, relative: above, it is said
 LARGEST_STRETCH = 3.0
 MARGIN = 0.4  # of a pitch, at least between a dot and the rim
 
@@ -68,7 +71,7 @@ def blown_up(rim: Mapping[str, Any], unit: str, stated: Stated) -> BlownUp:
         raise MembraneError("init: an inflated sheet; expected its --height, its --overpressure, or both")
     if height is None:
         return _by_pressure(rim, unit, stated)
-    hectopascal, said = 100 / METRE[unit] ** 2, []
+    one, said = hectopascal(unit), []
     points = _surface(rim, unit, {"height": height}, Material("neo_hookean", 1.0)).rim
 
     def held(stretch: float) -> float:
@@ -78,20 +81,20 @@ def blown_up(rim: Mapping[str, Any], unit: str, stated: Stated) -> BlownUp:
     modulus = None if shear_modulus is None or thickness is None else shear_modulus * thickness
     if overpressure is not None and modulus is not None:
         if prestretch is None:
-            prestretch, sentence = _stretch_by_pressure(held, overpressure * hectopascal / modulus, overpressure)
+            prestretch, sentence = _stretch_by_pressure(held, overpressure * one / modulus, overpressure)
             said.append(sentence)
         else:
-            said += _contradiction(held(prestretch) * modulus / hectopascal, stated)
+            said += _contradiction(held(prestretch) * modulus / one, stated)
     elif prestretch is None:
         prestretch = ASSUMED_PRESTRETCH
-        said.append(f"prestretch {prestretch:g} of the sheet in its rim is assumed; --prestretch states it")
+        said.append(ASSUMED)
     if overpressure is not None and modulus is None:
-        product = overpressure * hectopascal / held(prestretch)
+        product = overpressure * one / held(prestretch)
         thickness, shear_modulus, sentence = _split(product, thickness, shear_modulus, unit)
         said.append(f"{sentence} from the overpressure, {overpressure:g} hPa, and the height")
     material = Material("neo_hookean", round(prestretch, 6), None, shear_modulus, thickness)
     if overpressure is None and modulus is not None:
-        overpressure = held(prestretch) * modulus / hectopascal
+        overpressure = held(prestretch) * modulus / one
         said.append(f"overpressure {overpressure:.4g} hPa from the height and the material")
     surface = _surface(rim, unit, {"height": height}, material)
     return BlownUp(surface, material, overpressure, [*said, *_in_words(surface.formed, unit)])
@@ -106,7 +109,7 @@ def _by_pressure(rim: Mapping[str, Any], unit: str, stated: Stated) -> BlownUp:
     prestretch, said = stated.prestretch, []
     if prestretch is None:
         prestretch = ASSUMED_PRESTRETCH
-        said.append(f"prestretch {prestretch:g} of the sheet in its rim is assumed; --prestretch states it")
+        said.append(ASSUMED)
     material = Material("neo_hookean", prestretch, None, stated.shear_modulus, stated.thickness)
     surface = _surface(rim, unit, {"overpressure": stated.overpressure}, material)
     said.append(f"height {surface.formed.height:.4g} {unit} from the overpressure, {stated.overpressure:g} hPa")
@@ -177,21 +180,10 @@ def sheet_dots(surface: InflatedSurface, pitch: float) -> tuple[np.ndarray, list
     lines = 2 * len(formed.vertices) - 1
     vertices, sheet = formed.on((lines, lines))
     plane = ((sheet - outline.origin) @ outline.axes.T)[..., :2]
-    inside = _inside(outline.points, flat) & (_distance(outline.points, flat) > MARGIN * pitch)
+    inside = encloses(outline.points, flat) & (_distance(outline.points, flat) > MARGIN * pitch)
     found = LinearNDInterpolator(plane.reshape(-1, 2), vertices.reshape(-1, 3))(flat)
     kept = inside & np.isfinite(found).all(1)
     return rounded(found[kept]), np.where((i + j)[kept] % 2 == 0, "large", "small").tolist()
-
-
-def _inside(rim: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Which `points [D, 2]` are within a closed polygon, by the number of its sides to their right."""
-    a, b = rim[None], np.roll(rim, -1, 0)[None]
-    x, y = points[:, :1], points[:, 1:]
-    crosses = (a[..., 1] > y) != (b[..., 1] > y)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at = a[..., 0] + (y - a[..., 1]) / (b[..., 1] - a[..., 1]) * (b[..., 0] - a[..., 0])
-    inside: np.ndarray = (crosses & (at > x)).sum(1) % 2 == 1
-    return inside
 
 
 def _distance(rim: np.ndarray, points: np.ndarray) -> np.ndarray:

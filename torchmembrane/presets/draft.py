@@ -12,10 +12,11 @@ from ..markers.placement import FEWEST_MARKERS
 from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..sensor.inflated import InflatedSurface
-from ..sensor.parts import METRE, Material, Surface
+from ..sensor.parts import Material, Surface
 from ..sensor.toml import MOST_DOTS
+from ..sensor.units import hectopascal
 from ..surface.membrane import Membrane
-from .blown_up import sheet_dots
+from .blown_up import DISAGREEMENT, sheet_dots
 from .design import cylinder_dots, dome_dots
 
 SHAPES: dict[str, tuple[str, ...]] = {
@@ -31,7 +32,6 @@ SHAPES: dict[str, tuple[str, ...]] = {
 """The shapes that are drafted, and the lengths that each needs; the last three are sheets that are blown up, `blown_up`."""
 SHEETS = ("rectangle", "ellipse", "outline")
 ASSUMED_PRESTRETCH = 1.2
-DISAGREEMENT = 0.1  # between the overpressure stated and the one that the material holds, relative: above, it is said
 LARGEST_STRETCH = 4.0
 DECIMALS = 9  # of a distance
 PITCHES = 11  # of dots across the square root of the area, where nothing else is said
@@ -132,7 +132,7 @@ def overpressure(membrane: Membrane, material: Material, unit: str) -> float:
         71
     """
     energy = ElasticEnergy(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
-    return float(rest_balance(membrane, energy)[0]) * METRE[unit] ** 2 / 100
+    return float(rest_balance(membrane, energy)[0]) / hectopascal(unit)
 
 
 def balanced(

@@ -114,8 +114,8 @@ def numbers(frame: Mapping[str, Any], rest_normals: np.ndarray, length_unit: str
 
     confidence = of("confidence", 0)
     found |= {"markers_found": (confidence > 0).sum(), "markers_total": confidence.size}
-    plain = {"residual_px": "residual"} | {key: key for key in ("coverage", "pressure", "pressure_change", "volume_error")}
-    found |= {name: of(key) for name, key in (plain | {"depth_deviation": "depth_deviation"}).items()}
+    found["residual_px"] = of("residual")
+    found |= {key: of(key) for key in ("coverage", "pressure", "pressure_change", "depth_deviation", "volume_error")}
     hectopascals = METRE[length_unit] ** 2 / 100 if force_unit == "N" and length_unit in METRE else np.nan
     found |= {f"{key}_hpa": found[key] * hectopascals for key in ("pressure", "pressure_change")}
     force, wrench = of("force", 3), of("wrench", 6)

@@ -14,8 +14,9 @@ from ..forming.formed import FormedSurface, SheetMaterial, formed_surface
 from ..forming.outline import MOST_POINTS, ellipse, rectangle
 from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
-from .parts import METRE, Material, Surface
+from .parts import Material, Surface
 from .table import Table
+from .units import hectopascal
 
 SHAPE = "inflated"
 FORMULAS = ("rectangle", "ellipse")
@@ -93,12 +94,7 @@ class InflatedSurface(Surface):
         sheet = SheetMaterial(m.model, float(m.prestretch), float(m.c2_ratio or 0.0))
         if "height" in v:
             return formed_surface(self.rim, sheet, height=float(v["height"]))
-        return formed_surface(self.rim, sheet, pressure=v["overpressure"] * self.hectopascal / m.modulus)
-
-    @property
-    def hectopascal(self) -> float:
-        """1 hPa in N per length unit squared."""
-        return 100 / METRE[self.length_unit] ** 2
+        return formed_surface(self.rim, sheet, pressure=v["overpressure"] * hectopascal(self.length_unit) / m.modulus)
 
     def membrane(self, grid: tuple[int, int]) -> Membrane:
         """The rest surface on a solver grid; see `Surface.membrane`."""

@@ -16,7 +16,6 @@ from ..pose import Pose
 from ..surface.membrane import Membrane
 from .inflated import InflatedSurface
 from .parts import (
-    METRE,
     Cavity,
     Markers,
     Material,
@@ -28,6 +27,7 @@ from .parts import (
 )
 from .record import Record
 from .toml import read_sensor, tables_of, write_sensor
+from .units import METRE, hectopascal
 from .working_range import GENERAL, WorkingRange
 
 
@@ -105,7 +105,7 @@ class Sensor:
     def gas_pressure(self) -> float | None:
         """The cavity's absolute pressure at rest in N per length unit squared; 1 hPa = 100 N/m^2."""
         pressure = self.cavity.pressure
-        return None if pressure is None else 100 * pressure / METRE[self.length_unit] ** 2
+        return None if pressure is None else pressure * hectopascal(self.length_unit)
 
     @property
     def parts(self) -> SensorParts:

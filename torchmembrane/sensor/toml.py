@@ -22,7 +22,6 @@ from ..surface.membrane import Membrane
 from .inflated import SHAPE as INFLATED
 from .inflated import read_inflated, rim_lines
 from .parts import (
-    METRE,
     SHAPES_BY_ARRAYS,
     SHAPES_BY_NUMBERS,
     Cavity,
@@ -36,6 +35,7 @@ from .parts import (
 )
 from .record import Record, read_record
 from .table import Table, toml_lines
+from .units import METRE
 from .working_range import GENERAL, WorkingRange, range_file
 
 FORMAT = 1

@@ -8,7 +8,7 @@ import numpy as np
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 
 import torchmembrane as tm
-from torchmembrane.sensor.parts import METRE
+from torchmembrane.sensor.units import METRE
 
 
 def type_of(kind: str) -> Any:

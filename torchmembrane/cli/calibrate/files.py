@@ -25,10 +25,10 @@ from ...jobs.pressure import by_frame, refusal
 from ...plot.drawing import save
 from ...presets import sensor_file
 from ...sensor.companions import companions_of, files_of
-from ...sensor.parts import millimetre
 from ...sensor.record import Record
 from ...sensor.sensor import Sensor
 from ...sensor.toml import COORDINATE
+from ...sensor.units import millimetre
 from ...surface.checks import FARTHEST
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ from ...jobs.inputs import find_inputs, single_images
 from ...plot.calibration import fit_figure, surface_figure
 from ...sensor.inflated import InflatedSurface
 from ...sensor.sensor import Sensor
+from ...sensor.units import hectopascal
 from ..progress import ProgressDisplay
 from .files import read_depth, read_motions, read_sensor, read_sensor_image, write_calibrated
 
@@ -50,7 +51,7 @@ def _held(sensor: Sensor, gauge: float | None) -> list[str]:
     assert isinstance(sheet, InflatedSurface)
     if sensor.force_unit == "relative":
         return ["without a modulus, or a gauge at rest (--overpressure), forces stay relative"]
-    held = sheet.formed.pressure * sensor.material.modulus / sheet.hectopascal
+    held = sheet.formed.pressure * sensor.material.modulus / hectopascal(sensor.length_unit)
     read = "" if gauge is None else f", the gauge reads {gauge:g} hPa"
     return [f"shear modulus x thickness {sensor.material.modulus:.4g} N/{sensor.length_unit} holds {held:.4g} hPa{read}"]
 
