@@ -20,30 +20,41 @@ def percent(value: float) -> str:
     return f"{100 * value:.1f} %" if value < 0.02 else f"{100 * value:.0f} %"
 
 
-def default_errors(*parts: dict) -> Rows:
-    """Of force balance, in images with noise: median and worst, for every set of presses."""
-    rows = {
-        "surface: error over displacement, rms at the dots": ("force balance", percent),
-        "contact point": ("force balance: contact", "{:.1f} mm".format),
-        "force": ("force balance: force", percent),
-        "pressure change": ("force balance: pressure_change", percent),
-    }
+ESTIMATORS = {
+    "force balance": "**force balance**, the default",
+    "the sensor's material": "minimum energy: the sensor's own material",
+    "harmonic, triangles": "minimum energy: harmonic, triangles, exact volume",
+    "the paper": "the paper (`--estimator paper`): harmonic, affine quadrilaterals, linear volume",
+}
+FORCE_BALANCE = {
+    "surface: error over displacement, rms at the dots": ("force balance", percent),
+    "contact point": ("force balance: contact", "{:.1f} mm".format),
+    "force": ("force balance: force", percent),
+    "pressure change": ("force balance: pressure_change", percent),
+}
+
+
+def default_accuracy(found: dict) -> Rows:
+    """Errors of force balance in images with noise."""
+    rows = [
+        [name, *(text(value) for value in found["surface"][f"{key}, snr30"])] for name, (key, text) in FORCE_BALANCE.items()
+    ]
+    return [["", "median", "worst"], *rows]
+
+
+def estimators(found: dict) -> Rows:
+    """Errors of the surface over the displacement, for every estimator, in images with noise."""
+    errors = {name: found["surface"][f"{label}, snr30"] for label, name in ESTIMATORS.items()}
     return [
-        [name, *(text(value) for part in parts for value in part["surface"][f"{key}, snr30"])]
-        for name, (key, text) in rows.items()
+        ["error of the surface over the displacement", "median", "worst"],
+        *([name, f"{median:.2f}", f"{worst:.2f}"] for name, (median, worst) in errors.items()),
     ]
 
 
-def default_accuracy(independent: dict) -> Rows:
-    return [["", "median", "worst"], *default_errors(independent)]
-
-
-def marker_errors(*parts: dict) -> Rows:
-    """Median and 95 % of the error of a dot's pixel, by sensor, for every set of presses."""
-    found = [{(row["sensor"], row["images"]): row for row in part["markers"]} for part in parts]
-    kinds = ("clean", "snr30")
-    cells = {
-        sensor: [f"{each[sensor, kind]['median']:.3f} / {each[sensor, kind]['p95']:.3f} px" for each in found for kind in kinds]
-        for sensor in SENSORS
-    }
-    return [["sensor", *["clean", "30 dB noise"] * len(parts)], *([SENSORS[sensor], *row] for sensor, row in cells.items())]
+def marker_errors(found: dict) -> Rows:
+    """Median and 95 % of the error of a dot's pixel, by sensor."""
+    each = {(row["sensor"], row["images"]): f"{row['median']:.3f} / {row['p95']:.3f} px" for row in found["markers"]}
+    return [
+        ["sensor", "clean", "30 dB noise"],
+        *([name, each[sensor, "clean"], each[sensor, "snr30"]] for sensor, name in SENSORS.items()),
+    ]

@@ -70,7 +70,8 @@ def measure(name: str, independent: Path | None) -> None:
     if folder is None:
         print(f"{name}: left out, its data are not distributed; --independent FOLDER names them")
         return
-    made, result, began = MADE[part.data] if part.data else None, OUT / f"{name}.json", time.perf_counter()
+    made, result = MADE[part.data] if part.data else None, OUT / f"{name}.json"
+    began, load = time.perf_counter(), os.getloadavg()[0]
     for command in (made, f"{part.command} --json {result}"):
         if command:
             print(f"{name}: python -m {command}", flush=True)
@@ -86,6 +87,8 @@ def measure(name: str, independent: Path | None) -> None:
         ).stdout.strip(),
         date=datetime.date.today().isoformat(),
         processor=machine["processor"],
+        cores=os.cpu_count(),
+        load=max(load, os.getloadavg()[0]),
         seconds=round(seconds),
         torch=machine["torch"],
         results=kept(name, results),
@@ -111,7 +114,7 @@ def write_pages() -> None:
     """The tables of all pages, and the figures."""
     for page in PAGES:
         text = page.read_text()
-        made = {name: block(*TABLES[name]) for name in blocks(text)}
+        made = {name: block(*TABLES[name]) if all(map(record, TABLES[name][0])) else old for name, old in blocks(text).items()}
         if (new := filled(text, made)) != text:
             page.write_text(new)
             print(f"written: {page.relative_to(ROOT)}")

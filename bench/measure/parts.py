@@ -28,9 +28,9 @@ class Part(NamedTuple):
     data: str | None = None
 
     @property
-    def paths(self) -> list[str]:
+    def paths(self) -> tuple[str, ...]:
         """Paths whose change makes the figures old."""
-        return [f"{self.command.split()[0].replace('.', '/')}.py", *self.measures]
+        return (f"{self.command.split()[0].replace('.', '/')}.py", *self.measures)
 
     @property
     def shown(self) -> str:
@@ -51,7 +51,9 @@ def words(command: str, folder: str) -> list[str]:
 PARTS = {
     "frame": Part("bench.speed.frame"),
     "training": Part("bench.speed.training --turns 5"),
-    "solve": Part("bench.speed.speed"),
+    "force-balance": Part("bench.speed.speed --only force-balance"),
+    "minimum-energy": Part("bench.speed.speed --only minimum-energy"),
+    "paper-chain": Part("bench.speed.speed --only paper --image examples/two_contacts.png"),
     "exported-models": Part("bench.speed.exported_models", EXPORT),
     "scaling": Part("bench.speed.scaling"),
     "independent": Part("bench.accuracy.accuracy CASES", data="independent"),

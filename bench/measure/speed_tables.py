@@ -1,16 +1,16 @@
 """Tables of time and size: rows of cells, the first of which is the head, from the results of parts."""
 
-from bench.measure.accuracy_tables import Rows, default_errors
+from bench.measure.accuracy_tables import Rows, default_accuracy
 
 TRACKED = "tracked, from the frame before"
 
 
 def readme(independent: dict, frame: dict) -> Rows:
-    surface, contact, force, _ = default_errors(independent)
+    head, surface, contact, force, _ = default_accuracy(independent)
     rows = frame["rows"]
     times = " / ".join(f"{rows[name]['median']:.0f}" for name in ("one image", "in batches of 16", TRACKED))
     return [
-        ["", "median", "worst"],
+        head,
         ["shape, relative to the displacement", *surface[1:]],
         contact,
         force,
@@ -42,14 +42,19 @@ def frame_units(frame: dict) -> Rows:
         "markers alone, followed": "the markers alone, followed",
     }
     return [
-        ["", "ms: median (least)", "times the unit"],
-        ["the unit: 0.45 GFLOP as products of 186 x 186 matrices", times(rows["unit"]), "1"],
-        *([text, times(rows[name]), f"{rows[name]['units']:.1f}"] for name, text in names.items()),
+        ["", "ms", "times the unit"],
+        ["the unit: 0.45 GFLOP as products of 186 x 186 matrices", f"{rows['unit']['median']:.2g}", "1"],
+        *([text, f"{rows[name]['median']:.2g}", f"{rows[name]['units']:.1f}"] for name, text in names.items()),
     ]
 
 
 def times(row: dict) -> str:
-    return f"{row['median']:.1f} ({row['least']:.1f})"
+    """Median and least.
+
+    >>> times(dict(median=46.1, least=9.66))
+    '46 (9.7)'
+    """
+    return f"{row['median']:.2g} ({row['least']:.2g})"
 
 
 def exported_models(models: dict) -> Rows:
@@ -79,23 +84,19 @@ def training(found: dict) -> Rows:
     ]
 
 
-def solve_by_batch(found: dict) -> Rows:
-    """Markers and flow with minimum energy, 33 x 33, and force balance's solve, 17 x 17."""
-    energy = {
-        row["batch"]: row["milliseconds_a_frame"]
-        for row in found["rows"]
-        if row["estimator"] == "the sensor's material" and "milliseconds_a_frame" in row
-    }
-    balance = balance_times(found)
+def solve_by_batch(energy: dict, balance: dict) -> Rows:
+    """Markers and flow, and the solves of minimum energy, 33 x 33, and of force balance, 17 x 17."""
+    chosen = [row for row in energy["rows"] if row["estimator"] == "the sensor's material" and "solve_alone" not in row]
+    solve, names = balance_times(balance), ("markers", "flow", "solve")
     return [
         ["", "markers", "flow", "minimum energy, 33 x 33", "force balance, 17 x 17"],
         *(
             [
-                f"batch {batch}",
-                *(f"{row[name][0]:.2g}" for name in ("markers", "flow", "solve")),
-                f"{balance[f'batch {batch}, cold']:.1f}",
+                f"batch {row['batch']}",
+                *(f"{row['milliseconds_a_frame'][name][0]:.2g}" for name in names),
+                f"{solve['batch {batch}, cold'.format(**row)]:.2g}",
             ]
-            for batch, row in energy.items()
+            for row in chosen
         ),
     ]
 
@@ -110,7 +111,7 @@ def balance_against_scipy(found: dict) -> Rows:
     return [
         ["", "ms", "of the twin"],
         ["scipy twin", f"{twin:.0f}", "1"],
-        *([name.removesuffix(", cold"), f"{value:.1f}", f"{value / twin:.2f}"] for name, value in each.items()),
+        *([name.removesuffix(", cold"), f"{value:.2g}", f"{value / twin:.2f}"] for name, value in each.items()),
     ]
 
 
