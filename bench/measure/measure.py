@@ -19,7 +19,7 @@ from pathlib import Path
 
 from bench.measure.pages import PAGES, RECORDS, ROOT, block, blocks, changes_since, filled, record, uncommitted
 from bench.measure.parts import MADE, PARTS, words
-from bench.measure.tables import FIGURES, TABLES, kept
+from bench.measure.tables import FIGURES, SUMMARIES, TABLES
 
 OUT = Path("out/measure")
 ENVIRONMENT = dict(OMP_NUM_THREADS="1", MALLOC_TRIM_THRESHOLD_="2000000000", MALLOC_MMAP_THRESHOLD_="2000000000")
@@ -70,7 +70,7 @@ def measure(name: str, independent: Path | None) -> None:
     if folder is None:
         print(f"{name}: left out, its data are not distributed; --independent FOLDER names them")
         return
-    made, result = MADE[part.data] if part.data else None, OUT / f"{name}.json"
+    made, result = MADE[part.data] if part.data else (), OUT / f"{name}.json"
     began, load = time.perf_counter(), os.getloadavg()[0]
     for command in (made, f"{part.command} --json {result}"):
         if command:
@@ -91,7 +91,7 @@ def measure(name: str, independent: Path | None) -> None:
         load=max(load, os.getloadavg()[0]),
         seconds=round(seconds),
         torch=machine["torch"],
-        results=kept(name, results),
+        results=SUMMARIES[name](results) if name in SUMMARIES else results,
     )
     RECORDS.mkdir(exist_ok=True)
     (RECORDS / f"{name}.json").write_text(json.dumps(rounded(found), indent=1) + "\n")

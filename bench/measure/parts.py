@@ -1,5 +1,6 @@
 """What `make measure` measures, part by part: the command, its data, and the paths whose change makes the figures old."""
 
+import re
 import shlex
 from typing import NamedTuple
 
@@ -7,11 +8,20 @@ FRAME = ("torchmembrane/camera", "torchmembrane/estimators", "torchmembrane/mark
 FRAME += ("torchmembrane/reconstruct.py", "torchmembrane/solve", "torchmembrane/surface")
 EXPORT = (*FRAME, "torchmembrane/onnx", "torchmembrane/control_flow.py")
 CASES = (*FRAME, "bench/data/cases.py")
+RANDOM = (*FRAME, "bench/data/random_sensors.py")
+SIMULATOR = ("torchmembrane/simulate", "torchmembrane/mechanics", "torchmembrane/surface")
+CLI = (*FRAME, "torchmembrane/cli", "torchmembrane/calibrate", "torchmembrane/presets")
+SEEDS = (9001, 9002, 9003)
+RANDOM_SENSORS = "bench.data.random_sensors DATA"
 MADE = {
-    "cases": "bench.data.cases CASES",
-    "independent": None,
+    "cases": ("bench.data.cases CASES",),
+    "independent": (),
+    "light": (f"{RANDOM_SENSORS} --sensors 20 --presses 0 --light 54 --seed 2026",),
+    "gauge": (f"{RANDOM_SENSORS} --sensors 14 --presses 2 --light 8",),
+    "intervals": tuple(f"{RANDOM_SENSORS}/{seed} --sensors 40 --presses 2 --light 6 --seed {seed}" for seed in SEEDS),
+    "range": (f"{RANDOM_SENSORS} --sensors 240 --presses 4 --seed 8126",),
 }
-"""Folders of data, and what makes them; None: not distributed, `make measure INDEPENDENT=FOLDER` names it."""
+"""Folders of data, and what makes them. Nothing makes the independent ones: `make measure INDEPENDENT=FOLDER` names them."""
 
 
 class Part(NamedTuple):
@@ -35,17 +45,17 @@ class Part(NamedTuple):
     @property
     def shown(self) -> str:
         """The command, after the one that makes its data, as documents print it."""
-        made = MADE[self.data] if self.data else None
-        return " && ".join(f"python -m {command}" for command in (made, self.command) if command)
+        made = MADE[self.data] if self.data else ()
+        return " && ".join(f"python -m {command}" for command in (*made, self.command))
 
 
 def words(command: str, folder: str) -> list[str]:
     """A command's words, the folder in place of CASES and DATA.
 
-    >>> words("bench.data.cases CASES", "out")
-    ['bench.data.cases', 'out']
+    >>> words("bench.data.cases CASES/a", "out")
+    ['bench.data.cases', 'out/a']
     """
-    return [folder if word in ("CASES", "DATA") else word for word in shlex.split(command)]
+    return [re.sub("^(CASES|DATA)(?=/|$)", folder, word) for word in shlex.split(command)]
 
 
 PARTS = {
@@ -56,7 +66,21 @@ PARTS = {
     "paper-chain": Part("bench.speed.speed --only paper --image examples/two_contacts.png"),
     "exported-models": Part("bench.speed.exported_models", EXPORT),
     "scaling": Part("bench.speed.scaling"),
+    "simulator": Part("bench.accuracy.simulator", SIMULATOR),
+    "one-dimension": Part("bench.accuracy.one_dimension", ("torchmembrane/estimators/paper/studies",)),
+    "window-mistakes": Part("bench.accuracy.window_mistakes", (*CLI, "torchmembrane/forming")),
+    "cli-errors": Part("bench.robustness.cli_errors", CLI),
+    "memory": Part("bench.speed.memory", (*FRAME, "torchmembrane/jobs/workers.py")),
     "independent": Part("bench.accuracy.accuracy CASES", data="independent"),
+    "simulator-independent": Part("bench.accuracy.simulator CASES", SIMULATOR, data="independent"),
     "cases": Part("bench.accuracy.accuracy CASES", CASES, data="cases"),
+    "locators": Part("bench.accuracy.locators CASES", ("torchmembrane/markers", "bench/data/cases.py"), data="cases"),
+    "segmentation": Part("bench.accuracy.segmentation CASES", CASES, data="cases"),
+    "monge": Part("bench.accuracy.monge CASES", CASES, data="cases"),
+    "ablation": Part("bench.accuracy.ablation CASES", CASES, data="cases"),
+    "gauge": Part("bench.accuracy.gauge DATA", RANDOM, data="gauge"),
+    "light": Part("bench.accuracy.range DATA --only light", RANDOM, data="light"),
+    "intervals": Part(f"bench.accuracy.intervals {' '.join(f'DATA/{seed}' for seed in SEEDS)}", RANDOM, data="intervals"),
+    "range": Part("bench.accuracy.range DATA", RANDOM, data="range"),
 }
 """In the order in which they are measured, the quick ones first."""

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 import bench.measure.accuracy_tables as accuracy
+import bench.measure.paper_tables as paper
 import bench.measure.scaling_tables as scaling
+import bench.measure.simulator_tables as simulator
 import bench.measure.speed_tables as speed
 from bench.measure.parts import PARTS
 
@@ -25,6 +25,25 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows]]] = {
     "solve-by-batch": (("minimum-energy", "force-balance"), speed.solve_by_batch),
     "solve-against-scipy": (("force-balance",), speed.balance_against_scipy),
     "paper-stages": (("paper-chain",), speed.paper_stages),
+    "locators": (("locators",), paper.locators),
+    "locators-by-sensor": (("locators",), paper.locators_by_sensor),
+    "locator-times": (("locators",), paper.locator_times),
+    "paper-dots": (("locators",), paper.paper_dots),
+    "segmentation": (("segmentation",), paper.segmentation),
+    "monge": (("monge",), paper.monge),
+    "one-dimension": (("one-dimension",), paper.one_dimension),
+    "closed-forms": (("simulator",), simulator.closed_forms),
+    "simulated-presses": (("simulator",), simulator.simulated_presses),
+    "rendered-dots": (("simulator",), simulator.rendered_dots),
+    "agreement": (("simulator-independent",), simulator.agreement),
+    "window-mistakes": (("window-mistakes",), simulator.window_mistakes),
+    "cli-errors": (("cli-errors",), simulator.cli_errors),
+    "memory": (("memory",), simulator.memory),
+    "ablation": (("ablation",), accuracy.ablation),
+    "light": (("light",), accuracy.light_touches),
+    "gauge": (("gauge",), accuracy.gauge),
+    "intervals": (("intervals",), accuracy.intervals),
+    "range": (("range",), accuracy.working_range),
     "scaling-exponents": (("scaling",), scaling.exponents),
     "scaling-costs": (("scaling",), scaling.costs),
 }
@@ -38,9 +57,15 @@ def paths_of(table: str) -> tuple[str, ...]:
     return tuple(sorted({path for part in TABLES[table][0] for path in PARTS[part].paths}))
 
 
-def kept(part: str, results: dict) -> dict:
-    """What a record keeps of the results of a part: of errors case by case the median and the worst."""
-    if part in ("independent", "cases"):
-        of_each = {name: [float(np.nanmedian(values)), float(np.nanmax(values))] for name, values in results["surface"].items()}
-        return results | dict(surface=of_each)
-    return results
+SUMMARIES: dict[str, Callable[[dict], dict]] = {
+    "independent": accuracy.case_summary,
+    "cases": accuracy.case_summary,
+    "ablation": accuracy.ablation_summary,
+    "light": accuracy.light_summary,
+    "gauge": accuracy.gauge_summary,
+    "intervals": accuracy.intervals_summary,
+    "range": accuracy.range_summary,
+    "segmentation": paper.segmentation_summary,
+    "monge": paper.monge_summary,
+}
+"""Of a part whose results have a row for every case: what its record keeps of them."""
