@@ -72,12 +72,10 @@ def measure(name: str, independent: Path | None) -> None:
         return
     made, result = MADE[part.data] if part.data else (), OUT / f"{name}.json"
     began, load = time.perf_counter(), os.getloadavg()[0]
-    for command in (made, f"{part.command} --json {result}"):
-        if command:
-            print(f"{name}: python -m {command}", flush=True)
-            subprocess.run(
-                [sys.executable, "-m", *words(command, str(folder))], cwd=ROOT, check=True, env=os.environ | ENVIRONMENT
-            )
+    for command in (*made, f"{part.command} --json {result}"):
+        print(f"{name}: python -m {command}", flush=True)
+        called = [sys.executable, "-m", *words(command, str(folder))]
+        subprocess.run(called, cwd=ROOT, check=True, env=os.environ | ENVIRONMENT)
     results = json.loads((ROOT / result).read_text())
     machine, seconds = results.pop("machine"), time.perf_counter() - began
     found = dict(

@@ -52,6 +52,16 @@ def rendered_dots(found: dict) -> Rows:
     return [["", "dots", "rest, rms", "rest, worst", "pressed, rms", "pressed, worst"], *rows]
 
 
+def simulator_seconds(found: dict) -> Rows:
+    """Of an image and of a frame of a random data set."""
+    names = {
+        "image": "an image of 640 x 480",
+        "frame of a data set, friction 0.0": "a frame of a random data set on `fingertip`, 37 x 37",
+        "frame of a data set, friction 0.4": "the same with friction 0.4",
+    }
+    return [["", "seconds"], *([text, f"{found['seconds'][name]:.2f}"] for name, text in names.items())]
+
+
 def agreement(found: dict) -> Rows:
     """Largest differences from another program, %, by friction."""
     groups = {
