@@ -96,16 +96,16 @@ def measure(name: str, independent: Path | None) -> None:
 
 
 def rounded(value: object) -> object:
-    """Numbers to four digits, which is more than any table shows.
+    """Numbers to five digits, which is as much as any table shows.
 
     >>> rounded({"a": [1.23456, 3, "b"]})
-    {'a': [1.235, 3, 'b']}
+    {'a': [1.2346, 3, 'b']}
     """
     if isinstance(value, dict):
         return {key: rounded(each) for key, each in value.items()}
     if isinstance(value, list):
         return [rounded(each) for each in value]
-    return float(f"{value:.4g}") if isinstance(value, float) else value
+    return float(f"{value:.5g}") if isinstance(value, float) else value
 
 
 def write_pages() -> None:

@@ -68,5 +68,6 @@ SUMMARIES: dict[str, Callable[[dict], dict]] = {
     "range": accuracy.range_summary,
     "segmentation": paper.segmentation_summary,
     "monge": paper.monge_summary,
+    "simulator-independent": simulator.agreement_summary,
 }
 """Of a part whose results have a row for every case: what its record keeps of them."""
