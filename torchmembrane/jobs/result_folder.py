@@ -132,8 +132,8 @@ class ResultFolder:
             self.report(f"{_listed(damaged)}: damaged, done again")
         if unknown:
             self.report(
-                f"{self.path}: {len(unknown)} results do not say what their images held (earlier version); kept, whether these "
-                "have changed or not"
+                f"{self.path}: {len(unknown)} results do not say which images they are of (earlier version); they are kept, "
+                "even if these have changed"
             )
 
     def _file_of(self, name: str) -> Path | None:

@@ -77,7 +77,7 @@ def read_summary(folder: Path) -> list[dict[str, str]]:
     if not rows:
         raise MembraneError(
             f"{folder / SUMMARY}: no rows with this version's columns; expected a folder of results: the same reconstruct "
-            "command again makes its table anew"
+            "command again writes its table anew"
         )
     return rows
 
