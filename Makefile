@@ -3,6 +3,9 @@
 # make soak SOAK=HOURS PRESSES=10000 KILLS=10: damaged files for so many hours, jobs killed, random sensors pressed; all hours long.
 # make fuzz FUZZ=HOURS SEED=N: damaged files of every kind, models and bags as well, for so many hours.
 # make test-lowest: the quick start with the lowest versions that pyproject.toml allows, in .venv-lowest.
+# make test-lerobot: the plugin for LeRobot against LeRobot 0.6 in .venv-lerobot; needs Python 3.12 and 6 GB.
+# make test-ros: the node of ROS 2 under rclpy of PyPI in .venv-ros; needs Python 3.11, on Linux.
+# make test-dist: sdists and wheels of the three packages in out/dist, used from empty environments; of what is committed.
 # make docs: the site in out/site, links checked.
 # make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
 # make test-cpp | make test-arm: the C++ example (needs cmake); the edge package on an emulated aarch64. On Debian.
@@ -16,17 +19,25 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 LOWEST := .venv-lowest
+LEROBOT := .venv-lerobot
+PLUGIN := integrations/lerobot_camera_torchmembrane
+ROS := .venv-ros
+PYTHON311 ?= $(shell for each in python3.11 ~/.pyenv/versions/3.11*/bin/python3.11; do \
+	$$each -c '' 2> /dev/null && echo $$each && break; done)
+PYTHON312 ?= $(shell for each in python3.12 ~/.pyenv/versions/3.12*/bin/python3.12; do \
+	$$each -c '' 2> /dev/null && echo $$each && break; done)
 
 WEB := export/web
 CPP := out/cpp
 PAGE := $(WEB)/dist/index.html
 PACKAGES := $(WEB)/node_modules/.package-lock.json
 SENSOR := examples/sensor.toml examples/rest_grid.npz examples/dots.csv examples/rest.png
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder \
+# Compiled modules are kept whatever the environment says: some hundred tests start a Python of their own.
+PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder \
 	--durations=8
 IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
 
-.PHONY: demo test test-all checked test-lowest lint style types layers bench fuzz soak figures docs web test-web test-cpp test-arm clean
+.PHONY: demo test test-all checked test-lowest test-lerobot test-ros test-dist lint style types layers bench fuzz soak figures docs web test-web test-cpp test-arm clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -57,6 +68,33 @@ test-lowest: $(LOWEST)/.ready
 $(LOWEST)/.ready: pyproject.toml constraints-lowest.txt
 	$(PYTHON) -m venv --clear $(LOWEST)
 	$(LOWEST)/bin/python -m pip install --quiet --constraint constraints-lowest.txt --editable .
+	touch $@
+
+test-lerobot: $(LEROBOT)/.ready
+	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(LEROBOT)/bin/python -m pytest --override-ini addopts= $(PLUGIN)/tests --durations=5
+
+$(LEROBOT)/.ready: pyproject.toml $(PLUGIN)/pyproject.toml
+	@test -n "$(PYTHON312)" || { echo "LeRobot 0.6 needs Python 3.12: make test-lerobot PYTHON312=/path/to/python3.12"; exit 1; }
+	$(PYTHON312) -m venv --clear $(LEROBOT)
+	$(LEROBOT)/bin/python -m pip install --quiet "lerobot[core-scripts]==0.6.1" pytest --editable ".[rerun]" --editable $(PLUGIN)
+	touch $@
+
+test-ros: $(ROS)/.ready
+	OMP_NUM_THREADS=1 $(ROS)/bin/python -m pytest --override-ini addopts= ros/torchmembrane_ros/test --durations=5
+
+$(ROS)/.ready: pyproject.toml constraints.txt
+	@test -n "$(PYTHON311)" || { echo "rclpy of PyPI needs Python 3.11: make test-ros PYTHON311=/path/to/python3.11"; exit 1; }
+	$(PYTHON311) -m venv --clear $(ROS)
+	$(ROS)/bin/python -m pip install --quiet --constraint constraints.txt "torch" "setuptools"
+	$(ROS)/bin/python -m pip install --quiet ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs ros-geometry-msgs ros-std-srvs ros-diagnostic-msgs
+	$(ROS)/bin/python -m pip install --quiet --constraint constraints.txt pytest --editable ".[ros]"
+	touch $@
+
+test-dist: out/web/model.onnx $(VENV)/.dist
+	$(BIN)/python tests/dist.py out/dist out/web/model.onnx
+
+$(VENV)/.dist: $(READY)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt build
 	touch $@
 
 lint: style types layers
@@ -141,4 +179,4 @@ $(PACKAGES): $(WEB)/package.json $(WEB)/package-lock.json
 	cd $(WEB) && npm ci
 
 clean:
-	rm -rf $(VENV) $(LOWEST) out build *.egg-info $(WEB)/dist $(WEB)/node_modules
+	rm -rf $(VENV) $(LOWEST) $(LEROBOT) $(ROS) out build *.egg-info $(WEB)/dist $(WEB)/node_modules

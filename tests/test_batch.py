@@ -24,6 +24,7 @@ from torchmembrane.results.read import read_results
 from torchmembrane.results.status import Status
 from torchmembrane.results.store import Mesh, Settings
 from torchmembrane.results.summary import UNREADABLE
+from torchmembrane.sensor.record import Record
 from torchmembrane.surface.shapes import spherical_cap
 
 WIDTH, HEIGHT = 16, 12
@@ -37,7 +38,7 @@ CONTRACT = {
     "coverage": (), "camera_motion": (4,),
     "force_deviation": (3,), "depth_deviation": (),
 }  # fmt: skip
-OF_FILE = ("path", "file_size", "file_modified", "content_hash", "seconds")
+OF_FILE = ("path", "file_size", "file_modified", "content_hash", "time", "seconds")
 
 
 class Denting:
@@ -46,7 +47,9 @@ class Denting:
     def __init__(self, fingerprint="a" * 64):
         membrane = spherical_cap(12.0, 9.0, 3.0, grid=(5, 5))
         camera = SimpleNamespace(image_size=(WIDTH, HEIGHT), bits=None)
-        known = dict(name="cap", length_unit="mm", force_unit="N", fingerprint=fingerprint, camera=camera, tool=None)
+        known = dict(
+            name="cap", length_unit="mm", force_unit="N", fingerprint=fingerprint, camera=camera, tool=None, record=Record()
+        )
         self.sensor = SimpleNamespace(**known)
         self.estimator = SimpleNamespace(membrane=membrane, must_compile=False)
         self.vertex_pixels = membrane.rest[:, :2] + 8
@@ -101,7 +104,7 @@ def summary_of(out: Path) -> dict[str, dict]:
 
 def test_one_result_for_each_image_with_the_contract_s_keys(images, tmp_path):
     outcome, lines, made = reconstruct(images, tmp_path / "out")
-    assert outcome == (5, 0, 0, 0, 0, 0) and lines == [] and made.calls == [2, 2, 1]
+    assert outcome == (5, 0, 0, 0, 0, 0, 0) and lines == [] and made.calls == [2, 2, 1]
     for path in images:
         with np.load(tmp_path / "out" / f"{path.stem}.npz") as stored:
             assert {key: stored[key].shape for key in stored} == CONTRACT | dict.fromkeys(OF_FILE, ())
@@ -164,7 +167,7 @@ def test_broken_files_do_not_stop_their_batch(images, tmp_path):
     images[2].write_bytes(whole.getvalue()[:-60])
     Image.new("L", (WIDTH + 1, HEIGHT)).save(images[3])
     outcome, lines, _ = reconstruct(images, tmp_path / "out")
-    assert outcome == (2, 0, 0, 0, 3, 0)
+    assert outcome == (2, 0, 0, 0, 0, 3, 0)
     assert [line.partition(":")[0] for line in lines] == [str(path) for path in images[1:4]]
     rows = summary_of(tmp_path / "out")
     for k, path in enumerate(images):
@@ -179,14 +182,14 @@ def test_finished_frames_are_skipped_and_failed_ones_tried_again(images, tmp_pat
     grey_image(images[1], 0)
     images[2].write_bytes(b"broken")
     outcome, lines, _ = reconstruct(images, tmp_path / "out")
-    assert outcome == (3, 1, 0, 0, 2, 0) and len(lines) == 2
+    assert outcome == (3, 1, 0, 0, 0, 2, 0) and len(lines) == 2
     failed = results.load_frame(tmp_path / "out" / "i1.npz")
     assert int(failed["status"]) == Status.BLANK and np.isnan(failed["vertices"]).all()
     before = {path.stem: (tmp_path / "out" / f"{path.stem}.npz").stat().st_mtime_ns for path in (images[0], images[3])}
     grey_image(images[1], 90)
     grey_image(images[2], 90)
     outcome, lines, made = reconstruct(images, tmp_path / "out")
-    assert outcome == (2, 0, 0, 0, 0, 3) and lines == [] and sum(made.calls) == 2
+    assert outcome == (2, 0, 0, 0, 0, 0, 3) and lines == [] and sum(made.calls) == 2
     assert before == {name: (tmp_path / "out" / f"{name}.npz").stat().st_mtime_ns for name in before}
     rows = summary_of(tmp_path / "out")
     assert [rows[f"i{k}"]["status"] for k in range(5)] == [str(Status.NOT_CONVERGED), "0", "0", "0", "0"]
@@ -276,7 +279,7 @@ def test_an_interrupted_run_keeps_what_is_done_and_goes_on(images, tmp_path, set
     with pytest.raises(KeyboardInterrupt):
         reconstruct(images, tmp_path / "out", settings, Interrupted())
     assert read_results(tmp_path / "out").names == list(summary_of(tmp_path / "out")) == ["i0", "i1"]
-    assert reconstruct(images, tmp_path / "out", settings)[0] == (3, 0, 0, 0, 0, 2)
+    assert reconstruct(images, tmp_path / "out", settings)[0] == (3, 0, 0, 0, 0, 0, 2)
     assert read_results(tmp_path / "out").names == [path.stem for path in images]
     assert not [path for path in (tmp_path / "out").rglob("*") if "partial" in path.name or path.name[0] == "."]
 
@@ -295,7 +298,7 @@ def test_the_next_batch_is_read_while_one_is_computed(images, tmp_path):
                 time.sleep(0.001)
             return super().__call__(batch)
 
-    assert reconstruct(images, tmp_path / "out", reconstructor=Patient())[0] == (5, 0, 0, 0, 0, 0)
+    assert reconstruct(images, tmp_path / "out", reconstructor=Patient())[0] == (5, 0, 0, 0, 0, 0, 0)
 
 
 def test_two_images_of_one_name_are_refused(images, tmp_path):
@@ -410,7 +413,7 @@ def test_a_frame_tried_again_is_one_row_of_the_dataset(images, tmp_path, monkeyp
     assert len(list((tmp_path / "out" / "frames").glob("part-*.parquet"))) == 3
     grey_image(images[1], 90)
     outcome, _, made = reconstruct(images, tmp_path / "out", PARQUET)
-    assert outcome == (1, 0, 0, 0, 0, 4) and made.calls == [1]
+    assert outcome == (1, 0, 0, 0, 0, 0, 4) and made.calls == [1]
     assert sorted(pq.read_table(tmp_path / "out" / "frames")["name"].to_pylist()) == [path.stem for path in images]
     assert read_results(tmp_path / "out").batch().status.tolist() == [0] * 5
 
@@ -429,13 +432,13 @@ def write_video(path: Path, levels) -> Path:
 def test_a_video_gives_numbered_frames(tmp_path):
     video = write_video(tmp_path / "press.mkv", [100, 0, 120, 130, 140])
     outcome, lines, _ = reconstruct([video], tmp_path / "out")
-    assert outcome == (4, 0, 0, 0, 1, 0)
+    assert outcome == (4, 0, 0, 0, 0, 1, 0)
     assert len(lines) == 1 and lines[0].startswith(f"{video}, press_000001: blank")
     found = read_results(tmp_path / "out")
     assert found.names == [f"press_{k:06d}" for k in range(5)]
     batch = found.batch()
     assert torch.allclose(batch.pressure[[0, 2, 3, 4]] * 255, torch.tensor([100.0, 120, 130, 140]), atol=0.01)
-    assert reconstruct([video], tmp_path / "out")[0] == (0, 0, 0, 0, 1, 4)
+    assert reconstruct([video], tmp_path / "out")[0] == (0, 0, 0, 0, 0, 1, 4)
     assert summary_of(tmp_path / "out")["press_000003"]["file"] == str(video)
 
 
@@ -449,7 +452,7 @@ def test_a_video_of_another_suffix_or_in_a_folder(tmp_path):
 def test_bad_videos_are_reported_and_the_rest_goes_on(images, tmp_path):
     (tmp_path / "broken.mp4").write_bytes(b"no video")
     outcome, lines, _ = reconstruct([tmp_path / "broken.mp4", *images], tmp_path / "out")
-    assert outcome == (5, 0, 0, 0, 1, 0) and str(tmp_path / "broken.mp4") in lines[0]
+    assert outcome == (5, 0, 0, 0, 0, 1, 0) and str(tmp_path / "broken.mp4") in lines[0]
     assert summary_of(tmp_path / "out")["broken_000000"]["status"] == str(UNREADABLE)
 
 
@@ -467,10 +470,10 @@ def test_a_missing_extra_is_named(images, tmp_path, monkeypatch):
 def test_figures_beside_results(images, tmp_path):
     reconstruct(images[:2], tmp_path / "out")
     outcome, _, made = reconstruct(images[:2], tmp_path / "out", figures=True)
-    assert outcome == (2, 0, 0, 0, 0, 0)
+    assert outcome == (2, 0, 0, 0, 0, 0, 0)
     for path in images[:2]:
         assert Image.open(tmp_path / "out" / f"{path.stem}.png").size == (1066, 1170)
-    assert reconstruct(images[:2], tmp_path / "out", figures=True)[0] == (0, 0, 0, 0, 0, 2)
+    assert reconstruct(images[:2], tmp_path / "out", figures=True)[0] == (0, 0, 0, 0, 0, 0, 2)
 
 
 def test_figures_never_overwrite_images(images):

@@ -169,6 +169,7 @@ OTHERS_FILES = {
     "files/images.py": "open, of such a file, whose pages are read one by one",
     "files/parquet.py": "PyArrow reads itself, of what was looked at before",
     "results/frame_table.py": "JSON of a table's metadata, through io.parquet",
+    "live/peaks.py": "JSON of a text that is read with a bound",
     "results/summary.py": "line by line, as long as it likes, of a regular file",
     "files/provenance.py": "hashed piece by piece, of a regular file",
     "sensor/table.py": "tomllib, of text",

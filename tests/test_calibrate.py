@@ -6,6 +6,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -17,7 +18,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from torchmembrane import MembraneError, calibrate
+from torchmembrane import MembraneError, __version__, calibrate
 from torchmembrane.calibrate.camera import Views, lens_from_views, ports_from_views
 from torchmembrane.calibrate.depth import rest_from_depth
 from torchmembrane.calibrate.detection import find_target
@@ -31,6 +32,7 @@ from torchmembrane.cli import main as cli
 from torchmembrane.files.images import read_image, to_grey
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.record import Record
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.simulate.simulator import Simulator
@@ -435,7 +437,7 @@ def run(capsys, *arguments):
 
 
 def test_command_rest_writes_a_sensor_a_report_and_a_figure(design, image, tmp_path, capsys):
-    path = design.to_file(tmp_path / "design")
+    path = replace(design, record=Record("B2", uncertainty=0.03)).to_file(tmp_path / "design")
     Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(tmp_path / "rest.png")
     code, said, _ = run(capsys, "rest", path, tmp_path / "rest.png", "--out", tmp_path / "out")
     assert code == 0 and "tilt_x" in said and "±" in said
@@ -445,6 +447,8 @@ def test_command_rest_writes_a_sensor_a_report_and_a_figure(design, image, tmp_p
     assert Image.open(tmp_path / "out" / "report.png").size[0] > 1000
     sensor = Sensor.from_file(tmp_path / "out" / "sensor.toml")
     assert sensor.markers.rest_image is not None and sensor.camera.ports == design.camera.ports
+    by = f"torchmembrane {__version__}, calibrate rest"
+    assert sensor.record == Record("B2", date.today(), 1, by, 0.03)
 
 
 def test_command_camera_leaves_out_images_without_a_board(design, tmp_path, capsys):

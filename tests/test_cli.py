@@ -30,7 +30,7 @@ from torchmembrane.mechanics import hyperelastic
 from torchmembrane.presets import draft
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.results import store
-from torchmembrane.sensor import parts
+from torchmembrane.sensor import parts, units
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate import appearance, dataset, frames, simulator
 from torchmembrane.surface import checks
@@ -298,7 +298,7 @@ def test_the_options_choices_are_what_the_package_has():
     assert choices.FLOWS == tuple(FLOWS)
     assert choices.RESULT_FORMATS == store.FORMATS
     assert choices.LOCATORS == placement.LOCATORS
-    assert choices.DRAFTS == tuple(draft.SHAPES) and choices.LENGTH_UNITS == tuple(parts.METRE)
+    assert (*choices.DRAFTS, choices.OUTLINE) == tuple(draft.SHAPES) and choices.LENGTH_UNITS == tuple(units.METRE)
     assert choices.LENSES == tuple(model.COEFFICIENTS) and choices.LONGEST_SIDE == model.LONGEST_SIDE
     assert choices.FARTHEST == checks.FARTHEST
     assert choices.FILLINGS == parts.FILLINGS

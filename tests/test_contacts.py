@@ -14,6 +14,7 @@ from torchmembrane.markers.coverage import Coverage, facings
 from torchmembrane.presets import preset
 from torchmembrane.results.npz import ADDED, completed
 from torchmembrane.results.reconstruction import Reconstruction
+from torchmembrane.sensor.working_range import UNLIMITED
 from torchmembrane.simulate import Simulator, Sphere, Stroke
 from torchmembrane.simulate.appearance import Appearance
 from torchmembrane.surface.shapes import spherical_cap
@@ -252,9 +253,10 @@ def test_a_marker_faces_the_camera_by_the_cosine_between_its_normal_and_its_line
     torch.testing.assert_close(facings(point, normal), torch.tensor([0.8, 1.0, -(5**-0.5)]))
 
 
-def test_markers_that_the_press_turns_away_are_not_hidden(fingertip):
+def test_markers_that_the_press_turns_away_are_not_hidden(fingertip, monkeypatch):
     """Of a dent whose walls are seen at a grazing angle: lost markers on the walls are its doing, as many others are not."""
     reconstructor = fingertip[1]
+    monkeypatch.setattr(reconstructor, "range", UNLIMITED)
     net, rest = reconstructor.estimator, reconstructor.estimator.membrane.rest
     off2 = (rest - rest[rest[:, 2].argmax()]).square().sum(-1) / net.size**2
     dent = 1.4 * net.size * torch.exp(-off2 / 0.08)[:, None] * net.membrane.rest_normals * ~net.membrane.fixed[:, None]

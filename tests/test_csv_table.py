@@ -12,6 +12,7 @@ from torchmembrane.calibrate.layout import read_pixels
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli.calibrate.files import read_forces, read_motions
 from torchmembrane.files.csv_table import Columns, read_table
+from torchmembrane.files.timestamps import time_in
 from torchmembrane.jobs.inputs import Inputs
 from torchmembrane.jobs.pressure import read_pressures
 from torchmembrane.presets.dot_list import read_drafted_dots
@@ -193,14 +194,16 @@ def test_a_name_twice_or_of_no_image_is_named(kind, tmp_path):
     lines = READERS[kind][1]
     assert f"line {len(lines) + 1}: " in (said := refused(kind, tmp_path, "\n".join([*lines, lines[1]]))) and "twice" in said
     name, _, values = lines[1].partition(",")
-    assert "'z.png' is none of the" in refused(kind, tmp_path, "\n".join([*lines, f"z.png,{values}"]))
+    rest = [] if kind in ("gauge", "changes") else lines[1:]  # a gauge's log may have further readings
+    assert "'z.png' is none of the" in refused(kind, tmp_path, "\n".join([lines[0], *rest, f"z.png,{values}"]))
     other = name.removesuffix(".png") if name.endswith(".png") else f"{name}.png"
     assert "also in line 2" in refused(kind, tmp_path, "\n".join([*lines[:2], f"{other},{values}"]))
 
 
 def test_forces_are_of_images_by_either_name_in_any_order(tmp_path):
-    (found,) = read("magnitudes", tmp_path, "force,image\n3,c\n1,a.png\n")
-    np.testing.assert_array_equal(found, [[1.0], [np.nan], [3.0]])
+    forces, deviations = read("magnitudes", tmp_path, "force,image\n3,c\n1,a.png\n")
+    np.testing.assert_array_equal(forces, [[1.0], [np.nan], [3.0]])
+    assert deviations is None
 
 
 def test_a_force_of_zero_is_refused(tmp_path):
@@ -239,3 +242,47 @@ def test_too_few_and_too_many_lines_are_counted(lines, words, tmp_path):
 
 def test_a_line_within_quotes_is_counted_to_its_end(tmp_path):
     assert "line 3: " in refused("forces", tmp_path, 'image,fx,fy,fz\n"a\n.png",1,2,3\n')
+
+
+def test_readings_of_a_gauge_s_log_that_are_of_no_frame_are_counted(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("name,pressure\nz0,1\nb,2\nz1.png,3\nz2,\n")
+    found = read_pressures(path, IMAGES, MM)
+    assert found.unused == 2 and found.at("b", np.nan) == pytest.approx(2e-4) and np.isnan(found.at("a", np.nan))
+
+
+TAKEN = Inputs([Path(f"p_20260927T1138{second}.png") for second in ("29", "29.5", "31", "50")] + [Path("untimed.png")], [])
+BEGUN = 1790509109.0
+CLOCKS = {
+    "seconds": lambda t: f"{BEGUN + t:.3f}",
+    "dates": lambda t: f"2026-09-27T11:38:{29 + t:06.3f}",
+    "dates with blanks": lambda t: f"2026-09-27 11:38:{29 + t:06.3f}",
+}
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_readings_by_time_are_taken_between_their_neighbours(clock, tmp_path):
+    path, clock = tmp_path / "log.csv", CLOCKS[clock]
+    times = [1.0, -20.0, 0.0, 3.0]  # in any order
+    path.write_text("time,pressure_change\n" + "".join(f"{clock(t)},{10 * t}\n" for t in times))
+    found = read_pressures(path, TAKEN, MM)
+    assert found.since_rest and found.unused == 1 and found.reach == 3.0
+    readings = [1e4 * found.at(path.stem, time_in(path.stem)) for path in TAKEN.images]
+    assert readings == pytest.approx([0.0, 5.0, 20.0, np.nan, np.nan], abs=1e-3, nan_ok=True)
+    assert 1e4 * found.plus(1e-4).at("", BEGUN) == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "inputs, rows, said",
+    [
+        (TAKEN, "100,1\n200,2\n", "no reading is within 150 s of an image: readings from 100.000 to 200.000, images"),
+        (IMAGES, "100,1\n200,2\n", "no image's name says when it was taken"),
+        (TAKEN, "5,1\n5.0,2\n", "line 3: time = 5.0; expected each time once; line 2 has it as well"),
+        (TAKEN, "today,1\n", "line 2: time = 'today'; expected a number"),
+    ],
+)
+def test_a_log_by_time_that_fits_no_image_is_refused(inputs, rows, said, tmp_path):
+    (tmp_path / "log.csv").write_text(f"time,pressure\n{rows}")
+    with pytest.raises(MembraneError) as refusal:
+        read_pressures(tmp_path / "log.csv", inputs, MM)
+    assert said in str(refusal.value)

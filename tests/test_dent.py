@@ -124,7 +124,7 @@ def test_a_deep_press_is_found_from_a_deep_dent():
     reconstructor = tm.Reconstructor(sensor, check_rest=False, settings=tm.ForceBalanceSettings(outlier=5.0))
     found = solved(reconstructor, truth)
     surface, force = errors(found, truth)
-    assert found.status[0] == 0 and surface < 0.1 and force < 0.1
+    assert found.status[0] == tm.Status.OUT_OF_RANGE and surface < 0.1 and force < 0.1
     dent = reconstructor.estimator.dent
     dent.deep = dent.wide = dent.forward
     without, _ = errors(solved(reconstructor, truth), truth)

@@ -1,4 +1,4 @@
-"""A rest state that has aged: noticed in frames without contact, and only there; noise, touches and presses are no drift."""
+"""Drift of the rest image is detected in frames without contact, and only there; noise, touches and presses are no drift."""
 
 import re
 import warnings

@@ -3,12 +3,14 @@
 Its model is made by hand, of a few nodes; `tests/test_export.py` runs exported ones.
 """
 
+import csv
 import errno
 import io
 import json
 import os
 import struct
 import sys
+import tomllib
 import types
 import zlib
 from pathlib import Path
@@ -19,7 +21,9 @@ import pytest
 from onnx import TensorProto, helper
 from PIL import Image
 
+from torchmembrane.files.provenance import Origin
 from torchmembrane.onnx.export import sealed
+from torchmembrane.results.summary_row import NAMES
 
 ROOT = Path(__file__).parents[1]
 SIZE = WIDTH, HEIGHT = 8, 6
@@ -229,6 +233,12 @@ def png_of_16_bits(colour, *planes):
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
+def declared(png, width, height):
+    """A PNG whose header says another size than its data have."""
+    header = b"IHDR" + struct.pack(">LL", width, height) + png[24:29]
+    return png[:12] + header + struct.pack(">L", zlib.crc32(header)) + png[33:]
+
+
 def padded(jpeg):
     """A JPEG with bytes that mean nothing before its first table, as some cameras fill buffers."""
     at = jpeg.index(b"\xff\xdb")
@@ -306,7 +316,7 @@ REFUSED = {
     "flipped.png": (saved(GREY, "PNG").replace(b"IDAT", b"IDAT\x55", 1)[:-1], "not readable as an image ("),
     "small.png": (saved(GREY[:, :4], "PNG"), "the image is 4 x 6 px, expected 8 x 6: use images of this sensor's camera"),
     "turned.png": (saved(GREY.T, "PNG"), "the image is 6 x 8 px, expected 8 x 6"),
-    "huge.png": (saved(np.zeros((20000, 20000), np.uint8), "PNG"), "the image is 20000 x 20000 px, expected 8 x 6"),
+    "huge.png": (declared(saved(GREY, "PNG"), 20000, 20000), "the image is 20000 x 20000 px, expected 8 x 6"),
     "float_255.tif": (saved(GREY.astype(np.float32), "TIFF"), "float values from 0.0 to 235.0; expected finite, in 0..1"),
     "nan.tif": (saved(np.full((6, 8), np.nan, np.float32), "TIFF"), "float values from nan to nan"),
     "large_32.tif": (saved(WIDE.astype(np.int32) * 2, "TIFF"), "32-bit values from 0 to 120790; 8 or 16 bits are read"),
@@ -589,7 +599,8 @@ def test_a_folder_that_is_not_of_these_results_is_refused_and_left_as_it_is(kind
 def test_results_of_the_same_model_are_added_to(model, call, images, tmp_path):
     for name in ("a.png", "b.png"):
         assert call(model, images(name, GREY), "--out", tmp_path / "r")[0] == 0
-    assert sorted(path.name for path in (tmp_path / "r").iterdir()) == ["a.npz", "b.npz", "mesh.npz"]
+    tables = ["summary.csv", "summary_columns.csv"]
+    assert sorted(path.name for path in (tmp_path / "r").iterdir()) == ["a.npz", "b.npz", "mesh.npz", *tables]
 
 
 def test_a_full_disk_is_told_with_the_file_and_leaves_no_half_one(model, call, images, tmp_path, monkeypatch):
@@ -644,6 +655,64 @@ def test_without_images_or_folder_the_command_says_what_it_needs(model, call, im
     for arguments in ((), (images("a.png", GREY),), ("--out", tmp_path / "r")):
         code, _, err = call(model, *arguments)
         assert code == 2 and "expected IMAGES and --out DIR, or --camera NUMBER" in err
+
+
+def rows_of(folder):
+    with open(folder / "summary.csv", newline="") as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
+
+
+def test_the_table_of_a_folder_is_torchmembrane_s(model, call, images, tmp_path):
+    one, dark = images("press_20260927T113829.png", GREY), images("=dark.png", 0 * GREY)
+    broken = images("broken.png", b"no image")
+    code, out, err = call(model, one, dark, broken, "--out", tmp_path / "r")
+    assert code == 1 and (tmp_path / "r" / "summary_columns.csv").read_text().startswith("name,unit,meaning")
+    rows = rows_of(tmp_path / "r")
+    assert list(rows) == ["'=dark", "broken", one.stem] and tuple(rows["broken"]) == NAMES
+    assert [row["status"] for row in rows.values()] == ["4", "-1", "0"]
+    row, mean = rows[one.stem], GREY.mean() / 255
+    assert row["status_text"] == "ok" and rows["broken"]["status_text"].startswith("unreadable: ")
+    assert [float(row[f"force_{axis}"]) for axis in "xyz"] == pytest.approx([0, 0, -mean], rel=1e-4)
+    assert [float(row[key]) for key in ("deepest", "time")] == pytest.approx([mean, 1790509109], rel=1e-4)
+    assert row["content_hash"] == Origin.of(one).content_hash and row["contact_1_x"] == ""
+    with np.load(tmp_path / "r" / f"{one.stem}.npz") as stored:
+        assert str(stored["path"]) == row["file"] == str(one) and stored["time"] == 1790509109
+    again = images("again.png", GREY)
+    call(model, again, "--out", tmp_path / "r")
+    later = rows_of(tmp_path / "r")
+    assert list(later) == ["'=dark", "again", "broken", one.stem] and later[one.stem] == row
+
+
+def test_each_frame_s_line_says_status_and_force(model, call, images, tmp_path):
+    code, out, err = call(model, images("press.png", GREY), images("dark.png", 0 * GREY), "--out", tmp_path / "r")
+    first, last = out.splitlines()
+    assert first.startswith("press: ok, moved by at most ") and f"force {GREY.mean() / 255:.3g} N (0, 0, -" in first
+    assert last.startswith("frames: 1 reconstructed, 1 failed") and "blank or saturated" in err
+
+
+def test_contacts_are_told_with_place_and_force(edge):
+    session = types.SimpleNamespace(
+        length_unit="mm", force_unit="N", status_text=lambda code: "ok", mesh={"rest_normals": np.ones((1, 3))}
+    )
+    points = np.full((4, 3), np.nan)
+    points[:2] = [[1, 2, 3], [4, 5, 6]]
+    frame = {"status": 0, "displacement": np.ones((1, 3)), "vertices": np.ones((1, 3)), "force": np.array([0.0, 3.0, 4.0])}
+    frame |= {"contact_points": points, "contact_force": 2 * points, "contact_area": points[:, 0]}
+    said = edge.cli.line(session, frame)
+    assert said.endswith("force 5 N (0, 3, 4), contact at (1, 2, 3) mm of 7.48 N, contact at (4, 5, 6) mm of 17.5 N")
+
+
+@pytest.mark.parametrize("made, warned", [("99.0.0", True), ("0.0.9", False), (None, False), ("nonsense", False)])
+def test_a_model_of_a_later_version_is_told(made, warned, call, images, tmp_path):
+    model = tmp_path / "later.onnx"
+    model.write_bytes(model_of(metadata(version=made)))
+    code, _, err = call(model, images("press.png", GREY), "--out", tmp_path / "r")
+    assert code == 0 and ("made by torchmembrane 99.0.0; expected one of this torchmembrane-edge's version" in err) == warned
+
+
+def test_both_packages_have_one_version(edge):
+    projects = [tomllib.loads((folder / "pyproject.toml").read_text())["project"] for folder in (ROOT, ROOT / "export")]
+    assert [project["version"] for project in projects] == [edge.__version__] * 2
 
 
 def with_camera(monkeypatch, *frames):

@@ -197,6 +197,9 @@ def test_a_graph_captured_at_once_is_what_torch_makes_of_it_in_two_steps(monkeyp
     monkeypatch.setattr(torch.fx.config, "do_not_emit_stack_traces", True)  # which are all that would differ
     in_two_steps = traced_model(Composite(), inputs, ["a", "b"])
     assert [node.op_type for node in at_once.graph.node] == [node.op_type for node in in_two_steps.graph.node]
+    for model in (at_once, in_two_steps):
+        for node in model.graph.node:
+            del node.metadata_props[:]  # the modules that it stood in
     assert at_once.SerializeToString(deterministic=True) == in_two_steps.SerializeToString(deterministic=True)
 
 
@@ -260,7 +263,7 @@ def test_a_named_function_is_one_node_only_while_a_piece_is_traced():
     matrix = random @ random.mT + torch.eye(60)
     (node,) = traced_model(Rooted(), {"x": matrix}, ["y"]).graph.node
     assert (node.domain, node.op_type, list(node.attribute[0].ints)) == ("torchmembrane", "by_products", [60, 60])
-    with pytest.raises(Exception, match="cholesky|decompos"):
+    with pytest.raises(Exception, match="aten._linalg_check_errors"):
         traced_model(Rooted(torch.linalg.cholesky), {"x": matrix}, ["y"])
     root = by_products(matrix)
     torch.testing.assert_close(root @ matrix @ root.mT, torch.eye(60).expand(2, -1, -1), atol=1e-3, rtol=0)

@@ -176,3 +176,13 @@ def test_rerun_that_is_missing_is_said(stream, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(tm.MembraneError, match=r'pip install "torchmembrane\[rerun\]"'):
         RerunLog(stream.mesh, "never.rrd")
+
+
+@pytest.mark.parametrize("content", ["import no_such_module", "from ctypes import CDLL; CDLL('libnone.so.7')"])
+def test_rerun_that_is_broken_is_not_called_missing(stream, monkeypatch, tmp_path, content):
+    (tmp_path / "rerun").mkdir()
+    (tmp_path / "rerun/__init__.py").write_text(content)
+    monkeypatch.delitem(sys.modules, "rerun", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(tm.MembraneError, match=r"is installed and cannot be imported \(.*(no_such_module|libnone)"):
+        RerunLog(stream.mesh, "never.rrd")

@@ -231,3 +231,12 @@ def test_the_lowest_constraints_are_the_bounds_of_the_dependencies():
     assert not [(name, bound) for name, bound in shared if name in bounds and number(bound) < number(bounds[name])]
     edge = tomllib.loads((ROOT / "export" / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert f"pillow>={bounds['pillow']}" in edge["images"]
+
+
+def test_no_stray_file_is_tracked_at_the_top():
+    tracked = subprocess.run(["git", "ls-files", ":(glob)*"], cwd=ROOT, capture_output=True, text=True)
+    if tracked.returncode:
+        pytest.skip("no git checkout")
+    known = {".gitignore", ".pre-commit-config.yaml", "CITATION.cff", "LICENSE", "Makefile", "mkdocs.yml", "pyproject.toml"}
+    stray = [name for name in tracked.stdout.split() if name not in known and Path(name).suffix not in {".md", ".txt"}]
+    assert stray == []

@@ -21,7 +21,8 @@ from torchmembrane.presets.draft import (
     overpressure,
     pressure_in_hectopascal,
 )
-from torchmembrane.sensor.parts import METRE, Cavity, Markers, Material
+from torchmembrane.sensor.parts import Cavity, Markers, Material
+from torchmembrane.sensor.units import METRE
 from torchmembrane.simulate.appearance import noisy
 from torchmembrane.simulate.render import Renderer
 

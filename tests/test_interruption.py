@@ -14,7 +14,10 @@ from torchmembrane.cli.main import main
 from torchmembrane.interruption import Interrupted, ended_by_signals, starting_processes
 
 ROOT = Path(__file__).parents[1]
-BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+SIGINT, SIGTERM = (pytest.param(number, id=number.name) for number in (signal.SIGINT, signal.SIGTERM))
+BOTH = pytest.mark.parametrize("number", [SIGINT, SIGTERM])
+FIRST = pytest.mark.parametrize("number", [SIGINT, pytest.param(signal.SIGTERM, id="SIGTERM", marks=pytest.mark.full)])
+LAST = pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, id="SIGINT", marks=pytest.mark.full), SIGTERM])
 SLOW = 3.0
 """Seconds for what is said to take two, on a machine with much else to do."""
 
@@ -81,21 +84,26 @@ def script(body: str, folder: Path) -> list[str]:
     return ["-c", HEAD.replace("{body}", body.strip().replace("\n", "\n        ")), str(folder)]
 
 
-@BOTH
+WORK = {
+    "asleep": "time.sleep(60)",
+    "in Python": "while True: pass",
+    "in C": "compiled(30)",
+    "compiling": "with unstoppable(): compiled(30)",
+    "compiling for a frame": "with frame_in_work(), unstoppable(): compiled(30)",
+    "callback": "call = ctypes.CFUNCTYPE(None)(lambda: time.sleep(5))\nfor _ in range(9): call()",
+    "finalizer": "class Sleeper:\n    def __del__(self): time.sleep(5)\nfor _ in range(9): Sleeper()",
+    "reading": "sys.stdin.read() or time.sleep(60)",
+    "waiting": "import threading; threading.Event().wait()",
+}
+
+
 @pytest.mark.parametrize(
-    "body",
+    "number, body",
     [
-        "time.sleep(60)",
-        "while True: pass",
-        "compiled(30)",
-        "with unstoppable(): compiled(30)",
-        "with frame_in_work(), unstoppable(): compiled(30)",
-        "call = ctypes.CFUNCTYPE(None)(lambda: time.sleep(5))\nfor _ in range(9): call()",
-        "class Sleeper:\n    def __del__(self): time.sleep(5)\nfor _ in range(9): Sleeper()",
-        "sys.stdin.read() or time.sleep(60)",
-        "import threading; threading.Event().wait()",
+        pytest.param(number, body, id=f"{name}-{number.name}", marks=[] if k % 2 == quick else [pytest.mark.full])
+        for k, (name, body) in enumerate(WORK.items())
+        for quick, number in enumerate((signal.SIGINT, signal.SIGTERM))
     ],
-    ids=["asleep", "in Python", "in C", "compiling", "compiling for a frame", "callback", "finalizer", "reading", "waiting"],
 )
 def test_a_signal_ends_whatever_is_done_and_removes_its_part(number, body, tmp_path):
     ended = Ended(script(body, tmp_path), number)
@@ -115,13 +123,13 @@ def test_the_computation_of_a_frame_is_waited_for_but_not_for_ever(tmp_path):
 CLOSING = "try: time.sleep(60)\nfinally: time.sleep({seconds}); print('whole', flush=True)"
 
 
-@BOTH
+@FIRST
 def test_what_is_closed_is_not_disturbed_by_a_signal_that_comes_twice_at_once(number, tmp_path):
     ended = Ended(script(CLOSING.format(seconds=0.6), tmp_path), number, again=0.05)
     assert ended.code == 128 + number and "whole" in ended.said and "closed" in ended.said
 
 
-@BOTH
+@LAST
 def test_a_second_signal_ends_the_process_at_once(number, tmp_path):
     ended = Ended(script(CLOSING.format(seconds=60), tmp_path), number, again=0.6)
     assert ended.code == 128 + number and ended.seconds < SLOW and "whole" not in ended.said
@@ -173,7 +181,7 @@ def test_other_errors_are_not_taken_for_interruptions(monkeypatch):
         main(["check", "a.toml"])
 
 
-@BOTH
+@FIRST
 def test_a_command_ends_while_machine_code_is_compiled(number, small_sensor, small_images, tmp_path):
     for k in range(3):
         (tmp_path / f"{k}.png").hardlink_to(small_images[0])
@@ -184,7 +192,7 @@ def test_a_command_ends_while_machine_code_is_compiled(number, small_sensor, sma
     assert "ignored" not in ended.said
 
 
-@BOTH
+@LAST
 def test_a_camera_that_never_opens_is_left(number, small_sensor, tmp_path):
     pytest.importorskip("cv2")
     os.mkfifo(tmp_path / "camera")

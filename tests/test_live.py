@@ -4,6 +4,7 @@ Cameras are played by a class with the interface of `cv2.VideoCapture`.
 """
 
 import csv
+import json
 import re
 import shutil
 import signal
@@ -560,12 +561,19 @@ def test_the_command_follows_a_camera_and_says_what_ended_it(small_sensor, small
     images = [np.array(Image.open(path).convert("RGB")) for path in small_images]
     camera(images)
     record = tmp_path / "kept"
-    code = main(["live", str(small_sensor / "sensor.toml"), "--camera", "0", "--grid", "7", "7", "--record", str(record)])
+    options = ["--grid", "7", "7", "--record", str(record), "--life", str(tmp_path / "life.json")]
+    code = main(["live", str(small_sensor / "sensor.toml"), "--camera", "0", *options])
     out, err = capsys.readouterr()
     assert code == 2 and "--camera 0: no image in" in err
     followed = int(re.search(r"frames: 3 captured, (\d) followed", out)[1])
     results = tm.read_results(record)
     assert len(results) == followed and results["000002"]["vertices"].shape == (49, 3)
+    hardest = max(float(np.linalg.norm(frame["force"])) for frame in results)
+    life = json.loads((tmp_path / "life.json").read_text())
+    assert life["frames"] == followed and life["force"] == pytest.approx(hardest) and f"force {hardest:.3g} N" in out
+    (tmp_path / "life.json").write_text("another file")
+    assert main(["live", str(small_sensor / "sensor.toml"), "--images", str(small_sensor), *options[:3], *options[5:]]) == 2
+    assert "name another file" in capsys.readouterr().err
     sensor = Sensor.from_file(small_sensor / "sensor.toml")
     tracker = tm.Tracker(tm.Reconstructor(replace(sensor, membrane=sensor.surface.membrane((7, 7)))))
     for name in results.names:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
-from torchmembrane.calibrate.material import STRETCHES, Presses, _log_stretch, material_from_pixels
+from torchmembrane.calibrate.material import STRETCHES, KnownForces, Presses, _log_stretch, material_from_pixels
 from torchmembrane.calibrate.report import Report
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
@@ -79,7 +79,7 @@ def test_modulus_is_proportional_to_the_forces_and_needs_but_one_of_them(presses
     reconstructor = Reconstructor(sensor(Material("neo_hookean", 1.5)), dtype=torch.float64)
     seen = Presses(reconstructor, pixels - reconstructor.rest_pixels, torch.ones(pixels.shape[:2], dtype=torch.float64))
     lengths = np.linalg.norm(forces, axis=1, keepdims=True) * [[1.0], [np.nan]]
-    one, twice = (np.array(seen.modulus(0.2, 0.05, k * lengths)[:3]) for k in (1, 2))
+    one, twice = (np.array(seen.modulus(0.2, 0.05, KnownForces(k * lengths))[:3]) for k in (1, 2))
     assert np.allclose(twice, 2 * one) and one[0] > 0 > one[2]
 
 

@@ -3,8 +3,10 @@
 import io
 import json
 import math
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -241,13 +243,15 @@ def test_where_nothing_can_be_kept_the_work_goes_on(small_sensor, tmp_path):
 
 
 def test_the_command_says_that_it_goes_on_and_removes_the_file(tried, small_sensor, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    call = ["check", str(small_sensor / "sensor.toml"), "--accuracy", "--jobs", "1"]
+    sensor = shutil.copytree(small_sensor, tmp_path / "sensor")  # beside which its range is written
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    call = ["check", str(sensor / "sensor.toml"), "--accuracy", "--jobs", "1"]
     tried.interrupt = 3
     assert cli.main(call) == 130
-    (file,) = tmp_path.iterdir()
+    (file,) = Path().iterdir()
     assert len(json.loads(file.read_text())) == 3 and "what is done so far is kept" in capsys.readouterr().err
     tried.series, tried.interrupt = [], None
     assert cli.main(call) == 0
     assert f"check --accuracy: goes on from 3 finished series in {file.name}\n" in capsys.readouterr().err
-    assert len(tried.series) == 9 and list(tmp_path.iterdir()) == []
+    assert len(tried.series) == 9 and list(Path().iterdir()) == []

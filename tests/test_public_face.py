@@ -178,10 +178,10 @@ def test_a_result_moves_and_keeps_its_meaning(result):
 
 
 def test_a_status_is_its_number_and_says_its_text(result):
-    assert [int(status) for status in tm.Status] == list(range(9)) and tm.Status(3) == 3
+    assert [int(status) for status in tm.Status] == list(range(10)) and tm.Status(3) == 3
     assert all(tm.Status(int(code)) is tm.Status.OK for code in result.status)
     assert tm.Status.NOT_CONVERGED.has_surface and not tm.Status.BAD_VALUES.has_surface
-    assert len({status.text for status in tm.Status}) == 9
+    assert len({status.text for status in tm.Status}) == 10
 
 
 def test_a_tracker_gives_what_frames_with_their_previous_give(reconstructor, photographs, result):
@@ -199,6 +199,17 @@ def test_a_tracker_gives_what_frames_with_their_previous_give(reconstructor, pho
     torch.testing.assert_close(tracker(photographs[0]).vertices, first.vertices)
     with pytest.raises(tm.MembraneError, match="2 frames; expected one"):
         tracker(photographs[:2])
+
+
+def test_a_tracker_takes_one_image_of_every_layout(reconstructor, photographs):
+    """Grey and colour, channels first or last, with or without a batch of one: three planes are colours, never three frames."""
+    colour = np.stack([photographs[0], photographs[1], photographs[0]], -1)
+    for image in (photographs[0][..., None], colour):
+        layouts = image, image[None], np.moveaxis(image, -1, 0), np.moveaxis(image, -1, 0)[None]
+        seen = [tm.Tracker(reconstructor)(layout).pixels for layout in layouts]
+        for pixels in seen[1:]:
+            torch.testing.assert_close(pixels, seen[0], rtol=0, atol=0, equal_nan=True)
+    assert seen[0].isfinite().any()
 
 
 def test_rezero_in_a_press_warns_with_its_force(sensor):

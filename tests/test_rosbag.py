@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchmembrane import Camera, MembraneError, Sensor
+from torchmembrane import Camera, MembraneError, Sensor, Status
 from torchmembrane.cli.main import main
-from torchmembrane.integrations.messages import CHANNELS, cloud_layout, grey_of, projected, unlike
+from torchmembrane.integrations.frame_messages import CONTACT_FIELDS, POINT_FIELDS, cloud
+from torchmembrane.integrations.messages import CHANNELS, grey_of, projected, unlike
 from torchmembrane.integrations.rosbag import camera_remark
 from torchmembrane.results.read import read_results
 from torchmembrane.sensor.parts import Cavity
@@ -116,11 +117,10 @@ def test_a_bag_s_results_come_back_in_a_bag(tmp_path, gas_sensor, pictures, plug
     with AnyReader([tmp_path / "forces"]) as reader:
         for connection, received, content in reader.messages():
             found.setdefault(connection.topic, []).append((received, reader.deserialize(content, connection.msgtype)))
-    assert {topic: len(each) for topic, each in found.items()} == {
-        "/torchmembrane/wrench": 2,
-        "/torchmembrane/points": 2,
-        "/torchmembrane/pressure": 2,
-    }
+    statuses = [message.status[0] for _, message in found.pop("/torchmembrane/status")]
+    assert [(each.level, each.message) for each in statuses] == [(0, "ok"), (2, Status.BLANK.text), (0, "ok")]
+    names = "wrench", "force_deviation", "points", "contacts", "pressure"
+    assert {topic: len(each) for topic, each in found.items()} == {f"/torchmembrane/{name}": 2 for name in names}
     for k, number in enumerate(n for n in range(3) if n != BLANK):
         frame = results[f"run_{number:06d}"]
         for each in found.values():
@@ -132,6 +132,14 @@ def test_a_bag_s_results_come_back_in_a_bag(tmp_path, gas_sensor, pictures, plug
         np.testing.assert_allclose([wrench.force.x, wrench.force.y, wrench.force.z], frame["force"])  # N
         moment = [wrench.torque.x, wrench.torque.y, wrench.torque.z]
         np.testing.assert_allclose(moment, frame["wrench"][3:] / 1000, rtol=1e-6)  # N mm to N m
+        deviation = found["/torchmembrane/force_deviation"][k][1].vector
+        np.testing.assert_allclose([deviation.x, deviation.y, deviation.z], frame["force_deviation"])  # N
+        touched = found["/torchmembrane/contacts"][k][1]
+        contacts = np.frombuffer(touched.data, "<f4").reshape(touched.width, -1)
+        assert [each.name for each in touched.fields] == list(CONTACT_FIELDS) and len(contacts) > 0
+        np.testing.assert_allclose(contacts[0, :3], frame["contact_points"][0] / 1000, rtol=1e-6)
+        np.testing.assert_allclose(contacts[:, 3:6].sum(0), np.nansum(frame["contact_force"], 0), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(contacts[0, 6:], [*frame["contact_normal"][0], frame["contact_area"][0] / 1e6], rtol=1e-6)
         cloud = found["/torchmembrane/points"][k][1]
         assert [(each.name, each.offset) for each in cloud.fields] == [
             (name, 4 * k) for k, name in enumerate("x y z normal_traction shear_x shear_y shear_z".split())
@@ -243,9 +251,9 @@ FIELDS = ("encoding", "width", "height", "step", "is_bigendian", "data")
 
 def test_a_cloud_is_dense_where_all_of_its_values_are_finite():
     points = np.ones((3, 7), np.float32)
-    assert cloud_layout(points)["is_dense"]
+    assert cloud(points, POINT_FIELDS)["is_dense"]
     points[1, 4] = np.nan
-    assert not cloud_layout(points)["is_dense"]
+    assert not cloud(points, POINT_FIELDS)["is_dense"]
 
 
 def test_a_camera_info_that_disagrees_is_said(small_sensor):

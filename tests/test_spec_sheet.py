@@ -65,6 +65,7 @@ def result_with(r, states, displacement, **fields):
         force=torch.stack([state.force for state in states]),
         pressure_change=torch.zeros(B),
         status=torch.zeros(B, dtype=torch.int32),
+        normals=r.reconstructor.sensor.membrane.rest_normals.expand(B, V, 3),
     )
     blank = Reconstruction(*torch.zeros(len(Reconstruction._fields), B, 1))
     assert displacement.shape == (B, V, 3)
@@ -379,12 +380,14 @@ def test_the_command_prints_and_draws_the_sheet(small_sensor, sheet, monkeypatch
         return sheet
 
     monkeypatch.setattr("torchmembrane.accuracy.measure.spec_sheet", known)
-    call = ["check", str(small_sensor / "sensor.toml"), "--accuracy", "--seed", "3", "--jobs", "1"]
+    path = Sensor.from_file(small_sensor / "sensor.toml").to_file(tmp_path)
+    call = ["check", str(path), "--accuracy", "--seed", "3", "--jobs", "1"]
     assert cli.main([*call, "--out", str(tmp_path / "a.png")]) == 0
     said = capsys.readouterr().out
     assert {"progress", "finished"} < asked.keys() and asked["finished"].path.parent == tmp_path
     assert {key: asked[key] for key in ("seed", "noise", "jobs", "name")} == dict(seed=3, noise=None, jobs=1, name="cap")
-    assert said.endswith("\n".join(sheet_lines(sheet)) + f"\ndrawn in {tmp_path / 'a.png'}\n")
+    assert "\n".join(sheet_lines(sheet)) in said and said.endswith(f"\ndrawn in {tmp_path / 'a.png'}\n")
+    assert f"kept in {tmp_path / 'sensor_range.toml'}" in said and Sensor.from_file(path).range == sheet.range
     for part in ("at rest   surface", "lightest  ", "errors    by the true force", "two       ", "deepest   press", "force, N"):
         assert part in said
     assert Image.open(tmp_path / "a.png").size == (1600, 1160)

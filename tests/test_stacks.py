@@ -137,7 +137,7 @@ def test_frames_of_a_stack_are_named_as_those_of_a_video(run, tmp_path):
     assert outcome[0] == 4 and not lines
     assert read_results(tmp_path / "out").names == ["one", "run_000000", "run_000001", "run_000002"]
     assert pressures(tmp_path / "out") == [99, 60, 100, 140]
-    assert reconstruct([run], tmp_path / "out")[0] == (0, 0, 0, 0, 0, 3)
+    assert reconstruct([run], tmp_path / "out")[0] == (0, 0, 0, 0, 0, 0, 3)
     with pytest.raises(MembraneError, match="run_000001.png: a frame of .*run.tif has the same name"):
         find_inputs([run, grey_image(tmp_path / "run_000001.png", 9)])
 
@@ -172,7 +172,7 @@ def test_a_gif_is_a_video_and_no_image(run, tmp_path):
 def test_a_damaged_end_of_a_stack_is_a_failed_frame_and_the_batch_goes_on(run, tmp_path):
     run.write_bytes(run.read_bytes()[:-20])
     outcome, lines, _ = reconstruct([run, grey_image(tmp_path / "one.png", 99)], tmp_path / "out")
-    assert outcome[0] == 3 and outcome[4] == 1 and len(lines) == 1
+    assert outcome[0] == 3 and outcome.failed == 1 and len(lines) == 1
     assert f"{run}, run_000002: not readable as an image" in lines[0]
     assert summary_of(tmp_path / "out")["run_000002"]["status"] == "-1"
 

@@ -475,6 +475,7 @@ WITHIN = {
     "files/atomic.py": "the one place",
     "plot/drawing.py": "within whole_file",
     "plot/film.py": "within whole_file",
+    "results/data_set.py": "a folder of its own, renamed when it is whole",
     "results/frame_table.py": "within whole_file",
     "results/summary.py": "within whole_file",
     "simulate/frames.py": "within whole_file",

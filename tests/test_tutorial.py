@@ -19,7 +19,8 @@ from torchmembrane.cli.main import command_parser, main
 from torchmembrane.sensor.sensor import Sensor
 
 ROOT = Path(__file__).parents[1]
-TUTORIAL, BUBBLE, RECIPES = ((ROOT / "docs" / f"{name}.md").read_text() for name in ("own_sensor", "own_bubble", "recipes"))
+PAGES = ("own_sensor", "own_bubble", "own_window", "recipes")
+TUTORIAL, BUBBLE, WINDOW, RECIPES = ((ROOT / "docs" / f"{name}.md").read_text() for name in PAGES)
 
 
 def words(page: str) -> str:
@@ -72,7 +73,7 @@ def assert_newtons() -> dict[str, Any]:
     return row | {"true": true}
 
 
-@pytest.mark.parametrize("page", [TUTORIAL, BUBBLE], ids=["dome", "bubble"])
+@pytest.mark.parametrize("page", [TUTORIAL, BUBBLE, WINDOW], ids=["dome", "bubble", "window"])
 def test_every_command_of_a_page_is_one(page):
     parser = command_parser()
     for call in commands(page):
@@ -122,6 +123,15 @@ def test_the_bubble_s_gauge_gives_newtons(tmp_path, monkeypatch):
     assert f"says {float(row['force']):.2f} N; the truth is {row['true']:.3f} N" in words(BUBBLE)
     found = tomllib.loads(Path("material/sensor.toml").read_text())["material"]
     assert f"prestretch of {found['prestretch']:.2f} ±" in words(BUBBLE)
+
+
+@pytest.mark.full
+def test_the_window_s_ruler_and_gauge_give_newtons(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for call in commands(WINDOW):
+        assert main(call) == 0, call
+    row = assert_newtons()
+    assert f"says {float(row['force']):.3f} N; the truth is {row['true']:.3f} N" in words(WINDOW)
 
 
 def test_the_recipes_python_runs(monkeypatch):

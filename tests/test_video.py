@@ -111,12 +111,12 @@ def test_an_early_end_is_a_failed_frame_and_the_batch_goes_on(tmp_path):
     cut.write_bytes(content[: content.rindex(b"00dc", 0, content.rindex(b"idx1"))])
     whole = video(tmp_path / "whole.avi", 2, "mjpeg", (WIDTH, HEIGHT), level)
     outcome, lines, _ = reconstruct([cut, whole], tmp_path / "out")
-    assert outcome[0] == 5 and outcome[4] == 1
+    assert outcome[0] == 5 and outcome.failed == 1
     assert len(lines) == 1 and f"{cut}, cut_000003: the file ends early: 3 of 4 frames are there" in lines[0]
     assert "3 of 4 frames" in summary_of(tmp_path / "out")["cut_000003"]["status_text"]
     cut.write_bytes(content)
     outcome, lines, _ = reconstruct([cut, whole], tmp_path / "out")
-    assert outcome[0] == 4 and outcome[4] == 0 and lines[0].endswith("changed, done again")
+    assert outcome[0] == 4 and outcome.failed == 0 and lines[0].endswith("changed, done again")
 
 
 def test_a_damaged_picture_of_a_video_is_a_failed_frame_of_its_own(tmp_path):
@@ -127,7 +127,7 @@ def test_a_damaged_picture_of_a_video_is_a_failed_frame_of_its_own(tmp_path):
     content[at + 8 : at + 8 + size] = bytes(size)
     path.write_bytes(content)
     outcome, lines, _ = reconstruct([path], tmp_path / "out")
-    assert outcome[0] == 4 and outcome[4] == 1 and "film_000002: a damaged picture" in lines[0]
+    assert outcome[0] == 4 and outcome.failed == 1 and "film_000002: a damaged picture" in lines[0]
     pressures = [255 * float(frame["pressure"]) for frame in read_results(tmp_path / "out")]
     assert pressures == pytest.approx([40, 80, 160, 200], abs=4)
 
@@ -240,7 +240,7 @@ def test_grey_of_16_bits_is_read_with_the_bits_of_the_camera(tmp_path):
 def test_a_video_of_another_size_is_refused_once(tmp_path):
     path = video(tmp_path / "film.mp4", 4)
     outcome, lines, _ = reconstruct([path], tmp_path / "out", reconstructor=Denting())
-    assert outcome[4] == len(lines) == 1 and "images of 64 x 48 px; expected the sensor's 16 x 12" in lines[0]
+    assert outcome.failed == len(lines) == 1 and "images of 64 x 48 px; expected the sensor's 16 x 12" in lines[0]
 
 
 def test_a_video_without_times_is_played_at_its_own_pace(tmp_path):

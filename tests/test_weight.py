@@ -5,6 +5,7 @@ import shutil
 from argparse import ArgumentTypeError
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -134,7 +135,7 @@ def test_a_weight_beside_forces_is_refused(tmp_path, capsys):
     (tmp_path / "forces.csv").write_text("image,force\nflat_plate.png,1\n")
     call = ["calibrate", "material", str(EXAMPLES / "sensor.toml"), str(EXAMPLES / "flat_plate.png"), "--weight", "2N"]
     assert main([*call, "--forces", str(tmp_path / "forces.csv"), "--out", str(tmp_path / "out")]) == 2
-    assert "--weight and --forces" in capsys.readouterr().err
+    assert "--weight with --forces" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("calibration_grids")
@@ -144,3 +145,13 @@ def test_an_image_that_is_not_pressed_tells_no_modulus(tmp_path, capsys):
         call = ["calibrate", "material", str(EXAMPLES / "sensor.toml"), str(EXAMPLES / "rest.png"), *given]
         assert main([*call, "--out", str(tmp_path / "out")]) == 2
         assert "image 1 hardly shows a force" in capsys.readouterr().err
+
+
+def test_every_image_that_contradicts_the_others_is_named(monkeypatch):
+    sensor = tm.Sensor.from_file(EXAMPLES / "sensor.toml")
+    forces, deviations = np.array([1.0, 1.02, 1.6, 0.99, 0.4]), np.full(5, 0.05)
+    found = SimpleNamespace(sensor=sensor)
+    monkeypatch.setattr(weight_module, "material_from_images", lambda *_, **__: found)
+    monkeypatch.setattr(weight_module, "_told", lambda *_: (forces, deviations))
+    with pytest.raises(tm.MembraneError, match="image 3 shows 1.6, image 5 shows 0.4 times the others' force"):
+        weight_module.material_from_weight(sensor, torch.zeros(5, 1, 480, 640), 1.0)

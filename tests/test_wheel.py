@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 import venv
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -86,3 +87,22 @@ def test_presets_are_complete(seen):
 def test_the_command_helps(installed, arguments):
     said = call(installed / "torchmembrane", *arguments, cwd=installed.parent)
     assert said.startswith(f"usage: torchmembrane {arguments[0] if arguments[1:] else ''}".rstrip())
+
+
+def test_torchmembrane_edge_is_a_wheel_of_its_own(tmp_path):
+    """To install where there is no clone of this repository: every module, the command, and torchmembrane's version."""
+    source = tmp_path / "export"
+    shutil.copytree(
+        ROOT / "export" / "torchmembrane_edge", source / "torchmembrane_edge", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    for name in ("pyproject.toml", "README.md"):
+        shutil.copy(ROOT / "export" / name, source)
+    call(*PIP, "wheel", "--no-deps", "--no-build-isolation", "--no-index", "--wheel-dir", tmp_path, source, cwd=tmp_path)
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.name == f"torchmembrane_edge-{VERSION}-py3-none-any.whl"
+    modules = {path.name for path in (ROOT / "export" / "torchmembrane_edge").glob("*.py")}
+    with zipfile.ZipFile(wheel) as file:
+        names = file.namelist()
+        assert {Path(name).name for name in names if name.startswith("torchmembrane_edge/")} == modules
+        (points,) = (name for name in names if name.endswith("entry_points.txt"))
+        assert "torchmembrane-edge = torchmembrane_edge.cli:main" in file.read(points).decode()

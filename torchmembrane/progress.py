@@ -1,4 +1,4 @@
-"""What a long computation tells of itself as it goes: how much of the work is done, and which step comes next.
+"""How a long computation reports its progress: the share of the work that is done, and the step that begins.
 
 A computation takes `progress`, and calls it before each step; who called the computation decides what to show.
 """

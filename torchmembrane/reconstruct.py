@@ -88,6 +88,7 @@ class Reconstructor(nn.Module):
             raise MembraneError(f"Reconstructor: dtype = {dtype}; expected torch.float32 or torch.float64")
         self.sensor, self.estimator_name, self.locator_name, self.channels = sensor, name, locator, channels
         self.image_size, self.model = sensor.camera.image_size, model or sensor.material.model
+        self.range = sensor.range.of(sensor.fingerprint)
         self.camera, membrane = copy.deepcopy(sensor.camera), copy.deepcopy(sensor.membrane)
         vertex_pixels = self.camera.point_to_pixel(membrane.rest)
         imaged = imaged_vertices(sensor, vertex_pixels, whole=kind.needs_every_vertex)
@@ -260,7 +261,7 @@ class Reconstructor(nn.Module):
         normals, broken = membrane.normals(x), ~x.flatten(1).isfinite().all(1)
         in_view = self.coverage.in_view(confidence, facings(markers, self.marker_shares @ normals.to(markers)))
         residual = (miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()
-        gone, status = (status != Status.OK.value) | broken, self._judged(status, found, residual, in_view, broken)
+        gone, status = (status != Status.OK.value) | broken, self._judged(status, found, normals, residual, in_view, broken)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
         deviations = self.estimator.deviations(found, observation, contacts)
         wrench = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1)
@@ -290,10 +291,13 @@ class Reconstructor(nn.Module):
         measured = torch.where(lost[..., None], torch.nan, pixels).to(markers)
         return Reconstruction(pixels=measured, confidence=confidence, status=status.to(torch.int32), **kept)
 
-    def _judged(self, status: Tensor, found: Equilibrium, residual: Tensor, coverage: Tensor, broken: Tensor) -> Tensor:
+    def _judged(
+        self, status: Tensor, found: Equilibrium, normals: Tensor, residual: Tensor, coverage: Tensor, broken: Tensor
+    ) -> Tensor:
         """Statuses `[B]`, of frames that had none before the solve too: of several that hold the last."""
         ok, displaced = status == Status.OK.value, is_displaced(found.moved, self.image_size)
         for of_this, value in (
+            (self.range.is_beyond(found.vertices, normals, found.traction, self.estimator.membrane), Status.OUT_OF_RANGE.value),
             (~self.estimator.is_converged(found), Status.NOT_CONVERGED.value),
             (coverage < LEAST_COVERAGE, Status.HIDDEN.value),
             (~self.estimator.is_explained(found) | (residual > LARGEST_RESIDUAL) | displaced, Status.UNEXPLAINED.value),

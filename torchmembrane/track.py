@@ -1,4 +1,4 @@
-"""One stream of images: dots are followed from frame to frame, and a rest state that has aged is noticed."""
+"""One stream of images: dots are followed from frame to frame, and drift of the rest image is detected."""
 
 from math import isfinite
 
@@ -12,10 +12,15 @@ from .markers.drift import ENOUGH, DriftWatch
 from .reconstruct import Reconstructor
 from .results.reconstruction import Reconstruction
 from .results.status import Status
+from .stiffness import StiffnessWatch
 from .user_warnings import warn_user
 
+LOOKED_AT = (Status.OK, Status.UNEXPLAINED, Status.OUT_OF_RANGE)
+"""Of frames that tell of a drift: a camera that moved may leave them unexplained."""
 STEADY = 100
 """Frames in which a contact holds still from the beginning before it is said that it may be a drift."""
+FOUND_PRESSURE_ERROR = 0.06
+"""Of a pressure change that is found, relative (docs/calibration.md)."""
 LARGEST_STEADY = 0.3
 """px, rms: how far such a contact moves the markers at most."""
 
@@ -38,6 +43,7 @@ class Tracker:
 
     Attributes:
         time: of the latest frame, as it was given; None where it was not.
+        stiffness: what known loads, given by `weigh` and `gauge`, tell of the membrane's modulus.
 
     Limitations:
         A sudden change amid a stream that is taken for a contact is not noticed (see docs/drift.md). A touch too light to be
@@ -62,6 +68,7 @@ class Tracker:
             raise MembraneError(f"Tracker: reconstructor is a {type(reconstructor).__name__}; expected a tm.Reconstructor")
         self.reconstructor = reconstructor
         self.time: float | None = None
+        self.stiffness, self._said_due = StiffnessWatch(), False
         self._before: Reconstruction | None = None
         self._latest: Tensor | None = None
         self._latest_result: Reconstruction | None = None
@@ -72,7 +79,7 @@ class Tracker:
         """The frame's result, a batch of one.
 
         Args:
-            frame: `[H, W]`, `[H, W, 3]`, or a batch of one as for `Reconstructor`.
+            frame: `[H, W]`, `[1 | 3, H, W]` or `[H, W, 1 | 3]`, or a batch of one as for `Reconstructor`.
             pressure: that a gauge reads, as for `Reconstructor`.
             time: when the frame was taken, seconds of any clock; kept in `time`, later than that of the frame before.
 
@@ -92,7 +99,7 @@ class Tracker:
             result: Reconstruction = self.reconstructor(images, self._before, self._rest_pixels, pressure)
         self.time, self._latest, self._latest_result = time, images, result
         self._before = result if Status(int(result.status[0])).has_surface else None
-        if int(result.status[0]) in (Status.OK, Status.UNEXPLAINED):  # a camera that moved may leave it unexplained
+        if int(result.status[0]) in LOOKED_AT:
             self._look_for_drift(result)
         return result
 
@@ -103,10 +110,80 @@ class Tracker:
         in it, as `pixels` have it. Where a contact that holds still is said to be a drift, that one's."""
         return (self._steady if self._is_steady() else self._watch).drift().size
 
+    def warm_up(self) -> None:
+        """Do now what the first frame would wait for: machine code is compiled where there is none yet, which takes a minute or
+        more (`machine_code`). A stream's frames do not wait for it then; what the tracker has seen stays as it was."""
+        width, height = self.reconstructor.image_size
+        with torch.no_grad():
+            self.reconstructor.from_pixels(self.reconstructor.rest_pixels)
+            self.reconstructor(torch.zeros(height, width))
+
     def reset(self) -> None:
         """Forget the frames before, what `rezero` took for rest, the drift and the time."""
         self._before = self._latest = self._latest_result = self._rest_pixels = self.time = None
         self._watch_from(self.reconstructor.observer.rest_covariance)
+
+    def weigh(self, force: float) -> float:
+        """Compare the latest frame, in which something of known weight stands on the membrane alone, with that weight.
+
+        A membrane that softens or stiffens shows in nothing else but this and a gauge (`gauge`). Once the latest comparisons
+        say so for certain, a warning says that a calibration is due.
+
+        Args:
+            force: the weight, N.
+
+        Returns:
+            The force that is found, over the weight.
+
+        Raises:
+            MembraneError: there is no frame, its status is not ok, its contact reaches the rim, which bears a part of the
+                weight, or forces are relative.
+        """
+        result = self._relied_on("weigh")
+        if bool((result.contact_at_rim[0] == 1).any()):
+            raise MembraneError(
+                "Tracker.weigh: the contact reaches the rim, which bears a part of the weight; expected the weight on the "
+                "middle of the membrane"
+            )
+        expect(is_number(force) and isfinite(force) and force > 0, "Tracker.weigh: force", force, "the weight in N, positive")
+        deviation = float(result.force_deviation[0].norm())
+        return self._compared(float(result.force[0].norm()), float(force), deviation if isfinite(deviation) else 0.0)
+
+    def gauge(self, pressure_change: float) -> float:
+        """Compare the latest frame, which was taken without a `pressure`, with the change since rest that a gauge reads; as
+        `weigh`.
+
+        Args:
+            pressure_change: N / length^2, not zero.
+
+        Returns:
+            The change that is found, over that one.
+
+        Raises:
+            MembraneError: as of `weigh`, or the change is zero.
+        """
+        result = self._relied_on("gauge")
+        right = is_number(pressure_change) and isfinite(pressure_change) and pressure_change != 0
+        expect(right, "Tracker.gauge: pressure_change", pressure_change, "a change since rest, not zero: press the membrane")
+        found = float(result.pressure_change[0])
+        return self._compared(found, float(pressure_change), FOUND_PRESSURE_ERROR * abs(found))
+
+    def _relied_on(self, name: str) -> Reconstruction:
+        result, unit = self._latest_result, self.reconstructor.sensor.force_unit
+        if result is None:
+            raise MembraneError(f"Tracker.{name}: no frame yet; expected one with the load")
+        if int(result.status[0]) != Status.OK:
+            raise MembraneError(f"Tracker.{name}: the latest frame is not ok ({Status(int(result.status[0])).text})")
+        if unit != "N":
+            raise MembraneError(f"Tracker.{name}: forces are {unit}; expected a sensor file with shear_modulus and thickness")
+        return result
+
+    def _compared(self, found: float, known: float, deviation: float) -> float:
+        self.stiffness.add(found, known, deviation)
+        if self.stiffness.is_due and not self._said_due:
+            self._said_due = True
+            warn_user(stiffness_in_words(self.stiffness))
+        return found / known
 
     def rezero(self, frame: Tensor | np.ndarray | None = None) -> None:
         """Take a frame without contact, default the latest, for the rest state: what drifted since the rest image is nulled.
@@ -173,10 +250,11 @@ class Tracker:
         return motion[0] if float(shift.square().sum(-1).mean().sqrt()) > self.drift / 2 else None
 
     def _one(self, frame: Tensor | np.ndarray) -> Tensor:
-        images = self.reconstructor.grey(frame)
+        width, height = self.reconstructor.image_size
+        is_colour = np.shape(frame) == (3, height, width)  # of a batch, these would be three grey frames
+        images = self.reconstructor.grey(frame[None] if is_colour else frame)
         if len(images) != 1:
-            colours = "; a colour image [3, H, W] is given as frame[None]" if len(images) == 3 else ""
-            raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream{colours}")
+            raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
         return images
 
 
@@ -210,4 +288,15 @@ def drift_in_words(size: float, camera_motion: Tensor | None = None, is_steady: 
     return (
         f"Tracker: {where} the markers lie {size:.2f} px (rms) off the rest image, more than noise explains: {aged} has aged "
         f"(temperature, creep, swelling, pressure, a moved camera){camera}. Call Tracker.rezero() in a frame without contact"
+    )
+
+
+def stiffness_in_words(watch: StiffnessWatch) -> str:
+    """A changed modulus and its remedy."""
+    percent, changed = 100 * abs(watch.ratio - 1), "softened" if watch.ratio > 1 else "stiffened"
+    said = "too large" if watch.ratio > 1 else "too small"
+    return (
+        f"Tracker: loads are found {percent:.0f} % {said}, {100 * watch.deviation:.0f} % uncertain: the membrane has {changed} "
+        "since it was calibrated, and all forces are off by as much. A calibration is due: `torchmembrane calibrate material "
+        "--weight`, or --pressure with a gauge"
     )

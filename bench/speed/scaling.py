@@ -39,21 +39,22 @@ SWEEPS = dict(
     batch=(1, 2, 4, 8, 16, 32, 64),
 )
 PARTS = ("markers", "solve")
-NAMES = dict(lines="grid lines a side", dots="dots", width="image width, px", batch="frames in a batch")
+NAMES = dict(lines="grid lines per side", dots="dots", width="image width, px", batch="frames in a batch")
 PAGE = """# What a frame costs
 
-Processor time of one thread of a shared core against the lines of the grid, the dots, the size of the image and the frames
-in a batch; of a dome of radius 20 pressed by a ball, 33 x 33 vertices, some 150 dots and 640 x 480 pixels but for what is
-varied, every frame from rest. **Markers** is from the image to the markers' displacements, **solve** from these to the
-result; it takes several times as long where a frame is [solved a second time](mathematics.md), as that of 21 dots. Figure and
-tables are made anew by
+This page tells how the processor time of a frame grows with the grid lines, the dots, the image size and the number of frames
+in a batch. All times are of one thread of a shared core. The sensor is a dome of radius 20 pressed by a ball; it has 33 x 33
+vertices, about 150 dots and 640 x 480 pixels, except for the quantity that is varied. Every frame starts from rest. **Markers**
+is the time from the image to the markers' displacements, and **solve** the time from these to the result. The solve takes
+several times as long when a frame is [solved a second time](mathematics.md), as happened with 21 dots. This command makes the
+figure and the tables:
 
     python -m bench.speed.scaling --page docs/scaling.md
 
-![Milliseconds a frame against grid lines, dots, image width and batch](figures/scaling.png)
+![Milliseconds per frame against grid lines, dots, image width and batch](figures/scaling.png)
 
-The power is the slope of a line through the logarithms of the upper half of what was measured; of a batch, of the time of the
-whole batch.
+The exponent is the slope of a straight line fitted to the logarithms of the upper half of each series. For batches it refers to
+the time of the whole batch.
 
 {exponents}
 
@@ -121,8 +122,8 @@ def page(table: dict[str, list[dict]]) -> str:
         for k, row in enumerate(rows)
     ]
     return PAGE.format(
-        exponents=markdown(["cost grows with the power of", *PARTS], exponents),
-        costs=markdown(["varied", "", *(f"{part}, ms a frame" for part in PARTS)], costs),
+        exponents=markdown(["exponent of the cost in", *PARTS], exponents),
+        costs=markdown(["varied quantity", "value", *(f"{part}, ms per frame" for part in PARTS)], costs),
     )
 
 
@@ -154,7 +155,7 @@ def draw(table: dict[str, list[dict]], path: Path) -> None:
     ticks = [value for value in (1, 3, 10, 30, 100, 300, 1000) if low < value < high]
     axes[0].set_yticks(ticks, [str(value) for value in ticks])
     axes[0].set_yticks([], minor=True)
-    axes[0].set_ylabel("ms a frame")
+    axes[0].set_ylabel("ms per frame")
     figure.savefig(path, dpi=110)
 
 

@@ -1,7 +1,8 @@
 """Runs the models that `torchmembrane export` writes, with numpy and onnxruntime alone."""
 
+__version__ = "0.2.0"
+
 from .errors import EdgeError
 from .session import Session
 
 __all__ = ["EdgeError", "Session"]
-__version__ = "0.1.0"

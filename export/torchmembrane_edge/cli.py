@@ -8,6 +8,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -16,12 +17,12 @@ import numpy as np
 
 from . import results
 from .errors import EdgeError, printable
-from .images import frame_name, frames, pictures
+from .images import Frame, frame_name, frames, numbered, pictures
 from .session import MOST_THREADS, Session, model_file
+from .summary import UNREADABLE, Summary
+from .summary_row import AXES, CONTACTS, numbers
 
 FINISHED = (0, 3, 7, 8, 9)  # ok; not converged, unexplained, partly hidden, out of range: the answer is kept
-UNREADABLE = -1
-"""Status of a frame that gave no image."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".pgm", ".ppm")
 """Of the files that are taken from a folder."""
 OF_SYSTEM = re.compile(r"\._.*|\.DS_Store|(eh)?thumbs\.db|desktop\.ini|icon\r", re.IGNORECASE)
@@ -102,7 +103,7 @@ def image_files(arguments: Sequence[str]) -> list[Path]:
 
 def in_order(paths: list[Path]) -> list[Path]:
     """The paths as they are given; in the order of the numbers in their names where they come as shells expand a pattern."""
-    return sorted(paths, key=_numbered) if paths == sorted(paths) else paths
+    return sorted(paths, key=numbered) if paths == sorted(paths) else paths
 
 
 def without_system_files(paths: list[Path]) -> list[Path]:
@@ -114,52 +115,69 @@ def _expanded(argument: str) -> list[Path]:
     path = Path(argument)
     if path.is_dir():
         files = (p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file() and not p.name.startswith("."))
-        found = sorted(files, key=_numbered)
+        found = sorted(files, key=numbered)
         if not found:
             raise EdgeError(f"{printable(path)}: the folder holds no files {' '.join(SUFFIXES)}; expected one or more")
         return found
     if path.exists():
         return [path]
-    found = [p for p in map(Path, sorted(glob.glob(argument, recursive=True), key=_numbered)) if p.is_file()]
+    found = [p for p in map(Path, sorted(glob.glob(argument, recursive=True), key=numbered)) if p.is_file()]
     if not found:
         raise EdgeError(f"{printable(argument)}: no such file, no pattern that matches one; expected images, patterns, folders")
     return found
 
 
-def _numbered(path: str | Path) -> tuple[list[tuple[int, str]], str]:
-    parts = re.split("([0-9]+)", str(path))  # texts at even places, numbers at odd ones
-    digits = [part.lstrip("0") for part in parts]
-    return [(len(digits[k]), digits[k]) if k % 2 else (-1, part) for k, part in enumerate(parts)], str(path)
-
-
 def reconstruct(session: Session, paths: list[Path], out: Path, batch: int) -> int:
-    """Every frame's result as `NAME.npz` in the folder `out`, with `mesh.npz`; a model that tracks takes them for a video."""
+    """Every frame's result as `NAME.npz` in the folder `out`, with `mesh.npz` and `summary.csv`, and a line for each.
+
+    A model that tracks takes the frames for a video.
+    """
     results.begin(out, session.mesh)
+    summary = Summary(out, session)
     waiting = (frame for path in paths for frame in frames(path, session.image_size, session.bits))
     done, found = Counter(), None
-    while group := list(islice(waiting, batch)):
-        images = [frame.image for frame in group if frame.image is not None]
-        if images:
-            found = session.run(np.concatenate(images), found)
-        row = -1
-        for frame in group:
-            status, said = UNREADABLE, frame.reason
-            if frame.image is not None:
-                row += 1
-                results.save(out / f"{frame.name}.npz", {key: values[row] for key, values in found.items()})
-                status = int(found["status"][row])
-                said = session.status_text(status)
-            if status:
-                print(frame.says(said), file=sys.stderr)
-            done[status in FINISHED] += 1
+    try:
+        while group := list(islice(waiting, batch)):
+            start = time.perf_counter()
+            images = [frame.image for frame in group if frame.image is not None]
+            if images:
+                found = session.run(np.concatenate(images), found)
+            seconds = (time.perf_counter() - start) / max(len(images), 1)
+            rows = ({key: values[row] for key, values in found.items()} for row in range(len(images)))
+            for frame in group:
+                done[_kept(session, frame, None if frame.image is None else next(rows), seconds, summary) in FINISHED] += 1
+    except BaseException:  # interrupted, or no space left
+        with suppress(EdgeError):
+            summary.write()
+        raise
+    summary.write()
     print(f"frames: {done[True]} reconstructed, {done[False]} failed; results in {printable(out)}")
     return 1 if done[False] else 0
+
+
+def _kept(session: Session, frame: Frame, result: dict | None, seconds: float, summary: Summary) -> int:
+    """Write a frame's result and say what was found; returns its status."""
+    if result is None:
+        summary.add(frame.name, frame.path, f"unreadable: {frame.reason}", None, {})
+        print(frame.says(frame.reason), file=sys.stderr)
+        return UNREADABLE
+    status = int(result["status"])
+    text, origin = session.status_text(status), frame.origin | {"seconds": seconds}
+    results.save(summary.path.parent / f"{frame.name}.npz", result | origin)
+    summary.add(frame.name, frame.path, text, result, origin)
+    if status:
+        print(frame.says(text), file=sys.stderr)
+    if status in FINISHED:
+        print(printable(f"{frame.name}: {line(session, result)}, {1000 * seconds:.0f} ms"), flush=True)
+    return status
 
 
 def watch(session: Session, camera: int, frames: int | None) -> int:
     """Images of a camera, a line each: what was found and how long it took; Ctrl-C ends it."""
     import cv2
 
+    if hasattr(cv2, "setLogLevel"):
+        cv2.setLogLevel(0)  # what goes wrong is said in this package's own words
     width, height = session.image_size
     capture = cv2.VideoCapture(camera)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
@@ -177,7 +195,8 @@ def watch(session: Session, camera: int, frames: int | None) -> int:
             start = time.perf_counter()
             result = session.run(_red_first(image), result)
             milliseconds = 1000 * (time.perf_counter() - start)
-            print(f"{number}: {_line(session, result)}, {milliseconds:.1f} ms", flush=True)
+            first = {key: values[0] for key, values in result.items()}
+            print(f"{number}: {line(session, first)}, {milliseconds:.1f} ms", flush=True)
             number += 1
     except KeyboardInterrupt:
         pass
@@ -196,13 +215,27 @@ def _red_first(image: np.ndarray) -> np.ndarray:
     return image[..., 2::-1]
 
 
-def _line(session: Session, result: dict) -> str:
-    status = int(result["status"][0])
+def line(session: Session, result: dict) -> str:
+    """What was found in a frame, from its arrays: status, deepest displacement, force and contacts."""
+    status = int(result["status"])
+    text = session.status_text(status)
     if status not in FINISHED:
-        return session.status_text(status)
-    moved = np.linalg.norm(result["displacement"][0], axis=-1).max()
-    force = np.linalg.norm(result["force"][0])
-    return f"moved by at most {moved:.3g} {session.length_unit}, force {force:.3g} {session.force_unit}"
+        return text
+    found = numbers(result, session.mesh["rest_normals"], session.length_unit, session.force_unit)
+    length, force = session.length_unit, session.force_unit
+    moved = np.linalg.norm(result["displacement"], axis=-1).max()
+    said = [text.partition(":")[0], f"moved by at most {moved:.3g} {length}"]
+    said.append(f"force {found['force']:.3g} {force} {_vector(found, 'force')}")
+    for number in range(1, min(int(found["contacts"]), CONTACTS) + 1):
+        patch = f"contact_{number}"
+        push = found[f"{patch}_force"]
+        said.append(f"contact at {_vector(found, patch)} {length}" + (f" of {push:.3g} {force}" if np.isfinite(push) else ""))
+    return ", ".join(said)
+
+
+def _vector(found: dict, name: str) -> str:
+    parts = [f"{found[f'{name}_{axis}']:.3g}" for axis in AXES]
+    return f"({', '.join(parts)})"
 
 
 def _whole(least: int, most: int) -> Callable[[str], int]:
@@ -225,7 +258,7 @@ def _parser() -> argparse.ArgumentParser:
     add("model", metavar="MODEL.onnx", help="the exported model of the sensor")
     images = "image files, patterns, folders; several pictures in a file are frames of it; to a model that tracks, a video's"
     add("images", metavar="IMAGES", nargs="*", help=images)
-    add("--out", metavar="DIR", type=Path, help="folder of the results: NAME.npz and mesh.npz")
+    add("--out", metavar="DIR", type=Path, help="folder of the results: NAME.npz, mesh.npz and summary.csv")
     batch = "images computed at once (default: %(default)s; tracking: 1)"
     add("--batch", metavar="N", type=_whole(1, MOST_BATCH), default=1, help=batch)
     threads = "of onnxruntime (default: %(default)s)"

@@ -6,7 +6,9 @@ import struct
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from hashlib import blake2b
 from itertools import count
+from math import nan
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +16,7 @@ import numpy as np
 
 from .errors import EdgeError, in_one_line, printable
 from .session import grey
+from .timestamps import time_in
 
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "GIF", "PPM")
 MOST_BYTES = 2**28
@@ -39,12 +42,14 @@ IMAGEJ = re.compile(r"ImageJ=.*^images=(\d+)", re.DOTALL | re.MULTILINE)
 
 
 class Frame(NamedTuple):
-    """A frame to compute: `image [1, height, width]`, grey in 0..1, or the reason why there is none."""
+    """A frame to compute: `image [1, height, width]`, grey in 0..1, or the reason why there is none; `origin`: of its file, as
+    results hold it."""
 
     name: str
     path: Path
     image: np.ndarray | None
     reason: str = ""
+    origin: Mapping[str, Any] = {}
 
     def says(self, message: str) -> str:
         """A line of a message about this frame."""
@@ -68,9 +73,10 @@ def frames(path: Path, size: tuple[int, int], bits: int | None = None) -> Iterat
             _refuse_size(image, size)
             numbers, cut = _numbers(image, content)
             names = [f"{name}_{place:06d}" for place in range(len(numbers) + cut)]
+            origin = _origin(path, content, time_in(path.stem) if len(names) == 1 else nan)
             for number, each in zip(numbers, names if len(names) > 1 else [name], strict=False):
                 try:
-                    yield Frame(each, path, _grey(image, number, size, bits))
+                    yield Frame(each, path, _grey(image, number, size, bits), origin=origin)
                 except EdgeError as error:
                     yield Frame(each, path, None, str(error))
             if cut:
@@ -82,6 +88,20 @@ def frames(path: Path, size: tuple[int, int], bits: int | None = None) -> Iterat
 def frame_name(path: Path) -> str:
     """The name of a file's frame: the file's, without its ending, in UTF-8."""
     return printable(path.stem)
+
+
+def _origin(path: Path, content: bytes, time: float) -> dict[str, Any]:
+    """What results say of the file that they are of."""
+    stat, digest = path.stat(), blake2b(content, digest_size=16).hexdigest()
+    known = {"path": printable(path), "file_size": stat.st_size, "file_modified": stat.st_mtime_ns}
+    return known | {"content_hash": digest, "time": time}
+
+
+def numbered(name: str | Path) -> tuple[list[tuple[int, str]], str]:
+    """A key to sort names or paths by: numbers within them count as numbers."""
+    parts = re.split("([0-9]+)", str(name))  # texts at even places, numbers at odd ones
+    digits = [part.lstrip("0") for part in parts]
+    return [(len(digits[k]), digits[k]) if k % 2 else (-1, part) for k, part in enumerate(parts)], str(name)
 
 
 def pictures(path: Path) -> int:

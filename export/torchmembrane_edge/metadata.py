@@ -1,10 +1,13 @@
 """What a model says of its sensor, checked: the file may be damaged, or of somebody else's making."""
 
 import json
+import re
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from . import __version__
 from .errors import EdgeError, in_one_line
 
 FORMAT = "1"
@@ -65,7 +68,19 @@ class Metadata(NamedTuple):
             raise EdgeError(
                 f"{model}: its metadata are not readable ({in_one_line(error)}); expected those of {EXPECTED}"
             ) from error
+        _compare_versions(known.get("version", ""), model)
         return cls(*(known[key] for key in TEXTS), {int(code): text for code, text in texts.items()}, mesh, bits)
+
+
+def _compare_versions(made: str, model: str) -> None:
+    """Warn of a model that a later version made: what it holds may be unknown here."""
+    parts, here = (tuple(map(int, re.findall(r"\d+", version)[:2])) for version in (made, __version__))
+    if parts > here:
+        warnings.warn(
+            f"{model}: made by torchmembrane {in_one_line(made)}; expected one of this torchmembrane-edge's version, "
+            f"{__version__}, or before: install the later torchmembrane-edge",
+            stacklevel=4,
+        )
 
 
 def _parsed(key: str, text: str) -> dict[str, Any]:

@@ -52,17 +52,26 @@ def begin(out: Path, mesh: Mapping[str, Any]) -> None:
 
 
 def save(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write a file, whole or not at all.
+    """Write arrays as a file, whole or not at all.
 
     Raises:
         EdgeError: it cannot be written.
     """
     content = io.BytesIO()
     np.savez(content, **arrays)
+    write(path, content.getbuffer())
+
+
+def write(path: Path, content: bytes | memoryview) -> None:
+    """Write a file's content, whole or not at all.
+
+    Raises:
+        EdgeError: it cannot be written.
+    """
     partial = path.with_name(f".{blake2b(os.fsencode(path.name), digest_size=8).hexdigest()}-{os.getpid()}.partial")
     try:
         try:
-            partial.write_bytes(content.getbuffer())
+            partial.write_bytes(content)
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)

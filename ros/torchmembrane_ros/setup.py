@@ -1,5 +1,7 @@
 """The node as an ament package; its Python dependency, torchmembrane, is installed by pip beside it."""
 
+from glob import glob
+
 from setuptools import setup
 
 setup(
@@ -9,6 +11,8 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/torchmembrane_ros"]),
         ("share/torchmembrane_ros", ["package.xml"]),
+        ("share/torchmembrane_ros/config", glob("config/*.yaml")),
+        ("share/torchmembrane_ros/launch", glob("launch/*.launch.py")),
     ],
     license="MIT",
     entry_points={"console_scripts": ["tracker = torchmembrane_ros.node:main"]},

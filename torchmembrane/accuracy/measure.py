@@ -102,6 +102,7 @@ def spec_sheet(
         deepest=statistics.deepest_press(presses, near),
         presses=presses,
         pairs=pairs,
+        range=statistics.working_range(presses, sensor.membrane.size, sensor.fingerprint),
     )
 
 

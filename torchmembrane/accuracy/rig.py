@@ -13,6 +13,7 @@ from ..reconstruct import Reconstructor
 from ..results.reconstruction import Reconstruction
 from ..results.status import Status
 from ..sensor.sensor import Sensor
+from ..sensor.working_range import UNLIMITED, turn_cosine
 from ..simulate.appearance import Appearance, noisy
 from ..simulate.quasi_static import Press, carried
 from ..simulate.simulator import Simulator
@@ -64,7 +65,7 @@ class Rig:
         simulated = replace(sensor.markers, rest_image=self.simulator.rest_image())
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what is to be said of the sensor, its own reconstructor says
-            self.reconstructor = Reconstructor(replace(sensor, markers=simulated))
+            self.reconstructor = Reconstructor(replace(sensor, markers=simulated, range=UNLIMITED))
         self.seen = self._in_image()
 
     def rest_trials(self, frames: int, seed: int) -> list[RestTrial]:
@@ -160,6 +161,7 @@ def press_trials(
         lost,
         (result.contact_at_rim == 1).any(-1),
         result.status,
+        turn_cosine(result.normals.double(), normals).clamp(-1, 1).acos().rad2deg(),
     )
     return [PressTrial(stroke, *row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from ..results.status import Status
+from ..sensor.working_range import WorkingRange
 
 CLOSE = 0.25
 """Largest error of a surface, over its displacement, up to which a press counts as reconstructed."""
@@ -35,6 +36,7 @@ class PressTrial(NamedTuple):
         lost: share of the markers found at rest that are lost.
         at_rim: whether a contact is said to reach the rim, its force to be a lower bound.
         status: a `Status`.
+        turn: by which the surface found turns, degrees, as `WorkingRange` has it.
     """
 
     stroke: int
@@ -47,11 +49,17 @@ class PressTrial(NamedTuple):
     lost: float
     at_rim: bool
     status: int
+    turn: float = 0.0
 
     @property
     def relied_on(self) -> bool:
         """Whether the result says of itself that its force can be relied on: status ok, no contact at the rim."""
         return self.status == Status.OK and not self.at_rim
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether surface or force are off by more than `CLOSE`; a force that is said to be a lower bound is not."""
+        return self.surface_error > CLOSE or (self.force_error > CLOSE and not self.at_rim)
 
     def is_found(self, near: float) -> bool:
         """Whether the strongest contact is reported within `near` (length) of where it is, with status ok."""
@@ -239,6 +247,7 @@ class SpecSheet(NamedTuple):
         deepest: of deep presses.
         presses: every press of the strokes.
         pairs: every pair.
+        range: in which presses are right; None where none is.
     """
 
     name: str
@@ -258,3 +267,4 @@ class SpecSheet(NamedTuple):
     deepest: DeepestPress
     presses: Sequence[PressTrial]
     pairs: Sequence[PairTrial]
+    range: WorkingRange | None = None

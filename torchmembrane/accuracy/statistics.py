@@ -7,10 +7,13 @@ from itertools import takewhile
 import numpy as np
 
 from ..results.status import Status
+from ..sensor.working_range import GENERAL, WorkingRange
 from .spec_sheet import Band, ClosestPair, DeepestPress, LightestTouch, PairTrial, PressTrial, RestFloor, RestTrial, Spread
 
 EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Of the bands, over the hardest press."""
+LEAST_DEPTH = 0.05
+"""Over the size: of the presses that a range is judged by."""
 UNBROKEN = "the deepest press tried"
 UNFOUND = "never found"
 
@@ -114,6 +117,28 @@ def closest_pair(trials: Sequence[PairTrial]) -> ClosestPair:
         smallest += [told[-1].distance] if told else []
     distances = [trial.distance for trial in trials] or [np.nan]
     return ClosestPair(len(directions), len(smallest), spread(smallest), min(distances), max(distances))
+
+
+def working_range(trials: Sequence[PressTrial], size: float, fingerprint: str) -> WorkingRange | None:
+    """The range in which presses were shown right: up to the deepest that is shallower than every wrong one, and the hardest of
+    these. None where there is none.
+
+    Wrong is a press with status ok whose surface is off by more than `CLOSE` of its displacement, or whose force is, unless it
+    is said to be a lower bound. Presses shallower than `LEAST_DEPTH` are left out: there it is noise that decides.
+
+    Args:
+        trials: the presses, without limits.
+        size: of the surface, length unit.
+        fingerprint: of the sensor.
+    """
+    deep = [trial for trial in trials if trial.depth > LEAST_DEPTH * size and trial.status == Status.OK]
+    wrong = [trial.depth for trial in deep if trial.is_wrong]
+    right = [trial for trial in deep if trial.depth < min(wrong, default=np.inf)]
+    if not right:
+        return None
+    depth, turn, force = (max(getattr(trial, name) for trial in right) for name in ("depth", "turn", "force"))
+    depth, turn, force = (float(f"{value:.3g}") for value in (depth / size, max(turn, GENERAL.turn), force))
+    return WorkingRange(depth, turn, force, fingerprint)
 
 
 def _strokes(trials: Sequence[PressTrial]) -> list[list[PressTrial]]:

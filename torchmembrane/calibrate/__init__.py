@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .detection import find_target
     from .fit import Fit
     from .layout import FabricationLayout, layout_for_pixels, pixel_lattice
-    from .material import KnownPressures, MaterialFit, material_from_images, material_from_pixels
+    from .material import KnownForces, KnownPressures, MaterialFit, material_from_images, material_from_pixels
     from .rest import RestFit, rest_from_image
     from .views import ViewsFit, rest_from_views
     from .weight import WeightFit, material_from_weight
@@ -33,7 +33,7 @@ _MODULES = {
     ".detection": ("find_target",),
     ".fit": ("Fit",),
     ".layout": ("FabricationLayout", "layout_for_pixels", "pixel_lattice"),
-    ".material": ("KnownPressures", "MaterialFit", "material_from_images", "material_from_pixels"),
+    ".material": ("KnownForces", "KnownPressures", "MaterialFit", "material_from_images", "material_from_pixels"),
     ".rest": ("RestFit", "rest_from_image"),
     ".views": ("ViewsFit", "rest_from_views"),
     ".weight": ("WeightFit", "material_from_weight"),
@@ -47,6 +47,7 @@ __all__ = [
     "DotBoard",
     "FabricationLayout",
     "Fit",
+    "KnownForces",
     "KnownPressures",
     "MaterialFit",
     "RestFit",

@@ -15,9 +15,9 @@ from ..files.atomic import write_text
 from ..files.csv_table import Columns, read_table
 from ..files.digits import STORED, decimals
 from ..markers.placement import rim_mask
-from ..sensor.parts import millimetre
 from ..sensor.sensor import Sensor
 from ..sensor.toml import MOST_DOTS, SIZES
+from ..sensor.units import millimetre
 from ..surface.membrane import Membrane
 from ..surface.topology import rim_loop
 from .fit import outline_centres

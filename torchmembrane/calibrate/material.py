@@ -1,5 +1,6 @@
 """The membrane's prestretch from images of presses, and its stiffness from presses of known force."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from ..results.status import Status
 from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor
 from .gauge import UNSURE, FoundPressures, GaugeModulus, modulus_from_pressures
+from .known_modulus import ModulusEvidence, joined, modulus_at_rest, odd_ones
 from .stretch_loss import Explained, continued
 
 GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
@@ -58,6 +60,7 @@ class MaterialFit(NamedTuple):
         each: `[B, 2]` prestretch and standard deviation from each image alone.
         forces: `[B, 2]` magnitudes found and measured, N, NaN where not known.
         pressures: `[B, 2]` changes since rest found and measured, N per length unit squared, NaN where not known.
+        contradictions: sentences about measurements that contradict one another.
     """
 
     sensor: Sensor
@@ -67,6 +70,7 @@ class MaterialFit(NamedTuple):
     each: np.ndarray
     forces: np.ndarray
     pressures: np.ndarray
+    contradictions: Sequence[str] = ()
 
     @property
     def deviations(self) -> np.ndarray:
@@ -86,13 +90,33 @@ class KnownPressures(NamedTuple):
     since_rest: bool = False
 
 
+class KnownForces(NamedTuple):
+    """What pressed.
+
+    Attributes:
+        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
+        deviations: `[B]` standard deviations of their magnitudes, N; None, or NaN where not known: small beside `FORCE_ERROR`.
+    """
+
+    forces: np.ndarray
+    deviations: np.ndarray | None = None
+
+    @property
+    def relative(self) -> np.ndarray:
+        """Standard deviation of what each known force tells, relative, with `FORCE_ERROR` in it."""
+        size = np.linalg.norm(self.forces, axis=1)
+        own = np.zeros_like(size) if self.deviations is None else np.nan_to_num(self.deviations) / size
+        return np.hypot(FORCE_ERROR, own)[np.isfinite(size)]
+
+
 @check_arguments
 def material_from_images(
     sensor: Sensor,
     images: Tensor,
-    forces: np.ndarray | None = None,
+    forces: np.ndarray | KnownForces | None = None,
     pressures: KnownPressures | None = None,
     *,
+    overpressure: float | None = None,
     progress: Progress = silent,
 ) -> MaterialFit:
     """Prestretch from images of presses, and the modulus where forces or pressures are known; see `material_from_pixels`.
@@ -100,8 +124,10 @@ def material_from_images(
     Args:
         sensor: the sensor, calibrated but for its material.
         images: `[B, 1, H, W]` grey in 0..1.
-        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
-        pressures: in place of forces, what a gauge read.
+        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known; or
+            `KnownForces`, with their deviations.
+        pressures: what a gauge read.
+        overpressure: what it read at rest, hPa.
         progress: is told how far it is.
 
     Returns:
@@ -118,7 +144,7 @@ def material_from_images(
     displacement, confidence, _, status = flow
     for i in np.flatnonzero(status != Status.OK):
         raise MembraneError(f"calibrate material: image {i + 1}: {Status(int(status[i])).text}; leave it out")
-    known = MeasuredPresses(displacement, confidence, forces, pressures)
+    known = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure)
     return _material(sensor, reconstructor, known, within(progress, IMAGES_SHARE, 1.0))
 
 
@@ -126,9 +152,10 @@ def material_from_images(
 def material_from_pixels(
     sensor: Sensor,
     pixels: Tensor,
-    forces: np.ndarray | None = None,
+    forces: np.ndarray | KnownForces | None = None,
     pressures: KnownPressures | None = None,
     *,
+    overpressure: float | None = None,
     progress: Progress = silent,
 ) -> MaterialFit:
     """Prestretch from presses, and the modulus where their forces, or the pressures in the cavity, are known.
@@ -146,8 +173,10 @@ def material_from_pixels(
     Args:
         sensor: the sensor, calibrated but for its material.
         pixels: `[B, D, 2]` of the markers in B images of presses (NaN where lost), less what rest images show beside the model.
-        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
-        pressures: in place of forces, what a gauge read.
+        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known; or
+            `KnownForces`, with their deviations.
+        pressures: what a gauge read.
+        overpressure: what it read at rest, hPa.
         progress: is told how far it is.
 
     Returns:
@@ -169,7 +198,12 @@ def material_from_pixels(
     expect(known, "calibrate material: pixels", f"a tensor {list(pixels.shape)}", expected)
     lost = ~pixels.isfinite().all(-1)
     displacement = torch.where(lost[..., None], 0.0, pixels - reconstructor.rest_pixels)
-    return _material(sensor, reconstructor, MeasuredPresses(displacement, (~lost).to(pixels), forces, pressures), progress)
+    return _material(
+        sensor,
+        reconstructor,
+        MeasuredPresses(displacement, (~lost).to(pixels), _known(forces), pressures, overpressure),
+        progress,
+    )
 
 
 class MeasuredPresses(NamedTuple):
@@ -178,20 +212,23 @@ class MeasuredPresses(NamedTuple):
 
     displacement: Tensor
     confidence: Tensor
-    forces: np.ndarray | None
+    forces: KnownForces | None
     pressures: KnownPressures | None
+    overpressure: float | None
+
+
+def _known(forces: np.ndarray | KnownForces | None) -> KnownForces | None:
+    return forces if forces is None or isinstance(forces, KnownForces) else KnownForces(np.asarray(forces, float))
 
 
 def _material(
     sensor: Sensor, reconstructor: Reconstructor, known: MeasuredPresses, progress: Progress, rounds: int = GAS_ROUNDS
 ) -> MaterialFit:
-    displacement, confidence, forces, pressures = known
-    if forces is not None and pressures is not None:
-        raise MembraneError("calibrate material: forces and pressures; expected one of them, either gives the modulus")
+    displacement, confidence, forces, pressures, overpressure = known
     if pressures is not None:
         reconstructor.estimator.check_gauge()
     presses = Presses(reconstructor, displacement, confidence)
-    of_round, later = _shares(sensor, forces is not None or pressures is not None, rounds, progress)
+    of_round, later = _shares(sensor, any(given is not None for given in known[2:]), rounds, progress)
     of_profile = PROFILE_SHARE[0 if pressures is not None else 1 if forces is not None else 2]
     profile = presses.profile(within(of_round, 0.0, of_profile))
     of_modulus = within(of_round, of_profile, 1.0)
@@ -201,23 +238,36 @@ def _material(
     contradiction = ((each[:, 0] - log_stretch) ** 2 / variances).sum() / max(len(each) - 1, 1)
     deviation = np.hypot(deviation * np.sqrt(max(1.0, contradiction)), PRESTRETCH_ERROR)
     prestretch = float(np.exp(log_stretch))
-    values, effects = [prestretch], [[prestretch * deviation, 0.0]]
+    values = [prestretch]
     material = replace(sensor.material, prestretch=prestretch)
     magnitudes, gauged = np.full((2, len(each), 2), np.nan)
+    evidence, said = [], []
     if forces is not None:
-        modulus, scatter, change, magnitudes = presses.modulus(log_stretch, deviation, np.asarray(forces, float), of_modulus)
-    elif pressures is not None:
-        modulus, scatter, change, gauged = presses.gauge_modulus(log_stretch, deviation, pressures, of_modulus)
-    if forces is not None or pressures is not None:
-        values, effects = [prestretch, modulus], [*effects, [change, scatter]]
+        *told, magnitudes, odd = presses.modulus(log_stretch, deviation, forces, of_modulus)
+        evidence.append(ModulusEvidence("the forces", *told))
+        said += [
+            f"image {i + 1}: its force is {r:.2f} of what the others' tell, {z:.1f} standard deviations apart"
+            for i, r, z in odd
+        ]
+    if pressures is not None:
+        *told, gauged = presses.gauge_modulus(log_stretch, deviation, pressures, of_modulus)
+        evidence.append(ModulusEvidence("the gauge under presses", *told))
+    if overpressure is not None:
+        evidence.append(modulus_at_rest(sensor, log_stretch, deviation, overpressure))
+    covariance = np.array([[(prestretch * deviation) ** 2]])
+    if evidence:
+        found = joined(evidence)
+        prestretch, said = float(np.exp(log_stretch + found.shift * deviation)), said + found.contradictions
+        values, scale = [prestretch, found.modulus], np.array([prestretch * deviation, found.modulus])
+        covariance = scale[:, None] * found.covariance * scale
         thickness = material.thickness or 1.0
-        material = replace(material, shear_modulus=modulus / thickness, thickness=thickness)
+        modulus = found.modulus / thickness
+        material = replace(material, prestretch=max(1.0, prestretch), shear_modulus=modulus, thickness=thickness)
     alone = np.exp(each[:, :1]) * np.stack([np.ones(len(each)), np.sqrt(variances)], -1)
-    covariance = np.array(effects) @ np.array(effects).T
     made = replace(sensor, material=material)
     if rounds and not _is_settled(sensor, made):
         return _material(made, _reconstructor(made), known, later, rounds - 1)
-    return MaterialFit(made, np.array(values), covariance, profile, alone, magnitudes, gauged)
+    return MaterialFit(made, np.array(values), covariance, profile, alone, magnitudes, gauged, said)
 
 
 def _shares(sensor: Sensor, with_modulus: bool, rounds: int, progress: Progress) -> tuple[Progress, Progress]:
@@ -332,8 +382,8 @@ class Presses:
         return fitted.modulus, fitted.deviation, change, fitted.pressures
 
     def modulus(
-        self, log_stretch: float, deviation: float, forces: np.ndarray, progress: Progress = silent
-    ) -> tuple[float, float, float, np.ndarray]:
+        self, log_stretch: float, deviation: float, known: KnownForces, progress: Progress = silent
+    ) -> tuple[float, float, float, np.ndarray, list[tuple[int, float, float]]]:
         """The modulus from presses of known force.
 
         A gas resists in newtons: there the presses are explained anew with each modulus.
@@ -341,25 +391,30 @@ class Presses:
         Args:
             log_stretch: logarithm of the prestretch.
             deviation: its standard deviation.
-            forces: as for `material_from_pixels`.
+            known: as for `material_from_pixels`.
             progress: is told how far it is.
 
         Returns:
             The modulus; its standard deviation at this prestretch; its change with one deviation of the prestretch, the larger
-            of those to either side, negative, as under more tension at rest a softer membrane presses as hard; and magnitudes
-            of the forces found and measured, `[B, 2]`.
+            of those to either side, negative, as under more tension at rest a softer membrane presses as hard; magnitudes of
+            the forces found and measured, `[B, 2]`; and images whose forces the others contradict, as of `odd_ones`.
         """
+        forces, relative = known.forces, known.relative
+        weight = relative**-2.0 / (relative**-2.0).sum()
         modulus = self.reconstructor.sensor.material.modulus
         progress(0.0, "modulus from forces")
         self._refuse_unpressed(float(np.exp(log_stretch)), modulus, np.isfinite(forces).all(1))
         for _ in range(GAS_ROUNDS if self.reconstructor.estimator.cavity.filling == "gas" else 1):
             ratios, magnitudes = self._ratios(np.exp(log_stretch), modulus, forces)
-            modulus = float(ratios.mean() * modulus)
+            modulus = float((weight * ratios).sum() * modulus)
         progress(0.5, "modulus with the prestretch's error")
-        sides = [self._ratios(np.exp(log_stretch + s * deviation), modulus, forces)[0].mean() for s in (-1, 1)]
+        sides = [(weight * self._ratios(np.exp(log_stretch + s * deviation), modulus, forces)[0]).sum() for s in (-1, 1)]
         change = -modulus * np.abs(np.array(sides) - 1).max()
-        relative = max(FORCE_ERROR, ratios.std(ddof=1) / ratios.mean() if len(ratios) > 1 else 0.0)
-        return modulus, modulus * relative / np.sqrt(len(ratios)), change, magnitudes
+        sure, mean = (relative**-2.0).sum() ** -0.5, (weight * ratios).sum()
+        scatter = (((ratios / mean - 1) / relative) ** 2).sum() / max(len(ratios) - 1, 1)
+        images = np.flatnonzero(np.isfinite(forces).all(1))
+        odd = [(int(images[i]), ratio, apart) for i, ratio, apart in odd_ones(ratios, relative)]
+        return modulus, modulus * sure * max(1.0, scatter) ** 0.5, change, magnitudes, odd
 
     def _refuse_unpressed(self, stretch: float, modulus: float, known: np.ndarray) -> None:
         """Refuse images of known force `[B]` in which the markers show hardly any."""

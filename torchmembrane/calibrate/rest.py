@@ -13,6 +13,7 @@ from ..files.grayscale import check_image
 from ..markers.dots.pattern import measure_dots
 from ..markers.spacing import neighbours
 from ..progress import Progress, silent
+from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from ..user_warnings import warn_user
@@ -47,7 +48,9 @@ class RestFit(NamedTuple):
 
 
 @check_arguments
-def rest_from_image(sensor: Sensor, image: np.ndarray, *, progress: Progress = silent) -> RestFit:
+def rest_from_image(
+    sensor: Sensor, image: np.ndarray, overpressure: float | None = None, *, progress: Progress = silent
+) -> RestFit:
     """Pose of the rest surface, then each dot's position on it, from a rest image of listed dots.
 
     The pose is the one from which the camera sees the listed dots where they are measured; what is left is taken for errors of
@@ -56,10 +59,11 @@ def rest_from_image(sensor: Sensor, image: np.ndarray, *, progress: Progress = s
     Args:
         sensor: the design, with a list of dots.
         image: `[H, W]` the membrane at rest, grey in 0..1.
+        overpressure: that a gauge reads at rest, hPa; of an inflated surface alone.
         progress: is told how far it is.
 
     Returns:
-        The sensor with pose and dots found, and the fit.
+        The sensor with pose and dots found, and the fit; of an inflated surface its height and prestretch, too.
 
     Raises:
         MembraneError: the sensor lists no dots, or fewer than 8 of them are found.
@@ -81,6 +85,11 @@ def rest_from_image(sensor: Sensor, image: np.ndarray, *, progress: Progress = s
     """
     if sensor.markers.positions is None:
         raise MembraneError("calibrate rest: the sensor lists no dots; expected [markers] file, or use views or depth")
+    if isinstance(sensor.surface, InflatedSurface):
+        from .rest_of_sheet import rest_of_sheet  # here: it builds on this module
+
+        return rest_of_sheet(sensor, image, overpressure, progress)
+    _refuse_gauge(sensor, overpressure)
     image = check_image("calibrate rest: the image", image, sensor.camera.image_size)
     progress(0.0, "dots of the image")
     surface, X = fine_surface(sensor), sensor.markers.positions
@@ -111,13 +120,21 @@ def rest_from_image(sensor: Sensor, image: np.ndarray, *, progress: Progress = s
         return (x - pivot.numpy()) @ rotation.T + pivot.numpy() + offset
 
     left = pixels - modelled(torch.from_numpy(found), torch.from_numpy(outlines)).numpy()
-    _warn_of_press(sensor, pixels[visible], left[visible])
+    warn_of_press(sensor, pixels[visible], left[visible])
     progress(0.75, "dots on the rest surface")
     _, tangents = frames_at(surface, X)
-    shifts = _nulling(sensor, move(outlines), rotation @ tangents, pixels, visible)
+    shifts = nulling(sensor, move(outlines), rotation @ tangents, pixels, visible)
     progress(0.77, "rest surface where it was found")
     moved = recalibrated(sensor, surface, move(surface.rest.numpy()), move(X) + shifts, sensor.markers.sizes, image)
     return RestFit(moved, NAMES, result.in_degrees(1), pixels, left, shifts)
+
+
+def _refuse_gauge(sensor: Sensor, overpressure: float | None) -> None:
+    if overpressure is not None:
+        raise MembraneError(
+            f"calibrate rest: an overpressure, of a {sensor.surface.shape!r}; expected an inflated surface: only its shape "
+            "follows from a pressure"
+        )
 
 
 def common_residual(pixels: np.ndarray, residuals: np.ndarray) -> float:
@@ -136,8 +153,8 @@ def common_residual(pixels: np.ndarray, residuals: np.ndarray) -> float:
     return float(np.sqrt(max((residuals * around).sum(1).mean(), 0.0)))
 
 
-def _warn_of_press(sensor: Sensor, pixels: np.ndarray, residuals: np.ndarray) -> None:
-    """Say where residuals are a displacement of the surface, not errors of single dots."""
+def warn_of_press(sensor: Sensor, pixels: np.ndarray, residuals: np.ndarray) -> None:
+    """Say where `residuals [D, 2]` at `pixels [D, 2]` are a displacement of the surface, not errors of single dots."""
     common, limit = common_residual(pixels, residuals), PRESSED * float(np.hypot(*sensor.camera.image_size))
     if common > limit:
         warn_user(
@@ -189,7 +206,7 @@ def measured_outlines(
     return dot_outlines(surface, X, radii), pattern.pixels
 
 
-def _nulling(sensor: Sensor, outlines: np.ndarray, tangents: np.ndarray, pixels: np.ndarray, visible: np.ndarray) -> np.ndarray:
+def nulling(sensor: Sensor, outlines: np.ndarray, tangents: np.ndarray, pixels: np.ndarray, visible: np.ndarray) -> np.ndarray:
     """Shifts `[D, 3]` within the tangent plane after which each visible dot is modelled where it is measured; else 0."""
     outline, tangent, target = (torch.from_numpy(np.ascontiguousarray(a[visible])) for a in (outlines, tangents, pixels))
 

@@ -11,8 +11,8 @@ from ..files.grayscale import check_image
 from ..markers.dots.pattern import find_dots
 from ..markers.placement import rim_mask
 from ..progress import Progress, silent, within
-from ..sensor.parts import millimetre
 from ..sensor.sensor import Sensor
+from ..sensor.units import millimetre
 from .bundle import Bundle, bundle_adjusted
 from .fit import Fit, rotations, with_common_errors
 from .rest import measured_outlines, shading_bias

@@ -78,10 +78,12 @@ def material_from_weight(sensor: Sensor, images: Tensor, weight: float, *, progr
     sigma = deviations * forces
     off = abs(forces - weight) / sigma
     if (off > CONTRADICTION).any():
-        i = int((abs(forces - np.median(forces)) / sigma).argmax())
+        apart = abs(forces - np.median(forces)) / sigma
+        odd = np.flatnonzero(apart >= min(CONTRADICTION, apart.max()))
+        shown = ", ".join(f"image {i + 1} shows {forces[i] / np.median(forces):.3g}" for i in odd)
         raise MembraneError(
-            f"calibrate material: the images contradict one another: image {i + 1} shows {forces[i] / np.median(forces):.3g} "
-            "times the others' force; expected images under this weight alone: leave it out"
+            f"calibrate material: the images contradict one another: {shown} times the others' force; expected images "
+            "under this weight alone: leave out what is not"
         )
     scatter = float(np.sqrt((((forces - weight) / sigma) ** 2).sum() / max(len(forces) - 1, 1)))
     deviation = float((deviations**-2).sum() ** -0.5 * max(1.0, scatter))

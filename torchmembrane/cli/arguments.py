@@ -245,3 +245,13 @@ def _values(text: str, kind: Callable[[str], Any], number: int | None, expected:
     if not values or not all(map(math.isfinite, values)) or (number and len(values) != number):
         raise ArgumentTypeError(f"{text!r}; expected {expected}")
     return values
+
+
+def pressure(text: str) -> float:
+    """A pressure with its unit, in hPa."""
+    from ..presets.draft import PRESSURE_UNITS, pressure_in_hectopascal
+
+    try:
+        return pressure_in_hectopascal(text)
+    except ValueError:
+        raise ArgumentTypeError(f"{text!r}; expected a number and its unit, of {', '.join(PRESSURE_UNITS)}, as 20hPa") from None

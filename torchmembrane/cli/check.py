@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from ..errors import MembraneError
-from .arguments import add_command, add_force, add_sensor, count, number_from, seed
+from .arguments import add_command, add_force, add_sensor, count, number_from, pressure, seed
 from .choices import MOST_DECIBEL
 from .progress import ProgressDisplay, announce
 
@@ -16,13 +16,19 @@ if TYPE_CHECKING:
     from ..accuracy.finished import FinishedSeries
     from ..accuracy.spec_sheet import SpecSheet
     from ..sensor.sensor import Sensor
+    from ..sensor.working_range import WorkingRange
 
 PURPOSE = "say in words, and draw, what a sensor file means and what to expect of the sensor"
 EXAMPLES = """\
 examples:
   torchmembrane check sensor.toml
   torchmembrane check sensor.toml --out sensor.png
+  torchmembrane check sensor.toml --overpressure 12hPa
+  torchmembrane check sensor.toml --robot robot      # as URDF and MJCF
   torchmembrane check preset:bubble --accuracy --out bubble.png
+
+The rest surface is tested where it can fail: what tension and pressure leave unbalanced, how far the nearest sheet is that is
+blown up in the same rim, what that holds, what a gauge reads (--overpressure), and what either does to forces.
 
 --accuracy presses the sensor in the simulator, some 150 images, and reconstructs them: noise at rest, the lightest touch found,
 errors of force, depth and place, how near two touches are told apart, how deep a press may be. Some minutes of processor time,
@@ -39,6 +45,9 @@ def add_parser(commands: Any) -> None:
     add_sensor(add)
     add("--out", metavar="FIGURE.png", type=Path, help="draw it: side view with rays, rest surface, rest image, accuracy")
     add_force(add)
+    add("--robot", metavar="FOLDER", type=Path, help="write it for simulators of robots: URDF, MJCF, meshes (STL), in metres")
+    gauge = "what a gauge reads at rest, inside over outside, with its unit, as 12hPa: compared with the model's"
+    add("--overpressure", metavar="P", type=pressure, help=gauge)
     add("--accuracy", action="store_true", help="also what to expect of it, from simulated presses")
     add("--seed", type=seed, help="of presses and noise of --accuracy (default: 0)")
     noise = "of images of --accuracy, white over the noise's standard deviation (default: as in the rest image, else 40)"
@@ -53,10 +62,12 @@ def run(arguments: Namespace) -> int:
             raise MembraneError(f"--{name} goes with --accuracy only: add it")
     if arguments.accuracy:
         announce("check --accuracy")
-    from ..presets import sensor_file
+    from ..presets import PREFIX, sensor_file
     from ..reconstruct import Reconstructor
     from ..sensor.sensor import Sensor
+    from ..sensor.working_range import range_file
     from .describe import described, rest_frame
+    from .rest_words import rest_in_words
 
     if arguments.out:
         _spare_files(arguments, sensor_file(arguments.sensor))
@@ -68,9 +79,16 @@ def run(arguments: Namespace) -> int:
     except MembraneError as error:
         problem = MembraneError(f"{arguments.sensor}: {error}")
     frame = None if reconstructor is None else rest_frame(reconstructor)
-    print("\n".join(described(sensor, reconstructor, frame)), flush=True)
+    print("\n".join([*described(sensor, reconstructor, frame), *rest_in_words(sensor, arguments.overpressure)]), flush=True)
+    if arguments.robot:
+        from ..integrations.robot_model import write_robot_model
+
+        folder = write_robot_model(sensor, arguments.robot)
+        print(f"{sensor.name}.urdf, {sensor.name}.xml (MJCF) and their meshes written to {folder}")
     finished = _finished(sensor, arguments) if arguments.accuracy and not problem else None
     sheet = _sheet(sensor, arguments, finished) if finished else None
+    if sheet and sheet.range and not str(arguments.sensor).startswith(PREFIX):
+        _keep(sheet.range, range_file(sensor_file(arguments.sensor)))
     if arguments.out:
         from ..plot.drawing import save
         from ..plot.sensor import sensor_figure
@@ -82,6 +100,15 @@ def run(arguments: Namespace) -> int:
     if problem:
         raise problem
     return 0
+
+
+def _keep(range: "WorkingRange", path: Path) -> None:
+    """Keep the range beside the sensor file, and say so."""
+    try:
+        range.to_file(path)
+        print(f"          kept in {path}: this sensor's results beyond it get status 9")
+    except MembraneError as error:
+        print(f"          not kept: {error}")
 
 
 def _spare_files(arguments: Namespace, sensor: Path) -> None:

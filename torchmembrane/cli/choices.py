@@ -10,7 +10,8 @@ FLOWS = ("smooth", "bilinear")
 ENGINES = ("local", "ray")
 RESULT_FORMATS = ("npz", "parquet")
 
-DRAFTS = ("dome", "cap", "bubble", "fingertip", "half_cylinder")
+DRAFTS = ("dome", "cap", "bubble", "fingertip", "half_cylinder", "rectangle", "ellipse")
+OUTLINE = "outline"  # the shape of --outline
 LENGTH_UNITS = ("mm", "cm", "m", "um", "inch")
 LENSES = ("pinhole", "fisheye")
 LONGEST_SIDE = 16384

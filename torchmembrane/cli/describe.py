@@ -1,20 +1,23 @@
 """What a sensor file means, in words."""
 
 from collections.abc import Iterable
+from datetime import date
 
 import numpy as np
 import torch
 
 from ..camera.mode import Mode
 from ..camera.model import Camera
+from ..forming.sheet_energy import SheetEnergy
 from ..machine_code import using
-from ..markers.spacing import in_view
+from ..markers.placement import in_view
 from ..reconstruct import Reconstructor
 from ..results.reconstruction import Frame
 from ..results.status import Status
 from ..sensor.factories import elastic_energy
-from ..sensor.parts import METRE
+from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
+from ..sensor.units import hectopascal
 
 LISTED = 12
 """Missing markers that are named one by one."""
@@ -45,7 +48,7 @@ def pressure_in_words(pressure: float, sensor: Sensor) -> str:
     if sensor.force_unit == "relative":
         return f"{pressure:.4g} (relative)"
     unit = sensor.length_unit
-    return f"{pressure:.4g} N/{unit}² = {pressure * METRE[unit] ** 2 / 100:.4g} hPa"
+    return f"{pressure:.4g} N/{unit}² = {pressure / hectopascal(unit):.4g} hPa"
 
 
 def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame: Frame | None = None) -> list[str]:
@@ -58,8 +61,21 @@ def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame:
         "cavity": _cavity(sensor),
         "markers": _markers(sensor, reconstructor, frame),
         "tool": _tool(sensor),
+        "range": [_range(sensor)],
+        "record": sensor.record.said(date.today()) or ["none: no serial, no calibration is noted in the file"],
     }
     return [f"{key if i == 0 else '':<10}{line}" for key, block in lines.items() for i, line in enumerate(block)]
+
+
+def _range(sensor: Sensor) -> str:
+    """The limits of the sensor's answers, and where they come from."""
+    own = sensor.range.of(sensor.fingerprint)
+    size, unit = sensor.membrane.size, sensor.length_unit
+    limits = f"up to {own.depth * size:.3g} {unit} deep, the surface turned by {own.turn:.3g} degrees"
+    if own.sensor:
+        return f"{limits}, {own.force:.3g} {sensor.force_unit}, as `check --accuracy` has shown"
+    stale = "; that of `check --accuracy` is of another state of this file: make it anew" if sensor.range.sensor else ""
+    return f"{limits}, as of all sensors; `check --accuracy` finds this one's{stale}"
 
 
 def _camera(camera: Camera, unit: str) -> list[str]:
@@ -101,8 +117,23 @@ def _membrane(sensor: Sensor) -> list[str]:
     sides = ", ".join(f"{a} {low:.4g} to {high:.4g}" for a, low, high in zip("xyz", X.min(0), X.max(0), strict=True))
     return [
         f"{sensor.surface.shape}, {sides} {unit}",
+        *_sheet(sensor),
         f"area {float(membrane.rest_area.sum()):.4g} {unit}², volume over the rim {membrane.cavity_volume:.4g} {unit}³",
         f"grid {membrane.grid[0]} x {membrane.grid[1]}: {len(X)} vertices, {int(membrane.fixed.sum())} of them fixed",
+    ]
+
+
+def _sheet(sensor: Sensor) -> list[str]:
+    """Of an inflated surface: what is known of its equilibrium."""
+    surface, energy = sensor.surface, elastic_energy(sensor, sensor.membrane)
+    if not isinstance(surface, InflatedSurface) or not isinstance(energy, SheetEnergy):
+        return []
+    formed, stretches, unit = surface.formed, energy.rest_stretches, sensor.length_unit
+    at, material = formed.outline.camera_frame(np.append(formed.cells.worst, 0.0))[:2], sensor.material
+    return [
+        f"a sheet blown up to {formed.height:.4g} {unit} over its rim's plane; its stretches at rest are "
+        f"{float(stretches.min()):.4g} to {float(stretches.max()):.4g}, without pressure {material.prestretch:g} everywhere",
+        f"worst cell of its grid: an angle of {formed.cells.angle:.0f} degrees, near x, y = {_listed(at)}",
     ]
 
 
@@ -121,7 +152,8 @@ def _material(sensor: Sensor, reconstructor: Reconstructor | None) -> list[str]:
     if reconstructor is not None:
         tension, pressure = float(elastic_energy(sensor, sensor.membrane).tension), float(reconstructor.rest_pressure)
         held = f"{tension:.4g} {'(relative)' if relative else f'N/{unit}'}"
-        lines.append(f"at rest: tension {held}, pressure difference {pressure_in_words(pressure, sensor)}")
+        mean = "mean " * isinstance(sensor.surface, InflatedSurface)
+        lines.append(f"at rest: {mean}tension {held}, pressure difference {pressure_in_words(pressure, sensor)}")
     return lines
 
 
@@ -153,11 +185,16 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
     model = reconstructor.rest_pixels.cpu().numpy()
     lines += [f"  not found: marker {d} (from 0), expected at pixel {_listed(model[d])}" for d in missing[:LISTED]]
     lines += [f"  and {len(missing) - LISTED} more"] * (len(missing) > LISTED)
+    status = Status(int(frame["status"]))
+    reconstructed = [f"the rest image reconstructed: {status.text}"]
+    if markers.positions is None:  # each lies on its ray, whatever the surface's shape
+        placed = "they were placed from it: that it agrees does not tell whether the rest surface is right"
+        return [*lines, placed, *reconstructed * (status != Status.OK)]
     off = np.linalg.norm(reconstructor.observer.measured_rest.cpu().numpy() - model, axis=1)[found]
     if len(off):
         rms = np.sqrt((off**2).mean())
         lines.append(f"they lie {rms:.2f} px (rms; at most {off.max():.2f} px) from where the model has them")
-    return [*lines, f"the rest image reconstructed: {Status(int(frame['status'])).text}"]
+    return [*lines, *reconstructed]
 
 
 def _tool(sensor: Sensor) -> list[str]:

@@ -1,7 +1,7 @@
 """What `torchmembrane init` does: from its options to a sensor, and its file with words."""
 
 from argparse import Namespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,27 +11,29 @@ from ..camera.model import Camera
 from ..errors import MembraneError
 from ..files.images import read_image
 from ..markers.dots.pattern import find_dots
-from ..markers.placement import FEWEST_MARKERS
-from ..markers.spacing import in_view
+from ..markers.placement import FEWEST_MARKERS, in_view
 from ..presets.annotate import annotate
+from ..presets.blown_up import BlownUp, Stated, blown_up
 from ..presets.design import AIR
 from ..presets.dot_list import read_drafted_dots
-from ..presets.draft import SHAPES, RimCircle, balanced, drafted_dots, drafted_surface, focal_of_view, overpressure
+from ..presets.draft import SHAPES, SHEETS, RimCircle, balanced, drafted_dots, drafted_surface, focal_of_view, overpressure
 from ..reconstruct import Reconstructor
+from ..sensor.inflated import read_rim
 from ..sensor.parts import Cavity, Markers, Surface
 from ..sensor.sensor import Sensor
 from ..sensor.toml import default_grid
+from ..sensor.units import METRE
 from .choices import FROM_IMAGE
 
 ROUND = 0.95  # shorter over longer half axis of a rim, from which on it is taken for a circle
-LENGTHS = ("radius", "height", "semi_axes", "length", "half_angle")
+LENGTHS = ("radius", "height", "semi_axes", "length", "half_angle", "size", "corner")
 
 
 class Optics(NamedTuple):
-    """The camera, and its distance from the rim's plane."""
+    """The camera, and its distance from the rim's plane; None where the rim itself is in the camera's frame."""
 
     camera: Camera
-    distance: float
+    distance: float | None
 
 
 def needed(arguments: Namespace) -> list[str]:
@@ -40,11 +42,28 @@ def needed(arguments: Namespace) -> list[str]:
     wanted = [*SHAPES[arguments.shape]]
     if arguments.rest is None:
         wanted.append("image_size")
-    if arguments.rim is None or not lens:
+    if (arguments.rim is None or not lens) and not _rim_in_space(arguments):
         wanted.append("distance")
     if arguments.rim is None and not lens:
         wanted.append("view")
+    if arguments.shape in SHEETS and arguments.overpressure is not None:
+        wanted.remove("height")
     return [name for name in wanted if getattr(arguments, name) is None]
+
+
+def in_unit(length: float, unit: str | None, *, wanted: str) -> float:
+    """A length given in one unit in another; without a unit it is in that already.
+
+    Example:
+        >>> in_unit(0.6, "cm", wanted="mm")
+        6.0
+    """
+    return length if unit is None else float(f"{length * METRE[wanted] / METRE[unit]:.12g}")
+
+
+def _rim_in_space(arguments: Namespace) -> bool:
+    """Whether the rim's file has its points' z, in the camera's frame where no distance is given."""
+    return arguments.outline is not None and read_rim(arguments.outline).shape[1] == 3
 
 
 def write_draft(arguments: Namespace) -> list[str]:
@@ -53,15 +72,22 @@ def write_draft(arguments: Namespace) -> list[str]:
     seen = _rim_in_words(arguments, rest) if arguments.rim == FROM_IMAGE and rest is not None else []
     camera, distance = _optics(arguments, rest)
     lengths = {name: value for name in LENGTHS if (value := getattr(arguments, name)) is not None}
-    surface = drafted_surface(arguments.shape, lengths, distance)
-    markers = _markers(arguments, rest, surface, camera)
-    membrane, unit = surface.membrane(default_grid(markers)), arguments.unit
-    stated = arguments.overpressure
-    material, said = balanced(membrane, unit, stated, arguments.prestretch, arguments.shear_modulus, arguments.thickness)
-    filling = arguments.filling or ("gas" if arguments.shape == "bubble" else "liquid")
-    known = stated is None and material.shear_modulus is not None and material.thickness is not None
-    inside = overpressure(membrane, material, unit) if known else stated or 0.0
-    cavity = Cavity(filling, round(AIR + inside, 2) if filling == "gas" else None)
+    unit = arguments.unit
+    surface: Surface
+    if arguments.shape in SHEETS:
+        surface, material, inside, said = _sheet(arguments, distance)
+        markers = _markers(arguments, rest, surface, camera)
+        membrane = surface.membrane(default_grid(markers))
+    else:
+        assert distance is not None  # as `needed` has asked for it
+        surface = drafted_surface(arguments.shape, lengths, distance)
+        markers = _markers(arguments, rest, surface, camera)
+        membrane, inside = surface.membrane(default_grid(markers)), arguments.overpressure
+        material, said = balanced(membrane, unit, inside, arguments.prestretch, arguments.shear_modulus, arguments.thickness)
+        if inside is None and material.shear_modulus is not None and material.thickness is not None:
+            inside = overpressure(membrane, material, unit)
+    filling = arguments.filling or ("gas" if arguments.shape in ("bubble", *SHEETS) else "liquid")
+    cavity = Cavity(filling, round(AIR + (inside or 0.0), 2) if filling == "gas" else None)
     sensor = Sensor(arguments.name or arguments.sensor.stem, unit, camera, membrane, material, cavity, markers, surface)
     found = _dots_in_words(sensor)
     path = sensor.to_file(arguments.sensor)
@@ -69,9 +95,23 @@ def write_draft(arguments: Namespace) -> list[str]:
     return [f"sensor file: {path}", *seen, *found, *said, f"next: torchmembrane check {path} --out {path.with_suffix('.png')}"]
 
 
+def _sheet(arguments: Namespace, distance: float | None) -> BlownUp:
+    """The sheet that is blown up in the rim that the arguments describe."""
+    rim: dict[str, Any] = {"outline": arguments.shape}
+    if arguments.outline is not None:
+        rim["outline"] = read_rim(arguments.outline)
+    else:
+        rim |= {key: getattr(arguments, key) for key in ("size", "corner") if getattr(arguments, key) is not None}
+    if distance is not None:
+        rim["base_z"] = distance
+    names = "height", "overpressure", "prestretch", "shear_modulus", "thickness"
+    return blown_up(rim, arguments.unit, Stated(*(getattr(arguments, name) for name in names)))
+
+
 def refuse_foreign(arguments: Namespace) -> None:
     """Refuse lengths of other shapes, and two answers to one question."""
-    allowed = {*SHAPES[arguments.shape], *(["half_angle"] if arguments.shape == "half_cylinder" else [])}
+    more = {"half_cylinder": "half_angle", "rectangle": "corner"}
+    allowed = {*SHAPES[arguments.shape], more.get(arguments.shape)}
     for name in LENGTHS:
         if getattr(arguments, name) is not None and name not in allowed:
             expected = ", ".join(f"--{other.replace('_', '-')}" for other in SHAPES[arguments.shape])
@@ -98,13 +138,13 @@ def _optics(arguments: Namespace, rest: np.ndarray | None) -> Optics:
         circle, centre = RimCircle(arguments.radius, pixels, arguments.lens), arguments.centre or [u, v]
         distance = circle.distance(focal) if distance is None else distance
         focal = focal or circle.focal(distance)
-    if arguments.lens == "pinhole" and not distance > 0:
+    if arguments.lens == "pinhole" and distance is not None and not distance > 0:
         raise MembraneError(
             f"init: --distance {distance:g}: the rim behind a pinhole, which sees nothing there; expected a positive distance, "
             "or --lens fisheye"
         )
     camera = Camera(arguments.lens, tuple(size), (round(focal, 3),) * 2, centre, bits=arguments.bits)
-    return Optics(camera, float(f"{distance:.7g}"))
+    return Optics(camera, None if distance is None else float(f"{distance:.7g}"))
 
 
 def _rim_in_words(arguments: Namespace, rest: np.ndarray) -> list[str]:

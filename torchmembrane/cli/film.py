@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
 DEFAULT_RATE = 10.0
 """Frames per second."""
+MOST_FRAMES = 100
+"""On a sheet: of more, as many are chosen evenly."""
 
 
 class FrameImages:
@@ -54,3 +56,15 @@ def draw_film(results: "Results", images: FrameImages, path: Path, rate: float =
     drawn = (figure(frame, results.mesh, images.of(name), name, count) for name, frame in named)
     write_film(path, map(picture_of, drawn), rate)
     print(f"{len(results)} frames drawn in {path}")
+
+
+def draw_sheet(results: "Results", images: FrameImages, path: Path) -> None:
+    """Draw all frames, or `MOST_FRAMES` of them, small on one sheet, and say so."""
+    from ..files.order import evenly
+    from ..plot.drawing import save
+    from ..plot.sheet import sheet_figure
+
+    names = evenly(results.names, MOST_FRAMES)
+    chosen = {name: (results[name], images.of(name)) for name in names}
+    save(sheet_figure(chosen, results.mesh), path, "view")
+    print(f"{len(names)} of {len(results)} frames drawn in {path}")

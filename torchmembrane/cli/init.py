@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MembraneError
-from .arguments import Add, add_command, add_force, count, count_pair, number_from, positive, positive_pair, vector
-from .choices import DRAFTS, FARTHEST, FILLINGS, FROM_IMAGE, LENGTH_UNITS, LENSES, LONGEST_SIDE, POLARITIES
+from .arguments import Add, add_command, add_force, count, count_pair, number_from, positive, positive_pair, pressure, vector
+from .choices import DRAFTS, FARTHEST, FILLINGS, FROM_IMAGE, LENGTH_UNITS, LENSES, LONGEST_SIDE, OUTLINE, POLARITIES
 
 PURPOSE = "write a sensor file, with a word on every key, from a few numbers"
 EXAMPLES = """\
@@ -18,6 +18,9 @@ examples:
       --overpressure 71hPa --shear-modulus 0.3 --thickness 0.3
   torchmembrane init sensor.toml --shape dome --radius 12 --rest rest.png --rim 322,239,210 --focal 385 --lens fisheye
   torchmembrane init sensor.toml --shape dome --radius 12 --rest rest.png --rim auto --view 120 --lens fisheye
+  torchmembrane init window.toml --shape rectangle --size 50,36 --corner 4 --height 6 --overpressure 12hPa --prestretch 1.1 \
+      --thickness 0.2 --distance 40 --rest rest.png --focal 620
+  torchmembrane init window.toml --outline rim.csv --height 6 --distance 40 --rest rest.png --focal 620
   torchmembrane init sensor.toml            # on a terminal: asks
 
 What is needed: the shape and its lengths, the image's size (--image-size, or --rest), a focal length (--focal or --view),
@@ -32,8 +35,12 @@ Dots are a CSV with one of the headers
   u,v            px in the image at rest
 each with a further column size, small or large, or without.
 
-Of overpressure, prestretch and shear modulus x thickness any two give the third; where all are given and disagree, it is
-said. SENSOR.toml's files are written beside it. Next: torchmembrane check SENSOR.toml --out sensor.png
+rectangle, ellipse and --outline are sheets that are stretched in a rim and blown up: their shape is an equilibrium, solved from
+the rim, the prestretch and --height or --overpressure or both. rim.csv holds points once around: x,y from its middle, or x,y,z.
+Of such a sheet height, overpressure, prestretch and shear modulus x thickness any three give the fourth; of the other shapes
+overpressure, prestretch and shear modulus x thickness any two the third. Where all are given and disagree, it is said.
+
+SENSOR.toml's files are written beside it. Next: torchmembrane check SENSOR.toml --out sensor.png
 
 exit code: 0 written, 2 wrong usage"""
 ARRAYS = ("heightfield", "grid")
@@ -51,12 +58,19 @@ def _shape(text: str) -> str:
     raise ArgumentTypeError(f"{text!r}; expected one of {', '.join(DRAFTS)}; {remedy}")
 
 
+def _length(text: str) -> tuple[float, str | None]:
+    """A positive length, and its unit where that follows the number."""
+    unit = next((unit for unit in sorted(LENGTH_UNITS, key=len, reverse=True) if text.endswith(unit)), None)
+    return positive(text.removesuffix(unit or "")), unit
+
+
 _distance = number_from(-FARTHEST, FARTHEST)
 
 QUESTIONS = {
     "shape": (f"shape, {' | '.join(DRAFTS)}", _shape),
     "radius": ("radius of the dome, of the cap's rim, or of the cylinder", positive),
-    "height": ("height of the cap over its rim", positive),
+    "height": ("height of the cap, or of the sheet that is blown up, over its rim", _length),
+    "size": ("size A,B of the rim along x and y", positive_pair("two lengths, A,B")),
     "semi_axes": ("half axes A,B,C of the fingertip along x, y, z", vector),
     "length": ("length of the half cylinder", positive),
     "image_size": ("size of the camera's image, WIDTH,HEIGHT, px", count_pair("WIDTH,HEIGHT", LONGEST_SIDE)),
@@ -88,10 +102,19 @@ def _add_membrane(add: Add) -> None:
         "--shape",
         metavar=f"{{{','.join(DRAFTS)}}}",
         type=_shape,
-        help="half a sphere, a cap of one, such a cap of gas, half an ellipsoid, half a cylinder",
+        help="half a sphere, a cap of one, such a cap of gas, half an ellipsoid, half a cylinder, a sheet blown up in a rim",
     )
+    add(
+        "--outline",
+        metavar="RIM.csv",
+        type=Path,
+        help="in place of --shape: a sheet blown up in the closed rim of these points",
+    )
+    add("--size", metavar="A,B", type=positive_pair("two lengths, A,B"), help="of the rectangle or ellipse, along x and y")
+    add("--corner", metavar="R", type=positive, help="radius of the rectangle's corners (default: 0)")
     add("--radius", metavar="R", type=positive, help="of the dome, of the cap's or bubble's rim, or of the half cylinder")
-    add("--height", metavar="H", type=positive, help="of the cap or bubble, from its rim's plane to its pole")
+    height = "of the cap, bubble or blown up sheet, from its rim's plane to its highest point; its unit may follow: 6mm"
+    add("--height", metavar="H", type=_length, help=height)
     add("--semi-axes", metavar="A,B,C", type=vector, help="of the fingertip along x, y, z")
     add("--length", metavar="L", type=positive, help="of the half cylinder, along x")
     add("--half-angle", metavar="DEGREES", type=positive, help="of the half cylinder to either side of its top (default: 90)")
@@ -114,11 +137,17 @@ def _add_camera(add: Add) -> None:
 
 
 def _add_material(add: Add) -> None:
-    add("--filling", choices=FILLINGS, help="of the cavity (default: of a bubble gas, else liquid)")
-    add("--overpressure", metavar="P", type=_pressure, help="inside over outside, at rest, with its unit: 20hPa, 2kPa, 0.3psi")
-    add("--prestretch", metavar="L", type=positive, help="of the membrane at rest (default: from the overpressure, else 1.2)")
+    add("--filling", choices=FILLINGS, help="of the cavity (default: of a bubble or a blown up sheet gas, else liquid)")
+    prestretch = "of the membrane at rest (default: from the overpressure, else 1.2); of the sheet in its rim (else 1.1)"
+    add("--overpressure", metavar="P", type=pressure, help="inside over outside, at rest, with its unit: 20hPa, 2kPa, 0.3psi")
+    add("--prestretch", metavar="L", type=positive, help=prestretch)
     add("--shear-modulus", metavar="G", type=positive, help="N / length unit^2: a third of Young's modulus")
-    add("--thickness", metavar="T", type=positive, help="at rest: of the flat sheet over prestretch^2")
+    add(
+        "--thickness",
+        metavar="T",
+        type=positive,
+        help="of the membrane at rest, of the sheet in its rim: unstretched, over prestretch^2",
+    )
 
 
 def _add_markers(add: Add) -> None:
@@ -132,15 +161,6 @@ def _rim(text: str) -> list[float] | str:
     return text if text == FROM_IMAGE else vector(text)
 
 
-def _pressure(text: str) -> float:
-    from ..presets.draft import PRESSURE_UNITS, pressure_in_hectopascal
-
-    try:
-        return pressure_in_hectopascal(text)
-    except ValueError:
-        raise ArgumentTypeError(f"{text!r}; expected a number and its unit, of {', '.join(PRESSURE_UNITS)}, as 20hPa") from None
-
-
 def run(arguments: Namespace) -> int:
     """Write the file; returns the exit code."""
     path: Path = arguments.sensor
@@ -148,15 +168,21 @@ def run(arguments: Namespace) -> int:
         raise MembraneError(f"init {path}: expected a file that ends with .toml, as sensor.toml")
     from ..files.targets import refuse_overwriting
     from ..sensor.companions import companions_of
-    from .draft import needed, refuse_foreign, write_draft
+    from .draft import in_unit, needed, refuse_foreign, write_draft
 
-    read = [file for file in (arguments.rest, arguments.dots) if file is not None]
+    read = [file for file in (arguments.rest, arguments.dots, arguments.outline) if file is not None]
     refuse_overwriting(f"init {path}", companions_of(path), read, arguments.force)
+    if arguments.outline is not None:
+        if arguments.shape is not None:
+            raise MembraneError("init: --outline and --shape; expected one of them, either says the rim")
+        arguments.shape = OUTLINE
     if arguments.shape is None:
         arguments.shape = _asked("shape", *QUESTIONS["shape"])
     refuse_foreign(arguments)
     for name in needed(arguments):
         setattr(arguments, name, _asked(name, *QUESTIONS[name]))
+    if arguments.height is not None:
+        arguments.height = in_unit(*arguments.height, wanted=arguments.unit)
     print("\n".join(write_draft(arguments)))
     return 0
 

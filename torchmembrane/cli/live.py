@@ -1,4 +1,4 @@
-"""`torchmembrane live`: a camera followed as it goes, or a recording as if it were one."""
+"""`torchmembrane live`: reconstruct the frames of a camera, or of a recording played like one, as they come."""
 
 import signal
 import sys
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ..live.streams import Stream
     from ..sensor.sensor import Sensor
 
-PURPOSE = "follow a camera: wrench, status, rate and latency as it goes"
+PURPOSE = "reconstruct a live camera: wrench, status, frame rate and latency"
 EXAMPLES = """\
 examples:
   torchmembrane live sensor.toml --camera 0
@@ -48,6 +48,7 @@ image is read, a file's is due) to the result. `z` and Enter: nothing touches no
 SIGTERM end it with a summary. In a terminal the line is rewritten in place, elsewhere there is one each second.
 
 exit code: 0 ended or stopped, 2 wrong usage, or a source that gives no images (any more)"""
+MODULUS = "a membrane that has softened is seen only with a known weight or a gauge: tm.Tracker.weigh, calibrate material"
 SOURCES = ("camera", "video", "images")
 OF_TORCH = ("grid", "energy", "flow", "smoothing", "locator")
 DEFAULTS = {"estimator": "force-balance", "device": "cpu"}
@@ -60,19 +61,21 @@ def add_parser(commands: Any) -> None:
     add_sensor(add)
     opened = "a camera, by OpenCV: its number, 0 the first, or its path or address"
     add("--camera", metavar="NUMBER|PATH", type=camera, help=opened)
-    add("--video", metavar="FILE", type=Path, help="a video, as if it came from a camera")
+    add("--video", metavar="FILE", type=Path, help="a video, as if it came from a camera (extra video)")
     add("--images", metavar="FOLDER", type=Path, help="the images of a folder in name order, likewise")
     add("--rate", metavar="HZ", type=number_from(0.001, 1e6), help="pace of files (default: a video's own; of images 30)")
     add("--grid", metavar=("M", "N"), nargs=2, type=count, help="solver grid (default: the sensor file's)")
-    add_estimator(add)
     model = "compute by onnxruntime with a model of torchmembrane export; needs torchmembrane-edge"
     add("--model", metavar="MODEL.onnx", type=Path, help=model)
-    add_device(add)
     add("--threads", metavar="N", type=count, default=1, help="that compute (default: %(default)s)")
     kept = "keep images, results and times in a new folder; what the disk is too slow for is dropped and counted"
     add("--record", metavar="DIR", type=Path, help=kept)
+    life = "a file of the largest force and depth of this sensor's life, made where there is none"
+    add("--life", metavar="FILE.json", type=Path, help=life)
     add_rerun(add)
     add_force(add)
+    add_estimator(add)
+    add_device(add)
 
 
 def run(arguments: Namespace) -> int:
@@ -81,6 +84,7 @@ def run(arguments: Namespace) -> int:
     from ..live.line import Line, summary
     from ..live.loop import Tally, follow
     from ..live.mailbox import capture
+    from ..live.peaks import Peaks
     from ..presets import sensor_file
     from ..sensor.sensor import Sensor
 
@@ -95,12 +99,18 @@ def run(arguments: Namespace) -> int:
         with ExitStack() as stack:
             watchers = _watchers(arguments, stream, sensor.camera.bits, stack, said)
             stop, rezero = stack.enter_context(_stopped_by_signals()), _rezero_by_key()
-            mailbox, tally = stack.enter_context(capture(images)), Tally()
+            mailbox, tally, peaks = stack.enter_context(capture(images)), Tally(), Peaks(stream.mesh)
+            watchers.append(lambda seen, _: peaks.add(seen.frame))
+            if arguments.life is not None:
+                peaks.kept_in(arguments.life)  # nothing yet: another sensor's file is refused before the stream begins
             try:
                 follow(stream, mailbox, tally, [line, *watchers], stop, rezero, line.say)
             finally:
                 if stop.is_set():
                     answer()
+                line.say(f"{peaks.said}; {MODULUS}")
+                if arguments.life is not None:
+                    line.say(peaks.kept_in(arguments.life))
                 line.say(summary(tally))
     finally:
         for each in said:

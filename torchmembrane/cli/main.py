@@ -13,10 +13,10 @@ from signal import SIGINT
 from .. import __version__
 from ..errors import MembraneError
 from ..interruption import SAID, end_process, ended_by_signals
-from . import calibrate, check, export, init, live, reconstruct, simulate, view
+from . import calibrate, capture, check, export, init, live, reconstruct, simulate, view
 from .parser import CommandParser
 
-COMMANDS = (init, check, reconstruct, live, view, calibrate, simulate, export)
+COMMANDS = (init, check, capture, reconstruct, live, view, calibrate, simulate, export)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -21,8 +21,10 @@ from .choices import ENGINES, RESULT_FORMATS
 from .film import FrameImages, draw_film
 
 if TYPE_CHECKING:
+    from ..jobs.frame_reconstructor import Gauge
     from ..jobs.inputs import Inputs
     from ..jobs.local import FrameCounts
+    from ..reconstruct import Reconstructor
 
 PURPOSE = "reconstruct surfaces from images or a video of one sensor"
 EXAMPLES = """\
@@ -37,7 +39,7 @@ examples:
 DIR then holds
   NAME.npz       the result for the image NAME.png (parquet: the dataset frames/part-*.parquet)
   mesh.npz       rest surface, triangles, units
-  summary.csv    one row per frame
+  summary.csv    one row per frame; summary_columns.csv says what its columns mean
   NAME.png       its figure (--figures)
 Frames of a video, of a bag and of an image file that holds several pictures (TIFF, MPO, animated PNG, WebP
 or GIF) are called STEM_000000, STEM_000001 ... The same command again continues after an interruption:
@@ -63,13 +65,19 @@ def add_parser(commands: Any) -> None:
     add("--engine", choices=ENGINES, default=ENGINES[0], help=where)
     part = "do the I-th of N disjoint parts of the frames; others may do theirs in the same DIR at the same time"
     add("--shard", metavar="I/N", type=share, default=(1, 1), help=part)
-    add("--video", action="store_true", help="treat every input as a video (mp4, mov, avi, mkv, webm, gif always are)")
+    add(
+        "--video",
+        action="store_true",
+        help="treat every input as a video (mp4, mov, avi, mkv, webm, gif always are); extra video",
+    )
     add("--topic", metavar="TOPIC", help="of the images in bags of ROS 2 (default: the only one; needs the extra ros)")
     messages = "also a bag of their results, a folder: wrenches, tractions, of a gas pressures, in N, N m, m and Pa"
     add("--bag", metavar="BAG", type=Path, help=messages)
     own = "images of this recording without contact, or first:N, its first N frames: their mean is rest (default: the sensor's)"
     add("--rest", metavar="IMAGES", nargs="+", default=[], help=own)
-    gauge = "CSV name,pressure (across the membrane) or name,pressure_change (since rest), hPa: a gauge's readings of frames"
+    gauge = (
+        "a gauge's log, CSV: name or time of a frame, and pressure (across the membrane) or pressure_change (since rest), hPa"
+    )
     add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
     noise = "standard deviation of these, over the rest pressure (default: 0.01)"
     add("--pressure-noise", metavar="SHARE", type=positive, help=noise)
@@ -86,7 +94,6 @@ def run(arguments: Namespace) -> int:
     from ..jobs.bags import bag_remarks, result_bag, write_bag
     from ..jobs.inputs import find_inputs, frame_name
     from ..jobs.local import reconstruct_files
-    from ..jobs.pressure import recording_pressures
     from ..jobs.ray_engine import RayEngine
     from ..jobs.rest import recording_rest
     from ..presets import sensor_file
@@ -101,7 +108,7 @@ def run(arguments: Namespace) -> int:
     _spare_files(arguments, inputs)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
-    pressure = recording_pressures(reconstructor, arguments.pressure, inputs) if arguments.pressure else None
+    pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
     format = arguments.format or ("parquet" if by_ray else "npz")
     settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""))
     check_folder(arguments.out, sensor.fingerprint, settings)
@@ -131,6 +138,16 @@ def run(arguments: Namespace) -> int:
         draw_film(read_results(arguments.out), images, arguments.video_out)
     print(f"frames: {_said(counts)}; results in {arguments.out}")
     return 1 if counts.failed else 0
+
+
+def _pressures(log: Path, reconstructor: "Reconstructor", inputs: "Inputs") -> "Gauge":
+    """What a gauge's log says of the frames; unused readings are counted."""
+    from ..jobs.pressure import recording_pressures
+
+    readings = recording_pressures(reconstructor, log, inputs)
+    if readings.unused:
+        print(f"torchmembrane: {log}: {readings.unused} readings are of no frame of this call, and not used")
+    return readings.at
 
 
 def _check(arguments: Namespace) -> None:
@@ -164,7 +181,8 @@ def _spare_files(arguments: Namespace, inputs: "Inputs") -> None:
 
 
 def _said(counts: "FrameCounts") -> str:
-    doubts = ("not converged", counts.not_converged), ("unexplained", counts.unexplained), ("partly hidden", counts.hidden)
-    said = ", ".join(f"{count} {doubt}" for doubt, count in doubts if count)
+    doubts = {"not converged": counts.not_converged, "unexplained": counts.unexplained, "partly hidden": counts.hidden}
+    doubts["out of range"] = counts.out_of_range
+    said = ", ".join(f"{count} {doubt}" for doubt, count in doubts.items() if count)
     unsure = f" ({said})" if said else ""
     return f"{counts.reconstructed} reconstructed{unsure}, {counts.failed} failed, {counts.skipped} finished before"

@@ -19,6 +19,7 @@ def sheet_lines(sheet: SpecSheet) -> list[str]:
         "errors": _errors(sheet),
         "two": _closest(sheet),
         "deepest": _deepest(sheet),
+        "range": _range(sheet),
     }
     return [f"{key if i == 0 else '':<10}{line}" for key, block in blocks.items() for i, line in enumerate(block)]
 
@@ -117,3 +118,10 @@ def _spread(values: Spread, unit: str = "") -> str:
 
 def _share(value: float) -> str:
     return f"{_number(100 * value)} %" if isfinite(value) else "-"
+
+
+def _range(sheet: SpecSheet) -> Iterator[str]:
+    if sheet.range is None:
+        yield "none: presses are wrong from the shallowest on that noise does not decide"
+        return
+    yield f"presses shown right up to {sheet.range.depth:.3g} of the size deep and {sheet.range.force:.3g} {sheet.force_unit}"

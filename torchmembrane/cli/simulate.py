@@ -94,11 +94,11 @@ def _add_sequence(add: Add) -> None:
     legs = some_of(LEGS, f"legs of {', '.join(LEGS)}, as push,slide,release")
     add("--path", metavar="LEGS", type=legs, help=f"all frames along a path, of {', '.join(LEGS)}, as in push,slide,release")
     add("--frames", metavar="N", type=count, default=10, help="frames on each leg of --path (default: %(default)s)")
-    add("--video", action="store_true", help="--path as NAME.mp4 instead of images")
+    add("--video", action="store_true", help="--path as NAME.mp4 instead of images (extra video)")
     add("--random", metavar="N", type=count, help="a data set of N random presses")
     add("--seed", type=seed, default=0, help="of presses and noise (default: %(default)s)")
     add("--jobs", metavar="J", type=count, default=os.cpu_count(), help="processes of --random (default: all cores)")
-    stored = "of --random: png and npz files, or a Parquet data set"
+    stored = "of --random: png and npz files, or a Parquet data set (extra parquet)"
     add("--format", choices=SIMULATION_FORMATS, default=SIMULATION_FORMATS[0], help=stored)
     add("--increment", metavar="D", type=positive, help="longest motion in one step (default: from the size)")
 

@@ -6,8 +6,9 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import MembraneError
 from .arguments import add_command, add_force, add_rerun, positive, wants_rerun
-from .film import DEFAULT_RATE, FrameImages, draw_film, images_in
+from .film import DEFAULT_RATE, MOST_FRAMES, FrameImages, draw_film, draw_sheet, images_in
 
 if TYPE_CHECKING:
     from ..results.read import Results
@@ -20,7 +21,10 @@ examples:
   torchmembrane view results --frame press          # of a folder of either format; without --frame its first
   torchmembrane view results/frames/part-00000.parquet
   torchmembrane view results --video-out press.mp4 --images frames/        # all its frames, in name order; or press.gif
+  torchmembrane view results --plot forces.png      # over time; results day2/ --plot: side by side
+  torchmembrane view results --sheet sheet.png      # all its frames, small
   torchmembrane view results --rerun                # likewise, in the viewer Rerun; --save press.rrd: in a file
+  torchmembrane view results --dataset press        # a data set as Hugging Face's datasets loads it, with a card
   torchmembrane view results --frame press --ply press.ply   # the contact as a point cloud, nothing drawn
 
 Without --out a window is opened; without a display, NAME_view.png is written beside the results."""
@@ -29,17 +33,27 @@ Without --out a window is opened; without a display, NAME_view.png is written be
 def add_parser(commands: Any) -> None:
     """Add the command's parser."""
     add = add_command(commands, "view", run, PURPOSE, EXAMPLES)
-    add("result", metavar="RESULT", type=Path, help="a frame's result NAME.npz, a part of a Parquet dataset, or a folder")
+    what = "a frame's result NAME.npz, a part of a Parquet dataset, or a folder; with --plot several folders"
+    add("result", metavar="RESULT", type=Path, nargs="+", help=what)
     add("--frame", metavar="NAME", help="which frame of a folder or a part (default: the first)")
     add("--mesh", metavar="mesh.npz", type=Path, help="the mesh of its folder (default: mesh.npz beside it)")
     add("--image", metavar="IMAGE", type=Path, help="the frame's image, drawn behind the flow")
     add("--out", metavar="FILE.png", type=Path, help="where to draw it (default: in a window, if there is a display)")
+    plot = "draw force, moment and pressure of a folder's frames over time, of several folders side by side"
+    add("--plot", metavar="FILE.png", type=Path, help=plot)
+    add("--sheet", metavar="FILE.png", type=Path, help=f"draw a folder's frames small, on one sheet, {MOST_FRAMES} at most")
     film = "draw all frames of a folder, one after another: .mp4, .mov, .mkv (extra video) or .gif"
     add("--video-out", metavar="FILE", type=Path, help=film)
     add("--rate", metavar="HZ", type=positive, default=DEFAULT_RATE, help="frames per second of that (default: %(default)g)")
     pictures = "where the images of all frames are, by the frames' names (default: RESULT/images, as live --record has it)"
     add("--images", metavar="FOLDER", type=Path, help=pictures)
     add_rerun(add)
+    add(
+        "--dataset",
+        metavar="FOLDER",
+        type=Path,
+        help="write all frames and their images as a data set of Hugging Face (extra parquet)",
+    )
     add("--ply", metavar="FILE.ply", type=Path, help="write the touched vertices as a point cloud, and draw nothing")
     add_force(add)
 
@@ -50,34 +64,64 @@ def run(arguments: Namespace) -> int:
     from ..live.recording import times_of
     from ..results.read import read_results
 
-    rerun = wants_rerun(arguments)
-    _spare_files(arguments, arguments.out, arguments.video_out, arguments.save, arguments.ply)
-    if not rerun and arguments.video_out is None:
-        return _draw(arguments)
+    rerun, folders = wants_rerun(arguments), arguments.result
+    others = arguments.out, arguments.video_out, arguments.sheet, arguments.save, arguments.ply
+    alone = not rerun and all(made is None for made in (*others, arguments.dataset))
+    if len(folders) > 1 and not (alone and arguments.plot):
+        raise MembraneError(f"view: {len(folders)} results; expected one, or --plot FILE.png alone, which draws several")
+    _spare_files(arguments, folders, arguments.plot, *others)
+    arguments.result = folders[0]
+    if arguments.plot is not None:
+        _plot(folders, arguments.plot)
+    if not rerun and all(made is None for made in (arguments.video_out, arguments.sheet, arguments.dataset)):
+        return 0 if arguments.plot is not None else _draw(arguments)
     results, times = read_results(arguments.result), times_of(arguments.result)
     warn_of_times((name, times[name]) for name in results.names if name in times)
     width, height = results.mesh.image_size.tolist()
-    images = FrameImages(images_in(arguments.images or arguments.result / "images"), (width, height))
+    found = images_in(arguments.images or arguments.result / "images")
+    images = FrameImages(found, (width, height))
+    if arguments.sheet is not None:
+        draw_sheet(results, images, arguments.sheet)
     if arguments.video_out is not None:
         draw_film(results, images, arguments.video_out, arguments.rate)
+    if arguments.dataset is not None:
+        from ..results.data_set import write_data_set
+
+        write_data_set(results, arguments.dataset, found, times)
+        print(f"{len(results)} frames in {arguments.dataset}")
     if rerun:
         _show(results, images, times, arguments.save)
     return 0
 
 
-def _spare_files(arguments: Namespace, *targets: Path | None) -> None:
+def _spare_files(arguments: Namespace, folders: list[Path], *targets: Path | None) -> None:
     """Refuse to write over files, those of earlier drawings excepted."""
     from functools import partial
 
     from ..files.targets import refuse_overwriting
     from ..plot.drawing import drawn_by
 
-    result, images = arguments.result, arguments.images or arguments.result / "images"
-    read = [path for pattern in ("*.npz", "frames/*.parquet", "*.csv") for path in result.glob(pattern)]
-    read += [path for path in (result, arguments.mesh, arguments.image) if path is not None]
-    read += images_in(images).values()
+    patterns = "*.npz", "frames/*.parquet", "*.csv"
+    read = [path for folder in folders for pattern in patterns for path in folder.glob(pattern)]
+    read += [path for path in (*folders, arguments.mesh, arguments.image) if path is not None]
+    read += images_in(arguments.images or folders[0] / "images").values()
     written = [path for path in targets if path is not None]
     refuse_overwriting("view", written, read, arguments.force, partial(drawn_by, "view"))
+
+
+def _plot(folders: list[Path], path: Path) -> None:
+    """Draw the tables of folders over time, and say so."""
+    from ..plot.drawing import save
+    from ..plot.series import series_figure
+    from ..results.summary import read_summary
+
+    runs = {str(folder): read_summary(folder) for folder in folders}
+    units = {(rows[0]["length_unit"], rows[0]["force_unit"]) for rows in runs.values()}
+    if len(units) > 1:
+        said = ", ".join(f"{force} and {length}" for length, force in sorted(units))
+        raise MembraneError(f"view --plot: results in {said}; expected folders of the same units")
+    save(series_figure(runs), path, "view")
+    print(f"{sum(map(len, runs.values()))} frames of {', '.join(runs)} drawn in {path}")
 
 
 def _show(results: "Results", images: FrameImages, times: dict[str, float], save: Path | None) -> None:
@@ -109,7 +153,7 @@ def _draw(arguments: Namespace) -> int:
         show(drawing)
         return 0
     out = arguments.out or home / f"{name}_view.png"
-    _spare_files(arguments, out)
+    _spare_files(arguments, [arguments.result], out)
     save(drawing, out, "view")
     print(f"{name} drawn in {out}")
     return 0

@@ -1,9 +1,14 @@
-"""Packages that may be missing: imported where they are used, with an error that names the extra to install."""
+"""Packages that may be missing: imported where they are used, with an error that names the extra to install.
 
+Each of these functions raises that error where the package is missing, and another one where it is there and broken.
+"""
+
+import os
 from importlib import import_module
 from typing import Any
 
 from ..errors import MembraneError
+from .safe_read import in_one_line
 
 
 def load_pyarrow() -> tuple[Any, Any]:
@@ -33,7 +38,12 @@ def load_opencv(purpose: str = "calibration from boards needs OpenCV") -> Any:
     Raises:
         MembraneError: OpenCV is not installed.
     """
-    return _load("cv2", purpose, "calibrate")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what goes wrong is said in this package's own words
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    cv2 = _load("cv2", purpose, "calibrate")
+    if hasattr(cv2, "setLogLevel"):
+        cv2.setLogLevel(0)
+    return cv2
 
 
 def load_edge() -> Any:
@@ -92,5 +102,10 @@ def load_rosbags() -> Any:
 def _load(module: str, purpose: str, extra: str) -> Any:
     try:
         return import_module(module)
-    except ImportError as error:
-        raise MembraneError(f'{purpose}, which is not installed: pip install "torchmembrane[{extra}]"') from error
+    except (ImportError, OSError) as error:  # OSError: of a library that a package brings or expects
+        if isinstance(error, ModuleNotFoundError) and error.name == module:
+            raise MembraneError(f'{purpose}, which is not installed: pip install "torchmembrane[{extra}]"') from error
+        raise MembraneError(
+            f"{purpose}, which is installed and cannot be imported ({in_one_line(error)}): install it anew, "
+            f'pip install --force-reinstall "torchmembrane[{extra}]"'
+        ) from error

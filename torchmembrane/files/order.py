@@ -1,11 +1,13 @@
 """The order of frames by their names, and whether their times have another one."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from ..user_warnings import warn_user
 
+Item = TypeVar("Item")
 NUMBER = re.compile("([0-9]+)")
 APART = 1.0
 """Seconds: files of which one is older by less may have been written at once, as copies are."""
@@ -21,6 +23,19 @@ def in_order(name: str | Path) -> tuple[list[tuple[int, str]], str]:
     parts = NUMBER.split(str(name))  # texts at even places, numbers at odd ones
     digits = [part.lstrip("0") for part in parts]
     return [(len(digits[k]), digits[k]) if k % 2 else (-1, part) for k, part in enumerate(parts)], str(name)
+
+
+def evenly(items: Sequence[Item], most: int) -> list[Item]:
+    """So many of some items at most, the first and the last among them.
+
+    Example:
+        >>> evenly("abcdefg", 3), evenly("ab", 3)
+        (['a', 'd', 'g'], ['a', 'b'])
+    """
+    count = len(items)
+    if count <= most:
+        return list(items)
+    return [items[round(k * (count - 1) / (most - 1))] for k in range(most)]
 
 
 def warn_of_times(frames: Iterable[tuple[str, float]]) -> None:

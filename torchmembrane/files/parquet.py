@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import MembraneError
 from .optional import load_pyarrow
 from .safe_read import DAMAGE, in_one_line, regular_size
@@ -42,6 +44,23 @@ def read_table(path: Path, what: str, expected: str, columns: Sequence[str] | No
         raise
     except (*DAMAGE, arrow.ArrowException) as error:
         raise refusal(path, what, expected, error) from error
+
+
+def nested(values: np.ndarray) -> Any:
+    """Arrays `[rows, ...]` as a column of nested lists of fixed sizes.
+
+    Raises:
+        MembraneError: PyArrow is not installed.
+
+    Example:
+        >>> str(nested(np.zeros((2, 3, 4), np.float32)).type)
+        'fixed_size_list<item: fixed_size_list<item: float>[4]>[3]'
+    """
+    arrow, _ = load_pyarrow()
+    column = arrow.array(values.ravel())
+    for size in reversed(values.shape[1:]):
+        column = arrow.FixedSizeListArray.from_arrays(column, size)
+    return column
 
 
 def refusal(path: Path, what: str, expected: str, error: object) -> MembraneError:

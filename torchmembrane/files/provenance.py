@@ -1,9 +1,11 @@
-"""Where a frame came from, so that a new image under an old name is noticed."""
+"""Where a frame came from and when it was taken, so that a new image under an old name is noticed."""
 
 import hashlib
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
+
+from .timestamps import time_in
 
 DIGEST = partial(hashlib.blake2b, digest_size=16)
 
@@ -16,12 +18,14 @@ class Origin(NamedTuple):
         file_size: bytes; -1 where it is not known.
         file_modified: nanoseconds since 1970; -1 where it is not known.
         content_hash: BLAKE2b of 16 bytes of what it held, hexadecimal; "" where it is not known.
+        time: when the frame was taken, seconds, as its name, video, bag or camera says; NaN where it is not known.
     """
 
     path: str = ""
     file_size: int = -1
     file_modified: int = -1
     content_hash: str = ""
+    time: float = float("nan")
 
     @classmethod
     def of(cls, file: Path) -> "Origin":
@@ -37,12 +41,12 @@ class Origin(NamedTuple):
         stat = file.stat()
         with open(file, "rb") as content:
             digest = hashlib.file_digest(content, DIGEST).hexdigest()
-        return cls(printable(str(file)), stat.st_size, stat.st_mtime_ns, digest)
+        return cls(printable(str(file)), stat.st_size, stat.st_mtime_ns, digest, time_in(file.stem))
 
     @classmethod
     def of_bytes(cls, file: Path, content: bytes) -> "Origin":
         """That of a file of which only this content is known."""
-        return cls(printable(str(file)), len(content), content_hash=DIGEST(content).hexdigest())
+        return cls(printable(str(file)), len(content), content_hash=DIGEST(content).hexdigest(), time=time_in(file.stem))
 
     def is_of(self, file: Path) -> bool:
         """Whether a file holds what it held: by size and time, where these differ by its hash; True where that is not known,

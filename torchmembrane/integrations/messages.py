@@ -1,10 +1,9 @@
-"""ROS 2 messages and what they say here: images to grey values, results to fields in N, N m, m and Pa.
+"""ROS 2 messages of a camera, and what they say here: images to grey values, lenses compared.
 
-A message is whatever has the fields of its type, of a bag (rosbags) or of a live system (rclpy). Frames are the camera's: its
-optical frame, x right, y down, z forward.
+A message is whatever has the fields of its type, of a bag (rosbags) or of a live system (rclpy).
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,10 +14,6 @@ from ..camera.model import Camera
 from ..errors import MembraneError
 from ..files.bayer import PATTERNS, demosaiced
 from ..files.images import decode_image, read_pixels, to_grey
-from ..results.reconstruction import Frame
-from ..results.status import Status
-from ..results.store import Mesh
-from ..sensor.parts import METRE
 
 CHANNELS: dict[str, tuple[type[np.unsignedinteger[Any]], int, list[int]]] = {
     **{"mono8": (np.uint8, 1, [0]), "8UC1": (np.uint8, 1, [0]), "mono16": (np.uint16, 1, [0]), "16UC1": (np.uint16, 1, [0])},
@@ -34,8 +29,6 @@ PLANES = {"nv12": 1.5, "nv21": 1.5, "nv24": 3.0}
 """Encodings that hold the grey values of all pixels first, then the colours: bytes for each pixel."""
 MOSAICS = {f"bayer_{pattern}{bits}": pattern for pattern in PATTERNS for bits in (8, 16)}
 """Encodings of cameras that see one colour in each pixel: the colours of 2 x 2 pixels."""
-POINT_FIELDS = ("x", "y", "z", "normal_traction", "shear_x", "shear_y", "shear_z")
-"""Of a vertex, each float32: place, m; compressive normal traction and shear traction on the membrane, Pa."""
 SAME = 1.0
 """Pixels, rms over the image: by how much a CameraInfo may see the same ray elsewhere before it is said."""
 SAMPLES = 32
@@ -196,59 +189,3 @@ def projected(info: Any, rays: np.ndarray) -> np.ndarray:
             y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
         )
     return np.stack([f * x + u, g * y + v], -1)
-
-
-class Wrench(NamedTuple):
-    """Fields of a `geometry_msgs/Wrench`: `force [3]`, N, and `torque [3]` about the camera's centre of projection, N m."""
-
-    force: np.ndarray
-    torque: np.ndarray
-
-
-class SiUnits:
-    """A sensor's results in N, N m, m and Pa.
-
-    Args:
-        mesh: of the results.
-        gas_pressure: `Sensor.gas_pressure`.
-
-    Raises:
-        MembraneError: its forces are relative.
-    """
-
-    def __init__(self, mesh: Mesh, gas_pressure: float | None = None):
-        if mesh.force_unit != "N":
-            raise MembraneError(
-                f"forces of {mesh.name} are relative, messages are in newtons: add shear_modulus and thickness to the sensor "
-                "file, or find them by `torchmembrane calibrate material --weight`"
-            )
-        self.metre = METRE[mesh.length_unit]
-        self.gas_pressure = gas_pressure
-
-    def wrench(self, frame: Frame) -> Wrench:
-        """Of what touches the membrane, on it; from the frame's `wrench [6]`, N and N x length unit."""
-        return Wrench(frame["wrench"][:3].astype(float), frame["wrench"][3:].astype(float) / self.metre)
-
-    def points(self, frame: Frame) -> np.ndarray:
-        """`[V, 7]` float32: `POINT_FIELDS` of every vertex; from its `vertices`, `normals` and `traction`, `[V, 3]` each."""
-        traction, normals = frame["traction"] * self.metre**2, frame["normals"]
-        along = (traction * normals).sum(-1, keepdims=True)
-        return np.hstack([frame["vertices"] / self.metre, -along, traction - along * normals]).astype(np.float32)
-
-    def pressure(self, frame: Frame) -> float | None:
-        """Of the gas, absolute, Pa; from the frame's `pressure_change []`; None of a sensor without one."""
-        if self.gas_pressure is None:
-            return None
-        return (self.gas_pressure + float(frame["pressure_change"])) * self.metre**2
-
-
-def cloud_layout(points: np.ndarray) -> dict[str, Any]:
-    """Fields of a `sensor_msgs/PointCloud2` with `points [V, 7]`, as `SiUnits.points` gives them, but for header and fields."""
-    content, step = points.astype("<f4").tobytes(), 4 * len(POINT_FIELDS)
-    shape = {"height": 1, "width": len(points), "is_bigendian": False, "point_step": step, "row_step": len(content)}
-    return {**shape, "data": content, "is_dense": bool(np.isfinite(points).all())}
-
-
-def has_wrench(frame: Frame) -> bool:
-    """Whether a frame has a surface, and so messages."""
-    return Status(int(frame["status"])).has_surface

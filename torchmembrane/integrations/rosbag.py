@@ -10,8 +10,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from ..camera.model import Camera
 from ..errors import MembraneError
 from ..files.atomic import ROOM, make_folder, writing
@@ -20,7 +18,8 @@ from ..files.safe_read import in_one_line, read_text, regular_size
 from ..interruption import unfinished
 from ..results.reconstruction import Frame
 from .bounded_rosbags import bounded_rosbags, refuse_large
-from .messages import POINT_FIELDS, SiUnits, cloud_layout, info_topic, size_of, unlike
+from .frame_messages import Message, SiUnits, has_wrench
+from .messages import info_topic, size_of, unlike
 
 BAGS, ROS_1, METADATA = (".mcap", ".db3"), ".bag", "metadata.yaml"
 MOST_METADATA_BYTES = 2**20
@@ -30,16 +29,10 @@ MCAP_MARK, SQLITE_MARK, ROS_1_MARK = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#
 """The first bytes of a storage file; those of MCAP are its last ones, too."""
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-TOPICS = {
-    "wrench": ("/torchmembrane/wrench", "geometry_msgs/msg/WrenchStamped"),
-    "points": ("/torchmembrane/points", "sensor_msgs/msg/PointCloud2"),
-    "pressure": ("/torchmembrane/pressure", "sensor_msgs/msg/FluidPressure"),
-}
-"""Of the messages written: topic and type."""
+NAMESPACE = "/torchmembrane"
+"""Of the topics written, as of a node of this name."""
 OURS = "torchmembrane reconstruct --bag"
 """Stands in the metadata of a bag that is written here."""
-FLOAT32 = 7
-"""A PointField's datatype."""
 
 
 class StampedMessage(NamedTuple):
@@ -47,6 +40,12 @@ class StampedMessage(NamedTuple):
 
     received: int
     message: Any
+
+    @property
+    def time(self) -> float:
+        """Seconds since 1970 as its header says, or, where that is empty, of its reception."""
+        stamp = self.message.header.stamp
+        return float(stamp.sec + 1e-9 * stamp.nanosec) or 1e-9 * self.received
 
 
 def is_bag(path: Path) -> bool:
@@ -128,8 +127,7 @@ def camera_remark(bag: Path, topic: str, camera: Camera) -> str | None:
 class BagWriter:
     """A bag of results: `with BagWriter("out", units, mcap=True) as bag`, then `bag.add(image, frame)`.
 
-    A `WrenchStamped`, a `PointCloud2` and, of a gas, a `FluidPressure` for every frame, on `TOPICS`, with the image's header
-    and time of reception.
+    The messages of every frame on `TOPICS` in `NAMESPACE`, with the image's header and time of reception.
 
     Args:
         path: a folder: new, or of such a bag, which is replaced when the new one is whole.
@@ -173,42 +171,29 @@ class BagWriter:
                 self._writer.path.rename(self.path)
 
     def add(self, image: StampedMessage, frame: Frame) -> None:
-        """Write a frame's messages.
+        """Write a frame's messages; `written` counts those that have a wrench.
 
         Args:
             image: that it was reconstructed from.
-            frame: its result, which has a surface.
+            frame: its result.
         """
+        given = image.message.header
         with _writing_bag(self.path):
-            self._add(image, frame)
-        self.written += 1
+            stamp = self._new("builtin_interfaces/msg/Time", sec=given.stamp.sec, nanosec=given.stamp.nanosec)
+            header = self._new("std_msgs/msg/Header", stamp=stamp, frame_id=given.frame_id)
+            for topic, message in self.units.messages(frame).items():
+                self._write(topic, image.received, message._replace(fields={"header": header, **message.fields}))
+        self.written += has_wrench(frame)
 
-    def _add(self, image: StampedMessage, frame: Frame) -> None:
-        header = self._header(image.message.header)
-        wrench = self.units.wrench(frame)
-        vectors = (self._new("geometry_msgs/msg/Vector3", *each.tolist()) for each in wrench)
-        self._write("wrench", image, header, self._new("geometry_msgs/msg/Wrench", *vectors))
-        layout = cloud_layout(self.units.points(frame))
-        kind = "sensor_msgs/msg/PointField"
-        fields = [self._new(kind, name, 4 * k, FLOAT32, 1) for k, name in enumerate(POINT_FIELDS)]
-        self._write("points", image, header, fields=fields, **layout | {"data": np.frombuffer(layout["data"], np.uint8)})
-        pressure = self.units.pressure(frame)
-        if pressure is not None:
-            self._write("pressure", image, header, pressure, 0.0)
+    def _write(self, topic: str, received: int, message: Message) -> None:
+        if topic not in self._connections:
+            connection = self._writer.add_connection(f"{NAMESPACE}/{topic}", message.kind, typestore=self._store)
+            self._connections[topic] = connection
+        content = self._store.serialize_cdr(message.built(self._new), message.kind)
+        self._writer.write(self._connections[topic], received, content)
 
-    def _header(self, header: Any) -> Any:
-        stamp = self._new("builtin_interfaces/msg/Time", header.stamp.sec, header.stamp.nanosec)
-        return self._new("std_msgs/msg/Header", stamp, header.frame_id)
-
-    def _new(self, kind: str, *fields: Any, **named: Any) -> Any:
-        return self._store.types[kind](*fields, **named)
-
-    def _write(self, name: str, image: StampedMessage, *fields: Any, **named: Any) -> None:
-        topic, kind = TOPICS[name]
-        if name not in self._connections:
-            self._connections[name] = self._writer.add_connection(topic, kind, typestore=self._store)
-        content = self._store.serialize_cdr(self._new(kind, *fields, **named), kind)
-        self._writer.write(self._connections[name], image.received, content)
+    def _new(self, kind: str, **fields: Any) -> Any:
+        return self._store.types[kind](**fields)
 
 
 def _is_ours(path: Path) -> bool:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ..camera.model import Camera
 from ..errors import MembraneError
 from ..files.folder_lock import WHOLE, Shard
-from ..integrations.messages import SiUnits, has_wrench
+from ..integrations.frame_messages import SiUnits
 from ..integrations.rosbag import BagWriter, camera_remark, image_topic, is_mcap, messages
 from ..results.read import read_results
 from ..results.store import Mesh
@@ -45,7 +45,7 @@ def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstru
 
 
 def write_bag(writer: BagWriter, inputs: Inputs, results: Path) -> int:
-    """Write messages of all frames of the bags that have a surface in a folder of results; returns their number."""
+    """Write messages of all frames of the bags in a folder of results; returns the number of those with a wrench."""
     found = read_results(results)
     names = set(found.names)
     with writer:
@@ -53,6 +53,6 @@ def write_bag(writer: BagWriter, inputs: Inputs, results: Path) -> int:
             topic, _ = image_topic(path, inputs.topic)
             for number, image in enumerate(messages(path, topic)):
                 name = picture_name(path, number)
-                if name in names and has_wrench(frame := found[name]):
-                    writer.add(image, frame)
+                if name in names:
+                    writer.add(image, found[name])
     return writer.written

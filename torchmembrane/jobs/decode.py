@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import islice
+from math import isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeAlias
 
@@ -15,6 +16,7 @@ from torch import Tensor
 from ..errors import MembraneError
 from ..files.images import picture_count, stack_images, to_grey
 from ..files.provenance import Origin
+from ..files.timestamps import time_in
 from ..files.video import picture_total, picture_values, video_pictures
 from ..integrations.messages import grey_of
 from ..integrations.rosbag import image_topic, is_bag, messages
@@ -30,6 +32,13 @@ LONGEST_NAME = 251
 
 Load: TypeAlias = Callable[["Reconstructor"], Tensor]
 """Gives a frame's image `[1, 1, height, width]` or raises `MembraneError`."""
+
+
+class Picture(NamedTuple):
+    """A picture of a file of several: what gives its image, and when it was taken, seconds; NaN where that is not known."""
+
+    load: Load
+    time: float = float("nan")
 
 
 class Source(NamedTuple):
@@ -62,7 +71,7 @@ def sources(inputs: Inputs, reconstructor: "Reconstructor") -> Iterator[Source]:
     """All frames of the inputs: the images, then the pictures of videos, bags and stacks, which are called STEM_NUMBER."""
     yield from map(source_of, inputs.images)
     for path in inputs.videos:
-        yield from _pictures(path, _loads(path, inputs.topic, reconstructor))
+        yield from _frames(path, _pictures(path, inputs.topic, reconstructor))
 
 
 def source_of(path: Path) -> Source:
@@ -127,13 +136,13 @@ def _read(path: Path, reconstructor: "Reconstructor") -> Tensor:
     return reconstructor.read(path)
 
 
-def _pictures(path: Path, pictures: Iterator[Load]) -> Iterator[Source]:
+def _frames(path: Path, pictures: Iterator[Picture]) -> Iterator[Source]:
     """The frames of a file of several one after another; where no further one can be found, the reason is a frame as well."""
     number = -1
     try:
         origin = origin_of(path)
-        for number, load in enumerate(pictures):
-            yield Source(picture_name(path, number), path, load, origin)
+        for number, picture in enumerate(pictures):
+            yield Source(picture_name(path, number), path, picture.load, origin._replace(time=picture.time))
         if number < 0:
             raise MembraneError("holds no picture")
     except MembraneError as error:
@@ -141,15 +150,25 @@ def _pictures(path: Path, pictures: Iterator[Load]) -> Iterator[Source]:
         yield Source(picture_name(path, number + 1), path, refusal, Origin())
 
 
-def _loads(path: Path, topic: str | None, reconstructor: "Reconstructor") -> Iterator[Load]:
-    """What gives the pictures of a file of several."""
+def _pictures(path: Path, topic: str | None, reconstructor: "Reconstructor") -> Iterator[Picture]:
+    """The pictures of a file of several.
+
+    Those of a bag are of the time that their header says, or of their reception; those of a video of the time after its
+    beginning, which its name may say.
+    """
     if is_bag(path):
-        yield from (partial(_bag_image, image.message) for image in messages(path, image_topic(path, topic)[0]))
+        yield from (
+            Picture(partial(_bag_image, each.message), each.time) for each in messages(path, image_topic(path, topic)[0])
+        )
         return
-    size = reconstructor.sensor.camera.image_size
-    of_stack = picture_count(path, 1) > 0
-    for picture in stack_images(path, size, reconstructor.sensor.camera.bits) if of_stack else video_pictures(path, size):
-        yield partial(_refuse, str(picture)) if isinstance(picture, MembraneError) else partial(_image, picture)
+    camera, of_stack, begun = reconstructor.sensor.camera, picture_count(path, 1) > 0, time_in(path.stem)
+    begun = 0.0 if isnan(begun) else begun
+    for picture in stack_images(path, camera.image_size, camera.bits) if of_stack else video_pictures(path, camera.image_size):
+        if isinstance(picture, MembraneError):
+            yield Picture(partial(_refuse, str(picture)))
+        else:
+            after = getattr(picture, "time", None)  # an array has none
+            yield Picture(partial(_image, picture), nan if after is None else begun + after)
 
 
 def _bag_image(message: Any, reconstructor: "Reconstructor") -> Tensor:

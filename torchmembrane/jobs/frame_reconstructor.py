@@ -1,11 +1,11 @@
 """Frames in, rows of results out: the state of one worker, whatever hands out the work."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -24,6 +24,10 @@ from .inputs import frame_name
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
+
+
+Gauge: TypeAlias = Mapping[str, float] | Callable[[str, float], float]
+"""Pressures across the membrane that a gauge reads, by the names of frames, or by name and time, s; NaN where there is none."""
 
 
 class Outcome(NamedTuple):
@@ -53,7 +57,8 @@ class FrameReconstructor:
     Args:
         reconstructor: of the sensor.
         rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
-        pressure: that a gauge reads, by the names of the frames, as `Reconstructor` takes it.
+        pressure: that a gauge reads, by the names of the frames, or what gives it by name and time (s), as `Reconstructor`
+            takes it.
 
     Example:
         >>> from dataclasses import replace
@@ -69,7 +74,7 @@ class FrameReconstructor:
         self,
         reconstructor: "Reconstructor",
         rest_pixels: Tensor | None = None,
-        pressure: Mapping[str, float] | None = None,
+        pressure: Gauge | None = None,
     ):
         if not hasattr(reconstructor, "rest_pixels"):
             raise MembraneError(f"FrameReconstructor: reconstructor is a {_kind(reconstructor)}; expected a tm.Reconstructor")
@@ -105,8 +110,8 @@ class FrameReconstructor:
     def outcomes(self, group: list[DecodedFrame]) -> list[Outcome]:
         """What becomes of each frame of a batch."""
         start = time.perf_counter()
-        readable = [(frame.name, frame.image) for frame in group if frame.image is not None]
-        frames = iter(self._reconstructed([name for name, _ in readable], [image for _, image in readable]))
+        readable = [frame for frame in group if frame.image is not None]
+        frames = iter(self._reconstructed(readable))
         seconds = (time.perf_counter() - start) / max(len(readable), 1)
         return [
             Outcome(frame.name, frame.file, None, frame.reason)
@@ -153,22 +158,30 @@ class FrameReconstructor:
         return decoded(source, self.reconstructor)
 
     @torch.no_grad()
-    def _reconstructed(self, names: list[str], images: list[Tensor]) -> list[Frame]:
+    def _reconstructed(self, group: list[DecodedFrame]) -> list[Frame]:
+        images = [frame.image for frame in group if frame.image is not None]
         if not images:
             return []
         options: dict[str, Any] = {} if self.rest_pixels is None else {"rest_pixels": self.rest_pixels}
         if self.pressure is not None:
-            readings = [self.pressure.get(name, torch.nan) for name in names]
+            readings = [self._reading(frame.name, frame.origin.time) for frame in group]
             options["pressure"] = torch.tensor(readings, dtype=torch.float64)
         computed = self.reconstructor(torch.cat(images), **options)
         results = Reconstruction(*(field.cpu() for field in computed))
         return [results.frame(i) for i in range(len(images))]
 
+    def _reading(self, name: str, time: float) -> float:
+        """What the gauge reads in a frame."""
+        if callable(self.pressure):
+            return self.pressure(name, time)
+        return torch.nan if self.pressure is None else self.pressure.get(name, torch.nan)
+
     @cached_property
     def _blank(self) -> Frame:
         """What a file that gave no image has in place of a result."""
         width, height = self.reconstructor.image_size
-        (frame,) = self._reconstructed([""], [torch.zeros(1, 1, height, width).to(self.reconstructor.rest_pixels)])
+        image = torch.zeros(1, 1, height, width).to(self.reconstructor.rest_pixels)
+        (frame,) = self._reconstructed([DecodedFrame("", Path(), image)])
         return frame | {"status": np.array(UNREADABLE, np.int32)}
 
 

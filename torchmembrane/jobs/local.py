@@ -2,7 +2,7 @@
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from ..machine_code import SECONDS
 from ..results.status import Status
 from ..results.store import FINISHED, Mesh, Settings
 from .decode import Source, length_of, sources
-from .frame_reconstructor import FrameReconstructor, Outcome
+from .frame_reconstructor import FrameReconstructor, Gauge, Outcome
 from .inputs import Inputs, frame_name
 from .result_folder import ResultFolder, files_at_risk
 from .workers import Work, batch_for, outcomes_by, outcomes_here, workers_for
@@ -41,6 +41,7 @@ class FrameCounts(NamedTuple):
     not_converged: int
     unexplained: int
     hidden: int
+    out_of_range: int
     failed: int
     skipped: int
 
@@ -57,7 +58,7 @@ def reconstruct_files(
     engine: Engine | None = None,
     figures: bool = False,
     rest_pixels: Tensor | None = None,
-    pressure: Mapping[str, float] | None = None,
+    pressure: Gauge | None = None,
     report: Callable[[str], None] | None = None,
 ) -> FrameCounts:
     """Reconstruct all frames of `inputs` that have no finished result in the folder `out` yet.
@@ -78,7 +79,7 @@ def reconstruct_files(
         engine: what computes, in place of this machine's processes: from work, sources and batch, all outcomes.
         figures: also NAME.png for every frame; a finished frame that lacks its figure is done again.
         rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
-        pressure: that a gauge reads, by the names of the frames, as `Reconstructor` takes it.
+        pressure: that a gauge reads, by the names of the frames or by name and time, as `Reconstructor` takes it.
         report: called with one line per failed frame (default: the line is written to stderr, above the progress bar).
 
     Returns:
@@ -96,7 +97,7 @@ def reconstruct_files(
         >>> sensor = replace(sensor, markers=replace(sensor.markers, rest_image=None))  # quicker, less accurate
         >>> reconstructor, images = Reconstructor(sensor), find_inputs(["examples/rest.png"])
         >>> reconstruct_files(reconstructor, images, tempfile.mkdtemp(), Settings.of(reconstructor, "npz"))
-        FrameCounts(reconstructed=1, not_converged=0, unexplained=0, hidden=0, failed=0, skipped=0)
+        FrameCounts(reconstructed=1, not_converged=0, unexplained=0, hidden=0, out_of_range=0, failed=0, skipped=0)
     """
     out, report = Path(out), report or _write_line
     mesh = Mesh.of(reconstructor, settings)
@@ -116,7 +117,7 @@ def reconstruct_files(
                 folder.save()
                 progress.update(len(group), done)
     good = sum(done[status] for status in FINISHED)
-    doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN]
+    doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN], done[Status.OUT_OF_RANGE]
     return FrameCounts(good, *doubts, done.total() - good, progress.initial)
 
 

@@ -1,13 +1,16 @@
-"""A recording's pressure readings: a table of a gauge's values, by the frames' names."""
+"""A recording's pressure readings: a gauge's log, by the frames' names or by time."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from ..errors import MembraneError
 from ..files.csv_table import Columns, Row, Table, read_table
 from ..files.safe_read import shortened
-from ..sensor.parts import METRE
+from ..files.timestamps import time_in
 from ..sensor.sensor import Sensor
+from ..sensor.units import hectopascal
 from .inputs import Inputs, frame_name
 
 if TYPE_CHECKING:
@@ -15,27 +18,57 @@ if TYPE_CHECKING:
 
 MOST_BYTES = 2**26
 ACROSS, SINCE_REST = "pressure", "pressure_change"
-PRESSURES = Columns([("name", ACROSS), ("name", SINCE_REST)], "reading", unit="hPa, across the membrane or since rest")
+NAME, TIME = "name", "time"
+PRESSURES = Columns(
+    [(key, kind) for key in (NAME, TIME) for kind in (ACROSS, SINCE_REST)],
+    "reading",
+    unit="hPa, across the membrane or since rest; time in seconds, or as 2026-09-27T11:38:29.25",
+)
 UNKNOWN = ("", "nan")
 """Cells of frames that have no reading."""
 KINDS = {"name": "frames", "image": "images"}
 """What a table's first column names."""
+REACH, INTERVALS = 1.0, 1.5
+"""A frame has a reading by time where one is within so many seconds, or intervals between readings if that is more."""
 
 
 class PressureReadings(NamedTuple):
-    """What a gauge read.
+    """What a gauge read, force unit / length unit^2.
 
     Attributes:
-        values: by the names of the frames, force unit / length unit^2; frames without a reading are left out.
+        values: by the names of the frames; frames without a reading are left out.
         since_rest: whether these are changes since rest, or differences across the membrane.
+        times: `[T]` seconds, increasing, of readings by time; empty of those by name.
+        series: `[T]`, the readings then.
+        unused: readings that are of no frame of the call, as far as that is known before its videos are read.
     """
 
     values: dict[str, float]
     since_rest: bool
+    times: np.ndarray = np.zeros(0)
+    series: np.ndarray = np.zeros(0)
+    unused: int = 0
+
+    def at(self, name: str, time: float) -> float:
+        """The reading of a frame, by its name or between those next to its time, s; NaN where there is none."""
+        if name in self.values or not len(self.times):
+            return self.values.get(name, np.nan)
+        near = np.isfinite(time) and np.abs(self.times - time).min() <= self.reach
+        return float(np.interp(time, self.times, self.series)) if near else np.nan
+
+    @property
+    def reach(self) -> float:
+        """How far in time a reading may be from a frame, s."""
+        return max(REACH, INTERVALS * float(np.median(np.diff(self.times)))) if len(self.times) > 1 else REACH
+
+    def plus(self, offset: float) -> "PressureReadings":
+        """The readings with something added to each."""
+        values = {name: offset + value for name, value in self.values.items()}
+        return self._replace(values=values, series=offset + self.series)
 
 
-def recording_pressures(reconstructor: "Reconstructor", path: Path, inputs: Inputs) -> dict[str, float]:
-    """The pressures across the membrane that a table holds, by the names of the frames, force unit / length unit^2.
+def recording_pressures(reconstructor: "Reconstructor", path: Path, inputs: Inputs) -> PressureReadings:
+    """The pressures across the membrane that a gauge's log holds, force unit / length unit^2.
 
     Args:
         reconstructor: the sensor's.
@@ -54,56 +87,100 @@ def recording_pressures(reconstructor: "Reconstructor", path: Path, inputs: Inpu
             "cannot be compared with them; add both to the sensor file, or find them by `torchmembrane calibrate material "
             "--pressure`"
         )
-    values, since_rest = read_pressures(path, inputs, sensor)
-    offset = float(reconstructor.rest_pressure) if since_rest else 0.0
-    return {name: offset + value for name, value in values.items()}
+    found = read_pressures(path, inputs, sensor)
+    return found.plus(float(reconstructor.rest_pressure)) if found.since_rest else found
 
 
 def read_pressures(path: Path, inputs: Inputs, sensor: Sensor) -> PressureReadings:
-    """Read a table `name,pressure` or `name,pressure_change`, hPa; 1 hPa = 100 N/m^2.
+    """Read a gauge's log: `pressure` or `pressure_change` by `name` or by `time`, hPa; 1 hPa = 100 N/m^2.
 
     Args:
-        path: of the table. A name is that of a frame or of its image file; a value may be left empty, or be nan.
+        path: of the table. A name is that of a frame or of its image file; a value may be left empty, or be nan. Readings of
+            other frames, or at other times, are counted.
         inputs: the frames.
         sensor: gives the length unit.
 
     Raises:
-        MembraneError: the table cannot be read, or has another header, a name that is no frame's, a name twice, no number.
+        MembraneError: the table cannot be read, or has another header, a name or time twice, no number, or no reading of
+            any frame.
     """
     table = read_table(path, PRESSURES, MOST_BYTES)
-    name, column = table.form
-    hectopascal = 100 / METRE[sensor.length_unit] ** 2
-    given = {frame: row for frame, row in by_frame(table, inputs).items() if row.text(column).lower() not in UNKNOWN}
-    if not given:
+    key, column = table.form
+    known = Table(table.form, [row for row in table.rows if row.text(column).lower() not in UNKNOWN])
+    if not known.rows:
         raise MembraneError(f"{path}: no readings after the header but empty ones; expected {PRESSURES.expected}")
-    return PressureReadings({frame: row.number(column) * hectopascal for frame, row in given.items()}, column == SINCE_REST)
+    one, since_rest = hectopascal(sensor.length_unit), column == SINCE_REST
+    if key == TIME:
+        return _by_time(path, known, inputs, one, since_rest)
+    given, others = by_frame(known, inputs)
+    if not given:
+        raise refusal(others[0], known, inputs)
+    values = {frame: row.number(column) * one for frame, row in given.items()}
+    return PressureReadings(values, since_rest, unused=len(others))
 
 
-def by_frame(table: Table, inputs: Inputs) -> dict[str, Row]:
-    """The lines of a table by the names of the frames that they tell of.
+def _by_time(path: Path, table: Table, inputs: Inputs, one: float, since_rest: bool) -> PressureReadings:
+    rows = sorted(((_time(row), row) for row in table.rows), key=lambda timed: timed[0])
+    times = np.array([time for time, _ in rows])
+    if len(twice := np.flatnonzero(np.diff(times) == 0)):
+        raise rows[twice[0] + 1][1].refusal(TIME, f"each time once; line {rows[twice[0]][1].line} has it as well")
+    series = np.array([row.number(table.form[1]) for _, row in rows]) * one
+    readings = PressureReadings({}, since_rest, times, series)
+    if inputs.videos:
+        return readings
+    taken = np.array([time_in(image.stem) for image in inputs.images])
+    if np.isnan(taken).all():
+        raise MembraneError(
+            f"{path}: readings by time, and no image's name says when it was taken; expected names such as "
+            "press_20260927T113829.250.png, or a table with a column name in place of time"
+        )
+    taken = taken[np.isfinite(taken)]
+    near = np.abs(times[:, None] - taken).min(1) <= readings.reach
+    if not near.any():
+        raise MembraneError(
+            f"{path}: no reading is within {readings.reach:g} s of an image: readings from {times[0]:.3f} to {times[-1]:.3f}, "
+            f"images from {taken.min():.3f} to {taken.max():.3f} s since 1970; expected the times of one clock, dates as UTC"
+        )
+    return readings._replace(unused=int((~near).sum()))
+
+
+def _time(row: Row) -> float:
+    """The time of a reading, s."""
+    text = row.text(TIME)
+    dated = time_in(text)
+    return row.number(TIME) if np.isnan(dated) or text.replace(".", "").isdigit() else dated
+
+
+def by_frame(table: Table, inputs: Inputs) -> tuple[dict[str, Row], list[Row]]:
+    """The lines of a table by the names of the frames that they tell of, and the lines that tell of none.
 
     Args:
         table: whose first column holds names of frames, or of their image files.
         inputs: the frames.
 
     Raises:
-        MembraneError: a name that is no frame's, or that stands there twice.
+        MembraneError: a name that stands there twice.
     """
     column = table.form[0]
     names = [(image.name, frame_name(image)) for image in inputs.images]
     frames = dict(names) | {name: name for _, name in names}
     found: dict[str, Row] = {}
+    others: dict[str, Row] = {}
     for row in table.rows:
-        said = row.text(column)
-        name, quoted = frames.get(said, said), shortened(repr(said))
-        if said not in frames and inputs.video_of(name) is None:
-            raise MembraneError(f"{row.where}: {quoted} is none of the {KINDS[column]}; expected {_known(inputs)}")
-        if name in found:
-            raise MembraneError(f"{row.where}: {quoted} stands there twice, also in line {found[name].line}; expected it once")
-        found[name] = row
-    return found
+        if not (said := row.text(column)):
+            raise row.refusal(column, f"a name of one of the {KINDS[column]}")
+        name = frames.get(said, said)
+        lines = found if said in frames or inputs.video_of(name) else others
+        if name in lines:
+            quoted = shortened(repr(said))
+            raise MembraneError(f"{row.where}: {quoted} stands there twice, also in line {lines[name].line}; expected it once")
+        lines[name] = row
+    return found, list(others.values())
 
 
-def _known(inputs: Inputs) -> str:
+def refusal(row: Row, table: Table, inputs: Inputs) -> MembraneError:
+    """The error for a line that tells of no frame."""
+    column = table.form[0]
     names = [image.name for image in inputs.images[:1]] + [f"{frame_name(video)}_000000" for video in inputs.videos[:1]]
-    return f"their names, as {' or '.join(names)}"
+    quoted = shortened(repr(row.text(column)))
+    return MembraneError(f"{row.where}: {quoted} is none of the {KINDS[column]}; expected their names, as {' or '.join(names)}")

@@ -122,7 +122,7 @@ class ResultFolder:
             return origin.is_of(file)
 
         files = {name: file for name in sorted(origins, key=in_order) if (file := self._file_of(name))}
-        changed = [name for name, file in files.items() if not is_of(origins[name], file)]
+        changed = [name for name, file in files.items() if not is_of(origins[name]._replace(time=0.0), file)]
         self.finished.difference_update(changed)
         damaged = [path for path in self.frames.damaged if path.parent != self.path or self._file_of(path.stem)]
         unknown = [name for name in files if not origins[name].content_hash]

@@ -1,1 +1,1 @@
-"""One camera, followed as it goes: the newest frame is reconstructed, older ones are dropped rather than waited for."""
+"""A live camera: the newest frame is reconstructed, and frames that arrive during a reconstruction are dropped."""

@@ -1,7 +1,7 @@
 """Images as they come: of a camera, or of files at a pace."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,24 +40,40 @@ def camera_images(camera: int | str, size: tuple[int, int]) -> Iterator[np.ndarr
     Raises:
         MembraneError: OpenCV is missing or cannot open it; it gives images of another size, or none any more.
     """
+    return images_of(opened_camera(camera, size), camera, size)
+
+
+def opened_camera(camera: int | str, size: tuple[int, int] | None) -> Any:
+    """A `cv2.VideoCapture` of a camera.
+
+    Args:
+        camera: as of `camera_images`.
+        size: width and height that are asked for, px; None: the camera's own.
+
+    Raises:
+        MembraneError: OpenCV is missing or cannot open it.
+    """
     cv2 = load_opencv("cameras need OpenCV")
     opened = cv2.VideoCapture(camera)
     if not opened.isOpened():
         raise MembraneError(f"--camera {camera}: cannot be opened; expected a camera's number, 0 the first, or its path")
-    opened.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
-    opened.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+    if size is not None:
+        opened.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+        opened.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
     opened.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # images and videos are not turned either
-    return _read(opened, camera, size)
+    return opened
 
 
-def _read(opened: Any, camera: int | str, size: tuple[int, int]) -> Iterator[np.ndarray]:
+def images_of(opened: Any, camera: int | str, size: tuple[int, int] | None) -> Generator[np.ndarray, None, None]:
+    """The images of an opened camera, as of `camera_images`, until it gives none any more; then it is released."""
     missed = 0
     try:
         while missed < MOST_MISSED:
             taken, image = opened.read()
             if taken:
                 missed = 0
-                yield _checked(_red_first(image, camera), size, f"--camera {camera}")
+                image = _red_first(image, camera)
+                yield image if size is None else _checked(image, size, f"--camera {camera}")
             else:
                 missed += 1
                 time.sleep(BREATH)

@@ -17,6 +17,7 @@ import torch
 from onnx import TensorProto, helper
 from torch import Tensor, nn
 
+from .. import __version__
 from ..control_flow import FUNCTIONS, Value
 from ..errors import MembraneError, check_arguments
 from ..files.atomic import write_bytes
@@ -27,7 +28,7 @@ from ..results.store import FORMATS, Mesh, Settings
 from .check import checked
 from .graph import Assembly, described, inlined
 from .torch_internals import tree_flatten, tree_leaves, tree_map, tree_unflatten
-from .trace import traced_model
+from .trace import EXPORTER, traced_model
 
 FORMAT = 1
 SEAL = "SHA-256: "
@@ -175,9 +176,9 @@ def export(
 
     Standard operators only, batch free, float32, but for the solve of slack sheets, float64. Run on the sensor at rest and
     pressed, both simulated, it must give torch's statuses, and vertices within 3e-5 of the surface's size. The model's metadata
-    hold `format`, `status_texts` and `mesh` (the fields of `Mesh`) as JSON, and `bits` where the sensor's camera states them:
-    images of 16 bits are then divided by `2^bits - 1` before they are given to the model. The file ends in its digest
-    (`sealed`).
+    hold `format`, `version` (this package's), `status_texts` and `mesh` (the fields of `Mesh`) as JSON, and `bits` where the
+    sensor's camera states them: images of 16 bits are then divided by `2^bits - 1` before they are given to the model. The file
+    ends in its digest (`sealed`).
 
     Args:
         reconstructor: the sensor's.
@@ -205,7 +206,8 @@ def export(
     if tracking and reconstructor.observer.locator.follows:
         inputs.append(tracer.given("previous_pixels", reconstructor.rest_pixels.repeat(EXAMPLES, 1, 1)))
     values: Any = inputs  # stand for tensors
-    result: Any = reconstructor.reconstruct_grey(*values)
+    with EXPORTER.at_work():
+        result: Any = reconstructor.reconstruct_grey(*values)
     model = _finished(tracer, inputs, result, reconstructor)
     progress(CHECK, "check against torch")
     checked(model.SerializeToString(), reconstructor)
@@ -246,7 +248,7 @@ def metadata_of(reconstructor: Reconstructor) -> dict[str, str]:
     mesh = Mesh.of(reconstructor, Settings.of(reconstructor, FORMATS[0]))._asdict()
     plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in mesh.items()}
     texts = {str(status.value): status.text for status in Status}
-    metadata = {"format": str(FORMAT), "name": mesh["name"], "length_unit": mesh["length_unit"]}
+    metadata = {"format": str(FORMAT), "version": __version__, "name": mesh["name"], "length_unit": mesh["length_unit"]}
     bits = reconstructor.sensor.camera.bits
     metadata |= {} if bits is None else {"bits": str(bits)}
     return metadata | {"force_unit": mesh["force_unit"], "status_texts": json.dumps(texts), "mesh": json.dumps(plain)}

@@ -5,11 +5,13 @@ times as long. Private parts may change with every version of torch: `CHECKED` a
 `tests/test_torch_internals.py` names each one that is missing or works differently.
 """
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
+import onnx
 import torch
 from torch import Tensor, nn
 
@@ -19,12 +21,18 @@ CHECKED = ("2.13.0",)
 """Versions of torch."""
 
 try:
+    from onnx_ir.schemas import OpSignature
+    from torch._dispatch.python import enable_python_dispatcher
+    from torch._functorch.aot_autograd import FQN, GraphSignature
     from torch._subclasses.fake_tensor import FakeTensorMode
+    from torch._subclasses.functional_tensor import FunctionalTensorMode, dispatch_functionalize
     from torch.export import _trace
     from torch.export.exported_program import (
         _override_composite_implicit_decomp,
         _split_decomp_table_to_cia_and_python_decomp,
     )
+    from torch.fx.experimental.proxy_tensor import make_fx
+    from torch.nn.utils.stateless import _reparametrize_module
     from torch.onnx._internal.exporter import _fx_passes
     from torch.onnx._internal.exporter._decomp import (
         create_onnx_friendly_decomposition_table,
@@ -83,6 +91,7 @@ class TorchExporter:
     def __init__(self, translations: dict[Any, Callable[..., Any]]) -> None:
         self.translations = translations
         self._registries: dict[Any, ONNXRegistry] = {}
+        self._is_at_work = False
         self._from_torchlib = ONNXRegistry.from_torchlib
 
     def _registry(self, **options: Any) -> ONNXRegistry:
@@ -101,29 +110,103 @@ class TorchExporter:
         return _split_decomp_table_to_cia_and_python_decomp(table)
 
     def captured(self, module: nn.Module, examples: tuple[Tensor, ...]) -> torch.export.ExportedProgram:
-        """The module as a program of operators that ONNX has.
+        """The module as a program of operators that ONNX has; to be called within `at_work`.
 
         Torch's exporter captures a program of its own operators first, and decomposes these in a second step.
         """
-        kept, decomposed = self._decompositions
+        _, decomposed = self._decompositions
         at_once = partial(_trace._export_to_aten_ir, decomp_table=decomposed)
         with ExitStack() as stack:
             stack.enter_context(replaced(_trace, "_export_to_aten_ir", at_once))
+            stack.enter_context(replaced(_trace, "_aot_export_joint_with_descriptors", _captured_once))
             stack.enter_context(replaced(torch.fx.config, "do_not_emit_stack_traces", True))  # no model holds them
-            stack.enter_context(_override_composite_implicit_decomp(kept))
             return _trace._export(module, examples, strict=False, pre_dispatch=False)
 
     @contextmanager
     def at_work(self) -> Iterator[None]:
-        """Within, `torch.onnx.export` of a program that is `captured` leaves out what it would repeat."""
+        """Within, `torch.onnx.export` of a program that is `captured` leaves out what it would repeat.
+
+        It may stand within another one, which has prepared everything then.
+        """
+        if self._is_at_work:
+            yield
+            return
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # of torchvision, which is not needed
         with ExitStack() as stack:
+            self._is_at_work = True
+            stack.callback(setattr, self, "_is_at_work", False)
+            stack.enter_context(_override_composite_implicit_decomp(self._decompositions[0]))
             for owner, name, value in (
                 (ONNXRegistry, "from_torchlib", staticmethod(self._registry)),
                 (_TypePromotionInterpreter, "run_node", _promoted),
                 (_fx_passes, "decompose_with_registry", _as_it_is),
+                (OpSignature, "from_op_schema", staticmethod(_signature)),
             ):
                 stack.enter_context(replaced(owner, name, value))
             yield
+
+
+def _captured_once(
+    stack: ExitStack,
+    module: nn.Module,
+    args: tuple[Any, ...],
+    *,
+    kwargs: dict[str, Any],
+    decompositions: dict[Any, Any],
+    **_: Any,
+) -> tuple[torch.fx.GraphModule, GraphSignature]:
+    """The operators of a module that changes none of its tensors, and what its inputs and outputs are.
+
+    Torch's own function runs the module a first time, to find what it changes.
+    """
+    parameters, buffers = ([FQN(name) for name, _ in named()] for named in (module.named_parameters, module.named_buffers))
+    held = [*parameters, *buffers]
+
+    def function(*tensors: Tensor) -> Any:
+        with _reparametrize_module(module, dict(zip(held, tensors, strict=False))):
+            return module(*tensors[len(held) :])
+
+    mode = FunctionalTensorMode(export=True)
+    tensors = [*(module.get_parameter(name) for name in parameters), *(module.get_buffer(name) for name in buffers), *args]
+    with enable_python_dispatcher():
+        graph = make_fx(dispatch_functionalize(function, mode), decompositions, _disable_torch_fn_metadata_mode=True)(*tensors)
+    graph.graph.eliminate_dead_code()
+    graph.recompile()
+    *nodes, output = graph.graph.nodes
+    for node in nodes:
+        node.meta.setdefault("nn_module_stack", {})  # the modules that it stands in, which the model does not tell
+    inputs = [node.name for node in nodes if node.op == "placeholder"]
+    returned, structure = tree_flatten(output.args[0])
+    signature = GraphSignature(
+        parameters=parameters,
+        buffers=buffers,
+        user_inputs=inputs[len(held) :],
+        user_outputs=[node.name for node in returned],
+        inputs_to_parameters=dict(zip(inputs, parameters, strict=False)),
+        inputs_to_buffers=dict(zip(inputs[len(parameters) :], buffers, strict=False)),
+        buffers_to_mutate={},
+        parameters_to_mutate={},
+        user_inputs_to_mutate={},
+        in_spec=tree_flatten((args, kwargs))[1],
+        out_spec=structure,
+        backward_signature=None,
+        input_tokens=[],
+        output_tokens=[],
+    )
+    return graph, signature
+
+
+_from_op_schema = OpSignature.from_op_schema
+
+
+@cache
+def _signature_of(name: str, domain: str, version: int) -> OpSignature:
+    return _from_op_schema(onnx.defs.get_schema(name, version, domain))
+
+
+def _signature(schema: onnx.defs.OpSchema) -> OpSignature:
+    """What an operator of ONNX takes. Torch's exporter reads it anew for every node."""
+    return _signature_of(schema.name, schema.domain, schema.since_version)
 
 
 def _as_it_is(program: torch.export.ExportedProgram, registry: ONNXRegistry) -> torch.export.ExportedProgram:

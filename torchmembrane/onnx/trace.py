@@ -1,6 +1,5 @@
 """One piece of torch as an ONNX graph of its own, the length of the batch free."""
 
-import logging
 import warnings
 from typing import Any
 
@@ -70,7 +69,6 @@ def traced_model(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str
     Raises:
         ValueError: a number, not a length, depends on the batch's length.
     """
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     examples = empty_batches(inputs.values(), MANY)
     with warnings.catch_warnings(), EXPORTER.at_work(), writing():
         warnings.simplefilter("ignore")  # of the exporter about itself

@@ -1,4 +1,4 @@
-"""What to expect of a sensor, drawn: errors over force and depth, two touches told apart."""
+"""What to expect of a sensor, drawn: errors over force and depth, two contacts resolved."""
 
 from collections.abc import Sequence
 from typing import Any

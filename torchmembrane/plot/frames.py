@@ -49,7 +49,7 @@ def figure(
         places: for panels, 4 or 3; default: as many as there are. Films need figures of one size.
 
     Returns:
-        A figure of three panels, or four; of a frame without a surface its flow, and the reason in words.
+        A figure of three panels, or four; of a frame without a surface its flow in their place, and the reason in words.
 
     Example:
         >>> from dataclasses import replace
@@ -65,18 +65,19 @@ def figure(
     good = bool(np.isfinite(frame["vertices"]).all())
     forces = good and np.any(frame["traction"])
     square = (places or (4 if forces else 3)) == 4
-    drawing, grid = panels(2, rows=2) if square else panels(3)
+    drawing, grid = panels(2, rows=2) if square else panels(3 if good or places else 2)
     headline = _title(frame, mesh, name)
     fitting = 72 * drawing.get_figwidth() / (WIDEST_LETTER * len(headline))
-    drawing.suptitle(headline, fontsize=min(HEADLINE, fitting), color="k" if good else VERMILION)
-    draw_flow(drawing.add_subplot(grid[0]), frame, mesh, image)
+    colour = "k" if int(frame["status"]) == Status.OK else VERMILION
+    drawing.suptitle(headline, fontsize=min(HEADLINE, fitting), color=colour)
+    draw_flow(flow := drawing.add_subplot(grid[0] if good else grid[:, :]), frame, mesh, image)
     if good:
         draw_side(drawing.add_subplot(grid[1]), frame, mesh)
         draw_displacement(drawing.add_subplot(grid[2]), frame, mesh)
         if forces:
             draw_traction(drawing.add_subplot(grid[3]), frame, mesh)
     else:
-        _draw_failure(drawing.add_subplot(grid[1, :] if square else grid[0, 1:]), frame)
+        flow.set_title(_failure(frame), fontsize=12)
     return drawing
 
 
@@ -134,7 +135,7 @@ def draw_side(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
 def draw_displacement(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
     """Displacement along the rest normals where the rest vertices lie in the image; deepest point o, contacts x."""
     depth, place, unit = mesh.normal_displacement(frame), mesh.vertex_pixels, mesh.length_unit
-    limit = max(np.abs(depth).max(), _least(mesh))
+    limit = max(np.abs(depth).max(), least_displacement(mesh))
     triangulation = Triangulation(place[:, 0], place[:, 1], mesh.triangles)
     marks = MaxNLocator(9, steps=(1, 2, 5, 10), symmetric=True).tick_values(-limit, limit)
     marks = marks[np.abs(marks) < limit]
@@ -150,13 +151,13 @@ def draw_displacement(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> N
         nearest = np.linalg.norm(frame["vertices"] - point, axis=1).argmin()
         axes.plot(*place[nearest], "x", ms=10, color="k", mew=2)
     if _is_pressed(mesh, frame):
-        deepest, decimals = depth.argmin(), int(-np.floor(np.log10(_least(mesh))))
+        deepest, decimals = depth.argmin(), int(-np.floor(np.log10(least_displacement(mesh))))
         axes.plot(*place[deepest], "o", ms=9, mfc="none", mec="k", mew=1.6)
         _annotate(axes, f"{depth[deepest]:+.3g} {unit}", place[deepest], mesh.image_size)
         where = ", ".join(f"{c:.{max(decimals, 0)}f}" for c in frame["vertices"][deepest])
         axes.set_title(f"Deepest at x, y, z = {where} {unit}")
     else:
-        axes.set_title(f"Not pressed in by {_least(mesh):.1g} {unit} anywhere")
+        axes.set_title(f"Not pressed in by {least_displacement(mesh):.1g} {unit} anywhere")
 
 
 def draw_traction(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
@@ -199,13 +200,13 @@ def _colour_bar(axes: Axes, shades: TriContourSet, ticks: np.ndarray | None = No
     return bar
 
 
-def _least(mesh: Mesh) -> float:
+def least_displacement(mesh: Mesh) -> float:
     """The displacement under which nothing is marked and the colour scale does not shrink."""
     return LEAST_SCALE * float(np.ptp(mesh.rest_vertices, 0).max())
 
 
 def _is_pressed(mesh: Mesh, frame: dict[str, np.ndarray]) -> bool:
-    return bool(mesh.normal_displacement(frame).min() < -_least(mesh))
+    return bool(mesh.normal_displacement(frame).min() < -least_displacement(mesh))
 
 
 def _title(frame: dict[str, np.ndarray], mesh: Mesh, name: str) -> str:
@@ -219,14 +220,12 @@ def _title(frame: dict[str, np.ndarray], mesh: Mesh, name: str) -> str:
     return "    ".join(words)
 
 
-def _draw_failure(axes: Axes, frame: dict[str, np.ndarray]) -> None:
-    axes.set_axis_off()
-    headline, _, remedy = Status(int(frame["status"])).text.removesuffix("; no surface").partition(": ")
+def _failure(frame: dict[str, np.ndarray]) -> str:
+    """Why a frame has no surface, beside its headline."""
+    _, _, remedy = Status(int(frame["status"])).text.removesuffix("; no surface").partition(": ")
     found = frame["confidence"] > 0
     count = f"{found.sum()} of {found.size} markers found"
-    words = {"no surface for this frame": 24, headline: 17, remedy: 13, count: 13}
-    for line, (text, size) in enumerate(words.items()):
-        axes.text(0.5, 0.68 - 0.1 * line, text, ha="center", fontsize=size, color="k" if line else VERMILION)
+    return "; ".join(filter(None, ["no surface for this frame", remedy, count]))
 
 
 def _annotate(axes: Axes, text: str, place: np.ndarray, size: np.ndarray) -> None:

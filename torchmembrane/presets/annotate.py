@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..files.atomic import write_text
-from ..sensor.parts import METRE, millimetre
+from ..sensor.units import METRE, millimetre
 
 WORDS = {
     "": {
@@ -22,10 +22,14 @@ WORDS = {
         "distortion": "OpenCV's coefficients; `calibrate camera` finds all of these from a checkerboard",
     },
     "membrane": {
-        "shape": "spherical_cap | ellipsoid_cap | half_cylinder | grid | heightfield",
+        "shape": "spherical_cap | ellipsoid_cap | half_cylinder | grid | heightfield | inflated",
         "grid": "vertices of the solver; leave the line out for the default",
         "rim_radius": "of the fixed circle",
-        "height": "of the pole over the rim's plane",
+        "height": "of the pole, or of a blown up sheet's highest point, over the rim's plane",
+        "outline": "rectangle | ellipse, with size; or a file of the rim's points once around, x,y or x,y,z",
+        "size": "of the rim along x and y",
+        "corner": "radius of the rectangle's corners",
+        "overpressure": "inside over outside at rest, hPa, in place of the height",
         "base_z": "the rim's plane, from the camera's centre of projection along its axis; less than 0: behind a fisheye",
         "semi_axes": "along x, y, z",
         "radius": "of the cylinder",
@@ -67,6 +71,11 @@ FURTHER = """\
 # translation = [0.0, 0.0, 0.0]"""
 OF_EXAMPLES = {"thickness": 0.5, "distance": 2.0, "window": 3.0}  # mm, of the keys that are commented out
 MODULUS = 0.3  # N / mm^2
+OF_SHEETS = {
+    "prestretch": "of the sheet in its rim before it is blown up, over the unstretched sheet, 1 or more",
+    "thickness": "of the sheet in its rim before it is blown up: unstretched, over prestretch^2",
+}
+"""Of `[material]` where the shape is "inflated"."""
 
 
 def annotate(path: Path, said: Sequence[str], relative: bool, unit: str) -> None:
@@ -80,12 +89,13 @@ def annotate(path: Path, said: Sequence[str], relative: bool, unit: str) -> None
     """
     one = millimetre(unit)
     examples = {name: length * one for name, length in OF_EXAMPLES.items()} | {"modulus": MODULUS / one**2}
-    table, lines = "", [f"# {sentence}" for sentence in said]
-    for line in path.read_text(encoding="utf-8").splitlines():
+    table, lines, content = "", [f"# {sentence}" for sentence in said], path.read_text(encoding="utf-8")
+    words = WORDS | {"material": WORDS["material"] | OF_SHEETS} if 'shape = "inflated"' in content else WORDS
+    for line in content.splitlines():
         if head := re.fullmatch(r"\[+([\w.]+)\]+", line):
             table = head[1]
         key = line.partition(" = ")[0]
-        word = WORDS.get(table, {}).get(key)
+        word = words.get(table, {}).get(key)
         lines.append(f"{line}  # {word}" if word else line)
         if table == "material" and key == "prestretch" and relative:
             lines.append(RELATIVE.format(**examples))

@@ -11,9 +11,10 @@ from ..files.digits import rounded
 from ..files.images import to_grey
 from ..mechanics.cavity import rest_balance
 from ..sensor.factories import elastic_energy
-from ..sensor.parts import METRE, Cavity, Markers, Material, Surface
+from ..sensor.parts import Cavity, Markers, Material, Surface
 from ..sensor.sensor import Sensor
 from ..sensor.toml import default_grid
+from ..sensor.units import METRE
 from ..simulate.appearance import noisy
 from ..simulate.render import Renderer
 from . import NAMES

@@ -10,6 +10,7 @@ from ..errors import MembraneError
 from ..files.csv_table import ANGLE, ANY, Columns, read_table
 from ..files.digits import rounded
 from ..markers.placement import FEWEST_MARKERS
+from ..sensor.inflated import InflatedSurface
 from ..sensor.parts import OFF_SURFACE, Surface
 from ..sensor.toml import COORDINATE, MOST_DOTS, MOST_DOTS_BYTES, SIZES
 
@@ -43,7 +44,7 @@ def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.
     form, rows = read_table(path, DOTS, MOST_DOTS_BYTES)
     values = np.array([row.numbers(form, LIMITS[form[0]]) for row in rows])
     sizes = [row.choice(SIZE, SIZES) if SIZE in row.places else SIZES[0] for row in rows]
-    base_z = surface.values["base_z"]
+    base_z = rim_z(surface)
     if form == ("x", "y", "z"):
         _refuse_heights(path, surface, values)
         positions = values
@@ -59,9 +60,17 @@ def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.
     return rounded(positions), sizes
 
 
+def rim_z(surface: Surface) -> float:
+    """The z of the rim's plane; of a tilted or bent rim that of its middle."""
+    if isinstance(surface, InflatedSurface):
+        return float(surface.rim[:, 2].mean())
+    base_z: float = surface.values["base_z"]
+    return base_z
+
+
 def _refuse_heights(path: Path, surface: Surface, values: np.ndarray) -> None:
     """Refuse positions `[D, 3]` that lie on the membrane if they are taken from the rim's plane."""
-    membrane, base_z = surface.membrane(FINE), surface.values["base_z"]
+    membrane, base_z = surface.membrane(FINE), rim_z(surface)
     off, off_as_heights = (membrane.closest_points(points).distance.max() for points in (values, values + [0.0, 0.0, base_z]))
     if off_as_heights < OFF_SURFACE * membrane.size < off:
         raise MembraneError(

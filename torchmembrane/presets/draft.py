@@ -11,9 +11,12 @@ from ..errors import MembraneError
 from ..markers.placement import FEWEST_MARKERS
 from ..mechanics.cavity import rest_balance
 from ..mechanics.hyperelastic import ElasticEnergy
-from ..sensor.parts import METRE, Material, Surface
+from ..sensor.inflated import InflatedSurface
+from ..sensor.parts import Material, Surface
 from ..sensor.toml import MOST_DOTS
+from ..sensor.units import hectopascal
 from ..surface.membrane import Membrane
+from .blown_up import DISAGREEMENT, sheet_dots
 from .design import cylinder_dots, dome_dots
 
 SHAPES: dict[str, tuple[str, ...]] = {
@@ -22,10 +25,13 @@ SHAPES: dict[str, tuple[str, ...]] = {
     "bubble": ("radius", "height"),
     "fingertip": ("semi_axes",),
     "half_cylinder": ("radius", "length"),
+    "rectangle": ("size", "height"),
+    "ellipse": ("size", "height"),
+    "outline": ("height",),
 }
-"""The shapes that are drafted, and the lengths that each needs."""
+"""The shapes that are drafted, and the lengths that each needs; the last three are sheets that are blown up, `blown_up`."""
+SHEETS = ("rectangle", "ellipse", "outline")
 ASSUMED_PRESTRETCH = 1.2
-DISAGREEMENT = 0.1  # between the overpressure stated and the one that the material holds, relative: above, it is said
 LARGEST_STRETCH = 4.0
 DECIMALS = 9  # of a distance
 PITCHES = 11  # of dots across the square root of the area, where nothing else is said
@@ -33,7 +39,7 @@ PRESSURE_UNITS = {"Pa": 0.01, "hPa": 1.0, "mbar": 1.0, "kPa": 10.0, "bar": 1000.
 
 
 def drafted_surface(shape: str, numbers: Mapping[str, float | list[float]], base_z: float) -> Surface:
-    """The rest surface of one of `SHAPES`.
+    """The rest surface of one of `SHAPES` that is no sheet.
 
     Args:
         shape: "dome" (half a sphere) | "cap" | "bubble" (a cap of gas) | "fingertip" (half an ellipsoid) | "half_cylinder".
@@ -126,7 +132,7 @@ def overpressure(membrane: Membrane, material: Material, unit: str) -> float:
         71
     """
     energy = ElasticEnergy(membrane, material.model, material.prestretch, material.modulus, material.c2_ratio or 0.0)
-    return float(rest_balance(membrane, energy)[0]) * METRE[unit] ** 2 / 100
+    return float(rest_balance(membrane, energy)[0]) / hectopascal(unit)
 
 
 def balanced(
@@ -247,6 +253,8 @@ def drafted_dots(surface: Surface, pitch: float | None = None) -> tuple[np.ndarr
 
 def _pattern(surface: Surface, pitch: float) -> tuple[np.ndarray, list[str]]:
     v = surface.values
+    if isinstance(surface, InflatedSurface):
+        return sheet_dots(surface, pitch)
     if surface.shape == "half_cylinder":
         return cylinder_dots(v["radius"], v["length"], math.radians(v["half_angle"]), v["base_z"], pitch)
     if surface.shape == "ellipsoid_cap":

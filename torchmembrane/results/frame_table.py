@@ -13,7 +13,7 @@ import numpy as np
 from ..files.atomic import make_subfolder, whole_file
 from ..files.optional import load_pyarrow
 from ..files.order import in_order
-from ..files.parquet import read_table, refusal
+from ..files.parquet import nested, read_table, refusal
 from ..files.provenance import Origin
 from ..files.safe_read import DAMAGE
 from .npz import Stored
@@ -52,7 +52,7 @@ class FrameTable:
     def __init__(self, folder: Path, mesh: Mesh, gate: AbstractContextManager[Any]):
         self.arrow, self.parquet = load_pyarrow()
         self.folder, self.mesh, self.gate = folder, mesh, gate
-        self.metadata = {key: getattr(mesh, key) for key in ("length_unit", "force_unit", "name", "sensor")}
+        self.metadata = {key: getattr(mesh, key) for key in ("length_unit", "force_unit", "name", "sensor", "record")}
         self.damaged: list[Path] = []
         self.part_rows = max(1, min(PART_ROWS, PART_BYTES // (60 * len(mesh.rest_vertices) + 30 * len(mesh.rest_pixels) + 300)))
         self._waiting: dict[str, Stored] = {}
@@ -189,17 +189,11 @@ class FrameTable:
         arrays = [stored.arrays() for stored in rows.values()]
         values = {key: np.stack([row[key] for row in arrays]) for key in (*Origin._fields, "seconds", *Reconstruction._fields)}
         shapes = {key: list(values[key].shape[1:]) for key in Reconstruction._fields}
-        columns = {key: self._nested(value) for key, value in values.items()}
+        columns = {key: nested(value) for key, value in values.items()}
         words = [Status(status).text for status in values["status"]]
         columns |= {"name": self.arrow.array(list(rows)), "status_text": self.arrow.array(words)}
         table = self.arrow.table({key: columns[key] for key in COLUMNS})
         return table.replace_schema_metadata(self.metadata | {"shapes": json.dumps(shapes)})
-
-    def _nested(self, values: np.ndarray) -> Any:
-        column = self.arrow.array(values.ravel())
-        for size in reversed(values.shape[1:]):
-            column = self.arrow.FixedSizeListArray.from_arrays(column, size)
-        return column
 
 
 def read_part(part: Path) -> dict[str, Frame]:

@@ -27,10 +27,15 @@ class Status(IntEnum):
     BLANK = 4, "blank or saturated image: no contrast; no surface"
     BAD_VALUES = 5, "image holds NaN, infinity or values outside 0..1; no surface"
     NO_SOLUTION = 6, "the solve broke down: the flow folds the surface or is far too large; no surface"
-    UNEXPLAINED = 7, "the markers move as no surface of this sensor does (camera moved? wrong sensor file?): do not rely on it"
+    UNEXPLAINED = (
+        7,
+        "the markers move as no surface of this sensor does: look at the rest image first (has the camera moved since?), then "
+        "at the rest shape, then at the camera; do not rely on it",
+    )
     HIDDEN = 8, "a part of the membrane is hidden: the answer is kept, there it is a guess"
+    OUT_OF_RANGE = 9, "beyond the range in which this sensor's answers were shown right: the answer is kept, do not rely on it"
 
     @property
     def has_surface(self) -> bool:
         """Whether the frame keeps its answer; all others are NaN."""
-        return self in (Status.OK, Status.NOT_CONVERGED, Status.UNEXPLAINED, Status.HIDDEN)
+        return self in (Status.OK, Status.NOT_CONVERGED, Status.UNEXPLAINED, Status.HIDDEN, Status.OUT_OF_RANGE)

@@ -88,6 +88,7 @@ class Mesh(NamedTuple):
     estimator, energy, element, format, volume, flow, smoothing, locator, rest, pressure, pressure_noise    the `Settings`
     camera_in_tool  [3, 4]  rotation and translation from the camera's frame to the tool's, `p_tool = R p + t`; [0, 4] where the
                             sensor file has no `[tool]`; `tool` gives it as a `Pose`
+    record          `[record]` of the sensor file as JSON: serial, calibrated, images, by, uncertainty; empty without
     """
 
     rest_vertices: np.ndarray
@@ -114,6 +115,7 @@ class Mesh(NamedTuple):
     pressure: str = ""
     pressure_noise: float = 0.0
     camera_in_tool: np.ndarray = np.zeros((0, 4), np.float32)
+    record: str = ""
 
     @classmethod
     def of(cls, reconstructor: ResultMaker, settings: Settings) -> "Mesh":
@@ -134,6 +136,7 @@ class Mesh(NamedTuple):
             sensor=sensor.fingerprint,
             **settings._asdict(),
             camera_in_tool=_rows(sensor.tool),
+            record=sensor.record.text,
         )
 
     @classmethod

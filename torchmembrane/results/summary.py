@@ -1,14 +1,13 @@
-"""summary.csv: one row for every frame of a folder of results."""
+"""summary.csv: one row for every frame of a folder of results, and beside it the dictionary of its columns."""
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from ..errors import MembraneError
 from ..files.atomic import whole_file
 from ..files.order import in_order
 from ..files.provenance import printable
@@ -16,34 +15,25 @@ from ..files.safe_read import regular_size
 from .npz import Stored
 from .status import Status
 from .store import Mesh
+from .summary_row import NAMES, TEXT, Column, cell, escaped, in_units, numbers, unescaped
 
-SUMMARY = "summary.csv"
+SUMMARY, DICTIONARY = "summary.csv", "summary_columns.csv"
 EXPECTED = "a table of results: delete it, it is made from the frames"
 MOST_BYTES = 2**30
 LONGEST_LINE = 2**16
 UNREADABLE = -1
 """Status of a file that gave no image, hence no result."""
-OF_FILE = ("name", "file", "status", "status_text")
-OF_FRAME = (
-    *("markers_found", "markers_total", "residual_px", "pressure", "pressure_change"),
-    *("force", "force_x", "force_y", "force_z", "contacts", "contact_x", "contact_y", "contact_z", "contact_force"),
-    *("deepest", "deepest_x", "deepest_y", "deepest_z", "volume_error", "seconds", "content_hash"),
-)
-UNITS = ("length_unit", "force_unit")
-COLUMNS = (*OF_FILE, *OF_FRAME, *UNITS)
-TEXT = ("name", "file", "status_text", "content_hash", *UNITS)
-"""Columns of text, which the names of files, damaged images, results and `mesh.npz` give."""
-FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
-"""What a spreadsheet takes for a formula when a cell begins with it, spaces aside: such a text gets a ' before it."""
 
 
 class Summary:
     """summary.csv, made from the frames; the file itself tells only of unreadable ones, and of other shards' frames.
 
+    Beside it, summary_columns.csv says what each column means, and its unit.
+
     Args:
         folder: the folder of results.
         mesh: what its frames share.
-        gate: held while the file is changed.
+        gate: held while the files are changed.
     """
 
     def __init__(self, folder: Path, mesh: Mesh, gate: AbstractContextManager[Any]):
@@ -53,38 +43,50 @@ class Summary:
     def add(self, name: str, stored: Stored) -> None:
         """A row from a stored frame."""
         frame, origin, seconds = stored
-        depth, lowest, patches = self.mesh.normal_displacement(frame), [np.nan] * 4, np.isfinite(frame["contact_points"]).all(1)
-        if np.isfinite(depth).all():
-            lowest = [depth.min(), *frame["vertices"][depth.argmin()]]
-        strongest = [*frame["contact_points"][0], np.linalg.norm(frame["contact_force"][0])] if patches.size else [np.nan] * 4
-        status, found = int(frame["status"]), frame["confidence"] > 0
-        before = [*(frame[key] for key in ("residual", "pressure", "pressure_change")), np.linalg.norm(frame["force"])]
-        cells = [
-            *map(_number, [*before, *frame["force"]]),
-            patches.sum(),
-            *map(_number, [*strongest, *lowest, frame["volume_error"], seconds]),
-        ]
-        self._set(name, origin.path, status, Status(status).text, found.sum(), found.size, *cells, origin.content_hash)
+        mesh, status = self.mesh, int(frame["status"])
+        found = numbers(frame, mesh.rest_normals, mesh.length_unit, mesh.force_unit) | {"time": origin.time, "seconds": seconds}
+        texts = {"file": origin.path, "status_text": Status(status).text, "content_hash": origin.content_hash}
+        self._set(name, status, texts | {key: cell(key, value) for key, value in found.items()})
 
     def add_unreadable(self, name: str, file: Path, reason: str) -> None:
         """A row for a file that gave no image."""
-        self._set(name, printable(str(file)), UNREADABLE, f"unreadable: {reason}", *[""] * len(OF_FRAME))
+        self._set(name, UNREADABLE, {"file": printable(str(file)), "status_text": f"unreadable: {reason}"})
 
     def write(self, kept: Callable[[dict[str, str]], bool] = lambda row: True) -> None:
         """Write the rows added since the last time beside those of the file that are kept, in name order."""
         with self.gate:
             rows = {row["name"]: row for row in _rows(self.path) if kept(row)} | self.rows
-            with whole_file(self.path) as unfinished, open(unfinished, "w", newline="", encoding="utf-8") as file:
-                writer = csv.DictWriter(file, COLUMNS)
-                writer.writeheader()
-                for name in sorted(rows, key=in_order):
-                    writer.writerow({key: _escaped(key, rows[name][key]) for key in COLUMNS})
+            lines = ({key: escaped(key, rows[name][key]) for key in NAMES} for name in sorted(rows, key=in_order))
+            _write_table(self.path, NAMES, lines)
+            columns = in_units(self.mesh.length_unit, self.mesh.force_unit)
+            _write_table(self.path.with_name(DICTIONARY), Column._fields, (column._asdict() for column in columns))
         self.rows = {}
 
-    def _set(self, *values: object) -> None:
-        cells = [str(value) for value in (*values, self.mesh.length_unit, self.mesh.force_unit)]
-        row = dict(zip(COLUMNS, cells, strict=True))
-        self.rows[row["name"]] = row
+    def _set(self, name: str, status: int, cells: Mapping[str, str]) -> None:
+        known = {"name": name, "status": str(status), "length_unit": self.mesh.length_unit, "force_unit": self.mesh.force_unit}
+        self.rows[name] = {**dict.fromkeys(NAMES, ""), **known, **cells}
+
+
+def read_summary(folder: Path) -> list[dict[str, str]]:
+    """The rows of a folder's table, cells by the columns' names.
+
+    Raises:
+        MembraneError: there is none, or one of other columns.
+    """
+    rows = _rows(folder / SUMMARY)
+    if not rows:
+        raise MembraneError(
+            f"{folder / SUMMARY}: no rows with this version's columns; expected a folder of results: the same reconstruct "
+            "command again makes its table anew"
+        )
+    return rows
+
+
+def _write_table(path: Path, header: Iterable[str], rows: Iterable[dict[str, str]]) -> None:
+    with whole_file(path) as unfinished, open(unfinished, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(header))
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -93,31 +95,15 @@ def _rows(path: Path) -> list[dict[str, str]]:
         regular_size(path, MOST_BYTES, EXPECTED)
         with open(path, newline="", encoding="utf-8", errors="replace") as file:
             lines = (line.replace("\0", "") for line in iter(partial(file.readline, LONGEST_LINE), ""))
-            found = [row for row in csv.DictReader(lines) if tuple(row) == COLUMNS and _is_whole(row)]
+            found = [row for row in csv.DictReader(lines) if tuple(row) == NAMES and _is_whole(row)]
     except (FileNotFoundError, csv.Error):
         return []
-    return [{key: _unescaped(key, cell) for key, cell in row.items()} for row in found]
+    return [{key: unescaped(key, text) for key, text in row.items()} for row in found]
 
 
 def _is_whole(row: dict[str, Any]) -> bool:
     """Whether a row has all its cells, and numbers where they belong."""
     try:
-        return None not in row.values() and all(key in TEXT or not cell or float(cell) is not None for key, cell in row.items())
+        return None not in row.values() and all(key in TEXT or not text or float(text) is not None for key, text in row.items())
     except ValueError:
         return False
-
-
-def _escaped(key: str, cell: str) -> str:
-    return f"'{cell}" if key in TEXT and _is_formula(cell) else cell
-
-
-def _unescaped(key: str, cell: str) -> str:
-    return cell[1:] if key in TEXT and cell.startswith("'") and _is_formula(cell) else cell
-
-
-def _is_formula(cell: str) -> bool:
-    return cell.lstrip("' ").startswith(FORMULA)
-
-
-def _number(value: np.ndarray | float) -> str:
-    return f"{value:.6g}" if np.isfinite(value) else ""

@@ -27,7 +27,7 @@ def companions_of(path: Path) -> list[Path]:
 
     Example:
         >>> [file.name for file in companions_of(Path("a.toml"))]
-        ['a.toml', 'a_grid.npz', 'a_heightfield.npz', 'a_dots.csv', 'a_rest.png', 'a_rest.tiff']
+        ['a.toml', 'a_grid.npz', 'a_heightfield.npz', 'a_rim.csv', 'a_dots.csv', 'a_rest.png', 'a_rest.tiff']
     """
-    endings = *(f"_{shape}.npz" for shape in SHAPES_BY_ARRAYS), "_dots.csv", "_rest.png", "_rest.tiff"
+    endings = *(f"_{shape}.npz" for shape in SHAPES_BY_ARRAYS), "_rim.csv", "_dots.csv", "_rest.png", "_rest.tiff"
     return [path, *(path.with_name(path.stem + ending) for ending in endings)]

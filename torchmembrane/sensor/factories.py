@@ -2,9 +2,11 @@
 
 from typing import NamedTuple
 
+from ..forming.sheet_energy import SheetEnergy
 from ..mechanics.hyperelastic import ElasticEnergy
 from ..surface.membrane import Membrane
 from ..user_warnings import warn_user
+from .inflated import InflatedSurface
 from .sensor import Sensor
 
 
@@ -38,7 +40,7 @@ def elastic_energy(
         modulus: another shear modulus x thickness than the sensor's, force / length.
 
     Returns:
-        The `ElasticEnergy`.
+        The `ElasticEnergy`; of an inflated surface one whose prestretch and modulus belong to the sheet.
 
     Example:
         >>> from torchmembrane.sensor.sensor import Sensor
@@ -47,13 +49,15 @@ def elastic_energy(
         'harmonic'
     """
     material = sensor.material
-    return ElasticEnergy(
-        membrane,
+    stretched = (
         model or material.model,
         material.prestretch if prestretch is None else prestretch,
         material.modulus if modulus is None else modulus,
         material.c2_ratio or 0.0,
     )
+    if isinstance(sensor.surface, InflatedSurface):
+        return SheetEnergy(membrane, sensor.surface.sheet(membrane.grid), *stretched)
+    return ElasticEnergy(membrane, *stretched)
 
 
 def cavity_filling(sensor: Sensor, membrane: Membrane, *, warn: bool = False) -> CavityFilling:

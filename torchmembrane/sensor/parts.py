@@ -18,10 +18,11 @@ from ..pose import Pose
 from ..surface import shapes
 from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
+from .record import Record
 from .synonyms import did_you_mean
+from .working_range import GENERAL, WorkingRange
 
 OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, in the surface's size
-METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0, "um": 1e6, "inch": 1 / 0.0254}  # one metre in the length unit
 MOST_PRESTRETCH, MOST_C2_RATIO = 10.0, 1e3
 POSITIVE = {"shear_modulus": (1e-12, 1e12), "thickness": (1e-6, 1e5), "pressure": (1e-3, 1e6), "volume": (1e-12, 1e18)}
 """What such a quantity of a membrane can be, in the file's units with any of the length units."""
@@ -34,19 +35,6 @@ SHAPES_BY_NUMBERS = {
     "half_cylinder": ("radius", "length", "half_angle", "base_z"),
 }
 SHAPES_BY_ARRAYS = {"grid": ("vertices", "fixed"), "heightfield": ("x", "y", "z")}
-
-
-def millimetre(unit: str) -> float:
-    """One millimetre in a length unit.
-
-    Args:
-        unit: one of `METRE`.
-
-    Example:
-        >>> millimetre("um"), millimetre("m")
-        (1000.0, 0.001)
-    """
-    return METRE[unit] / METRE["mm"]
 
 
 @check_arguments
@@ -258,6 +246,8 @@ class SensorParts(NamedTuple):
         markers: the `Markers`.
         surface: the rest surface as the file describes it.
         tool: the camera's pose in the tool's frame, where it is known.
+        record: serial and calibration.
+        range: in which its answers were shown right.
     """
 
     name: str
@@ -269,6 +259,8 @@ class SensorParts(NamedTuple):
     markers: Markers
     surface: Surface
     tool: Pose | None = None
+    record: Record = Record()
+    range: WorkingRange = GENERAL
 
 
 def refuse_other_size(size: tuple[int, int], camera: Camera) -> None:

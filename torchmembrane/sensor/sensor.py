@@ -14,8 +14,8 @@ from ..camera.model import Camera
 from ..errors import MembraneError, check_arguments, expect
 from ..pose import Pose
 from ..surface.membrane import Membrane
+from .inflated import InflatedSurface
 from .parts import (
-    METRE,
     Cavity,
     Markers,
     Material,
@@ -25,7 +25,10 @@ from .parts import (
     refuse_off_surface,
     refuse_other_size,
 )
+from .record import Record
 from .toml import read_sensor, tables_of, write_sensor
+from .units import METRE, hectopascal
+from .working_range import GENERAL, WorkingRange
 
 
 @check_arguments
@@ -43,6 +46,8 @@ class Sensor:
         markers: what the camera follows on it.
         surface: how the file describes the rest surface (default: by the membrane's grid).
         tool: the camera's pose in the frame of the tool (a robot's flange, a fingertip), where it is known.
+        record: serial and calibration of the piece, as `[record]` has them; no part of the fingerprint.
+        range: in which its answers were shown right, of `check --accuracy`; else the general one.
 
     A rest image of the calibrated size is cropped and binned where the camera is `in_mode`.
 
@@ -64,9 +69,13 @@ class Sensor:
     markers: Markers
     surface: Surface = None  # type: ignore[assignment]  # set below where it is left out
     tool: Pose | None = None
+    record: Record = Record()
+    range: WorkingRange = GENERAL
 
     def __post_init__(self) -> None:
         expect(self.length_unit in METRE, "length_unit", self.length_unit, f"one of {', '.join(METRE)}")
+        if isinstance(self.surface, InflatedSurface):
+            self._solve_again(self.surface)
         if self.surface is None or not _same_surface(self.surface.membrane(self.membrane.grid), self.membrane):
             object.__setattr__(self, "surface", Surface.of(self.membrane))
         if self.markers.rest_image is not None:
@@ -75,6 +84,16 @@ class Sensor:
             names = [f"Sensor: markers.positions[{i}]" for i in range(len(self.markers.positions))]
             refuse_off_surface(self.membrane, self.markers.positions, names)
             refuse_coincident(self.membrane, self.markers.positions, names)
+
+    def _solve_again(self, surface: InflatedSurface) -> None:
+        """The rest surface of the sensor's own material, where the given one was solved with another."""
+        own = surface.made_of(self.material, self.length_unit)
+        if own is surface:
+            return
+        grid = self.membrane.grid
+        if _same_surface(surface.membrane(grid), self.membrane):
+            object.__setattr__(self, "membrane", own.membrane(grid))
+        object.__setattr__(self, "surface", own)
 
     @property
     def force_unit(self) -> str:
@@ -86,7 +105,7 @@ class Sensor:
     def gas_pressure(self) -> float | None:
         """The cavity's absolute pressure at rest in N per length unit squared; 1 hPa = 100 N/m^2."""
         pressure = self.cavity.pressure
-        return None if pressure is None else 100 * pressure / METRE[self.length_unit] ** 2
+        return None if pressure is None else pressure * hectopascal(self.length_unit)
 
     @property
     def parts(self) -> SensorParts:

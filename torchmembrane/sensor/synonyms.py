@@ -8,6 +8,7 @@ MEANT = {
     "ellipsoid_cap": ("half_ellipsoid", "ellipsoid", "fingertip", "finger"),
     "half_cylinder": ("cylinder", "cylindrical", "semi_cylinder", "tube"),
     "heightfield": ("height_field", "heightmap", "height_map", "heights", "plane", "flat", "pad"),
+    "inflated": ("blown_up", "balloon", "sheet", "window", "membrane", "rectangle", "ellipse", "outline"),
     "grid": ("mesh", "stl", "points", "vertices"),
     "neo_hookean": ("neohookean", "neo_hooke", "rubber", "silicone", "hyperelastic"),
     "mooney_rivlin": ("mooney", "rivlin"),

@@ -10,6 +10,7 @@ import os
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,11 @@ class Table:
         """A list of finite numbers, `count` of them where that is given."""
         return [float(value) for value in self._list(key, count, _finite, "finite")]
 
+    def date(self, key: str) -> date:
+        """A day, as TOML has it or in quotes."""
+        value = self._get(key, lambda value: _day(value) is not None, "a day as 2026-09-27")
+        return _day(value) or value
+
     def whole_number(self, key: str) -> int:
         """A whole number."""
         value: int = self._get(key, _whole, "a whole number")
@@ -223,6 +229,8 @@ def _shown(value: object) -> str:
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_shown, value))}]"
+    if isinstance(value, date):
+        return value.isoformat()
     return repr(value.item() if isinstance(value, np.generic) else value)
 
 
@@ -267,6 +275,14 @@ def _texts(value: object) -> Iterator[str]:
 
 def _finite(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _day(value: object) -> date | None:
+    """The day that a value is, if it is one."""
+    try:
+        return date.fromisoformat(str(value)) if isinstance(value, str | date) else None
+    except ValueError:
+        return None
 
 
 def _whole(value: object) -> bool:

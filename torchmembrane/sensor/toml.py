@@ -19,8 +19,9 @@ from ..files.safe_read import read_arrays
 from ..pose import Pose
 from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
+from .inflated import SHAPE as INFLATED
+from .inflated import read_inflated, rim_lines
 from .parts import (
-    METRE,
     SHAPES_BY_ARRAYS,
     SHAPES_BY_NUMBERS,
     Cavity,
@@ -32,7 +33,10 @@ from .parts import (
     refuse_off_surface,
     refuse_other_size,
 )
+from .record import Record, read_record
 from .table import Table, toml_lines
+from .units import METRE
+from .working_range import GENERAL, WorkingRange, range_file
 
 FORMAT = 1
 COARSEST, FINEST = 25, 33  # solver grids chosen where the file names none
@@ -65,7 +69,7 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
         ('neo_hookean', (33, 33))
     """
     file = Table.from_file(path)
-    file.allow(("format", "name", "length_unit", "camera", "membrane", "material", "cavity", "markers", "tool"))
+    file.allow(("format", "name", "length_unit", "camera", "membrane", "material", "cavity", "markers", "tool", "record"))
     if file.number("format") != FORMAT:
         raise file.refuse("format", f"{FORMAT}, the one this version reads: update torchmembrane or the file")
     name, length_unit = file.text("name"), file.text("length_unit", METRE)
@@ -74,7 +78,7 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
     cavity = _read_cavity(file.table("cavity"))
     dotted = not undotted or "file" in file.table("markers") or "rest_image" in file.table("markers")
     markers, lines = _read_markers(file.table("markers"), camera) if dotted else (_dots_to_come(file.table("markers")), [])
-    surface, membrane = _read_membrane(file.table("membrane"), markers)
+    surface, membrane = _read_membrane(file.table("membrane"), markers, material, length_unit)
     if not dotted:
         middle = len(membrane.rest) // 2
         markers = replace(markers, positions=membrane.rest[middle : middle + 1].numpy())
@@ -85,7 +89,10 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
     with file.table("camera").naming("distortion"):
         refuse_folds(camera, membrane.rest)
     tool = _read_tool(file.table("tool")) if "tool" in file else None
-    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool)
+    record = read_record(file.table("record")) if "record" in file else Record()
+    kept = range_file(path)
+    range = WorkingRange.from_file(kept) if kept.exists() else GENERAL
+    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool, record, range)
 
 
 def write_sensor(parts: SensorParts, path: Path) -> Path:
@@ -106,6 +113,9 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
         content = io.BytesIO()
         np.savez_compressed(content, **surface.values)
         write_bytes(path.with_name(tables["membrane"]["file"]), content.getbuffer())
+    if surface.shape == INFLATED and "outline" in surface.arrays():
+        tables["membrane"]["outline"] = f"{path.stem}_rim.csv"
+        write_text(path.with_name(tables["membrane"]["outline"]), rim_lines(surface.values["outline"]))
     if markers.positions is not None:
         tables["markers"]["file"] = f"{path.stem}_dots.csv"
         _write_dots(path.with_name(tables["markers"]["file"]), markers.positions, markers.sizes or [])
@@ -119,6 +129,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
         blocks["camera"] += toml_lines("camera.ports", port, repeated=True)
     if ports:
         blocks["camera"] += toml_lines("camera.medium", medium)
+    blocks |= {"record": toml_lines("record", parts.record.known)} if parts.record.known else {}
     write_text(path, "\n\n".join("\n".join(lines) for lines in blocks.values()) + "\n")
     return path
 
@@ -255,10 +266,11 @@ def _write_dots(path: Path, positions: np.ndarray, sizes: list[str]) -> None:
     write_text(path, "\n".join(map(",".join, [DOTS_HEADER, *rows])) + "\n")
 
 
-def _read_membrane(table: Table, markers: Markers) -> tuple[Surface, Membrane]:
-    shape = table.text("shape", [*SHAPES_BY_ARRAYS, *SHAPES_BY_NUMBERS])
+def _read_membrane(table: Table, markers: Markers, material: Material, length_unit: str) -> tuple[Surface, Membrane]:
+    shape = table.text("shape", [*SHAPES_BY_ARRAYS, *SHAPES_BY_NUMBERS, INFLATED])
     arrays, numbers = SHAPES_BY_ARRAYS.get(shape), SHAPES_BY_NUMBERS.get(shape, ())
-    table.allow(("shape", "grid", *(("file",) if arrays else numbers)), f"for shape {shape}")
+    if shape != INFLATED:
+        table.allow(("shape", "grid", *(("file",) if arrays else numbers)), f"for shape {shape}")
     named = table.whole_numbers("grid", 2) if "grid" in table else None
     grid = (named[0], named[1]) if named else default_grid(markers)
     if min(grid) < FEWEST_LINES or max(grid) > MOST_LINES:
@@ -271,6 +283,10 @@ def _read_membrane(table: Table, markers: Markers) -> tuple[Surface, Membrane]:
             membrane = surface.membrane(grid)
             lines = surface.values["vertices" if shape == "grid" else "z"].shape[:2]
             return surface, membrane.resampled(grid) if lines == grid and not named else membrane  # evenly, unless asked for
+    if shape == INFLATED:
+        blown_up = read_inflated(table, material, length_unit)
+        with table.naming():
+            return blown_up, blown_up.membrane(grid)
     surface = Surface(shape, {key: table.numbers(key, 3) if key == "semi_axes" else table.number(key) for key in numbers})
     with table.naming():
         return surface, surface.membrane(grid)

@@ -29,12 +29,36 @@ def resampled_grid(X: np.ndarray, fixed: np.ndarray, grid: tuple[int, int]) -> t
     if min(X.shape[:2]) < FEWEST:
         raise MembraneError(f"Membrane: {X.shape[0]} x {X.shape[1]} lines; expected {FEWEST} or more each way, to interpolate")
     lines = even_lines(X, grid[0]), even_lines(X.swapaxes(0, 1), grid[1])
-    m, n = (np.arange(count) for count in X.shape[:2])
-    vertices = np.stack([RectBivariateSpline(m, n, X[..., c])(*lines) for c in range(3)], -1)
+    vertices = on_lines(X, lines)
     rows, columns = (np.rint(line[1:-1]).clip(1, count - 2).astype(int) for line, count in zip(lines, X.shape[:2], strict=True))
     resampled = np.ones(grid, bool)
     resampled[1:-1, 1:-1] = fixed[rows][:, columns]
     return vertices, resampled
+
+
+def on_lines(X: np.ndarray, lines: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """A grid's values between its lines, bicubic in the numbers of these.
+
+    Args:
+        X: `[m, n, 3]`, 4 lines or more each way.
+        lines: where the new lines are, `[M]` in 0..m - 1 and `[N]` in 0..n - 1.
+
+    Returns:
+        `[M, N, 3]`.
+
+    Example:
+        >>> X = np.stack(np.meshgrid(np.arange(4.0), np.arange(5.0), [0.0], indexing="ij"), -1)[:, :, 0]
+        >>> on_lines(X, (np.array([1.5]), np.array([0.0, 2.25]))).round(6).tolist()
+        [[[1.5, 0.0, 0.0], [1.5, 2.25, 0.0]]]
+    """
+    m, n = (np.arange(count) for count in X.shape[:2])
+    return np.stack([RectBivariateSpline(m, n, X[..., c])(*lines) for c in range(3)], -1)
+
+
+def at_equal_steps(X: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """A grid's values `[m, n, 3]` on other numbers of lines, at equal steps of its own lines, `[*grid, 3]`."""
+    m, n = X.shape[:2]
+    return on_lines(X, (np.linspace(0, m - 1, grid[0]), np.linspace(0, n - 1, grid[1])))
 
 
 def even_lines(X: np.ndarray, count: int) -> np.ndarray:

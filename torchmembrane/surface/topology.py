@@ -85,6 +85,24 @@ def triangles_to_corners(values: Tensor) -> Tensor:
     return torch.stack([a, first[..., 1, :], first[..., 2, :] + second[..., 1, :], d], -2)
 
 
+def grid_triangles(grid: tuple[int, int]) -> np.ndarray:
+    """The vertices of all triangles of a grid, those of a quadrilateral one after the other.
+
+    Args:
+        grid: `m, n`.
+
+    Returns:
+        `[2 (m-1) (n-1), 3]`, in the grid's own winding.
+
+    Example:
+        >>> grid_triangles((2, 2)).tolist()
+        [[0, 2, 3], [0, 3, 1]]
+    """
+    index = torch.arange(grid[0] * grid[1])[:, None]
+    triangles: np.ndarray = triangles_of(corners(index, grid)).reshape(-1, 3).numpy()
+    return triangles
+
+
 def rim_loop(grid: tuple[int, int]) -> np.ndarray:
     """The vertices of the grid's border, once around, each once.
 

@@ -1,8 +1,14 @@
-"""A membrane's camera for LeRobot, what it feels as observations, and recorded runs as data sets."""
+"""A membrane's camera for LeRobot, what it feels as observations, and data sets with what was felt.
 
-from .camera import TorchMembraneCamera
-from .config import TorchMembraneCameraConfig
-from .convert import convert
-from .processor import TactileProcessorStep
+`convert` and `add` import what LeRobot's extra `dataset` brings; everything else does without.
+"""
 
-__all__ = ["TactileProcessorStep", "TorchMembraneCamera", "TorchMembraneCameraConfig", "convert"]
+from .versions import refuse_untested
+
+refuse_untested()
+
+from .camera import TorchMembraneCamera  # noqa: E402
+from .config import TorchMembraneCameraConfig  # noqa: E402
+from .processor import TactileProcessorStep  # noqa: E402
+
+__all__ = ["TactileProcessorStep", "TorchMembraneCamera", "TorchMembraneCameraConfig"]

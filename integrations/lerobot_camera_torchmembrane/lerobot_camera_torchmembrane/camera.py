@@ -1,84 +1,58 @@
 """The camera inside of a membrane, as LeRobot reads cameras."""
 
-from pathlib import Path
-from typing import Any
+import time
 
 import cv2
 import numpy as np
-from lerobot.cameras.camera import Camera
-from lerobot.cameras.configs import ColorMode
-from lerobot.cameras.opencv import OpenCVCamera, OpenCVCameraConfig
+from lerobot.cameras.opencv import OpenCVCamera
 
 from .config import TorchMembraneCameraConfig
 
+FIRST_FRAME = 10.0
+"""Seconds in which a video's first frame must have come."""
 
-class TorchMembraneCamera(Camera):
-    """Frames `[height, width, 3]` uint8 of a membrane's camera, read by LeRobot's own OpenCV camera.
+
+class TorchMembraneCamera(OpenCVCamera):
+    """Frames `[height, width, 3]` uint8 of a membrane's camera: LeRobot's own OpenCV camera, which a video file may stand for.
+
+    A video's frames come at `fps` as a device's do, whether they are read or not, and begin again after the last one.
 
     Args:
-        config: a `TorchMembraneCameraConfig`. A video file's frames come one after another, from its start again at its end.
+        config: a `TorchMembraneCameraConfig`.
     """
 
     def __init__(self, config: TorchMembraneCameraConfig):
         super().__init__(config)
-        self.config, self.color_mode = config, config.color_mode
-        place = config.index_or_path
-        self.video = isinstance(place, str) and Path(place).is_file()
-        self.source: cv2.VideoCapture | OpenCVCamera | None = None
-
-    @property
-    def is_connected(self) -> bool:
-        """Whether frames can be read."""
-        return self.source is not None
-
-    @staticmethod
-    def find_cameras() -> list[dict[str, Any]]:
-        """Video devices as LeRobot's OpenCV camera finds them."""
-        return OpenCVCamera.find_cameras()
+        self._due = 0.0
 
     def connect(self, warmup: bool = True) -> None:
-        """Open the device or the video file.
+        """Open the device or the video file, and wait for a first frame.
+
+        Args:
+            warmup: whether a device is read for `warmup_s` seconds first; a video begins with its first frame.
 
         Raises:
-            ConnectionError: it cannot be opened.
+            DeviceAlreadyConnectedError: it is open.
+            ConnectionError: it cannot be opened, or gives no frame.
         """
-        config = self.config
-        if self.video:
-            self.source = cv2.VideoCapture(str(config.index_or_path))
-            if not self.source.isOpened():
-                self.source = None
-                raise ConnectionError(f"{config.index_or_path}: cannot be read; expected a video file")
-            return
-        size = dict(fps=config.fps, width=config.width, height=config.height, color_mode=config.color_mode)
-        source = OpenCVCamera(OpenCVCameraConfig(index_or_path=config.index_or_path, **size))
-        source.connect(warmup)
-        self.source = source
-
-    def read(self) -> np.ndarray:
-        """The next frame."""
-        source = self._connected()
-        return source.read() if isinstance(source, OpenCVCamera) else self._next(source)
-
-    def async_read(self, timeout_ms: float = 200) -> np.ndarray:
-        """The newest frame that was not read, waited for at most so long."""
-        source = self._connected()
-        return source.async_read(timeout_ms) if isinstance(source, OpenCVCamera) else self._next(source)
-
-    def disconnect(self) -> None:
-        """Close the device or the video file."""
-        source, self.source = self._connected(), None
-        source.disconnect() if isinstance(source, OpenCVCamera) else source.release()
-
-    def _connected(self) -> "cv2.VideoCapture | OpenCVCamera":
-        if self.source is None:
-            raise ConnectionError(f"{self.config.index_or_path}: not connected; call connect() first")
-        return self.source
-
-    def _next(self, video: cv2.VideoCapture) -> np.ndarray:
-        there, frame = video.read()
-        if not there:
-            video.set(cv2.CAP_PROP_POS_FRAMES, 0)
-            there, frame = video.read()
-        if not there:
+        super().connect(warmup and not self.config.is_video)
+        if self.config.is_video and not self.new_frame_event.wait(FIRST_FRAME):
+            self.disconnect()
             raise ConnectionError(f"{self.config.index_or_path}: no frame can be read; expected a video file")
-        return frame if self.color_mode == ColorMode.BGR else cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+
+    def _configure_capture_settings(self) -> None:
+        if not self.config.is_video:  # of a file there is nothing to set
+            super()._configure_capture_settings()
+
+    def _read_from_hardware(self) -> np.ndarray:
+        if not self.config.is_video:
+            return super()._read_from_hardware()
+        there, frame = self.videocapture.read()
+        if not there:  # the end: opened anew, as not every file can be set back
+            ended, self.videocapture = self.videocapture, cv2.VideoCapture(self.index_or_path, self.backend)
+            ended.release()
+            frame = super()._read_from_hardware()
+        self.stop_event.wait(max(self._due - time.perf_counter(), 0))
+        now, interval = time.perf_counter(), 1 / self.fps
+        self._due = (now if now - self._due > interval else self._due) + interval
+        return frame

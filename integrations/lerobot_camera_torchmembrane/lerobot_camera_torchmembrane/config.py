@@ -1,32 +1,58 @@
 """What a membrane's camera is configured by."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from lerobot.cameras.configs import CameraConfig, ColorMode
+import cv2
+from lerobot.cameras.configs import CameraConfig
+from lerobot.cameras.opencv import OpenCVCameraConfig
 
 from torchmembrane import MembraneError, Sensor
 
 
 @CameraConfig.register_subclass("torchmembrane")
 @dataclass(kw_only=True)
-class TorchMembraneCameraConfig(CameraConfig):
-    """The camera inside of a membrane.
+class TorchMembraneCameraConfig(OpenCVCameraConfig):
+    """The camera inside of a membrane: LeRobot's OpenCV camera, of a sensor file's size.
 
     Args:
         sensor: path of the sensor file, `sensor.toml`; width and height are its camera's.
-        index_or_path: of the video device, as OpenCV takes it, or a video file.
+        index_or_path: of the video device, as OpenCV takes it, or a video file, whose own rate is the default of `fps`.
 
     Raises:
-        MembraneError: the sensor file is wrong, or says another width or height.
+        MembraneError: the sensor file is wrong, or says another width or height; or a file is no video, or of another size.
     """
 
     sensor: str
-    index_or_path: int | str = 0
-    color_mode: ColorMode = ColorMode.RGB
+    index_or_path: int | Path = 0
+
+    @property
+    def is_video(self) -> bool:
+        """Whether frames come from a file."""
+        return Path(str(self.index_or_path)).is_file()
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         size = Sensor.from_file(self.sensor).camera.image_size
         given = self.width or size[0], self.height or size[1]
         if given != tuple(size):
             raise MembraneError(f"{self.sensor}: width x height = {given[0]} x {given[1]}; expected {size[0]} x {size[1]}")
         self.width, self.height = size
+        if self.is_video:
+            rate = self._check_video()
+            self.fps = self.fps or rate
+
+    def _check_video(self) -> int:
+        """Whole frames per second of the video file."""
+        video = cv2.VideoCapture(str(self.index_or_path))
+        rate, *found = (video.get(what) for what in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        opened = video.isOpened()
+        video.release()
+        if not opened:
+            raise MembraneError(f"{self.index_or_path}: not readable as a video; expected a video device or a video file")
+        turned = abs(self.rotation) == 90
+        expected = (self.height, self.width) if turned else (self.width, self.height)
+        if tuple(found) != expected:
+            came, wanted = ("{:.0f} x {:.0f}".format(*each) for each in (found, expected))
+            raise MembraneError(f"{self.index_or_path}: frames of {came}; expected {wanted}, of {self.sensor}")
+        return max(round(rate), 1)

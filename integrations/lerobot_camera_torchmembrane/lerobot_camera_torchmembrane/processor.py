@@ -3,30 +3,34 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import torch
 from lerobot.configs.types import FeatureType, PipelineFeatureType, PolicyFeature
 from lerobot.processor.pipeline import ObservationProcessorStep, ProcessorStepRegistry
 
 import torchmembrane as tm
 
-from .tactile import keys, points
+from . import tactile
 
 
 @ProcessorStepRegistry.register(name="torchmembrane_tactile")
 @dataclass
 class TactileProcessorStep(ObservationProcessorStep):
-    """From the image of a membrane's camera to its points `[V, 6]` (dx, dy, dz, Fx, Fy, Fz) and wrench `[6]`.
+    """From the image of a membrane's camera to what it feels, in the form of the observations that the image is found in.
+
+    In a robot's observations the image is `NAME`, and plain numbers are added, `NAME.Fx` ... `NAME.Mz` and `NAME.status`, as
+    `record` of LeRobot writes them. In a policy's the image is `observation.images.NAME`, and tensors are added,
+    `observation.tactile.NAME.wrench [6]`, `.contacts [24]`, `.status [1]` and `.points [V, 6]`, with the image's batch of one.
 
     Args:
         sensor: path of the sensor file.
-        name: of the camera: the image is `name`, `observation.images.name` or `observation.image.name`.
+        name: of the camera.
 
     Raises:
-        MembraneError: the sensor file is wrong, or an image is of another size.
+        MembraneError: the sensor file is wrong, or an image is of another size, or missing.
 
     Limitations:
-        Frames without a surface give zeros. Frames of one stream: each starts from the one before, until `reset`.
+        Frames without a surface give zeros; `status` tells. Frames are those of one stream; `reset()` starts anew.
+        Machine code is compiled when the step is made, which takes a minute or more after an installation.
     """
 
     sensor: str
@@ -35,19 +39,23 @@ class TactileProcessorStep(ObservationProcessorStep):
 
     def __post_init__(self) -> None:
         self.tracker = tm.Tracker(tm.Reconstructor.from_file(self.sensor))
+        self.tracker.warm_up()
         self.area = self.tracker.reconstructor.estimator.membrane.rest_area.numpy()
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """The observation with the two keys added."""
-        image = next((observation[key] for key in self._image_keys() if key in observation), None)
-        if image is None:
-            came = ", ".join(observation)
+        """The observation with what is felt added."""
+        key = next((key for key in (self.name, self._image_key) if key in observation), None)
+        if key is None:
             raise tm.MembraneError(
-                f"TactileProcessorStep: observations {came}; expected one of {', '.join(self._image_keys())}"
+                f"TactileProcessorStep: observations {', '.join(observation)}; expected {self.name} or {self._image_key}"
             )
-        result = self.tracker(image).frame(0)
-        felt = points(result["displacement"], result["traction"], self.area), np.nan_to_num(result["wrench"])
-        return observation | {key: torch.from_numpy(value) for key, value in zip(keys(self.name), felt, strict=True)}
+        image = observation[key]
+        frame = self.tracker(image).frame(0)
+        if key == self.name:
+            return observation | tactile.scalars(frame, self.name)
+        values = tactile.felt(frame) | {"points": tactile.points(frame, self.area)}
+        tensors = {tactile.key(self.name, what): torch.from_numpy(value) for what, value in values.items()}
+        return observation | {key: value[None] if image.ndim == 4 else value for key, value in tensors.items()}
 
     def get_config(self) -> dict[str, Any]:
         """What the step is made from again."""
@@ -60,11 +68,15 @@ class TactileProcessorStep(ObservationProcessorStep):
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """The features with the two keys added."""
-        shapes = (len(self.area), 6), (6,)
-        added = {key: PolicyFeature(FeatureType.STATE, shape) for key, shape in zip(keys(self.name), shapes, strict=True)}
-        observations = features.get(PipelineFeatureType.OBSERVATION, {}) | added
-        return features | {PipelineFeatureType.OBSERVATION: observations}
+        """The features with what is felt added."""
+        observed = features.get(PipelineFeatureType.OBSERVATION, {})
+        if self.name in observed:
+            added: dict[str, Any] = dict.fromkeys(tactile.scalar_names(self.name), float)
+        else:
+            declared = tactile.features(self.name, len(self.area))
+            added = {key: PolicyFeature(FeatureType.STATE, each["shape"]) for key, each in declared.items()}
+        return features | {PipelineFeatureType.OBSERVATION: observed | added}
 
-    def _image_keys(self) -> tuple[str, ...]:
-        return self.name, f"observation.images.{self.name}", f"observation.image.{self.name}"
+    @property
+    def _image_key(self) -> str:
+        return f"observation.images.{self.name}"

@@ -2,68 +2,106 @@
 
 ros2 run torchmembrane_ros tracker --ros-args -p sensor:=sensor.toml -r image:=/finger/image_raw
 
-Parameters: `sensor`, the sensor file; `compressed`, whether `image` is a CompressedImage. Publishes `wrench`, `points` and, of
-a gas, `pressure`, with the image's header. A frame without a surface is logged and nothing is published. The first CameraInfo
-beside the images is compared with the sensor file, and what disagrees is logged. The service `rezero` (std_srvs/Trigger) takes
-the latest image for the rest state.
+A lifecycle node. Configured, it has read the sensor file and compiled what the first image would wait for; active, it
+subscribes, and publishes `~/wrench`, `~/force_deviation`, `~/points`, `~/contacts`, `~/status` and, of a gas, `~/pressure`
+with the image's header, and how it is doing on `/diagnostics`. The first CameraInfo beside the images is compared with the
+sensor file. The service `~/rezero` (std_srvs/Trigger) takes the latest image for the rest state.
 """
 
+import time
 import warnings
-from array import array
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any
 
 import rclpy
+import rclpy.executors
+import rclpy.time
 import torch
-from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
-from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, FluidPressure, Image, PointCloud2, PointField
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 import torchmembrane as tm
-from torchmembrane.integrations.messages import POINT_FIELDS, SiUnits, cloud_layout, grey_of, has_wrench, info_topic, unlike
+from torchmembrane.integrations.frame_messages import TOPICS, SiUnits
+from torchmembrane.integrations.messages import grey_of, info_topic, unlike
+from torchmembrane.live.mailbox import Mailbox
 from torchmembrane.results.store import Mesh, Settings
 
-FIELDS = [PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, name in enumerate(POINT_FIELDS)]
-NEWEST = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+from . import parameters
+from .health import Health
+from .outgoing import make, transform_of, type_of
+
+SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+AGAIN = 10.0
+"""Seconds before the same warning is logged again."""
+PERIOD = 1.0
+"""Seconds between two messages on /diagnostics."""
+WAIT = 0.1
+"""Seconds after which the thread that computes looks whether it shall end."""
 
 
-class TrackerNode(Node):
-    """Follows one sensor's camera."""
+class TrackerNode(LifecycleNode):
+    """Follows one sensor's camera. A thread takes the newest image and computes; the executor's thread is free for all else."""
 
-    def __init__(self) -> None:
-        super().__init__("torchmembrane")
-        reconstructor = tm.Reconstructor.from_file(self.declare_parameter("sensor", "sensor.toml").value)
-        self.tracker = tm.Tracker(reconstructor)
-        self.camera = reconstructor.sensor.camera
-        self.compared = False
-        mesh = Mesh.of(reconstructor, Settings.of(reconstructor, "npz"))
-        self.units = SiUnits(mesh, reconstructor.sensor.gas_pressure)
-        kind = CompressedImage if self.declare_parameter("compressed", False).value else Image
-        self.wrenches = self.create_publisher(WrenchStamped, "wrench", 1)
-        self.clouds = self.create_publisher(PointCloud2, "points", 1)
-        self.pressures = self.create_publisher(FluidPressure, "pressure", 1)
-        self.create_subscription(CameraInfo, info_topic(self.resolve_topic_name("image")), self.compare, NEWEST)
-        self.create_subscription(kind, "image", self.follow, NEWEST)
-        self.create_service(Trigger, "rezero", self.rezero)
+    def __init__(self, **options: Any) -> None:
+        super().__init__("torchmembrane", **options)
+        parameters.declare(self)
+        self.lock = Lock()  # of the tracker
+        self.outputs: dict[str, Any] = {}
+        self.subscriptions_made: list[Any] = []
+        self.thread: Thread | None = None
 
-    def follow(self, message: Image | CompressedImage) -> None:
-        """Reconstruct an image, and publish what it gives."""
+    def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Read the sensor file and get ready for images."""
         try:
-            frame = self.tracker(grey_of(message, self.camera.image_size, self.camera.bits)).frame(0)
+            self._configure()
         except tm.MembraneError as error:
-            self.get_logger().warning(str(error))
-            return
-        if not has_wrench(frame):
-            self.get_logger().warning(tm.Status(int(frame["status"])).text)
-            return
-        force, torque = (Vector3(x=x, y=y, z=z) for x, y, z in (each.tolist() for each in self.units.wrench(frame)))
-        self.wrenches.publish(WrenchStamped(header=message.header, wrench=Wrench(force=force, torque=torque)))
-        layout = cloud_layout(self.units.points(frame))
-        layout |= {"data": array("B", layout["data"]), "fields": FIELDS}  # bytes would be checked one by one
-        self.clouds.publish(PointCloud2(header=message.header, **layout))
-        pressure = self.units.pressure(frame)
-        if pressure is not None:
-            self.pressures.publish(FluidPressure(header=message.header, fluid_pressure=pressure, variance=0.0))
+            self.get_logger().error(str(error))
+            return FAILURE
+        except Exception as error:  # rclpy goes on to on_error without a word
+            self.get_logger().error(f"{type(error).__name__}: {error}")
+            raise
+        return SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribe."""
+        super().on_activate(state)
+        self.mailbox, self.compared = Mailbox(), False
+        self.thread = Thread(target=self._compute, args=(self.mailbox,), name="compute", daemon=True)
+        self.thread.start()
+        newest = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        info = self.create_subscription(CameraInfo, info_topic(self.resolve_topic_name("image")), self.compare, newest)
+        self.subscriptions_made = [info, self._subscribe()]
+        self.timer = self.create_timer(PERIOD, self.report)
+        self.get_logger().info(f"ready: {self.health.name}, waits for images on {self.resolve_topic_name('image')}")
+        return SUCCESS
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let go of the images; the next ones start from rest."""
+        self.stop()
+        self.tracker.reset()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Forget the sensor."""
+        self._release()
+        return SUCCESS
+
+    def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Stop whatever goes on."""
+        self.stop()
+        self._release()
+        return SUCCESS
+
+    def on_error(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """After an error in a transition: unconfigured again."""
+        self.stop()
+        self._release()
+        return SUCCESS
 
     def compare(self, info: CameraInfo) -> None:
         """Say what the first CameraInfo has otherwise than the sensor file."""
@@ -79,7 +117,7 @@ class TrackerNode(Node):
     def rezero(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Take the latest image for the rest state."""
         try:
-            with warnings.catch_warnings(record=True) as said:
+            with self.lock, warnings.catch_warnings(record=True) as said:
                 warnings.simplefilter("always")
                 self.tracker.rezero()
             response.success, response.message = True, "; ".join(str(each.message) for each in said)
@@ -87,16 +125,116 @@ class TrackerNode(Node):
             response.success, response.message = False, str(error)
         return response
 
+    def report(self) -> None:
+        """Say how the node is doing, and subscribe anew where publishers of images came that offer otherwise."""
+        status = self.health.message(self.mailbox.captured, self.tracker.drift).built(make)
+        self.diagnostics.publish(DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[status]))
+        if self._reliability() != self.reliability:
+            self.destroy_subscription(self.subscriptions_made.pop())
+            self.subscriptions_made.append(self._subscribe())
+
+    def follow(self, message: Image | CompressedImage) -> None:
+        """Reconstruct an image, and publish what it gives."""
+        try:
+            grey = grey_of(message, self.camera.image_size, self.camera.bits)
+            with self.lock, warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                frame = self.tracker(grey).frame(0)
+        except tm.MembraneError as error:
+            self.health.refuse()
+            self.get_logger().warning(str(error), throttle_duration_sec=AGAIN)
+            return
+        for each in said:
+            self.get_logger().warning(str(each.message))
+        status = tm.Status(int(frame["status"]))
+        if not status.has_surface:
+            self.get_logger().warning(status.text, throttle_duration_sec=AGAIN)
+        header = Header(stamp=message.header.stamp, frame_id=self.get_parameter("frame_id").value or message.header.frame_id)
+        for topic, each in self.units.messages(frame).items():
+            self.outputs[topic].publish(each._replace(fields={"header": header, **each.fields}).built(make))
+        age = self.get_clock().now() - rclpy.time.Time.from_msg(message.header.stamp, self.get_clock().clock_type)
+        self.health.add(age.nanoseconds / 1e9, status)
+
+    def _configure(self) -> None:
+        parameters.refuse_wrong(self)
+        path = Path(self.get_parameter("sensor").value)
+        reconstructor = tm.Reconstructor.from_file(path)
+        sensor, self.camera = reconstructor.sensor, reconstructor.sensor.camera
+        self.units = SiUnits(Mesh.of(reconstructor, Settings.of(reconstructor, "npz")), sensor.gas_pressure)
+        tool_frame, frame_id = (self.get_parameter(name).value for name in ("tool_frame", "frame_id"))
+        if tool_frame:
+            self._send_transform(transform_of(sensor, tool_frame, frame_id))
+        began, self.tracker = time.monotonic(), tm.Tracker(reconstructor)
+        self.get_logger().info("compiles machine code where there is none yet, which takes a minute or more")
+        self.tracker.warm_up()
+        self.get_logger().info(f"configured in {time.monotonic() - began:.0f} s: {path}")
+        self.health = Health(sensor, path)
+        for name in self.units.topics():
+            self.outputs[name] = self.create_lifecycle_publisher(type_of(TOPICS[name]), f"~/{name}", 5)
+        self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 5)
+        self.rezero_service = self.create_service(Trigger, "~/rezero", self.rezero)
+
+    def _send_transform(self, transform: Any) -> None:
+        """To /tf_static, where those that come later find it too."""
+        from tf2_msgs.msg import TFMessage
+
+        kept = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.transforms = self.create_publisher(TFMessage, "/tf_static", kept)
+        self.transforms.publish(TFMessage(transforms=[transform]))
+
+    def _reliability(self) -> ReliabilityPolicy:
+        """Of the subscription to images: what is asked for, or what all publishers offer."""
+        asked = self.get_parameter("reliability").value
+        offered = [each.qos_profile.reliability for each in self.get_publishers_info_by_topic(self.resolve_topic_name("image"))]
+        is_best_effort = ReliabilityPolicy.BEST_EFFORT in offered if asked == "auto" else asked == "best_effort"
+        return ReliabilityPolicy.BEST_EFFORT if is_best_effort else ReliabilityPolicy.RELIABLE
+
+    def _subscribe(self) -> Any:
+        self.reliability = self._reliability()
+        depth = self.get_parameter("depth").value
+        quality = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=self.reliability)
+        kind = CompressedImage if self.get_parameter("compressed").value else Image
+        return self.create_subscription(kind, "image", self.mailbox.put, quality)
+
+    def _compute(self, mailbox: Mailbox) -> None:
+        while not mailbox.ended and self.context.ok():
+            picture = mailbox.take(WAIT)
+            if picture is not None:
+                self.follow(picture.image)
+
+    def stop(self) -> None:
+        """Let go of the images."""
+        if self.thread is not None:
+            self.mailbox.end()
+            self.thread.join()
+            self.thread = None
+            self.destroy_timer(self.timer)
+            while self.subscriptions_made:
+                self.destroy_subscription(self.subscriptions_made.pop())
+
+    def _release(self) -> None:
+        for publisher in self.outputs.values():
+            self.destroy_lifecycle_publisher(publisher)
+        if self.outputs:
+            self.destroy_publisher(self.diagnostics)
+            self.destroy_service(self.rezero_service)
+        self.outputs = {}
+
 
 def main() -> None:
     """Spin until interrupted."""
     torch.set_num_threads(1)
     rclpy.init()
+    node = TrackerNode()
     try:
-        rclpy.spin(TrackerNode())
-    except KeyboardInterrupt:
+        if node.get_parameter("autostart").value:
+            if node.trigger_configure() != SUCCESS:
+                raise SystemExit("torchmembrane: not configured; the error above says why")
+            node.trigger_activate()
+        rclpy.spin(node)
+    except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
         pass
-    except tm.MembraneError as error:  # of the sensor file, or its forces are relative
-        raise SystemExit(f"torchmembrane: error: {error}") from error
     finally:
+        node.stop()
+        node.destroy_node()
         rclpy.try_shutdown()

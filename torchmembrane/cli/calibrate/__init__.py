@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..arguments import Add, add_command, add_force, count_pair, positive, weight
+from ..arguments import Add, add_command, add_force, count_pair, positive, pressure, weight
 from ..choices import PORTS
 from ..progress import announce
 
@@ -56,6 +56,7 @@ def _run(module: str, step: str, arguments: Namespace) -> int:
     from .files import spare_files
 
     spare_files(step, arguments)
+    arguments.step = step
     return int(getattr(import_module(f".{module}", __name__), step)(arguments))
 
 
@@ -79,6 +80,8 @@ def _ports_options(add: Add) -> None:
 
 def _rest_options(add: Add) -> None:
     add("image", metavar="REST.png", help="the membrane at rest")
+    gauge = "of an inflated surface: what a gauge reads at rest, inside over outside, with its unit, as 12hPa"
+    add("--overpressure", metavar="P", type=pressure, help=gauge)
 
 
 def _views_options(add: Add) -> None:
@@ -100,11 +103,14 @@ def _depth_options(add: Add) -> None:
 def _material_options(add: Add) -> None:
     add("images", metavar="IMAGES", nargs="+", help="of presses, deep ones: files, globs, folders")
     vectors, lengths = "CSV image,fx,fy,fz (on the membrane, in the camera's frame)", "image,force (magnitude)"
-    add("--forces", metavar="FILE.csv", type=Path, help=f"{vectors} or {lengths}, N: total force in some images")
+    table = f"{vectors} or {lengths}, N: total force in some images; each with a further column deviation or without"
+    add("--forces", metavar="FILE.csv", type=Path, help=table)
     gauge = (
-        "CSV name,pressure (images at rest and pressed) or name,pressure_change (since rest), hPa: a gauge's readings of some"
+        "a gauge's log, CSV: name or time of an image, and pressure (at rest and pressed) or pressure_change (since rest), hPa"
     )
     add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
+    at_rest = "what a gauge reads at rest, inside over outside, with its unit, as 12hPa; goes with the others"
+    add("--overpressure", metavar="P", type=pressure, help=at_rest)
     add("--weight", metavar="WEIGHT", type=weight, help="that lies on the membrane in every image, alone, as 200g or 1.96N")
 
 

@@ -49,7 +49,7 @@ def _write(arguments: Namespace, sensor: Sensor, found: CameraFit, pixels: np.nd
     design = [_value(sensor.camera, name) for name in found.names]
     report = Report.of(title, found.names, units, design, found.fit, pixels, found.residuals)
     drawing = fit_figure(report, sensor.camera.image_size)
-    return write_calibrated(arguments, replace(sensor, camera=found.camera), report, drawing)
+    return write_calibrated(arguments, replace(sensor, camera=found.camera), report, drawing, len(pixels))
 
 
 def _value(camera: Camera, name: str) -> float:

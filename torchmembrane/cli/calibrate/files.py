@@ -2,13 +2,17 @@
 
 from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import replace
+from datetime import date
 from glob import glob
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ... import __version__
 from ...calibrate.detection import find_target
+from ...calibrate.material import KnownForces
 from ...calibrate.report import Report
 from ...camera.targets import Checkerboard, DotBoard
 from ...errors import MembraneError
@@ -17,13 +21,14 @@ from ...files.images import read_image, read_pixels
 from ...files.safe_read import read_array
 from ...files.targets import refuse_overwriting
 from ...jobs.inputs import Inputs, find_inputs, frame_name, single_images
-from ...jobs.pressure import by_frame
+from ...jobs.pressure import by_frame, refusal
 from ...plot.drawing import save
 from ...presets import sensor_file
 from ...sensor.companions import companions_of, files_of
-from ...sensor.parts import millimetre
+from ...sensor.record import Record
 from ...sensor.sensor import Sensor
 from ...sensor.toml import COORDINATE
+from ...sensor.units import millimetre
 from ...surface.checks import FARTHEST
 
 if TYPE_CHECKING:
@@ -32,7 +37,9 @@ if TYPE_CHECKING:
 MOST_TABLE_BYTES = 2**20
 PLACES, TURNS = ("x", "y", "z"), ("turn_x", "turn_y", "turn_z")
 MOTIONS = Columns([(*PLACES, *TURNS)], "image", unit="length unit and degrees")
-FORCES = Columns([("image", "fx", "fy", "fz"), ("image", "force")], "force", unit="N, on the membrane, in the camera's frame")
+FORCES = Columns(
+    [("image", "fx", "fy", "fz"), ("image", "force")], "force", "deviation", unit="N, on the membrane, in the camera's frame"
+)
 LISTS = ("images", "air", "medium")
 FILES = ("image", "depth", "motions", "forces", "pressure", "pixels")
 """Arguments of the steps that name files to read: images, and single files."""
@@ -58,9 +65,28 @@ def spare_files(step: str, arguments: Namespace) -> None:
     refuse_overwriting(f"calibrate {step} --out {arguments.out}", targets, read, arguments.force)
 
 
-def write_calibrated(arguments: Namespace, sensor: Sensor, report: Report, drawing: "Figure") -> int:
-    """Write the calibrated sensor and its report, print what was found; returns the exit code."""
-    path = sensor.to_file(arguments.out)
+def write_calibrated(
+    arguments: Namespace,
+    sensor: Sensor,
+    report: Report,
+    drawing: "Figure",
+    images: int,
+    uncertainty: float | None = None,
+) -> int:
+    """Write the calibrated sensor with its record, and its report, print what was found; returns the exit code.
+
+    Args:
+        arguments: of the command.
+        sensor: as found.
+        report: of it.
+        drawing: its figure.
+        images: that it was found from.
+        uncertainty: relative standard deviation of forces, where the step tells it; default: the file's, of an earlier step.
+    """
+    uncertainty = sensor.record.uncertainty if uncertainty is None else float(f"{uncertainty:.2g}")
+    by = f"torchmembrane {__version__}, calibrate {arguments.step}"
+    record = Record(sensor.record.serial, date.today(), images, by, uncertainty)
+    path = replace(sensor, record=record).to_file(arguments.out)
     report.write(arguments.out)
     save(drawing, arguments.out / "report.png", "calibrate")
     print("\n".join([*report.lines, f"calibrated sensor: {path}; report.json and report.png beside it"]))
@@ -104,8 +130,8 @@ def read_motions(path: Path) -> np.ndarray:
     return values
 
 
-def read_forces(path: Path, inputs: Inputs) -> np.ndarray:
-    """Forces of the images `[B, 3]`, or magnitudes `[B, 1]`, N, NaN where the file has none.
+def read_forces(path: Path, inputs: Inputs) -> KnownForces:
+    """Forces of the images `[B, 3]`, or magnitudes `[B, 1]`, N, NaN where the file has none, and their standard deviations.
 
     Args:
         path: of a table of forces by the names of images.
@@ -116,12 +142,20 @@ def read_forces(path: Path, inputs: Inputs) -> np.ndarray:
     """
     table = read_table(path, FORCES, MOST_TABLE_BYTES)
     columns = table.form[1:]
-    known = {}
-    for name, row in by_frame(table, inputs).items():
+    known, deviations, (lines, others) = {}, {}, by_frame(table, inputs)
+    if others:
+        raise refusal(others[0], table, inputs)
+    for name, row in lines.items():
         known[name] = row.numbers(columns)
         if not any(known[name]):
             raise row.refusal(columns[-1], "a force that is not zero: leave out images in which nothing presses")
-    return np.array([known.get(frame_name(image), [np.nan] * len(columns)) for image in inputs.images])
+        if "deviation" in row.places:
+            deviations[name] = row.number("deviation")
+            if not deviations[name] >= 0:
+                raise row.refusal("deviation", "a standard deviation of the force, N, 0 or more")
+    names = [frame_name(image) for image in inputs.images]
+    forces = np.array([known.get(name, [np.nan] * len(columns)) for name in names])
+    return KnownForces(forces, np.array([deviations.get(name, np.nan) for name in names]) if deviations else None)
 
 
 def read_depth(path: Path, unit: float | None, length_unit: str) -> np.ndarray:

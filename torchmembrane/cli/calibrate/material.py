@@ -1,6 +1,8 @@
 """The step `material`: prestretch and stiffness from images of presses."""
 
+import re
 from argparse import Namespace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -9,10 +11,13 @@ from ...calibrate.material import STRETCHES, KnownPressures, material_from_image
 from ...calibrate.report import Report
 from ...calibrate.weight import WeightFit, material_from_weight
 from ...errors import MembraneError
+from ...files.timestamps import time_in
 from ...jobs.inputs import Inputs, find_inputs, frame_name, single_images
 from ...jobs.pressure import read_pressures
 from ...plot.calibration import material_figure
 from ...progress import Progress
+from ...reconstruct import Reconstructor
+from ...results.status import Status
 from ...sensor.sensor import Sensor
 from ..progress import ProgressDisplay
 from .files import read_forces, read_sensor, read_sensor_image, write_calibrated
@@ -28,7 +33,9 @@ def material(arguments: Namespace) -> int:
     with ProgressDisplay("calibrate material") as progress:
         weighed = _weighed(arguments, sensor, images, progress) if arguments.weight else None
         if weighed is None:
-            found = material_from_images(sensor, images, forces, pressures, progress=progress)
+            found = material_from_images(
+                sensor, images, forces, pressures, overpressure=arguments.overpressure, progress=progress
+            )
         else:
             found = weighed.material
     unit, n = sensor.length_unit, len(found.values)
@@ -38,6 +45,9 @@ def material(arguments: Namespace) -> int:
         notes.append(f"the prestretch may be larger: {STRETCHES[-1]:g} is the largest that was tried")
     if n == 2:
         notes.append("modulus: shear modulus x thickness; the sensor file's thickness is kept, or 1 where it has none")
+    notes += [_by_name(sentence, paths) for sentence in found.contradictions]
+    if weighed is None:
+        notes += _doubted(found.sensor, images, paths)
     if weighed is not None:
         forces_said = ", ".join(f"{force:.3g}" for force in weighed.forces)
         notes.append(
@@ -53,17 +63,40 @@ def material(arguments: Namespace) -> int:
         correlations=found.covariance / np.outer(found.deviations, found.deviations),
     )
     made = found.sensor if weighed is None else weighed.sensor
-    return write_calibrated(arguments, made, report, material_figure(report, found, [path.name for path in paths]))
+    by_forces = found.deviations[1] / found.values[1] if n == 2 else None
+    uncertainty = by_forces if weighed is None else weighed.deviation
+    drawing = material_figure(report, found, [path.name for path in paths])
+    return write_calibrated(arguments, made, report, drawing, len(paths), uncertainty)
+
+
+def _by_name(sentence: str, paths: list[Path]) -> str:
+    """A sentence about `image N` with that image's name."""
+    return re.sub(r"^image (\d+)", lambda match: paths[int(match[1]) - 1].name, sentence)
+
+
+def _doubted(sensor: Sensor, images: torch.Tensor, paths: list[Path]) -> list[str]:
+    """Images that the material found does not explain, each by its name: they were used."""
+    with torch.no_grad():
+        statuses = Reconstructor(sensor, check_rest=False)(images).status.tolist()
+    return [
+        f"{path.name}: with this material {Status(status).text}; it was used: leave it out and see what changes"
+        for path, status in zip(paths, statuses, strict=True)
+        if status != Status.OK
+    ]
 
 
 def _weighed(arguments: Namespace, sensor: Sensor, images: torch.Tensor, progress: Progress) -> WeightFit:
-    if arguments.forces or arguments.pressure:
+    if arguments.forces or arguments.pressure or arguments.overpressure:
         raise MembraneError(
-            "calibrate material: --weight and --forces or --pressure; expected one of them, either gives newtons"
+            "calibrate material: --weight with --forces, --pressure or --overpressure; expected the weight alone, or its force "
+            "in the file of --forces, which goes with gauges"
         )
     return material_from_weight(sensor, images, arguments.weight, progress=progress)
 
 
 def _pressures(arguments: Namespace, inputs: Inputs, sensor: Sensor) -> KnownPressures:
-    values, since_rest = read_pressures(arguments.pressure, inputs, sensor)
-    return KnownPressures(np.array([values.get(frame_name(path), np.nan) for path in inputs.images]), since_rest)
+    found = read_pressures(arguments.pressure, inputs, sensor)
+    if found.unused:
+        print(f"{arguments.pressure}: {found.unused} readings are of none of the images, and not used")
+    readings = np.array([found.at(frame_name(path), time_in(path.stem)) for path in inputs.images])
+    return KnownPressures(readings, found.since_rest)

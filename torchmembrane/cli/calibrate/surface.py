@@ -14,7 +14,9 @@ from ...calibrate.views import rest_from_views
 from ...errors import MembraneError
 from ...jobs.inputs import find_inputs, single_images
 from ...plot.calibration import fit_figure, surface_figure
+from ...sensor.inflated import InflatedSurface
 from ...sensor.sensor import Sensor
+from ...sensor.units import hectopascal
 from ..progress import ProgressDisplay
 from .files import read_depth, read_motions, read_sensor, read_sensor_image, write_calibrated
 
@@ -27,16 +29,31 @@ def rest(arguments: Namespace) -> int:
     sensor = read_sensor(arguments)
     image = read_sensor_image(arguments.image, sensor)
     with ProgressDisplay("calibrate rest") as progress:
-        found = rest_from_image(sensor, image, progress=progress)
-    units = ["degrees"] * 3 + [sensor.length_unit] * 3
+        found = rest_from_image(sensor, image, arguments.overpressure, progress=progress)
+    sheet, unit = sensor.surface, sensor.length_unit
+    units, design = ["degrees"] * 3 + [unit] * 3, np.zeros(6)
     shifts = np.linalg.norm(found.shifts, axis=1)
     notes = [
         f"{np.isfinite(found.pixels).all(1).sum()} of {len(shifts)} dots found; moved along the surface to null what is left: "
-        f"{np.sqrt((shifts**2).mean()):.3g} {sensor.length_unit} rms, at most {shifts.max():.3g}"
+        f"{np.sqrt((shifts**2).mean()):.3g} {unit} rms, at most {shifts.max():.3g}"
     ]
+    if isinstance(sheet, InflatedSurface):
+        units, design = [*units, unit, ""], np.append(design, [sheet.formed.height, sensor.material.prestretch])
+        notes += _held(found.sensor, arguments.overpressure)
     title = "rest surface from one image"
-    report = Report.of(title, found.names, units, np.zeros(6), found.fit, found.pixels, found.residuals, notes)
-    return write_calibrated(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size))
+    report = Report.of(title, found.names, units, design, found.fit, found.pixels, found.residuals, notes)
+    return write_calibrated(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size), 1)
+
+
+def _held(sensor: Sensor, gauge: float | None) -> list[str]:
+    """What the sheet found holds, and what the gauge reads."""
+    sheet = sensor.surface
+    assert isinstance(sheet, InflatedSurface)
+    if sensor.force_unit == "relative":
+        return ["without a modulus, or a gauge at rest (--overpressure), forces stay relative"]
+    held = sheet.formed.pressure * sensor.material.modulus / hectopascal(sensor.length_unit)
+    read = "" if gauge is None else f", the gauge reads {gauge:g} hPa"
+    return [f"shear modulus x thickness {sensor.material.modulus:.4g} N/{sensor.length_unit} holds {held:.4g} hPa{read}"]
 
 
 def views(arguments: Namespace) -> int:
@@ -59,7 +76,7 @@ def views(arguments: Namespace) -> int:
     modelled = found.sensor.camera.point_to_pixel(torch.from_numpy(found.dots)).numpy()
     pixels = np.broadcast_to(modelled, found.residuals.shape)
     report = Report.of(f"rest surface from {P} views", found.names, units, design, found.fit, pixels, found.residuals, notes)
-    return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface))
+    return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface), P)
 
 
 def depth(arguments: Namespace) -> int:
@@ -76,7 +93,7 @@ def depth(arguments: Namespace) -> int:
         f"{len(found.sensor.markers.sizes or ())} dots placed on the surface",
     ]
     report = Report.without_parameters("rest surface from a depth image", notes)
-    return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface))
+    return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface), 1)
 
 
 def _drawn(sensor: Sensor, report: Report, surface: Correction) -> "Figure":

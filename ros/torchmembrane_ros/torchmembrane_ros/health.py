@@ -1,0 +1,90 @@
+"""How the node is doing, once a second on /diagnostics: rate, latency, statuses, drift, age of the calibration."""
+
+import time
+from collections import Counter, deque
+from datetime import date
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+import torchmembrane as tm
+from torchmembrane.integrations.frame_messages import DOUBTFUL, FAILED, GOOD, Message, diagnosis
+
+RECENT = 100
+"""Images over which rate and latency are taken."""
+SILENT = 2.0
+"""Seconds without an image after which that is said."""
+
+
+class Followed(NamedTuple):
+    """An image that was reconstructed: when that was done (s), how old the image was by then (s), and its status."""
+
+    time: float
+    latency: float
+    status: tm.Status
+
+
+class Health:
+    """What is counted while images are followed.
+
+    Args:
+        sensor: that is followed.
+        path: of its file, whose age is told where the file has no record of its calibration.
+    """
+
+    def __init__(self, sensor: tm.Sensor, path: Path):
+        self.name, self.record = sensor.name, sensor.record
+        self.written = date.fromtimestamp(path.stat().st_mtime)
+        self.recent: deque[Followed] = deque(maxlen=RECENT)
+        self.statuses: Counter[tm.Status] = Counter()
+        self.refused = 0
+
+    def add(self, latency: float, status: tm.Status) -> None:
+        """One more image."""
+        self.recent.append(Followed(time.monotonic(), latency, status))
+        self.statuses[status] += 1
+
+    def refuse(self) -> None:
+        """One more image that cannot be read."""
+        self.refused += 1
+
+    def message(self, received: int, drift: float) -> Message:
+        """A `DiagnosticStatus`.
+
+        Args:
+            received: images so far; those that were neither followed nor refused were displaced by newer ones.
+            drift: px, of the tracker.
+        """
+        recent = list(self.recent)
+        times, latencies = [each.time for each in recent], [1000 * each.latency for each in recent]
+        rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
+        median, most = np.percentile(latencies, [50, 99]) if latencies else (np.nan, np.nan)
+        followed = self.statuses.total()
+        values = {
+            "rate, Hz": f"{rate:.1f}",
+            "latency, ms (median)": f"{median:.0f}",
+            "latency, ms (99 %)": f"{most:.0f}",
+            "images received": str(received),
+            "images followed": str(followed),
+            "images refused": str(self.refused),
+            "images displaced by newer ones": str(max(received - followed - self.refused, 0)),
+            "drift, px": f"{drift:.3f}",
+            "serial": self.record.serial or "unknown",
+            **self._age(),
+        }
+        values |= {f"status {int(status)}: {status.text}": str(count) for status, count in sorted(self.statuses.items())}
+        return diagnosis(*self._judged(), values)
+
+    def _age(self) -> dict[str, str]:
+        """Of the calibration, in days, or of the sensor file."""
+        what, day = ("calibration", self.record.calibrated) if self.record.calibrated else ("sensor file", self.written)
+        return {f"age of the {what}, days": str((date.today() - day).days)}
+
+    def _judged(self) -> tuple[int, str, str]:
+        """Level, name and words."""
+        name = f"torchmembrane: {self.name}"
+        if not self.recent or time.monotonic() - self.recent[-1].time > SILENT:
+            return DOUBTFUL, name, "no images come" if not self.refused else "images come, none can be followed"
+        status = self.recent[-1].status
+        return GOOD if status == tm.Status.OK else DOUBTFUL if status.has_surface else FAILED, name, status.text

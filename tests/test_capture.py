@@ -1,0 +1,135 @@
+"""Photographs of a camera: its settings are held as far as the driver lets, and what is not is said."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from torchmembrane.cli.main import main
+from torchmembrane.files.timestamps import time_in
+from torchmembrane.live import capture
+from torchmembrane.live.capture import SETTLING, STALE, Held, hold
+
+ROOT = Path(__file__).parents[1]
+AUTO = {"AUTO_EXPOSURE": 3.0, "AUTO_WB": 1.0, "AUTOFOCUS": 1.0}
+
+
+class Driver:
+    """A camera with the interface of `cv2.VideoCapture`: its images brighten until it is held.
+
+    Args:
+        lets: the properties that it takes.
+        backend: of the system.
+    """
+
+    def __init__(self, lets, backend="V4L2"):
+        self.values = {"EXPOSURE": 100.0, "GAIN": 7.0, "WB_TEMPERATURE": 4600.0, "FOCUS": 30.0, **AUTO}
+        self.lets, self.backend, self.reads, self.held_at, self.released = set(lets), backend, 0, None, False
+
+    def _key(self, number):
+        return next((key for key in self.values if getattr(cv2, f"CAP_PROP_{key}") == number), None)
+
+    def isOpened(self):  # noqa: N802
+        return True
+
+    def getBackendName(self):  # noqa: N802
+        return self.backend
+
+    def get(self, number):
+        return self.values.get(self._key(number), 0.0)
+
+    def set(self, number, value):
+        key = self._key(number)
+        if key in self.lets:
+            self.values[key] = value
+        if key == "AUTO_EXPOSURE":
+            self.held_at = self.reads
+        return key in self.lets
+
+    def read(self):
+        self.reads += 1
+        self.values["EXPOSURE"] += self.held_at is None
+        return True, np.full((6, 8, 3), min(self.reads, 255), np.uint8)
+
+    def release(self):
+        self.released = True
+
+
+def test_settings_are_taken_from_the_automatics_and_kept_as_they_are():
+    driver = Driver(Driver([]).values)
+    before = dict(driver.values)
+    assert hold(driver) == Held(["exposure", "gain", "white balance", "focus"], [])
+    assert driver.values == before | {"AUTO_EXPOSURE": 1.0, "AUTO_WB": 0.0, "AUTOFOCUS": 0.0}
+    other = Driver(Driver([]).values, "DSHOW")
+    hold(other)
+    assert other.values["AUTO_EXPOSURE"] == 0.25
+
+
+@pytest.mark.parametrize(
+    "lets, free",
+    [
+        (["AUTO_EXPOSURE", "EXPOSURE", "GAIN"], ["white balance", "focus"]),
+        (["EXPOSURE", "GAIN", "AUTO_WB", "WB_TEMPERATURE", "AUTOFOCUS", "FOCUS"], ["exposure"]),
+        ([], ["exposure", "gain", "white balance", "focus"]),
+    ],
+)
+def test_what_a_driver_does_not_let_be_held_is_said(lets, free):
+    found = hold(Driver(lets))
+    assert found.free == free and f"the driver does not let {', '.join(free)} be held" in found.said
+
+
+def test_a_driver_that_takes_a_setting_and_ignores_it_does_not_hold_it():
+    class Deaf(Driver):
+        def set(self, number, value):
+            return True
+
+    assert hold(Deaf([])).free == ["exposure", "white balance", "focus"]  # the gain is what it was
+
+
+def test_photographs_are_taken_with_settings_held_and_named_by_their_time(monkeypatch, tmp_path, capsys):
+    driver = Driver(Driver([]).values)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: driver)
+    assert main(["capture", "--camera", "0", "--out", str(tmp_path / "rest"), "--count", "3", "--every", "0.01"]) == 0
+    said, paths = capsys.readouterr().out, sorted((tmp_path / "rest").iterdir())
+    assert "exposure, gain, white balance, focus held" in said and "3 photographs of 8 x 6 px" in said
+    assert driver.held_at == SETTLING and driver.released and len(paths) == 3
+    first = np.asarray(Image.open(paths[0]))
+    assert first.shape == (6, 8, 3) and first[0, 0, 0] == SETTLING + STALE + 1
+    times = [time_in(path.stem) for path in paths]
+    assert all(np.isfinite(times)) and times[2] - times[0] > 0.018
+
+
+def test_a_photograph_of_another_size_than_the_sensor_s_is_refused(monkeypatch, small_sensor, tmp_path, capsys):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: Driver([]))
+    call = ["capture", str(small_sensor / "sensor.toml"), "--camera", "0", "--out", str(tmp_path / "rest")]
+    assert main(call) == 2
+    assert "images of 8 x 6 px; expected the sensor's 160 x 120" in capsys.readouterr().err and not (tmp_path / "rest").exists()
+
+
+@pytest.mark.parametrize("options", [["capture", "--out", "rest"], ["live", "preset:bubble"]])
+def test_only_this_package_s_words_reach_the_terminal_where_there_is_no_camera(options, tmp_path):
+    command = [sys.executable, "-m", "torchmembrane", *options, "--camera", "987"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}, capture_output=True, text=True
+    )
+    lines = (done.stdout + done.stderr).splitlines()
+    assert done.returncode == 2 and "--camera 987: cannot be opened" in done.stderr
+    assert lines and all(re.match("torchmembrane: ", line) for line in lines), lines
+
+
+def test_what_live_alone_has_comes_first_in_its_help(capsys):
+    with pytest.raises(SystemExit):
+        main(["live", "--help"])
+    said = capsys.readouterr().out
+    places = [said.index(f"\n  --{name} ") for name in ("camera", "video", "images", "record", "model", "estimator", "device")]
+    assert max(places[:5]) < min(places[5:])
+
+
+def test_the_module_says_its_settings_as_opencv_calls_them():
+    names = [name for setting in capture.SETTINGS for name in (setting.value, setting.switch) if name]
+    assert all(hasattr(cv2, f"CAP_PROP_{name}") for name in names)

@@ -1,0 +1,66 @@
+"""URDF and MJCF of a sensor: closed meshes that are the rest surface, and frames that are the camera's and the tool's."""
+
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import trimesh
+
+import torchmembrane as tm
+from torchmembrane.cli.main import main
+from torchmembrane.integrations.robot_model import roll_pitch_yaw, write_robot_model
+from torchmembrane.presets import NAMES
+
+TOOL = tm.Pose(np.array([10.0, 70.0, -40.0]), np.array([1.5, 0.0, 30.0]))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_meshes_are_closed_and_face_outwards(name, tmp_path):
+    """The membrane's volume is that between rim and surface, by the divergence theorem positive for outward triangles."""
+    sensor = tm.preset(name)
+    write_robot_model(sensor, tmp_path)
+    for mesh in ("membrane", "rim"):
+        loaded = trimesh.load(tmp_path / f"{mesh}.stl")
+        assert loaded.is_watertight and loaded.is_winding_consistent and loaded.volume > 0
+    rest = sensor.membrane.rest.double().numpy() / 1000
+    found = trimesh.load(tmp_path / "membrane.stl").vertices
+    apart = np.linalg.norm(rest[:, None] - found[None], axis=-1)
+    assert apart.min(1).max() < 1e-7 and (apart.min(0) > 1e-7).sum() == 1  # m; the middle of the lid
+
+
+def test_frames_are_the_camera_s_on_the_tool(tmp_path):
+    sensor = replace(tm.preset("fingertip"), tool=TOOL)
+    write_robot_model(sensor, tmp_path)
+    origin = ElementTree.parse(tmp_path / "fingertip.urdf").find("joint/origin")
+    np.testing.assert_allclose(np.array(origin.get("xyz").split(), float), TOOL.translation / 1000)
+    roll, pitch, yaw = np.array(origin.get("rpy").split(), float)
+    np.testing.assert_allclose(turned(2, yaw) @ turned(1, pitch) @ turned(0, roll), TOOL.rotation, atol=1e-8)
+    camera = ElementTree.parse(tmp_path / "fingertip.xml").find("worldbody/body/camera")
+    x, y = np.array(camera.get("xyaxes").split(), float).reshape(2, 3)
+    np.testing.assert_allclose(-np.cross(x, y), TOOL.rotation[:, 2], atol=1e-8)  # MuJoCo's camera looks along -z
+    np.testing.assert_allclose(x, TOOL.rotation[:, 0], atol=1e-8)
+    loaded = trimesh.load(tmp_path / "membrane.stl").vertices
+    expected = TOOL.points(sensor.membrane.rest.double().numpy()) / 1000
+    assert np.linalg.norm(expected[:, None] - loaded[None], axis=-1).min(1).max() < 1e-7
+
+
+@pytest.mark.parametrize("pitch", [-np.pi / 2, -0.4, 0.0, 1.2, np.pi / 2])
+def test_angles_give_their_rotation_back(pitch):
+    rotation = turned(2, 0.7) @ turned(1, pitch) @ turned(0, -2.1)
+    roll, found, yaw = roll_pitch_yaw(rotation)
+    np.testing.assert_allclose(turned(2, yaw) @ turned(1, found) @ turned(0, roll), rotation, atol=1e-9)
+
+
+def test_the_command_writes_them(tmp_path, capsys):
+    assert main(["check", "preset:fingertip", "--robot", str(tmp_path / "robot")]) == 0
+    assert (tmp_path / "robot/fingertip.urdf").exists() and "fingertip.urdf" in capsys.readouterr().out
+
+
+def turned(axis, angle):
+    a, b = (k for k in range(3) if k != axis)
+    sign = -1 if axis == 1 else 1
+    rotation = np.eye(3)
+    rotation[a, a] = rotation[b, b] = np.cos(angle)
+    rotation[a, b], rotation[b, a] = -sign * np.sin(angle), sign * np.sin(angle)
+    return rotation

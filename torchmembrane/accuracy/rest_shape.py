@@ -1,0 +1,115 @@
+"""Whether a rest surface can be at rest: the forces that are left over, and the nearest sheet that is blown up in its rim."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import MembraneError
+from ..forming.formed import SheetMaterial, film, formed_surface
+from ..mechanics.cavity import rest_balance
+from ..sensor.factories import elastic_energy
+from ..sensor.inflated import InflatedSurface
+from ..sensor.sensor import Sensor
+from ..surface.membrane import Membrane
+from ..surface.topology import rim_loop
+
+RAISED = 1.02  # of a height, to see how the sheet follows it
+LINES = 17  # of the sheet's grid: its shape is then right to some thousandths of its height
+
+
+class NearestSheet(NamedTuple):
+    """The nearest rest surface that is a sheet, blown up in the same rim, of the same rubber.
+
+    Attributes:
+        height: of its highest point above the rim's plane.
+        distance: rms of the given surface's distance from it, length unit.
+        most: the largest.
+        pressure: that holds it, force / length^2.
+        stretch: of the sheet in its rim, before it is blown up.
+        least: mean stretch that blowing up alone gives.
+    """
+
+    height: float
+    distance: float
+    most: float
+    pressure: float
+    stretch: float
+    least: float
+
+
+class RestShape(NamedTuple):
+    """What a rest surface says of itself.
+
+    Attributes:
+        pressure: that the fluid has over its surroundings by the model, force / length^2.
+        left_over: rms over the surface of the forces per area that neither tension nor pressure balances, over the pressure;
+            a fixed load takes them up.
+        nearest: None of a surface that is such a sheet, or in whose rim there is none.
+    """
+
+    pressure: float
+    left_over: float
+    nearest: NearestSheet | None
+
+
+def rest_shape(sensor: Sensor) -> RestShape:
+    """Compare a sensor's rest surface with what can be at rest.
+
+    Args:
+        sensor: any.
+
+    Returns:
+        The `RestShape`.
+
+    Example:
+        >>> from torchmembrane.presets import preset
+        >>> found = rest_shape(preset("bubble"))
+        >>> found.left_over < 0.06, found.nearest.distance < 0.2
+        (True, True)
+    """
+    membrane = sensor.membrane
+    p0, load = rest_balance(membrane, elastic_energy(sensor, membrane))
+    load, area = load[membrane.free_vertices], membrane.rest_area[membrane.free_vertices]
+    left_over = float((load.square().sum(1) / area).sum() / area.sum()) ** 0.5 / abs(float(p0))
+    return RestShape(float(p0), left_over, _nearest(sensor))
+
+
+def _nearest(sensor: Sensor) -> NearestSheet | None:
+    membrane, material = sensor.membrane, sensor.material
+    if isinstance(sensor.surface, InflatedSurface):
+        return None
+    X = membrane.rest.numpy()
+    rim = X[rim_loop(membrane.grid)]
+    try:
+        flat = film(rim, LINES)
+        height = float(((X - flat.outline.origin) @ flat.outline.axes[2]).max())
+        least = (float(membrane.rest_area.sum()) / flat.area) ** 0.5
+        stretch = max(1.0, material.prestretch / least)
+        sheet = SheetMaterial(material.model, stretch, material.c2_ratio or 0.0)
+        low, high = (formed_surface(rim, sheet, height=h, lines=LINES) for h in (height, RAISED * height))
+    except MembraneError:
+        return None
+    off = _above(low.vertices, X)
+    slope = _above(high.vertices, X) - off
+    share = -float((slope * off).sum() / (slope * slope).sum())
+    distance = _above(low.vertices + share * (high.vertices - low.vertices), X)
+    modulus = material.modulus * least**2  # the sheet is as much thicker as it is smaller
+    return NearestSheet(
+        height=low.height + share * (high.height - low.height),
+        distance=float(np.sqrt((distance**2).mean())),
+        most=float(np.abs(distance).max()),
+        pressure=modulus * (low.pressure + share * (high.pressure - low.pressure)),
+        stretch=stretch,
+        least=least,
+    )
+
+
+def _above(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Signed distances of points `[N, 3]` from a grid's surface, positive outside, `[N]`."""
+    surface = Membrane(vertices)
+    near = surface.closest_points(points)
+    closest, normals = (
+        (a.numpy()[near.vertices] * near.weights[..., None]).sum(1) for a in (surface.rest, surface.rest_normals)
+    )
+    signed: np.ndarray = ((points - closest) * normals).sum(1)
+    return signed

@@ -1,0 +1,131 @@
+"""A modulus that several measurements tell: forces, a gauge under presses and at rest; joined, and contradictions named."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..mechanics.cavity import rest_balance
+from ..sensor.factories import elastic_energy
+from ..sensor.inflated import InflatedSurface
+from ..sensor.sensor import Sensor
+from ..sensor.units import hectopascal
+
+REST_ERROR = 0.05
+"""Of the modulus from a gauge at rest, relative: that of the rest shape, whose height enters, and of the reading."""
+CONTRADICTING = 2.5  # standard deviations between two measurements, above which it is said
+
+
+class ModulusEvidence(NamedTuple):
+    """What one kind of measurement says of the modulus.
+
+    Attributes:
+        source: in words.
+        modulus: shear modulus x thickness, force / length.
+        deviation: standard deviation, at the prestretch found.
+        change: with one standard deviation of the prestretch.
+    """
+
+    source: str
+    modulus: float
+    deviation: float
+    change: float
+
+
+class JoinedEvidence(NamedTuple):
+    """Prestretch and modulus by all that is known.
+
+    Attributes:
+        shift: of the logarithm of the prestretch, in its standard deviations.
+        modulus: force / length.
+        covariance: `[2, 2]` of the shift and of the logarithm of the modulus.
+        contradictions: a sentence for each two kinds of measurement that contradict one another.
+    """
+
+    shift: float
+    modulus: float
+    covariance: np.ndarray
+    contradictions: list[str]
+
+
+def joined(evidence: Sequence[ModulusEvidence]) -> JoinedEvidence:
+    """The prestretch's shift `t` and the modulus `m` that several measurements agree on, by weighted least squares:
+
+        t^2 + sum_i (log m - log m_i - g_i t)^2 / s_i^2,    s_i = deviation / modulus,  g_i = change / modulus
+
+    What the presses' shapes say of the prestretch is the first term. Each measurement's modulus depends on the prestretch in
+    its own way, so that two of them tell it, too. Where they cannot agree, the covariance grows by their scatter.
+
+    Example:
+        >>> by_force, at_rest = ModulusEvidence("forces", 0.5, 0.05, 0.0), ModulusEvidence("gauge", 0.3, 0.02, 0.0)
+        >>> found = joined([by_force, at_rest])
+        >>> round(found.modulus, 2), found.contradictions[0].split(":")[0]
+        (0.35, 'forces and gauge contradict one another')
+    """
+    modulus, deviation, change = (np.array([one[k] for one in evidence]) for k in (1, 2, 3))
+    s, g = deviation / modulus, change / modulus
+    rows = np.vstack([[1.0, 0.0], np.stack([-g, np.ones(len(s))], 1) / s[:, None]])
+    values = np.concatenate([[0.0], np.log(modulus) / s])
+    covariance = np.linalg.inv(rows.T @ rows)
+    shift, logarithm = covariance @ rows.T @ values
+    scatter = ((rows @ [shift, logarithm] - values) ** 2).sum() / max(len(s) - 1, 1)
+    said, at = [], np.log(modulus) + g * shift
+    for i, one in enumerate(evidence):
+        for k in range(i + 1, len(evidence)):
+            apart = abs(at[i] - at[k]) / np.hypot(s[i], s[k])
+            if apart > CONTRADICTING:
+                told = (f"{np.exp(at[j]):.3g} ± {np.exp(at[j]) * s[j]:.1g}" for j in (i, k))
+                said.append(
+                    f"{one.source} and {evidence[k].source} contradict one another: moduli of {' and '.join(told)}, "
+                    f"{apart:.1f} standard deviations apart: one of them, or the rest shape, is wrong"
+                )
+    return JoinedEvidence(float(shift), float(np.exp(logarithm)), covariance * max(1.0, scatter), said)
+
+
+def odd_ones(ratios: np.ndarray, deviations: np.ndarray) -> list[tuple[int, float, float]]:
+    """Which of several ratios, whose mean counts, the others contradict: each with its ratio to their mean, and by how much.
+
+    Args:
+        ratios: `[n]`.
+        deviations: `[n]`, relative.
+
+    Returns:
+        Index, ratio, and standard deviations apart, of each that is more than `CONTRADICTING` apart from the others.
+
+    Example:
+        >>> [(i, round(r, 2)) for i, r, _ in odd_ones(np.array([1.0, 1.02, 1.6, 0.98]), np.full(4, 0.1))]
+        [(2, 1.6)]
+    """
+    found = []
+    for i in range(len(ratios)) if len(ratios) > 2 else ():
+        others = np.arange(len(ratios)) != i
+        weight = deviations[others] ** -2.0
+        mean = (weight * ratios[others]).sum() / weight.sum()
+        apart = (ratios[i] / mean - 1) / np.hypot(deviations[i], weight.sum() ** -0.5)
+        if abs(apart) > CONTRADICTING:
+            found.append((i, float(ratios[i] / mean), float(abs(apart))))
+    return found
+
+
+def modulus_at_rest(sensor: Sensor, log_stretch: float, deviation: float, overpressure: float) -> ModulusEvidence:
+    """The modulus that holds the rest surface against what a gauge reads there.
+
+    Args:
+        sensor: gives rest surface and material.
+        log_stretch: logarithm of the prestretch.
+        deviation: its standard deviation.
+        overpressure: at rest, hPa.
+    """
+    measured = overpressure * hectopascal(sensor.length_unit)
+
+    def modulus(stretch: float) -> float:
+        if isinstance(sensor.surface, InflatedSurface):
+            sheet = sensor.surface.made_of(replace(sensor.material, prestretch=max(1.0, stretch)), sensor.length_unit)
+            return float(measured / sheet.formed.pressure)
+        energy = elastic_energy(sensor, sensor.membrane, prestretch=stretch, modulus=1.0)
+        return float(measured / float(rest_balance(sensor.membrane, energy)[0]))
+
+    found, low, high = (modulus(float(np.exp(log_stretch + s * deviation))) for s in (0, -1, 1))
+    change = float(np.sign(high - low) * max(abs(low - found), abs(high - found)))
+    return ModulusEvidence("the gauge at rest", found, REST_ERROR * found, change)

@@ -1,0 +1,84 @@
+"""The elastic energy of a membrane that was a sheet before it was blown up: stretched by another amount at every place."""
+
+import torch
+from torch import Tensor
+
+from ..mechanics.hyperelastic import ElasticEnergy
+from ..surface.membrane import Membrane
+from ..surface.topology import grid_triangles
+
+
+class SheetEnergy(ElasticEnergy):
+    """`ElasticEnergy` whose prestretch and modulus belong to the sheet, not to the rest surface.
+
+    With `G` the metric of the sheet's triangles and `g` that of the membrane's, `I = tr(G^-1 g)` and `D = det g / det G` in the
+    same `W(I, D)`, per area of the sheet: tension at rest then varies from place to place and with the direction, as the blown
+    up sheet's does. A membrane that is its own sheet has the energy of `ElasticEnergy`.
+
+    Args:
+        membrane: the rest surface.
+        sheet: `[V, 3]`, where its vertices were before: stretched in its rim by the prestretch, without pressure.
+        model: "harmonic" | "neo_hookean" | "mooney_rivlin".
+        prestretch: of the sheet, equal in both directions.
+        modulus: shear modulus x thickness of the sheet as it is stretched in its rim, force / length.
+        c2_ratio: C2 / C1, Mooney-Rivlin only.
+
+    Example:
+        >>> from torchmembrane.surface.shapes import spherical_cap
+        >>> flat, cap = (spherical_cap(12.0, height, 15.0, (9, 9)) for height in (1e-5, 5.0))
+        >>> energy = SheetEnergy(cap, flat.rest, "neo_hookean", prestretch=1.1)
+        >>> bool(energy.tension > ElasticEnergy(cap, prestretch=1.1).tension)
+        True
+    """
+
+    sheet: Tensor
+    rest: Tensor
+    is_free: Tensor
+
+    def __init__(
+        self,
+        membrane: Membrane,
+        sheet: Tensor,
+        model: str = "neo_hookean",
+        prestretch: float = 1.0,
+        modulus: float = 1.0,
+        c2_ratio: float = 0.0,
+    ) -> None:
+        of_rest = ElasticEnergy(membrane, model)
+        super().__init__(_Reference(sheet, membrane.grid), model, prestretch, modulus, c2_ratio)  # type: ignore[arg-type]
+        self.modulus, self.c2_ratio = modulus, c2_ratio
+        for name in ("rest_edges", "rest_sides", "rest_cell_edges"):
+            self.register_buffer(name, getattr(of_rest, name))
+        split = torch.from_numpy(grid_triangles(membrane.grid))
+        for name, value in (("sheet", sheet), ("rest", membrane.rest), ("is_free", (~membrane.fixed)[split].any(1))):
+            self.register_buffer(name, value)
+
+    def on(self, membrane: Membrane) -> "SheetEnergy":
+        """The same sheet on every second line of the grid."""
+        sheet = self.sheet.unflatten(0, self.grid)[::2, ::2].flatten(0, 1)
+        return SheetEnergy(membrane, sheet, self.model, float(self.prestretch), self.modulus, self.c2_ratio)
+
+    @property
+    def rest_stretches(self) -> Tensor:
+        """The principal stretches at rest over the unstretched sheet, larger and smaller, `[T, 2]`, of triangles that are not
+        wholly on the rim."""
+        return (self.prestretch * self.principal_stretches(self.rest))[self.is_free]
+
+    @property
+    def tension(self) -> Tensor:
+        """The mean tension at rest (force / length), over the rest surface and both principal directions.
+
+        Half the trace of the stress resultant is `(I dW/dI + 2 D dW/dD) / sqrt D`.
+        """
+        strain = self.strain(self.rest)
+        w_I, w_D = self.first_derivatives(strain.I, strain.D)
+        area = self.area * self.is_free.unflatten(0, (-1, 2)).T.flatten()  # first triangles of all cells, then second ones
+        total: Tensor = (area * (strain.I * w_I + 2 * strain.D * w_D)).sum() / (area * strain.D.sqrt()).sum()
+        return total
+
+
+class _Reference:
+    """What `ElasticEnergy` takes of a membrane."""
+
+    def __init__(self, rest: Tensor, grid: tuple[int, int]) -> None:
+        self.rest, self.grid = rest, grid

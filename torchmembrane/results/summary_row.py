@@ -1,0 +1,172 @@
+"""A row of summary.csv: its columns, what each means, and the cells that a frame's arrays give.
+
+torchmembrane and torchmembrane-edge both have this file, the same to the letter.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+CONTACTS = 4
+"""Patches that have columns of their own."""
+AXES = "xyz"
+METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0, "um": 1e6, "inch": 1 / 0.0254}
+"""One metre in the length unit."""
+FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
+"""What a spreadsheet takes for a formula when a cell begins with it, spaces aside: such a text gets a ' before it."""
+
+
+class Column(NamedTuple):
+    """A column: its name, the unit of its numbers, and its meaning.
+
+    Units are words, or `length`, `force`, `moment`, `area` or `pressure`, which `in_units` says in the sensor's units; "text"
+    where there are no numbers.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+
+
+def _vector(name: str, unit: str, meaning: str) -> list[Column]:
+    return [Column(f"{name}_{axis}", unit, f"{meaning}, along {axis} of the camera's frame") for axis in AXES]
+
+
+def _contact(number: int) -> list[Column]:
+    patch, name = f"contact patch {number}, strongest first", f"contact_{number}"
+    return [
+        *_vector(name, "length", f"{patch}: its centroid"),
+        Column(f"{name}_force", "force", f"{patch}: magnitude of its force"),
+        *_vector(f"{name}_force", "force", f"{patch}: its force"),
+        Column(f"{name}_area", "area", f"{patch}: its area"),
+    ]
+
+
+COLUMNS = (
+    Column("name", "text", "of the frame, as results bear it"),
+    Column("file", "text", "the image, video or bag that it came from"),
+    Column("status", "code", "0: ok; -1: the file could not be read; others as status_text says"),
+    Column("status_text", "text", "the status in words"),
+    Column(
+        "time",
+        "s",
+        "when the frame was taken: since 1970 as its name (a date taken for UTC), bag or camera says; of a video without a "
+        "time in its name since its beginning; empty where it is not known",
+    ),
+    Column("markers_found", "count", "markers found in the image"),
+    Column("markers_total", "count", "markers of the sensor"),
+    Column("coverage", "share", "of the membrane's area that found markers see, of what they see at rest"),
+    Column("residual_px", "px", "rms distance of measured from modelled markers"),
+    Column("pressure", "pressure", "difference across the membrane"),
+    Column("pressure_change", "pressure", "the same minus its rest value"),
+    Column("pressure_hpa", "hPa", "difference across the membrane; empty where forces are relative"),
+    Column("pressure_change_hpa", "hPa", "the same minus its rest value"),
+    Column("force", "force", "magnitude of the total contact force on the membrane"),
+    *_vector("force", "force", "total contact force on the membrane"),
+    *_vector("force_deviation", "force", "standard deviation of the total contact force, the model's error included"),
+    *_vector("moment", "moment", "moment of the total contact force about the camera's origin"),
+    Column("contacts", "count", "contact patches found"),
+    *(column for number in range(1, CONTACTS + 1) for column in _contact(number)),
+    Column("deepest", "length", "lowest displacement along the outward rest normal: negative is an indentation"),
+    *_vector("deepest", "length", "where that vertex is now"),
+    Column("depth_deviation", "length", "standard deviation of the deepest displacement"),
+    Column("volume_error", "share", "(volume - target) / rest volume of the cavity"),
+    Column("seconds", "s", "that the frame took to compute, in its batch"),
+    Column("content_hash", "text", "BLAKE2b, 16 bytes, of the file"),
+    Column("length_unit", "text", "of all lengths here"),
+    Column("force_unit", "text", "of all forces here: N, or relative where the sensor file has no modulus"),
+)
+NAMES = tuple(column.name for column in COLUMNS)
+TEXT = tuple(column.name for column in COLUMNS if column.unit == "text")
+"""Columns that the names of files, damaged images, results and `mesh.npz` give."""
+
+
+def in_units(length_unit: str, force_unit: str) -> list[Column]:
+    """The columns with the sensor's units.
+
+    Example:
+        >>> [column.unit for column in in_units("mm", "N") if column.name in ("deepest", "moment_x", "pressure", "time")]
+        ['s', 'N/mm^2', 'N mm', 'mm']
+    """
+    length, force = length_unit, force_unit
+    said = {"length": length, "force": force, "moment": f"{force} {length}", "area": f"{length}^2"}
+    said["pressure"] = f"{force}/{length}^2"
+    return [column._replace(unit=said.get(column.unit, column.unit)) for column in COLUMNS]
+
+
+def numbers(frame: Mapping[str, Any], rest_normals: np.ndarray, length_unit: str, force_unit: str) -> dict[str, Any]:
+    """The numbers of a row that a frame's arrays give, NaN where nothing is known.
+
+    Args:
+        frame: arrays by the names of `Reconstruction`; those that it lacks are unknown.
+        rest_normals: `[V, 3]`, of the rest surface.
+        length_unit: of its lengths.
+        force_unit: of its forces.
+    """
+    found: dict[str, Any] = {}
+
+    def vector(name: str, values: np.ndarray) -> None:
+        found.update({f"{name}_{axis}": value for axis, value in zip(AXES, values, strict=True)})
+
+    def of(key: str, *shape: int) -> np.ndarray:
+        return np.asarray(frame[key]) if key in frame else np.full(shape, np.nan)
+
+    confidence = of("confidence", 0)
+    found |= {"markers_found": (confidence > 0).sum(), "markers_total": confidence.size}
+    found["residual_px"] = of("residual")
+    found |= {key: of(key) for key in ("coverage", "pressure", "pressure_change", "depth_deviation", "volume_error")}
+    hectopascals = METRE[length_unit] ** 2 / 100 if force_unit == "N" and length_unit in METRE else np.nan
+    found |= {f"{key}_hpa": found[key] * hectopascals for key in ("pressure", "pressure_change")}
+    force, wrench = of("force", 3), of("wrench", 6)
+    found["force"] = np.linalg.norm(force)
+    vector("force", force)
+    vector("force_deviation", of("force_deviation", 3))
+    vector("moment", wrench[3:])
+    points = of("contact_points", 0, 3)
+    found["contacts"] = np.isfinite(points).all(-1).sum()
+    places, forces, areas = _rows(points, 3), _rows(of("contact_force", 0, 3), 3), _rows(of("contact_area", 0), 1)
+    for number, (place, push, area) in enumerate(zip(places, forces, areas, strict=True), 1):
+        vector(f"contact_{number}", place)
+        vector(f"contact_{number}_force", push)
+        found |= {f"contact_{number}_force": np.linalg.norm(push), f"contact_{number}_area": area[0]}
+    along = (of("displacement", len(rest_normals), 3) * rest_normals).sum(-1)
+    is_known = along.size > 0 and np.isfinite(along).all()
+    found["deepest"] = along.min() if is_known else np.nan
+    vector("deepest", of("vertices", len(rest_normals), 3)[along.argmin()] if is_known else np.full(3, np.nan))
+    return found
+
+
+def _rows(values: np.ndarray, width: int) -> np.ndarray:
+    """The first `CONTACTS` rows, `[CONTACTS, width]`, NaN where there are fewer."""
+    rows = np.full((CONTACTS, width), np.nan)
+    given = values.reshape(len(values), width)[:CONTACTS]
+    rows[: len(given)] = given
+    return rows
+
+
+def cell(name: str, value: Any) -> str:
+    """A number as a cell: six digits, of times microseconds; empty where it is not known.
+
+    Example:
+        >>> cell("force", 1.23456789), cell("time", 1790509109.25), cell("contacts", 2), cell("force", float("nan"))
+        ('1.23457', '1790509109.250000', '2', '')
+    """
+    if not np.isfinite(value):
+        return ""
+    return f"{value:.6f}" if name == "time" else f"{value:.6g}"
+
+
+def escaped(name: str, text: str) -> str:
+    """A cell as it is written: text that a spreadsheet would take for a formula gets a ' before it."""
+    return f"'{text}" if name in TEXT and is_formula(text) else text
+
+
+def unescaped(name: str, text: str) -> str:
+    """The cell that was written as this text."""
+    return text[1:] if name in TEXT and text.startswith("'") and is_formula(text) else text
+
+
+def is_formula(text: str) -> bool:
+    """Whether a spreadsheet would take a text for a formula."""
+    return text.lstrip("' ").startswith(FORMULA)
