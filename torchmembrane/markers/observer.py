@@ -100,7 +100,7 @@ class MarkerObserver(nn.Module):
         nulled (5.2)."""
         with torch.no_grad():
             pixels, confidence, covariance = self.locator(image[None, None])
-        found = confidence > FOUND
+        found = (confidence > FOUND) & self.seen_at_rest  # what the model has outside cannot be one of the dots in view
         in_view = int(self.seen_at_rest.sum())
         if found.sum() < max(FEWEST_MARKERS, ALIKE_SHARE * in_view):
             raise MembraneError(
