@@ -93,7 +93,7 @@ class NeighbourAgreement(nn.Module):
         `[B, E, C + 1, C + 1]`, first messages `[B, E, C + 1]`."""
         middle = expected.mean(1, keepdim=True)
         square = square_distance(expected - middle, blobs - middle)
-        cost = square * self.pull + (0.5 * misfit).clamp(max=SIZE) + FAR * (square > self.reach)
+        cost = square * self.pull + (0.5 * misfit).clamp(max=SIZE) + FAR * (square > self.reach).to(square.dtype)
         value, index = cost.topk(min(CANDIDATES, cost.shape[-1]), largest=False)
         places = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
         offset = places - expected[:, :, None]

@@ -191,7 +191,7 @@ class DotMatcher(nn.Module):
         finite = previous.isfinite().all(-1)
         enough = finite.to(flow.dtype).mean(-1, keepdim=True) > 0.5
         flow = torch.where((finite & enough)[..., None], previous - self.pixels - self.origin, flow)
-        return flow, torch.where(enough, finite, found)
+        return flow, (finite & enough) | (found & ~enough)  # onnxruntime chooses between numbers only
 
     @traced
     def follow(self, known: Tensor, base: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
