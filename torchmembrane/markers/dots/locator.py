@@ -204,7 +204,7 @@ class DotLocator(nn.Module):
         deviation = safe_length(seen - predicted, -1) / self.match.nearest
         confidence = quality * torch.sigmoid(20 * (OUTLIER - deviation))
         confidence = confidence * self.coherence(seen, confidence, strain, predicted, blobs, log_radius, valid)
-        odds = torch.where(certainty < KEPT, UNSEEN, 1.0)
+        odds = 1 + (UNSEEN - 1) * (certainty < KEPT).to(confidence.dtype)
         confidence = confidence / (confidence + (1 - confidence) * odds)
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
         confidence = self._alike(confidence, CONFIDENCE)
