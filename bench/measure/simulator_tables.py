@@ -1,0 +1,101 @@
+"""Tables of the simulator and of wrong numbers in a sensor file: rows of cells, the first of which is the head."""
+
+from bench.measure.accuracy_tables import Rows
+
+CLOSED_FORMS = {
+    "spherical cap, p = 2 T / R": "liquid in a spherical cap, p = 2 T / R",
+    "half cylinder, p = T / R": "liquid in a half cylinder, p = T / R",
+    "neo-Hookean sphere inflated to 1.5": "neo-Hookean sphere inflated to 1.5 times its radius",
+    "flat square, Fourier series": "flat square under little pressure, Fourier series",
+}
+
+
+def closed_forms(found: dict) -> Rows:
+    """Relative errors on three grids, and their order of convergence."""
+    rows = [
+        [CLOSED_FORMS[row["name"]], *map(scientific, row["errors"]), ", ".join(f"{rate:.2f}" for rate in row["rates"])]
+        for row in found["closed_forms"]
+    ]
+    return [["", *map(str, found["closed_forms"][0]["grids"]), "rates"], *rows]
+
+
+def scientific(value: float, digits: int = 1) -> str:
+    """A number with one digit before the point.
+
+    >>> scientific(0.00423), scientific(5e-12, 0), scientific(0.0)
+    ('4.2e-3', '5e-12', '0')
+    """
+    mantissa, _, power = f"{value:.{digits}e}".partition("e")
+    return f"{mantissa}e{int(power)}" if value else "0"
+
+
+def simulated_presses(found: dict) -> Rows:
+    rows = [
+        [
+            f"{row['friction']:g}",
+            *(scientific(row[key], 0) for key in ("imbalance", "volume_error", "penetration")),
+            str(row["steps"]),
+            f"{row['seconds']:.2f}",
+        ]
+        for row in found["presses"]
+    ]
+    return [["friction", "imbalance", "volume error", "penetration, mm", "Newton steps", "seconds"], *rows]
+
+
+def rendered_dots(found: dict) -> Rows:
+    """Errors of the centroids of rendered dots, px."""
+    of = {(row["preset"], row["surface"]): row for row in found["dots"]}
+    rows = []
+    for name in dict.fromkeys(preset for preset, _ in of):
+        each = [f"{of[name, surface][key]:.{d}f}" for surface in ("rest", "pressed") for key, d in (("rms", 4), ("worst", 3))]
+        rows.append([f"`{name}`", str(of[name, "rest"]["dots"]), *each])
+    return [["", "dots", "rest, rms", "rest, worst", "pressed, rms", "pressed, worst"], *rows]
+
+
+def agreement(found: dict) -> Rows:
+    """Largest differences from another program, %, by friction."""
+    groups = {
+        "without friction": lambda row: row["friction"] == 0,
+        "with friction": lambda row: row["friction"] > 0,
+        "all": bool,
+    }
+    rows = []
+    for name, belongs in groups.items():
+        chosen = [row for row in found["agreement"] if belongs(row)]
+        worst = [f"{max(abs(row[key]) for row in chosen):.2f}" for key in ("dots", "probes", "force", "force_size", "pressure")]
+        seconds = [row["seconds"] for row in chosen]
+        rows.append([name, str(len(chosen)), *worst, f"{min(seconds):.1f} to {max(seconds):.1f}"])
+    head = ["", "cases", "dots", "probes", "force vector", "force magnitude", "pressure change", "seconds per press"]
+    return [head, *rows]
+
+
+def window_mistakes(found: dict) -> Rows:
+    """Forces found over true, and the rise of the pressure, where one number of a window is wrong."""
+    true = ", ".join(f"{rise:.2f}" for rise in found["true_rises"])
+    rows = [
+        [row["wrong"], *(f"{ratio:.2f}" for ratio in row["forces"]), ", ".join(f"{rise:.2f}" for rise in row["rises"])]
+        for row in found["rows"]
+    ]
+    return [["wrong", "pressed at an angle", "pressed in the middle", f"rise of the pressure, hPa (true {true})"], *rows]
+
+
+def cli_errors(found: dict) -> Rows:
+    """Force and depth of the tutorial's press where one number of `init` is wrong."""
+    rows = [[row["wrong"], f"{row['force']:.2f}", f"{row['deepest']:.2f}"] for row in found["rows"]]
+    return [["in `init`", "force, N", "deepest, mm"], *rows, ["the truth", f"{found['force']:.3f}", f"{found['deepest']:.2f}"]]
+
+
+def memory(found: dict) -> Rows:
+    """Memory of a batch beside what `--batch auto` assumes for a frame."""
+    of: dict[tuple[int, int, int], dict] = {}
+    for row in found["rows"]:
+        of.setdefault((row["lines"], *row["size"]), {})[row["batch"]] = row
+    rows = [
+        [
+            f"{lines} x {lines}, {width} x {height}",
+            *(f"{row['bytes'] / 2**20:.0f} MB" for row in each.values()),
+            f"{each[1]['assumed'] / 2**20:.0f} MB",
+        ]
+        for (lines, width, height), each in of.items()
+    ]
+    return [["grid, image", "batch 1", "4", "16", "assumed per frame"], *rows]
