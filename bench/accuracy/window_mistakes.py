@@ -61,7 +61,7 @@ def main() -> None:
         for press, options in PRESSES.items():
             run(f"simulate {folder}/real.toml --indenter sphere --radius 6 {options} --noise 40 --out {folder} --name {press}")
             truth = np.load(folder / f"{press}_truth.npz")
-            truths[press] = np.linalg.norm(truth["force"]), float(truth["p"] - truth["p0"]) / hectopascal("mm")
+            truths[press] = float(np.linalg.norm(truth["force"])), float(truth["p"] - truth["p0"]) / hectopascal("mm")
         print("true rise of the pressure, hPa:", ", ".join(f"{rise:.2f}" for _, rise in truths.values()))
         for row, wrong in ROWS.items():
             path = folder / f"{re.sub(r'[^a-z0-9]+', '_', row)}.toml"

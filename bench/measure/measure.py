@@ -72,12 +72,10 @@ def measure(name: str, independent: Path | None) -> None:
         return
     made, result = MADE[part.data] if part.data else (), OUT / f"{name}.json"
     began, load = time.perf_counter(), os.getloadavg()[0]
-    for command in (made, f"{part.command} --json {result}"):
-        if command:
-            print(f"{name}: python -m {command}", flush=True)
-            subprocess.run(
-                [sys.executable, "-m", *words(command, str(folder))], cwd=ROOT, check=True, env=os.environ | ENVIRONMENT
-            )
+    for command in (*made, f"{part.command} --json {result}"):
+        print(f"{name}: python -m {command}", flush=True)
+        called = [sys.executable, "-m", *words(command, str(folder))]
+        subprocess.run(called, cwd=ROOT, check=True, env=os.environ | ENVIRONMENT)
     results = json.loads((ROOT / result).read_text())
     machine, seconds = results.pop("machine"), time.perf_counter() - began
     found = dict(
@@ -98,16 +96,16 @@ def measure(name: str, independent: Path | None) -> None:
 
 
 def rounded(value: object) -> object:
-    """Numbers to four digits, which is more than any table shows.
+    """Numbers to five digits, which is as much as any table shows.
 
     >>> rounded({"a": [1.23456, 3, "b"]})
-    {'a': [1.235, 3, 'b']}
+    {'a': [1.2346, 3, 'b']}
     """
     if isinstance(value, dict):
         return {key: rounded(each) for key, each in value.items()}
     if isinstance(value, list):
         return [rounded(each) for each in value]
-    return float(f"{value:.4g}") if isinstance(value, float) else value
+    return float(f"{value:.5g}") if isinstance(value, float) else value
 
 
 def write_pages() -> None:

@@ -37,10 +37,11 @@ def markdown(rows: list[list[str]]) -> str:
 
 
 def source(found: dict) -> str:
-    """One sentence: revision, date, processor and command of a record, or the revision that first published its table."""
+    """One sentence: revision, date, processor and command of a record, of times the load as well."""
     how, where = ("Measured at", found["processor"]) if found["seconds"] else ("Published at", "processor not recorded")
-    load = f", {found['cores']} cores under a load of {found['load']:.1f}" if found["seconds"] else ""
-    return f"*{how} revision {found['revision']}, {found['date']}, {where}{load}: `{found['command']}`*"
+    if found["load"] and " bench.speed." in found["command"]:
+        where += f", {found['cores']} cores under a load of {found['load']:.1f}"
+    return f"*{how} revision {found['revision']}, {found['date']}, {where}: `{found['command']}`*"
 
 
 def block(parts: tuple[str, ...], make: Callable[..., list[list[str]]]) -> str:

@@ -52,21 +52,40 @@ def rendered_dots(found: dict) -> Rows:
     return [["", "dots", "rest, rms", "rest, worst", "pressed, rms", "pressed, worst"], *rows]
 
 
+def simulator_seconds(found: dict) -> Rows:
+    """Of an image and of a frame of a random data set."""
+    names = {
+        "image": "an image of 640 x 480",
+        "frame of a data set, friction 0.0": "a frame of a random data set on `fingertip`, 37 x 37",
+        "frame of a data set, friction 0.4": "the same with friction 0.4",
+    }
+    return [["", "seconds"], *([text, f"{found['seconds'][name]:.2f}"] for name, text in names.items())]
+
+
 def agreement(found: dict) -> Rows:
     """Largest differences from another program, %, by friction."""
-    groups = {
+    rows = []
+    for name, group in found["groups"].items():
+        worst, seconds = [f"{value:.2f}" for value in group["worst"]], [f"{value:.1f}" for value in group["seconds"]]
+        rows.append([name, str(group["cases"]), *worst, " to ".join(seconds)])
+    head = ["", "cases", "dots", "probes", "force vector", "force magnitude", "pressure change", "seconds per press"]
+    return [head, *rows]
+
+
+def agreement_summary(results: dict) -> dict:
+    """The largest differences, and the least and the largest time, of the presses of every group."""
+    parts = {
         "without friction": lambda row: row["friction"] == 0,
         "with friction": lambda row: row["friction"] > 0,
         "all": bool,
     }
-    rows = []
-    for name, belongs in groups.items():
-        chosen = [row for row in found["agreement"] if belongs(row)]
-        worst = [f"{max(abs(row[key]) for row in chosen):.2f}" for key in ("dots", "probes", "force", "force_size", "pressure")]
+    groups = {}
+    for name, belongs in parts.items():
+        chosen = [row for row in results["agreement"] if belongs(row) and "failed" not in row]
+        worst = [max(abs(row[key]) for row in chosen) for key in ("dots", "probes", "force", "force_size", "pressure")]
         seconds = [row["seconds"] for row in chosen]
-        rows.append([name, str(len(chosen)), *worst, f"{min(seconds):.1f} to {max(seconds):.1f}"])
-    head = ["", "cases", "dots", "probes", "force vector", "force magnitude", "pressure change", "seconds per press"]
-    return [head, *rows]
+        groups[name] = dict(cases=len(chosen), worst=worst, seconds=[min(seconds), max(seconds)])
+    return dict(groups=groups)
 
 
 def window_mistakes(found: dict) -> Rows:

@@ -35,6 +35,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows]]] = {
     "closed-forms": (("simulator",), simulator.closed_forms),
     "simulated-presses": (("simulator",), simulator.simulated_presses),
     "rendered-dots": (("simulator",), simulator.rendered_dots),
+    "simulator-seconds": (("simulator",), simulator.simulator_seconds),
     "agreement": (("simulator-independent",), simulator.agreement),
     "window-mistakes": (("window-mistakes",), simulator.window_mistakes),
     "cli-errors": (("cli-errors",), simulator.cli_errors),
@@ -67,5 +68,6 @@ SUMMARIES: dict[str, Callable[[dict], dict]] = {
     "range": accuracy.range_summary,
     "segmentation": paper.segmentation_summary,
     "monge": paper.monge_summary,
+    "simulator-independent": simulator.agreement_summary,
 }
 """Of a part whose results have a row for every case: what its record keeps of them."""

@@ -49,15 +49,15 @@ def called(words: str) -> str:
     return said.getvalue()
 
 
-def outcome(options: str) -> dict[str, float]:
-    """Force and depth of the press, by a sensor that was begun with these numbers."""
+def outcome(options: str, out: Path) -> dict[str, float]:
+    """Force and depth of the press, by a sensor that was begun with these numbers; `out`: a new folder."""
     called(f"init mine.toml --force --shape dome --radius 12 --rest photos/sensor_rest.png --lens fisheye --view 120 {options}")
     if "--dots" in options:
         called("calibrate rest mine.toml photos/sensor_rest.png --out rest --force")
     first = "rest/sensor.toml" if "--dots" in options else "mine.toml"
     called(f"calibrate material {first} photos/weight.png --weight 126.5g --out material --force")
-    called("reconstruct material/sensor.toml photos/press.png --out results --force")
-    (found,) = csv.DictReader(Path("results/summary.csv").open())
+    called(f"reconstruct material/sensor.toml photos/press.png --out {out}")
+    (found,) = csv.DictReader((out / "summary.csv").open())
     return dict(force=float(found["force"]), deepest=-float(found["deepest"]), residual=float(found["residual_px"]))
 
 
@@ -73,8 +73,8 @@ def main() -> None:
         np.savetxt("dots.csv", dots - [0, 0, 15], "%.5f", ",", header="x,y,h", comments="")
         force = float(np.linalg.norm(np.load("photos/press_truth.npz")["force"]))
         print(f"truth: {force:.3f} N, pressed 3 mm deep", flush=True)
-        for wrong, options in ROWS.items():
-            rows.append(dict(wrong=wrong, **outcome(options)))
+        for number, (wrong, options) in enumerate(ROWS.items()):
+            rows.append(dict(wrong=wrong, **outcome(options, Path(f"results{number}"))))
             print("{wrong}: {force:.2f} N, {deepest:.2f} mm, residual {residual:.3f} px".format(**rows[-1]), flush=True)
     write(args.json, dict(force=force, deepest=3.0, rows=rows))
 
