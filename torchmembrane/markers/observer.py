@@ -14,7 +14,6 @@ from ..results.status import Status
 from .locator import Locator, isotropic
 from .placement import FEWEST_MARKERS, PlacedMarkers
 from .screening import MismatchScreen
-from .spacing import partly_in_view
 
 NOISE = 0.05
 """px, standard deviation of a marker in an image where nothing else is known."""
@@ -80,7 +79,7 @@ class MarkerObserver(nn.Module):
         self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
         self.register_buffer("measured_rest", torch.from_numpy(markers.model_pixels))
         self.register_buffer("rest_covariance", isotropic(self.rest_pixels[:, 0], NOISE))
-        in_view = torch.from_numpy(partly_in_view(markers.model_pixels, image_size))
+        in_view = torch.from_numpy(markers.in_view)
         if in_view.sum() < FEWEST_MARKERS:
             raise MembraneError(
                 f"sensor {name!r}: {int(in_view.sum())} of {len(in_view)} markers are in the camera's view; expected at least "

@@ -16,7 +16,7 @@ from ..surface.topology import rim_loop
 from .dots.locator import DotLocator
 from .dots.pattern import DotPattern, find_dots, measure_dots
 from .locator import Locator
-from .spacing import in_view
+from .spacing import in_view, partly_in_view
 from .texture.locator import TextureLocator
 from .texture.patches import choose_patches
 
@@ -36,12 +36,14 @@ class PlacedMarkers:
         positions: `[D, 3]`, length unit, camera frame.
         model_pixels: `[D, 2]`, where the camera model projects them.
         points: the same as points of the membrane's triangles.
+        in_view: `[D]` bool, which of them reach into the image at rest.
         locator: finds them in images.
     """
 
     positions: np.ndarray
     model_pixels: np.ndarray
     points: SurfacePoints
+    in_view: np.ndarray
     locator: Locator
 
 
@@ -80,6 +82,7 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS
     anchors = vertex_pixels[sensor.membrane.fixed].numpy()
     markers, (width, height) = sensor.markers, sensor.camera.image_size
     built: Locator
+    pattern: DotPattern | None = None
     if markers.kind == "dots" and markers.positions is not None:
         positions = np.asarray(markers.positions, dtype=float)
         if len(positions) < FEWEST_MARKERS:
@@ -99,7 +102,9 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS
             positions, placed = _place_on_surface(sensor, pattern.pixels)
             pattern = DotPattern(*(field[placed] for field in pattern))
             built = of_dots(pattern, (width, height), markers.polarity, anchors)
-    return PlacedMarkers(positions, _model_pixels(sensor, positions), sensor.membrane.closest_points(positions), built)
+    pixels, points = _model_pixels(sensor, positions), sensor.membrane.closest_points(positions)
+    seen = in_view(pixels, (width, height)) if pattern is None else partly_in_view(pixels, pattern.shapes, (width, height))
+    return PlacedMarkers(positions, pixels, points, seen, built)
 
 
 def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]]:

@@ -4,8 +4,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-CUT = 0.25
-"""Spacings: how far outside the image the centre of a marker may be that shows in it; the radius of a large one."""
 FADED = 30.0
 """Exponent of a weight that no longer counts; products with subnormal numbers take fifty times as long."""
 
@@ -65,16 +63,21 @@ def in_view(pixels: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
     return np.all(np.logical_and(pixels >= 0, pixels <= np.array(image_size) - 1), axis=1)
 
 
-def partly_in_view(pixels: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
-    """Which markers with centres `pixels [D, 2]`, all finite, show in an image of that width and height, `[D]` bool: those of
-    which the border cuts off a part are among them, up to `CUT` of their spacing outside.
+def partly_in_view(pixels: np.ndarray, shapes: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+    """Which dots reach into an image of that width and height, `[D]` bool, also where the border cuts off a part of them.
+
+    Args:
+        pixels: centres `[D, 2]`, px.
+        shapes: `[D, 2, 2]` px, pixel = centre + shape @ (unit circle).
+        image_size: width, height.
 
     Example:
-        >>> partly_in_view(np.array([[-2.0, 5.0], [8.0, 5.0], [18.0, 5.0], [28.0, 5.0]]), (16, 16)).tolist()
+        >>> pixels, shapes = np.array([[-2.0, 5.0], [8.0, 5.0], [18.0, 5.0], [28.0, 5.0]]), np.tile(4 * np.eye(2), (4, 1, 1))
+        >>> partly_in_view(pixels, shapes, (16, 16)).tolist()
         [True, True, True, False]
     """
-    outside = np.maximum(-pixels, pixels - (np.array(image_size) - 1)).max(1)
-    return np.asarray(outside < CUT * spacing(pixels)[1])
+    extent = np.linalg.norm(shapes, axis=2)
+    return np.all((pixels > -extent) & (pixels < np.array(image_size) - 1 + extent), axis=1)
 
 
 def thin_out(points: np.ndarray, gap: float) -> np.ndarray:

@@ -141,7 +141,7 @@ class DotLocator(nn.Module):
         blobs, log_radius, strength = (x[0].numpy() for x in self.detect.double()(drawn))
         blobs, log_radius, strength = (x[strength > 1e-6] for x in (blobs, log_radius, strength))  # the rest fill up the count
         own = cKDTree(blobs).query(pixels)[1]
-        self.match = DotMatcher(pixels, log_radius[own], tolerance, partly_in_view(pixels, image_size))
+        self.match = DotMatcher(pixels, log_radius[own], tolerance, partly_in_view(pixels, shapes, image_size))
         self.coherence = Coherence(pixels, log_radius[own], tolerance)
         self.register_buffer("strength", torch.as_tensor(strength[own]))
         self.register_buffer("rest", torch.as_tensor(pixels))
