@@ -35,11 +35,11 @@ class Summary:
     Args:
         folder: the folder of results.
         mesh: what its frames share.
-        gate: held while the files are changed.
+        write_lock: held while the files are changed.
     """
 
-    def __init__(self, folder: Path, mesh: Mesh, gate: AbstractContextManager[Any]):
-        self.path, self.mesh, self.gate = folder / SUMMARY, mesh, gate
+    def __init__(self, folder: Path, mesh: Mesh, write_lock: AbstractContextManager[Any]):
+        self.path, self.mesh, self.write_lock = folder / SUMMARY, mesh, write_lock
         self.rows: dict[str, dict[str, str]] = {}
 
     def add(self, name: str, stored: Stored) -> None:
@@ -57,7 +57,7 @@ class Summary:
 
     def write(self, kept: Callable[[dict[str, str]], bool] = lambda row: True) -> None:
         """Write the rows added since the last time beside those of the file that are kept, in name order."""
-        with self.gate:
+        with self.write_lock:
             rows = {row["name"]: row for row in _rows(self.path) if kept(row)} | self.rows
             lines = ({key: escaped(key, rows[name][key]) for key in NAMES} for name in sorted(rows, key=in_order))
             _write_table(self.path, NAMES, lines)
@@ -80,7 +80,7 @@ def read_summary(folder: Path) -> list[dict[str, str]]:
     if not rows:
         raise MembraneError(
             f"{folder / SUMMARY}: no rows with this version's columns; expected a folder of results: the same reconstruct "
-            "command again makes its table anew"
+            "command again writes its table anew"
         )
     return rows
 
