@@ -3,11 +3,12 @@
 import json
 import re
 import subprocess
+from pathlib import Path
 
 import pytest
 
-from bench.measure import pages
-from bench.measure.parts import PARTS, words
+from bench.measure import measure, pages
+from bench.measure.parts import PARTS, Part, words
 from bench.measure.tables import FIGURES, TABLES
 
 IDENTITY = ("-c", "user.name=A", "-c", "user.email=a@b.c")
@@ -69,7 +70,7 @@ def commit(tmp_path, monkeypatch):
 
     def change(name: str) -> str:
         with (tmp_path / name).open("a") as file:
-            file.write("changed\n")
+            file.write("# changed\n")
         git("add", name)
         git("commit", "--quiet", "--message", name)
         return git("rev-parse", "--short", "HEAD")
@@ -88,3 +89,31 @@ def test_a_table_says_that_it_is_old_once_its_paths_change(commit, tmp_path):
     (tmp_path / "measured.py").write_text("not committed")
     assert pages.uncommitted(("measured.py", "other.py")) == ["measured.py"]
     assert pages.changes_since("0000000", ("measured.py",)) == []
+
+
+MADE = """
+import json, sys
+machine = dict(processor="A", torch="2.13")
+json.dump(dict(machine=machine, rows=[dict(ms=1.2345678, each=[1, 2])]), open(sys.argv[sys.argv.index("--json") + 1], "w"))
+"""
+
+
+def test_a_part_leaves_a_record_of_what_was_measured_where_and_when(commit, tmp_path, monkeypatch):
+    for name, value in dict(ROOT=tmp_path, RECORDS=tmp_path / "records", OUT=Path("out")).items():
+        monkeypatch.setattr(measure, name, value)
+    monkeypatch.setattr(pages, "RECORDS", tmp_path / "records")
+    monkeypatch.setattr(measure, "PARTS", {"made": Part("made --turns 5", ())})
+    (tmp_path / "made.py").write_text(MADE)
+    with pytest.raises(SystemExit, match=r"commit made\.py first"):
+        measure.measure("made", None)
+    assert measure.is_due("made") and measure.state("made") == "never measured"
+    revision = commit("made.py")
+    (tmp_path / "out").mkdir()
+    measure.measure("made", None)
+    found = pages.record("made")
+    assert found["command"] == "python -m made --turns 5" and found["revision"] == revision and found["processor"] == "A"
+    assert found["results"] == {"rows": [{"ms": 1.2346, "each": [1, 2]}]}
+    assert not measure.is_due("made") and measure.state("made").endswith("; current")
+    later = commit("made.py")
+    pages.changes_since.cache_clear()
+    assert later != revision and measure.is_due("made") and "old: 1 commits" in measure.state("made")

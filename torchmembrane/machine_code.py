@@ -61,8 +61,8 @@ each literal; loops that need not be unrolled run to a length that is read from 
 
 
 def kept(function: Callable[..., Any]) -> Any:
-    """A function that Python calls, compiled and kept on disk, beside its file or in the user's cache, until that file changes;
-    in this process alone where neither can be written.
+    """Decorate a function so that it is compiled and kept on disk, beside its file or in the user's cache, until that file
+    changes; if neither can be written, it is kept in this process only.
 
     Example:
         >>> kept(lambda x: 2 * x)(3)

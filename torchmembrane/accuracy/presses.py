@@ -137,7 +137,8 @@ def _pair(simulator: Simulator, places: np.ndarray, ways: np.ndarray) -> list[Pa
 
 
 def followed(simulator: Simulator, paths: Sequence[Sequence], friction: float) -> tuple[list[Press], str]:
-    """Equilibria at the poses after the first, as far as the membrane follows, and why no farther."""
+    """The equilibria at the poses after the first one, as far as the membrane can follow, and the reason why it cannot follow
+    further."""
     states: list[Press] = []
     options = dict(friction=friction, increment=INCREMENT * simulator.membrane.size, **simulator.cavity)
     try:

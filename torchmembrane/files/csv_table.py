@@ -168,7 +168,7 @@ def read_table(path: Path, columns: Columns, most_bytes: int) -> Table:
 
 
 def _rows(lines: list[str]) -> tuple[list[tuple[int, list[str]]], str]:
-    """Lines that are not empty, each with its number and cells, and what ended them early, if anything did."""
+    """The lines that are not empty, each with its number and cells, and the damage that ended them early, or ""."""
     reader = csv.reader(("\n" if COMMENT.match(line) else line for line in lines), strict=True, skipinitialspace=True)
     rows = []
     try:

@@ -35,9 +35,9 @@ def ffmpeg_name(path: Path) -> str:
 
 
 def video_pictures(path: Path, size: tuple[int, int]) -> Iterator[Any]:
-    """The pictures of a video one after another, as PyAV gives them; in place of a damaged one, the reason why.
+    """The pictures of a video one after another, as PyAV gives them; in place of a damaged one, the error.
 
-    A picture that follows a damaged one is damaged as well, up to the next that is coded by itself.
+    The pictures after a damaged one count as damaged too, up to the next key frame.
 
     Args:
         path: of the video.
@@ -47,8 +47,8 @@ def video_pictures(path: Path, size: tuple[int, int]) -> Iterator[Any]:
         `av.VideoFrame`, or a `MembraneError` that does not name the file.
 
     Raises:
-        MembraneError: PyAV is not installed; the file is no video, one of another size, or it ends early, and how many frames
-            of how many there are.
+        MembraneError: PyAV is not installed; the file is not a video, has another size, or ends early; the message then says
+            how many frames it holds and should hold.
     """
     av, number, damage = load_pyav(), 0, ""
     with _opened(path) as (container, stream):

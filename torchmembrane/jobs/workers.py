@@ -82,7 +82,7 @@ def outcomes_here(work: Work, sources: Iterator[Source], batch: int) -> Iterator
 
 
 def outcomes_by(workers: int, work: Work, sources: Iterator[Source], batch: int) -> Iterator[list[Outcome]]:
-    """The same by worker processes, in the order of the sources; pictures of videos are decoded in this process.
+    """The outcomes computed by worker processes, in the order of the sources; pictures of videos are decoded in this process.
 
     Raises:
         MembraneError: a worker process has ended.

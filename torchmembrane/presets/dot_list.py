@@ -1,4 +1,4 @@
-"""Dots as people list them, in any frame: on the membrane, in the camera's frame."""
+"""Dots as users list them in various frames, placed on the membrane in the camera's frame."""
 
 from pathlib import Path
 
