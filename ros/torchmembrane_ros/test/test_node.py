@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from datetime import date, timedelta
 from functools import cache
@@ -26,7 +27,7 @@ from rclpy.type_support import check_for_type_support
 from sensor_msgs.msg import CameraInfo, CompressedImage, FluidPressure, Image, PointCloud2
 from std_srvs.srv import Trigger
 from torchmembrane_ros.health import Health
-from torchmembrane_ros.node import FAILURE, SUCCESS, TrackerNode
+from torchmembrane_ros.node import FAILURE, SUCCESS, TrackerNode, main
 from torchmembrane_ros.outgoing import quaternion, transform_of
 from torchmembrane_ros.parameters import PARAMETERS
 
@@ -354,6 +355,23 @@ def test_the_transform_is_the_camera_s_pose_on_the_tool(sensor):
     ])  # fmt: skip
     np.testing.assert_allclose(turned, tool.rotation, atol=1e-9)
     assert np.linalg.norm(quaternion(np.eye(3))) == pytest.approx(1) and abs(quaternion(np.eye(3))[3]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_an_end_while_a_message_is_on_its_way_is_no_error(monkeypatch, ended):
+    """As rclpy has it: SIGTERM makes publishers invalid at once, also for a timer that is publishing."""
+
+    def spin(_):
+        raise RuntimeError("publisher's context is invalid")
+
+    nothing = lambda *_: None  # noqa: E731
+    stand_in = SimpleNamespace(init=nothing, spin=spin, try_shutdown=nothing, ok=lambda: not ended, executors=rclpy.executors)
+    monkeypatch.setattr("torchmembrane_ros.node.rclpy", stand_in)
+    given = SimpleNamespace(value=False)
+    node = SimpleNamespace(get_parameter=lambda _: given, stop=nothing, destroy_node=nothing)
+    monkeypatch.setattr("torchmembrane_ros.node.TrackerNode", lambda: node)
+    with nullcontext() if ended else pytest.raises(RuntimeError, match="context is invalid"):
+        main()
 
 
 class Sent(type(TransformStamped)):
