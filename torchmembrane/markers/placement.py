@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..sensor.sensor import Sensor
+from ..sensor.views import SurfaceInView
 from ..surface.projection import SurfacePoints
 from ..surface.tangent import tangent_axes
 from ..surface.topology import rim_loop
@@ -21,6 +22,10 @@ from .texture.patches import choose_patches
 
 LOCATORS = ("fit", "soft")
 FEWEST_MARKERS = 8
+GRAZING = 0.1
+"""Cosine between a line of sight and the normal below which a marker is not seen."""
+BEHIND = 0.02
+"""How far behind the surface a marker of the list may lie, over its size, and be on it."""
 SMOOTH_GRID = 33
 """Vertices per side of the surface on which markers are placed: the solver's facets are too coarse for oblique rays."""
 DOT_RADIUS = (0.16, 0.27)
@@ -126,7 +131,22 @@ def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
     """Where the camera sees `positions [D, 3]`; what it cannot image lies far outside, each point elsewhere."""
     pixels = sensor.camera.point_to_pixel(torch.from_numpy(positions)).numpy()
     outside = -float(max(sensor.camera.image_size)) * (2 + np.arange(len(pixels)))
-    return np.where(np.isfinite(pixels).all(1, keepdims=True), pixels, outside[:, None])
+    seen = np.isfinite(pixels).all(1) & visible(sensor, positions)
+    return np.where(seen[:, None], pixels, outside[:, None])
+
+
+def visible(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
+    """Which of `positions [D, 3]` on the rest surface turn to the camera and are not behind another part of it, `[D]` bool: all
+    of a sensor with one view, whose camera sees all of its membrane."""
+    if not isinstance(sensor.surface, SurfaceInView):
+        return np.ones(len(positions), bool)
+    membrane, distance = sensor.membrane, np.linalg.norm(positions, axis=1)
+    sight = positions / distance[:, None]
+    nearest = membrane.ray_points(np.zeros_like(positions), sight).distance
+    points = membrane.closest_points(positions)
+    normals = (membrane.rest_normals.numpy()[points.vertices] * points.weights[..., None]).sum(1)
+    turned = (normals * sight).sum(1) > GRAZING * np.linalg.norm(normals, axis=1)
+    return turned & ~(nearest < distance - BEHIND * membrane.size)
 
 
 def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

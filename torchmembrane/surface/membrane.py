@@ -3,12 +3,15 @@
 Which vertices form the triangles: `topology`. Sums around a vertex are convolutions of the grid: `stencil`.
 """
 
+import copy
+
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from ..errors import MembraneError, check_arguments
+from ..pose import ViewPose
 from ..solve.stencil import apply_stencil, stencil_kernels
 from . import projection
 from .checks import checked_grid, checked_orientation
@@ -250,6 +253,32 @@ class Membrane(nn.Module):
             raise MembraneError(f"Membrane.resampled: grid {grid[0]} x {grid[1]}; expected at least 5 x 5 vertices")
         X = self.rest.cpu().double().numpy().reshape(*self.grid, 3)
         return Membrane(*resampled_grid(X, self.fixed.cpu().numpy().reshape(self.grid), grid))
+
+    def in_frame(self, pose: ViewPose, outside: bool = False) -> "Membrane":
+        """The same rest surface in another frame, such as that of another view, which need not see all of it.
+
+        Args:
+            pose: of this frame in the other one; it may reflect.
+            outside: whether the other view looks at the outer side, which is then away from its triangles' normals.
+
+        Returns:
+            Another `Membrane`, the same vertices in the same order.
+
+        Example:
+            >>> from torchmembrane.surface.shapes import spherical_cap
+            >>> cap, mirror = spherical_cap(12.0, 9.0, 15.0), ViewPose(np.diag([-1.0, 1.0, 1.0]), np.zeros(3))
+            >>> bool(torch.allclose(cap.in_frame(mirror).rest_normals, mirror.vectors(cap.rest_normals)))
+            True
+        """
+        other = copy.deepcopy(self)
+        other.rest = pose.points(self.rest)
+        if (pose.determinant < 0) != outside:
+            other.outward, other.triangles = -self.outward, self.triangles[:, [0, 2, 1]]
+            other.chord_kernels[:2] *= -1
+            for constant in (other.volume_third_derivatives, other.volume_cross_products):
+                constant *= -1
+        other.rest_normals, other.rest_volume = other.normals(other.rest), other.volume(other.rest)
+        return other
 
     def closest_points(self, points: ArrayLike) -> SurfacePoints:
         """The material points of the rest surface closest to given ones.
