@@ -165,6 +165,38 @@ def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, n
     return (smooth.rest.numpy()[hits.vertices] * hits.weights[..., None]).sum(1)[placed], placed
 
 
+def markers_in_view(sensor: Sensor) -> np.ndarray:
+    """Which of a sensor's listed dots its camera sees at rest, `[D]` bool.
+
+    Args:
+        sensor: with listed dots; one view of several as `Sensor.in_view` gives it.
+
+    Example:
+        >>> from torchmembrane.presets import preset
+        >>> bool(markers_in_view(preset("bubble")).all())
+        True
+    """
+    return in_view(_model_pixels(sensor, np.asarray(sensor.markers.positions, dtype=float)), sensor.camera.image_size)
+
+
+def refuse_blind(sensor: Sensor, name: str) -> None:
+    """Refuse a view that sees too few of the listed dots at rest.
+
+    Args:
+        sensor: of this view, as `Sensor.in_view` gives it.
+        name: of sensor and view, for the message.
+
+    Raises:
+        MembraneError: says how many are seen, and the remedy.
+    """
+    seen = markers_in_view(sensor)
+    if seen.sum() < FEWEST_MARKERS:
+        raise MembraneError(
+            f"sensor {name!r}: {seen.sum()} of {len(seen)} markers are seen; expected at least {FEWEST_MARKERS}: check the "
+            "view's pose, which is of its frame in the first view's, its focal length, and its side"
+        )
+
+
 def _listed_pattern(sensor: Sensor, positions: np.ndarray) -> DotPattern:
     """The dots of the sensor's list, measured in the rest image where there is one."""
     markers, pixels = sensor.markers, _model_pixels(sensor, positions)

@@ -10,9 +10,10 @@ from torch import Tensor
 from ..camera.model import Camera
 from ..camera.rig import Rig
 from ..sensor.sensor import Sensor
+from ..sensor.views import SurfaceInView
 from ..surface.projection import SurfacePoints
 from .observer import MarkerObserver
-from .placement import PlacedMarkers, imaged_vertices, place_markers
+from .placement import PlacedMarkers, imaged_vertices, place_markers, refuse_blind
 from .views import ViewsObserver
 
 
@@ -77,6 +78,8 @@ def _of_one_view(
     """Observer and markers of a sensor with one view, and its rest pixels of the vertices."""
     vertex_pixels = sensor.camera.point_to_pixel(sensor.membrane.rest)
     imaged = imaged_vertices(sensor, vertex_pixels, whole)
+    if isinstance(sensor.surface, SurfaceInView):
+        refuse_blind(sensor, name)
     markers = place_markers(sensor, vertex_pixels, locator)
     rim, rest_image = vertex_pixels[sensor.membrane.fixed & imaged].numpy(), sensor.markers.rest_image
     observer = MarkerObserver(markers, rim, name, dtype, rest_image, sensor.camera.image_size, check_rest)

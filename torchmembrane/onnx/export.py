@@ -198,8 +198,7 @@ def export(
         raise MembraneError(f"export: {path}: the folder {Path(path).parent} does not exist; make it first")
     if reconstructor.rest_pixels.dtype != torch.float32:
         raise MembraneError(f"export: the reconstructor is {reconstructor.rest_pixels.dtype}; expected torch.float32")
-    if reconstructor.sensor.views:
-        raise MembraneError("export: a sensor with several views; expected one view, as of sensor.in_view(0)")
+    reconstructor.sensor.refuse_views("export")
     progress(0.0, "image")
     width, height = reconstructor.image_size
     image = torch.rand(EXAMPLES, 1, height, width, generator=torch.Generator().manual_seed(0)).to(reconstructor.rest_pixels)

@@ -122,6 +122,17 @@ class Sensor:
             views=(),
         )
 
+    def refuse_views(self, owner: str) -> None:
+        """Refuse a sensor with several views where only one is taken.
+
+        Args:
+            owner: what takes it, as the message begins.
+
+        Raises:
+            MembraneError: with the remedy.
+        """
+        expect(not self.views, f"{owner}: views", len(self.views), "one camera, as of sensor.in_view(0)")
+
     @property
     def image_size(self) -> tuple[int, int]:
         """Width and height, px, of its images: the camera's; of several views those of the image that they share, or of the

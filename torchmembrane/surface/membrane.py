@@ -266,16 +266,16 @@ class Membrane(nn.Module):
 
         Example:
             >>> from torchmembrane.surface.shapes import spherical_cap
-            >>> cap, mirror = spherical_cap(12.0, 9.0, 15.0), ViewPose(np.diag([-1.0, 1.0, 1.0]), np.zeros(3))
-            >>> bool(torch.allclose(cap.in_frame(mirror).rest_normals, mirror.vectors(cap.rest_normals)))
+            >>> mirrored = spherical_cap(12.0, 9.0, 15.0).in_frame(ViewPose(np.diag([-1.0, 1.0, 1.0]), np.zeros(3)))
+            >>> bool((mirrored.rest_normals * mirrored.rest).sum(-1).min() > 0)
             True
         """
         other = copy.deepcopy(self)
         other.rest = pose.points(self.rest)
         if (pose.determinant < 0) != outside:
             other.outward, other.triangles = -self.outward, self.triangles[:, [0, 2, 1]]
-            other.chord_kernels[:2] *= -1
-            for constant in (other.volume_third_derivatives, other.volume_cross_products):
+            signed = other.chord_kernels[:2], other.chords_beyond_border.chunk(2)[0]
+            for constant in (*signed, other.volume_third_derivatives, other.volume_cross_products):
                 constant *= -1
         other.rest_normals, other.rest_volume = other.normals(other.rest), other.volume(other.rest)
         return other
