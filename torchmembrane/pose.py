@@ -1,4 +1,4 @@
-"""Where one frame is in another: points, vectors and wrenches from the camera's to a tool's, from one view's to another's."""
+"""Poses: points, vectors and wrenches from the camera's frame to a tool's, or from one view's to another's."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar

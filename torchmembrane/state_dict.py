@@ -1,4 +1,4 @@
-"""What a `state_dict` keeps: the camera, the material and what follows from it; all else is rebuilt from the sensor."""
+"""The contents of a `state_dict`: camera, material and what follows from it; everything else is rebuilt from the sensor."""
 
 from typing import Any
 
@@ -49,7 +49,7 @@ def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) ->
 
 
 def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Check a state and put the constants in that it lacks, so that those are as they are."""
+    """Check a state and add the constants that it lacks, with their present values."""
     kept, others = _kept(module), []
     first = {id(buffer): name for name, buffer in reversed(list(module.named_buffers()))}
     for name, buffer in module.named_buffers(remove_duplicate=False):

@@ -1,4 +1,4 @@
-"""The right to write into a folder: one job has it, or several shards of one job."""
+"""Locks of folders: one job, or several shards of one job, may write into a folder."""
 
 import zlib
 from contextlib import suppress
@@ -17,7 +17,7 @@ PATIENCE = 600.0
 
 
 class Shard(NamedTuple):
-    """One of `total` disjoint parts of a job, told by the frames' names: the same on every machine, in any order.
+    """One of `total` disjoint parts of a job. A frame's shard depends only on its name, so it is the same on every machine.
 
     Attributes:
         number: 1 to `total`.
@@ -33,7 +33,7 @@ class Shard(NamedTuple):
     total: int = 1
 
     def holds(self, name: str) -> bool:
-        """Whether a frame of this name is this shard's."""
+        """Whether a frame of this name belongs to this shard."""
         return zlib.crc32(name.encode()) % self.total == self.number - 1
 
 
@@ -42,7 +42,7 @@ WHOLE = Shard()
 
 
 class Claim:
-    """A folder claimed for writing: `with Claim(folder, shard) as claim`, and `with claim.gate` while its files are changed.
+    """A folder locked for writing: `with Claim(folder, shard) as claim`, and `with claim.gate` while its files are changed.
 
     The locks are the operating system's: they end with the process, however that ends.
 
@@ -96,7 +96,7 @@ def _said(lock: str) -> str:
 
 
 def _remove(lock: BaseFileLock) -> None:
-    """Delete the file of a held lock: whoever waits for it sees that it is gone, and makes a new one."""
+    """Delete the file of a held lock; a process that waits for it notices and makes a new one."""
     with suppress(OSError):  # Windows keeps open files
         Path(lock.lock_file).unlink()
 

@@ -1,4 +1,4 @@
-"""Bags among the inputs of a job: what their cameras say, and a bag of the results."""
+"""ROS bags among the inputs of a job: checks of their CameraInfo messages, and a bag of the results."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def bag_remarks(inputs: Inputs, camera: Camera) -> Iterator[str]:
-    """What the bags' CameraInfos say otherwise than the sensor file.
+    """The differences between the bags' CameraInfo messages and the sensor file.
 
     Raises:
         MembraneError: a bag cannot be read, it is not clear which of its topics is meant, or it is of images of another size.
@@ -29,7 +29,7 @@ def bag_remarks(inputs: Inputs, camera: Camera) -> Iterator[str]:
 
 
 def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstructor", shard: Shard) -> BagWriter:
-    """Where the results of bags will be written to.
+    """The path of the bag to which results will be written.
 
     Raises:
         MembraneError: none of the inputs is a bag, only a shard of them is done, the estimator finds no forces or they are

@@ -1,4 +1,5 @@
-"""What a call names - files, globs, folders - as images, and as videos, bags and stacks of images, in the order of the call."""
+"""The inputs of a job: the files, globs and folders of a call, resolved to images, videos, bags and stacks of images in the
+order of the call."""
 
 import glob
 import os
@@ -35,7 +36,7 @@ class Inputs(NamedTuple):
 
     @property
     def bags(self) -> list[Path]:
-        """Those of the videos that are bags."""
+        """The videos that are bags."""
         return [path for path in self.videos if is_bag(path)]
 
     @property
@@ -80,7 +81,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
 
     Args:
         arguments: paths of files, folders (their images in name order, or the bag that it is) and glob patterns. Numbers in
-            names count as numbers: 2 before 10. Hidden files, and those that systems leave in folders, are passed over.
+            names count as numbers: 2 before 10. Hidden files and those that operating systems leave in folders are ignored.
         video: take every file for a video.
         topic: of the bags' images.
 
@@ -116,7 +117,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
 
 
 def single_images(inputs: Inputs) -> list[Path]:
-    """The image files, where only images are meant that have a file each.
+    """The image files of inputs that may only be images with a file each.
 
     Raises:
         MembraneError: there are files of several pictures among the inputs.

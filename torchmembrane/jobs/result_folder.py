@@ -1,4 +1,4 @@
-"""The folder of a job's results: what is finished, and the one place where frames, figures and summary.csv are written."""
+"""The folder of a job's results: it knows the finished frames, and writes frames, figures and summary.csv."""
 
 from collections.abc import Callable
 from functools import cache
@@ -18,7 +18,7 @@ from .inputs import Inputs, frame_name
 
 
 def files_at_risk(folder: Path, inputs: Inputs, figures: bool) -> list[Path]:
-    """Files that are in a folder and that a job would write over, if they are none of its own earlier results.
+    """Files in a folder that a job would overwrite and that are not its own earlier results.
 
     Args:
         folder: of the results.
@@ -73,7 +73,7 @@ class ResultFolder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        """Write what is held back."""
+        """Write all buffered frames."""
         try:
             self.frames.close()
             self.summary.write()
@@ -81,7 +81,7 @@ class ResultFolder:
             self._claim.__exit__(kind, error, traceback)
 
     def keep(self, outcome: Outcome) -> int:
-        """Store a frame's result, or that it has none; returns its status."""
+        """Store a frame's result, or note that it has none; return its status."""
         if outcome.stored is None:
             self.frames.forget(outcome.name)
             self.summary.add_unreadable(outcome.name, outcome.file, outcome.reason)
@@ -91,7 +91,7 @@ class ResultFolder:
         return outcome.status
 
     def save(self) -> None:
-        """Write what has been held back for long."""
+        """Write the frames that have been buffered for long enough."""
         self.frames.save()
 
     def _open(self) -> None:
@@ -115,7 +115,7 @@ class ResultFolder:
         self._judge({name: origins[name] for name in self.finished})
 
     def _judge(self, origins: dict[str, Origin]) -> None:
-        """Take frames whose images have changed from the finished ones, and say what was found."""
+        """Remove frames whose images have changed from the finished ones, and report what was found."""
 
         @cache
         def is_of(origin: Origin, file: Path) -> bool:

@@ -17,6 +17,7 @@ from ..surface.topology import rim_loop
 from .dots.locator import DotLocator
 from .dots.pattern import DotPattern, find_dots, measure_dots
 from .locator import Locator
+from .spacing import in_view
 from .texture.locator import TextureLocator
 from .texture.patches import choose_patches
 
@@ -115,16 +116,6 @@ def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]
 
         return SoftLocator, SoftTextureLocator
     raise MembraneError(f"Reconstructor: locator = {name!r}; expected one of {', '.join(LOCATORS)}")
-
-
-def in_view(pixels: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
-    """Which of `pixels [D, 2]` lie in an image of that width and height, `[D]` bool.
-
-    Example:
-        >>> in_view(np.array([[0.0, 479.0], [640.0, 3.0], [np.nan, 3.0]]), (640, 480)).tolist()
-        [True, False, False]
-    """
-    return np.all(np.logical_and(pixels >= 0, pixels <= np.array(image_size) - 1), axis=1)
 
 
 def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:

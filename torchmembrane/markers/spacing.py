@@ -4,6 +4,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+CUT = 0.25
+"""Spacings: how far outside the image the centre of a marker may be that shows in it; the radius of a large one."""
 FADED = 30.0
 """Exponent of a weight that no longer counts; products with subnormal numbers take fifty times as long."""
 
@@ -51,6 +53,28 @@ def neighbours(points: np.ndarray, count: int) -> np.ndarray:
         [[1], [0], [0]]
     """
     return np.asarray(cKDTree(points).query(points, k=min(count + 1, len(points)))[1])[:, 1:]
+
+
+def in_view(pixels: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+    """Which of `pixels [D, 2]` lie in an image of that width and height, `[D]` bool.
+
+    Example:
+        >>> in_view(np.array([[0.0, 479.0], [640.0, 3.0], [np.nan, 3.0]]), (640, 480)).tolist()
+        [True, False, False]
+    """
+    return np.all(np.logical_and(pixels >= 0, pixels <= np.array(image_size) - 1), axis=1)
+
+
+def partly_in_view(pixels: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+    """Which markers with centres `pixels [D, 2]`, all finite, show in an image of that width and height, `[D]` bool: those of
+    which the border cuts off a part are among them, up to `CUT` of their spacing outside.
+
+    Example:
+        >>> partly_in_view(np.array([[-2.0, 5.0], [8.0, 5.0], [18.0, 5.0], [28.0, 5.0]]), (16, 16)).tolist()
+        [True, True, True, False]
+    """
+    outside = np.maximum(-pixels, pixels - (np.array(image_size) - 1)).max(1)
+    return np.asarray(outside < CUT * spacing(pixels)[1])
 
 
 def thin_out(points: np.ndarray, gap: float) -> np.ndarray:

@@ -201,7 +201,7 @@ def _colour_bar(axes: Axes, shades: TriContourSet, ticks: np.ndarray | None = No
 
 
 def least_displacement(mesh: Mesh) -> float:
-    """The displacement under which nothing is marked and the colour scale does not shrink."""
+    """The displacement below which nothing is marked; the colour scale never covers less."""
     return LEAST_SCALE * float(np.ptp(mesh.rest_vertices, 0).max())
 
 
@@ -252,7 +252,7 @@ def _magnification(flow: np.ndarray, width: float) -> int:
 
 
 def _thinned(pixels: np.ndarray, pitch: float) -> np.ndarray:
-    """Which `[D]` of the points to draw: the first one in every cell of `pitch`, all of them where few would go."""
+    """Which of the points to draw, `[D]`: the first one in every cell of `pitch`, or all if few would be left out."""
     first = np.zeros(len(pixels), bool)
     first[np.unique(pixels // pitch, axis=0, return_index=True)[1]] = True
     return first if first.sum() < 0.6 * len(pixels) else np.ones(len(pixels), bool)

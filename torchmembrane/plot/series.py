@@ -85,7 +85,7 @@ def _draw(axes: Axes, times: np.ndarray, rows: Sequence[Mapping[str, str]], what
 
 
 def _line(axes: Axes, times: np.ndarray, values: np.ndarray, **style) -> None:
-    """A line, with a point for each frame that has no neighbour."""
+    """A line, with a point for each frame without a neighbour."""
     known = np.isfinite(values)
     alone = known & ~np.append(False, known[:-1]) & ~np.append(known[1:], False)
     axes.plot(times, values, **style)
@@ -106,7 +106,8 @@ def _shade(axes: Axes, times: np.ndarray, rows: Sequence[Mapping[str, str]], sha
 
 
 def _times(rows: Sequence[Mapping[str, str]]) -> tuple[np.ndarray, str]:
-    """Times of the frames and what they are: seconds since the first, where all are known and in order; else numbers."""
+    """Times of the frames and the label of their axis: seconds since the first frame if all are known and in order, else frame
+    numbers."""
     times = _numbers(rows, "time")
     if np.isfinite(times).all() and (np.diff(times) > 0).all():
         return times - times[0], "time [s]"
