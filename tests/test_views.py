@@ -5,11 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import torchmembrane as tm
 from torchmembrane.camera.rig import Rig
 from torchmembrane.cli.describe import described, rest_frame
 from torchmembrane.cli.main import main
+from torchmembrane.errors import MembraneError
+from torchmembrane.jobs.inputs import Inputs, of_first_view
 from torchmembrane.plot.sensor import sensor_figure
 from torchmembrane.pose import ViewPose
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
@@ -249,8 +252,28 @@ def test_check_says_and_draws_each_view(reconstructor, press):
     assert titles[2:] == ["Rest image of view left", "Rest image of view right"]
 
 
-def test_the_command_writes_an_image_for_each_view(press, tmp_path, capsys):
-    """simulate -> DIR/NAME_VIEW.png, and a sensor that can be read again."""
+def test_commands_take_an_image_of_each_view(press, tmp_path, capsys):
+    """simulate writes NAME_VIEW.png, reconstruct takes them; results keep the views apart, in files and tables."""
+    out, found = tmp_path / "out", tmp_path / "found"
+    press[0].at_rest().to_file(out)
+    for number in range(2):
+        for name, image in zip(("left", "right"), press[1], strict=True):
+            Image.fromarray(image).save(out / f"press{number}_{name}.png")
+    (out / "press1_right.png").unlink()
+    images = f"{out}/press*.png"
+    assert main(["reconstruct", str(out / "sensor.toml"), images, "--out", str(found), "--workers", "1", "--figures"]) == 1
+    assert "press1_right.png" in capsys.readouterr().err  # its frame has no result, the other one has
+    results = tm.read_results(found)
+    assert results.names == ["press0_left"] and results.mesh.views == 2 and results.mesh.rest_pixels.shape == (2, 49, 2)
+    frame = results["press0_left"]
+    assert frame["pixels"].shape == (2, 49, 2) and frame["residual"].shape == (2,) and (found / "press0_left.png").exists()
+    row = (found / "summary.csv").read_text().splitlines()[1]
+    assert row.startswith("press0_left,") and ",49,49," in row
+    with pytest.raises(MembraneError, match="of no view"):
+        of_first_view(Inputs([tmp_path / "press_left.png", tmp_path / "other.png"], []), ["left", "right"])
+
+
+def test_simulate_writes_an_image_for_each_view(press, tmp_path, capsys):
     file = press[0].sensor.to_file(tmp_path / "sensor")
     call = f"simulate {file} --indenter sphere --radius 3 --depth 0.5 --out {tmp_path / 'out'}".split()
     assert main(call) == 0 and "press_left.png, " in capsys.readouterr().out

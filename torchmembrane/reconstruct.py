@@ -1,6 +1,7 @@
 """From images to surfaces: `Reconstructor`, an `nn.Module` that holds everything constant of one sensor."""
 
 import copy
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,13 @@ from .files.tensors import tensor_of
 from .markers.coverage import LEAST_COVERAGE, Coverage, facings
 from .markers.observer import FOUND, MarkerFlow
 from .markers.sightings import sightings
+from .mechanics.principal import FIELDS, principal_fields
 from .results.frame_status import broken_down, is_seen
 from .results.reconstruction import Reconstruction
 from .results.status import Status
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
-from .sensor.view_images import grey_views
+from .sensor.view_images import grey_views, read_views
 from .state_dict import keep_small
 from .surface.bicubic import bicubic_shares
 
@@ -142,8 +144,11 @@ class Reconstructor(nn.Module):
 
     @check_arguments
     def read(self, *paths: str | Path) -> Tensor:
-        """Image files, one or more, as a batch `[B, 1, height, width]` in 0..1, of this module's precision and device."""
+        """Image files, one or more, as a batch `[B, 1, height, width]` in 0..1, of this module's precision and device. Of views
+        with images of their own those of the first view, NAME_VIEW; the others', which lie beside them, are read too."""
         expect(len(paths) > 0, "Reconstructor.read: paths", list(paths), "one image file or more")
+        if self.sensor.views_apart:
+            return torch.cat([read_views(Path(path), self.sensor.views, self.rest_pixels) for path in paths])
         images = [read_image(path, self.image_size, self.sensor.camera.bits) for path in paths]
         return torch.cat([grey_batch(image, self.image_size, "rgb", self.rest_pixels) for image in images])
 
@@ -308,6 +313,19 @@ class Reconstructor(nn.Module):
     def _gauged(self, observation: Observation, pressure: Tensor | float | None) -> Observation:
         """The observation with what a gauge reads, if one does."""
         return observation if pressure is None else self.estimator.gauged(observation, tensor_of("pressure", pressure))
+
+    def fields(self, result: Reconstruction, names: Sequence[str] = FIELDS) -> dict[str, Tensor]:
+        """Principal "stretch" and "tension" (force / length) at the vertices of `result`, `[B, V, 2]` by their names, as of
+        `principal_fields`; NaN where there is no surface.
+
+        Raises:
+            MembraneError: another name, or an estimator without an `elasticity`.
+        """
+        if unknown := [name for name in names if name not in FIELDS]:
+            raise MembraneError(f"Reconstructor.fields: {unknown[0]!r}; expected {', '.join(FIELDS)}")
+        elasticity: Any = getattr(self.estimator, "elasticity", None)
+        expect(elasticity is not None, "Reconstructor.fields: elasticity of the estimator", None, "force-balance")
+        return {name: principal_fields(elasticity, self.estimator.membrane, result.vertices, name) for name in names}
 
     def standard_deviations(self, result: Reconstruction, pressure: Tensor | float | None = None) -> StandardDeviations:
         """Of vertices, total force and pressure of `result`, caused by the locator's noise, and by that of a gauge where its

@@ -100,7 +100,6 @@ def reconstruct_files(
         FrameCounts(reconstructed=1, not_converged=0, unexplained=0, hidden=0, out_of_range=0, failed=0, skipped=0)
     """
     out, report = Path(out), report or _write_line
-    reconstructor.sensor.refuse_views("reconstruct")
     mesh = Mesh.of(reconstructor, settings)
     refuse_overwriting(f"--out {out}", files_at_risk(out, inputs, figures), [*inputs.images, *inputs.videos], force=True)
     if inputs.need_pyav:

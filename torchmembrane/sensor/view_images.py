@@ -1,6 +1,7 @@
 """Images of several views, each of which has its own, as one grey batch."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..files.grayscale import Channels, grey_batch
+from ..files.images import read_image
 from .views import View
 
 
@@ -36,6 +38,9 @@ def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Ten
             )
             raise MembraneError(f"images {list(given.shape)}; expected {expected}")
         images = given.unbind(axis)
+        if not has_colours:  # a stack may be as large as the largest view
+            sizes = [view.camera.image_size for view in views]
+            images = [batch[..., :height, :width] for batch, (width, height) in zip(images, sizes, strict=True)]
     if len(images) != count:
         raise MembraneError(f"images of {len(images)} views; expected {count}: {', '.join(view.name for view in views)}")
     each = [
@@ -47,6 +52,33 @@ def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Ten
         raise MembraneError(f"images: {frames} frames of the views; expected the same number of each")
     height, width = (max(batch.shape[axis] for batch in each) for axis in (-2, -1))
     return torch.cat([F.pad(batch, (0, width - batch.shape[-1], 0, height - batch.shape[-2])) for batch in each], 1)
+
+
+def read_views(path: Path, views: Sequence[View], like: Tensor) -> Tensor:
+    """A frame's images of all views, `[1, W, height, width]`, as of `grey_views`.
+
+    Args:
+        path: of the first view's image, NAME_VIEW and an ending; the others have the same name and ending, with their view's.
+        views: of the sensor.
+        like: a tensor of the precision and device.
+
+    Raises:
+        MembraneError: the file is not named after the first view, or a view's cannot be read.
+    """
+    first = f"_{views[0].name}"
+    if not path.stem.endswith(first):
+        raise MembraneError(f"{path}: expected the first view's image, NAME{first}{path.suffix}, beside those of the others")
+    stem = path.stem.removesuffix(first)
+    files = [path.with_name(f"{stem}_{view.name}{path.suffix}") for view in views]
+    images = [read_image(file, view.camera.image_size, view.camera.bits) for file, view in zip(files, views, strict=True)]
+    return grey_views(images, views, "rgb", like)
+
+
+def first_view_image(grey: Tensor, views: Sequence[View]) -> Tensor:
+    """The first view's image `[height, width]` of the grey image `[1, C, ...]` of a frame; that of a sensor with one view."""
+    left, top = (views[0].region or (0, 0))[:2] if views else (0, 0)
+    width, height = views[0].camera.image_size if views else (grey.shape[-1], grey.shape[-2])
+    return grey[0, 0, top : top + height, left : left + width]
 
 
 def _as_batch(images: Any) -> Any:

@@ -132,7 +132,7 @@ class Membrane(nn.Module):
             1.0
         """
         area = torch.linalg.vector_norm(self.area_vectors(x), dim=-1, keepdim=True)
-        return self._thirds_to_vertices(area).squeeze(-1)
+        return self.thirds_to_vertices(area).squeeze(-1)
 
     def normals(self, x: Tensor) -> Tensor:
         """Unit outward normals at the vertices: of the area vectors summed around them, as the volume gradient's.
@@ -255,14 +255,11 @@ class Membrane(nn.Module):
         return Membrane(*resampled_grid(X, self.fixed.cpu().numpy().reshape(self.grid), grid))
 
     def in_frame(self, pose: ViewPose, outside: bool = False) -> "Membrane":
-        """The same rest surface in another frame, such as that of another view, which need not see all of it.
+        """The same rest surface, its vertices in the same order, in another frame, such as that of a view that sees a part of it.
 
         Args:
             pose: of this frame in the other one; it may reflect.
             outside: whether the other view looks at the outer side, which is then away from its triangles' normals.
-
-        Returns:
-            Another `Membrane`, the same vertices in the same order.
 
         Example:
             >>> from torchmembrane.surface.shapes import spherical_cap
@@ -328,7 +325,8 @@ class Membrane(nn.Module):
         crossed: Tensor = first + second
         return crossed
 
-    def _thirds_to_vertices(self, per_triangle: Tensor) -> Tensor:
+    def thirds_to_vertices(self, per_triangle: Tensor) -> Tensor:
+        """Sums `[..., V, C]` of a third of what the triangles around each vertex have, `[..., m-1, n-1, 2, C]`."""
         thirds = (per_triangle / 3).unsqueeze(-2).expand(*per_triangle.shape[:-1], 3, per_triangle.shape[-1])
         return corners_to_vertices(triangles_to_corners(thirds), self.grid)
 
