@@ -3,10 +3,10 @@
 python -m bench.accuracy.views [--sensors 20] [--presses 60] [--first 0] [--depth 0.02,0.3] [--json FILE]
 
 Each sensor of `data/random_sensors.py` with listed dots gets a second camera of the same lens, 0.2 to 2 times the membrane's
-size beside the first, that looks at its middle. Each press is reconstructed from the dots' true pixels with 0.05 px of noise: by
-the first view, by both, and by both where every third dot is hidden from one and every other third from the other. Shape is the rms
-error of the dots over their rms displacement, depth the error of the deepest displacement over it, force the error over the
-force; `deep` are presses deeper than 0.2 of the size, `soft` open cavities and prestretch below 1.1.
+size beside the first, that looks at its middle. Each press is reconstructed from the dots' true pixels with 0.05 px of noise:
+by the first view, by both, and by both where every third dot is hidden from one and every other third from the other. Shape is
+the rms error of the dots over their rms displacement, depth the error of the deepest displacement over it, force the error over
+the force; `deep` are presses deeper than 0.2 of the size, `soft` open cavities and prestretch below 1.1.
 """
 
 import argparse

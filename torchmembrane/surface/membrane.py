@@ -255,7 +255,7 @@ class Membrane(nn.Module):
         return Membrane(*resampled_grid(X, self.fixed.cpu().numpy().reshape(self.grid), grid))
 
     def in_frame(self, pose: ViewPose, outside: bool = False) -> "Membrane":
-        """The same rest surface, its vertices in the same order, in another frame, such as that of a view that sees a part of it.
+        """The same rest surface, its vertices in the same order, in another frame: of a view that may see a part of it only.
 
         Args:
             pose: of this frame in the other one; it may reflect.
