@@ -30,7 +30,7 @@ from .results.status import Status
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
 from .sensor.view_images import grey_views, read_views
-from .state_dict import keep_small
+from .state_dict import drop_derived_buffers
 from .surface.bicubic import bicubic_shares
 
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
@@ -109,7 +109,7 @@ class Reconstructor(nn.Module):
         self.coverage = Coverage(membrane, positions, self.observer.seen_at_rest, facing)
         self.to(dtype)
         self._solve_by(built_estimator(problem, name, kind, settings), dtype)
-        keep_small(self)
+        drop_derived_buffers(self)
 
     def _solve_by(self, estimator: Estimator, dtype: torch.dtype) -> None:
         """Take an estimator, in a precision unless it must be in double, as of a slack sheet: so is what it is given then."""

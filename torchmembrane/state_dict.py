@@ -14,10 +14,10 @@ STIFFNESS, FOLLOWING = ("c1", "c2"), ("rest_pressure", "rest_load")
 """Of these: what another sensor's has otherwise, which is refused; what follows from the others."""
 IDENTITY = "rest_markers"
 """The markers' rest positions `[D, 3]`: those of another sensor are refused."""
-ALIKE = 1e-4  # largest distance of rest markers of one sensor, over their extent
+SAME_MARKERS = 1e-4  # largest distance of rest markers of one sensor, over their extent
 
 
-def keep_small(module: nn.Module) -> None:
+def drop_derived_buffers(module: nn.Module) -> None:
     """Leave constants that are rebuilt from the sensor out of a module's state; parameters that were added stay.
 
     States that hold all constants can still be loaded: those are checked for their shapes and left out. A state with another
@@ -61,7 +61,11 @@ def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) ->
             )
         if name == IDENTITY and given is not None:
             _check_identity(given, buffer)
-        elif given is not None and name in kept and not torch.allclose(given.to(buffer), buffer, rtol=ALIKE, atol=ALIKE**2):
+        elif (
+            given is not None
+            and name in kept
+            and not torch.allclose(given.to(buffer), buffer, rtol=SAME_MARKERS, atol=SAME_MARKERS**2)
+        ):
             others.append(name)
         if first[id(buffer)] not in kept:
             state[prefix + name] = buffer
@@ -86,7 +90,7 @@ def _check_others(names: list[str]) -> None:
 
 def _check_identity(given: Tensor, own: Tensor) -> None:
     off = torch.linalg.vector_norm(given.to(own) - own, dim=-1).max()
-    if off > ALIKE * torch.linalg.vector_norm(own.amax(0) - own.amin(0)):
+    if off > SAME_MARKERS * torch.linalg.vector_norm(own.amax(0) - own.amin(0)):
         raise MembraneError(
             f"Reconstructor.load_state_dict: {IDENTITY} up to {float(off):.3g} off this sensor's; expected the state of this "
             "sensor: build the Reconstructor from that sensor's file"

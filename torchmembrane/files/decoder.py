@@ -177,7 +177,7 @@ def refuse_damaged(image: Image.Image, content: bytes) -> None:
         refuse_damaged_page(image.tag_v2, file := BytesIO(content))  # type: ignore[attr-defined]
         refuse_displaced(image.tag_v2, file)  # type: ignore[attr-defined]
     if image.format == "WEBP" and not _fills_its_file(content):
-        raise ValueError("its chunks do not fill the file")
+        raise ValueError("its chunks do not add up to the length of the file")
     if image.format in ("JPEG", "MPO"):
         if any(0 in steps for steps in image.quantization.values()):  # type: ignore[attr-defined]
             raise ValueError("a quantisation table of the JPEG holds 0")

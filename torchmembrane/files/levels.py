@@ -65,7 +65,7 @@ def refuse_beyond(highest: Any, white: int) -> None:
         bits = (white + 1).bit_length() - 1
         raise MembraneError(
             f"values up to {int(highest)}; expected at most {white}, as bits = {bits} in the sensor file's [camera] says: "
-            "correct it, or leave it out where the values fill the 16 bits"
+            "correct it, or leave it out if the values use all 16 bits"
         )
 
 

@@ -52,7 +52,7 @@ def warn_of_times(frames: Iterable[tuple[str, float]]) -> None:
         if time < at - APART:
             warn_user(
                 f"{name} follows {latest} by the numbers in their names, but is older by {at - time:.0f} s; the order of the "
-                "names is taken. Where the other one is meant, rename the files"
+                "names is taken. If the other order is meant, rename the files"
             )
             return
         if time > at:

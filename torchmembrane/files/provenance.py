@@ -11,7 +11,7 @@ DIGEST = partial(hashlib.blake2b, digest_size=16)
 
 
 class Origin(NamedTuple):
-    """The file of a frame as it was when the frame was reconstructed.
+    """The file of a frame as it was when the frame was reconstructed, and what was measured beside it.
 
     Attributes:
         path: as given.
@@ -19,6 +19,7 @@ class Origin(NamedTuple):
         file_modified: nanoseconds since 1970; -1 where it is not known.
         content_hash: BLAKE2b hash of its content, 16 bytes as hexadecimal; "" if it is not known.
         time: when the frame was taken, seconds, as its name, video, bag or camera says; NaN where it is not known.
+        gauge: pressure across the membrane that a gauge read then, force unit / length unit^2; NaN where none did.
     """
 
     path: str = ""
@@ -26,6 +27,7 @@ class Origin(NamedTuple):
     file_modified: int = -1
     content_hash: str = ""
     time: float = float("nan")
+    gauge: float = float("nan")
 
     @classmethod
     def of(cls, file: Path) -> "Origin":

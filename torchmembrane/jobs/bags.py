@@ -36,9 +36,9 @@ def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstru
             relative, or there is something else at the path.
     """
     if shard != WHOLE:
-        raise MembraneError("--bag with --shard: leave --bag out, and call once more for all when the shards are done")
+        raise MembraneError("--bag with --shard: leave --bag out, and write the bag by one more call when all shards are done")
     if not inputs.bags:
-        raise MembraneError(f"--bag {path}: none of the inputs is a bag, whose messages' times the results' would have")
+        raise MembraneError(f"--bag {path}: none of the inputs is a bag; expected one, whose times the results take")
     if not reconstructor.finds_tractions:
         raise MembraneError(f"--bag {path}: {mesh.estimator} finds no forces; expected force-balance")
     return BagWriter(path, SiUnits(mesh, reconstructor.sensor.gas_pressure), is_mcap(inputs.bags[0]))

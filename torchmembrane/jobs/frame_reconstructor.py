@@ -117,7 +117,7 @@ class FrameReconstructor:
         return [
             Outcome(frame.name, frame.file, None, frame.reason)
             if frame.image is None
-            else _outcome(frame, frame.image, Stored(next(frames), frame.origin, seconds))
+            else _outcome(frame, frame.image, Stored(next(frames), self._measured(frame), seconds))
             for frame in group
         ]
 
@@ -170,6 +170,10 @@ class FrameReconstructor:
         computed = self.reconstructor(torch.cat(images), **options)
         results = Reconstruction(*(field.cpu() for field in computed))
         return [results.frame(i) for i in range(len(images))]
+
+    def _measured(self, frame: DecodedFrame) -> Origin:
+        """A frame's origin, with what the gauge read."""
+        return frame.origin._replace(gauge=float(self._reading(frame.name, frame.origin.time)))
 
     def _reading(self, name: str, time: float) -> float:
         """What the gauge reads in a frame."""

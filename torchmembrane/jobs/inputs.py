@@ -107,7 +107,9 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
     for name, count in Counter(map(frame_name, paths)).items():
         if count > 1:
             twins = ", ".join(printable(str(path)) for path in paths if frame_name(path) == name)
-            raise MembraneError(f"two inputs of the name {name!r} ({twins}); results bear it: rename, or use two calls")
+            raise MembraneError(
+                f"two inputs have the name {name!r} ({twins}), as would their results: rename one, or use two calls"
+            )
     for image in inputs.images:
         if of_video := inputs.video_of(frame_name(image)):
             raise MembraneError(f"{image}: a frame of {of_video} has the same name; use two calls")

@@ -108,7 +108,7 @@ def read_pressures(path: Path, inputs: Inputs, sensor: Sensor) -> PressureReadin
     key, column = table.form
     known = Table(table.form, [row for row in table.rows if row.text(column).lower() not in UNKNOWN])
     if not known.rows:
-        raise MembraneError(f"{path}: no readings after the header but empty ones; expected {PRESSURES.expected}")
+        raise MembraneError(f"{path}: no readings after the header, only empty values; expected {PRESSURES.expected}")
     one, since_rest = hectopascal(sensor.length_unit), column == SINCE_REST
     if key == TIME:
         return _by_time(path, known, inputs, one, since_rest)
@@ -173,7 +173,7 @@ def by_frame(table: Table, inputs: Inputs) -> tuple[dict[str, Row], list[Row]]:
         lines = found if said in frames or inputs.video_of(name) else others
         if name in lines:
             quoted = shortened(repr(said))
-            raise MembraneError(f"{row.where}: {quoted} stands there twice, also in line {lines[name].line}; expected it once")
+            raise MembraneError(f"{row.where}: {quoted} is listed twice, also in line {lines[name].line}; expected it once")
         lines[name] = row
     return found, list(others.values())
 

@@ -101,8 +101,8 @@ def outcomes_by(workers: int, work: Work, sources: Iterator[Source], batch: int)
                 yield waiting.popleft().result()
         except BrokenProcessPool as error:
             raise MembraneError(
-                f"one of {workers} worker processes has ended (out of memory?); what is done is kept: pass fewer --workers, or "
-                "a smaller --batch"
+                f"one of {workers} worker processes has ended (out of memory?); finished frames are kept: pass fewer "
+                "--workers, or a smaller --batch"
             ) from error
 
 

@@ -111,7 +111,9 @@ def focal_of_view(model: str, width: int, degrees: float) -> float:
     """
     half = math.radians(degrees) / 2
     if model == "pinhole" and not degrees < 180:
-        raise MembraneError(f"field of view {degrees:g} degrees; expected less than 180 of a pinhole lens: a fisheye sees more")
+        raise MembraneError(
+            f"field of view {degrees:g} degrees; expected less than 180 for a pinhole lens (a fisheye sees more)"
+        )
     if not degrees <= 360:
         raise MembraneError(f"field of view {degrees:g} degrees; expected at most 360")
     return width / 2 / (math.tan(half) if model == "pinhole" else half)

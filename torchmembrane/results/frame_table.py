@@ -44,15 +44,15 @@ class FrameTable:
     Args:
         folder: of the parts.
         mesh: what the frames share.
-        gate: held while parts are changed.
+        write_lock: held while parts are changed.
 
     Attributes:
         damaged: parts that could not be read, as far as `stored` has come; they were renamed.
     """
 
-    def __init__(self, folder: Path, mesh: Mesh, gate: AbstractContextManager[Any]):
+    def __init__(self, folder: Path, mesh: Mesh, write_lock: AbstractContextManager[Any]):
         self.arrow, self.parquet = load_pyarrow()
-        self.folder, self.mesh, self.gate = folder, mesh, gate
+        self.folder, self.mesh, self.write_lock = folder, mesh, write_lock
         self.metadata = {key: getattr(mesh, key) for key in ("length_unit", "force_unit", "name", "sensor", "record")}
         self.damaged: list[Path] = []
         self.part_rows = max(1, min(PART_ROWS, PART_BYTES // (60 * len(mesh.rest_vertices) + 30 * len(mesh.rest_pixels) + 300)))
@@ -70,7 +70,7 @@ class FrameTable:
         Parts are repaired on the way: unreadable ones are renamed to `*.damaged`, duplicate rows left by an interrupted merge
         are removed, and parts of earlier versions are rewritten.
         """
-        with self.gate:
+        with self.write_lock:
             seen: set[str] = set()
             for part in self._parts():
                 try:
@@ -112,7 +112,7 @@ class FrameTable:
     def forget(self, name: str) -> None:
         """Remove a frame, if it is there."""
         self._waiting.pop(name, None)
-        with self.gate:
+        with self.write_lock:
             self._drop([name])
 
     def save(self) -> None:
@@ -123,14 +123,14 @@ class FrameTable:
     def close(self) -> None:
         """Write the buffered frames, and merge small parts."""
         self._flush()
-        with self.gate:
+        with self.write_lock:
             self._merge(least=2)
 
     def _flush(self) -> None:
         self._saved = time.monotonic()
         if not self._waiting:
             return
-        with self.gate:
+        with self.write_lock:
             make_subfolder(self.folder)
             self._drop(self._waiting)
             last = max((int(part.stem.rpartition("-")[2]) for part in self._parts()), default=-1)

@@ -18,29 +18,29 @@ from .store import MESH, Mesh, check_folder
 Frames: TypeAlias = "FrameFiles | FrameTable"
 
 
-def open_folder(folder: str | Path, mesh: Mesh, gate: AbstractContextManager[Any]) -> Frames:
+def open_folder(folder: str | Path, mesh: Mesh, write_lock: AbstractContextManager[Any]) -> Frames:
     """Open the frames of a folder for writing; the folder is made if it does not exist.
 
     Args:
         folder: of the results.
         mesh: what they share.
-        gate: a lock that is held while files are changed that other processes change as well.
+        write_lock: a lock that is held while files are changed that other processes change as well.
 
     Raises:
         MembraneError: what `check_folder` refuses.
     """
     folder = Path(folder)
-    with gate:
+    with write_lock:
         check_folder(folder, mesh.sensor, mesh.settings)
         if not (folder / MESH).exists():
             mesh.save(make_folder(folder) / MESH)
-    return frames_of(folder, mesh, gate)
+    return frames_of(folder, mesh, write_lock)
 
 
-def frames_of(folder: Path, mesh: Mesh, gate: AbstractContextManager[Any] | None = None) -> Frames:
+def frames_of(folder: Path, mesh: Mesh, write_lock: AbstractContextManager[Any] | None = None) -> Frames:
     """The frames of a folder whose mesh this is."""
     if mesh.format == "parquet":
-        return FrameTable(folder / "frames", mesh, gate or nullcontext())
+        return FrameTable(folder / "frames", mesh, write_lock or nullcontext())
     return FrameFiles(folder, mesh)
 
 

@@ -21,7 +21,7 @@ RIDGES = (0.0, 1e-6, 1e-5, 1e-4)
 """Added, one instead of the other, to a diagonal about 1 of a matrix that rounding has left without a factor."""
 
 
-def takes(matrix: Tensor) -> bool:
+def is_supported(matrix: Tensor) -> bool:
     """Whether these operators can be used: on a processor, without gradients, and not in an exported model."""
     recorded = torch.is_grad_enabled() and matrix.requires_grad
     return matrix.device.type == "cpu" and not recorded and not torch.compiler.is_exporting()
