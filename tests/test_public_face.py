@@ -178,10 +178,10 @@ def test_a_result_moves_and_keeps_its_meaning(result):
 
 
 def test_a_status_is_its_number_and_says_its_text(result):
-    assert [int(status) for status in tm.Status] == list(range(10)) and tm.Status(3) == 3
+    assert [int(status) for status in tm.Status] == list(range(11)) and tm.Status(3) == 3
     assert all(tm.Status(int(code)) is tm.Status.OK for code in result.status)
     assert tm.Status.NOT_CONVERGED.has_surface and not tm.Status.BAD_VALUES.has_surface
-    assert len({status.text for status in tm.Status}) == 10
+    assert len({status.text for status in tm.Status}) == 11
 
 
 def test_a_tracker_gives_what_frames_with_their_previous_give(reconstructor, photographs, result):

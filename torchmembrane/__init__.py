@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from .estimators.registry import register_estimator
     from .mechanics.hyperelastic import ElasticEnergy
     from .onnx.export import export
-    from .pose import Pose
+    from .pose import Pose, ViewPose
     from .presets import preset
     from .reconstruct import Reconstructor
     from .results.read import read_results
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from .results.status import Status
     from .sensor.parts import Cavity, Markers, Material, Surface
     from .sensor.sensor import Sensor
+    from .sensor.views import View
     from .surface.membrane import Membrane
     from .track import Tracker
 
@@ -70,6 +71,8 @@ _HOMES = {
     "Status": "results.status",
     "Surface": "sensor.parts",
     "Tracker": "track",
+    "View": "sensor.views",
+    "ViewPose": "pose",
     "export": "onnx.export",
     "preset": "presets",
     "read_results": "results.read",
@@ -106,6 +109,8 @@ __all__ = [
     "Status",
     "Surface",
     "Tracker",
+    "View",
+    "ViewPose",
     "__version__",
     "calibrate",
     "export",

@@ -1,7 +1,7 @@
-"""Poses: transformation of points, vectors and wrenches from the camera's frame to a tool's."""
+"""Poses: points, vectors and wrenches from the camera's frame to a tool's, or from one view's to another's."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -45,6 +45,7 @@ class Pose:
 
     rotation: np.ndarray
     translation: np.ndarray
+    may_reflect: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         rotation, translation = np.asarray(self.rotation, float), np.asarray(self.translation, float)
@@ -59,7 +60,7 @@ class Pose:
         expected = "orthogonal rows of length one: give a rotation alone, without scale, with more decimals"
         expect(bool(orthogonal), "rotation", rotation.tolist(), expected)
         expected = "determinant 1; this one's is -1, a reflection: make the axes right-handed"
-        expect(bool(determinant > 0), "rotation", rotation.tolist(), expected)
+        expect(bool(determinant > 0) or self.may_reflect, "rotation", rotation.tolist(), expected)
         known = translation.shape == (3,) and bool(np.isfinite(translation).all())
         expect(known, "translation", translation.tolist(), "three finite numbers, in the sensor's length unit")
         object.__setattr__(self, "rotation", rotation)
@@ -106,6 +107,51 @@ class Pose:
         adjoint = np.block([[self.rotation, np.zeros((3, 3))], [lever, self.rotation]])
         moved: Values = wrench @ _like(wrench, adjoint.T)
         return moved
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPose(Pose):
+    """The pose of a view's frame in the first view's; a view by a mirror is reflected, with determinant -1.
+
+    Args:
+        rotation: `[3, 3]` rows of an orthogonal matrix, or a rotation vector `[3]`, degrees.
+        translation: `[3]`, length unit.
+
+    Example:
+        >>> mirrored = ViewPose(np.diag([-1.0, 1.0, 1.0]), np.array([20.0, 0.0, 0.0]))  # by a mirror at x = 10
+        >>> mirrored.points(np.array([2.0, 3.0, 30.0])).tolist()
+        [18.0, 3.0, 30.0]
+    """
+
+    may_reflect: ClassVar[bool] = True
+
+    @classmethod
+    def of_matrix(cls, matrix: np.ndarray) -> "ViewPose":
+        """The pose that a matrix `[4, 4]` of homogeneous coordinates describes.
+
+        Raises:
+            MembraneError: another shape or last row, or rows that are not orthogonal.
+        """
+        given = np.asarray(matrix, float)
+        right = given.shape == (4, 4) and np.array_equal(given[3], [0, 0, 0, 1])
+        expect(right, "pose", given.tolist(), "four rows of four numbers, the last one 0, 0, 0, 1")
+        return cls(given[:3, :3], given[:3, 3])
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The same as a matrix `[4, 4]` of homogeneous coordinates."""
+        rows: np.ndarray = np.vstack([np.column_stack([self.rotation, self.translation]), [0.0, 0.0, 0.0, 1.0]])
+        return rows
+
+    @property
+    def determinant(self) -> int:
+        """1, or -1 of a reflection."""
+        return 1 if np.linalg.det(self.rotation) > 0 else -1
+
+    @property
+    def inverse(self) -> "ViewPose":
+        """The pose of the first view's frame in this one's."""
+        return ViewPose(self.rotation.T, -self.rotation.T @ self.translation)
 
 
 def _checked(name: str, values: Any, count: int) -> Any:

@@ -1,6 +1,7 @@
 """From images to surfaces: `Reconstructor`, an `nn.Module` that holds everything constant of one sensor."""
 
 import copy
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,28 +9,31 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .camera.motion import in_pixels, in_words, is_displaced, shift_of
+from .camera.rig import turns_by_noise
 from .control_flow import in_inference_mode, traced
 from .errors import MembraneError, check_arguments, expect
-from .estimators.base import Equilibrium, Estimator, Observation, Problem, StandardDeviations
+from .estimators.base import Equilibrium, Estimator, Observation, StandardDeviations
 from .estimators.contacts import Contacts
 from .estimators.precision import PRECISIONS, check_precision, full_precision
 from .estimators.registry import built_estimator, estimator_kind
+from .estimators.sensor_problem import LEAST_ERROR, problem_of
 from .files.grayscale import CHANNELS, Channels, grey_batch
 from .files.images import read_image
 from .files.tensors import tensor_of
 from .markers.coverage import LEAST_COVERAGE, Coverage, facings
-from .markers.observer import FOUND, MarkerFlow, MarkerObserver
-from .markers.placement import imaged_vertices, place_markers
+from .markers.observer import FOUND, MarkerFlow
+from .markers.sightings import sightings
+from .mechanics.principal import FIELDS, principal_fields
+from .results.frame_status import broken_down, is_seen
 from .results.reconstruction import Reconstruction
 from .results.status import Status
 from .sensor.factories import cavity_filling, elastic_energy
 from .sensor.sensor import Sensor
-from .state_dict import keep_small
+from .sensor.view_images import grey_views, read_views
+from .state_dict import drop_derived_buffers
 from .surface.bicubic import bicubic_shares
 
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
-LEAST_ERROR = 0.02  # px
 LARGEST_RESIDUAL = 1.5  # px, of a plausible answer, however noisy its image
 
 
@@ -87,42 +91,31 @@ class Reconstructor(nn.Module):
         if dtype not in PRECISIONS:
             raise MembraneError(f"Reconstructor: dtype = {dtype}; expected torch.float32 or torch.float64")
         self.sensor, self.estimator_name, self.locator_name, self.channels = sensor, name, locator, channels
-        self.image_size, self.model = sensor.camera.image_size, model or sensor.material.model
+        self.image_size, self.model = sensor.image_size, model or sensor.material.model
         self.range = sensor.range.of(sensor.fingerprint)
-        self.camera, membrane = copy.deepcopy(sensor.camera), copy.deepcopy(sensor.membrane)
-        vertex_pixels = self.camera.point_to_pixel(membrane.rest)
-        imaged = imaged_vertices(sensor, vertex_pixels, whole=kind.needs_every_vertex)
-        markers, cavity = place_markers(sensor, vertex_pixels, locator), cavity_filling(sensor, membrane, warn=True)
-        positions, model_pixels = torch.from_numpy(markers.positions), torch.from_numpy(markers.model_pixels)
-        self.marker_points = markers.points
-        rim_pixels, rest_image = vertex_pixels[membrane.fixed & imaged].numpy(), sensor.markers.rest_image
-        self.observer = MarkerObserver(markers, rim_pixels, sensor.name, dtype, rest_image, self.image_size, check_rest)
-        problem = Problem(
-            camera=self.camera,
-            membrane=membrane,
-            elasticity=elastic_energy(sensor, membrane, model),
-            filling=cavity.filling,
-            gas=cavity.gas,
-            markers=markers.points,
-            positions=positions,
-            rest_pixels=model_pixels,
-            vertex_pixels=vertex_pixels,
-            rest_covariance=2 * self.observer.rest_covariance.double() + LEAST_ERROR**2 * torch.eye(2).double(),
-        )
-        self.register_buffer("vertex_pixels", vertex_pixels)
+        views, membrane = max(1, len(sensor.views)), copy.deepcopy(sensor.membrane)
+        expected = "1, as of sensor.in_view(0), or force-balance"
+        expect(views == 1 or kind.takes_views, f"Reconstructor: views for {name}", views, expected)
+        seen = sightings(sensor, locator, dtype, kind.needs_every_vertex, check_rest)
+        cavity = cavity_filling(sensor, membrane, warn=True)
+        self.observer, self.camera, self.marker_points = seen.observer, seen.camera, seen.markers.points
+        positions = torch.from_numpy(seen.markers.positions)
+        problem = problem_of(seen, membrane, elastic_energy(sensor, membrane, model), cavity)
+        self.register_buffer("vertex_pixels", seen.vertex_pixels)
         self.register_buffer("rest_markers", positions)
-        self.register_buffer("marker_shares", torch.from_numpy(bicubic_shares(markers.points, membrane.grid, membrane.fixed)))
-        facing = facings(positions, self.marker_shares @ membrane.rest_normals)
+        shares = bicubic_shares(self.marker_points, membrane.grid, membrane.fixed)
+        self.register_buffer("marker_shares", torch.from_numpy(shares))
+        facing = self._facings(positions, self.marker_shares @ membrane.rest_normals)
         self.coverage = Coverage(membrane, positions, self.observer.seen_at_rest, facing)
         self.to(dtype)
         self._solve_by(built_estimator(problem, name, kind, settings), dtype)
-        keep_small(self)
+        drop_derived_buffers(self)
 
     def _solve_by(self, estimator: Estimator, dtype: torch.dtype) -> None:
         """Take an estimator, in a precision unless it must be in double, as of a slack sheet: so is what it is given then."""
         self.estimator = estimator if estimator.solves_in_double else estimator.to(dtype)
         if estimator.solves_in_double:
-            self.observer.locator.be_exact()
+            self.observer.be_exact()
 
     @classmethod
     @check_arguments
@@ -136,8 +129,8 @@ class Reconstructor(nn.Module):
 
     @property
     def rest_pixels(self) -> Tensor:
-        """Where the model sees the markers at rest, `[D, 2]` px."""
-        return self.observer.rest_pixels
+        """Where the model sees the markers at rest, `[D, 2]` px; of several views `[W, D, 2]`."""
+        return self.observer.by_view(self.observer.rest_pixels[None])[0]
 
     @property
     def rest_pressure(self) -> Tensor:
@@ -151,9 +144,12 @@ class Reconstructor(nn.Module):
 
     @check_arguments
     def read(self, *paths: str | Path) -> Tensor:
-        """Image files, one or more, as a batch `[B, 1, height, width]` in 0..1, of this module's precision and device."""
+        """Image files, one or more, as a batch `[B, 1, height, width]` in 0..1, of this module's precision and device. Of views
+        with images of their own those of the first view, NAME_VIEW; the others', which lie beside them, are read too."""
         expect(len(paths) > 0, "Reconstructor.read: paths", list(paths), "one image file or more")
-        images = [read_image(path, self.image_size, self.camera.bits) for path in paths]
+        if self.sensor.views_apart:
+            return torch.cat([read_views(Path(path), self.sensor.views, self.rest_pixels) for path in paths])
+        images = [read_image(path, self.image_size, self.sensor.camera.bits) for path in paths]
         return torch.cat([grey_batch(image, self.image_size, "rgb", self.rest_pixels) for image in images])
 
     def forward(
@@ -189,7 +185,9 @@ class Reconstructor(nn.Module):
 
     def grey(self, images: Tensor | np.ndarray) -> Tensor:
         """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
-        return grey_batch(images, self.image_size, self.channels, self.rest_pixels, self.camera.bits)
+        if self.sensor.views_apart:
+            return grey_views(images, self.sensor.views, self.channels, self.rest_pixels)
+        return grey_batch(images, self.image_size, self.channels, self.rest_pixels, self.sensor.camera.bits)
 
     def reconstruct_grey(
         self,
@@ -245,7 +243,7 @@ class Reconstructor(nn.Module):
         square = (found * displacement.square().sum(-1)).sum(-1) / found.sum(-1).clamp_min(1)
         one = torch.eye(2, dtype=covariance.dtype, device=covariance.device)
         error = (LEAST_ERROR**2 + MODEL_ERROR**2 * square)[:, None, None, None] * one
-        return self.estimator.prepare(self.camera, self.rest_pixels + displacement, confidence, covariance + error)
+        return self.estimator.prepare(self.camera, self.observer.rest_pixels + displacement, confidence, covariance + error)
 
     @traced
     def result(
@@ -255,13 +253,13 @@ class Reconstructor(nn.Module):
         membrane, lost, x = self.estimator.membrane, confidence <= FOUND, found.vertices
         u = x - membrane.rest
         markers = self.rest_markers + self.marker_shares @ u.to(self.marker_shares)
-        pixels = self.rest_pixels + displacement
-        modelled = self.camera.point_to_pixel(markers) + shift_of(found.moved, pixels, self.image_size)
+        pixels, by_view = self.observer.rest_pixels + displacement, self.observer.by_view
+        modelled = self.camera.point_to_pixel(self.observer.seen_by_each(markers)) + self.camera.shift_of(found.moved, pixels)
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))
         normals, broken = membrane.normals(x), ~x.flatten(1).isfinite().all(1)
-        in_view = self.coverage.in_view(confidence, facings(markers, self.marker_shares @ normals.to(markers)))
-        residual = (miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()
-        gone, status = (status != Status.OK.value) | broken, self._judged(status, found, normals, residual, in_view, broken)
+        in_view = self.coverage.in_view(confidence, self._facings(markers, self.marker_shares @ normals.to(markers)))
+        residual = (by_view(miss2).sum(-1) / (~by_view(lost)).sum(-1).clamp_min(1)).sqrt()
+        gone, status = ~is_seen(status) | broken, self._judged(status, found, normals, residual, in_view, broken)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
         deviations = self.estimator.deviations(found, observation, contacts)
         wrench = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1)
@@ -279,7 +277,7 @@ class Reconstructor(nn.Module):
             residual=residual,
             wrench=wrench,
             coverage=self.coverage(confidence),
-            camera_motion=in_words(found.moved, self.image_size),
+            camera_motion=self.camera.motion_in_words(found.moved),
             force_deviation=deviations.force,
             depth_deviation=deviations.depth,
             **{f"contact_{name}": getattr(contacts, name) for name in Contacts._fields[1:]},
@@ -288,27 +286,46 @@ class Reconstructor(nn.Module):
             name: torch.where(gone.reshape(-1, *(1,) * (value.ndim - 1)), torch.nan, value).to(markers)
             for name, value in values.items()
         }
-        measured = torch.where(lost[..., None], torch.nan, pixels).to(markers)
-        return Reconstruction(pixels=measured, confidence=confidence, status=status.to(torch.int32), **kept)
+        measured = by_view(torch.where(lost[..., None], torch.nan, pixels).to(markers))
+        return Reconstruction(pixels=measured, confidence=by_view(confidence), status=status.to(torch.int32), **kept)
 
     def _judged(
         self, status: Tensor, found: Equilibrium, normals: Tensor, residual: Tensor, coverage: Tensor, broken: Tensor
     ) -> Tensor:
         """Statuses `[B]`, of frames that had none before the solve too: of several that hold the last."""
-        ok, displaced = status == Status.OK.value, is_displaced(found.moved, self.image_size)
+        ok, displaced = is_seen(status), self.camera.is_displaced(found.moved)
+        unlike = (residual[..., None] > LARGEST_RESIDUAL).flatten(1).any(1)
         for of_this, value in (
             (self.range.is_beyond(found.vertices, normals, found.traction, self.estimator.membrane), Status.OUT_OF_RANGE.value),
             (~self.estimator.is_converged(found), Status.NOT_CONVERGED.value),
             (coverage < LEAST_COVERAGE, Status.HIDDEN.value),
-            (~self.estimator.is_explained(found) | (residual > LARGEST_RESIDUAL) | displaced, Status.UNEXPLAINED.value),
+            (~self.estimator.is_explained(found) | unlike | displaced, Status.UNEXPLAINED.value),
             (broken, Status.NO_SOLUTION.value),
         ):
             status = torch.where(ok & of_this, value, status)
         return status
 
+    def _facings(self, points: Tensor, normals: Tensor) -> Tensor:
+        """How the markers at `points [..., D, 3]` face what sees them, for each sighting."""
+        each = self.observer.seen_by_each
+        return facings(self.camera.lines_of_sight(each(points)), each(normals))
+
     def _gauged(self, observation: Observation, pressure: Tensor | float | None) -> Observation:
         """The observation with what a gauge reads, if one does."""
         return observation if pressure is None else self.estimator.gauged(observation, tensor_of("pressure", pressure))
+
+    def fields(self, result: Reconstruction, names: Sequence[str] = FIELDS) -> dict[str, Tensor]:
+        """Principal "stretch" and "tension" (force / length) at the vertices of `result`, `[B, V, 2]` by their names, as of
+        `principal_fields`; NaN where there is no surface.
+
+        Raises:
+            MembraneError: another name, or an estimator without an `elasticity`.
+        """
+        if unknown := [name for name in names if name not in FIELDS]:
+            raise MembraneError(f"Reconstructor.fields: {unknown[0]!r}; expected {', '.join(FIELDS)}")
+        elasticity: Any = getattr(self.estimator, "elasticity", None)
+        expect(elasticity is not None, "Reconstructor.fields: elasticity of the estimator", None, "force-balance")
+        return {name: principal_fields(elasticity, self.estimator.membrane, result.vertices, name) for name in names}
 
     def standard_deviations(self, result: Reconstruction, pressure: Tensor | float | None = None) -> StandardDeviations:
         """Of vertices, total force and pressure of `result`, caused by the locator's noise, and by that of a gauge where its
@@ -319,32 +336,12 @@ class Reconstructor(nn.Module):
         """
         if not isinstance(result, Reconstruction):
             raise MembraneError(f"standard_deviations: result is a {type(result).__name__}; expected a tm.Reconstruction")
-        pixels = torch.where(result.pixels.isfinite(), result.pixels, self.rest_pixels)
-        origins, directions = self.camera.pixel_to_ray(pixels)
-        distance = torch.linalg.vector_norm(result.markers - origins, dim=-1)[..., None, None]
-        half = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
-        after, before = (self.camera.pixel_to_ray(pixels[..., None, :] + step) for step in (half, -half))
-        turn = (after.origin - before.origin) / distance + after.direction - before.direction
-        noise = torch.linalg.cholesky(2 * self.observer.rest_covariance).mT @ turn
-        observation = self._gauged(self.observation(pixels - self.rest_pixels, result.confidence), pressure)
+        sighted, markers = self.observer.sighted, self.observer.seen_by_each(result.markers)
+        pixels = sighted(torch.where(result.pixels.isfinite(), result.pixels, self.rest_pixels))
+        noise = turns_by_noise(self.camera, pixels, markers, 2 * self.observer.rest_covariance)
+        observation = self._gauged(self.observation(pixels - self.observer.rest_pixels, sighted(result.confidence)), pressure)
         vertices = torch.where(result.vertices.isfinite(), result.vertices, self.estimator.membrane.rest)
         pressure = torch.where(result.pressure.isfinite(), result.pressure, self.estimator.rest_pressure)
-        moved = in_pixels(result.camera_motion, self.image_size).nan_to_num()
+        moved = self.camera.motion_in_pixels(result.camera_motion).nan_to_num()
         found = self.estimator.standard_deviations(vertices, pressure, moved, observation, noise)
         return found.known(result.vertices.flatten(1).isfinite().all(1))
-
-
-def broken_down(status: Tensor, vertices: Tensor) -> Tensor | None:
-    """Statuses `[B]` with the frames whose solve broke down said; None where none did, or no gradient is asked for.
-
-    A broken solve passes NaN to all that its gradient reaches, also what the batch's other frames share with it: so it is not
-    the one to be differentiated.
-
-    Args:
-        status: `[B]`, before the solve.
-        vertices: `[B, V, 3]` that it found.
-    """
-    if torch.compiler.is_compiling() or not isinstance(vertices, Tensor) or not vertices.requires_grad:
-        return None
-    broken = (status == Status.OK.value) & ~vertices.flatten(1).isfinite().all(1)
-    return torch.where(broken, Status.NO_SOLUTION.value, status) if bool(broken.any()) else None

@@ -17,7 +17,7 @@ IDENTITY = "rest_markers"
 SAME_MARKERS = 1e-4  # largest distance of rest markers of one sensor, over their extent
 
 
-def keep_small(module: nn.Module) -> None:
+def drop_derived_buffers(module: nn.Module) -> None:
     """Leave constants that are rebuilt from the sensor out of a module's state; parameters that were added stay.
 
     States that hold all constants can still be loaded: those are checked for their shapes and left out. A state with another

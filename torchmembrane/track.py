@@ -66,6 +66,7 @@ class Tracker:
     def __init__(self, reconstructor: Reconstructor):
         if not hasattr(reconstructor, "observer"):
             raise MembraneError(f"Tracker: reconstructor is a {type(reconstructor).__name__}; expected a tm.Reconstructor")
+        reconstructor.sensor.refuse_views("Tracker")
         self.reconstructor = reconstructor
         self.time: float | None = None
         self.stiffness, self._said_due = StiffnessWatch(), False

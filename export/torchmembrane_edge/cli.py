@@ -22,7 +22,7 @@ from .session import MOST_THREADS, Session, model_file
 from .summary import UNREADABLE, Summary
 from .summary_row import AXES, CONTACTS, numbers
 
-FINISHED = (0, 3, 7, 8, 9)  # ok; not converged, unexplained, partly hidden, out of range: the answer is kept
+FINISHED = (0, 3, 7, 8, 9, 10)  # ok; not converged, unexplained, partly hidden, out of range, a view left out: it is kept
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".pgm", ".ppm")
 """Of the files that are taken from a folder."""
 OF_SYSTEM = re.compile(r"\._.*|\.DS_Store|(eh)?thumbs\.db|desktop\.ini|icon\r", re.IGNORECASE)

@@ -119,9 +119,9 @@ def numbers(frame: Mapping[str, Any], rest_normals: np.ndarray, length_unit: str
     def of(key: str, *shape: int) -> np.ndarray:
         return np.asarray(frame[key]) if key in frame else np.full(shape, np.nan)
 
-    confidence = of("confidence", 0)
-    found |= {"markers_found": (confidence > 0).sum(), "markers_total": confidence.size}
-    found["residual_px"] = of("residual")
+    is_found = np.atleast_2d(of("confidence", 0) > 0)  # by any view
+    found |= {"markers_found": is_found.any(0).sum(), "markers_total": is_found.shape[1]}
+    found["residual_px"] = of("residual").max()
     found |= {key: of(key) for key in ("coverage", "pressure", "pressure_change", "depth_deviation", "volume_error")}
     hectopascals = METRE[length_unit] ** 2 / 100 if force_unit == "N" and length_unit in METRE else np.nan
     found |= {f"{key}_hpa": found[key] * hectopascals for key in ("pressure", "pressure_change")}

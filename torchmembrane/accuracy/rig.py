@@ -61,6 +61,7 @@ class Rig:
     """
 
     def __init__(self, sensor: Sensor, noise: float):
+        sensor.refuse_views("check --accuracy")
         self.simulator = Simulator(sensor, appearance=Appearance(noise=noise))
         simulated = replace(sensor.markers, rest_image=self.simulator.rest_image())
         with warnings.catch_warnings():

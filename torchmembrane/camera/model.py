@@ -16,6 +16,7 @@ from ..files.decoder import MOST_PIXELS
 from ..files.levels import check_bits
 from .distortion import fisheye_direction, fisheye_image, pinhole_direction, pinhole_image
 from .mode import Mode
+from .motion import ImageMotion
 from .ports import MOST_INDEX, Layers, Port, apparent_points, check_ports, layers_of, refract
 
 COEFFICIENTS = {"pinhole": 5, "fisheye": 4}  # k1 k2 p1 p2 k3 | k1 k2 k3 k4
@@ -48,7 +49,7 @@ class Rays(NamedTuple):
 
 
 @check_arguments
-class Camera(nn.Module):
+class Camera(ImageMotion, nn.Module):
     """A pinhole or fisheye camera, central in air or looking through flat layers into a medium.
 
     The parameters are float64 buffers that enter the arithmetic directly, so `torch.func.functional_call` can
@@ -132,6 +133,11 @@ class Camera(nn.Module):
         self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
 
     @property
+    def image_sizes(self) -> list[tuple[int, int]]:  # type: ignore[override]
+        """Its own alone."""
+        return [self.image_size]
+
+    @property
     def ports(self) -> list[Port]:
         """The flat layers in order from the camera, as numbers."""
         rows = torch.stack([self.port_distance, self.port_thickness, self.port_index], -1)
@@ -209,6 +215,10 @@ class Camera(nn.Module):
             points = apparent_points(points, self._layers(), self.medium_index)
         lens = pinhole_image if self.model == "pinhole" else fisheye_image
         return lens(points, self.distortion) * self.focal + self.centre
+
+    def lines_of_sight(self, points: Tensor) -> Tensor:
+        """From the centre of projection to points `[..., 3]`, refraction apart: the points themselves."""
+        return points
 
     def can_image(self, points: Tensor) -> Tensor:
         """Whether points lie where the lens can image something: before a pinhole, beyond the last port, around a fisheye.

@@ -3,6 +3,7 @@
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 LARGEST_SHIFT = 0.03
@@ -42,6 +43,57 @@ def is_displaced(moved: Tensor, image_size: tuple[int, int]) -> Tensor:
     """Whether the motion `[B, 4]` shifts the image farther than a camera moves, `[B]` bool."""
     displaced: Tensor = torch.linalg.vector_norm(moved[..., :2], dim=-1) > LARGEST_SHIFT * _half_diagonal(image_size)
     return displaced
+
+
+class ImageMotion:
+    """What has one image or several, each of which may have moved against the rim: a camera, or a rig of them.
+
+    `moved [B, 4 W]` is the motion of W images, one after the other; pixels `[..., N, 2]` are those of the markers in the first
+    image, then in the second, and so on.
+
+    Attributes:
+        image_sizes: width and height of each image.
+    """
+
+    image_sizes: list[tuple[int, int]]
+
+    def motion_of_pixels(self, pixels: Tensor) -> Tensor:
+        """Derivatives `[..., N, 2, 4 W]` of `pixels [..., N, 2]`, as the function of this name has them."""
+        sizes = self.image_sizes
+        if len(sizes) == 1:
+            return motion_of_pixels(pixels, sizes[0])
+        each = zip(pixels.unflatten(-2, (len(sizes), -1)).unbind(-3), sizes, strict=True)
+        blocks = [motion_of_pixels(*part) for part in each]
+        return torch.cat([F.pad(block, (4 * w, 4 * (len(sizes) - 1 - w))) for w, block in enumerate(blocks)], -3)
+
+    def shift_of(self, moved: Tensor, pixels: Tensor) -> Tensor:
+        """What the motion does to `pixels [B, N, 2]`, px."""
+        if len(self.image_sizes) == 1:
+            return shift_of(moved, pixels, self.image_sizes[0])
+        shift: Tensor = (self.motion_of_pixels(pixels) * moved[:, None, None]).sum(-1)
+        return shift
+
+    def motion_in_words(self, moved: Tensor) -> Tensor:
+        """The motion as du, dv (px), rotation (degrees) and scale, `[B, 4]`; of several images `[B, W, 4]`."""
+        sizes = self.image_sizes
+        if len(sizes) == 1:
+            return in_words(moved, sizes[0])
+        return torch.stack([in_words(each, size) for each, size in zip(moved.split(4, -1), sizes, strict=True)], -2)
+
+    def motion_in_pixels(self, motion: Tensor) -> Tensor:
+        """What `motion_in_words` gave as `moved` again."""
+        sizes = self.image_sizes
+        if len(sizes) == 1:
+            return in_pixels(motion, sizes[0])
+        return torch.cat([in_pixels(each, size) for each, size in zip(motion.unbind(-2), sizes, strict=True)], -1)
+
+    def is_displaced(self, moved: Tensor) -> Tensor:
+        """Whether an image is shifted farther than a camera moves, `[B]` bool."""
+        sizes = self.image_sizes
+        if len(sizes) == 1:
+            return is_displaced(moved, sizes[0])
+        each = [is_displaced(part, size) for part, size in zip(moved.split(4, -1), sizes, strict=True)]
+        return torch.stack(each).any(0)
 
 
 def _half_diagonal(image_size: tuple[int, int]) -> float:

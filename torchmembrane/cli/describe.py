@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from datetime import date
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,10 +11,11 @@ from ..camera.mode import Mode
 from ..camera.model import Camera
 from ..forming.sheet_energy import SheetEnergy
 from ..machine_code import using
-from ..markers.spacing import in_view
+from ..markers.placement import markers_in_view
 from ..reconstruct import Reconstructor
 from ..results.reconstruction import Frame
 from ..results.status import Status
+from ..sensor.camera_tables import shared_image
 from ..sensor.factories import elastic_energy
 from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
@@ -30,11 +32,15 @@ FILLINGS = {
 
 def rest_frame(reconstructor: Reconstructor) -> Frame | None:
     """The frame of the sensor's own rest image, None where there is none."""
-    image = reconstructor.sensor.markers.rest_image
-    if image is None:
+    sensor = reconstructor.sensor
+    image: Any = sensor.markers.rest_image
+    if sensor.views:
+        images = [view.rest_image for view in sensor.views]
+        image = images if sensor.views_apart else shared_image(images, sensor.views)
+    if image is None or (sensor.views and any(view.rest_image is None for view in sensor.views)):
         return None
     with torch.no_grad(), using(not reconstructor.estimator.must_compile):  # one frame is not worth the wait
-        return reconstructor(torch.from_numpy(image)).frame(0)
+        return reconstructor(image).frame(0)
 
 
 def pressure_in_words(pressure: float, sensor: Sensor) -> str:
@@ -55,7 +61,7 @@ def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame:
     """Lines that say what was understood of a `Sensor`; more of them with its `Reconstructor` and rest frame."""
     lines = {
         "sensor": [f"{sensor.name!r}, fingerprint {sensor.fingerprint[:12]}, lengths in {sensor.length_unit}"],
-        "camera": _camera(sensor.camera, sensor.length_unit),
+        "camera": _views(sensor) or _camera(sensor.camera, sensor.length_unit),
         "membrane": _membrane(sensor),
         "material": _material(sensor, reconstructor),
         "cavity": _cavity(sensor),
@@ -93,6 +99,20 @@ def _camera(camera: Camera, unit: str) -> list[str]:
     for port in camera.ports:
         lines.append(f"port at {port.distance:g} {unit}, {port.thickness:g} {unit} thick, index {port.index:g}")
     lines.append(f"medium of index {float(camera.medium_index):g} behind" if camera.ports else "no ports")
+    return lines
+
+
+def _views(sensor: Sensor) -> list[str]:
+    """Of several views each one's camera, place and what it sees at rest; none of one."""
+    lines = []
+    for number, view in enumerate(sensor.views):
+        rotation, mirror = view.pose.rotation, "by a mirror, " * (view.pose.determinant < 0)
+        at, ahead = _listed(view.pose.translation), _listed(rotation[:, 2].round(9) + 0.0)
+        region = "" if view.region is None else ", the region {} of {} x {} px".format(list(view.region), *sensor.image_size)
+        place = f"{mirror}from {at} {sensor.length_unit} along {ahead}, {view.side}{region}"
+        seen = markers_in_view(sensor.in_view(number))
+        lines += [f"view {view.name!r} {place}: sees {seen.sum()} of {len(seen)} markers"]
+        lines += [f"  {line}" for line in _camera(view.camera, sensor.length_unit)]
     return lines
 
 
@@ -173,13 +193,15 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
     if markers.positions is not None:
         listed, large = len(markers.positions), sum(size == "large" for size in markers.sizes or ())
         lines[0] += f", {listed} listed: {large} large, {listed - large} small"
-        seen = in_view(sensor.camera.point_to_pixel(torch.from_numpy(markers.positions)).numpy(), sensor.camera.image_size)
-        lines += [f"{seen.sum()} of {listed} in the camera's view"] * (not seen.all())
+        seen = markers_in_view(sensor)
+        lines += [f"{seen.sum()} of {listed} in the camera's view"] * (not seen.all() and not sensor.views)
     if reconstructor is not None and markers.positions is None:
         lines[0] += f", {len(reconstructor.rest_pixels)} placed on the rest surface from the rest image"
     if frame is None or reconstructor is None:
         return [*lines, "no rest image" if markers.rest_image is None else "not looked for in the rest image"]
     found = frame["confidence"] > 0
+    if sensor.views:
+        return [*lines, *_of_views(sensor, reconstructor, frame)]
     lines.append(f"{found.sum()} of {found.size} found in the rest image")
     missing = np.flatnonzero(~found)
     model = reconstructor.rest_pixels.cpu().numpy()
@@ -195,6 +217,20 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
         rms = np.sqrt((off**2).mean())
         lines.append(f"they lie {rms:.2f} px (rms; at most {off.max():.2f} px) from where the model has them")
     return [*lines, *reconstructed]
+
+
+def _of_views(sensor: Sensor, reconstructor: Reconstructor, frame: Frame) -> list[str]:
+    """How many markers are found in each view's rest image, and how far from where the model has them."""
+    observer, lines = reconstructor.observer, []
+    measured = observer.by_view(observer.measured_rest[None])[0]
+    off = torch.linalg.vector_norm(measured - reconstructor.rest_pixels, dim=-1).cpu().numpy()
+    for number, view in enumerate(sensor.views):
+        found = frame["confidence"][number] > 0
+        rms = np.sqrt((off[number, found] ** 2).mean()) if found.any() else np.nan
+        lines.append(
+            f"view {view.name!r}: {found.sum()} found in its rest image, {rms:.2f} px (rms) from where the model has them"
+        )
+    return [*lines, f"the rest images reconstructed: {Status(int(frame['status'])).text}"]
 
 
 def _tool(sensor: Sensor) -> list[str]:

@@ -2,7 +2,7 @@
 
 import math
 from argparse import Namespace
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from itertools import chain
 from pathlib import Path
@@ -18,7 +18,7 @@ from ..sensor.companions import companions_of, files_of
 from ..sensor.sensor import Sensor
 from ..simulate.appearance import Appearance
 from ..simulate.dataset import KINDS, DatasetOutcome, Plan, make_frames, stroke_to
-from ..simulate.frames import SENSOR, SETTINGS, open_frames, video_file
+from ..simulate.frames import SENSOR, SETTINGS, image_files, open_frames, video_file
 from ..simulate.indenters import Box, Cylinder, Indenter, Plane, Sphere, Wedge
 from ..simulate.mesh_indenter import MeshIndenter
 from ..simulate.simulator import Simulator, Stroke
@@ -41,8 +41,10 @@ OUTWARDS = 0.3
 def simulate(arguments: Namespace) -> int:
     """Simulate what the arguments ask for; returns the exit code."""
     torch.set_num_threads(1)
-    _spare_files(arguments)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
+    if arguments.video and sensor.views_apart:
+        raise MembraneError("--video: the sensor's views have images of their own; expected images, or regions of one image")
+    _spare_files(arguments, sensor.views_apart)
     appearance = Appearance(noise=arguments.noise, highlight=arguments.highlight, blur=arguments.blur)
     options = arguments.grid, appearance, arguments.dots, arguments.missing
     if not arguments.random:
@@ -54,7 +56,7 @@ def simulate(arguments: Namespace) -> int:
     return 1 if outcome.failed else 0
 
 
-def _spare_files(arguments: Namespace) -> None:
+def _spare_files(arguments: Namespace, views: Sequence[str]) -> None:
     """Refuse a folder in which files would be lost; a frame of an earlier simulation in it is made anew."""
     out, read = arguments.out, files_of(sensor_file(arguments.sensor))
     is_known = (out / SETTINGS).exists()
@@ -63,7 +65,7 @@ def _spare_files(arguments: Namespace) -> None:
     if arguments.path:
         names = [_numbered(arguments.name, number) for number in range(len(arguments.path) * arguments.frames)]
     truths = [out / f"{name}_truth.npz" for name in names]
-    targets += truths + [out / f"{name}.png" for name in names if not arguments.video]
+    targets += truths + [out / file for name in names if not arguments.video for file in image_files(name, views)]
     if arguments.video:
         targets.append(out / f"{arguments.name}.mp4")
     if arguments.random and not is_known:
@@ -100,8 +102,9 @@ def _single(arguments: Namespace, simulator: Simulator) -> int:
     open_frames(arguments.out, simulator, {}).write(arguments.name, frame)
     force, touching = float(state.force.norm()), int(state.contact.sum())
     change = pressure_in_words(float(state.pressure - state.rest_pressure), simulator.sensor)
+    shown = ", ".join(str(arguments.out / file) for file in image_files(arguments.name, simulator.sensor.views_apart))
     print(
-        f"{arguments.out / arguments.name}.png: force {force:.4g} {simulator.sensor.force_unit}, pressure change {change}, "
+        f"{shown}: force {force:.4g} {simulator.sensor.force_unit}, pressure change {change}, "
         f"{touching} of {len(state.contact)} vertices in contact"
     )
     return 0

@@ -92,7 +92,7 @@ def run(arguments: Namespace) -> int:
     """Reconstruct; returns the exit code."""
     from ..files.folder_lock import Shard
     from ..jobs.bags import bag_remarks, result_bag, write_bag
-    from ..jobs.inputs import find_inputs, frame_name
+    from ..jobs.inputs import find_inputs, frame_name, of_first_view
     from ..jobs.local import reconstruct_files
     from ..jobs.ray_engine import RayEngine
     from ..jobs.rest import recording_rest
@@ -104,9 +104,9 @@ def run(arguments: Namespace) -> int:
 
     _check(arguments)
     by_ray = arguments.engine == "ray"
-    inputs = find_inputs(arguments.images, arguments.video, arguments.topic)
-    _spare_files(arguments, inputs)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
+    inputs = of_first_view(find_inputs(arguments.images, arguments.video, arguments.topic), sensor.views_apart)
+    _spare_files(arguments, inputs)
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
     format = arguments.format or ("parquet" if by_ray else "npz")

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ..camera.model import Camera
+from ..camera.rig import Rig
 from ..control_flow import traced
 from ..errors import MembraneError
 from ..mechanics.cavity import CavityLaw, rest_balance
@@ -29,9 +30,12 @@ class Problem(NamedTuple):
     rest_pixels      [D, 2]  where the camera model sees the markers at rest, px
     vertex_pixels    [V, 2]  where the camera model sees the grid's vertices at rest, px
     rest_covariance  [D, 2, 2]  px^2, noise of the markers' displacements in a frame like the rest image
+    rest_confidence  [D]  1 of markers whose rays at rest count
+    views            W, how many views see the markers: each marker is then listed once for each view, D is all of these, and
+                     the camera is a `Rig`
     """
 
-    camera: Camera
+    camera: Camera | Rig
     membrane: Membrane
     elasticity: ElasticEnergy
     filling: str
@@ -41,6 +45,8 @@ class Problem(NamedTuple):
     rest_pixels: Tensor
     vertex_pixels: Tensor
     rest_covariance: Tensor
+    rest_confidence: Tensor
+    views: int = 1
 
     def cavity_law(self) -> CavityLaw:
         """What the fluid asks of the enclosed volume; the rest pressure is the one that balances the membrane's tension."""
@@ -55,7 +61,7 @@ class Observation(NamedTuple):
     confidence  [B, D]  of the markers, 0 for a lost one, else up to 1
     across      [B, N, 2, 3]  two vectors across each ray: the ray's turn along them counts in standard deviations of its
                 marker; None: all rays are as sure in all directions
-    motion      [B, N, 2, 4]  by how much of these a moved camera turns the ray, as `marker_residuals.marker_rays` gives it;
+    motion      [B, N, 2, 4 W]  by how much of these a moved camera turns the ray, as `marker_residuals.marker_rays` gives it;
                 None: the camera has not moved
     gauge       [B, 2]  what a pressure gauge reads, as `pressure_gauge.gauge_reading` gives it; None: there is no gauge
     """
@@ -82,7 +88,7 @@ class Equilibrium(NamedTuple):
     relative_step  [B]  the solve's last step over the surface's size
     reference      [B, V]  the traction that pushes are measured against
     misfit         [B]  rms of the angles between markers and their rays, in standard deviations
-    moved          [B, 4]  motion of the camera against the rim
+    moved          [B, 4 W]  motion of each of the W views' cameras against the rim
     objective      [B]  what the solve minimises, over the number of markers seen
     unexplained    [B]  the part of it that no push explains: misfit, pulls and shear
     pushed         [B]  share of the surface that something pushes
@@ -167,6 +173,7 @@ class Estimator(nn.Module, ABC):
         needs_every_vertex: whether every vertex of the grid must be seen by the camera at rest; a sensor of which that is not
             true is refused.
         finds_tractions: whether `forward` finds tractions, and with them forces.
+        takes_views: whether it can be given several views, as of `Problem.views`; refused otherwise.
         in_parts: whether `forward` is put together of methods marked `control_flow.traced`; an exported model holds any other
             `forward` as one part, which must consist of torch operations that ONNX has.
         name: the one by which it was asked for; set by `Reconstructor`.
@@ -201,6 +208,7 @@ class Estimator(nn.Module, ABC):
     needs_every_vertex: ClassVar[bool] = True
     finds_tractions: ClassVar[bool] = False
     in_parts: ClassVar[bool] = False
+    takes_views: ClassVar[bool] = False
     name: str = ""
 
     def __init__(self, membrane: Membrane, cavity: CavityLaw, settings: Any = None, spacing: float = 0.0):
@@ -219,11 +227,11 @@ class Estimator(nn.Module, ABC):
         """The estimator of a sensor; `settings`: an instance of `Settings`, None: its defaults."""
 
     @abstractmethod
-    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
+    def prepare(self, camera: Any, pixels: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
         """The rays that `forward` needs.
 
         Args:
-            camera: the sensor's.
+            camera: the sensor's `Camera`; of several views a `Rig`.
             pixels: of the markers, `[B, D, 2]`; those of a lost one mean nothing.
             confidence: of the markers, `[B, D]`, 0 for a lost one.
             covariance: of the pixels, `[B, D, 2, 2]` px^2, with the model's own error.
@@ -294,7 +302,7 @@ class Estimator(nn.Module, ABC):
         Args:
             x: the surface found, `[B, V, 3]`.
             pressure: found, `[B]`.
-            moved: motion of the camera found, `[B, 4]`.
+            moved: motion of the cameras found, `[B, 4 W]`.
             observation: that it was found from.
             marker_noise: `[B, D, 2, 3]`, how noise in each of two independent directions turns the markers' rays.
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..files.atomic import whole_file
 from ..files.optional import load_rerun
+from ..results.frame_shapes import of_first_view
 from ..results.reconstruction import Frame
 from ..results.status import Status
 from ..results.store import Mesh
@@ -94,7 +95,7 @@ class RerunLog:
         self._log("surface", rr.ViewCoordinates.RDF, static=True)
         rim = mesh.rest_vertices[rim_loop((int(mesh.grid[0]), int(mesh.grid[1])))]
         self._log("surface/rest", rr.LineStrips3D([np.concatenate([rim, rim[:1]])], colors=GREY), static=True)
-        places = rr.Points2D(mesh.rest_pixels, radii=2.0, colors=BLUE)
+        places = rr.Points2D(mesh.rest_pixels[0] if mesh.views else mesh.rest_pixels, radii=2.0, colors=BLUE)
         self._log("camera/image/rest", places, static=True)
         colours = [VERMILION, (0, 158, 115), BLUE]
         for name, unit in (("force", mesh.force_unit), ("moment", f"{mesh.force_unit} {mesh.length_unit}")):
@@ -108,7 +109,8 @@ class RerunLog:
         self._log("camera/image", self._rr.Image(np.ascontiguousarray(levels)).compress(jpeg_quality=QUALITY))
 
     def _add_markers(self, frame: Frame) -> None:
-        rest, now = self._mesh.rest_pixels, frame["pixels"]
+        mesh, now = self._mesh, of_first_view(frame, "pixels")
+        rest = mesh.rest_pixels[0] if mesh.views else mesh.rest_pixels
         found = np.isfinite(now).all(1)
         arrows = self._rr.Arrows2D(origins=rest[found], vectors=LONGER * (now - rest)[found], radii=1.0, colors=VERMILION)
         self._log("camera/image/flow", arrows)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..camera.model import Camera
 from ..errors import MembraneError
 from ..files.images import picture_count, stack_images, to_grey
 from ..files.provenance import Origin
@@ -157,11 +158,12 @@ def _pictures(path: Path, topic: str | None, reconstructor: "Reconstructor") -> 
     file name may give.
     """
     if is_bag(path):
+        _only_camera(path, reconstructor)
         yield from (
             Picture(partial(_bag_image, each.message), each.time) for each in messages(path, image_topic(path, topic)[0])
         )
         return
-    camera, of_stack, begun = reconstructor.sensor.camera, picture_count(path, 1) > 0, time_in(path.stem)
+    camera, of_stack, begun = _only_camera(path, reconstructor), picture_count(path, 1) > 0, time_in(path.stem)
     begun = 0.0 if isnan(begun) else begun
     for picture in stack_images(path, camera.image_size, camera.bits) if of_stack else video_pictures(path, camera.image_size):
         if isinstance(picture, MembraneError):
@@ -169,6 +171,13 @@ def _pictures(path: Path, topic: str | None, reconstructor: "Reconstructor") -> 
         else:
             after = getattr(picture, "time", None)  # an array has none
             yield Picture(partial(_image, picture), nan if after is None else begun + after)
+
+
+def _only_camera(path: Path, reconstructor: "Reconstructor") -> Camera:
+    """The camera whose images a file of several pictures holds."""
+    if reconstructor.sensor.views:
+        raise MembraneError(f"{path}: holds several pictures; of a sensor with several views expected images, NAME_VIEW.png")
+    return reconstructor.sensor.camera
 
 
 def _bag_image(message: Any, reconstructor: "Reconstructor") -> Tensor:

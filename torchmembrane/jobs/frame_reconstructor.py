@@ -185,7 +185,8 @@ class FrameReconstructor:
     def _blank(self) -> Frame:
         """The empty result of a file whose image could not be read."""
         width, height = self.reconstructor.image_size
-        image = torch.zeros(1, 1, height, width).to(self.reconstructor.rest_pixels)
+        channels = max(1, len(self.reconstructor.sensor.views_apart))
+        image = torch.zeros(1, channels, height, width).to(self.reconstructor.rest_pixels)
         (frame,) = self._reconstructed([DecodedFrame("", Path(), image)])
         return frame | {"status": np.array(UNREADABLE, np.int32)}
 

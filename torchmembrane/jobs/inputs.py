@@ -118,6 +118,32 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
     return inputs
 
 
+def of_first_view(inputs: Inputs, views: Sequence[str]) -> Inputs:
+    """Inputs with one image for each frame: of views with images of their own, NAME_VIEW.png, the first view's.
+
+    Args:
+        inputs: as `find_inputs` gives them.
+        views: names of the sensor's views with images of their own; none of one view, or of regions of one image.
+
+    Raises:
+        MembraneError: an image is of none of the views, or a frame has no image of the first one.
+
+    Example:
+        >>> both = Inputs([Path("press_left.png"), Path("press_right.png")], [])
+        >>> [path.name for path in of_first_view(both, ["left", "right"]).images]
+        ['press_left.png']
+    """
+    if not views:
+        return inputs
+    firsts = [path for path in inputs.images if path.stem.endswith(f"_{views[0]}")]
+    names = {path.stem.removesuffix(views[0]) for path in firsts}
+    for path in inputs.images:
+        stem = next((path.stem.removesuffix(view) for view in views if path.stem.endswith(f"_{view}")), None)
+        if stem not in names:
+            raise MembraneError(f"{path}: of no view, or of none of the frames; expected NAME_{', NAME_'.join(views)} of each")
+    return inputs._replace(images=firsts)
+
+
 def single_images(inputs: Inputs) -> list[Path]:
     """The image files of inputs that may only be images with a file each.
 

@@ -21,6 +21,7 @@ from ..interruption import frame_in_work, starting_processes
 from ..machine_code import using
 from ..processes import begin_worker, handed_over
 from ..results.store import Mesh
+from ..sensor.view_images import first_view_image
 from .decode import DecodedFrame, Source, decoded, read_ahead
 from .frame_reconstructor import FrameReconstructor, Outcome
 
@@ -70,7 +71,7 @@ class Work(NamedTuple):
             folder, mesh = self.figures
             for outcome, frame in zip(found, group, strict=True):
                 if outcome.stored is not None and frame.image is not None:
-                    image = frame.image[0, 0].cpu().numpy()
+                    image = first_view_image(frame.image, self.reconstructor.reconstructor.sensor.views).cpu().numpy()
                     save(figure(outcome.stored.frame, mesh, image, frame.name), folder / f"{frame.name}.png", DRAWS)
         return found
 

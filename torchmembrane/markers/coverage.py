@@ -28,10 +28,11 @@ class Coverage(nn.Module):
     Args:
         membrane: the rest surface on the solver's grid.
         positions: of the markers, `[D, 3]`.
-        seen: `[D]` bool, which of them are seen at rest.
-        facing: `[D]`, how they face the camera at rest, as of `facings`.
+        seen: `[D]` bool, which of them are seen at rest; of W views `[W D]`, view by view.
+        facing: `[D]` or `[W D]`, how they face the camera at rest, as of `facings`.
     """
 
+    seen: Tensor
     facing: Tensor
     nearest: Tensor
     near: Tensor
@@ -39,6 +40,9 @@ class Coverage(nn.Module):
 
     def __init__(self, membrane: Membrane, positions: Tensor, seen: Tensor, facing: Tensor):
         super().__init__()
+        self.views = len(seen) // len(positions)
+        self.register_buffer("seen", seen)
+        seen = seen.unflatten(0, (self.views, -1)).any(0)
         reach = REACH * membrane.size / len(positions) ** 0.5
         distance = torch.where(seen, torch.cdist(membrane.rest, positions.to(membrane.rest)), torch.inf)
         distance, nearest = distance.topk(min(NEAREST, len(positions)), largest=False)
@@ -49,13 +53,19 @@ class Coverage(nn.Module):
         self.register_buffer("share", area / area.sum())
 
     def forward(self, confidence: Tensor) -> Tensor:
-        """The share `[B]`, of markers with `confidence [B, D]`, 0 where one is lost."""
+        """The share `[B]`, of markers with `confidence [B, D]`, 0 where one is lost; of several views `[B, W D]`."""
         found = (confidence > 0).to(self.near.dtype)
+        found = found if self.views == 1 else found.unflatten(1, (self.views, -1)).amax(1)
         seen: Tensor = (found[:, self.nearest] * self.near).amax(-1) @ self.share
         return seen
 
     def in_view(self, confidence: Tensor, facing: Tensor) -> Tensor:
         """The same, those counted too that the press has turned away: by how the markers on the surface found face the camera,
         `facing [B, D]`."""
-        counted: Tensor = self(torch.where(facing < TURNED_AWAY * self.facing, 1.0, confidence))
+        turned = facing < TURNED_AWAY * self.facing
+        if self.views > 1:  # from every view that saw it at rest
+            turned = (
+                (turned | ~self.seen).unflatten(1, (self.views, -1)).all(1, keepdim=True).expand(-1, self.views, -1).flatten(1)
+            )
+        counted: Tensor = self(torch.where(turned, 1.0, confidence))
         return counted

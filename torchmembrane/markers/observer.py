@@ -75,6 +75,7 @@ class MarkerObserver(nn.Module):
     ):
         super().__init__()
         self.locator: Locator = markers.locator
+        self.image_size = image_size
         self.screen = MismatchScreen(markers.model_pixels, rim_pixels)
         self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
         self.register_buffer("measured_rest", torch.from_numpy(markers.model_pixels))
@@ -94,6 +95,27 @@ class MarkerObserver(nn.Module):
         self.largest_offset = LARGEST_OFFSET * float(np.hypot(*image_size))
         if check_rest:
             self.check_rest(name)
+
+    @property
+    def follows(self) -> bool:
+        """Whether markers are looked for first where they were in the frame before."""
+        return self.locator.follows
+
+    def be_exact(self) -> None:
+        """Locate in double precision."""
+        self.locator.be_exact()
+
+    def by_view(self, values: Tensor) -> Tensor:
+        """Values `[B, D, ...]` of one view as they are; of several `ViewsObserver` has them `[B, W, D, ...]`."""
+        return values
+
+    def sighted(self, values: Tensor) -> Tensor:
+        """The other way round, of `by_view`."""
+        return values
+
+    def seen_by_each(self, values: Tensor) -> Tensor:
+        """Values of the markers for each view that sees them."""
+        return values
 
     def _in_rest_image(self, image: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor]:
         """The markers in the rest image, their covariance, which are found: subtracted from every frame's, rest offsets are

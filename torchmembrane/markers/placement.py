@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..errors import MembraneError
 from ..sensor.sensor import Sensor
+from ..sensor.views import SurfaceInView
 from ..surface.projection import SurfacePoints
 from ..surface.tangent import tangent_axes
 from ..surface.topology import rim_loop
@@ -22,6 +23,10 @@ from .texture.patches import choose_patches
 
 LOCATORS = ("fit", "soft")
 FEWEST_MARKERS = 8
+GRAZING = 0.1
+"""Cosine between a line of sight and the normal below which a marker is not seen."""
+BEHIND = 0.02
+"""How far behind the surface a marker of the list may lie, over its size, and be on it."""
 SMOOTH_GRID = 33
 """Vertices per side of the surface on which markers are placed: the solver's facets are too coarse for oblique rays."""
 DOT_RADIUS = (0.16, 0.27)
@@ -122,7 +127,22 @@ def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
     """Where the camera sees `positions [D, 3]`; what it cannot image lies far outside, each point elsewhere."""
     pixels = sensor.camera.point_to_pixel(torch.from_numpy(positions)).numpy()
     outside = -float(max(sensor.camera.image_size)) * (2 + np.arange(len(pixels)))
-    return np.where(np.isfinite(pixels).all(1, keepdims=True), pixels, outside[:, None])
+    seen = np.isfinite(pixels).all(1) & visible(sensor, positions)
+    return np.where(seen[:, None], pixels, outside[:, None])
+
+
+def visible(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
+    """Which of `positions [D, 3]` on the rest surface turn to the camera and are not behind another part of it, `[D]` bool: all
+    of a sensor with one view, whose camera sees all of its membrane."""
+    if not isinstance(sensor.surface, SurfaceInView):
+        return np.ones(len(positions), bool)
+    membrane, distance = sensor.membrane, np.linalg.norm(positions, axis=1)
+    sight = positions / distance[:, None]
+    nearest = membrane.ray_points(np.zeros_like(positions), sight).distance
+    points = membrane.closest_points(positions)
+    normals = (membrane.rest_normals.numpy()[points.vertices] * points.weights[..., None]).sum(1)
+    turned = (normals * sight).sum(1) > GRAZING * np.linalg.norm(normals, axis=1)
+    return turned & ~(nearest < distance - BEHIND * membrane.size)
 
 
 def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -139,6 +159,38 @@ def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, n
             f"least {FEWEST_MARKERS}: check the camera, the rest surface and the polarity"
         )
     return (smooth.rest.numpy()[hits.vertices] * hits.weights[..., None]).sum(1)[placed], placed
+
+
+def markers_in_view(sensor: Sensor) -> np.ndarray:
+    """Which of a sensor's listed dots its camera sees at rest, `[D]` bool.
+
+    Args:
+        sensor: with listed dots; one view of several as `Sensor.in_view` gives it.
+
+    Example:
+        >>> from torchmembrane.presets import preset
+        >>> bool(markers_in_view(preset("bubble")).all())
+        True
+    """
+    return in_view(_model_pixels(sensor, np.asarray(sensor.markers.positions, dtype=float)), sensor.camera.image_size)
+
+
+def refuse_blind(sensor: Sensor, name: str) -> None:
+    """Refuse a view that sees too few of the listed dots at rest.
+
+    Args:
+        sensor: of this view, as `Sensor.in_view` gives it.
+        name: of sensor and view, for the message.
+
+    Raises:
+        MembraneError: says how many are seen, and the remedy.
+    """
+    seen = markers_in_view(sensor)
+    if seen.sum() < FEWEST_MARKERS:
+        raise MembraneError(
+            f"sensor {name!r}: {seen.sum()} of {len(seen)} markers are seen; expected at least {FEWEST_MARKERS}: check the "
+            "view's pose, which is of its frame in the first view's, its focal length, and its side"
+        )
 
 
 def _listed_pattern(sensor: Sensor, positions: np.ndarray) -> DotPattern:

@@ -198,12 +198,13 @@ def export(
         raise MembraneError(f"export: {path}: the folder {Path(path).parent} does not exist; make it first")
     if reconstructor.rest_pixels.dtype != torch.float32:
         raise MembraneError(f"export: the reconstructor is {reconstructor.rest_pixels.dtype}; expected torch.float32")
+    reconstructor.sensor.refuse_views("export")
     progress(0.0, "image")
     width, height = reconstructor.image_size
     image = torch.rand(EXAMPLES, 1, height, width, generator=torch.Generator().manual_seed(0)).to(reconstructor.rest_pixels)
     tracer = Tracer(within(progress, 0.0, CHECK))
     inputs = [tracer.given("image", image)]
-    if tracking and reconstructor.observer.locator.follows:
+    if tracking and reconstructor.observer.follows:
         inputs.append(tracer.given("previous_pixels", reconstructor.rest_pixels.repeat(EXAMPLES, 1, 1)))
     values: Any = inputs  # stand for tensors
     with EXPORTER.at_work():

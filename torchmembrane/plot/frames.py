@@ -8,6 +8,7 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 from matplotlib.tri import Triangulation, TriContourSet
 
+from ..results.frame_shapes import of_first_view
 from ..results.status import Status
 from ..results.store import Mesh
 from .drawing import (
@@ -85,7 +86,7 @@ def figure(
 def draw_flow(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh, image: np.ndarray | None = None) -> None:
     """Circles where markers are at rest, arrows to where they are now (thinned and magnified if need be), lost markers."""
     image_axes(axes, mesh.image_size, image)
-    rest, now = mesh.rest_pixels, frame["pixels"]
+    rest, now = mesh.rest_pixels[0] if mesh.views else mesh.rest_pixels, of_first_view(frame, "pixels")
     lost = ~np.isfinite(now).all(1)
     rest, flow, gone = rest[~lost], (now - rest)[~lost], rest[lost]
     times, shown = _magnification(flow, mesh.image_size[0]), _thinned(rest, mesh.image_size[0] / ARROWS_ACROSS)
@@ -232,7 +233,7 @@ def _title(frame: dict[str, np.ndarray], mesh: Mesh, name: str) -> str:
     if np.isfinite(frame["pressure_change"]):
         words += [
             f"pressure change {frame['pressure_change']:+.3g} {_pressure_unit(mesh)}",
-            f"residual {frame['residual']:.2f} px",
+            f"residual {frame['residual'].max():.2f} px",
         ]
     return "    ".join(words)
 
@@ -240,7 +241,7 @@ def _title(frame: dict[str, np.ndarray], mesh: Mesh, name: str) -> str:
 def _failure(frame: dict[str, np.ndarray]) -> str:
     """Why a frame has no surface, beside its headline."""
     _, _, remedy = Status(int(frame["status"])).text.removesuffix("; no surface").partition(": ")
-    found = frame["confidence"] > 0
+    found = np.atleast_2d(frame["confidence"] > 0).any(0)
     count = f"{found.sum()} of {found.size} markers found"
     return "; ".join(filter(None, ["no surface for this frame", remedy, count]))
 

@@ -58,13 +58,15 @@ def sensor_figure(
         >>> [axes.get_title() for axes in sensor_figure(preset("bubble")).axes]
         ['From the side', 'Rest surface, markers (185)', 'Rest image']
     """
-    drawing, places = panels(3, 0.0 if sheet is None else BELOW)
+    drawing, places = panels(max(3, 2 + len(sensor.views)), 0.0 if sheet is None else BELOW)
     drawing.suptitle(f"Sensor {sensor.name!r}", fontsize=17)
     X, grid = sensor.membrane.rest.numpy(), sensor.membrane.grid
     markers = sensor.markers.positions if reconstructor is None else reconstructor.rest_markers.cpu().numpy()
     _draw_rays(drawing.add_subplot(places[0]), sensor, X)
     _draw_space(drawing.add_subplot(places[1], projection="3d"), X, grid, markers, sensor.length_unit)
-    _draw_projection(drawing.add_subplot(places[2]), sensor, reconstructor, frame)
+    for number in range(max(1, len(sensor.views))):
+        found = None if reconstructor is None or frame is None else _found(reconstructor, frame, number)
+        _draw_projection(drawing.add_subplot(places[2 + number]), sensor, number, found)
     if sheet is not None:
         draw_sheet(drawing, sheet)
     return drawing
@@ -86,6 +88,8 @@ def _draw_rays(axes: Axes, sensor: Sensor, X: np.ndarray) -> None:
     axes.plot([], [], color=VERMILION, lw=0.8, label="viewing rays")
     axes.plot(*X[line][:, plane].T, color="k", lw=2, label="rest surface")
     axes.plot(0, 0, "^", ms=11, color="k", label="camera")
+    for view in sensor.views[1:]:
+        axes.plot(*view.pose.translation[plane], "^", ms=11, mfc="none", color="k", label=f"view {view.name}")
     side_axes(axes, "xy"[across], sensor.length_unit)
     axes.set_title("From the side")
     legend_below(axes)
@@ -116,20 +120,27 @@ def _draw_space(axes: Any, X: np.ndarray, grid: tuple[int, int], markers: np.nda
     axes.set_title(title)
 
 
-def _draw_projection(
-    axes: Axes, sensor: Sensor, reconstructor: "Reconstructor | None", frame: dict[str, np.ndarray] | None
-) -> None:
+def _found(reconstructor: "Reconstructor", frame: dict[str, np.ndarray], view: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where a view's markers are in its rest image, `[D, 2]`, and which of them are found, `[D]` bool."""
+    observer = reconstructor.observer
+    place = observer.by_view(observer.measured_rest[None]).reshape(-1, *reconstructor.rest_markers.shape[:1], 2)
+    return place[view].cpu().numpy(), frame["confidence"].reshape(len(place), -1)[view] > 0
+
+
+def _draw_projection(axes: Axes, sensor: Sensor, view: int, markers: tuple[np.ndarray, np.ndarray] | None) -> None:
+    """A view's rest image, with the grid, and its markers as `_found` gives them."""
+    name, sensor = sensor.views[view].name if sensor.views else "", sensor.in_view(view)
     grid, image = sensor.membrane.grid, sensor.markers.rest_image
     with torch.no_grad():
         pixels = sensor.camera.point_to_pixel(sensor.membrane.rest).numpy()
     image_axes(axes, sensor.camera.image_size, image)
     axes.add_collection(mesh_lines(pixels, grid, color=BLUE, lw=0.4))
     axes.plot(*pixels[closed_rim(grid)].T, color=BLUE, lw=1.8, label="rim and grid")
-    if frame is not None and reconstructor is not None:
-        place, found = reconstructor.observer.measured_rest.cpu().numpy(), frame["confidence"] > 0
+    if markers is not None:
+        place, found = markers
         size, label = 6 if len(found) < 300 else 2.5, f"markers found ({found.sum()})"
         axes.plot(*place[found].T, "o", ms=size, mfc="none", mec=VERMILION, mew=1, label=label)
         if not found.all():
             axes.plot(*place[~found].T, "x", ms=7, mec="k", mew=1.6, label=f"not found ({(~found).sum()})")
-    axes.set_title("Rest image" if image is not None else "Image (no rest image)")
+    axes.set_title(("Rest image" if image is not None else "Image (no rest image)") + f" of view {name}" * bool(name))
     legend_below(axes)

@@ -1,4 +1,4 @@
-"""The shapes of a frame's arrays: `V` vertices, `D` markers, `P` contact patches."""
+"""The shapes of a frame's arrays: `V` vertices, `D` markers, `P` contact patches, `W` views where there are several."""
 
 from collections.abc import Mapping
 
@@ -14,25 +14,41 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     **{"force_deviation": (3,), "depth_deviation": ()},
 }
 
+OF_EACH_VIEW = ("pixels", "confidence", "residual", "camera_motion")
+"""Of several views these begin with an axis `W`."""
+
 
 def shape_of(key: str, sizes: Mapping[str, int]) -> tuple[int, ...]:
-    """The shape of an array for given numbers of vertices, markers and patches.
+    """The shape of an array for given numbers of vertices, markers and patches, and of views, `W`, if there are several.
 
     Example:
         >>> shape_of("contact_force", {"P": 4})
         (4, 3)
     """
-    return tuple(sizes[length] if isinstance(length, str) else length for length in SHAPES[key])
+    alone = tuple(sizes[length] if isinstance(length, str) else length for length in SHAPES[key])
+    return (sizes["W"], *alone) if key in OF_EACH_VIEW and sizes.get("W") else alone
 
 
-def unlike(frame: Mapping[str, np.ndarray], vertices: int, markers: int) -> str:
-    """What of a frame is not as of a surface with so many vertices and markers; "" where all is.
+def of_first_view(frame: Mapping[str, np.ndarray], key: str) -> np.ndarray:
+    """An array of a frame; of several views the first one's.
+
+    Example:
+        >>> of_first_view({"residual": np.array([0.1, 0.2])}, "residual").item()
+        0.1
+    """
+    array = np.asarray(frame[key])
+    first: np.ndarray = np.asarray(array[0]) if array.ndim > len(SHAPES[key]) else array
+    return first
+
+
+def unlike(frame: Mapping[str, np.ndarray], vertices: int, markers: int, views: int = 0) -> str:
+    """What of a frame is not as of a surface with so many vertices and markers; "" where all is. `views`: 0 of a single one.
 
     Example:
         >>> unlike({key: np.zeros(shape_of(key, {"V": 9, "D": 2, "P": 4})) for key in SHAPES}, 9, 3)
         'markers is float64 (2, 3), expected numbers (3, 3)'
     """
-    sizes = {"V": vertices, "D": markers, "P": len(np.atleast_1d(frame["contact_points"]))}
+    sizes = {"V": vertices, "D": markers, "P": len(np.atleast_1d(frame["contact_points"])), "W": views}
     for key, array in ((key, np.asarray(value)) for key, value in frame.items()):
         if array.dtype.kind not in "iuf" or array.shape != shape_of(key, sizes):
             return f"{key} is {array.dtype} {array.shape}, expected numbers {shape_of(key, sizes)}"

@@ -34,8 +34,9 @@ class Status(IntEnum):
     )
     HIDDEN = 8, "a part of the membrane is hidden: the answer is kept, there it is a guess"
     OUT_OF_RANGE = 9, "beyond the range in which this sensor's answers were shown right: the answer is kept, do not rely on it"
+    VIEW_LEFT_OUT = 10, "a view shows too little (blank, blurred or another scene) and was left out: the answer is the others'"
 
     @property
     def has_surface(self) -> bool:
         """Whether the frame keeps its answer; all others are NaN."""
-        return self in (Status.OK, Status.NOT_CONVERGED, Status.UNEXPLAINED, Status.HIDDEN, Status.OUT_OF_RANGE)
+        return self in (Status.OK, Status.NOT_CONVERGED) or self >= Status.UNEXPLAINED

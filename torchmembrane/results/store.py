@@ -81,7 +81,7 @@ class Mesh(NamedTuple):
     fixed           [V]     bool, the rim
     grid            [2]     int64, `V = grid[0] * grid[1]`, row-major
     vertex_pixels   [V, 2]  where the rest vertices are seen
-    rest_pixels     [D, 2]  where the markers are seen at rest
+    rest_pixels     [D, 2]  where the markers are seen at rest; of several views [W, D, 2]
     image_size      [2]     int64, width and height, px
     length_unit, force_unit, name    of the sensor
     sensor          fingerprint of its file
@@ -169,14 +169,23 @@ class Mesh(NamedTuple):
         Raises:
             MembraneError: an array is of another shape or type than here.
         """
-        if said := unlike(frame, len(self.rest_vertices), len(self.rest_pixels)):
+        if said := unlike(frame, len(self.rest_vertices), self.rest_pixels.shape[-2], self.views):
             raise MembraneError(f"{path}: {said} as of its {MESH}: give the {MESH} of its folder, or reconstruct it again")
+
+    @property
+    def views(self) -> int:
+        """How many there are, 0 of a single one."""
+        return len(self.rest_pixels) if self.rest_pixels.ndim == 3 else 0
 
     def _refuse_unlike(self) -> None:
         """Raise `ValueError` if the shapes of the fields do not fit together."""
         V = len(self.rest_vertices)
         wanted = {"rest_vertices": (V, 3), "rest_normals": (V, 3), "fixed": (V,), "grid": (2,), "image_size": (2,)}
-        wanted |= {"triangles": (len(self.triangles), 3), "vertex_pixels": (V, 2), "rest_pixels": (len(self.rest_pixels), 2)}
+        wanted |= {
+            "triangles": (len(self.triangles), 3),
+            "vertex_pixels": (V, 2),
+            "rest_pixels": (*self.rest_pixels.shape[:-1], 2),
+        }
         if self.camera_in_tool.size:  # none is `[0]` as `torchmembrane-edge` once wrote it
             wanted["camera_in_tool"] = (3, 4)
         for name, shape in wanted.items():

@@ -1,5 +1,6 @@
 """The files of a sensor on disk: its `.toml`, and the arrays, dots and images beside it."""
 
+import glob
 from pathlib import Path
 
 from .parts import SHAPES_BY_ARRAYS
@@ -30,4 +31,5 @@ def companions_of(path: Path) -> list[Path]:
         ['a.toml', 'a_grid.npz', 'a_heightfield.npz', 'a_rim.csv', 'a_dots.csv', 'a_rest.png', 'a_rest.tiff']
     """
     endings = *(f"_{shape}.npz" for shape in SHAPES_BY_ARRAYS), "_rim.csv", "_dots.csv", "_rest.png", "_rest.tiff"
-    return [path, *(path.with_name(path.stem + ending) for ending in endings)]
+    of_views = sorted(path.parent.glob(f"{glob.escape(path.stem)}_rest_*"))
+    return [path, *(path.with_name(path.stem + ending) for ending in endings), *of_views]

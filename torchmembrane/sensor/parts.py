@@ -6,7 +6,7 @@ Lengths are in the sensor's unit, in the camera's frame. Pressures are in hPa, a
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,6 +21,9 @@ from ..surface.membrane import Membrane
 from .record import Record
 from .synonyms import did_you_mean
 from .working_range import GENERAL, WorkingRange
+
+if TYPE_CHECKING:
+    from .views import View
 
 OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, in the surface's size
 MOST_PRESTRETCH, MOST_C2_RATIO = 10.0, 1e3
@@ -248,6 +251,7 @@ class SensorParts(NamedTuple):
         tool: the camera's pose in the tool's frame, where it is known.
         record: serial and calibration.
         range: in which its answers were shown right.
+        views: all, where there are several.
     """
 
     name: str
@@ -261,6 +265,7 @@ class SensorParts(NamedTuple):
     tool: Pose | None = None
     record: Record = Record()
     range: WorkingRange = GENERAL
+    views: tuple["View", ...] = ()
 
 
 def refuse_other_size(size: tuple[int, int], camera: Camera) -> None:

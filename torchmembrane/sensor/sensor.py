@@ -28,6 +28,7 @@ from .parts import (
 from .record import Record
 from .toml import read_sensor, tables_of, write_sensor
 from .units import METRE, hectopascal
+from .views import SurfaceInView, View, refuse_views
 from .working_range import GENERAL, WorkingRange
 
 
@@ -48,6 +49,8 @@ class Sensor:
         tool: the camera's pose in the frame of the tool (a robot's flange, a fingertip), where it is known.
         record: serial and calibration of the piece, as `[record]` has them; no part of the fingerprint.
         range: in which its answers were shown right, of `check --accuracy`; else the general one.
+        views: all `View`s of a sensor with several cameras or mirrors, the first one that of `camera` and the markers' rest
+            image; empty: the camera is the only one.
 
     A rest image of the calibrated size is cropped and binned where the camera is `in_mode`.
 
@@ -71,6 +74,7 @@ class Sensor:
     tool: Pose | None = None
     record: Record = Record()
     range: WorkingRange = GENERAL
+    views: tuple[View, ...] = ()
 
     def __post_init__(self) -> None:
         expect(self.length_unit in METRE, "length_unit", self.length_unit, f"one of {', '.join(METRE)}")
@@ -84,6 +88,65 @@ class Sensor:
             names = [f"Sensor: markers.positions[{i}]" for i in range(len(self.markers.positions))]
             refuse_off_surface(self.membrane, self.markers.positions, names)
             refuse_coincident(self.membrane, self.markers.positions, names)
+        if self.views:
+            first = replace(self.views[0], camera=self.camera, rest_image=self.markers.rest_image)
+            object.__setattr__(self, "views", (first, *self.views[1:]))
+            refuse_views(self.views, self.markers.kind == "dots" and self.markers.positions is not None)
+
+    def in_view(self, number: int) -> "Sensor":
+        """The sensor of one of the views alone, in that view's frame: its camera, and the membrane as it is seen from there.
+
+        Args:
+            number: of the view, from 0; 0 of a sensor with one camera is the sensor itself.
+
+        Raises:
+            MembraneError: there is no such view.
+
+        Example:
+            >>> sensor = Sensor.from_file("examples/sensor.toml")
+            >>> sensor.in_view(0) is sensor
+            True
+        """
+        expect(0 <= number < max(1, len(self.views)), "Sensor.in_view: number", number, f"0 to {max(1, len(self.views)) - 1}")
+        if number == 0:
+            return replace(self, views=()) if self.views else self
+        view, markers = self.views[number], self.markers
+        positions = None if markers.positions is None else view.pose.inverse.points(markers.positions)
+        return replace(
+            self,
+            camera=view.camera,
+            membrane=view.membrane(self.membrane),
+            markers=replace(markers, positions=positions, rest_image=view.rest_image),
+            surface=SurfaceInView(self.surface, view),
+            tool=None,
+            views=(),
+        )
+
+    def refuse_views(self, owner: str) -> None:
+        """Refuse a sensor with several views where only one is taken.
+
+        Args:
+            owner: what takes it, as the message begins.
+
+        Raises:
+            MembraneError: with the remedy.
+        """
+        expect(not self.views, f"{owner}: views", len(self.views), "one camera, as of sensor.in_view(0)")
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height, px, of its images: the camera's; of several views those of the image that they share, or of the
+        largest."""
+        modes = [view.camera.mode for view in self.views if view.region is not None]
+        if modes and modes[0] is not None:
+            return modes[0].image_size
+        sizes = [view.camera.image_size for view in self.views] or [self.camera.image_size]
+        return max(size[0] for size in sizes), max(size[1] for size in sizes)
+
+    @property
+    def views_apart(self) -> list[str]:
+        """Names of the views where each has images of its own; none of one view, or of regions of one image."""
+        return [view.name for view in self.views if view.region is None]
 
     def _solve_again(self, surface: InflatedSurface) -> None:
         """The rest surface of the sensor's own material, where the given one was solved with another."""
@@ -118,6 +181,7 @@ class Sensor:
         markers = self.markers
         arrays: dict[str, np.ndarray | None] = {**self.surface.arrays()}
         arrays |= {"positions": markers.positions, "rest_image": markers.rest_image}
+        arrays |= {f"rest_image {view.name}": view.rest_image for view in self.views[1:]}
         words = dict(tables_of(self.parts), sizes=markers.sizes)
         digest = hashlib.sha256(json.dumps(_as_numbers(words), sort_keys=True).encode())
         for key, array in sorted(arrays.items()):

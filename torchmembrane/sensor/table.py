@@ -106,8 +106,9 @@ class Table:
         """The tables of a list of them, `[[key]]`; none if there are none."""
         if key not in self:
             return []
-        values = self._get(key, _are_tables, f"tables [[{self.name}.{key}]]")
-        return [Table(self.path, f"{self.name}.{key}[{i}]", value) for i, value in enumerate(values)]
+        name = f"{self.name}.{key}" if self.name else key
+        values = self._get(key, _are_tables, f"tables [[{name}]]")
+        return [Table(self.path, f"{name}[{i}]", value) for i, value in enumerate(values)]
 
     def text(self, key: str, choices: Iterable[str] = ()) -> str:
         """Text that is not empty; one of `choices` where they are given."""
@@ -159,6 +160,15 @@ class Table:
             return _is_list(value, 3, _finite) or _is_list(value, 3, lambda row: _is_list(row, 3, _finite))
 
         value: list[Any] = self._get(key, right, "three rows of three finite numbers, or a rotation vector of three, degrees")
+        return value
+
+    def matrix(self, key: str, count: int) -> list[list[float]]:
+        """A square matrix of finite numbers, row by row."""
+
+        def right(value: object) -> bool:
+            return _is_list(value, count, lambda row: _is_list(row, count, _finite))
+
+        value: list[list[float]] = self._get(key, right, f"{count} rows of {count} finite numbers")
         return value
 
     def file(self, key: str) -> Path:

@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..camera.folds import refuse_folds
 from ..camera.model import Camera
-from ..camera.ports import Port
 from ..errors import MembraneError
 from ..files.atomic import make_folder, write_bytes, write_text
 from ..files.csv_table import Columns, Limit, read_table
@@ -19,6 +17,7 @@ from ..files.safe_read import read_arrays
 from ..pose import Pose
 from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
+from .camera_tables import camera_table, read_cameras, refuse_folded, view_tables, with_rest_images, write_cameras
 from .inflated import SHAPE as INFLATED
 from .inflated import read_inflated, rim_lines
 from .parts import (
@@ -73,11 +72,12 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
     if file.number("format") != FORMAT:
         raise file.refuse("format", f"{FORMAT}, the one this version reads: update torchmembrane or the file")
     name, length_unit = file.text("name"), file.text("length_unit", METRE)
-    camera = _read_camera(file.table("camera"))
+    camera, views = read_cameras(file)
     material = _read_material(file.table("material"))
     cavity = _read_cavity(file.table("cavity"))
     dotted = not undotted or "file" in file.table("markers") or "rest_image" in file.table("markers")
     markers, lines = _read_markers(file.table("markers"), camera) if dotted else (_dots_to_come(file.table("markers")), [])
+    views, markers = with_rest_images(file, views, markers) if views else (views, markers)
     surface, membrane = _read_membrane(file.table("membrane"), markers, material, length_unit)
     if not dotted:
         middle = len(membrane.rest) // 2
@@ -86,13 +86,13 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
         names = [f"{line}: the dot" for line in lines]
         refuse_off_surface(membrane, markers.positions, names)
         refuse_coincident(membrane, markers.positions, names)
-    with file.table("camera").naming("distortion"):
-        refuse_folds(camera, membrane.rest)
+    refuse_folded(file, camera, views, membrane)
     tool = _read_tool(file.table("tool")) if "tool" in file else None
     record = read_record(file.table("record")) if "record" in file else Record()
     kept = range_file(path)
     range = WorkingRange.from_file(kept) if kept.exists() else GENERAL
-    return SensorParts(name, length_unit, camera, membrane, material, cavity, markers, surface, tool, record, range)
+    given = name, length_unit, camera, membrane, material, cavity, markers, surface, tool, record, range
+    return SensorParts(*given, tuple(views))
 
 
 def write_sensor(parts: SensorParts, path: Path) -> Path:
@@ -107,7 +107,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
     """
     make_folder(path.parent)
     tables, surface, markers = tables_of(parts), parts.surface, parts.markers
-    tables["camera"] |= _calibrated(parts.camera)
+    cameras, shared = write_cameras(path, parts.camera, parts.views)
     if surface.shape in SHAPES_BY_ARRAYS:
         tables["membrane"]["file"] = f"{path.stem}_{surface.shape}.npz"
         content = io.BytesIO()
@@ -119,34 +119,21 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
     if markers.positions is not None:
         tables["markers"]["file"] = f"{path.stem}_dots.csv"
         _write_dots(path.with_name(tables["markers"]["file"]), markers.positions, markers.sizes or [])
-    if markers.rest_image is not None:
-        tables["markers"]["rest_image"] = write_image(
-            path.with_name(f"{path.stem}_rest"), markers.rest_image, parts.camera.bits
-        ).name
-    ports, medium = tables["camera"].pop("ports"), tables["camera"].pop("medium")
-    blocks = {name: toml_lines(name, table) for name, table in tables.items()}
-    for port in ports:
-        blocks["camera"] += toml_lines("camera.ports", port, repeated=True)
-    if ports:
-        blocks["camera"] += toml_lines("camera.medium", medium)
+    rest_image = shared if parts.views else markers.rest_image
+    if rest_image is not None:
+        tables["markers"]["rest_image"] = write_image(path.with_name(f"{path.stem}_rest"), rest_image, parts.camera.bits).name
+    blocks = {name: cameras if name == "camera" else toml_lines(name, table) for name, table in tables.items()}
     blocks |= {"record": toml_lines("record", parts.record.known)} if parts.record.known else {}
     write_text(path, "\n\n".join("\n".join(lines) for lines in blocks.values()) + "\n")
     return path
 
 
-def tables_of(parts: SensorParts) -> dict[str, dict[str, Any]]:
+def tables_of(parts: SensorParts) -> dict[str, Any]:
     """A sensor's numbers and words, without arrays, as the tables and keys of its file; a camera in a mode is that mode's."""
     camera, material, cavity, markers = parts.camera, parts.material, parts.cavity, parts.markers
-    tables: dict[str, dict[str, Any]] = {
+    tables: dict[str, Any] = {
         "": {"format": FORMAT, "name": parts.name, "length_unit": parts.length_unit},
-        "camera": {
-            "model": camera.model,
-            "image_size": list(camera.image_size),
-            **{key: getattr(camera, key).tolist() for key in ("focal", "centre", "distortion")},
-            **({} if camera.bits is None else {"bits": camera.bits}),
-            "ports": [port._asdict() for port in camera.ports],
-            "medium": {"index": camera.medium_index.item()} if camera.ports else {},
-        },
+        "camera": view_tables(parts.views) if parts.views else camera_table(camera),
         "membrane": {"shape": parts.surface.shape, "grid": list(parts.membrane.grid), **parts.surface.numbers()},
         "material": asdict(material),
         "cavity": asdict(cavity),
@@ -154,14 +141,6 @@ def tables_of(parts: SensorParts) -> dict[str, dict[str, Any]]:
     }
     tool = parts.tool
     return tables if tool is None else tables | {"tool": {key: value.tolist() for key, value in vars(tool).items()}}
-
-
-def _calibrated(camera: Camera) -> dict[str, list[float]]:
-    """The calibration and the mode of a camera in one, as keys of its file; none where its values are no longer the mode's."""
-    mode, found = camera.mode, (camera.focal.tolist(), camera.centre.tolist())
-    if mode is None or found != (list(mode.binned_focal), list(mode.binned_centre)):
-        return {}
-    return {key: list(value) for key, value in mode._asdict().items()}
 
 
 def default_grid(markers: Markers) -> tuple[int, int]:
@@ -185,30 +164,6 @@ def default_grid(markers: Markers) -> tuple[int, int]:
         return FINEST, FINEST
     n = COARSEST if 2.8 * math.sqrt(len(markers.positions)) < COARSEST + 2 else FINEST
     return n, n
-
-
-def _read_camera(table: Table) -> Camera:
-    table.allow(("model", "image_size", "focal", "centre", "distortion", "crop", "binning", "bits", "ports", "medium"))
-    ports = table.tables("ports")
-    medium = table.table("medium") if ports or "medium" in table else None
-    for part in ports:
-        part.allow(Port._fields)
-    if medium:
-        medium.allow(("index",))
-    crop = table.whole_numbers("crop", 4) if "crop" in table else None
-    binning = table.whole_pair("binning") if "binning" in table else [1, 1]
-    with table.naming():
-        calibrated = Camera(
-            model=table.text("model", ("pinhole", "fisheye")),
-            image_size=table.whole_numbers("image_size", 2),
-            focal=table.numbers("focal", 2),
-            centre=table.numbers("centre", 2),
-            distortion=table.numbers("distortion"),
-            ports=[Port(*(port.number(key) for key in Port._fields)) for port in ports],
-            medium_index=medium.number("index") if medium else 1.0,
-            bits=table.whole_number("bits") if "bits" in table else None,
-        )
-        return calibrated.in_mode(crop, binning) if "crop" in table or "binning" in table else calibrated
 
 
 def _read_tool(table: Table) -> Pose:

@@ -2,9 +2,9 @@
 
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from ..files.parquet import read_table, refusal
 from ..files.safe_read import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays, read_text
 from ..files.system_files import is_of_system
 from ..results.npz import save_frame
-from ..sensor.sensor import Sensor
 from .simulator import SimulatedFrame, Simulator
 
 SENSOR, SETTINGS, REST = "sensor.toml", "simulation.json", "rest_truth.npz"
@@ -33,23 +32,29 @@ FORMATS = ("png", "parquet")
 
 
 class SimulatedFrames:
-    """Frames as NAME.png and NAME_truth.npz in a folder.
+    """Frames as NAME.png and NAME_truth.npz in a folder; of views with images of their own as NAME_VIEW.png each.
 
     Args:
         folder: that exists.
+        views: names of the views that have images of their own, if there are several.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, views: Sequence[str] = ()) -> None:
+        self.folder, self.views = folder, views
 
     def names(self) -> set[str]:
         """The frames that are there."""
         found = {path.name.removesuffix("_truth.npz") for path in self.folder.glob("*_truth.npz") if not is_of_system(path)}
-        return {name for name in found if (self.folder / f"{name}.png").exists()}
+        return {name for name in found if all(path.exists() for path in self.images(name))}
+
+    def images(self, name: str) -> list[Path]:
+        """The image files of a frame."""
+        return [self.folder / file for file in image_files(name, self.views)]
 
     def write(self, name: str, frame: SimulatedFrame) -> None:
-        """Write a frame's image and truth."""
-        write_bytes(self.folder / f"{name}.png", png(frame.image))
+        """Write a frame's images and truth."""
+        for path, image in zip(self.images(name), (frame.image, *frame.further), strict=True):
+            write_bytes(path, png(image))
         self.write_truth(name, frame)
 
     def write_truth(self, name: str, frame: SimulatedFrame) -> None:
@@ -62,9 +67,9 @@ class SimulatedFrames:
     def __iter__(self) -> Iterator[tuple[str, SimulatedFrame]]:
         """Names and frames in name order."""
         for name in sorted(self.names(), key=in_order):
-            image = self.folder / f"{name}.png"
             truth = read_arrays(self.folder / f"{name}_truth.npz", None, A_TRUTH, NUMBERS + TEXT)
-            yield name, SimulatedFrame(read_pixels(image), {key: array.copy() for key, array in truth.items()})
+            first, *further = map(read_pixels, self.images(name))
+            yield name, SimulatedFrame(first, {key: array.copy() for key, array in truth.items()}, tuple(further))
 
 
 class SimulatedFrameTable(SimulatedFrames):
@@ -174,21 +179,28 @@ def open_frames(folder: Path, simulator: Simulator, settings: dict[str, Any], fo
     Raises:
         MembraneError: the folder was made with another sensor, appearance or `settings`, or has other contents.
     """
+    if format == "parquet" and simulator.sensor.views_apart:
+        raise MembraneError("--format parquet: views with images of their own; expected --format png, or regions of one image")
     settings = settings | {"sensor": simulator.sensor.fingerprint, "grid": list(simulator.grid), "format": format}
     settings = json.loads(json.dumps(settings | asdict(simulator.appearance) | simulator.pattern.described()))
     _check(folder, settings)
     if not (folder / SETTINGS).exists():
         make_folder(folder)
-        simulated(simulator).to_file(folder / SENSOR)
+        simulator.at_rest().to_file(folder / SENSOR)
         write_bytes(folder / SETTINGS, json.dumps(settings, indent=1).encode())
-    record = simulator.sensor.record.text
-    return SimulatedFrameTable(folder, record) if format == "parquet" else SimulatedFrames(folder)
+    if format == "parquet":
+        return SimulatedFrameTable(folder, simulator.sensor.record.text)
+    return SimulatedFrames(folder, simulator.sensor.views_apart)
 
 
-def simulated(simulator: Simulator) -> Sensor:
-    """The sensor with the rest image that the simulator makes."""
-    sensor = simulator.sensor
-    return replace(sensor, markers=replace(sensor.markers, rest_image=simulator.rest_image()))
+def image_files(name: str, views: Sequence[str]) -> list[str]:
+    """Names of a frame's image files.
+
+    Example:
+        >>> image_files("press", ()), image_files("press", ("left", "right"))
+        (['press.png'], ['press_left.png', 'press_right.png'])
+    """
+    return [f"{name}_{view}.png" for view in views] or [f"{name}.png"]
 
 
 def png(image: np.ndarray) -> bytes:

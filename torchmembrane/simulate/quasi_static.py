@@ -234,7 +234,7 @@ def _result(
     normal = torch.stack([contact.normal for contact in contacts])
     each = torch.stack([contact.force(free) for contact in contacts])
     nodal = torch.zeros_like(x).index_copy(0, problem.free, each.sum(0))
-    fluid = pressure * membrane._thirds_to_vertices(membrane.area_vectors(x))
+    fluid = pressure * membrane.thirds_to_vertices(membrane.area_vectors(x))
     rim = (problem.elasticity.gradient(x) - fluid)[membrane.fixed].sum(0)
     left_over = nodal.sum(0) + fluid.sum(0) + problem.load.sum(0) + rim
     return Press(

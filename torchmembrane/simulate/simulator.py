@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 from math import gcd
 from typing import Any, NamedTuple
@@ -12,13 +13,14 @@ import torch
 
 from ..errors import MembraneError, check_arguments
 from ..files.images import to_grey
+from ..sensor.camera_tables import shared_image
 from ..sensor.factories import cavity_filling, elastic_energy
 from ..sensor.sensor import Sensor
 from .appearance import DEFAULT_APPEARANCE, Appearance, noisy
 from .indenters import Indenter
 from .pattern import pattern_of
 from .quasi_static import Press, presses
-from .render import Renderer
+from .render import RenderedDots, Renderer
 
 LEGS = ("push", "slide", "release")
 REST_NOISE = 2**31 - 1  # its seed, unlike those of frames
@@ -82,12 +84,14 @@ class SimulatedFrame(NamedTuple):
     """An image with what is true in it.
 
     Attributes:
-        image: `[H, W]` uint8.
+        image: `[H, W]` uint8; of several views the first one's, or the one whose regions they are.
         truth: arrays by the names of `Simulator.frame`.
+        further: images of the further views that have images of their own.
     """
 
     image: np.ndarray
     truth: dict[str, np.ndarray]
+    further: tuple[np.ndarray, ...] = ()
 
 
 @check_arguments
@@ -132,17 +136,54 @@ class Simulator:
         self.elasticity = elastic_energy(sensor, self.membrane)
         self.cavity = cavity_filling(sensor, self.membrane)._asdict()
         self.pattern = pattern_of(sensor, radii, missing)
-        self.renderer = Renderer(sensor, self.grid, self.pattern, appearance)
-        self.rest_dots = self.renderer.dots(self.membrane.rest)
+        self.renderer = Renderer(sensor.in_view(0), self.grid, self.pattern, appearance)
+        self.renderers = [self.renderer]
+        for number in range(1, len(sensor.views)):
+            alone = sensor.in_view(number)
+            self.renderers.append(Renderer(alone, self.grid, pattern_of(alone, radii, missing), appearance))
+        self.rest_dots = self.dots(self.membrane.rest)
 
     def image(self, vertices: torch.Tensor, rng: np.random.Generator) -> np.ndarray:
-        """The membrane at `vertices [V, 3]` as the chip delivers it, uint8 `[H, W]`; `rng` makes the noise."""
+        """The membrane at `vertices [V, 3]` as the chip delivers it, uint8 `[H, W]`; `rng` makes the noise. Of several views
+        the first one's, or the one whose regions they are."""
+        return self.images(vertices, rng)[0]
+
+    def images(self, vertices: torch.Tensor, rng: np.random.Generator) -> list[np.ndarray]:
+        """The same of all views that have images of their own; of regions the image that they share."""
+        views = self.view_images(vertices, rng)
+        shared = shared_image(views, self.sensor.views) if self.sensor.views else None
+        return views if shared is None else [shared]
+
+    def view_images(self, vertices: torch.Tensor, rng: np.random.Generator) -> list[np.ndarray]:
+        """What each view sees, uint8 `[H, W]`."""
         with torch.no_grad():
-            return (255 * noisy(self.renderer(vertices), self.appearance.noise, rng)).round().byte().cpu().numpy()
+            clean = [renderer(x) for renderer, x in zip(self.renderers, self._in_views(vertices), strict=True)]
+            return [(255 * noisy(image, self.appearance.noise, rng)).round().byte().cpu().numpy() for image in clean]
+
+    def dots(self, vertices: torch.Tensor) -> RenderedDots:
+        """The pattern's dots on the membrane at `vertices [V, 3]`; of several views pixels `[W, D, 2]` and which are visible
+        `[W, D]` in each."""
+        each = [renderer.dots(x) for renderer, x in zip(self.renderers, self._in_views(vertices), strict=True)]
+        if len(each) == 1:
+            return each[0]
+        return RenderedDots(
+            each[0].positions, *(torch.stack([getattr(dots, key) for dots in each]) for key in ("pixels", "visible"))
+        )
+
+    def _in_views(self, vertices: torch.Tensor) -> list[torch.Tensor]:
+        """The vertices in the views' frames."""
+        return [vertices, *(view.pose.inverse.points(vertices) for view in self.sensor.views[1:])]
 
     def rest_image(self) -> np.ndarray:
-        """The image at rest, float32 `[H, W]`, as a sensor keeps it."""
-        return to_grey(self.image(self.membrane.rest, np.random.default_rng(REST_NOISE)))
+        """The image at rest, float32 `[H, W]`, as a sensor keeps it; of several views the first one's."""
+        return to_grey(self.view_images(self.membrane.rest, np.random.default_rng(REST_NOISE))[0])
+
+    def at_rest(self) -> Sensor:
+        """The sensor with the rest images that this simulator makes."""
+        sensor = self.sensor
+        images = [to_grey(image) for image in self.view_images(self.membrane.rest, np.random.default_rng(REST_NOISE))]
+        views = tuple(replace(view, rest_image=image) for view, image in zip(sensor.views, images, strict=False))
+        return replace(sensor, markers=replace(sensor.markers, rest_image=images[0]), views=views)
 
     def presses(self, stroke: Stroke, legs: Sequence[str], frames: int = 1, increment: float | None = None) -> Iterator[Press]:
         """Equilibria along a stroke.
@@ -194,12 +235,13 @@ class Simulator:
 
         Returns:
             The image with its truth: dots_nominal, dots_deformed `[D, 3]`, uv_nominal, uv_deformed `[D, 2]` px (of the dots'
-            centres: the centre of the outline lies some 0.1 px from it), visible_nominal, visible_deformed `[D]`;
+            centres: the centre of the outline lies some 0.1 px from it), visible_nominal, visible_deformed `[D]`, of W views
+            `[W, D, 2]` and `[W, D]`;
             vertices_nominal, vertices_deformed `[V, 3]`, triangles `[T, 3]`, contact_mask `[V]`, traction `[V, 3]`; p, p0
             pressure difference now and at rest; force `[3]` on the membrane, force_each `[I, 3]`, contact_centroid_each
             `[I, 3]`; stroke: JSON.
         """
-        dots, rest = self.renderer.dots(state.vertices), self.rest_dots
+        dots, rest = self.dots(state.vertices), self.rest_dots
         truth = {
             "dots_nominal": rest.positions,
             "dots_deformed": dots.positions,
@@ -220,7 +262,8 @@ class Simulator:
         }
         arrays = {key: np.asarray(value) for key, value in truth.items()}
         arrays = {key: a.astype(np.float32) if a.dtype.kind == "f" else a for key, a in arrays.items()}
-        return SimulatedFrame(self.image(state.vertices, rng), arrays | {"stroke": np.array(json.dumps(stroke.described()))})
+        first, *further = self.images(state.vertices, rng)
+        return SimulatedFrame(first, arrays | {"stroke": np.array(json.dumps(stroke.described()))}, tuple(further))
 
 
 def solid_angle(corners: torch.Tensor) -> float:

@@ -3,12 +3,15 @@
 Which vertices form the triangles: `topology`. Sums around a vertex are convolutions of the grid: `stencil`.
 """
 
+import copy
+
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from ..errors import MembraneError, check_arguments
+from ..pose import ViewPose
 from ..solve.stencil import apply_stencil, stencil_kernels
 from . import projection
 from .checks import checked_grid, checked_orientation
@@ -129,7 +132,7 @@ class Membrane(nn.Module):
             1.0
         """
         area = torch.linalg.vector_norm(self.area_vectors(x), dim=-1, keepdim=True)
-        return self._thirds_to_vertices(area).squeeze(-1)
+        return self.thirds_to_vertices(area).squeeze(-1)
 
     def normals(self, x: Tensor) -> Tensor:
         """Unit outward normals at the vertices: of the area vectors summed around them, as the volume gradient's.
@@ -251,6 +254,29 @@ class Membrane(nn.Module):
         X = self.rest.cpu().double().numpy().reshape(*self.grid, 3)
         return Membrane(*resampled_grid(X, self.fixed.cpu().numpy().reshape(self.grid), grid))
 
+    def in_frame(self, pose: ViewPose, outside: bool = False) -> "Membrane":
+        """The same rest surface, its vertices in the same order, in another frame: of a view that may see a part of it only.
+
+        Args:
+            pose: of this frame in the other one; it may reflect.
+            outside: whether the other view looks at the outer side, which is then away from its triangles' normals.
+
+        Example:
+            >>> from torchmembrane.surface.shapes import spherical_cap
+            >>> mirrored = spherical_cap(12.0, 9.0, 15.0).in_frame(ViewPose(np.diag([-1.0, 1.0, 1.0]), np.zeros(3)))
+            >>> bool((mirrored.rest_normals * mirrored.rest).sum(-1).min() > 0)
+            True
+        """
+        other = copy.deepcopy(self)
+        other.rest = pose.points(self.rest)
+        if (pose.determinant < 0) != outside:
+            other.outward, other.triangles = -self.outward, self.triangles[:, [0, 2, 1]]
+            signed = other.chord_kernels[:2], other.chords_beyond_border.chunk(2)[0]
+            for constant in (*signed, other.volume_third_derivatives, other.volume_cross_products):
+                constant *= -1
+        other.rest_normals, other.rest_volume = other.normals(other.rest), other.volume(other.rest)
+        return other
+
     def closest_points(self, points: ArrayLike) -> SurfacePoints:
         """The material points of the rest surface closest to given ones.
 
@@ -299,7 +325,8 @@ class Membrane(nn.Module):
         crossed: Tensor = first + second
         return crossed
 
-    def _thirds_to_vertices(self, per_triangle: Tensor) -> Tensor:
+    def thirds_to_vertices(self, per_triangle: Tensor) -> Tensor:
+        """Sums `[..., V, C]` of a third of what the triangles around each vertex have, `[..., m-1, n-1, 2, C]`."""
         thirds = (per_triangle / 3).unsqueeze(-2).expand(*per_triangle.shape[:-1], 3, per_triangle.shape[-1])
         return corners_to_vertices(triangles_to_corners(thirds), self.grid)
 

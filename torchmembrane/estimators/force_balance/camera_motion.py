@@ -6,7 +6,8 @@ surface. With the angles' derivatives `K` in it, a step solves
     [M  B'] [d ]     [g]         B = K^T w J,  T = K^T w K + stiffness,  k = K^T w r + stiffness x motion
     [B  T ] [dm] = - [k],
 
-by the factor of `M`: with `d = -M^-1 (g + B' dm)` the second row is `(T - B M^-1 B') dm = B M^-1 g - k`.
+by the factor of `M`: with `d = -M^-1 (g + B' dm)` the second row is `(T - B M^-1 B') dm = B M^-1 g - k`. Of W views each moves
+by itself: `4 W` unknowns, one view's after the other's.
 """
 
 from typing import Any, NamedTuple, TypeVar
@@ -42,18 +43,19 @@ def camera_stiffness(play: Any, moved2: Scalar) -> Scalar:
 
 
 class CameraMotion(NamedTuple):
-    """Of a step: `coupling` `B [B, 4, 3 N]` to the vertices, `own` `T [B, 4, 4]` and `slope` `k [B, 4]`."""
+    """Of a step: `coupling` `B [B, 4 W, 3 N]` to the vertices, `own` `T [B, 4 W, 4 W]` and `slope` `k [B, 4 W]`."""
 
     coupling: Tensor
     own: Tensor
     slope: Tensor
 
     def held(self, moved: Tensor, play: float | Tensor) -> "CameraMotion":
-        """With the loss `RARE / 2 log(play^2 + |moved|^2)` of what has `moved [B, 4]`: a camera rarely moves, and then by any
-        amount."""
-        stiffness = camera_stiffness(play, moved.square().sum(-1))
-        one = torch.eye(4, dtype=moved.dtype, device=moved.device)
-        own, slope = self.own + stiffness[:, None, None] * one, self.slope + stiffness[:, None] * moved
+        """With the loss `RARE / 2 log(play^2 + |m|^2)` of each view's motion `m` in `moved [B, 4 W]`: a camera rarely moves,
+        and then by any amount."""
+        each = moved.unflatten(-1, (-1, 4))
+        stiffness = camera_stiffness(play, each.square().sum(-1))[..., None].expand_as(each).flatten(-2)
+        one = torch.eye(moved.shape[-1], dtype=moved.dtype, device=moved.device)
+        own, slope = self.own + stiffness[..., None] * one, self.slope + stiffness * moved
         return CameraMotion(self.coupling, own, slope)
 
     def eased(self, solved: Tensor, of_motion: Tensor) -> Tensor:
@@ -64,10 +66,10 @@ class CameraMotion(NamedTuple):
 
     def eliminated(self, products: Tensor) -> tuple[Tensor, Tensor]:
         """What three loads' solutions of the surface alone have to do with the loads, `[B, 3, 3]` (row x, column y: `x . M^-1
-        y`), and how the camera follows each, `[B, 4, 3]`; the camera's slope comes with the second load.
+        y`), and how the camera follows each, `[B, 4 W, 3]`; the camera's slope comes with the second load.
 
         Args:
-            products: the same with `M` alone, of these loads and the coupling, `[B, 7, 7]`.
+            products: the same with `M` alone, of these loads and the coupling, `[B, 3 + 4 W, 3 + 4 W]`.
         """
         loads, coupling = products[:, :, :3], products[:, :, 3:]
         pulled = loads[:, 3:] - F.pad(self.slope[..., None], (1, 1))
@@ -75,11 +77,11 @@ class CameraMotion(NamedTuple):
         return loads[:, :3] + coupling[:, :3] @ following, following
 
     def without(self, loads: Tensor, slopes: Tensor) -> Tensor:
-        """Loads `[B, L, 3 N]` on the surface alone, of those that pull the camera by `slopes [B, L, 4]` as well."""
+        """Loads `[B, L, 3 N]` on the surface alone, of those that pull the camera by `slopes [B, L, 4 W]` as well."""
         kept: Tensor = loads - solve_dense(self.own, slopes.mT).mT @ self.coupling
         return kept
 
     def turning(self, y: Tensor) -> Tensor:
-        """`T^-1 B y`, `[B, L, 4]`, of fields `y [B, L, 3 N]`."""
+        """`T^-1 B y`, `[B, L, 4 W]`, of fields `y [B, L, 3 N]`."""
         turned: Tensor = solve_dense(self.own, self.coupling @ y.mT).mT
         return turned

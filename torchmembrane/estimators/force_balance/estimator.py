@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...camera.model import Camera
+from ...camera.model import Rays
 from ...control_flow import retry_rows, traced, where_rows
 from ...mechanics.cavity import CavityLaw, rest_balance
 from ...mechanics.hyperelastic import ElasticEnergy
@@ -70,6 +70,7 @@ class ForceBalance(Estimator):
         gas: a gas' absolute pressure at rest and its volume.
         settings: everything else.
         rest: the markers' rays at rest with their noise; None: from the origin, with `noise`.
+        views: how many views see the markers, which are listed once for each.
         is_coarse: whether a finer grid follows.
 
     Limitations:
@@ -80,6 +81,7 @@ class ForceBalance(Estimator):
     needs_every_vertex: ClassVar[bool] = False
     finds_tractions: ClassVar[bool] = True
     in_parts: ClassVar[bool] = True
+    takes_views: ClassVar[bool] = True
     settings: ForceBalanceSettings
 
     def __init__(
@@ -93,16 +95,17 @@ class ForceBalance(Estimator):
         gas: tuple[float, float] | None = None,
         settings: ForceBalanceSettings | None = None,
         rest: Observation | None = None,
+        views: int = 1,
         is_coarse: bool = False,
     ):
-        settings, spacing = settings or ForceBalanceSettings(), membrane.size / len(positions) ** 0.5
+        settings, spacing = settings or ForceBalanceSettings(), membrane.size / (len(positions) // views) ** 0.5
         super().__init__(membrane, CavityLaw(membrane, rest_balance(membrane, elasticity)[0], filling, gas), settings, spacing)
         self.size, self.coarseness = membrane.size, max(1.0, (RESOLVED - 1) / (min(membrane.grid) - 1)) ** 2
         self._far = settings.far * self.coarseness
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
-        bearings = MarkerBearings(membrane, markers, positions, noise, rest)
-        self.coarse = self._coarser(membrane, elasticity, bearings, rest=rest, filling=filling, gas=gas)
+        bearings = MarkerBearings(membrane, markers, positions, noise, rest, views)
+        self.coarse = self._coarser(membrane, elasticity, bearings, rest=rest, filling=filling, gas=gas, views=views)
         self.refinement = None if self.coarse is None else Refinement(self.coarse.membrane.grid, membrane.grid)
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
@@ -120,10 +123,10 @@ class ForceBalance(Estimator):
         """The estimator of a sensor."""
         variance = problem.rest_covariance.diagonal(dim1=-2, dim2=-1).mean()
         noise = float(variance.sqrt() / problem.camera.focal.mean())
-        sure = torch.ones_like(problem.rest_pixels[None, :, 0])
+        sure = problem.rest_confidence[None]
         rest = marker_rays(problem.camera, problem.rest_pixels[None], problem.positions, sure, problem.rest_covariance[None])
         surface = problem.membrane, problem.elasticity, problem.markers, problem.positions
-        return cls(*surface, noise, problem.filling, problem.gas, settings, rest)
+        return cls(*surface, noise, problem.filling, problem.gas, settings, rest, problem.views)
 
     def _coarser(self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerBearings, **others: Any) -> Self | None:
         grid, positions = membrane.grid, bearings.positions
@@ -163,10 +166,11 @@ class ForceBalance(Estimator):
         if self.coarse is not None:
             self.coarse.set_prestretch(prestretch)
 
-    def prepare(self, camera: Camera, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
+    def prepare(self, camera: Any, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
         """The rays of the markers seen at `pixels [B, D, 2]`, each with its own noise where its `covariance` is given."""
         if covariance is None:
-            return Observation(*camera.pixel_to_ray(pixels), confidence)
+            rays: Rays = camera.pixel_to_ray(pixels)
+            return Observation(*rays, confidence)
         return marker_rays(camera, pixels, self.equations.bearings.positions, confidence, covariance)
 
     def check_gauge(self) -> None:
@@ -243,11 +247,10 @@ class ForceBalance(Estimator):
 
     @traced
     def at_rest(self, confidence: Tensor) -> State:
-        """The rest surface and pressure and a camera that has not moved, for every row of `confidence [B, D]`."""
-        frames, pressure = confidence.shape[0], self.rest_pressure
-        return State(
-            torch.zeros_like(self.membrane.rest).repeat(frames, 1, 1), pressure.repeat(frames), (0 * pressure).repeat(frames, 4)
-        )
+        """The rest surface and pressure and cameras that have not moved, for every row of `confidence [B, D]`."""
+        frames, pressure, motions = confidence.shape[0], self.rest_pressure, 4 * self.equations.bearings.views
+        still = (0 * pressure).repeat(frames, motions)
+        return State(torch.zeros_like(self.membrane.rest).repeat(frames, 1, 1), pressure.repeat(frames), still)
 
     @traced
     def coarsened(self, u: Tensor, pressure: Tensor, moved: Tensor) -> State:

@@ -28,7 +28,7 @@ step makes of more does not stay in a processor's cache."""
 
 class State(NamedTuple):
     """What the steps change: the surface's displacement `u [B, V, 3]` from rest (positions in float32 would round the strain
-    of a slack sheet), the `pressure [B]`, and by how much the camera has `moved [B, 4]`."""
+    of a slack sheet), the `pressure [B]`, and by how much the W views' cameras have `moved [B, 4 W]`."""
 
     u: Tensor
     pressure: Tensor
@@ -112,7 +112,7 @@ class Descent(nn.Module):
 
     def is_native(self, *values: Any) -> bool:
         """Whether steps of these tensors are taken by machine code."""
-        return takes(*values, self.equations.forces.elasticity.prestretch)
+        return self.equations.bearings.views == 1 and takes(*values, self.equations.forces.elasticity.prestretch)
 
     @traced
     def _unweighted(self, u: Tensor) -> Tensor:
@@ -133,7 +133,7 @@ class Descent(nn.Module):
     def objective_at_rest(self, measured: Bearings) -> Tensor:
         """The same of the surface at rest and a camera that has not moved; there are no tractions."""
         still, none = torch.zeros_like(self.membrane.rest[None]), torch.zeros_like(measured.noise_level)
-        angles = self.equations.bearings.angles(still, measured, none[:, None].expand(-1, 4))[0]
+        angles = self.equations.bearings.angles(still, measured, none[:, None].expand(-1, measured.motion.shape[2]))[0]
         return self.misfit(angles, none + self.cavity.rest_pressure, measured)
 
     def misfit(self, angles: Tensor, pressure: Tensor, measured: Bearings) -> Tensor:

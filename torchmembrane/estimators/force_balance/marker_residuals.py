@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...camera.model import Camera
-from ...camera.motion import motion_of_pixels
+from ...camera.rig import Rig
 from ...control_flow import traced
 from ...markers.spacing import neighbours
 from ...solve.stencil import inner
@@ -29,7 +29,7 @@ class Bearings(NamedTuple):
     across       `[B, 2, 3, D]`, two vectors across each ray, along which its turns are measured in standard deviations
     weight       `[B, D]`, the markers' confidence
     noise_level  `[B]`, the markers' standard deviations over their own at rest, their geometric mean
-    motion       `[B, 2, 4, D]`, derivatives of the angles in the camera's motion: du, dv, rotation, growth (px)
+    motion       `[B, 2, 4 W, D]`, derivatives of the angles in the motion of each view's image: du, dv, rotation, growth (px)
     gauge        `[B, 2]`, as of `Observation`, or None
     """
 
@@ -41,7 +41,7 @@ class Bearings(NamedTuple):
     gauge: Tensor | None = None
 
 
-def marker_rays(camera: Camera, pixels: Tensor, positions: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
+def marker_rays(camera: Camera | Rig, pixels: Tensor, positions: Tensor, confidence: Tensor, covariance: Tensor) -> Observation:
     """The rays of markers, each with its own noise.
 
     Args:
@@ -71,7 +71,7 @@ def marker_rays(camera: Camera, pixels: Tensor, positions: Tensor, confidence: T
     first = in_u * a.rsqrt()
     second = (in_v - b / a * in_u) * (c - b * b / a).rsqrt()
     across = torch.stack([first, second], 2)
-    of_u, of_v = motion_of_pixels(pixels, camera.image_size).unbind(-2)
+    of_u, of_v = camera.motion_of_pixels(pixels).unbind(-2)
     motion = torch.stack([of_u * a.rsqrt(), (of_v - b / a * of_u) * (c - b * b / a).rsqrt()], 2)
     return Observation(origins[:, 0], directions[:, 0], confidence, across, motion)
 
@@ -97,6 +97,7 @@ class MarkerBearings(nn.Module):
         positions: `[D, 3]` their rest positions.
         noise: standard deviation of a marker's angles, radians, where an observation does not give it.
         rest: the markers' rays at rest; None: from the origin, with that noise.
+        views: how many views see the markers, which are listed once for each.
     """
 
     positions: Tensor
@@ -106,11 +107,21 @@ class MarkerBearings(nn.Module):
     pair_shares: Tensor
     nearest: Tensor
 
-    def __init__(self, membrane: Membrane, markers: SurfacePoints, positions: Tensor, noise: float, rest: Observation | None):
+    def __init__(
+        self,
+        membrane: Membrane,
+        markers: SurfacePoints,
+        positions: Tensor,
+        noise: float,
+        rest: Observation | None,
+        views: int = 1,
+    ):
         super().__init__()
-        self.grid, self.noise = membrane.grid, noise
+        self.grid, self.noise, self.views = membrane.grid, noise, views
         self.register_buffer("positions", torch.as_tensor(positions, dtype=torch.float64))
-        self.register_buffer("nearest", torch.from_numpy(neighbours(self.positions.numpy(), NEIGHBOURS).copy()))
+        count = len(self.positions) // views
+        nearest = torch.from_numpy(neighbours(self.positions[:count].numpy(), NEIGHBOURS).copy())
+        self.register_buffer("nearest", torch.cat([nearest + view * count for view in range(views)]))
         vertex_shares, pair_shares = _shares(membrane, markers)
         self.register_buffer("vertex_shares", vertex_shares)
         self.register_buffer("pair_shares", pair_shares)
@@ -127,7 +138,7 @@ class MarkerBearings(nn.Module):
         if across is None:
             across = tangent_frame(directions) / self.noise
         if motion is None:
-            motion = torch.zeros_like(across[..., :1]).expand(-1, -1, -1, 4)
+            motion = torch.zeros_like(across[..., :1]).expand(-1, -1, -1, 4 * self.views)
         found = (confidence > 0).to(confidence.dtype)
         excess = torch.where(found > 0, _spread(across) / self.rest_spread, 1.0).log()
         noise_level = (excess.sum(-1) / found.sum(-1).clamp_min(1) / 2).exp()
@@ -142,7 +153,7 @@ class MarkerBearings(nn.Module):
 
     def angles(self, u: Tensor, measured: Bearings, moved: Tensor) -> tuple[Tensor, Tensor]:
         """Angles across the measured rays `[B, 2, D]`, and the bearing Jacobian: their derivatives in the markers' positions,
-        `[B, 2, 3, D]`; `moved [B, 4]`: of the camera."""
+        `[B, 2, 3, D]`; `moved [B, 4 W]`: of the views' cameras."""
         to_marker = self.markers(u).mT - measured.origins
         distance = torch.linalg.vector_norm(to_marker, dim=1, keepdim=True)
         along = (to_marker / distance)[:, None]

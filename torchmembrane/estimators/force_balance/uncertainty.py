@@ -127,9 +127,8 @@ def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observat
     """
     membrane, loss = equations.forces.membrane, equations.loss
     measured = equations.bearings.measured(rest)
-    state = State(
-        torch.zeros_like(membrane.rest[None]), cavity.rest_pressure[None], torch.zeros_like(membrane.rest[:1, :1]).expand(1, 4)
-    )
+    still = torch.zeros_like(membrane.rest[:1, :1]).expand(1, measured.motion.shape[2])
+    state = State(torch.zeros_like(membrane.rest[None]), cavity.rest_pressure[None], still)
     at, normal, solution = linearise(equations, cavity, state, measured, (torch.inf, torch.inf), play)
     alone = torch.eye(2).to(measured.weight).expand(1, measured.weight.shape[1], 2, 2)
     loads = noise_loads(equations, normal, measured, solution.motion, alone)

@@ -1,0 +1,282 @@
+"""Several views of one membrane: the sensor's file, what each view sees, and what is reconstructed from all of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import torchmembrane as tm
+from torchmembrane.camera.rig import Rig
+from torchmembrane.cli.describe import described, rest_frame
+from torchmembrane.cli.main import main
+from torchmembrane.errors import MembraneError
+from torchmembrane.jobs.inputs import Inputs, of_first_view
+from torchmembrane.plot.sensor import sensor_figure
+from torchmembrane.pose import ViewPose
+from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.sensor import Sensor
+from torchmembrane.sensor.views import View
+from torchmembrane.simulate import Simulator, Sphere
+from torchmembrane.simulate.dataset import stroke_to
+
+CAMERA = tm.Camera("pinhole", (160, 120), (100, 100), (79.5, 59.5))
+BESIDE = ViewPose(np.array([0.0, -25.0, 0.0]), np.array([7.0, 0.0, 0.0]))
+MIRROR = ViewPose(np.diag([-1.0, 1.0, 1.0]), np.zeros(3))  # in the plane x = 0
+
+
+def cap(*views, camera=CAMERA):
+    """A cap with 49 dots, symmetric to x = 0."""
+    surface = Surface("spherical_cap", {"rim_radius": 8.0, "height": 4.0, "base_z": 14.0})
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-5, 5, 7)] * 2))
+    dots = np.stack([x, y, 8 + np.sqrt(100 - x**2 - y**2)], -1)
+    material = Material("neo_hookean", 1.3, shear_modulus=0.3, thickness=0.4)
+    parts = "cap", "mm", camera, surface.membrane((9, 9)), material, Cavity("liquid"), Markers("dots", "dark", dots), surface
+    return Sensor(*parts, views=(View("left", camera), *views) if views else ())
+
+
+@pytest.fixture(scope="module")
+def press():
+    """A sensor with two views, and a press: its images, its truth."""
+    simulator = Simulator(cap(View("right", CAMERA, BESIDE)))
+    stroke = stroke_to(simulator, Sphere(3.0), np.array([0.0, 1.0, 18.0]), np.array([-0.3, 0.0, -0.95]), 1.2)
+    (state,) = simulator.presses(stroke, ["push"])
+    frame = simulator.frame(state, stroke, np.random.default_rng(0))
+    return simulator, [frame.image, *frame.further], frame.truth, state
+
+
+@pytest.fixture(scope="module")
+def reconstructor(press):
+    return tm.Reconstructor(press[0].at_rest())
+
+
+@pytest.fixture(scope="module")
+def alone(press):
+    """The first view's reconstructor."""
+    return tm.Reconstructor(press[0].at_rest().in_view(0))
+
+
+@pytest.fixture(scope="module")
+def found(reconstructor, press):
+    return reconstructor(press[1])
+
+
+def off(result, truth):
+    """Rms distance of the markers from the truth."""
+    return float(np.sqrt(((result.markers[0].numpy() - truth["dots_deformed"]) ** 2).sum(-1).mean()))
+
+
+def test_the_file_keeps_views_that_have_images_of_their_own(press, tmp_path):
+    sensor = press[0].at_rest()
+    path = sensor.to_file(tmp_path)
+    assert sorted(file.name for file in tmp_path.glob("*.png")) == ["sensor_rest_left.png", "sensor_rest_right.png"]
+    again = tm.Sensor.from_file(path)
+    assert again.fingerprint == sensor.fingerprint != replace(sensor, views=()).fingerprint
+    assert [view.name for view in again.views] == ["left", "right"]
+    np.testing.assert_array_equal(again.views[1].pose.matrix, BESIDE.matrix)
+    np.testing.assert_array_equal(again.views[1].rest_image, sensor.views[1].rest_image)
+
+
+def test_regions_share_one_image(press, found, tmp_path):
+    """Left and right half of an image of 320 x 120 px show what two cameras of 160 x 120 px show."""
+    whole = tm.Camera("pinhole", (320, 120), (100, 100), (79.5, 59.5))
+    other = tm.Camera("pinhole", (320, 120), (100, 100), (239.5, 59.5)).in_mode((160, 0, 160, 120))
+    first = whole.in_mode((0, 0, 160, 120))
+    views = View("left", first, is_region=True), View("right", other, BESIDE, is_region=True)
+    sensor = replace(cap(camera=first), views=views)
+    simulator = Simulator(sensor)
+    (image,) = simulator.images(press[3].vertices, np.random.default_rng(0))
+    np.testing.assert_array_equal(image, np.concatenate(press[1], 1))
+    path = simulator.at_rest().to_file(tmp_path)
+    again = tm.Sensor.from_file(path)
+    assert again.fingerprint == simulator.at_rest().fingerprint and again.image_size == (320, 120)
+    assert [view.region for view in again.views] == [(0, 0, 160, 120), (160, 0, 160, 120)]
+    assert sorted(file.name for file in tmp_path.glob("*.png")) == ["sensor_rest.png"]
+    one, two = found, tm.Reconstructor(again)(image)
+    for name in ("vertices", "force", "pixels", "residual"):
+        torch.testing.assert_close(getattr(one, name), getattr(two, name), rtol=2e-3, atol=1e-3, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('name = "right"', 'name = "left"', "View: name is 'left'; expected another name"),
+        ('name = "right"\n', "", r"\[camera\[1\]\] name is missing"),
+        ('name = "right"', 'name = "to the right"', "expected a name of letters"),
+        ('name = "right"', 'name = "right"\nside = "beside"', '"inside" or "outside"'),
+        ('name = "right"', 'name = "right"\nregion = [0, 0, 200, 120]', "within the calibrated image of 160 x 120"),
+        ('name = "right"', 'name = "right"\nregion = [0, 0, 160, 120]', "one of each view, or of none"),
+        ('name = "left"', 'name = "left"\nside = "outside"', "'inside' of the first view"),
+        ("[0.0, 1.0, 0.0, 0.0]", "[0.0, 2.0, 0.0, 0.0]", "orthogonal rows"),
+        (", [0.0, 0.0, 0.0, 1.0]]", "]", "4 rows of 4 finite numbers"),
+        ("[markers]", '[markers]\nrest_image = "sensor_rest_left.png"', "give rest_image in each"),
+    ],
+)
+def test_what_is_no_view_is_refused_in_words(press, tmp_path, old, new, said):
+    path = press[0].at_rest().to_file(tmp_path)
+    text = path.read_text()
+    at = text.rindex(old) if old.startswith(("[0", ", [0")) else text.index(old)
+    path.write_text(text[:at] + new + text[at + len(old) :])
+    with pytest.raises(tm.MembraneError, match=said):
+        tm.Sensor.from_file(path)
+
+
+def test_views_need_listed_dots_and_an_estimator_that_takes_them(press):
+    sensor = press[0].at_rest()
+    image = Markers("dots", "dark", rest_image=sensor.markers.rest_image)
+    with pytest.raises(tm.MembraneError, match="dots with their positions"):
+        replace(sensor, markers=image)
+    with pytest.raises(tm.MembraneError, match="views for minimum-energy is 2; expected 1"):
+        tm.Reconstructor(sensor, "minimum-energy")
+
+
+def test_a_mirror_shows_the_image_reversed():
+    """The cap is symmetric to the mirror, the lens to its image's middle: what the mirror shows is the image reversed."""
+    simulator = Simulator(cap(View("mirror", CAMERA, MIRROR)))
+    direct, mirrored = simulator.view_images(simulator.membrane.rest, np.random.default_rng(0))
+    assert direct.std() > 30
+    np.testing.assert_allclose(mirrored.astype(float), direct[:, ::-1], atol=2.01)
+
+
+def test_a_view_from_outside_sees_the_outer_side():
+    """From beyond the cap, looking back: all dots of a dome that bulges towards the camera are seen, none as from within."""
+    back = ViewPose(np.array([180.0, 0.0, 0.0]), np.array([0.0, 0.0, 36.0]))
+    outside, wrong = (View("back", CAMERA, back, side=side) for side in ("outside", "inside"))
+    assert bool(Simulator(cap(outside)).rest_dots.visible.all())
+    with pytest.raises(tm.MembraneError, match="view back.*: 0 of 49 markers are seen"):
+        tm.Reconstructor(cap(wrong))
+    sensor = cap(outside).in_view(1)
+    assert float((sensor.membrane.rest_normals * sensor.membrane.rest).sum(-1).min()) > 0  # away from its camera
+
+
+def test_rays_of_a_rig_pass_through_the_points_whose_pixels_they_are():
+    port = tm.Camera("fisheye", (640, 480), (180, 180), (310, 250), ports=[(2, 3, 1.49)], medium_index=1.33)
+    rig = Rig(
+        [CAMERA, port, CAMERA], [ViewPose(np.eye(3), np.zeros(3)), BESIDE, ViewPose(MIRROR.rotation, np.array([30.0, 1, 0]))]
+    )
+    points = (torch.rand(4, 7, 3, dtype=torch.float64) * torch.tensor([6, 6, 4]) + torch.tensor([2, -3, 14])).repeat(1, 3, 1)
+    origin, direction = rig.pixel_to_ray(rig.point_to_pixel(points))
+    miss = torch.linalg.cross(points - origin, direction)
+    torch.testing.assert_close(miss, torch.zeros_like(miss), rtol=0, atol=1e-9)
+    torch.testing.assert_close(direction.norm(dim=-1), torch.ones(4, 21).double())
+
+
+def test_two_views_see_what_one_infers(found, alone, press):
+    """Both views' markers are found and explained; the surface is nearer to the truth than that of the first view alone."""
+    simulator, images, truth, state = press
+    assert found.status.tolist() == [0] and list(found.pixels.shape) == [1, 2, 49, 2]
+    assert list(found.confidence.shape) == [1, 2, 49] and list(found.residual.shape) == [1, 2]
+    assert list(found.camera_motion.shape) == [1, 2, 4] and list(found.markers.shape) == [1, 49, 3]
+    seen = found.confidence[0] > 0.5
+    assert seen.float().mean() > 0.9
+    pixels = torch.from_numpy(truth["uv_deformed"])
+    assert float((found.pixels[0] - pixels)[seen].norm(dim=-1).median()) < 0.1
+    assert off(found, truth) < 0.6 * off(alone(images[0]), truth)
+
+
+def test_a_list_and_a_stack_are_the_same(reconstructor, found, press):
+    one, stacked = reconstructor(press[1]), reconstructor(np.stack([np.stack(press[1])] * 2))
+    for name in ("vertices", "force", "pixels", "residual"):
+        batch, single = getattr(stacked, name)[1:], getattr(one, name)
+        torch.testing.assert_close(batch, single, rtol=2e-3, atol=1e-3, equal_nan=True)
+    for wrong, said in ((press[1][0], "expected a list of 2 batches"), (press[1][:1], "images of 1 views; expected 2")):
+        with pytest.raises(tm.MembraneError, match=said):
+            reconstructor(wrong)
+
+
+def test_the_order_of_the_views_does_not_matter(press, found):
+    """The other view as the first: the same surface in that view's frame."""
+    simulator, images, truth, state = press
+    sensor, inverse = simulator.at_rest(), BESIDE.inverse
+    other = sensor.in_view(1)
+    other = replace(other, membrane=Surface.of(other.membrane).membrane((9, 9)), surface=None)
+    swapped = replace(other, views=(View("right", CAMERA), View("left", CAMERA, inverse, sensor.markers.rest_image)))
+    got = tm.Reconstructor(swapped)(images[::-1])
+    back = BESIDE.points(got.vertices[0])
+    assert float((back - found.vertices[0]).norm(dim=-1).max()) < 0.02 * 1.2
+    np.testing.assert_allclose(BESIDE.vectors(got.force[0]).numpy(), found.force[0].numpy(), atol=0.03 * found.force.norm())
+
+
+def test_a_view_that_fails_is_left_out_and_named(reconstructor, alone, press):
+    """Its confidence is zero, the frame's status says so, and the answer is that of the others."""
+    left, right = press[1]
+    blank = np.full_like(left, 30)
+    got = reconstructor([np.stack([left, blank, blank]), np.stack([blank, right, blank])])
+    assert got.status.tolist() == [10, 10, 4] and tm.Status(10).has_surface
+    assert (got.confidence[0, 1] == 0).all() and (got.confidence[1, 0] == 0).all() and (got.confidence[0, 0] > 0).any()
+    assert got.pixels[0, 1].isnan().all() and got.vertices[2].isnan().all()
+    assert float((got.vertices[0] - alone(left).vertices[0]).norm(dim=-1).max()) < 0.05
+
+
+def test_markers_that_one_view_sees_count_as_much(reconstructor, press):
+    """Every third dot is hidden from one view, every other third from the other: nothing is missing, the shape stays right."""
+    truth = press[2]
+    pixels, sure = torch.from_numpy(truth["uv_deformed"])[None], torch.ones(1, 2, 49)
+    whole = reconstructor.from_pixels(pixels, sure)
+    sure[:, 0, 0::3], sure[:, 1, 1::3] = 0, 0
+    part = reconstructor.from_pixels(pixels, sure)
+    assert part.status.tolist() == whole.status.tolist() == [0] and float(part.coverage[0]) == float(whole.coverage[0])
+    assert off(part, truth) < 1.5 * off(whole, truth) + 0.005
+
+
+def test_a_knocked_view_is_found_by_its_own_motion(reconstructor, found, press):
+    """The second image is 2 px to the right: that view has moved, the first has not, and the answer stays."""
+    left, right = press[1]
+    knocked = reconstructor([left, np.roll(right, 2, axis=1)])
+    motion = knocked.camera_motion[0]
+    assert abs(float(motion[1, 0]) - 2) < 0.1 and float(motion[0, :2].norm()) < 0.1
+    assert knocked.status.tolist() == [0]
+    assert float((knocked.vertices - found.vertices).norm(dim=-1).max()) < 0.06
+
+
+def test_noise_spreads_from_all_views(reconstructor, found):
+    """With a second view the depth is known better."""
+    both = reconstructor.standard_deviations(found)
+    one = reconstructor.standard_deviations(found._replace(confidence=found.confidence * torch.tensor([1.0, 0.0])[:, None]))
+    assert float(both.vertices.max()) < 0.8 * float(one.vertices.max())
+
+
+def test_what_takes_one_view_says_so(reconstructor):
+    with pytest.raises(tm.MembraneError, match="Tracker: views is 2; expected one camera"):
+        tm.Tracker(reconstructor)
+
+
+def test_check_says_and_draws_each_view(reconstructor, press):
+    sensor = reconstructor.sensor
+    frame = rest_frame(reconstructor)
+    said = "\n".join(described(sensor, reconstructor, frame))
+    assert "view 'right' from 7, 0, 0 mm along -0.42262, 0, 0.90631, inside: sees 49 of 49" in said
+    assert "view 'left': 49 found in its rest image" in said and "rest images reconstructed: ok" in said
+    titles = [axes.get_title() for axes in sensor_figure(sensor, reconstructor, frame).axes]
+    assert titles[2:] == ["Rest image of view left", "Rest image of view right"]
+
+
+def test_commands_take_an_image_of_each_view(press, tmp_path, capsys):
+    """simulate writes NAME_VIEW.png, reconstruct takes them; results keep the views apart, in files and tables."""
+    out, found = tmp_path / "out", tmp_path / "found"
+    press[0].at_rest().to_file(out)
+    for number in range(2):
+        for name, image in zip(("left", "right"), press[1], strict=True):
+            Image.fromarray(image).save(out / f"press{number}_{name}.png")
+    (out / "press1_right.png").unlink()
+    images = f"{out}/press*.png"
+    assert main(["reconstruct", str(out / "sensor.toml"), images, "--out", str(found), "--workers", "1", "--figures"]) == 1
+    assert "press1_right.png" in capsys.readouterr().err  # its frame has no result, the other one has
+    results = tm.read_results(found)
+    assert results.names == ["press0_left"] and results.mesh.views == 2 and results.mesh.rest_pixels.shape == (2, 49, 2)
+    frame = results["press0_left"]
+    assert frame["pixels"].shape == (2, 49, 2) and frame["residual"].shape == (2,) and (found / "press0_left.png").exists()
+    row = (found / "summary.csv").read_text().splitlines()[1]
+    assert row.startswith("press0_left,") and ",49,49," in row
+    with pytest.raises(MembraneError, match="of no view"):
+        of_first_view(Inputs([tmp_path / "press_left.png", tmp_path / "other.png"], []), ["left", "right"])
+
+
+def test_simulate_writes_an_image_for_each_view(press, tmp_path, capsys):
+    file = press[0].sensor.to_file(tmp_path / "sensor")
+    call = f"simulate {file} --indenter sphere --radius 3 --depth 0.5 --out {tmp_path / 'out'}".split()
+    assert main(call) == 0 and "press_left.png, " in capsys.readouterr().out
+    names = {path.name for path in (tmp_path / "out").glob("*.png")}
+    assert names == {"press_left.png", "press_right.png", "sensor_rest_left.png", "sensor_rest_right.png"}
+    assert len(tm.Sensor.from_file(tmp_path / "out" / "sensor.toml").views) == 2

@@ -1,0 +1,38 @@
+"""What an estimator is built from, of a sensor whose markers are placed."""
+
+import torch
+
+from ..markers.sightings import Sightings
+from ..mechanics.hyperelastic import ElasticEnergy
+from ..sensor.factories import CavityFilling
+from ..surface.membrane import Membrane
+from .base import Problem
+
+LEAST_ERROR = 0.02  # px
+
+
+def problem_of(seen: Sightings, membrane: Membrane, elasticity: ElasticEnergy, cavity: CavityFilling) -> Problem:
+    """The problem of a sensor, in double precision.
+
+    Args:
+        seen: how its markers are seen.
+        membrane: the rest surface on the solver's grid.
+        elasticity: of it.
+        cavity: what fills it.
+    """
+    views = len(seen.positions) // len(seen.markers.positions)
+    counts = torch.ones_like(seen.positions[:, 0]) if views == 1 else seen.observer.seen_at_rest.double()
+    return Problem(
+        camera=seen.camera,
+        membrane=membrane,
+        elasticity=elasticity,
+        filling=cavity.filling,
+        gas=cavity.gas,
+        markers=seen.points,
+        positions=seen.positions,
+        rest_pixels=seen.rest_pixels,
+        vertex_pixels=seen.vertex_pixels,
+        rest_covariance=2 * seen.observer.rest_covariance.double() + LEAST_ERROR**2 * torch.eye(2).double(),
+        rest_confidence=counts,
+        views=views,
+    )

@@ -1,0 +1,86 @@
+"""How a sensor's markers are seen: by its camera, or by each of its views; what a `Reconstructor` is built from."""
+
+import copy
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..camera.model import Camera
+from ..camera.rig import Rig
+from ..sensor.sensor import Sensor
+from ..sensor.views import SurfaceInView
+from ..surface.projection import SurfacePoints
+from .observer import MarkerObserver
+from .placement import PlacedMarkers, imaged_vertices, place_markers, refuse_blind
+from .views import ViewsObserver
+
+
+class Sightings(NamedTuple):
+    """A sensor's markers as they are seen, N times: D markers in each of W views, `N = W D`, the first view's first.
+
+    Attributes:
+        observer: finds them in images.
+        camera: what sees them: the `Camera`, or a `Rig` of several views.
+        markers: the D markers on the rest surface, with the first view's locator.
+        positions: `[N, 3]` at rest, length unit.
+        points: the same N as points of the membrane's triangles.
+        rest_pixels: `[N, 2]`, where the model sees them.
+        vertex_pixels: `[V, 2]`, where the first view sees the grid's vertices.
+    """
+
+    observer: MarkerObserver | ViewsObserver
+    camera: Camera | Rig
+    markers: PlacedMarkers
+    positions: Tensor
+    points: SurfacePoints
+    rest_pixels: Tensor
+    vertex_pixels: Tensor
+
+
+def sightings(sensor: Sensor, locator: str, dtype: torch.dtype, whole: bool, check_rest: bool) -> Sightings:
+    """The sightings of a sensor's markers.
+
+    Args:
+        sensor: the sensor.
+        locator: how markers are found in images, "fit" or "soft".
+        dtype: precision of the pixels.
+        whole: whether every vertex must be imaged.
+        check_rest: whether a rest image that disagrees with the model is refused.
+
+    Raises:
+        MembraneError: too few markers are seen, or not where the model has them.
+    """
+    observer, markers, vertex_pixels = _of_one_view(sensor.in_view(0), sensor.name, locator, dtype, whole, check_rest)
+    positions, rest_pixels = torch.from_numpy(markers.positions), torch.from_numpy(markers.model_pixels)
+    if not sensor.views:
+        camera = copy.deepcopy(sensor.camera)
+        return Sightings(observer, camera, markers, positions, markers.points, rest_pixels, vertex_pixels)
+    observers, pixels = [observer], [rest_pixels]
+    for number, view in enumerate(sensor.views[1:], 1):
+        name = f"{sensor.name}, view {view.name}"
+        observer, of_view, _ = _of_one_view(sensor.in_view(number), name, locator, dtype, whole, check_rest)
+        observers.append(observer)
+        pixels.append(torch.from_numpy(of_view.model_pixels))
+    regions = [view.region for view in sensor.views if view.region is not None]
+    together = ViewsObserver(observers, [view.name for view in sensor.views], regions or None)
+    outside = [view.side == "outside" for view in sensor.views]
+    rig = Rig([view.camera for view in sensor.views], [view.pose for view in sensor.views], outside)
+    points = SurfacePoints(*(np.concatenate([field] * len(observers)) for field in markers.points))
+    repeated = positions.repeat(len(observers), 1)
+    return Sightings(together, rig, markers, repeated, points, torch.cat(pixels), vertex_pixels)
+
+
+def _of_one_view(
+    sensor: Sensor, name: str, locator: str, dtype: torch.dtype, whole: bool, check_rest: bool
+) -> tuple[MarkerObserver, PlacedMarkers, Tensor]:
+    """Observer and markers of a sensor with one view, and its rest pixels of the vertices."""
+    vertex_pixels = sensor.camera.point_to_pixel(sensor.membrane.rest)
+    imaged = imaged_vertices(sensor, vertex_pixels, whole)
+    if isinstance(sensor.surface, SurfaceInView):
+        refuse_blind(sensor, name)
+    markers = place_markers(sensor, vertex_pixels, locator)
+    rim, rest_image = vertex_pixels[sensor.membrane.fixed & imaged].numpy(), sensor.markers.rest_image
+    observer = MarkerObserver(markers, rim, name, dtype, rest_image, sensor.camera.image_size, check_rest)
+    return observer, markers, vertex_pixels

@@ -1,0 +1,161 @@
+"""Markers that several views see: each view has its own locator, rest image and noise; what they show is listed view by view.
+
+Of W views of D markers there are `N = W D` sightings: all markers in the first view, then all in the second, and so on.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..control_flow import traced
+from ..errors import MembraneError
+from ..files.tensors import tensor_of
+from ..results.status import Status
+from .observer import MarkerFlow, MarkerObserver, RestState
+
+GRAVEST = (Status.BAD_VALUES, Status.BLANK, Status.TOO_FEW_MARKERS, Status.UNLIKE_REST)
+"""Of views that all fail: the first of these that one of them has is the frame's."""
+
+
+class ViewsObserver(nn.Module):
+    """Images of all views to what their markers show; as `MarkerObserver`, of sightings.
+
+    Args:
+        observers: of the views.
+        names: of the views, for messages.
+        regions: left, top, width, height of each view in the image that they share; None: each has a channel of its own.
+    """
+
+    def __init__(
+        self, observers: Sequence[MarkerObserver], names: Sequence[str], regions: Sequence[tuple[int, int, int, int]] | None
+    ):
+        super().__init__()
+        self.each, self.names, self.regions = nn.ModuleList(observers), list(names), regions
+        self.count, self.views = len(observers[0].rest_pixels), len(observers)
+
+    def _joined(self, name: str) -> Tensor:
+        return torch.cat([getattr(observer, name) for observer in self.each])
+
+    @property
+    def rest_pixels(self) -> Tensor:
+        """Where the model sees the markers at rest, `[N, 2]` px."""
+        return self._joined("rest_pixels")
+
+    @property
+    def measured_rest(self) -> Tensor:
+        """Where they are in the rest images, `[N, 2]` px."""
+        return self._joined("measured_rest")
+
+    @property
+    def rest_covariance(self) -> Tensor:
+        """Their noise there, `[N, 2, 2]` px^2."""
+        return self._joined("rest_covariance")
+
+    @property
+    def seen_at_rest(self) -> Tensor:
+        """Which of the sightings there are at rest, `[N]` bool."""
+        return self._joined("seen_at_rest")
+
+    @property
+    def follows(self) -> bool:
+        """Whether markers are looked for first where they were in the frame before."""
+        return all(observer.follows for observer in self.each)
+
+    def be_exact(self) -> None:
+        """Locate in double precision."""
+        for observer in self.each:
+            observer.be_exact()  # type: ignore[operator]
+
+    def by_view(self, values: Tensor) -> Tensor:
+        """Values `[B, N, ...]` as `[B, W, D, ...]`."""
+        return values.unflatten(1, (self.views, self.count))
+
+    def sighted(self, values: Tensor) -> Tensor:
+        """Values `[B, W, D, ...]` as `[B, N, ...]`."""
+        return values.flatten(1, 2)
+
+    def seen_by_each(self, values: Tensor) -> Tensor:
+        """Values of the markers, `[..., D, C]`, for each sighting, `[..., N, C]`."""
+        return torch.cat([values] * self.views, -2)
+
+    def images(self, grey: Tensor) -> list[Tensor]:
+        """Each view's images `[B, 1, height, width]`, of grey images `[B, 1, ...]` of the regions, or `[B, W, ...]`."""
+        if self.regions is None:
+            sizes = [observer.image_size for observer in self.each]
+            return [grey[:, w : w + 1, :height, :width] for w, (width, height) in enumerate(sizes)]  # type: ignore[misc]
+        return [grey[:, :, v : v + height, u : u + width] for u, v, width, height in self.regions]
+
+    def forward(self, images: Tensor, previous: Tensor | None = None, rest_pixels: Tensor | None = None) -> MarkerFlow:
+        """What grey images show, as of `MarkerObserver`; `status [B, W]` is each view's."""
+        befores, rests = self._split(previous, 1), self._split(rest_pixels, 0)
+        each = zip(self.each, self.images(images), befores, rests, strict=True)
+        return self._together([observer(*given) for observer, *given in each])
+
+    def from_pixels(self, pixels: Any, confidence: Any, rest_pixels: Any) -> MarkerFlow:
+        """What markers located elsewhere show; `pixels [B, W, D, 2]` or `[W, D, 2]`, the others alike."""
+        pixels, shape = tensor_of("from_pixels: pixels", pixels), (self.views, self.count, 2)
+        pixels = pixels[None] if pixels.ndim == 3 else pixels
+        if tuple(pixels.shape[1:]) != shape:
+            expected = f"[B, {self.views}, {self.count}, 2], of each view one for each marker"
+            raise MembraneError(f"from_pixels: pixels {list(pixels.shape)}; expected {expected}")
+        sure = [None] * self.views if confidence is None else tensor_of("from_pixels: confidence", confidence).unbind(-2)
+        rests = self._split(None if rest_pixels is None else self.rest_given(rest_pixels), 0)
+        each = zip(self.each, pixels.unbind(1), sure, rests, strict=True)
+        return self._together([observer.from_pixels(*given) for observer, *given in each])  # type: ignore[operator]
+
+    @traced
+    def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
+        """Displacements, confidence and status `[B]`: a view that fails is left out where another one does not."""
+        parts = zip(
+            *(self.by_view(each).unbind(1) for each in (displacement, confidence, covariance)), status.unbind(1), strict=True
+        )
+        judged = [observer.judge(*part) for observer, part in zip(self.each, parts, strict=True)]  # type: ignore[operator]
+        flow = self._together([part._replace(confidence=part.confidence * (part.status == 0)[:, None]) for part in judged])
+        fails = flow.status != Status.OK.value
+        gravest = torch.zeros_like(flow.status[:, 0])
+        for failure in reversed(GRAVEST):
+            gravest = torch.where((flow.status == failure.value).any(1), failure.value, gravest)
+        left_out = torch.where(fails.any(1), Status.VIEW_LEFT_OUT.value, Status.OK.value)
+        return flow._replace(status=torch.where(fails.all(1), gravest, left_out))
+
+    def rest_of(self, images: Tensor) -> RestState:
+        """The markers in grey images without contact, as of `MarkerObserver`, of all sightings."""
+        rests = [observer.rest_of(part) for observer, part in zip(self.each, self.images(images), strict=True)]  # type: ignore[operator]
+        return RestState(*map(torch.cat, zip(*rests, strict=True)))
+
+    def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels `[B, N, 2]` of the markers in grey images, and which of them are found `[B, N]`."""
+        found = [observer.locate(part) for observer, part in zip(self.each, self.images(images), strict=True)]  # type: ignore[operator]
+        pixels, is_found = zip(*found, strict=True)
+        return torch.cat(pixels, 1), torch.cat(is_found, 1)
+
+    def check_rest(self, name: str) -> None:
+        """Refuse a rest image that disagrees with the model by more than calibration could explain."""
+        for view, observer in zip(self.names, self.each, strict=True):
+            observer.check_rest(f"{name}, view {view}")  # type: ignore[operator]
+
+    def rest_given(self, rest_pixels: Any) -> Tensor:
+        """The markers at rest as a caller gives them, `[W, D, 2]` or `[N, 2]` px, as sightings."""
+        rest = tensor_of("rest_pixels", rest_pixels).to(self.rest_pixels)
+        if rest.shape[-1:] != (2,) or rest.numel() != 2 * self.views * self.count:
+            raise MembraneError(f"rest_pixels {list(rest.shape)}; expected [{self.views}, {self.count}, 2], of each view")
+        return rest.reshape(-1, 2)
+
+    def before(self, previous: Any, frames: int) -> Tensor:
+        """Pixels `[B, N, 2]` of a previous result, refused where it cannot be one of these frames'."""
+        given, expected = getattr(previous, "pixels", None), [frames, self.views, self.count, 2]
+        if not isinstance(given, Tensor) or list(given.shape) != expected:
+            came = f"pixels {list(given.shape)}" if isinstance(given, Tensor) else f"no pixels: a {type(previous).__name__}"
+            raise MembraneError(f"Reconstructor: previous has {came}; expected {expected}: an earlier result for each image")
+        return self.sighted(given.to(self.rest_pixels))
+
+    def _split(self, values: Tensor | None, axis: int) -> Sequence[Tensor | None]:
+        return [None] * self.views if values is None else values.chunk(self.views, axis)
+
+    def _together(self, flows: Sequence[MarkerFlow]) -> MarkerFlow:
+        displacement, confidence, covariance, status = zip(*flows, strict=True)
+        return MarkerFlow(
+            torch.cat(displacement, 1), torch.cat(confidence, 1), torch.cat(covariance, 1), torch.stack(status, 1)
+        )

@@ -1,0 +1,86 @@
+"""Images of several views, each of which has its own, as one grey batch."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..errors import MembraneError
+from ..files.grayscale import Channels, grey_batch
+from ..files.images import read_image
+from .views import View
+
+
+def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Tensor) -> Tensor:
+    """Grey images `[B, W, height, width]` in 0..1; a smaller view's are dark beyond its own size.
+
+    Args:
+        images: of W views, the first view's first: a list of W batches, each as `grey_batch` takes them; or stacked,
+            `[W, height, width]` or `[B, W, height, width]`, colour with its three channels last.
+        views: of the sensor.
+        channels: order of the channels of colour images.
+        like: a tensor of the precision and device.
+
+    Raises:
+        MembraneError: another number of views, or of frames in one of them.
+    """
+    count = len(views)
+    if not isinstance(images, list | tuple):
+        given = torch.as_tensor(images) if not isinstance(images, Tensor) else images
+        has_colours = given.ndim >= 4 and given.shape[-1] == 3
+        axis = given.ndim - 3 - has_colours
+        if axis not in (0, 1) or given.shape[axis] != count:
+            expected = (
+                f"a list of {count} batches, or [B, {count}, H, W], for the views {', '.join(view.name for view in views)}"
+            )
+            raise MembraneError(f"images {list(given.shape)}; expected {expected}")
+        images = given.unbind(axis)
+        if not has_colours:  # a stack may be as large as the largest view
+            sizes = [view.camera.image_size for view in views]
+            images = [batch[..., :height, :width] for batch, (width, height) in zip(images, sizes, strict=True)]
+    if len(images) != count:
+        raise MembraneError(f"images of {len(images)} views; expected {count}: {', '.join(view.name for view in views)}")
+    each = [
+        grey_batch(_as_batch(batch), view.camera.image_size, channels, like, view.camera.bits)
+        for batch, view in zip(images, views, strict=True)
+    ]
+    frames = [len(batch) for batch in each]
+    if len(set(frames)) > 1:
+        raise MembraneError(f"images: {frames} frames of the views; expected the same number of each")
+    height, width = (max(batch.shape[axis] for batch in each) for axis in (-2, -1))
+    return torch.cat([F.pad(batch, (0, width - batch.shape[-1], 0, height - batch.shape[-2])) for batch in each], 1)
+
+
+def read_views(path: Path, views: Sequence[View], like: Tensor) -> Tensor:
+    """A frame's images of all views, `[1, W, height, width]`, as of `grey_views`.
+
+    Args:
+        path: of the first view's image, NAME_VIEW and an ending; the others have the same name and ending, with their view's.
+        views: of the sensor.
+        like: a tensor of the precision and device.
+
+    Raises:
+        MembraneError: the file is not named after the first view, or a view's cannot be read.
+    """
+    first = f"_{views[0].name}"
+    if not path.stem.endswith(first):
+        raise MembraneError(f"{path}: expected the first view's image, NAME{first}{path.suffix}, beside those of the others")
+    stem = path.stem.removesuffix(first)
+    files = [path.with_name(f"{stem}_{view.name}{path.suffix}") for view in views]
+    images = [read_image(file, view.camera.image_size, view.camera.bits) for file, view in zip(files, views, strict=True)]
+    return grey_views(images, views, "rgb", like)
+
+
+def first_view_image(grey: Tensor, views: Sequence[View]) -> Tensor:
+    """The first view's image `[height, width]` of the grey image `[1, C, ...]` of a frame; that of a sensor with one view."""
+    left, top = (views[0].region or (0, 0))[:2] if views else (0, 0)
+    width, height = views[0].camera.image_size if views else (grey.shape[-1], grey.shape[-2])
+    return grey[0, 0, top : top + height, left : left + width]
+
+
+def _as_batch(images: Any) -> Any:
+    """Three grey frames `[3, H, W]` as such, which are no colours here."""
+    return images[:, None] if images.ndim == 3 and images.shape[-1] != 3 else images

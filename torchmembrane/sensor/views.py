@@ -1,0 +1,127 @@
+"""Several views of one membrane: cameras, or mirrors, each with its pose, and the rest surface as each of them sees it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..camera.model import Camera
+from ..errors import check_arguments, expect
+from ..files.images import read_image, to_grey
+from ..pose import ViewPose
+from ..surface.membrane import Membrane
+from .parts import Surface
+
+SIDES = ("inside", "outside")
+MOST_VIEWS = 8
+SAME_PLACE = 1e-9
+"""Largest entry by which the first view's pose may differ from none."""
+
+
+@check_arguments
+@dataclass(frozen=True, eq=False)
+class View:
+    """One view of a membrane by several cameras or mirrors.
+
+    Args:
+        name: one word, also of the files of its images.
+        camera: the calibrated `Camera`; of a region of a shared image that of the region, `camera.in_mode(region)`.
+        pose: of the view's frame in the first view's; reflected of a mirror.
+        rest_image: as of `Markers`, without contact; None: displacements are then from where the model sees the markers.
+        side: of the membrane at which it looks, "inside" | "outside".
+        is_region: whether it is a region of an image that all views share.
+
+    Raises:
+        MembraneError: names the value, what came and what was expected.
+
+    Example:
+        >>> camera = Camera("pinhole", (640, 480), (400, 400), (320, 240))
+        >>> View("left", camera, ViewPose(np.array([0.0, 30.0, 0.0]), np.array([-20.0, 0.0, 0.0]))).side
+        'inside'
+    """
+
+    name: str
+    camera: Camera
+    pose: ViewPose = field(default_factory=lambda: ViewPose(np.eye(3), np.zeros(3)))
+    rest_image: np.ndarray | None = None
+    side: str = SIDES[0]
+    is_region: bool = False
+
+    def __post_init__(self) -> None:
+        expected = "a name of letters, digits and dashes, of which image files are named"
+        expect(self.name.replace("-", "").isalnum() and self.name.isascii(), "View: name", self.name, expected)
+        expect(self.side in SIDES, "View: side", self.side, "'inside' or 'outside'")
+        if self.rest_image is not None:
+            given = self.rest_image
+            image = read_image(given) if isinstance(given, str) else to_grey(given)
+            object.__setattr__(self, "rest_image", image)
+            size, wanted = (image.shape[1], image.shape[0]), self.camera.image_size
+            expect(size == wanted, f"View {self.name!r}: size of its rest image", list(size), f"{list(wanted)}, its camera's")
+
+    @property
+    def region(self) -> tuple[int, int, int, int] | None:
+        """Left, top, width, height in the shared image, px; None: the view has images of its own."""
+        return tuple(self.camera.mode.crop) if self.is_region and self.camera.mode is not None else None  # type: ignore[return-value]
+
+    def membrane(self, membrane: Membrane) -> Membrane:
+        """The membrane in the view's frame; its outward normals point away from the view's camera, also of one outside."""
+        return membrane.in_frame(self.pose.inverse, outside=self.side == "outside")
+
+    def described(self) -> dict[str, Any]:
+        """Name, pose, region and side, as keys of the sensor's file."""
+        return {
+            "name": self.name,
+            "pose": self.pose.matrix.tolist(),
+            "region": None if self.region is None else list(self.region),
+            "side": None if self.side == SIDES[0] else self.side,
+        }
+
+
+class SurfaceInView(Surface):
+    """A rest surface in the frame of a view, which may see a part of it only.
+
+    Args:
+        surface: in the first view's frame.
+        view: the view.
+    """
+
+    def __init__(self, surface: Surface, view: View) -> None:
+        object.__setattr__(self, "shape", surface.shape)
+        object.__setattr__(self, "values", surface.values)
+        object.__setattr__(self, "whole", surface)
+        object.__setattr__(self, "view", view)
+
+    whole: Surface
+    view: View
+
+    def membrane(self, grid: tuple[int, int]) -> Membrane:
+        """The rest surface on a solver grid, in the view's frame."""
+        return self.view.membrane(self.whole.membrane(grid))
+
+
+def refuse_views(views: Sequence[View], has_listed_dots: bool) -> None:
+    """Refuse views that do not go together.
+
+    Args:
+        views: all of a sensor's, the first one first.
+        has_listed_dots: whether the markers are dots of a list.
+
+    Raises:
+        MembraneError: names the view, what came and what was expected.
+    """
+    expect(len(views) <= MOST_VIEWS, "views", len(views), f"at most {MOST_VIEWS}")
+    names = [view.name for view in views]
+    for number, name in enumerate(names):
+        expect(name not in names[:number], "View: name", name, "another name for each view")
+    expected = "four rows of the unit matrix: poses are to the first view, whose frame is that of the membrane"
+    first = views[0].pose.matrix
+    expect(bool(np.abs(first - np.eye(4)).max() <= SAME_PLACE), f"View {names[0]!r}: pose", first.tolist(), expected)
+    expect(views[0].side == SIDES[0], f"View {names[0]!r}: side", views[0].side, "'inside' of the first view: list it later")
+    expect(has_listed_dots, "markers of several views", "none listed", "dots with their positions (`file`), seen by any view")
+    parts = [view.region is not None for view in views]
+    expect(all(parts) or not any(parts), "region", "of some views", "one of each view, or of none")
+    wholes = [view.camera.mode.image_size for view in views if view.region is not None and view.camera.mode is not None]
+    for whole in wholes:
+        expected = f"{list(wholes[0])}, that of the first: regions are of one shared image"
+        expect(whole == wholes[0], "image_size of a view with a region", list(whole), expected)
