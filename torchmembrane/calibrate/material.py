@@ -156,6 +156,7 @@ def material_from_pixels(
     pressures: KnownPressures | None = None,
     *,
     overpressure: float | None = None,
+    noise: float | None = None,
     progress: Progress = silent,
 ) -> MaterialFit:
     """Prestretch from presses, and the modulus where their forces, or the pressures in the cavity, are known.
@@ -177,6 +178,7 @@ def material_from_pixels(
             `KnownForces`, with their deviations.
         pressures: what a gauge read.
         overpressure: what it read at rest, hPa.
+        noise: of the pixels, as for `Reconstructor.from_pixels`.
         progress: is told how far it is.
 
     Returns:
@@ -198,23 +200,22 @@ def material_from_pixels(
     expect(known, "calibrate material: pixels", f"a tensor {list(pixels.shape)}", expected)
     lost = ~pixels.isfinite().all(-1)
     displacement = torch.where(lost[..., None], 0.0, pixels - reconstructor.rest_pixels)
-    return _material(
-        sensor,
-        reconstructor,
-        MeasuredPresses(displacement, (~lost).to(pixels), _known(forces), pressures, overpressure),
-        progress,
-    )
+    confidence = (~lost).to(pixels)
+    covariance = None if noise is None else reconstructor.observer.covariance_of(noise, confidence)
+    measured = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure, covariance)
+    return _material(sensor, reconstructor, measured, progress)
 
 
 class MeasuredPresses(NamedTuple):
     """What is known of presses: the markers' displacement `[B, D, 2]` px and confidence `[B, D]`, forces or pressures as of
-    `material_from_pixels`."""
+    `material_from_pixels`, the displacements' covariance (default: the rest image's)."""
 
     displacement: Tensor
     confidence: Tensor
     forces: KnownForces | None
     pressures: KnownPressures | None
     overpressure: float | None
+    covariance: Tensor | None = None
 
 
 def _known(forces: np.ndarray | KnownForces | None) -> KnownForces | None:
@@ -224,11 +225,11 @@ def _known(forces: np.ndarray | KnownForces | None) -> KnownForces | None:
 def _material(
     sensor: Sensor, reconstructor: Reconstructor, known: MeasuredPresses, progress: Progress, rounds: int = GAS_ROUNDS
 ) -> MaterialFit:
-    displacement, confidence, forces, pressures, overpressure = known
+    displacement, confidence, forces, pressures, overpressure, covariance = known
     if pressures is not None:
         reconstructor.estimator.check_gauge()
-    presses = Presses(reconstructor, displacement, confidence)
-    of_round, later = _shares(sensor, any(given is not None for given in known[2:]), rounds, progress)
+    presses = Presses(reconstructor, displacement, confidence, covariance)
+    of_round, later = _shares(sensor, any(given is not None for given in known[2:5]), rounds, progress)
     of_profile = PROFILE_SHARE[0 if pressures is not None else 1 if forces is not None else 2]
     profile = presses.profile(within(of_round, 0.0, of_profile))
     of_modulus = within(of_round, of_profile, 1.0)
@@ -311,11 +312,14 @@ class Presses:
         reconstructor: the sensor's.
         displacement: `[B, D, 2]` of its markers, px.
         confidence: `[B, D]` of its markers.
+        covariance: `[B, D, 2, 2]` of the displacements, px^2; default: the rest image's.
     """
 
-    def __init__(self, reconstructor: Reconstructor, displacement: Tensor, confidence: Tensor):
+    def __init__(
+        self, reconstructor: Reconstructor, displacement: Tensor, confidence: Tensor, covariance: Tensor | None = None
+    ):
         self.reconstructor = reconstructor
-        self.observation = reconstructor.observation(displacement, confidence)
+        self.observation = reconstructor.observation(displacement, confidence, covariance)
 
     def explained(self, stretch: float, modulus: float, grid: tuple[int, int] | None = None) -> Explained:
         """The estimator with this material, on this grid, default the reconstructor's, and what it finds."""
