@@ -263,8 +263,8 @@ class Reconstructor(nn.Module):
         residual = (miss2.sum(-1) / (~lost).sum(-1).clamp_min(1)).sqrt()
         gone, status = (status != Status.OK.value) | broken, self._judged(status, found, normals, residual, in_view, broken)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
-        deviations = self.estimator.deviations(found, observation, contacts)
-        wrench = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1)
+        wrench, record = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1), self.sensor.record
+        deviations = self.estimator.deviations(found, observation, contacts).calibrated(wrench[:, :3], record.uncertainty)
         values = dict(
             vertices=x,
             displacement=u,

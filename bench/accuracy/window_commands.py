@@ -2,7 +2,7 @@
 
 python -m bench.accuracy.window_commands [--rims rectangle ...] [--keep DIR]
 
-The windows of `bench.accuracy.windows`: truth on an unstructured mesh, by another solver. Their photographs, at rest and of each
+The windows of `bench.accuracy.windows`: truth on an unstructured mesh, by another solver. Photographs, at rest and of each
 press, are drawn from the mesh: shaded triangles, and round dots of two sizes on the sheet, with noise of 40 dB. Then:
 
     init mine.toml RIM --height H --overpressure 12hPa --prestretch 1.1 --distance 40 --focal 480 --rest rest.png
@@ -29,7 +29,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 import torchmembrane as tm
-from bench.accuracy.windows import GAUGE, MODULUS, PITCH, PRESSES, STRETCH, Twin, centres, rims
+from bench.accuracy.windows import GAUGE, MODULUS, PITCH, STRETCH, Twin, centres, rims
 from torchmembrane.forming.outline import encloses, outline_of
 from torchmembrane.sensor.inflated import rim_lines
 
@@ -103,9 +103,10 @@ def measured(name: str, rim: np.ndarray, folder: Path, rng: np.random.Generator)
         paint.image(x, rng).save(folder / f"press_{k}.png")
         rows.append(f"press_{k}.png,{float(force.norm()):.5f},{KNOWN * float(force.norm()):.5f}")
     (folder / "forces.csv").write_text("\n".join(rows) + "\n")
-    (folder / "rim.csv").write_text(rim_lines(rim))
+    bent = bool(np.ptp(rim[:, 2]))
+    (folder / "rim.csv").write_text(rim_lines(rim if bent else rim[:, :2]))
     height = float(rest[:, 2].max()) - outline_of(rim).origin[2]
-    by_points = f"--outline rim.csv --distance {0 if np.ptp(rim[:, 2]) else DISTANCE:g}"
+    by_points = f"--outline rim.csv --distance {0 if bent else DISTANCE:g}"
     outline = f"{OPTIONS[name]} --distance {DISTANCE:g}" if name in OPTIONS else by_points
     known = f"{outline} --height {height:.3f}mm --focal 480 --centre 319.5,239.5 --rest rest.png"
     said = command(folder, f"init mine.toml {known} --overpressure {GAUGE:g}hPa --prestretch {STRETCH:g}")

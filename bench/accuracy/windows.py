@@ -21,7 +21,8 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 
 import torchmembrane as tm
-from torchmembrane.calibrate.material import KnownForces, material_from_pixels
+from torchmembrane.calibrate.known_modulus import KnownForces
+from torchmembrane.calibrate.material import material_from_pixels
 from torchmembrane.forming.outline import ellipse, encloses, outline_of, rectangle
 from torchmembrane.presets.blown_up import Stated, blown_up
 from torchmembrane.sensor.parts import Cavity, Markers
