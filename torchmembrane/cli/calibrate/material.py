@@ -72,7 +72,7 @@ def _of_forces(arguments: Namespace, found: MaterialFit, weighed: WeightFit | No
     if found.force_deviation is None:
         return []
     return [
-        f"forces are known to {100 * found.force_deviation:.2g} % (the errors of prestretch and modulus partly cancel in them), "
+        f"forces are known to {100 * found.force_deviation:.2g} % (in them errors of prestretch and modulus partly cancel) "
         f"if the height of the rest surface is right to {100 * arguments.rest_error:.2g} % (--rest-error)"
     ]
 
