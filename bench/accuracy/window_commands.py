@@ -103,11 +103,9 @@ def measured(name: str, rim: np.ndarray, folder: Path, rng: np.random.Generator)
         paint.image(x, rng).save(folder / f"press_{k}.png")
         rows.append(f"press_{k}.png,{float(force.norm()):.5f},{KNOWN * float(force.norm()):.5f}")
     (folder / "forces.csv").write_text("\n".join(rows) + "\n")
-    bent = bool(np.ptp(rim[:, 2]))
-    (folder / "rim.csv").write_text(rim_lines(rim if bent else rim[:, :2]))
+    (folder / "rim.csv").write_text(rim_lines(rim - [0.0, 0.0, DISTANCE] if np.ptp(rim[:, 2]) else rim[:, :2]))
     height = float(rest[:, 2].max()) - outline_of(rim).origin[2]
-    by_points = f"--outline rim.csv --distance {0 if bent else DISTANCE:g}"
-    outline = f"{OPTIONS[name]} --distance {DISTANCE:g}" if name in OPTIONS else by_points
+    outline = f"{OPTIONS.get(name, '--outline rim.csv')} --distance {DISTANCE:g}"
     known = f"{outline} --height {height:.3f}mm --focal 480 --centre 319.5,239.5 --rest rest.png"
     said = command(folder, f"init mine.toml {known} --overpressure {GAUGE:g}hPa --prestretch {STRETCH:g}")
     modulus = next(line for line in said.splitlines() if "modulus" in line)

@@ -149,7 +149,7 @@ def odd_ones(ratios: np.ndarray, deviations: np.ndarray) -> list[tuple[int, floa
 
 
 def modulus_at_rest(
-    sensor: Sensor, log_stretch: float, deviation: float, overpressure: float, raised: Sensor | None = None
+    sensor: Sensor, log_stretch: float, deviation: float, overpressure: float, other: Sensor | None = None
 ) -> ModulusEvidence:
     """The modulus that holds the rest surface against what a gauge reads there.
 
@@ -158,7 +158,7 @@ def modulus_at_rest(
         log_stretch: logarithm of the prestretch.
         deviation: its standard deviation.
         overpressure: at rest, hPa.
-        raised: the sensor whose rest surface is higher by one standard deviation.
+        other: the sensor whose rest surface's height differs by one standard deviation.
     """
     measured = overpressure * hectopascal(sensor.length_unit)
 
@@ -171,5 +171,5 @@ def modulus_at_rest(
 
     found, low, high = (modulus(float(np.exp(log_stretch + s * deviation))) for s in (0, -1, 1))
     change = float(np.sign(high - low) * max(abs(low - found), abs(high - found)))
-    by_height = 0.0 if raised is None else modulus(float(np.exp(log_stretch)), raised) - found
+    by_height = 0.0 if other is None else modulus(float(np.exp(log_stretch)), other) - found
     return ModulusEvidence("the gauge at rest", found, REST_ERROR * found, change, by_height)

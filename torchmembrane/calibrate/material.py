@@ -25,7 +25,7 @@ WRONG = 0.02  # probability that an image is explained wrongly altogether and ca
 GAS_SETTLED = 0.1  # change of a gas' modulus, relative, that changes the prestretch by less than its deviation
 FINE = 4001  # prestretches over which the probability is summed
 # What takes how much of the time, measured: of all, the markers in the images; of a round, the losses with pressures, forces or
-# neither known, and the same on a higher rest surface.
+# neither known, and the same on a rest surface of another height.
 IMAGES_SHARE, PROFILE_SHARE, HEIGHT_SHARE = 0.05, (0.5, 0.65, 0.85), 0.15
 
 
@@ -219,9 +219,9 @@ def _material(
     of_profile = PROFILE_SHARE[0 if known.pressures is not None else 1 if known.forces is not None else 2]
     shapes = _by_shapes(profile := presses.profile(within(of_round, 0.0, of_profile)))
     of_round(of_profile, "prestretch with the rest surface's error")
-    higher = presses.raised(known.rest_error)
-    by = height_effect(presses.told(shapes.around), higher.told(shapes.around), shapes.deviation, shapes.by_losses**2)
-    evidence = _Evidence(presses, higher, shapes, by)
+    other = presses.at_other_height(known.rest_error)
+    by = height_effect(presses.told(shapes.around), other.told(shapes.around), shapes.deviation, shapes.by_losses**2)
+    evidence = _Evidence(presses, other, shapes, by)
     evidence.gather(known, within(of_round, of_profile + HEIGHT_SHARE, 1.0))
     values = np.exp([shapes.mean])
     covariance, of_force, material = values**2 * (shapes.deviation**2 + by.shift**2), None, sensor.material
@@ -246,8 +246,8 @@ class _Evidence:
     """What forces and gauges tell of the modulus: `found`; magnitudes and pressures found and measured, `[B, 2]`, NaN where not
     known; sentences about measurements that the others contradict."""
 
-    def __init__(self, presses: Presses, higher: Presses, shapes: _ByShapes, by: HeightEffect) -> None:
-        self.presses, self.higher, self.by, self.at = presses, higher, by, (shapes.mean, shapes.deviation)
+    def __init__(self, presses: Presses, other: Presses, shapes: _ByShapes, by: HeightEffect) -> None:
+        self.presses, self.other, self.by, self.at = presses, other, by, (shapes.mean, shapes.deviation)
         self.magnitudes, self.gauged = np.full((2, len(shapes.each), 2), np.nan)
         self.found: list[ModulusEvidence] = []
         self.said: list[str] = []
@@ -262,11 +262,11 @@ class _Evidence:
                 for i, r, z in odd
             ]
         if known.pressures is not None:
-            *told, self.gauged = self.presses.gauge_modulus(*self.at, known.pressures, self.higher, progress)
+            *told, self.gauged = self.presses.gauge_modulus(*self.at, known.pressures, self.other, progress)
             self.found.append(ModulusEvidence("the gauge under presses", *told))
         if known.overpressure is not None:
-            sensor, raised = (presses.reconstructor.sensor for presses in (self.presses, self.higher))
-            self.found.append(modulus_at_rest(sensor, *self.at, known.overpressure, raised))
+            sensor, moved = (presses.reconstructor.sensor for presses in (self.presses, self.other))
+            self.found.append(modulus_at_rest(sensor, *self.at, known.overpressure, moved))
 
 
 def _shares(sensor: Sensor, with_modulus: bool, rounds: int, progress: Progress) -> tuple[Progress, Progress]:

@@ -13,7 +13,7 @@ from ..reconstruct import Reconstructor
 from ..sensor.factories import elastic_energy
 from .gauge import UNSURE, FoundPressures, GaugeModulus, modulus_from_pressures
 from .known_modulus import KnownForces, KnownPressures, odd_ones
-from .rest_error import PressesTold, raised
+from .rest_error import PressesTold, at_other_height
 from .stretch_loss import Explained, continued
 
 PRESSURE_GRID = (33, 33)  # on coarser ones pressure changes are off by up to a tenth
@@ -53,10 +53,10 @@ class Presses:
         self.reconstructor, self.measured = reconstructor, (displacement, confidence, covariance)
         self.observation = reconstructor.observation(*self.measured)
 
-    def raised(self, share: float) -> "Presses":
-        """The same markers where the rest surface is higher by a share."""
+    def at_other_height(self, share: float) -> "Presses":
+        """The same markers where the rest surface's height differs by a share."""
         r = self.reconstructor
-        sensor, kept = raised(r.sensor, r.rest_markers.double().numpy(), share)
+        sensor, kept = at_other_height(r.sensor, r.rest_markers.double().numpy(), share)
         return Presses(Reconstructor(sensor, dtype=torch.float64, check_rest=False), *(a[:, kept] for a in self.measured))
 
     def explained(self, stretch: float, modulus: float, grid: tuple[int, int] | None = None) -> Explained:
@@ -109,11 +109,11 @@ class Presses:
         log_stretch: float,
         deviation: float,
         pressures: KnownPressures,
-        higher: "Presses | None" = None,
+        other: "Presses | None" = None,
         progress: Progress = silent,
     ) -> tuple[float, float, float, float, np.ndarray]:
         """The modulus from pressures; arguments and what is returned as of `modulus`, with pressure changes for forces, and
-        before these the change where the rest surface is `higher`."""
+        before these the change on the rest surface of another height."""
         modulus = self.reconstructor.sensor.material.modulus
         progress(0.0, "modulus from pressures")
         fitted = self._gauge_fit(np.exp(log_stretch), modulus, pressures)
@@ -125,8 +125,8 @@ class Presses:
         low, high = changes
         change = float(np.sign(high - low) * max(abs(low), abs(high)))
         progress(0.75, "modulus from pressures with the rest surface's error")
-        raised = fitted if higher is None else higher._gauge_fit(np.exp(log_stretch), fitted.modulus, pressures)
-        return fitted.modulus, fitted.deviation, change, raised.modulus - fitted.modulus, fitted.pressures
+        moved = fitted if other is None else other._gauge_fit(np.exp(log_stretch), fitted.modulus, pressures)
+        return fitted.modulus, fitted.deviation, change, moved.modulus - fitted.modulus, fitted.pressures
 
     def _gauge_fit(self, stretch: float, begin: float, pressures: KnownPressures) -> GaugeModulus:
         def found(modulus: float) -> FoundPressures:

@@ -1,4 +1,4 @@
-"""How sure a rest surface is: the sensor whose surface is higher over its rim, and what that does to what presses tell.
+"""How sure a rest surface is: the sensor whose surface has another height over its rim, and what presses tell then.
 
 Dots that were placed from the rest image lie on its rays whatever the surface: they are moved along these. What the image
 leaves open is mostly one number, how high the surface stands over its rim.
@@ -10,13 +10,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ..errors import expect
+from ..errors import MembraneError, expect
 from ..sensor.inflated import InflatedSurface
 from ..sensor.parts import Markers, Surface
 from ..sensor.sensor import Sensor
 from ..surface.membrane import Membrane
 from ..surface.topology import rim_loop
-from .surface import FINE
 
 HEIGHT_ERROR = 0.05
 """Standard deviation of the rest surface's height over its rim, relative, where nothing is said of it."""
@@ -25,7 +24,7 @@ MOST_SHIFT = 3.0  # of the prestretch by the height, in standard deviations by t
 
 
 @dataclass(frozen=True, eq=False)
-class _Raised(Surface):
+class _Scaled(Surface):
     """A surface whose heights over its rim's plane are larger by a share."""
 
     share: float = 0.0
@@ -40,8 +39,10 @@ class _Raised(Surface):
         return Membrane(x + self.share * ((x - centre) @ normal)[..., None] * normal, fixed)
 
 
-def raised(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
-    """The sensor whose rest surface is higher over its rim by a share, its markers where their rays meet it.
+def at_other_height(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
+    """The sensor whose rest surface is lower over its rim by a share, its markers where their rays meet it.
+
+    Where a surface folds when it is lowered, it is raised: what a small change does has then the other sign throughout.
 
     Args:
         sensor: any.
@@ -50,26 +51,41 @@ def raised(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor,
 
     Returns:
         The sensor, without a rest image, and which markers it has, `[D]` bool: the rays of others miss the surface.
+
+    Raises:
+        MembraneError: the surface folds either way.
     """
-    expect(
-        0 < share <= MOST_ERROR, "calibrate material: rest error", share, f"more than 0, at most {MOST_ERROR:g} of the height"
+    right = 0 < share <= MOST_ERROR
+    expect(right, "calibrate material: rest error", share, f"more than 0, at most {MOST_ERROR:g}, of the height")
+    for change in (-share, share):
+        try:
+            return _changed(sensor, positions, change)
+        except MembraneError as error:
+            refused = error
+    raise MembraneError(
+        f"calibrate material: with its height changed by {share:g} the rest surface folds ({refused}); expected a smaller "
+        "--rest-error, or a surface that the camera sees at less of a slant"
     )
+
+
+def _changed(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
     surface = sensor.surface
     if isinstance(surface, InflatedSurface):
         surface = surface.of_height((1 + share) * surface.formed.height)
     else:
-        surface = _Raised(surface.shape, surface.values, share)
+        surface = _Scaled(surface.shape, surface.values, share)
+    membrane = surface.membrane(sensor.membrane.grid)
     rays = sensor.camera.pixel_to_ray(sensor.camera.point_to_pixel(torch.from_numpy(positions)))
     origins, directions = rays.origin.numpy(), rays.direction.numpy()
-    distance = surface.membrane((FINE, FINE)).ray_points(origins, directions).distance
-    kept = np.isfinite(distance)
-    markers = Markers("dots", positions=(origins + distance[:, None] * directions)[kept])
-    moved = replace(sensor, surface=surface, membrane=surface.membrane(sensor.membrane.grid), markers=markers)
-    return moved, kept
+    before, after = (surface.ray_points(origins, directions).distance for surface in (sensor.membrane, membrane))
+    moved = after - before  # of facets on the same grid: a marker that is off its facet stays so
+    kept = np.isfinite(moved)
+    markers = Markers("dots", positions=(positions + moved[:, None] * directions)[kept])
+    return replace(sensor, surface=surface, membrane=membrane, markers=markers), kept
 
 
 class HeightEffect(NamedTuple):
-    """What presses tell otherwise where the rest surface is higher.
+    """What presses tell otherwise where the rest surface has another height, by one standard deviation of it.
 
     Attributes:
         shift: of the logarithm of the prestretch that they tell.
@@ -90,7 +106,7 @@ class PressesTold(NamedTuple):
     forces: np.ndarray
 
 
-def height_effect(own: PressesTold, higher: PressesTold, step: float, variance: float) -> HeightEffect:
+def height_effect(own: PressesTold, other: PressesTold, step: float, variance: float) -> HeightEffect:
     """From what presses tell on both surfaces.
 
     Near its minimum the loss is a parabola over the prestretch's logarithm, of curvature 1 / variance; a slope `k` that the
@@ -98,12 +114,12 @@ def height_effect(own: PressesTold, higher: PressesTold, step: float, variance: 
 
     Args:
         own: on the sensor's surface.
-        higher: on the surface raised by one standard deviation.
+        other: on that of another height.
         step: of the prestretch's logarithm.
         variance: of the prestretch's logarithm by the presses' losses.
     """
-    added = higher.losses - own.losses
+    added = other.losses - own.losses
     bound = MOST_SHIFT * variance**0.5
     shift = float(np.clip(-variance * (added[2] - added[0]) / (2 * step), -bound, bound))
     low, middle, high = np.log(own.forces).mean(1)
-    return HeightEffect(shift, float(high - low) / 2, float(np.log(higher.forces[1]).mean() - middle))
+    return HeightEffect(shift, float(high - low) / 2, float(np.log(other.forces[1]).mean() - middle))
