@@ -113,7 +113,8 @@ def _material_options(add: Add) -> None:
     add("--overpressure", metavar="P", type=pressure, help=at_rest)
     sure = "standard deviation of the rest surface's height over its rim, relative (default: %(default)s)"
     add("--rest-error", metavar="SHARE", type=number_from(1e-3, MOST_HEIGHT_ERROR), default=HEIGHT_ERROR, help=sure)
-    add("--weight", metavar="WEIGHT", type=weight, help="that lies on the membrane in every image, alone, as 200g or 1.96N")
+    lies = "that lies on the membrane, alone, in every image that --forces does not list, as 200g or 1.96N"
+    add("--weight", metavar="WEIGHT", type=weight, help=lies)
 
 
 def _layout_options(add: Add) -> None:

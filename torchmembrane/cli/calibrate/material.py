@@ -7,17 +7,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ...calibrate.known_modulus import KnownPressures
+from ...calibrate.known_modulus import KnownForces, KnownPressures
 from ...calibrate.material import MaterialFit, material_from_images
 from ...calibrate.presses import STRETCHES
 from ...calibrate.report import Report
 from ...calibrate.weight import WeightFit, material_from_weight
-from ...errors import MembraneError
 from ...files.timestamps import time_in
 from ...jobs.inputs import Inputs, find_inputs, frame_name, single_images
 from ...jobs.pressure import read_pressures
 from ...plot.calibration import material_figure
-from ...progress import Progress
 from ...reconstruct import Reconstructor
 from ...results.status import Status
 from ...sensor.sensor import Sensor
@@ -29,11 +27,12 @@ def material(arguments: Namespace) -> int:
     """`torchmembrane calibrate material`"""
     sensor, inputs = read_sensor(arguments), find_inputs(arguments.images)
     paths = single_images(inputs)
-    forces = read_forces(arguments.forces, inputs) if arguments.forces else None
+    alone = arguments.weight is not None and not (arguments.forces or arguments.pressure or arguments.overpressure)
+    forces = known_forces(arguments, inputs)
     pressures = _pressures(arguments, inputs, sensor) if arguments.pressure else None
     images = torch.from_numpy(np.stack([read_sensor_image(path, sensor) for path in paths]))[:, None]
     with ProgressDisplay("calibrate material") as progress:
-        weighed = _weighed(arguments, sensor, images, progress) if arguments.weight else None
+        weighed = material_from_weight(sensor, images, arguments.weight, progress=progress) if alone else None
         known = dict(overpressure=arguments.overpressure, rest_error=arguments.rest_error, progress=progress)
         found = material_from_images(sensor, images, forces, pressures, **known) if weighed is None else weighed.material
     unit, n = sensor.length_unit, len(found.values)
@@ -93,13 +92,21 @@ def _doubted(sensor: Sensor, images: torch.Tensor, paths: list[Path]) -> list[st
     ]
 
 
-def _weighed(arguments: Namespace, sensor: Sensor, images: torch.Tensor, progress: Progress) -> WeightFit:
-    if arguments.forces or arguments.pressure or arguments.overpressure:
-        raise MembraneError(
-            "calibrate material: --weight with --forces, --pressure or --overpressure; expected the weight alone, or its force "
-            "in the file of --forces, which goes with gauges"
-        )
-    return material_from_weight(sensor, images, arguments.weight, progress=progress)
+def known_forces(arguments: Namespace, inputs: Inputs) -> KnownForces | None:
+    """Those of the table, and in images without one the weight; None without either.
+
+    Args:
+        arguments: `forces`, a table, and `weight`, N.
+        inputs: the images.
+    """
+    table = read_forces(arguments.forces, inputs) if arguments.forces else None
+    if arguments.weight is None:
+        return table
+    weights = np.full((len(inputs.images), 1), arguments.weight)
+    if table is None:
+        return KnownForces(weights)
+    sizes = np.linalg.norm(table.forces, axis=1, keepdims=True)
+    return KnownForces(np.where(np.isfinite(sizes), sizes, weights), table.deviations)
 
 
 def _pressures(arguments: Namespace, inputs: Inputs, sensor: Sensor) -> KnownPressures:
