@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from torchmembrane.calibrate import material
+from torchmembrane.calibrate import material, presses
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.markers.dots import pattern
@@ -112,7 +112,7 @@ def calibration_grids(request, monkeypatch):
     """Those of `calibrate material`: coarser ones and fewer prestretches; with the mark `full` its own."""
     if request.param == "coarse":
         monkeypatch.setattr(material, "GRID", (9, 9))
-        monkeypatch.setattr(material, "PRESSURE_GRID", (17, 17))
-        monkeypatch.setattr(material, "STRETCHES", np.geomspace(1.05, 1.7, 6))
-        monkeypatch.setattr(material, "BETWEEN", 3)
+        monkeypatch.setattr(presses, "PRESSURE_GRID", (17, 17))
+        monkeypatch.setattr(presses, "STRETCHES", np.geomspace(1.05, 1.7, 6))
+        monkeypatch.setattr(presses, "BETWEEN", 3)
     return request.param

@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 
 from torchmembrane import __version__, presets
-from torchmembrane.calibrate import camera
+from torchmembrane.calibrate import camera, rest_error
 from torchmembrane.camera import model
 from torchmembrane.cli import arguments as types
 from torchmembrane.cli import choices
@@ -300,6 +300,7 @@ def test_the_options_choices_are_what_the_package_has():
     assert choices.LOCATORS == placement.LOCATORS
     assert (*choices.DRAFTS, choices.OUTLINE) == tuple(draft.SHAPES) and choices.LENGTH_UNITS == tuple(units.METRE)
     assert choices.LENSES == tuple(model.COEFFICIENTS) and choices.LONGEST_SIDE == model.LONGEST_SIDE
+    assert (choices.HEIGHT_ERROR, choices.MOST_HEIGHT_ERROR) == (rest_error.HEIGHT_ERROR, rest_error.MOST_ERROR)
     assert choices.FARTHEST == checks.FARTHEST
     assert choices.FILLINGS == parts.FILLINGS
     assert choices.PRESETS == presets.NAMES and choices.INDENTERS == dataset.KINDS and choices.LEGS == simulator.LEGS

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchmembrane import Reconstructor
+from torchmembrane import MembraneError, Reconstructor, Status
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.contacts import Contacts
@@ -270,3 +270,14 @@ def test_the_gap_is_the_mean_distance_to_the_nearest_markers_that_are_seen():
     seen[0, 0] = 0
     assert float(gap_around(deepest, positions, seen, dome)[0]) == pytest.approx(3.5)
     assert float(gap_around(deepest, positions, 0 * seen, dome)[0]) == pytest.approx(dome.size)
+
+
+def test_pixels_as_noisy_as_they_are_said_to_be_are_explained():
+    reconstructor = Reconstructor(preset("bubble"))
+    u, v = 0.2 * torch.randn(2, *reconstructor.rest_pixels.shape, generator=torch.Generator().manual_seed(0))
+    pixels, rest = reconstructor.rest_pixels + u, reconstructor.rest_pixels + v
+    unsaid, said = (reconstructor.from_pixels(pixels, rest_pixels=rest, noise=noise) for noise in (None, 0.2))
+    assert unsaid.status.tolist() == [Status.UNEXPLAINED] and said.status.tolist() == [Status.OK]
+    for wrong in (0.0, -0.1, float("nan"), 1e3):
+        with pytest.raises(MembraneError, match="noise of pixels"):
+            reconstructor.from_pixels(pixels, noise=wrong)

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from torchmembrane import MembraneError, Sensor
 from torchmembrane.cli.main import main
-from torchmembrane.forming.formed import LINES, SheetMaterial, formed_surface
+from torchmembrane.forming import outline_grid as outline_grid_module
+from torchmembrane.forming.formed import LINES, SheetMaterial, film, formed_surface
 from torchmembrane.forming.outline import ellipse, outline_of, rectangle
 from torchmembrane.forming.sheet_energy import SheetEnergy
 from torchmembrane.mechanics.cavity import rest_balance
@@ -315,3 +316,12 @@ def test_a_sheet_is_the_same_in_every_unit_of_length(unit):
     )
     np.testing.assert_allclose(other.vertices / unit, one.vertices, atol=1e-9)
     assert other.pressure * unit == pytest.approx(one.pressure, rel=1e-9)
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_rest_surface_is_the_same_without_gradients(mode):
+    rim = np.insert(ellipse((41.0, 30.0)), 2, 30.0, axis=1)
+    with mode():
+        found = film(rim, 9).vertices
+    outline_grid_module._outline_grid.cache_clear()
+    np.testing.assert_array_equal(found, film(rim, 9).vertices)

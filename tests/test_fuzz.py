@@ -7,7 +7,18 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FEW = ["sensors=40", "images=40", "npz=20", "parquet=20", "readings=35", "dots=35", "motions=35", "forces=35", "videos=15"]
+FEW = [
+    "sensors=40",
+    "images=40",
+    "npz=20",
+    "parquet=20",
+    "readings=35",
+    "dots=35",
+    "motions=35",
+    "forces=35",
+    "rims=15",
+    "videos=15",
+]
 MORE = [
     "sensors=120",
     "images=120",
@@ -17,6 +28,7 @@ MORE = [
     "dots=100",
     "motions=100",
     "forces=100",
+    "rims=60",
     "videos=30",
 ]
 

@@ -9,7 +9,8 @@ import torch
 
 from torchmembrane import MembraneError
 from torchmembrane.calibrate.gauge import GAUGE_ERROR, PRESSURE_ERROR, FoundPressures, modulus_from_pressures
-from torchmembrane.calibrate.material import KnownPressures, material_from_pixels
+from torchmembrane.calibrate.known_modulus import KnownPressures
+from torchmembrane.calibrate.material import material_from_pixels
 from torchmembrane.camera.model import Camera
 from torchmembrane.cli import main as cli
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy

@@ -20,7 +20,6 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 LONG_FILE, LONGEST_FILE, LONGEST_FUNCTION = 350, 450, 50
 ONE_THING: dict[str, str] = {
-    "calibrate/material.py": "presses explained with one material or another, and the material found by it",
     "mechanics/hyperelastic.py": "one energy with its gradient and Hessian",
 }
 """Files of more than `LONG_FILE` lines, and why each is one thing."""

@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from torchmembrane import Sensor
-from torchmembrane.calibrate.known_modulus import ModulusEvidence, joined, modulus_at_rest, odd_ones
-from torchmembrane.calibrate.material import FORCE_ERROR, KnownForces
+from torchmembrane.calibrate.known_modulus import (
+    FORCE_ERROR,
+    KnownForces,
+    ModulusEvidence,
+    joined,
+    modulus_at_rest,
+    odd_ones,
+)
 from torchmembrane.cli.calibrate.files import read_forces
 from torchmembrane.jobs.inputs import Inputs
 from torchmembrane.mechanics.cavity import rest_balance
@@ -29,7 +35,7 @@ def test_measurements_that_agree_are_surer_together_and_ones_that_differ_less_su
 def test_one_measurement_leaves_the_prestretch_and_what_it_does_to_the_modulus():
     """Covariance `[[1, g], [g, s^2 + g^2]]` of the shift and the modulus' logarithm."""
     found = joined([ModulusEvidence("forces", 0.5, 0.05, -0.1)])
-    np.testing.assert_allclose(found.covariance, [[1.0, -0.2], [-0.2, 0.1**2 + 0.2**2]])
+    np.testing.assert_allclose(found.covariance[:2, :2], [[1.0, -0.2], [-0.2, 0.1**2 + 0.2**2]])
 
 
 def test_two_measurements_that_depend_on_the_prestretch_in_their_own_way_tell_it():
@@ -41,6 +47,20 @@ def test_two_measurements_that_depend_on_the_prestretch_in_their_own_way_tell_it
     assert found.covariance[0, 0] < 0.02 and not found.contradictions
     alike = joined([at_rest, at_rest._replace(source="b")])
     assert alike.shift == pytest.approx(0.0, abs=1e-6) and alike.covariance[0, 0] > 0.99  # an error that both share stays
+
+
+def test_an_uncertain_height_of_the_rest_surface_enters_prestretch_and_modulus():
+    """`t = e + b h`, `log m = log m_1 + g t + c h` with `e`, `h` of variance 1; what two tell in their own way is known."""
+    one = ModulusEvidence("gauge", 0.5, 0.01, -0.1, 0.05)
+    s, g, b, c = 0.02, -0.2, 0.3, 0.1
+    along = g * b + c
+    expected = [[1 + b**2, g + b * along, b], [g + b * along, s**2 + g**2 + along**2, along], [b, along, 1.0]]
+    np.testing.assert_allclose(joined([one], b).covariance, expected, atol=1e-12)
+    true = 0.7  # higher by so many deviations; the prestretch as the shapes say
+    gauge = ModulusEvidence("gauge", 0.5 * np.exp(-0.3 * true), 0.001, 0.0, 0.3 * 0.5 * np.exp(-0.3 * true))
+    forces = ModulusEvidence("forces", 0.5 * np.exp(0.1 * true), 0.001, 0.0, -0.1 * 0.5 * np.exp(0.1 * true))
+    found = joined([gauge, forces])
+    assert found.modulus == pytest.approx(0.5, rel=0.003) and found.covariance[2, 2] < 0.01 and not found.contradictions
 
 
 def test_each_force_that_the_others_contradict_is_named():

@@ -18,6 +18,7 @@ from torchmembrane.accuracy.finished import FinishedSeries
 from torchmembrane.accuracy.measure import spec_sheet
 from torchmembrane.accuracy.spec_sheet import Effort, Outcome, PairTrial, PressTrial, RestTrial
 from torchmembrane.calibrate import depth, material, rest, views
+from torchmembrane.calibrate import presses as presses_module
 from torchmembrane.cli import main as cli
 from torchmembrane.cli import progress as shown
 from torchmembrane.cli.progress import LINE_SECONDS, ProgressDisplay
@@ -165,9 +166,9 @@ def test_the_losses_tell_equal_steps_up_to_the_end(monkeypatch):
         explained=lambda stretch, modulus: (stretch, SimpleNamespace(unexplained=torch.tensor([(stretch - 1.4) ** 2]))),
     )
     for name in ("_solutions", "_profile"):
-        setattr(presses, name, getattr(material.Presses, name).__get__(presses))
+        setattr(presses, name, getattr(presses_module.Presses, name).__get__(presses))
     monkeypatch.setattr("torchmembrane.calibrate.stretch_loss._better", lambda own, *_: own)
-    found = material.Presses.profile(presses, lambda share, _: told.append(share))
+    found = presses_module.Presses.profile(presses, lambda share, _: told.append(share))
     assert len(found.stretches) == 14 and told[0] == 0 and told == sorted(told) and 0.9 < told[-1] < 1
 
 

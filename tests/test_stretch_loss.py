@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchmembrane.calibrate.material import Presses
+from torchmembrane.calibrate.presses import Presses
 from torchmembrane.calibrate.stretch_loss import continued
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance.gauss_newton import State

@@ -14,7 +14,9 @@ import torch
 import torchmembrane as tm
 from torchmembrane.calibrate import weight as weight_module
 from torchmembrane.cli import arguments
+from torchmembrane.cli.calibrate.material import known_forces
 from torchmembrane.cli.main import main
+from torchmembrane.jobs.inputs import Inputs
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NAMES = ("press_on_axis", "two_contacts", "flat_plate")
@@ -131,11 +133,14 @@ def test_a_weight_is_the_same_in_all_of_its_units():
         assert arguments.weight(text) == pytest.approx(1.96133, rel=1e-12)
 
 
-def test_a_weight_beside_forces_is_refused(tmp_path, capsys):
-    (tmp_path / "forces.csv").write_text("image,force\nflat_plate.png,1\n")
-    call = ["calibrate", "material", str(EXAMPLES / "sensor.toml"), str(EXAMPLES / "flat_plate.png"), "--weight", "2N"]
-    assert main([*call, "--forces", str(tmp_path / "forces.csv"), "--out", str(tmp_path / "out")]) == 2
-    assert "--weight with --forces" in capsys.readouterr().err
+def test_a_weight_beside_a_table_is_the_force_of_the_images_that_the_table_lacks(tmp_path):
+    images = Inputs([tmp_path / f"{name}.png" for name in "abc"], [])
+    (tmp_path / "forces.csv").write_text("image,fx,fy,fz,deviation\nb.png,0,3,-4,0.1\n")
+    both = known_forces(SimpleNamespace(forces=tmp_path / "forces.csv", weight=2.0), images)
+    np.testing.assert_allclose(both.forces, [[2.0], [5.0], [2.0]])
+    np.testing.assert_array_equal(both.deviations, [np.nan, 0.1, np.nan])
+    np.testing.assert_array_equal(known_forces(SimpleNamespace(forces=None, weight=2.0), images).forces, np.full((3, 1), 2.0))
+    assert known_forces(SimpleNamespace(forces=None, weight=None), images) is None
 
 
 @pytest.mark.usefixtures("calibration_grids")

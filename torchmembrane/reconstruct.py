@@ -38,9 +38,7 @@ LARGEST_RESIDUAL = 1.5  # px, of a plausible answer, however noisy its image
 
 
 class Reconstructor(nn.Module):
-    """Images of one sensor to surfaces.
-
-    Calling it with images gives a `Reconstruction`; `from_pixels` starts from markers located elsewhere.
+    """Images of one sensor to surfaces, called with images; `from_pixels` starts from markers located elsewhere.
 
     Args:
         sensor: a `Sensor` (`Reconstructor.from_file` reads one).
@@ -206,6 +204,7 @@ class Reconstructor(nn.Module):
         confidence: Tensor | None = None,
         rest_pixels: Tensor | None = None,
         pressure: Tensor | float | None = None,
+        noise: float | None = None,
     ) -> Reconstruction:
         """Reconstruct from marker centres located elsewhere; those that belong with no neighbour get confidence 0.
 
@@ -214,13 +213,14 @@ class Reconstructor(nn.Module):
             confidence: `[B, D]` or `[D]` in 0..1; default: 1 where finite.
             rest_pixels: `[D, 2]`, the same markers located in the rest image; default: the model's rest pixels.
             pressure: as for images.
+            noise: standard deviation of one marker's u and v, px; default: 0.05 in these images, and at rest the rest image's.
 
         Raises:
             MembraneError: another shape, or a confidence outside 0..1.
         """
         check_precision(self.rest_pixels.dtype)
         with full_precision(self.rest_pixels.device.type):
-            flow = self.observer.from_pixels(pixels, confidence, rest_pixels)
+            flow = self.observer.from_pixels(pixels, confidence, rest_pixels, noise)
             return in_inference_mode(self._solve, flow, pressure)
 
     def _seen(self, grey: Tensor, before: Tensor | None, rest: Tensor | None, *gauge: Any) -> Reconstruction:
@@ -261,8 +261,8 @@ class Reconstructor(nn.Module):
         residual = (by_view(miss2).sum(-1) / (~by_view(lost)).sum(-1).clamp_min(1)).sqrt()
         gone, status = ~is_seen(status) | broken, self._judged(status, found, normals, residual, in_view, broken)
         contacts, load = self.estimator.contacts(found, normals), found.traction * membrane.rest_area[:, None]
-        deviations = self.estimator.deviations(found, observation, contacts)
-        wrench = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1)
+        wrench, record = torch.cat([load, torch.linalg.cross(x, load)], -1).sum(1), self.sensor.record
+        deviations = self.estimator.deviations(found, observation, contacts).calibrated(wrench[:, :3], record.uncertainty)
         values = dict(
             vertices=x,
             displacement=u,

@@ -21,7 +21,8 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 
 import torchmembrane as tm
-from torchmembrane.calibrate.material import KnownForces, material_from_pixels
+from torchmembrane.calibrate.known_modulus import KnownForces
+from torchmembrane.calibrate.material import material_from_pixels
 from torchmembrane.forming.outline import ellipse, encloses, outline_of, rectangle
 from torchmembrane.presets.blown_up import Stated, blown_up
 from torchmembrane.sensor.parts import Cavity, Markers
@@ -104,6 +105,16 @@ class Twin:
         first = (self.inverse * g).sum((1, 2))
         return (self.area * MODULUS / 2 * (STRETCH**2 * first + self.det / torch.linalg.det(g) / STRETCH**4 - 3)).sum()
 
+    def at(self, wanted: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Points of the sheet `[D, 2]` on the mesh, those outside left out: the vertices around each `[D, 3]`, and weights."""
+        a, b, c = self.flat[self.cells.numpy()].transpose(1, 0, 2)
+        inverse = np.linalg.inv(np.stack([b - a, c - a], -1))
+        share = np.einsum("tij,dtj->dti", inverse, wanted[:, None] - a)
+        weights = np.concatenate([1 - share.sum(-1, keepdims=True), share], -1)
+        inside = weights.min(-1)
+        cell, kept = inside.argmax(1), inside.max(1) > -1e-9
+        return self.cells[cell[kept]], torch.from_numpy(weights[np.arange(len(wanted)), cell][kept])
+
     def blown_up(self) -> Tensor:
         x = self.sheet.clone()
         width = np.abs(self.flat).max(0)
@@ -157,6 +168,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rng, errors = np.random.default_rng(0), []
+    noise = {"noise": arguments.noise} if arguments.noise else {}
     camera = tm.Camera("pinhole", (640, 480), (480.0, 480.0), (321.0, 238.0))
     for name, rim in rims().items():
         if name not in arguments.rims:
@@ -184,7 +196,7 @@ def main() -> None:
         cavity, markers = Cavity("gas", AIR + GAUGE, gas), Markers("dots", positions=positions)
         sensor = tm.Sensor(name, "mm", camera, membrane, found.material, cavity, markers, found.surface)
         if arguments.material:
-            calibrated(name, sensor, [twin.pressed(rest, centre, gas) for centre in centres(rest)], seen, kept)
+            calibrated(name, sensor, [twin.pressed(rest, centre, gas) for centre in centres(rest)], seen, kept, noise)
             continue
         reconstructor = tm.Reconstructor(sensor)
         modulus = found.material.modulus / MODULUS
@@ -192,7 +204,7 @@ def main() -> None:
         for ((px, py), depth), centre in zip(PRESSES, centres(rest), strict=True):
             x, force = twin.pressed(rest, centre, gas)
             with torch.no_grad():
-                result = reconstructor.from_pixels(seen(x)[kept][None], rest_pixels=rest_pixels[kept]).frame(0)
+                result = reconstructor.from_pixels(seen(x)[kept][None], rest_pixels=rest_pixels[kept], **noise).frame(0)
             deepest = [float(-u.min()) for u in (x[:, 2] - rest[:, 2], torch.from_numpy(result["displacement"][:, 2]))]
             ratio = np.linalg.norm(result["force"]) / float(force.norm())
             errors.append([abs(ratio - 1), abs(deepest[1] / deepest[0] - 1)])
@@ -213,12 +225,12 @@ def centres(rest: Tensor) -> list[Tensor]:
     return [torch.cat([place, top + BALL - depth]) for place, top, (_, depth) in zip(places, tops, PRESSES, strict=True)]
 
 
-def calibrated(name: str, sensor: tm.Sensor, presses: list, seen, kept: np.ndarray) -> None:
+def calibrated(name: str, sensor: tm.Sensor, presses: list, seen, kept: np.ndarray, noise: dict) -> None:
     """Calibrate the material from presses, and print it."""
     forces = np.stack([force.numpy() for _, force in presses])
     known = KnownForces(forces, 0.03 * np.linalg.norm(forces, axis=1))
     pixels = torch.stack([seen(x)[kept] for x, _ in presses])
-    found = material_from_pixels(sensor, pixels, known, overpressure=GAUGE)
+    found = material_from_pixels(sensor, pixels, known, overpressure=GAUGE, **noise)
     off = (found.values - [STRETCH, MODULUS]) / found.deviations
     said = [f"{value:.3f} ± {sd:.3f} ({z:+.1f})" for value, sd, z in zip(found.values, found.deviations, off, strict=True)]
     print(f"{name}: prestretch {said[0]}, modulus {said[1]} {list(found.contradictions)}", flush=True)
@@ -227,16 +239,7 @@ def calibrated(name: str, sensor: tm.Sensor, presses: list, seen, kept: np.ndarr
 def lattice(twin: Twin) -> tuple[Tensor, Tensor]:
     """Dots on the mesh: the vertices around each `[D, 3]`, and weights."""
     i, j = np.meshgrid(*(np.arange(-12, 13),) * 2)
-    wanted = np.stack([i, j], -1).reshape(-1, 2) * PITCH
-    a, b, c = twin.flat[twin.cells.numpy()].transpose(1, 0, 2)
-    to = wanted[:, None] - a
-    inverse = np.linalg.inv(np.stack([b - a, c - a], -1))
-    share = np.einsum("tij,dtj->dti", inverse, to)
-    weights = np.concatenate([1 - share.sum(-1, keepdims=True), share], -1)
-    inside = weights.min(-1)
-    cell = inside.argmax(1)
-    kept = inside.max(1) > 0
-    return twin.cells[cell[kept]], torch.from_numpy(weights[np.arange(len(wanted)), cell][kept])
+    return twin.at(np.stack([i, j], -1).reshape(-1, 2) * PITCH)
 
 
 if __name__ == "__main__":

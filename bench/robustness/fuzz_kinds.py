@@ -31,6 +31,8 @@ from bench.robustness.malformed_files import (
 )
 from torchmembrane.cli.calibrate.files import read_forces, read_motions
 from torchmembrane.files.folder_lock import WHOLE
+from torchmembrane.forming.formed import film
+from torchmembrane.forming.outline import rectangle
 from torchmembrane.jobs.decode import decoded, sources
 from torchmembrane.jobs.inputs import find_inputs
 from torchmembrane.jobs.local import reconstruct_files
@@ -41,12 +43,15 @@ from torchmembrane.presets.dot_list import read_drafted_dots
 from torchmembrane.results.read import read_frame
 from torchmembrane.results.reconstruction import Reconstruction
 from torchmembrane.results.store import Mesh, Settings
+from torchmembrane.sensor.inflated import read_rim, rim_lines
 
 MOST_LINES, MOST_DOTS = 33, 300
 """Larger sensors, where accepted, are not held to the bounds: they are read, not built."""
 WRONG = 0.25
 """Of the press: error of a surface that is wrong."""
 MOTIONS = "\n".join(["x,y,z,turn_x,turn_y,turn_z", "0,0,0,0,0,0", "1.5,0,0,0,-4.0,0", "0,1.5,0,4.0,0,0"])
+RIM = rim_lines(np.insert(rectangle((50.0, 36.0), 10.0)[::12], 2, 40.0, axis=1))
+RIM_LINES = 9  # of the grid in a rim
 PATIENCE = 60
 """Seconds after which a model that runs in a process of its own is ended."""
 
@@ -105,6 +110,7 @@ class Uses:
             "motions": lambda: Kind(
                 singles("m.csv", table(MOTIONS)), lambda folder: self.tabled(read_motions, folder / "m.csv")
             ),
+            "rims": lambda: Kind(singles("r.csv", table(RIM)), self.rim),
             "forces": lambda: Kind(
                 singles("f.csv", table(forces)), lambda folder: self.tabled(read_forces, folder / "f.csv", self.presses)
             ),
@@ -178,6 +184,15 @@ class Uses:
 
     def dots(self, folder: Path) -> str:
         read_drafted_dots(folder / "d.csv", self.dome.surface, self.dome.camera)
+        return "read"
+
+    def rim(self, folder: Path) -> str:
+        """Read a rim, and where it is accepted find the film in it."""
+        rim = read_rim(folder / "r.csv")
+        try:
+            film(rim if rim.shape[1] == 3 else np.insert(rim, 2, 0.0, axis=1), RIM_LINES)
+        except tm.MembraneError:  # the sensor's file is named where it is read
+            return "read, no sheet in it"
         return "read"
 
     def tabled(self, read: Callable[..., object], *arguments: object) -> str:

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from .depth import DepthFit, rest_from_depth
     from .detection import find_target
     from .fit import Fit
+    from .known_modulus import KnownForces, KnownPressures
     from .layout import FabricationLayout, layout_for_pixels, pixel_lattice
-    from .material import KnownForces, KnownPressures, MaterialFit, material_from_images, material_from_pixels
+    from .material import MaterialFit, material_from_images, material_from_pixels
     from .rest import RestFit, rest_from_image
     from .views import ViewsFit, rest_from_views
     from .weight import WeightFit, material_from_weight
@@ -32,8 +33,9 @@ _MODULES = {
     ".depth": ("DepthFit", "rest_from_depth"),
     ".detection": ("find_target",),
     ".fit": ("Fit",),
+    ".known_modulus": ("KnownForces", "KnownPressures"),
     ".layout": ("FabricationLayout", "layout_for_pixels", "pixel_lattice"),
-    ".material": ("KnownForces", "KnownPressures", "MaterialFit", "material_from_images", "material_from_pixels"),
+    ".material": ("MaterialFit", "material_from_images", "material_from_pixels"),
     ".rest": ("RestFit", "rest_from_image"),
     ".views": ("ViewsFit", "rest_from_views"),
     ".weight": ("WeightFit", "material_from_weight"),

@@ -12,9 +12,40 @@ from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
 from ..sensor.units import hectopascal
 
-REST_ERROR = 0.05
-"""Of the modulus from a gauge at rest, relative: that of the rest shape, whose height enters, and of the reading."""
+REST_ERROR = 0.05  # of the modulus from a gauge at rest, relative: that of the grid and of the reading
+FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known force (docs/calibration.md)
 CONTRADICTING = 2.5  # standard deviations between two measurements, above which it is said
+
+
+class KnownPressures(NamedTuple):
+    """What a gauge read.
+
+    Attributes:
+        readings: `[B]` of the images, N per length unit squared, NaN where not known.
+        since_rest: whether these are changes since rest; else what the gauge reads at rest is found as well.
+    """
+
+    readings: np.ndarray
+    since_rest: bool = False
+
+
+class KnownForces(NamedTuple):
+    """What pressed.
+
+    Attributes:
+        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
+        deviations: `[B]` standard deviations of their magnitudes, N; None, or NaN where not known: small beside `FORCE_ERROR`.
+    """
+
+    forces: np.ndarray
+    deviations: np.ndarray | None = None
+
+    @property
+    def relative(self) -> np.ndarray:
+        """Standard deviation of what each known force tells, relative, with `FORCE_ERROR` in it."""
+        size = np.linalg.norm(self.forces, axis=1)
+        own = np.zeros_like(size) if self.deviations is None else np.nan_to_num(self.deviations) / size
+        return np.hypot(FORCE_ERROR, own)[np.isfinite(size)]
 
 
 class ModulusEvidence(NamedTuple):
@@ -25,12 +56,14 @@ class ModulusEvidence(NamedTuple):
         modulus: shear modulus x thickness, force / length.
         deviation: standard deviation, at the prestretch found.
         change: with one standard deviation of the prestretch.
+        by_height: change with one standard deviation of the rest surface's height.
     """
 
     source: str
     modulus: float
     deviation: float
     change: float
+    by_height: float = 0.0
 
 
 class JoinedEvidence(NamedTuple):
@@ -39,7 +72,8 @@ class JoinedEvidence(NamedTuple):
     Attributes:
         shift: of the logarithm of the prestretch, in its standard deviations.
         modulus: force / length.
-        covariance: `[2, 2]` of the shift and of the logarithm of the modulus.
+        covariance: `[3, 3]` of the shift, of the logarithm of the modulus, and of the rest surface's height in its standard
+            deviations.
         contradictions: a sentence for each two kinds of measurement that contradict one another.
     """
 
@@ -49,13 +83,19 @@ class JoinedEvidence(NamedTuple):
     contradictions: list[str]
 
 
-def joined(evidence: Sequence[ModulusEvidence]) -> JoinedEvidence:
+def joined(evidence: Sequence[ModulusEvidence], by_height: float = 0.0) -> JoinedEvidence:
     """The prestretch's shift `t` and the modulus `m` that several measurements agree on, by weighted least squares:
 
-        t^2 + sum_i (log m - log m_i - g_i t)^2 / s_i^2,    s_i = deviation / modulus,  g_i = change / modulus
+        (t - b h)^2 + h^2 + sum_i (log m - log m_i - g_i t - c_i h)^2 / s_i^2,    s_i = deviation / modulus,
+                                                                    g_i = change / modulus,  c_i = by_height / modulus
 
-    What the presses' shapes say of the prestretch is the first term. Each measurement's modulus depends on the prestretch in
-    its own way, so that two of them tell it, too. Where they cannot agree, the covariance grows by their scatter.
+    What the presses' shapes say of the prestretch is the first term. All of it is said at the file's rest surface, which may be
+    higher by `h` of its standard deviations. Each measurement's modulus depends on prestretch and height in its own way, so
+    that two of them tell these, too. Where they cannot agree, the covariance grows by their scatter.
+
+    Args:
+        evidence: of each measurement.
+        by_height: `b`, the shift that the presses' shapes tell, with one standard deviation of the height.
 
     Example:
         >>> by_force, at_rest = ModulusEvidence("forces", 0.5, 0.05, 0.0), ModulusEvidence("gauge", 0.3, 0.02, 0.0)
@@ -63,14 +103,14 @@ def joined(evidence: Sequence[ModulusEvidence]) -> JoinedEvidence:
         >>> round(found.modulus, 2), found.contradictions[0].split(":")[0]
         (0.35, 'forces and gauge contradict one another')
     """
-    modulus, deviation, change = (np.array([one[k] for one in evidence]) for k in (1, 2, 3))
-    s, g = deviation / modulus, change / modulus
-    rows = np.vstack([[1.0, 0.0], np.stack([-g, np.ones(len(s))], 1) / s[:, None]])
-    values = np.concatenate([[0.0], np.log(modulus) / s])
+    modulus, deviation, change, raised = (np.array([one[k] for one in evidence]) for k in (1, 2, 3, 4))
+    s, g, c = deviation / modulus, change / modulus, raised / modulus
+    rows = np.vstack([[1.0, 0.0, -by_height], [0.0, 0.0, 1.0], np.stack([-g, np.ones(len(s)), -c], 1) / s[:, None]])
+    values = np.concatenate([[0.0, 0.0], np.log(modulus) / s])
     covariance = np.linalg.inv(rows.T @ rows)
-    shift, logarithm = covariance @ rows.T @ values
-    scatter = ((rows @ [shift, logarithm] - values) ** 2).sum() / max(len(s) - 1, 1)
-    said, at = [], np.log(modulus) + g * shift
+    shift, logarithm, height = covariance @ rows.T @ values
+    scatter = ((rows @ [shift, logarithm, height] - values) ** 2).sum() / max(len(s) - 1, 1)
+    said, at = [], np.log(modulus) + g * shift + c * height
     for i, one in enumerate(evidence):
         for k in range(i + 1, len(evidence)):
             apart = abs(at[i] - at[k]) / np.hypot(s[i], s[k])
@@ -108,7 +148,9 @@ def odd_ones(ratios: np.ndarray, deviations: np.ndarray) -> list[tuple[int, floa
     return found
 
 
-def modulus_at_rest(sensor: Sensor, log_stretch: float, deviation: float, overpressure: float) -> ModulusEvidence:
+def modulus_at_rest(
+    sensor: Sensor, log_stretch: float, deviation: float, overpressure: float, other: Sensor | None = None
+) -> ModulusEvidence:
     """The modulus that holds the rest surface against what a gauge reads there.
 
     Args:
@@ -116,10 +158,11 @@ def modulus_at_rest(sensor: Sensor, log_stretch: float, deviation: float, overpr
         log_stretch: logarithm of the prestretch.
         deviation: its standard deviation.
         overpressure: at rest, hPa.
+        other: the sensor whose rest surface's height differs by one standard deviation.
     """
     measured = overpressure * hectopascal(sensor.length_unit)
 
-    def modulus(stretch: float) -> float:
+    def modulus(stretch: float, sensor: Sensor = sensor) -> float:
         if isinstance(sensor.surface, InflatedSurface):
             sheet = sensor.surface.made_of(replace(sensor.material, prestretch=max(1.0, stretch)), sensor.length_unit)
             return float(measured / sheet.formed.pressure)
@@ -128,4 +171,5 @@ def modulus_at_rest(sensor: Sensor, log_stretch: float, deviation: float, overpr
 
     found, low, high = (modulus(float(np.exp(log_stretch + s * deviation))) for s in (0, -1, 1))
     change = float(np.sign(high - low) * max(abs(low - found), abs(high - found)))
-    return ModulusEvidence("the gauge at rest", found, REST_ERROR * found, change)
+    by_height = 0.0 if other is None else modulus(float(np.exp(log_stretch)), other) - found
+    return ModulusEvidence("the gauge at rest", found, REST_ERROR * found, change, by_height)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,42 +10,23 @@ from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from ..errors import MembraneError, check_arguments, expect
-from ..estimators.force_balance.estimator import ForceBalance
 from ..files.tensors import tensor_of
 from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
 from ..results.status import Status
-from ..sensor.factories import elastic_energy
 from ..sensor.sensor import Sensor
-from .gauge import UNSURE, FoundPressures, GaugeModulus, modulus_from_pressures
-from .known_modulus import ModulusEvidence, joined, modulus_at_rest, odd_ones
-from .stretch_loss import Explained, continued
+from .known_modulus import KnownForces, KnownPressures, ModulusEvidence, joined, modulus_at_rest
+from .presses import GAS_ROUNDS, LossProfile, Presses
+from .rest_error import HEIGHT_ERROR, HeightEffect, height_effect
 
 GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
-PRESSURE_GRID = (33, 33)  # on coarser ones pressure changes are off by up to a tenth
-STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it
-BETWEEN = 5  # prestretches tried on either side of the lowest
 PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the loss's, alike in all images
 WRONG = 0.02  # probability that an image is explained wrongly altogether and carries no information
-FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known force (docs/calibration.md)
-GAS_ROUNDS = 4
 GAS_SETTLED = 0.1  # change of a gas' modulus, relative, that changes the prestretch by less than its deviation
 FINE = 4001  # prestretches over which the probability is summed
 # What takes how much of the time, measured: of all, the markers in the images; of a round, the losses with pressures, forces or
-# neither known; over a solve from rest, the steps from both neighbours' solutions.
-IMAGES_SHARE, PROFILE_SHARE, CONTINUED = 0.05, (0.6, 0.8, 1.0), 0.1
-
-
-class LossProfile(NamedTuple):
-    """The least loss at each prestretch.
-
-    Attributes:
-        stretches: `[S]` prestretches, increasing.
-        losses: `[S, B]` of every image.
-    """
-
-    stretches: np.ndarray
-    losses: np.ndarray
+# neither known, and the same on a rest surface of another height.
+IMAGES_SHARE, PROFILE_SHARE, HEIGHT_SHARE = 0.05, (0.5, 0.65, 0.85), 0.15
 
 
 class MaterialFit(NamedTuple):
@@ -61,6 +41,7 @@ class MaterialFit(NamedTuple):
         forces: `[B, 2]` magnitudes found and measured, N, NaN where not known.
         pressures: `[B, 2]` changes since rest found and measured, N per length unit squared, NaN where not known.
         contradictions: sentences about measurements that contradict one another.
+        force_deviation: relative standard deviation of the scale of forces that the sensor then says; None without a modulus.
     """
 
     sensor: Sensor
@@ -71,42 +52,12 @@ class MaterialFit(NamedTuple):
     forces: np.ndarray
     pressures: np.ndarray
     contradictions: Sequence[str] = ()
+    force_deviation: float | None = None
 
     @property
     def deviations(self) -> np.ndarray:
         """Standard deviations of the values, `[n]`."""
         return np.sqrt(np.diag(self.covariance))
-
-
-class KnownPressures(NamedTuple):
-    """What a gauge read.
-
-    Attributes:
-        readings: `[B]` of the images, N per length unit squared, NaN where not known.
-        since_rest: whether these are changes since rest; else what the gauge reads at rest is found as well.
-    """
-
-    readings: np.ndarray
-    since_rest: bool = False
-
-
-class KnownForces(NamedTuple):
-    """What pressed.
-
-    Attributes:
-        forces: total force on the membrane, `[B, 3]` in the camera's frame or `[B, 1]` magnitudes, N, NaN where not known.
-        deviations: `[B]` standard deviations of their magnitudes, N; None, or NaN where not known: small beside `FORCE_ERROR`.
-    """
-
-    forces: np.ndarray
-    deviations: np.ndarray | None = None
-
-    @property
-    def relative(self) -> np.ndarray:
-        """Standard deviation of what each known force tells, relative, with `FORCE_ERROR` in it."""
-        size = np.linalg.norm(self.forces, axis=1)
-        own = np.zeros_like(size) if self.deviations is None else np.nan_to_num(self.deviations) / size
-        return np.hypot(FORCE_ERROR, own)[np.isfinite(size)]
 
 
 @check_arguments
@@ -117,6 +68,7 @@ def material_from_images(
     pressures: KnownPressures | None = None,
     *,
     overpressure: float | None = None,
+    rest_error: float = HEIGHT_ERROR,
     progress: Progress = silent,
 ) -> MaterialFit:
     """Prestretch from images of presses, and the modulus where forces or pressures are known; see `material_from_pixels`.
@@ -128,6 +80,7 @@ def material_from_images(
             `KnownForces`, with their deviations.
         pressures: what a gauge read.
         overpressure: what it read at rest, hPa.
+        rest_error: standard deviation of the rest surface's height over its rim, relative.
         progress: is told how far it is.
 
     Returns:
@@ -144,7 +97,7 @@ def material_from_images(
     displacement, confidence, _, status = flow
     for i in np.flatnonzero(status != Status.OK):
         raise MembraneError(f"calibrate material: image {i + 1}: {Status(int(status[i])).text}; leave it out")
-    known = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure)
+    known = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure, rest_error)
     return _material(sensor, reconstructor, known, within(progress, IMAGES_SHARE, 1.0))
 
 
@@ -156,6 +109,8 @@ def material_from_pixels(
     pressures: KnownPressures | None = None,
     *,
     overpressure: float | None = None,
+    noise: float | None = None,
+    rest_error: float = HEIGHT_ERROR,
     progress: Progress = silent,
 ) -> MaterialFit:
     """Prestretch from presses, and the modulus where their forces, or the pressures in the cavity, are known.
@@ -177,6 +132,8 @@ def material_from_pixels(
             `KnownForces`, with their deviations.
         pressures: what a gauge read.
         overpressure: what it read at rest, hPa.
+        noise: of the pixels, as for `Reconstructor.from_pixels`.
+        rest_error: standard deviation of the rest surface's height over its rim, relative.
         progress: is told how far it is.
 
     Returns:
@@ -198,76 +155,118 @@ def material_from_pixels(
     expect(known, "calibrate material: pixels", f"a tensor {list(pixels.shape)}", expected)
     lost = ~pixels.isfinite().all(-1)
     displacement = torch.where(lost[..., None], 0.0, pixels - reconstructor.rest_pixels)
-    return _material(
-        sensor,
-        reconstructor,
-        MeasuredPresses(displacement, (~lost).to(pixels), _known(forces), pressures, overpressure),
-        progress,
-    )
+    confidence = (~lost).to(pixels)
+    covariance = None if noise is None else reconstructor.observer.covariance_of(noise, confidence)
+    measured = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure, rest_error, covariance)
+    return _material(sensor, reconstructor, measured, progress)
 
 
 class MeasuredPresses(NamedTuple):
     """What is known of presses: the markers' displacement `[B, D, 2]` px and confidence `[B, D]`, forces or pressures as of
-    `material_from_pixels`."""
+    `material_from_pixels`, the displacements' covariance (default: the rest image's)."""
 
     displacement: Tensor
     confidence: Tensor
     forces: KnownForces | None
     pressures: KnownPressures | None
     overpressure: float | None
+    rest_error: float
+    covariance: Tensor | None = None
+
+    @property
+    def tells_modulus(self) -> bool:
+        """Whether anything but the shapes is known."""
+        return any(given is not None for given in (self.forces, self.pressures, self.overpressure))
 
 
 def _known(forces: np.ndarray | KnownForces | None) -> KnownForces | None:
     return forces if forces is None or isinstance(forces, KnownForces) else KnownForces(np.asarray(forces, float))
 
 
+class _ByShapes(NamedTuple):
+    """What the presses' shapes say of the logarithm of the prestretch: its mean and standard deviation, that of the losses
+    alone, and mean and variance by each image `[B]`."""
+
+    mean: float
+    deviation: float
+    by_losses: float
+    each: np.ndarray
+    variances: np.ndarray
+
+    @property
+    def around(self) -> np.ndarray:
+        """One deviation below, the mean, and one above, `[3]`."""
+        found: np.ndarray = self.mean + self.deviation * np.array([-1.0, 0.0, 1.0])
+        return found
+
+
+def _by_shapes(profile: LossProfile) -> _ByShapes:
+    each, own = np.array([_log_stretch(profile.stretches, losses[:, None]) for losses in profile.losses.T]).T
+    mean, by_losses = _log_stretch(profile.stretches, profile.losses)
+    variances = own**2 + PRESTRETCH_ERROR**2
+    contradiction = ((each - mean) ** 2 / variances).sum() / max(len(each) - 1, 1)
+    deviation = float(np.hypot(by_losses * np.sqrt(max(1.0, contradiction)), PRESTRETCH_ERROR))
+    return _ByShapes(mean, deviation, by_losses, each, variances)
+
+
 def _material(
     sensor: Sensor, reconstructor: Reconstructor, known: MeasuredPresses, progress: Progress, rounds: int = GAS_ROUNDS
 ) -> MaterialFit:
-    displacement, confidence, forces, pressures, overpressure = known
-    if pressures is not None:
+    if known.pressures is not None:
         reconstructor.estimator.check_gauge()
-    presses = Presses(reconstructor, displacement, confidence)
-    of_round, later = _shares(sensor, any(given is not None for given in known[2:]), rounds, progress)
-    of_profile = PROFILE_SHARE[0 if pressures is not None else 1 if forces is not None else 2]
-    profile = presses.profile(within(of_round, 0.0, of_profile))
-    of_modulus = within(of_round, of_profile, 1.0)
-    each = np.array([_log_stretch(profile.stretches, losses[:, None]) for losses in profile.losses.T])
-    log_stretch, deviation = _log_stretch(profile.stretches, profile.losses)
-    variances = each[:, 1] ** 2 + PRESTRETCH_ERROR**2
-    contradiction = ((each[:, 0] - log_stretch) ** 2 / variances).sum() / max(len(each) - 1, 1)
-    deviation = np.hypot(deviation * np.sqrt(max(1.0, contradiction)), PRESTRETCH_ERROR)
-    prestretch = float(np.exp(log_stretch))
-    values = [prestretch]
-    material = replace(sensor.material, prestretch=prestretch)
-    magnitudes, gauged = np.full((2, len(each), 2), np.nan)
-    evidence, said = [], []
-    if forces is not None:
-        *told, magnitudes, odd = presses.modulus(log_stretch, deviation, forces, of_modulus)
-        evidence.append(ModulusEvidence("the forces", *told))
-        said += [
-            f"image {i + 1}: its force is {r:.2f} of what the others' tell, {z:.1f} standard deviations apart"
-            for i, r, z in odd
-        ]
-    if pressures is not None:
-        *told, gauged = presses.gauge_modulus(log_stretch, deviation, pressures, of_modulus)
-        evidence.append(ModulusEvidence("the gauge under presses", *told))
-    if overpressure is not None:
-        evidence.append(modulus_at_rest(sensor, log_stretch, deviation, overpressure))
-    covariance = np.array([[(prestretch * deviation) ** 2]])
-    if evidence:
-        found = joined(evidence)
-        prestretch, said = float(np.exp(log_stretch + found.shift * deviation)), said + found.contradictions
-        values, scale = [prestretch, found.modulus], np.array([prestretch * deviation, found.modulus])
-        covariance = scale[:, None] * found.covariance * scale
+    presses = Presses(reconstructor, known.displacement, known.confidence, known.covariance)
+    of_round, later = _shares(sensor, known.tells_modulus, rounds, progress)
+    of_profile = PROFILE_SHARE[0 if known.pressures is not None else 1 if known.forces is not None else 2]
+    shapes = _by_shapes(profile := presses.profile(within(of_round, 0.0, of_profile)))
+    of_round(of_profile, "prestretch with the rest surface's error")
+    other = presses.at_other_height(known.rest_error)
+    by = height_effect(presses.told(shapes.around), other.told(shapes.around), shapes.deviation, shapes.by_losses**2)
+    evidence = _Evidence(presses, other, shapes, by)
+    evidence.gather(known, within(of_round, of_profile + HEIGHT_SHARE, 1.0))
+    values = np.exp([shapes.mean])
+    covariance, of_force, material = values**2 * (shapes.deviation**2 + by.shift**2), None, sensor.material
+    covariance, said = covariance[:, None], evidence.said
+    if evidence.found:
+        found = joined(evidence.found, by.shift / shapes.deviation)
+        along = np.array([by.by_stretch, 1.0, by.by_height])
+        of_force = float(along @ found.covariance @ along) ** 0.5
+        values = np.array([np.exp(shapes.mean + found.shift * shapes.deviation), found.modulus])
+        scale = values * [shapes.deviation, 1.0]
+        covariance, said = scale[:, None] * found.covariance[:2, :2] * scale, said + found.contradictions
         thickness = material.thickness or 1.0
-        modulus = found.modulus / thickness
-        material = replace(material, prestretch=max(1.0, prestretch), shear_modulus=modulus, thickness=thickness)
-    alone = np.exp(each[:, :1]) * np.stack([np.ones(len(each)), np.sqrt(variances)], -1)
-    made = replace(sensor, material=material)
+        material = replace(material, shear_modulus=found.modulus / thickness, thickness=thickness)
+    made = replace(sensor, material=replace(material, prestretch=max(1.0, float(values[0]))))
     if rounds and not _is_settled(sensor, made):
         return _material(made, _reconstructor(made), known, later, rounds - 1)
-    return MaterialFit(made, np.array(values), covariance, profile, alone, magnitudes, gauged, said)
+    alone = np.exp(shapes.each)[:, None] * np.stack([np.ones(len(shapes.each)), np.sqrt(shapes.variances)], -1)
+    return MaterialFit(made, values, covariance, profile, alone, evidence.magnitudes, evidence.gauged, said, of_force)
+
+
+class _Evidence:
+    """What forces and gauges tell of the modulus: `found`; magnitudes and pressures found and measured, `[B, 2]`, NaN where not
+    known; sentences about measurements that the others contradict."""
+
+    def __init__(self, presses: Presses, other: Presses, shapes: _ByShapes, by: HeightEffect) -> None:
+        self.presses, self.other, self.by, self.at = presses, other, by, (shapes.mean, shapes.deviation)
+        self.magnitudes, self.gauged = np.full((2, len(shapes.each), 2), np.nan)
+        self.found: list[ModulusEvidence] = []
+        self.said: list[str] = []
+
+    def gather(self, known: MeasuredPresses, progress: Progress) -> None:
+        """From what is known."""
+        if known.forces is not None:
+            modulus, deviation, change, self.magnitudes, odd = self.presses.modulus(*self.at, known.forces, progress)
+            self.found.append(ModulusEvidence("the forces", modulus, deviation, change, -self.by.by_height * modulus))
+            self.said += [
+                f"image {i + 1}: its force is {r:.2f} of what the others' tell, {z:.1f} standard deviations apart"
+                for i, r, z in odd
+            ]
+        if known.pressures is not None:
+            *told, self.gauged = self.presses.gauge_modulus(*self.at, known.pressures, self.other, progress)
+            self.found.append(ModulusEvidence("the gauge under presses", *told))
+        if known.overpressure is not None:
+            sensor, moved = (presses.reconstructor.sensor for presses in (self.presses, self.other))
+            self.found.append(modulus_at_rest(sensor, *self.at, known.overpressure, moved))
 
 
 def _shares(sensor: Sensor, with_modulus: bool, rounds: int, progress: Progress) -> tuple[Progress, Progress]:
@@ -302,138 +301,3 @@ def _log_stretch(stretches: np.ndarray, losses: np.ndarray) -> tuple[float, floa
     weight = (WRONG + (1 - WRONG) * alone / alone.mean(0)).prod(1)
     mean = (weight * fine).sum() / weight.sum()
     return mean, np.sqrt((weight * (fine - mean) ** 2).sum() / weight.sum())
-
-
-class Presses:
-    """B presses as measured, to be explained by one material or another.
-
-    Args:
-        reconstructor: the sensor's.
-        displacement: `[B, D, 2]` of its markers, px.
-        confidence: `[B, D]` of its markers.
-    """
-
-    def __init__(self, reconstructor: Reconstructor, displacement: Tensor, confidence: Tensor):
-        self.reconstructor = reconstructor
-        self.observation = reconstructor.observation(displacement, confidence)
-
-    def explained(self, stretch: float, modulus: float, grid: tuple[int, int] | None = None) -> Explained:
-        """The estimator with this material, on this grid, default the reconstructor's, and what it finds."""
-        r, known = self.reconstructor, self.reconstructor.estimator
-        assert isinstance(known, ForceBalance)  # as `_reconstructor` chooses
-        cavity, membrane = known.cavity, known.membrane if grid is None else r.sensor.surface.membrane(grid)
-        elasticity = elastic_energy(r.sensor, membrane, prestretch=stretch, modulus=modulus)
-        points = r.marker_points if grid is None else membrane.closest_points(r.rest_markers.numpy())
-        gas = tuple(cavity.gas.tolist())
-        estimator = ForceBalance(
-            membrane, elasticity, points, r.rest_markers, known.equations.bearings.noise, cavity.filling, gas
-        )
-        with torch.no_grad():
-            return estimator, estimator(self.observation)
-
-    def profile(self, progress: Progress) -> LossProfile:
-        """The presses' losses at `STRETCHES`, and closer together around the lowest."""
-        work = np.array([len(STRETCHES), CONTINUED * len(STRETCHES), BETWEEN, CONTINUED * (len(STRETCHES) + BETWEEN)])
-        ends = np.cumsum([0.0, *work / work.sum()]).tolist()
-        solve, follow, solve_between, follow_all = (within(progress, *pair) for pair in zip(ends, ends[1:], strict=False))
-        solutions = self._solutions(STRETCHES, solve)
-        total = self._profile(solutions, follow).losses.sum(1)
-        k = min(max(int(np.argmin(total)), 1), len(STRETCHES) - 2)
-        between = np.geomspace(STRETCHES[k - 1], STRETCHES[k + 1], BETWEEN + 2)[1:-1]
-        return self._profile(solutions | self._solutions(between, solve_between), follow_all)
-
-    def _solutions(self, stretches: np.ndarray, progress: Progress) -> dict[float, Explained]:
-        """What explains the presses at each prestretch, solved from rest."""
-        modulus, found = self.reconstructor.sensor.material.modulus, {}
-        for k, stretch in enumerate(stretches):
-            progress(k / len(stretches), f"force balance at prestretch {stretch:.3g}")
-            found[stretch] = self.explained(stretch, modulus)
-        return found
-
-    def _profile(self, solutions: dict[float, Explained], progress: Progress) -> LossProfile:
-        stretches = sorted(solutions)
-        best = continued([solutions[stretch] for stretch in stretches], self.observation, progress)
-        seen = self.observation.confidence.sum(-1)
-        return LossProfile(np.array(stretches), np.array([(seen * found.unexplained).numpy() for _, found in best]))
-
-    def gauge_modulus(
-        self, log_stretch: float, deviation: float, pressures: KnownPressures, progress: Progress
-    ) -> tuple[float, float, float, np.ndarray]:
-        """The modulus from pressures; arguments and what is returned as of `modulus`, with pressure changes for forces."""
-        gas, modulus = self.reconstructor.estimator.cavity.filling == "gas", self.reconstructor.sensor.material.modulus
-        readings = np.asarray(pressures.readings, float)
-
-        def found(stretch: float, modulus: float) -> FoundPressures:
-            estimator, it = self.explained(stretch, modulus, PRESSURE_GRID)
-            noise = estimator.equations.bearings.noise
-            with torch.no_grad():
-                spread = estimator.standard_deviations(it.vertices, it.pressure, it.moved, self.observation, noise)
-            rest = float(estimator.rest_pressure)
-            return FoundPressures((it.pressure - rest).numpy(), spread.pressure.numpy(), rest)
-
-        def fit(stretch: float, begin: float, share: float) -> GaugeModulus:
-            progress(share, f"modulus from pressures at prestretch {stretch:.3g}")
-            return modulus_from_pressures(partial(found, stretch), readings, pressures.since_rest, begin, gas)
-
-        fitted = fit(np.exp(log_stretch), modulus, 0.0)
-        sides = ((np.exp(log_stretch + s * deviation), share) for s, share in ((-1, 1 / 3), (1, 2 / 3)))
-        low, high = (fit(stretch, fitted.modulus, share).modulus - fitted.modulus for stretch, share in sides)
-        change = float(np.sign(high - low) * max(abs(low), abs(high)))
-        return fitted.modulus, fitted.deviation, change, fitted.pressures
-
-    def modulus(
-        self, log_stretch: float, deviation: float, known: KnownForces, progress: Progress = silent
-    ) -> tuple[float, float, float, np.ndarray, list[tuple[int, float, float]]]:
-        """The modulus from presses of known force.
-
-        A gas resists in newtons: there the presses are explained anew with each modulus.
-
-        Args:
-            log_stretch: logarithm of the prestretch.
-            deviation: its standard deviation.
-            known: as for `material_from_pixels`.
-            progress: is told how far it is.
-
-        Returns:
-            The modulus; its standard deviation at this prestretch; its change with one deviation of the prestretch, the larger
-            of those to either side, negative, as under more tension at rest a softer membrane presses as hard; magnitudes of
-            the forces found and measured, `[B, 2]`; and images whose forces the others contradict, as of `odd_ones`.
-        """
-        forces, relative = known.forces, known.relative
-        weight = relative**-2.0 / (relative**-2.0).sum()
-        modulus = self.reconstructor.sensor.material.modulus
-        progress(0.0, "modulus from forces")
-        self._refuse_unpressed(float(np.exp(log_stretch)), modulus, np.isfinite(forces).all(1))
-        for _ in range(GAS_ROUNDS if self.reconstructor.estimator.cavity.filling == "gas" else 1):
-            ratios, magnitudes = self._ratios(np.exp(log_stretch), modulus, forces)
-            modulus = float((weight * ratios).sum() * modulus)
-        progress(0.5, "modulus with the prestretch's error")
-        sides = [(weight * self._ratios(np.exp(log_stretch + s * deviation), modulus, forces)[0]).sum() for s in (-1, 1)]
-        change = -modulus * np.abs(np.array(sides) - 1).max()
-        sure, mean = (relative**-2.0).sum() ** -0.5, (weight * ratios).sum()
-        scatter = (((ratios / mean - 1) / relative) ** 2).sum() / max(len(ratios) - 1, 1)
-        images = np.flatnonzero(np.isfinite(forces).all(1))
-        odd = [(int(images[i]), ratio, apart) for i, ratio, apart in odd_ones(ratios, relative)]
-        return modulus, modulus * sure * max(1.0, scatter) ** 0.5, change, magnitudes, odd
-
-    def _refuse_unpressed(self, stretch: float, modulus: float, known: np.ndarray) -> None:
-        """Refuse images of known force `[B]` in which the markers show hardly any."""
-        estimator, it = self.explained(stretch, modulus)
-        noise = estimator.equations.bearings.noise
-        with torch.no_grad():
-            spread = estimator.standard_deviations(it.vertices, it.pressure, it.moved, self.observation, noise)
-        force = (it.traction * estimator.membrane.rest_area[:, None]).sum(1)
-        unsure = (spread.force.norm(dim=1) > UNSURE * force.norm(dim=1)).numpy()
-        for i in np.flatnonzero(known & unsure):
-            raise MembraneError(
-                f"calibrate material: image {i + 1} hardly shows a force, though one is given for it; expected presses that "
-                "dent the membrane visibly: leave it out"
-            )
-
-    def _ratios(self, stretch: float, modulus: float, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Forces measured over found of the presses of known force `[F]`, and all magnitudes, found and measured `[B, 2]`."""
-        estimator, equilibrium = self.explained(stretch, modulus)
-        found = (equilibrium.traction * estimator.membrane.rest_area[:, None]).sum(1).numpy()
-        size, measured = np.linalg.norm(found, axis=1), np.linalg.norm(forces, axis=1)
-        along = (forces * found).sum(1) / size if forces.shape[1] == 3 else measured
-        return (along / size)[np.isfinite(along)], np.stack([size, measured], -1)

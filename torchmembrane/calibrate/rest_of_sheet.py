@@ -56,9 +56,8 @@ class _Material:
 
     def of(self, height: float, prestretch: float) -> InflatedSurface:
         """The sheet at a height, with a prestretch."""
-        values = {key: value for key, value in self.surface.values.items() if key != "overpressure"} | {"height": height}
         material = replace(self.surface.material, prestretch=max(1.0, prestretch))
-        return InflatedSurface(self.surface.shape, values, material, self.surface.length_unit)
+        return replace(self.surface.of_height(height), material=material)
 
     def positions(self, sheet: InflatedSurface) -> np.ndarray:
         """Of the dots, `[D, 3]`."""

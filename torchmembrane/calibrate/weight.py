@@ -15,7 +15,8 @@ from ..results.reconstruction import Reconstruction
 from ..results.status import Status
 from ..sensor.sensor import Sensor
 from .gauge import CONTRADICTION, UNSURE
-from .material import GAS_ROUNDS, MaterialFit, material_from_images
+from .material import MaterialFit, material_from_images
+from .presses import GAS_ROUNDS
 
 SURE = 0.05  # relative standard deviation of the scale, at most: two of them are a tenth
 AT_THE_RIM = 0.1  # share of the force in patches that reach the rim, from which on it is refused
@@ -108,7 +109,8 @@ def _stiffer(sensor: Sensor, ratio: float) -> Sensor:
 def _told(sensor: Sensor, images: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Magnitudes of the forces in the images, `[B]`, and their relative deviations; refused where they tell no scale."""
     with torch.no_grad():
-        result: Reconstruction = Reconstructor(sensor)(images)
+        found_now = replace(sensor, record=sensor.record._replace(uncertainty=None))  # of the scale, which is looked for
+        result: Reconstruction = Reconstructor(found_now)(images)
     forces = result.force.norm(dim=1).double().numpy()
     along = (result.force_deviation * result.force).norm(dim=1).double().numpy() / forces.clip(1e-12)
     deviations = along / forces.clip(1e-12)

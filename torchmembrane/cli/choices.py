@@ -29,3 +29,4 @@ MOST_BLUR, MOST_DECIBEL = 20.0, 200.0
 MOST_FRICTION, MOST_LINES = 10.0, 129
 
 PORTS = ("port_distance", "port_thickness", "port_index", "medium_index")
+HEIGHT_ERROR, MOST_HEIGHT_ERROR = 0.05, 0.5

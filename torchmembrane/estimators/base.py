@@ -139,6 +139,15 @@ class Deviations(NamedTuple):
         force = torch.full_like(found.vertices[:, 0], torch.nan)
         return cls(force, force[:, 0])
 
+    def calibrated(self, force: Tensor, uncertainty: float | None) -> "Deviations":
+        """With that of the scale of all forces, relative, by the calibration of the material; None: not known.
+
+        Args:
+            force: `[B, 3]`, as found.
+            uncertainty: as in the sensor's record.
+        """
+        return self._replace(force=torch.hypot(self.force, uncertainty * force)) if uncertainty else self
+
 
 class StandardDeviations(NamedTuple):
     """Of `vertices [B, V, 3]` (zero where fixed), total `force [B, 3]` and `pressure [B]`."""

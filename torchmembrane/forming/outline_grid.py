@@ -72,6 +72,8 @@ def outline_grid(points: np.ndarray, lines: int) -> OutlineGrid:
 
 
 @lru_cache(maxsize=32)
+@torch.inference_mode(False)  # gradients are needed whatever the caller's mode
+@torch.enable_grad()
 def _outline_grid(content: bytes, count: int, lines: int) -> OutlineGrid:
     problem = _GridProblem(np.frombuffer(content).reshape(count, 2), lines)
     z = problem.start()

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ..control_flow import can_sync, traced
-from ..errors import MembraneError
+from ..errors import MembraneError, expect
 from ..files.levels import too_few_bits
 from ..files.tensors import tensor_of
 from ..results.status import Status
@@ -17,6 +17,7 @@ from .screening import MismatchScreen
 
 NOISE = 0.05
 """px, standard deviation of a marker in an image where nothing else is known."""
+MOST_NOISE = 100.0  # px
 FOUND = 0.5
 """Confidence above which a marker counts as found."""
 FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5  # of the markers: fewer found are too few, or an image unlike the rest image
@@ -211,7 +212,9 @@ class MarkerObserver(nn.Module):
         displacement, confidence = (pixels - rest).masked_fill(bad[..., None], 0.0), confidence.masked_fill(bad, 0.0)
         return displacement, confidence, self.rest_covariance + covariance.masked_fill(bad[..., None, None], 0.0)
 
-    def from_pixels(self, pixels: Tensor, confidence: Tensor | None, rest_pixels: Tensor | None) -> MarkerFlow:
+    def from_pixels(
+        self, pixels: Tensor, confidence: Tensor | None, rest_pixels: Tensor | None, noise: float | None = None
+    ) -> MarkerFlow:
         """What markers located elsewhere show, those that belong with no neighbour without confidence.
 
         Arguments and errors as for `Reconstructor.from_pixels`.
@@ -227,8 +230,16 @@ class MarkerObserver(nn.Module):
         confidence = torch.where(finite, _checked_confidence(confidence, pixels), 0.0)
         displacement = torch.where(finite[..., None], pixels - rest, 0.0)
         status = torch.zeros_like(confidence[:, 0], dtype=torch.long)
-        covariance = self.rest_covariance + isotropic(confidence, NOISE)
+        covariance = self.covariance_of(noise, confidence)
         return MarkerFlow(displacement, self.screen(displacement, confidence), covariance, status)
+
+    def covariance_of(self, noise: float | None, confidence: Tensor) -> Tensor:
+        """Of displacements `[B, D, 2, 2]` px^2 between pixels located elsewhere, now and at rest, each with this standard
+        deviation in u and v, px; default: `NOISE` now, and what the markers of the rest image have."""
+        if noise is None:
+            return self.rest_covariance + isotropic(confidence, NOISE)
+        expect(0 < noise < MOST_NOISE, "noise of pixels", noise, f"more than 0 and less than {MOST_NOISE:g} px")
+        return isotropic(confidence, 2**0.5 * noise)
 
     def rest_given(self, rest_pixels: Any) -> Tensor:
         """The markers at rest as a caller gives them, `[D, 2]` px."""

@@ -104,6 +104,11 @@ class InflatedSurface(Surface):
         """Where the vertices of a solver grid were without pressure, `[V, 3]`."""
         return torch.from_numpy(self.formed.on(grid)[1].reshape(-1, 3).copy())
 
+    def of_height(self, height: float) -> "InflatedSurface":
+        """The same sheet and rim, blown up to another height."""
+        values = {key: value for key, value in self.values.items() if key != "overpressure"} | {"height": height}
+        return replace(self, values=values)
+
     def made_of(self, material: Material, length_unit: str) -> "InflatedSurface":
         """The same rim and height, or overpressure, with another sheet."""
         if (material, length_unit) == (self.material, self.length_unit):

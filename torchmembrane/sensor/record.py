@@ -9,14 +9,14 @@ from .table import Table
 
 
 class Record(NamedTuple):
-    """`[record]` of a sensor file. It says nothing of how images become results, so it is no part of the fingerprint.
+    """`[record]` of a sensor file. It says nothing of how images become surfaces, so it is no part of the fingerprint.
 
     Attributes:
         serial: of the piece, any text.
         calibrated: the day of the latest calibration.
         images: that it was made from.
         by: what made it.
-        uncertainty: standard deviation of forces by the calibration of the material, over the force.
+        uncertainty: standard deviation of forces by the calibration of the material, over the force; `force_deviation` has it.
 
     Example:
         >>> Record("A17", date(2026, 9, 27), 12, uncertainty=0.04).text

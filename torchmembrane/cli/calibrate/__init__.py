@@ -10,8 +10,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..arguments import Add, add_command, add_force, count_pair, positive, pressure, weight
-from ..choices import PORTS
+from ..arguments import Add, add_command, add_force, count_pair, number_from, positive, pressure, weight
+from ..choices import HEIGHT_ERROR, MOST_HEIGHT_ERROR, PORTS
 from ..progress import announce
 
 PURPOSE = "find lens, ports, rest surface and dots from images; make a layout of dots"
@@ -111,7 +111,10 @@ def _material_options(add: Add) -> None:
     add("--pressure", metavar="FILE.csv", type=Path, help=gauge)
     at_rest = "what a gauge reads at rest, inside over outside, with its unit, as 12hPa; goes with the others"
     add("--overpressure", metavar="P", type=pressure, help=at_rest)
-    add("--weight", metavar="WEIGHT", type=weight, help="that lies on the membrane in every image, alone, as 200g or 1.96N")
+    sure = "standard deviation of the rest surface's height over its rim, relative (default: %(default)s)"
+    add("--rest-error", metavar="SHARE", type=number_from(1e-3, MOST_HEIGHT_ERROR), default=HEIGHT_ERROR, help=sure)
+    lies = "that lies on the membrane, alone, in every image that --forces does not list, as 200g or 1.96N"
+    add("--weight", metavar="WEIGHT", type=weight, help=lies)
 
 
 def _layout_options(add: Add) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ... import __version__
 from ...calibrate.detection import find_target
-from ...calibrate.material import KnownForces
+from ...calibrate.known_modulus import KnownForces
 from ...calibrate.report import Report
 from ...camera.targets import Checkerboard, DotBoard
 from ...errors import MembraneError

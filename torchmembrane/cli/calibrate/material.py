@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ...calibrate.material import STRETCHES, KnownPressures, material_from_images
+from ...calibrate.known_modulus import KnownForces, KnownPressures
+from ...calibrate.material import MaterialFit, material_from_images
+from ...calibrate.presses import STRETCHES
 from ...calibrate.report import Report
 from ...calibrate.weight import WeightFit, material_from_weight
-from ...errors import MembraneError
 from ...files.timestamps import time_in
 from ...jobs.inputs import Inputs, find_inputs, frame_name, single_images
 from ...jobs.pressure import read_pressures
 from ...plot.calibration import material_figure
-from ...progress import Progress
 from ...reconstruct import Reconstructor
 from ...results.status import Status
 from ...sensor.sensor import Sensor
@@ -27,17 +27,14 @@ def material(arguments: Namespace) -> int:
     """`torchmembrane calibrate material`"""
     sensor, inputs = read_sensor(arguments), find_inputs(arguments.images)
     paths = single_images(inputs)
-    forces = read_forces(arguments.forces, inputs) if arguments.forces else None
+    alone = arguments.weight is not None and not (arguments.forces or arguments.pressure or arguments.overpressure)
+    forces = known_forces(arguments, inputs)
     pressures = _pressures(arguments, inputs, sensor) if arguments.pressure else None
     images = torch.from_numpy(np.stack([read_sensor_image(path, sensor) for path in paths]))[:, None]
     with ProgressDisplay("calibrate material") as progress:
-        weighed = _weighed(arguments, sensor, images, progress) if arguments.weight else None
-        if weighed is None:
-            found = material_from_images(
-                sensor, images, forces, pressures, overpressure=arguments.overpressure, progress=progress
-            )
-        else:
-            found = weighed.material
+        weighed = material_from_weight(sensor, images, arguments.weight, progress=progress) if alone else None
+        known = dict(overpressure=arguments.overpressure, rest_error=arguments.rest_error, progress=progress)
+        found = material_from_images(sensor, images, forces, pressures, **known) if weighed is None else weighed.material
     unit, n = sensor.length_unit, len(found.values)
     each = zip(paths, found.each, strict=True)
     notes = [f"{path.name} alone: prestretch {one:.3f} ± {sd:.2g}" for path, (one, sd) in each]
@@ -46,14 +43,9 @@ def material(arguments: Namespace) -> int:
     if n == 2:
         notes.append("modulus: shear modulus x thickness; the sensor file's thickness is kept, or 1 where it has none")
     notes += [_by_name(sentence, paths) for sentence in found.contradictions]
+    notes += _of_forces(arguments, found, weighed)
     if weighed is None:
         notes += _doubted(found.sensor, images, paths)
-    if weighed is not None:
-        forces_said = ", ".join(f"{force:.3g}" for force in weighed.forces)
-        notes.append(
-            f"the file's modulus is scaled to {weighed.sensor.material.modulus:.4g} N/{unit}, so that its reconstruction says "
-            f"the weight, {arguments.weight:.4g} N: {forces_said} N; forces are scaled to {100 * weighed.deviation:.0f} %"
-        )
     report = Report.without_parameters(f"material from {len(paths)} images of presses", notes)._replace(
         names=["prestretch", "modulus"][:n],
         units=["", f"N/{unit}"][:n],
@@ -63,10 +55,25 @@ def material(arguments: Namespace) -> int:
         correlations=found.covariance / np.outer(found.deviations, found.deviations),
     )
     made = found.sensor if weighed is None else weighed.sensor
-    by_forces = found.deviations[1] / found.values[1] if n == 2 else None
-    uncertainty = by_forces if weighed is None else weighed.deviation
+    uncertainty = found.force_deviation if weighed is None else weighed.deviation
     drawing = material_figure(report, found, [path.name for path in paths])
     return write_calibrated(arguments, made, report, drawing, len(paths), uncertainty)
+
+
+def _of_forces(arguments: Namespace, found: MaterialFit, weighed: WeightFit | None) -> list[str]:
+    """How surely the scale of forces is known, in sentences."""
+    if weighed is not None:
+        told, unit = ", ".join(f"{force:.3g}" for force in weighed.forces), weighed.sensor.length_unit
+        return [
+            f"the file's modulus is scaled to {weighed.sensor.material.modulus:.4g} N/{unit}, so that its reconstruction says "
+            f"the weight, {arguments.weight:.4g} N: {told} N; forces are scaled to {100 * weighed.deviation:.0f} %"
+        ]
+    if found.force_deviation is None:
+        return []
+    return [
+        f"forces are known to {100 * found.force_deviation:.2g} % (in them errors of prestretch and modulus partly cancel) "
+        f"if the height of the rest surface is right to {100 * arguments.rest_error:.2g} % (--rest-error)"
+    ]
 
 
 def _by_name(sentence: str, paths: list[Path]) -> str:
@@ -85,13 +92,21 @@ def _doubted(sensor: Sensor, images: torch.Tensor, paths: list[Path]) -> list[st
     ]
 
 
-def _weighed(arguments: Namespace, sensor: Sensor, images: torch.Tensor, progress: Progress) -> WeightFit:
-    if arguments.forces or arguments.pressure or arguments.overpressure:
-        raise MembraneError(
-            "calibrate material: --weight with --forces, --pressure or --overpressure; expected the weight alone, or its force "
-            "in the file of --forces, which goes with gauges"
-        )
-    return material_from_weight(sensor, images, arguments.weight, progress=progress)
+def known_forces(arguments: Namespace, inputs: Inputs) -> KnownForces | None:
+    """Those of the table, and in images without one the weight; None without either.
+
+    Args:
+        arguments: `forces`, a table, and `weight`, N.
+        inputs: the images.
+    """
+    table = read_forces(arguments.forces, inputs) if arguments.forces else None
+    if arguments.weight is None:
+        return table
+    weights = np.full((len(inputs.images), 1), arguments.weight)
+    if table is None:
+        return KnownForces(weights)
+    sizes = np.linalg.norm(table.forces, axis=1, keepdims=True)
+    return KnownForces(np.where(np.isfinite(sizes), sizes, weights), table.deviations)
 
 
 def _pressures(arguments: Namespace, inputs: Inputs, sensor: Sensor) -> KnownPressures:

@@ -1,0 +1,204 @@
+"""Presses as measured, explained by one material or another: what each prestretch costs, and which modulus forces tell."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import MembraneError
+from ..estimators.force_balance.estimator import ForceBalance
+from ..progress import Progress, silent, within
+from ..reconstruct import Reconstructor
+from ..sensor.factories import elastic_energy
+from .gauge import UNSURE, FoundPressures, GaugeModulus, modulus_from_pressures
+from .known_modulus import KnownForces, KnownPressures, odd_ones
+from .rest_error import PressesTold, at_other_height
+from .stretch_loss import Explained, continued
+
+PRESSURE_GRID = (33, 33)  # on coarser ones pressure changes are off by up to a tenth
+STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it
+BETWEEN = 5  # prestretches tried on either side of the lowest
+GAS_ROUNDS = 4
+CONTINUED = 0.1  # of a solve from rest takes each step from a neighbour's solution, measured
+
+
+class LossProfile(NamedTuple):
+    """The least loss at each prestretch.
+
+    Attributes:
+        stretches: `[S]` prestretches, increasing.
+        losses: `[S, B]` of every image.
+    """
+
+    stretches: np.ndarray
+    losses: np.ndarray
+
+
+class Presses:
+    """B presses as measured, to be explained by one material or another.
+
+    Args:
+        reconstructor: the sensor's.
+        displacement: `[B, D, 2]` of its markers, px.
+        confidence: `[B, D]` of its markers.
+        covariance: `[B, D, 2, 2]` of the displacements, px^2; default: the rest image's.
+    """
+
+    def __init__(
+        self, reconstructor: Reconstructor, displacement: Tensor, confidence: Tensor, covariance: Tensor | None = None
+    ):
+        if covariance is None:
+            covariance = (2 * reconstructor.observer.rest_covariance).expand(*displacement.shape, 2)
+        self.reconstructor, self.measured = reconstructor, (displacement, confidence, covariance)
+        self.observation = reconstructor.observation(*self.measured)
+
+    def at_other_height(self, share: float) -> "Presses":
+        """The same markers where the rest surface's height differs by a share."""
+        r = self.reconstructor
+        sensor, kept = at_other_height(r.sensor, r.rest_markers.double().numpy(), share)
+        return Presses(Reconstructor(sensor, dtype=torch.float64, check_rest=False), *(a[:, kept] for a in self.measured))
+
+    def explained(self, stretch: float, modulus: float, grid: tuple[int, int] | None = None) -> Explained:
+        """The estimator with this material, on this grid, default the reconstructor's, and what it finds."""
+        r, known = self.reconstructor, self.reconstructor.estimator
+        assert isinstance(known, ForceBalance)  # as `_reconstructor` chooses
+        cavity, membrane = known.cavity, known.membrane if grid is None else r.sensor.surface.membrane(grid)
+        elasticity = elastic_energy(r.sensor, membrane, prestretch=stretch, modulus=modulus)
+        points = r.marker_points if grid is None else membrane.closest_points(r.rest_markers.numpy())
+        gas = tuple(cavity.gas.tolist())
+        estimator = ForceBalance(
+            membrane, elasticity, points, r.rest_markers, known.equations.bearings.noise, cavity.filling, gas
+        )
+        with torch.no_grad():
+            return estimator, estimator(self.observation)
+
+    def profile(self, progress: Progress) -> LossProfile:
+        """The presses' losses at `STRETCHES`, and closer together around the lowest."""
+        work = np.array([len(STRETCHES), CONTINUED * len(STRETCHES), BETWEEN, CONTINUED * (len(STRETCHES) + BETWEEN)])
+        ends = np.cumsum([0.0, *work / work.sum()]).tolist()
+        solve, follow, solve_between, follow_all = (within(progress, *pair) for pair in zip(ends, ends[1:], strict=False))
+        solutions = self._solutions(STRETCHES, solve)
+        total = self._profile(solutions, follow).losses.sum(1)
+        k = min(max(int(np.argmin(total)), 1), len(STRETCHES) - 2)
+        between = np.geomspace(STRETCHES[k - 1], STRETCHES[k + 1], BETWEEN + 2)[1:-1]
+        return self._profile(solutions | self._solutions(between, solve_between), follow_all)
+
+    def _solutions(self, stretches: np.ndarray, progress: Progress) -> dict[float, Explained]:
+        """What explains the presses at each prestretch, solved from rest."""
+        modulus, found = self.reconstructor.sensor.material.modulus, {}
+        for k, stretch in enumerate(stretches):
+            progress(k / len(stretches), f"force balance at prestretch {stretch:.3g}")
+            found[stretch] = self.explained(stretch, modulus)
+        return found
+
+    def _profile(self, solutions: dict[float, Explained], progress: Progress) -> LossProfile:
+        stretches = sorted(solutions)
+        best = continued([solutions[stretch] for stretch in stretches], self.observation, progress)
+        seen = self.observation.confidence.sum(-1)
+        return LossProfile(np.array(stretches), np.array([(seen * found.unexplained).numpy() for _, found in best]))
+
+    def told(self, log_stretches: np.ndarray) -> PressesTold:
+        """Losses and forces at three prestretches."""
+        explained = [self.explained(float(np.exp(z)), self.reconstructor.sensor.material.modulus) for z in log_stretches]
+        losses = np.array([float((self.observation.confidence.sum(-1) * found.unexplained).sum()) for _, found in explained])
+        return PressesTold(losses, np.stack([np.linalg.norm(_forces(each), axis=1) for each in explained]))
+
+    def gauge_modulus(
+        self,
+        log_stretch: float,
+        deviation: float,
+        pressures: KnownPressures,
+        other: "Presses | None" = None,
+        progress: Progress = silent,
+    ) -> tuple[float, float, float, float, np.ndarray]:
+        """The modulus from pressures; arguments and what is returned as of `modulus`, with pressure changes for forces, and
+        before these the change on the rest surface of another height."""
+        modulus = self.reconstructor.sensor.material.modulus
+        progress(0.0, "modulus from pressures")
+        fitted = self._gauge_fit(np.exp(log_stretch), modulus, pressures)
+        changes = []
+        for k, s in enumerate((-1, 1)):
+            progress((k + 1) / 4, "modulus from pressures with the prestretch's error")
+            at = self._gauge_fit(np.exp(log_stretch + s * deviation), fitted.modulus, pressures)
+            changes.append(at.modulus - fitted.modulus)
+        low, high = changes
+        change = float(np.sign(high - low) * max(abs(low), abs(high)))
+        progress(0.75, "modulus from pressures with the rest surface's error")
+        moved = fitted if other is None else other._gauge_fit(np.exp(log_stretch), fitted.modulus, pressures)
+        return fitted.modulus, fitted.deviation, change, moved.modulus - fitted.modulus, fitted.pressures
+
+    def _gauge_fit(self, stretch: float, begin: float, pressures: KnownPressures) -> GaugeModulus:
+        def found(modulus: float) -> FoundPressures:
+            estimator, it = self.explained(stretch, modulus, PRESSURE_GRID)
+            noise = estimator.equations.bearings.noise
+            with torch.no_grad():
+                spread = estimator.standard_deviations(it.vertices, it.pressure, it.moved, self.observation, noise)
+            rest = float(estimator.rest_pressure)
+            return FoundPressures((it.pressure - rest).numpy(), spread.pressure.numpy(), rest)
+
+        gas = self.reconstructor.estimator.cavity.filling == "gas"
+        return modulus_from_pressures(found, np.asarray(pressures.readings, float), pressures.since_rest, begin, gas)
+
+    def modulus(
+        self, log_stretch: float, deviation: float, known: KnownForces, progress: Progress = silent
+    ) -> tuple[float, float, float, np.ndarray, list[tuple[int, float, float]]]:
+        """The modulus from presses of known force.
+
+        A gas resists in newtons: there the presses are explained anew with each modulus.
+
+        Args:
+            log_stretch: logarithm of the prestretch.
+            deviation: its standard deviation.
+            known: as for `material_from_pixels`.
+            progress: is told how far it is.
+
+        Returns:
+            The modulus; its standard deviation at this prestretch; its change with one deviation of the prestretch, the larger
+            of those to either side, negative, as under more tension at rest a softer membrane presses as hard; magnitudes of
+            the forces found and measured, `[B, 2]`; and images whose forces the others contradict, as of `odd_ones`.
+        """
+        forces, relative = known.forces, known.relative
+        weight = relative**-2.0 / (relative**-2.0).sum()
+        modulus = self.reconstructor.sensor.material.modulus
+        progress(0.0, "modulus from forces")
+        self._refuse_unpressed(float(np.exp(log_stretch)), modulus, np.isfinite(forces).all(1))
+        for _ in range(GAS_ROUNDS if self.reconstructor.estimator.cavity.filling == "gas" else 1):
+            ratios, magnitudes = self._ratios(np.exp(log_stretch), modulus, forces)
+            modulus = float((weight * ratios).sum() * modulus)
+        progress(0.5, "modulus with the prestretch's error")
+        sides = [(weight * self._ratios(np.exp(log_stretch + s * deviation), modulus, forces)[0]).sum() for s in (-1, 1)]
+        change = -modulus * np.abs(np.array(sides) - 1).max()
+        sure, mean = (relative**-2.0).sum() ** -0.5, (weight * ratios).sum()
+        scatter = (((ratios / mean - 1) / relative) ** 2).sum() / max(len(ratios) - 1, 1)
+        images = np.flatnonzero(np.isfinite(forces).all(1))
+        odd = [(int(images[i]), ratio, apart) for i, ratio, apart in odd_ones(ratios, relative)]
+        return modulus, modulus * sure * max(1.0, scatter) ** 0.5, change, magnitudes, odd
+
+    def _refuse_unpressed(self, stretch: float, modulus: float, known: np.ndarray) -> None:
+        """Refuse images of known force `[B]` in which the markers show hardly any."""
+        estimator, it = self.explained(stretch, modulus)
+        noise = estimator.equations.bearings.noise
+        with torch.no_grad():
+            spread = estimator.standard_deviations(it.vertices, it.pressure, it.moved, self.observation, noise)
+        force = (it.traction * estimator.membrane.rest_area[:, None]).sum(1)
+        unsure = (spread.force.norm(dim=1) > UNSURE * force.norm(dim=1)).numpy()
+        for i in np.flatnonzero(known & unsure):
+            raise MembraneError(
+                f"calibrate material: image {i + 1} hardly shows a force, though one is given for it; expected presses that "
+                "dent the membrane visibly: leave it out"
+            )
+
+    def _ratios(self, stretch: float, modulus: float, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Forces measured over found of the presses of known force `[F]`, and all magnitudes, found and measured `[B, 2]`."""
+        found = _forces(self.explained(stretch, modulus))
+        size, measured = np.linalg.norm(found, axis=1), np.linalg.norm(forces, axis=1)
+        along = (forces * found).sum(1) / size if forces.shape[1] == 3 else measured
+        return (along / size)[np.isfinite(along)], np.stack([size, measured], -1)
+
+
+def _forces(explained: Explained) -> np.ndarray:
+    """Found in presses, `[B, 3]`."""
+    estimator, equilibrium = explained
+    found: np.ndarray = (equilibrium.traction * estimator.membrane.rest_area[:, None]).sum(1).numpy()
+    return found

@@ -1,0 +1,125 @@
+"""How sure a rest surface is: the sensor whose surface has another height over its rim, and what presses tell then.
+
+Dots that were placed from the rest image lie on its rays whatever the surface: they are moved along these. What the image
+leaves open is mostly one number, how high the surface stands over its rim.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ..errors import MembraneError, expect
+from ..sensor.inflated import InflatedSurface
+from ..sensor.parts import Markers, Surface
+from ..sensor.sensor import Sensor
+from ..surface.membrane import Membrane
+from ..surface.topology import rim_loop
+
+HEIGHT_ERROR = 0.05
+"""Standard deviation of the rest surface's height over its rim, relative, where nothing is said of it."""
+MOST_ERROR = 0.5
+MOST_SHIFT = 3.0  # of the prestretch by the height, in standard deviations by the losses: beyond, a loss is no parabola
+
+
+@dataclass(frozen=True, eq=False)
+class _Scaled(Surface):
+    """A surface whose heights over its rim's plane are larger by a share."""
+
+    share: float = 0.0
+
+    def membrane(self, grid: tuple[int, int]) -> Membrane:
+        """On a solver grid; see `Surface.membrane`."""
+        membrane = super().membrane(grid)
+        x, fixed = (a.unflatten(0, grid).numpy() for a in (membrane.rest, membrane.fixed))
+        rim = membrane.rest.numpy()[rim_loop(grid)]
+        centre = rim.mean(0)
+        normal = np.linalg.svd(rim - centre)[2][2]
+        return Membrane(x + self.share * ((x - centre) @ normal)[..., None] * normal, fixed)
+
+
+def at_other_height(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
+    """The sensor whose rest surface is lower over its rim by a share, its markers where their rays meet it.
+
+    Where a surface folds when it is lowered, it is raised: what a small change does has then the other sign throughout.
+
+    Args:
+        sensor: any.
+        positions: `[D, 3]` of its markers.
+        share: of the height.
+
+    Returns:
+        The sensor, without a rest image, and which markers it has, `[D]` bool: the rays of others miss the surface.
+
+    Raises:
+        MembraneError: the surface folds either way.
+    """
+    right = 0 < share <= MOST_ERROR
+    expect(right, "calibrate material: rest error", share, f"more than 0, at most {MOST_ERROR:g}, of the height")
+    for change in (-share, share):
+        try:
+            return _changed(sensor, positions, change)
+        except MembraneError as error:
+            refused = error
+    raise MembraneError(
+        f"calibrate material: with its height changed by {share:g} the rest surface folds ({refused}); expected a smaller "
+        "--rest-error, or a surface that the camera sees at less of a slant"
+    )
+
+
+def _changed(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
+    surface = sensor.surface
+    if isinstance(surface, InflatedSurface):
+        surface = surface.of_height((1 + share) * surface.formed.height)
+    else:
+        surface = _Scaled(surface.shape, surface.values, share)
+    membrane = surface.membrane(sensor.membrane.grid)
+    rays = sensor.camera.pixel_to_ray(sensor.camera.point_to_pixel(torch.from_numpy(positions)))
+    origins, directions = rays.origin.numpy(), rays.direction.numpy()
+    before, after = (surface.ray_points(origins, directions).distance for surface in (sensor.membrane, membrane))
+    moved = after - before  # of facets on the same grid: a marker that is off its facet stays so
+    kept = np.isfinite(moved)
+    markers = Markers("dots", positions=(positions + moved[:, None] * directions)[kept])
+    return replace(sensor, surface=surface, membrane=membrane, markers=markers), kept
+
+
+class HeightEffect(NamedTuple):
+    """What presses tell otherwise where the rest surface has another height, by one standard deviation of it.
+
+    Attributes:
+        shift: of the logarithm of the prestretch that they tell.
+        by_stretch: change of the forces' logarithm with one standard deviation of the prestretch, in the mean.
+        by_height: with the height.
+    """
+
+    shift: float
+    by_stretch: float
+    by_height: float
+
+
+class PressesTold(NamedTuple):
+    """What presses tell at three prestretches, one standard deviation apart: their loss in sum, `[3]`, and the magnitudes of
+    the forces found, `[3, B]`."""
+
+    losses: np.ndarray
+    forces: np.ndarray
+
+
+def height_effect(own: PressesTold, other: PressesTold, step: float, variance: float) -> HeightEffect:
+    """From what presses tell on both surfaces.
+
+    Near its minimum the loss is a parabola over the prestretch's logarithm, of curvature 1 / variance; a slope `k` that the
+    height adds to it moves the minimum by `-k variance`.
+
+    Args:
+        own: on the sensor's surface.
+        other: on that of another height.
+        step: of the prestretch's logarithm.
+        variance: of the prestretch's logarithm by the presses' losses.
+    """
+    added = other.losses - own.losses
+    bound = MOST_SHIFT * variance**0.5
+    shift = float(np.clip(-variance * (added[2] - added[0]) / (2 * step), -bound, bound))
+    low, middle, high = np.log(own.forces).mean(1)
+    return HeightEffect(shift, float(high - low) / 2, float(np.log(other.forces[1]).mean() - middle))
