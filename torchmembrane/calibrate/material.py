@@ -149,14 +149,15 @@ def material_from_pixels(
         end.
     """
     reconstructor = _reconstructor(sensor)
+    observer, shape = reconstructor.observer, reconstructor.rest_pixels.shape
     pixels = tensor_of("calibrate material: pixels", pixels).to(reconstructor.rest_pixels)
-    known = pixels.ndim == 3 and pixels.shape[1:] == reconstructor.rest_pixels.shape
-    expected = f"[B, {len(reconstructor.rest_pixels)}, 2], one for each marker"
-    expect(known, "calibrate material: pixels", f"a tensor {list(pixels.shape)}", expected)
+    expected = f"[B, {', '.join(map(str, shape))}], one for each marker"
+    expect(pixels.shape[1:] == shape, "calibrate material: pixels", f"a tensor {list(pixels.shape)}", expected)
+    pixels = observer.sighted(pixels)
     lost = ~pixels.isfinite().all(-1)
-    displacement = torch.where(lost[..., None], 0.0, pixels - reconstructor.rest_pixels)
+    displacement = torch.where(lost[..., None], 0.0, pixels - observer.rest_pixels)
     confidence = (~lost).to(pixels)
-    covariance = None if noise is None else reconstructor.observer.covariance_of(noise, confidence)
+    covariance = None if noise is None else observer.covariance_of(noise, confidence)
     measured = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure, rest_error, covariance)
     return _material(sensor, reconstructor, measured, progress)
 

@@ -93,8 +93,8 @@ class ViewsObserver(nn.Module):
         each = zip(self.each, self.images(images), befores, rests, strict=True)
         return self._together([observer(*given) for observer, *given in each])
 
-    def from_pixels(self, pixels: Any, confidence: Any, rest_pixels: Any) -> MarkerFlow:
-        """What markers located elsewhere show; `pixels [B, W, D, 2]` or `[W, D, 2]`, the others alike."""
+    def from_pixels(self, pixels: Any, confidence: Any, rest_pixels: Any, noise: float | None = None) -> MarkerFlow:
+        """What markers located elsewhere show; `pixels [B, W, D, 2]` or `[W, D, 2]`, `confidence` and `rest_pixels` alike."""
         pixels, shape = tensor_of("from_pixels: pixels", pixels), (self.views, self.count, 2)
         pixels = pixels[None] if pixels.ndim == 3 else pixels
         if tuple(pixels.shape[1:]) != shape:
@@ -103,7 +103,12 @@ class ViewsObserver(nn.Module):
         sure = [None] * self.views if confidence is None else tensor_of("from_pixels: confidence", confidence).unbind(-2)
         rests = self._split(None if rest_pixels is None else self.rest_given(rest_pixels), 0)
         each = zip(self.each, pixels.unbind(1), sure, rests, strict=True)
-        return self._together([observer.from_pixels(*given) for observer, *given in each])  # type: ignore[operator]
+        return self._together([observer.from_pixels(*given, noise) for observer, *given in each])  # type: ignore[operator]
+
+    def covariance_of(self, noise: float | None, confidence: Tensor) -> Tensor:
+        """As of `MarkerObserver`, of the sightings `[B, N]`."""
+        parts = zip(self.each, self.by_view(confidence).unbind(1), strict=True)
+        return torch.cat([observer.covariance_of(noise, part) for observer, part in parts], 1)  # type: ignore[operator]
 
     @traced
     def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
