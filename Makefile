@@ -1,5 +1,6 @@
 # make demo | make test | make lint (style, types, layers) | make bench | make figures: each sets itself up on a machine with Python 3.11+ only.
 # make test-all: every test, those that `make test` leaves out for their length as well; weekly and before a release.
+# make coverage: the tests of make test, and which share of the package's lines they run; in out/coverage.json by file.
 # make soak SOAK=HOURS PRESSES=10000 KILLS=10: damaged files for so many hours, jobs killed, random sensors pressed; all hours long.
 # make fuzz FUZZ=HOURS SEED=N: damaged files of every kind, models and bags as well, for so many hours.
 # make test-lowest: the quick start with the lowest versions that pyproject.toml allows, in .venv-lowest.
@@ -7,6 +8,8 @@
 # make test-ros: the node of ROS 2 under rclpy of PyPI in .venv-ros; needs Python 3.11, on Linux.
 # make test-dist: sdists and wheels of the three packages in out/dist, used from empty environments; of what is committed.
 # make docs: the site in out/site, links checked.
+# make measure PARTS="frame training" INDEPENDENT=FOLDER: measures what the documents quote and writes their tables; without PARTS
+#   what has changed since it was measured, hours in all. make measured says what was measured when, and what is old.
 # make web | make test-web: the page in the browser; they need Node.js 20+ with npm too, and get the rest themselves.
 # make test-cpp | make test-arm: the C++ example (needs cmake); the edge package on an emulated aarch64. On Debian.
 PYTHON ?= python3
@@ -37,7 +40,7 @@ PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --n
 	--durations=8
 IMAGES := examples/two_contacts.png examples/press_on_axis.png examples/flat_plate.png
 
-.PHONY: demo test test-all checked test-lowest test-lerobot test-ros test-dist lint style types layers bench fuzz soak figures docs web test-web test-cpp test-arm clean
+.PHONY: demo test test-all coverage checked test-lowest test-lerobot test-ros test-dist lint style types layers bench measure measured fuzz soak figures docs web test-web test-cpp test-arm clean
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -57,6 +60,13 @@ test: $(READY) checked
 test-all: $(READY) checked
 	@echo 'Every test: those of make test, and those marked full (pytest -m full --collect-only -q lists them).'
 	$(PYTEST) -m ""
+
+coverage: $(VENV)/.coverage
+	mkdir -p out && COVERAGE_FILE=out/.coverage $(PYTEST) --cov=torchmembrane --cov-report=term:skip-covered --cov-report=json:out/coverage.json
+
+$(VENV)/.coverage: $(READY)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt pytest-cov
+	touch $@
 
 checked: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/compile.py & compiling=$$!; $(MAKE) --no-print-directory lint; found=$$?; \
@@ -112,6 +122,12 @@ layers: $(READY)
 bench: $(READY)
 	$(BIN)/python -m bench.speed.speed --json out/bench/speed.json
 
+measure: $(READY)
+	$(BIN)/python -m bench.measure.measure $(PARTS) $(if $(INDEPENDENT),--independent $(INDEPENDENT))
+
+measured: $(READY)
+	$(BIN)/python -m bench.measure.measure --list
+
 fuzz: $(READY)
 	PYTHONPATH=export $(BIN)/python -m bench.robustness.fuzz --hours $(FUZZ) --seed $(SEED) --json out/bench/fuzz.json
 
@@ -126,7 +142,7 @@ figures: $(READY)
 	$(BIN)/python docs/figures.py
 
 docs: $(VENV)/.docs
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 $(VENV)/.docs: $(READY)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"

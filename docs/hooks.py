@@ -1,7 +1,10 @@
 """Code in the site's pages breaks where it can be read: not within an option, in a table not within a short name. Pictures open
-in their own size where they are clicked."""
+in their own size where they are clicked. A measured table says so where what it measures has changed since."""
 
 import re
+
+from bench.measure.pages import aged
+from bench.measure.tables import TABLES, paths_of
 
 LONGEST = 18  # letters of a name that is kept whole in a table
 OPTION = re.compile(r"(?<![\w-])--?[A-Za-z][\w-]*")
@@ -9,6 +12,11 @@ CODE = re.compile(r"(<code[^>]*>)(.*?)(</code>)", re.S)
 PICTURE = re.compile(r'<img [^>]*src="([^"]+)"[^>]*>')
 CELL = re.compile(r"<(t[dh]).*?</\1>", re.S)
 JOINT = re.compile(r"(?<=\w)(::|[._/(\[,=])(?=[\w\]])")
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """A page whose measured tables say how old they are."""
+    return aged(markdown, {table: paths_of(table) for table in TABLES})
 
 
 def on_page_content(html: str, **_: object) -> str:

@@ -38,7 +38,7 @@ CONTRACT = {
     "coverage": (), "camera_motion": (4,),
     "force_deviation": (3,), "depth_deviation": (),
 }  # fmt: skip
-OF_FILE = ("path", "file_size", "file_modified", "content_hash", "time", "seconds")
+OF_FILE = ("path", "file_size", "file_modified", "content_hash", "time", "gauge", "seconds")
 
 
 class Denting:

@@ -194,7 +194,7 @@ OWN_FILES = {
 }
 
 
-def test_strangers_files_are_opened_in_one_place():
+def test_untrusted_files_are_opened_in_one_place():
     """Every call of a reader in the package, but of `read_text`, `read_bytes` and `read_table` as functions of io."""
     package, found = Path(__file__).parents[1] / "torchmembrane", set()
     for path in package.rglob("*.py"):

@@ -13,12 +13,16 @@ from scipy.spatial import cKDTree
 
 from bench.accuracy import thresholded_dots
 from torchmembrane.errors import MembraneError
+from torchmembrane.markers.dots.alignment import Alignment
 from torchmembrane.markers.dots.bands import bands, blur_rows
 from torchmembrane.markers.dots.blobs import _maxima
 from torchmembrane.markers.dots.coherence import Coherence
 from torchmembrane.markers.dots.deformation import monomial_map
+from torchmembrane.markers.dots.detect import BlobDetector
+from torchmembrane.markers.dots.ellipse import draw_dots
 from torchmembrane.markers.dots.fit import EllipseFit
 from torchmembrane.markers.dots.locator import DotLocator, membrane_mask
+from torchmembrane.markers.dots.match import DotMatcher
 from torchmembrane.markers.dots.pattern import DotPattern, find_dots, measure_dots
 from torchmembrane.markers.dots.pyramid import mean_pyramid
 
@@ -602,3 +606,100 @@ def test_maxima_are_the_values_that_a_maximum_filter_leaves(shape):
     values = np.random.default_rng(0).integers(0, 6, shape) / 5
     expected = (values == ndimage.maximum_filter(values, (3, 3, 3))) & (values > 0.5)
     np.testing.assert_array_equal(_maxima(values, 0.5), np.argwhere(expected))
+
+
+@pytest.mark.parametrize("radius", [5.0, 6.2])
+def test_large_dots_close_together_are_each_found(radius):
+    pixels = 40.0 + 15.3 * np.stack(np.meshgrid(np.arange(12), np.arange(9)), -1).reshape(-1, 2) @ [[1.0, 0.2], [-0.2, 1.0]]
+    shapes, inside = np.tile(radius * np.eye(2), (len(pixels), 1, 1)), torch.ones(1, 1, *SIZE[::-1], dtype=torch.float64)
+    detect = BlobDetector(np.full(len(pixels), radius), 14.0, len(pixels), inside)
+    blobs, _, _ = detect.double()(mean_pyramid(draw_dots(pixels, shapes, SIZE)))
+    within = np.all((pixels > 10) & (pixels < np.array(SIZE) - 11), 1)
+    assert cKDTree(blobs[0].numpy()).query(pixels[within])[0].max() < 1.5
+
+
+def test_dots_are_looked_for_two_pitches_off_also_where_the_rim_is_far():
+    pixels = 120.0 + 14.0 * np.stack(np.meshgrid(np.arange(6), np.arange(5)), -1).reshape(-1, 2)
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    rim = pixels.mean(0) + 105 * np.stack([np.cos(angle), np.sin(angle)], -1)
+    mask = membrane_mask(pixels, rim, SIZE)[0, 0].numpy() > 0
+    for way in ([-28, 0], [28, 0], [0, -28], [0, 28], [20, 20]):
+        u, v = (pixels + way).astype(int).T
+        assert mask[v, u].all()
+    assert not mask[5, 5]
+
+
+def whole(pixels, pitches=0.0, degrees=0.0, shear=0.0, scale=1.0):
+    """A pattern that moves as a whole, its edge as well; a shift in pitches."""
+    a = np.deg2rad(degrees)
+    matrix = scale * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) @ [[1, shear], [0, 1]]
+    middle = pixels.mean(0)
+    return middle + (pixels - middle) @ matrix.T + pitches * PITCH * np.array([0.8, -0.6]), matrix
+
+
+@pytest.mark.parametrize("motion", [dict(pitches=1.0), dict(pitches=1.9), dict(degrees=15), dict(shear=0.25), dict(scale=0.8)])
+@pytest.mark.parametrize("two_sizes", [True, False])
+def test_a_pattern_that_moves_as_a_whole_is_followed_with_its_outline(two_sizes, motion):
+    s = scene("square", two_sizes)
+    inner = np.linalg.norm(s.pixels - CENTRE, axis=1) < 62
+    rest, shapes = s.pixels[inner], s.shapes[inner]
+    moved, matrix = whole(rest, **motion)
+    locate = DotLocator(DotPattern(rest, shapes, s.sizes[inner]), SIZE, "dark")
+    pixels, confidence, _ = locate(batch(render(moved, matrix @ shapes, noise=0.01)))
+    assert np.linalg.norm(pixels[0].numpy() - moved, axis=1).max() < 0.3 and confidence.min() > 0.5
+
+
+def matched(pixels, moved, generator):
+    """How many dots at `pixels` find their blob at `moved`, how many another, how many have one; some blobs are missing, some
+    false."""
+    there = generator.random(len(moved)) > 0.05
+    false = generator.uniform(moved.min(0) - PITCH, moved.max(0) + PITCH, (len(moved) // 10, 2))
+    blobs = torch.as_tensor(np.concatenate([moved[there] + generator.normal(0, 0.5, (there.sum(), 2)), false]))[None]
+    match = DotMatcher(pixels, np.zeros(len(pixels)), 0.45, np.ones(len(pixels), bool)).double()
+    found, sure, _ = match(blobs, torch.zeros_like(blobs[..., 0]), torch.ones_like(blobs[..., 0]))
+    right = (np.linalg.norm(found[0].numpy() - moved, axis=1) < 3) & there
+    return right.sum(), ((sure[0].numpy() > 0.3) & ~right).sum(), there.sum()
+
+
+@pytest.mark.parametrize("arrangement", ["square", "hexagonal", "random"])
+def test_neighbours_agree_on_a_drag_of_two_pitches_with_missing_and_false_blobs(arrangement):
+    generator = np.random.default_rng(2)
+    pixels = scene("square" if arrangement == "random" else arrangement).pixels
+    if arrangement == "random":
+        pixels = pixels + generator.uniform(-6, 6, pixels.shape)
+    away = ((pixels - CENTRE - [20, 10]) ** 2).sum(1) / (2 * (4 * PITCH) ** 2)
+    moved = pixels + 2 * PITCH * np.exp(-away)[:, None] * [0.6, 0.8]
+    right, wrong, there = matched(pixels, moved, generator)
+    assert right >= there - 1 and wrong <= 3
+
+
+@pytest.mark.parametrize("seen_share", [1.0, 0.6])
+def test_a_lattice_is_laid_on_its_blobs_by_its_outline(seen_share):
+    rest = np.stack(np.meshgrid(np.arange(9.0), np.arange(7.0)), -1).reshape(-1, 2) * PITCH
+    rest = rest - rest.mean(0)
+    seen = np.argsort(np.argsort(rest[:, 0])) < seen_share * len(rest)
+    moved, _ = whole(rest, pitches=2.0, degrees=2)
+    blobs = torch.as_tensor(moved)[None]
+    eye, one = torch.eye(2).double()[None, ..., None].expand(1, 2, 2, len(rest)), torch.ones(1, len(rest)).double()
+    lay = Alignment(rest, seen).double()
+    place = lay(
+        torch.as_tensor(rest)[None],
+        blobs[:, seen],
+        torch.zeros(1, len(rest), seen.sum()).double(),
+        eye[..., seen],
+        one[:, seen],
+    )
+    assert np.linalg.norm(place[0].numpy() - moved, axis=1)[seen].max() < 0.25 * PITCH
+
+
+def test_dots_beyond_the_border_of_the_image_do_not_move_those_in_it():
+    rest = np.stack(np.meshgrid(np.arange(-3, 18), np.arange(-3, 14)), -1).reshape(-1, 2) * PITCH + [9.0, 5.0]
+    shapes = np.tile(3.4 * np.eye(2), (len(rest), 1, 1))
+    away = ((rest - CENTRE) ** 2).sum(1) / (2 * (2.5 * PITCH) ** 2)
+    moved = rest + 0.5 * PITCH * np.exp(-away)[:, None] * [0.6, 0.8]
+    seen = np.all((rest > 8) & (rest < np.array(SIZE) - 9), 1)
+    locate = DotLocator(DotPattern(rest, shapes, np.ones(len(rest), int)), SIZE, "dark")
+    image = draw_dots(moved, shapes, SIZE).float()
+    pixels, confidence, _ = locate(image)
+    assert np.linalg.norm(pixels[0].numpy() - moved, axis=1)[seen].max() < 0.3 and confidence[0, seen].min() > 0.5
+    assert seen.sum() < 0.6 * len(rest)

@@ -18,7 +18,7 @@ from test_batch import CONTRACT, NPZ, PARQUET, Denting, grey_image, reconstruct,
 
 from torchmembrane.cli.main import main
 from torchmembrane.errors import MembraneError
-from torchmembrane.files.folder_lock import WHOLE, Claim, Shard
+from torchmembrane.files.folder_lock import WHOLE, FolderLock, Shard
 from torchmembrane.files.provenance import Origin
 from torchmembrane.jobs import workers
 from torchmembrane.jobs.inputs import find_inputs
@@ -238,12 +238,12 @@ def test_a_row_of_another_shard_without_a_number_where_one_belongs_is_left_out(c
     assert set(summary_of(tmp_path / "out")) == {row["name"] for row in rows} - {other["name"]}
 
 
-def test_a_claimed_folder_is_refused_until_the_other_job_ends(images, tmp_path):
-    with Claim(tmp_path / "out", WHOLE):
+def test_a_locked_folder_is_refused_until_the_other_job_ends(images, tmp_path):
+    with FolderLock(tmp_path / "out", WHOLE):
         for shard in (WHOLE, Shard(2, 2)):
             with pytest.raises(MembraneError, match="another job is writing there .all frames"):
                 reconstruct(images, tmp_path / "out", shard=shard)
-    with Claim(tmp_path / "out", Shard(1, 2)):
+    with FolderLock(tmp_path / "out", Shard(1, 2)):
         for shard in (WHOLE, Shard(1, 2), Shard(2, 3)):
             with pytest.raises(MembraneError, match="shard 1/2"):
                 reconstruct(images, tmp_path / "out", shard=shard)
@@ -254,16 +254,16 @@ def test_a_claimed_folder_is_refused_until_the_other_job_ends(images, tmp_path):
 
 def test_a_lock_ends_with_a_killed_process(tmp_path):
     script = (
-        "import sys, time; from pathlib import Path; from torchmembrane.files.folder_lock import Claim, WHOLE\n"
-        "with Claim(Path(sys.argv[1]), WHOLE): print('claimed', flush=True); time.sleep(60)"
+        "import sys, time; from pathlib import Path; from torchmembrane.files.folder_lock import FolderLock, WHOLE\n"
+        "with FolderLock(Path(sys.argv[1]), WHOLE): print('locked', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", script, tmp_path / "out"], stdout=subprocess.PIPE) as process:
-        assert process.stdout.readline() == b"claimed\n"
-        with pytest.raises(MembraneError), Claim(tmp_path / "out", WHOLE):
+        assert process.stdout.readline() == b"locked\n"
+        with pytest.raises(MembraneError), FolderLock(tmp_path / "out", WHOLE):
             pass
         process.kill()
-    with Claim(tmp_path / "out", WHOLE) as claim:
-        assert claim.alone
+    with FolderLock(tmp_path / "out", WHOLE) as lock:
+        assert lock.alone
 
 
 @both

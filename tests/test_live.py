@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 import warnings
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -22,13 +23,13 @@ import torch
 from PIL import Image
 
 import torchmembrane as tm
-from torchmembrane.cli.live import _stopped_by_signals
+from torchmembrane.cli.live import _stopped_by_signals, request_of
 from torchmembrane.cli.main import main
 from torchmembrane.files.grayscale import grey_batch
 from torchmembrane.files.images import read_image, write_as_taken
 from torchmembrane.live.background import Background
 from torchmembrane.live.line import Line, described, summary
-from torchmembrane.live.loop import RECENT, Seen, Tally, follow
+from torchmembrane.live.loop import RECENT, Seen, Tally, follow, rezeroed
 from torchmembrane.live.mailbox import Mailbox, capture
 from torchmembrane.live.recording import Recording, times_of
 from torchmembrane.live.sources import MOST_MISSED, Timed, camera_images, folder_images, paced, video_images
@@ -121,16 +122,27 @@ def test_a_stop_ends_an_endless_source_at_once():
     assert time.monotonic() - start < 1.0 and closed.wait(1.0)
 
 
-def test_rezero_is_done_once_between_frames_and_its_refusal_is_said(stream):
-    asked, said, slow = Event(), [], Slow(0.0)
-    asked.set()
+def test_requests_are_answered_once_between_frames_and_a_refusal_is_said(stream):
+    asked, said, slow = deque([rezeroed]), [], Slow(0.0)
     with capture(numbered(3, 100.0)) as mailbox:
         follow(slow, mailbox, Tally(), [], Event(), asked, said.append)
-    assert slow.zeroed == 1 and said == ["the latest frame is taken for rest"] and not asked.is_set()
-    asked.set()
+    assert slow.zeroed == 1 and said == ["the latest frame is taken for rest"] and not asked
+    asked.extend(request_of(text, "mm") for text in ("z", "200g", "12hPa", "q"))
     with capture(iter(())) as mailbox:
         follow(stream, mailbox, Tally(), [], Event(), asked, said.append)
-    assert said[1].startswith("not taken for rest: Tracker.rezero: no frame yet")
+    for answer, name in zip(said[1:4], ("rezero", "weigh", "gauge"), strict=True):
+        assert answer.startswith(f"not done: Tracker.{name}: no frame yet")
+    assert said[4].startswith("'q' is not understood; expected z") and len(said) == 5
+
+
+def test_known_loads_are_compared_with_the_latest_frame(stream, small_images):
+    """A load that is stated as twice what is found gives a ratio of a half; a gauge is read in hPa, 1e-4 N/mm^2."""
+    frame = stream(read_image(small_images[2]), 0.0)
+    force, change = float(np.linalg.norm(frame["force"])), float(frame["pressure_change"])
+    answer = request_of(f"{2 * force:.6f}N", "mm")(stream)
+    assert "the force is found 0.500 times as large as known" in answer and stream.tracker.stiffness.ratio < 0.51
+    answer = request_of(f"{change / 1e-4 / 2:.6f}hPa", "mm")(stream)
+    assert "the change of pressure is found 2.000 times" in answer
 
 
 def test_a_mailbox_that_ended_gives_its_last_picture_first():
@@ -243,13 +255,13 @@ def test_a_recording_that_cannot_be_closed_says_so_beside_another_error(stream, 
 
 
 def test_rezero_of_live_says_that_a_contact_was_found(stream, small_images, recwarn):
-    asked, said = Event(), []
+    asked, said = deque(), []
     image = read_image(small_images[2])
 
     def pressed():
         yield image
         time.sleep(0.5)
-        asked.set()
+        asked.append(rezeroed)
         yield image
 
     with capture(pressed()) as mailbox:

@@ -88,6 +88,26 @@ def test_a_part_of_the_membrane_is_seen_and_the_press_in_it_found(scale, shift):
     assert np.linalg.norm(result.force[0].numpy() - frame.truth["force"]) < 0.25 * np.linalg.norm(frame.truth["force"])
 
 
+@pytest.mark.parametrize(("pin", "status"), [(0.0, tm.Status.OK), (1.0, tm.Status.UNEXPLAINED), (4.0, tm.Status.UNEXPLAINED)])
+def test_markers_that_move_as_the_tips_of_pins_are_not_those_of_a_membrane(fingertip, pin, status):
+    """Pins that stand on the inner side turn with it: their tips move sideways with the slope, as no marker on it does."""
+    sensor, simulator = fingertip
+    stroke = Stroke(Sphere(3.0).touching(simulator.membrane, WAY), WAY, 0.5)
+    (state,) = simulator.presses(stroke, ("push",))
+    truth, membrane = simulator.frame(state, stroke, np.random.default_rng(0)).truth, simulator.membrane
+    X, Y, at = truth["dots_nominal"], truth["dots_deformed"], membrane.closest_points(sensor.markers.positions)
+
+    def seen(base, normals):
+        tips = base - pin * (normals.numpy()[at.vertices] * at.weights[..., None]).sum(1)
+        return sensor.camera.point_to_pixel(torch.from_numpy(tips))
+
+    moved = seen(Y, membrane.normals(torch.as_tensor(state.vertices))) - seen(X, membrane.rest_normals)
+    reconstructor = tm.Reconstructor(sensor)
+    result = reconstructor.from_pixels(reconstructor.rest_pixels + moved)
+    assert result.status.tolist() == [status]
+    assert pin > 0 or np.linalg.norm(result.markers[0].numpy() - Y) < 0.15 * np.linalg.norm(Y - X)
+
+
 def test_what_the_lens_cannot_image_is_no_error(fingertip):
     """A pinhole camera inside the membrane: what lies beside or behind it has no pixel."""
     sensor, _ = fingertip

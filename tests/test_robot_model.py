@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 import torchmembrane as tm
-from torchmembrane.cli.main import main
 from torchmembrane.integrations.robot_model import roll_pitch_yaw, write_robot_model
 from torchmembrane.presets import NAMES
 
@@ -50,11 +49,6 @@ def test_angles_give_their_rotation_back(pitch):
     rotation = turned(2, 0.7) @ turned(1, pitch) @ turned(0, -2.1)
     roll, found, yaw = roll_pitch_yaw(rotation)
     np.testing.assert_allclose(turned(2, yaw) @ turned(1, found) @ turned(0, roll), rotation, atol=1e-9)
-
-
-def test_the_command_writes_them(tmp_path, capsys):
-    assert main(["check", "preset:fingertip", "--robot", str(tmp_path / "robot")]) == 0
-    assert (tmp_path / "robot/fingertip.urdf").exists() and "fingertip.urdf" in capsys.readouterr().out
 
 
 def turned(axis, angle):

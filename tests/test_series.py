@@ -49,6 +49,20 @@ def test_lines_are_the_table_s_columns_over_its_times():
     assert pressure.get_ylabel() == "pressure change [hPa]" and pressure.get_xlabel() == "time [s]"
 
 
+def test_a_gauge_s_readings_stand_beside_the_pressure_found():
+    """Readings are across the membrane, what is drawn since rest: 700 hPa are across it at rest."""
+    rows = table()
+    for k in (1, 3):
+        rows[k] |= {"pressure_hpa": str(700 + 3 * k), "gauge_pressure_hpa": str(700 + 4 * k)}
+    pressure = series_figure({"day": rows}).axes[2]
+    np.testing.assert_allclose(line(pressure, "read by a gauge")[1], [np.nan, 4, np.nan, 12, np.nan, np.nan])
+
+
+def test_the_axis_says_when_a_recording_began():
+    rows = [row | {"time": str(1790509109.25 + k)} for k, row in enumerate(table())]
+    assert series_figure({"day": rows}).axes[2].get_xlabel() == "time [s] since 2026-09-27 11:38:29 UTC"
+
+
 def test_without_times_frames_are_numbered():
     axes = series_figure({"day": table(times=False)}).axes
     assert axes[2].get_xlabel() == "frame" and line(axes[0], "z")[0].tolist() == [0, 1, 2, 3, 4, 5]

@@ -2,10 +2,13 @@
 
 import json
 import sys
+from dataclasses import replace
+from datetime import date
 from pathlib import Path
 
 import av
 import numpy as np
+import pyarrow.parquet
 import pytest
 import torch
 import trimesh
@@ -17,6 +20,7 @@ from torchmembrane.cli import main as cli
 from torchmembrane.presets import NAMES, design, preset, preset_file, sensor_file
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
+from torchmembrane.sensor.record import Record
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.simulate import dataset
 from torchmembrane.simulate.frames import SimulatedFrames, SimulatedFrameTable
@@ -183,6 +187,17 @@ def test_processes_and_formats_do_not_change_a_data_set(sensor_path, tmp_path, c
     for name in files:
         assert np.array_equal(files[name].image, rows[name].image) and same(files[name].truth, rows[name].truth)
     assert "0 made, 0 failed, 2 there before" in run(capsys, *call, "--format", "parquet", "--out", tmp_path / "rows")[1]
+
+
+@pytest.mark.parametrize("format", ["png", "parquet"])
+def test_a_data_set_carries_the_sensor_s_record(sensor_path, tmp_path, capsys, format):
+    recorded = replace(Sensor.from_file(sensor_path), record=Record("A17", date(2026, 9, 27), 12))
+    path = recorded.to_file(tmp_path / "recorded.toml")
+    call = ("simulate", path, "--random", "1", "--jobs", "1", "--format", format, "--out", tmp_path / "rows")
+    assert run(capsys, *call)[0] == 0
+    assert Sensor.from_file(tmp_path / "rows" / "sensor.toml").record == recorded.record
+    for part in (tmp_path / "rows").glob("frames/*.parquet"):
+        assert pyarrow.parquet.read_schema(part).metadata[b"record"].decode() == recorded.record.text
 
 
 def test_presses_that_fail_are_reported_and_give_1(sensor_path, tmp_path, capsys, monkeypatch):

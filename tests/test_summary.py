@@ -15,6 +15,7 @@ from torchmembrane.files.timestamps import time_in
 from torchmembrane.integrations.rosbag import StampedMessage
 from torchmembrane.results import summary_row
 from torchmembrane.results.read import read_results
+from torchmembrane.results.summary import read_summary
 from torchmembrane.results.summary_row import METRE, NAMES
 from torchmembrane.sensor import units
 
@@ -28,22 +29,25 @@ HEADER = (
         f"contact_{k}_force_z,contact_{k}_area,"
         for k in (1, 2, 3, 4)
     )
-    + "deepest,deepest_x,deepest_y,deepest_z,depth_deviation,volume_error,seconds,content_hash,length_unit,force_unit"
+    + "deepest,deepest_x,deepest_y,deepest_z,depth_deviation,volume_error,seconds,content_hash,length_unit,force_unit,"
+    "gauge_pressure_hpa,contact_1_at_rim,contact_2_at_rim,contact_3_at_rim,contact_4_at_rim"
 )
 """What programs that read the table rely on: a column is never renamed or moved."""
+AFTER = ("gauge_pressure_hpa", "contact_1_at_rim", "contact_2_at_rim", "contact_3_at_rim", "contact_4_at_rim")
+"""Those that came after the first version of the table."""
 
 
 class Scattering(Denting):
     """Every number of a result is another one; three contact patches of four."""
 
-    def __call__(self, batch):
+    def __call__(self, batch, pressure=None):
         found = super().__call__(batch)
         draw = torch.Generator().manual_seed(3)
         plain = {
             key: value if key in ("status", "confidence") else value + torch.rand(value.shape, generator=draw)
             for key, value in found._asdict().items()
         }
-        for key in ("contact_points", "contact_force", "contact_area"):
+        for key in ("contact_points", "contact_force", "contact_area", "contact_at_rim"):
             plain[key][:, 3] = torch.nan
         return type(found)(**plain)
 
@@ -54,7 +58,8 @@ def table(tmp_path_factory):
     folder = tmp_path_factory.mktemp("summary")
     image = grey_image(folder / "press_20260927T113829.250.png", 120)
     (folder / "broken.png").write_bytes(b"no image")
-    reconstruct([image, folder / "broken.png"], folder / "out", reconstructor=Scattering())
+    gauge = {image.stem: 0.00125}  # N/mm^2
+    reconstruct([image, folder / "broken.png"], folder / "out", reconstructor=Scattering(), pressure=gauge)
     rows = summary_of(folder / "out")
     return rows[image.stem], read_results(folder / "out")[image.stem], rows["broken"], folder
 
@@ -78,6 +83,7 @@ def test_each_column_holds_what_the_frame_s_arrays_say(table):
         "pressure_change": frame["pressure_change"],
         "pressure_hpa": frame["pressure"] * 1e4,  # 1 N/mm^2 is 1e6 Pa
         "pressure_change_hpa": frame["pressure_change"] * 1e4,
+        "gauge_pressure_hpa": 12.5,
         "force": np.sqrt((frame["force"] ** 2).sum()),
         "contacts": 3,
         "deepest": lowest.min(),
@@ -89,6 +95,7 @@ def test_each_column_holds_what_the_frame_s_arrays_say(table):
     for k in range(4):
         place, force, area = (frame[f"contact_{key}"][k] for key in ("points", "force", "area"))
         triples |= {f"contact_{k + 1}": place, f"contact_{k + 1}_force": force}
+        expected[f"contact_{k + 1}_at_rim"] = frame["contact_at_rim"][k]
         expected |= {f"contact_{k + 1}_force": np.sqrt((force**2).sum()), f"contact_{k + 1}_area": area}
     expected |= {f"{key}_{axis}": value for key, values in triples.items() for axis, value in zip("xyz", values, strict=True)}
     for key, value in expected.items():
@@ -118,6 +125,18 @@ def test_the_dictionary_beside_the_table_has_every_column_with_the_sensor_s_unit
     assert list(columns) == HEADER.split(",") and all(column["meaning"] for column in columns.values())
     units = {key: columns[key]["unit"] for key in ("force", "moment_x", "contact_2_area", "pressure", "pressure_hpa", "time")}
     assert list(units.values()) == ["N", "N mm", "mm^2", "N/mm^2", "hPa", "s"]
+
+
+def test_rows_of_a_table_without_the_last_columns_are_kept(table, tmp_path):
+    """As of a folder that was written before these came."""
+    before = [name for name in NAMES if name not in AFTER]
+    with open(tmp_path / "summary.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, before, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerow(table[0])
+    (row,) = read_summary(tmp_path)
+    assert {name: row[name] for name in before} == {name: table[0][name] for name in before}
+    assert {row[name] for name in AFTER} == {""}
 
 
 def test_relative_pressures_are_not_given_in_hectopascals():

@@ -140,7 +140,11 @@ def tours(tmp_path_factory):
     return tour
 
 
-@pytest.fixture(params=["m", "um", *(pytest.param(unit, marks=pytest.mark.full) for unit in ("cm", "inch"))])
+UNITS = ["m", "um", *(pytest.param(unit, marks=pytest.mark.full) for unit in ("cm", "inch"))]
+"""The largest and the smallest unit; those between them when all tests run."""
+
+
+@pytest.fixture(params=UNITS)
 def pair(request, tours, capsys):
     """The tour in mm, and in another unit."""
     return tours("mm", capsys), tours(request.param, capsys)
@@ -224,7 +228,7 @@ def test_the_live_line_shows_digits_in_every_unit(pair):
     assert (np.abs(lines[1] - lines[0]) < 5 * NEAR * sizes).all()
 
 
-@pytest.mark.parametrize("unit", ["cm", "m", "inch", "um"])
+@pytest.mark.parametrize("unit", UNITS)
 def test_tensor_operations_find_what_machine_code_finds(unit, tours, capsys):
     """On other devices, with gradients, in exported models and until machine code is compiled."""
     tour = tours(unit, capsys)

@@ -31,7 +31,7 @@ class MembraneError(ValueError):
 
 
 def expect(right: bool, name: str, value: object, expected: str) -> None:
-    """Refuse a value that is not right.
+    """Raise an error unless a value is right.
 
     Args:
         right: whether it is.
@@ -54,10 +54,10 @@ def expect(right: bool, name: str, value: object, expected: str) -> None:
 
 
 def check_arguments(target: Checked) -> Checked:
-    """A public function, or a class that is made, whose arguments are compared with their annotations before they are used.
+    """Decorate a public function or class so that its arguments are checked against their annotations.
 
-    A number is whatever Python takes for one; a list any sequence; an array whatever numpy makes an array of numbers of. An
-    argument that is missing, or has another name, is Python's own error.
+    A number is anything that Python accepts as one, a list any sequence, and an array anything that numpy converts to an array
+    of numbers. A missing or misnamed argument is Python's own error.
 
     Args:
         target: the function or class.
@@ -99,7 +99,7 @@ def check_arguments(target: Checked) -> Checked:
 
 
 def _given(signature: inspect.Signature, arguments: tuple[Any, ...], options: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Names and values of the arguments of a call, but for those that are the default; none where Python refuses the call."""
+    """Names and values of the arguments of a call, except those that are the default; none if Python rejects the call."""
     try:
         bound = signature.bind(*arguments, **options).arguments
     except TypeError:
@@ -113,7 +113,7 @@ def _given(signature: inspect.Signature, arguments: tuple[Any, ...], options: di
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of an annotation's type, or can be taken for it."""
+    """Whether a value has an annotation's type, or is accepted in its place."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return True
@@ -154,7 +154,7 @@ def _is_list(value: Any) -> bool:
 
 
 def is_number(value: Any) -> bool:
-    """Whether Python takes a value for a real number, as it does an array or a tensor without axes."""
+    """Whether Python accepts a value as a real number, which includes arrays and tensors without axes."""
     if getattr(value, "shape", None) not in (None, ()) or isinstance(value, str | bytes):
         return False
     try:
@@ -165,7 +165,7 @@ def is_number(value: Any) -> bool:
 
 
 def is_array(value: Any) -> bool:
-    """Whether a value is a tensor of real numbers, or numpy makes an array of real numbers of it."""
+    """Whether a value is a tensor of real numbers, or can be converted to an array of real numbers by numpy."""
     import numpy as np
 
     if hasattr(value, "is_complex"):

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM end a command soon, wherever it is.
+"""Ctrl-C and SIGTERM end a command soon, whatever it is doing.
 
 The first signal raises `Interrupted` in the main thread, as Python does for Ctrl-C. A thread sees to it that this ends the
 command: where the exception is lost in a callback, it is raised again; where the main thread is in compiled code that does not
@@ -46,7 +46,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class _State:
-    """Of the signals of one command, and of what they find.
+    """The state of the signals of one command.
 
     Attributes:
         number: of the first signal; 0: none yet.
@@ -61,7 +61,7 @@ class _State:
         self.answered = self.raised = self.lost = False
 
     def on_signal(self, number: int, _: object) -> None:
-        """Raise once: later signals must not disturb what is closed because of the first."""
+        """Raise the exception once: later signals must not disturb the clean-up after the first one."""
         self.number = self.number or number
         if not self.answered and not self.held:
             self.answered = self.raised = True
@@ -80,7 +80,7 @@ _unfinished: set[Path] = set()
 
 @contextmanager
 def ended_by_signals() -> Iterator[Callable[[], int]]:
-    """Within, SIGINT and SIGTERM raise `Interrupted` in the main thread, or end the process. In other threads: nothing.
+    """Within a block, SIGINT and SIGTERM raise `Interrupted` in the main thread, or end the process; not in other threads.
 
     Yields:
         A function that gives the number of the signal whose exception was raised; 0: none.
@@ -114,27 +114,27 @@ def ended_by_signals() -> Iterator[Callable[[], int]]:
 
 
 def answer() -> None:
-    """Say that the main thread has got the signal by other means and ends: it is not disturbed by its exception any more."""
+    """Declare that the main thread knows of the signal and is ending, so that the exception is not raised in it again."""
     _state.answered = True
 
 
 @contextmanager
 def unstoppable() -> Iterator[None]:
-    """Around code that does not return to Python for long, in any thread: a signal ends the process there."""
+    """For code that does not return to Python for a long time, in any thread: a signal within the block ends the process."""
     with _within(_unstoppable):
         yield
 
 
 @contextmanager
 def frame_in_work() -> Iterator[None]:
-    """Around the computation of frames, which may take longer than `PATIENCE` and is waited for."""
+    """For the computation of frames, which may take longer than `PATIENCE` and is waited for."""
     with _within(_frames):
         yield
 
 
 @contextmanager
 def unfinished(path: Path) -> Iterator[None]:
-    """Within, a file or folder is work that is removed in the end, also when the process is ended in the midst of it."""
+    """Remove an unfinished file or folder at the end of a block, also if the process is ended within it."""
     _unfinished.add(path)
     try:
         yield
@@ -144,14 +144,14 @@ def unfinished(path: Path) -> Iterator[None]:
 
 
 def remove_unfinished() -> None:
-    """Remove what this process has begun to write."""
+    """Remove the unfinished files of this process."""
     for path in list(_unfinished):
         _remove(path)
 
 
 @contextmanager
 def starting_processes() -> Iterator[None]:
-    """Around the start of processes: a signal is raised when they have started, and Ctrl-C does not reach them.
+    """For the start of processes: a signal is raised only when they have started, and Ctrl-C does not reach them.
 
     A process that is interrupted while it starts would print a traceback; one that its parent does not know yet would stay.
     """
@@ -167,7 +167,7 @@ def starting_processes() -> Iterator[None]:
 
 
 def end_process(number: int) -> NoReturn:
-    """Say so, and end this process and those that it has started, without what else Python does at the end, which takes long.
+    """Print a message and end this process and those that it has started, without Python's usual clean-up, which takes long.
 
     Args:
         number: of the signal that has come.
@@ -205,7 +205,7 @@ def _watch(state: _State, reader: socket.socket) -> None:
 
 @contextmanager
 def _blocked() -> Iterator[None]:
-    """Within, processes are started that Ctrl-C does not reach: they inherit that this thread does not take its signal."""
+    """Start processes within a block that Ctrl-C does not reach: they inherit this thread's blocked signal."""
     from multiprocessing.resource_tracker import ensure_running
 
     ensure_running()  # it would let the signal in again

@@ -1,7 +1,7 @@
-"""Functions of arrays as machine code, made by numba at their first call: loops without Python, for one frame at a time.
+"""Functions of arrays compiled to machine code by numba at their first call: loops for one frame at a time.
 
-Compiling takes about `SECONDS`, once for each precision; the code is kept on disk. Where that is not worth the wait,
-`using(False)` leaves the work to tensor operations, which give the same numbers up to rounding.
+Compiling takes about `SECONDS`, once for each precision; the code is kept on disk. If that is not worth the wait,
+`using(False)` switches to tensor operations, which give the same numbers up to rounding.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ _used = ContextVar("machine code is used", default=True)
 
 @contextmanager
 def using(wanted: bool) -> Iterator[None]:
-    """Within, whether machine code is used or tensor operations are.
+    """Set within a block whether machine code or tensor operations are used.
 
     Example:
         >>> with using(False):
@@ -61,8 +61,8 @@ each literal; loops that need not be unrolled run to a length that is read from 
 
 
 def kept(function: Callable[..., Any]) -> Any:
-    """A function that Python calls, compiled and kept on disk, beside its file or in the user's cache, until that file changes;
-    in this process alone where neither can be written.
+    """Decorate a function so that it is compiled and kept on disk, beside its file or in the user's cache, until that file
+    changes; if neither can be written, it is kept in this process only.
 
     Example:
         >>> kept(lambda x: 2 * x)(3)
@@ -75,7 +75,7 @@ def kept(function: Callable[..., Any]) -> Any:
 
 
 class Kept:
-    """What is known of a `kept` function: for which precisions it has been compiled, in this process or on disk.
+    """The state of a `kept` function: the precisions for which it has been compiled, in this process or on disk.
 
     Args:
         function: as `kept` gives it.
@@ -98,7 +98,7 @@ class Kept:
 
     @contextmanager
     def compiling(self, dtype: np.dtype[Any]) -> Iterator[None]:
-        """Around a call: where it compiles, that is logged, and noted when it is done."""
+        """For a call: if it compiles, this is logged, and noted when it is done."""
         with self.lock:  # threads begin their first calls at the same time
             is_new = not self.is_compiled(dtype) and dtype.name not in self.announced
             self.announced.add(dtype.name)
@@ -119,12 +119,12 @@ class Kept:
 
 
 def fingerprint(*files: str | None) -> str:
-    """Of the contents of source files: a `kept` function in whose closure it is, is made anew where one of them has changed."""
+    """A hash of source files: a `kept` function with it in its closure is compiled again after one of them has changed."""
     return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files if file)).hexdigest()
 
 
 def aligned(size: int, dtype: np.dtype) -> np.ndarray:
-    """Zeros that begin at a multiple of 64 bytes.
+    """An array of zeros whose address is a multiple of 64 bytes.
 
     Example:
         >>> aligned(3, np.dtype("float32")).ctypes.data % 64

@@ -1,4 +1,4 @@
-"""Where one frame is in another: points, vectors and wrenches from the camera's frame to a tool's."""
+"""Poses: transformation of points, vectors and wrenches from the camera's frame to a tool's."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar

@@ -1,4 +1,4 @@
-"""Processes of one thread each that work for this one, and end with it."""
+"""Worker processes with one thread each, which end with this process."""
 
 import os
 import pickle
@@ -35,9 +35,10 @@ def spawned_pool(jobs: int, begin: Callable[[Path], None], shared: Any) -> Itera
 
 @contextmanager
 def handed_over(shared: Any) -> Iterator[Path]:
-    """A file with something pickled, for new processes: through a pipe, one would have to be up before the next one starts.
+    """A file with a pickled object for new processes.
 
-    It is pickled by itself, as torch would move tensors whose memory arrays look at, where processes share them.
+    Through a pipe, one process would have to be running before the next one starts. Plain pickle is used, because torch's would
+    move tensors to shared memory, away from arrays that share theirs.
     """
     folder = Path(mkdtemp())
     with unfinished(folder):
@@ -48,7 +49,7 @@ def handed_over(shared: Any) -> Iterator[Path]:
 
 
 def begin_worker(path: Path) -> Any:
-    """Make ready a worker process: one thread, interrupted and ended by its parent alone, and with it.
+    """Set up a worker process: it uses one thread, and only its parent interrupts and ends it.
 
     Args:
         path: as `handed_over` gave it.

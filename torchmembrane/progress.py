@@ -1,6 +1,6 @@
 """How a long computation reports its progress: the share of the work that is done, and the step that begins.
 
-A computation takes `progress`, and calls it before each step; who called the computation decides what to show.
+A computation takes `progress` and calls it before each step; its caller decides what to show.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What a `state_dict` keeps: the camera, the material and what follows from it; all else is rebuilt from the sensor."""
+"""The contents of a `state_dict`: camera, material and what follows from it; everything else is rebuilt from the sensor."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ STIFFNESS, FOLLOWING = ("c1", "c2"), ("rest_pressure", "rest_load")
 """Of these: what another sensor's has otherwise, which is refused; what follows from the others."""
 IDENTITY = "rest_markers"
 """The markers' rest positions `[D, 3]`: those of another sensor are refused."""
-ALIKE = 1e-4  # largest distance of rest markers of one sensor, over their extent
+SAME_MARKERS = 1e-4  # largest distance of rest markers of one sensor, over their extent
 
 
 def keep_small(module: nn.Module) -> None:
@@ -49,7 +49,7 @@ def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) ->
 
 
 def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Check a state and put the constants in that it lacks, so that those are as they are."""
+    """Check a state and add the constants that it lacks, with their present values."""
     kept, others = _kept(module), []
     first = {id(buffer): name for name, buffer in reversed(list(module.named_buffers()))}
     for name, buffer in module.named_buffers(remove_duplicate=False):
@@ -61,7 +61,11 @@ def _complete(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) ->
             )
         if name == IDENTITY and given is not None:
             _check_identity(given, buffer)
-        elif given is not None and name in kept and not torch.allclose(given.to(buffer), buffer, rtol=ALIKE, atol=ALIKE**2):
+        elif (
+            given is not None
+            and name in kept
+            and not torch.allclose(given.to(buffer), buffer, rtol=SAME_MARKERS, atol=SAME_MARKERS**2)
+        ):
             others.append(name)
         if first[id(buffer)] not in kept:
             state[prefix + name] = buffer
@@ -86,7 +90,7 @@ def _check_others(names: list[str]) -> None:
 
 def _check_identity(given: Tensor, own: Tensor) -> None:
     off = torch.linalg.vector_norm(given.to(own) - own, dim=-1).max()
-    if off > ALIKE * torch.linalg.vector_norm(own.amax(0) - own.amin(0)):
+    if off > SAME_MARKERS * torch.linalg.vector_norm(own.amax(0) - own.amin(0)):
         raise MembraneError(
             f"Reconstructor.load_state_dict: {IDENTITY} up to {float(off):.3g} off this sensor's; expected the state of this "
             "sensor: build the Reconstructor from that sensor's file"

@@ -1,4 +1,4 @@
-"""Whether a membrane is still as stiff as it was calibrated: known loads compared with what is found."""
+"""Whether a membrane is still as stiff as it was calibrated: known loads are compared with the loads found."""
 
 from collections import deque
 from math import sqrt
@@ -16,7 +16,7 @@ SURE = 3.0
 class StiffnessWatch:
     """Ratios of found to known loads, the latest `MEMORY`; a membrane that has softened gives ratios above 1.
 
-    What a camera sees tells the membrane's strain, not its modulus: without a known load a change of the modulus is not seen.
+    A camera sees the membrane's strain, not its modulus: a change of the modulus is noticed only with a known load.
 
     Example:
         >>> watch = StiffnessWatch()
@@ -30,7 +30,7 @@ class StiffnessWatch:
         self._latest: deque[tuple[float, float]] = deque(maxlen=MEMORY)
 
     def add(self, found: float, known: float, deviation: float = 0.0) -> None:
-        """One comparison; `deviation` is that of what is found, in its unit."""
+        """Add one comparison; `deviation` is the standard deviation of the load found, in its unit."""
         self._latest.append((found / known, max(LEAST_DEVIATION, deviation / abs(known))))
 
     @property

@@ -51,7 +51,8 @@ def row_of(r: tm.Reconstructor, path: Path) -> dict:
     )
 
 
-def line(name: str, rows: list[dict], of: str) -> None:
+def line(name: str, rows: list[dict], of: str) -> dict[str, float]:
+    """How often the deviations of force or depth hold, how wide they are, and how they rank; printed."""
     error, deviation = (np.array([row[f"{of}_{what}"] for row in rows]) for what in ("error", "deviation"))
     held = (abs(error) < deviation).mean()
     size = np.array([row[of] for row in rows])
@@ -60,29 +61,35 @@ def line(name: str, rows: list[dict], of: str) -> None:
     wide = np.median(deviation / size) / np.sqrt(np.mean((error / size) ** 2))
     drawn = np.abs(np.random.default_rng(0).normal(size=(DRAWS, len(rows)))) * deviation
     normal = np.mean([spearmanr(each, deviation).statistic for each in drawn])
+    ranks = float(spearmanr(error, deviation).statistic)
     print(
-        f"{name:28s} {len(rows):4d}: held {held:.2f}, wide {wide:.2f}, "
-        f"ranks {spearmanr(error, deviation).statistic:.2f} ({normal:.2f})"
+        f"{name:28s} {len(rows):4d}: held {held:.2f}, wide {wide:.2f}, ranks {ranks:.2f} ({normal:.2f})"
         + (f", too shallow by {np.median(-signed / size):.2f}" if of == "depth" else "")
     )
+    return dict(held=float(held), width=float(wide), ranks=ranks)
 
 
-def report(rows: list[dict]) -> None:
+def report(rows: list[dict]) -> list[dict]:
+    """Printed, and for all frames and every band what `line` gives of force and depth."""
     largest: dict[str, float] = {}
     for row in rows:
         largest[row["sensor"]] = max(largest.get(row["sensor"], 0.0), row["force"])
     told = [row for row in rows if row["status"] == 0 and row["force"] > 0 and row["depth"] > 0]
-    for of in ("force", "depth"):
-        line(of, told, of)
-        for low, high in zip(BANDS[:-1], BANDS[1:], strict=True):
-            within = [row for row in told if low < row["force"] / largest[row["sensor"]] <= high]
+    bands = [dict(low=None, high=None, frames=len(told), **{of: line(of, told, of) for of in ("force", "depth")})]
+    for low, high in zip(BANDS[:-1], BANDS[1:], strict=True):
+        within = [row for row in told if low < row["force"] / largest[row["sensor"]] <= high]
+        band = dict(low=low, high=high, frames=len(within))
+        for of in ("force", "depth"):
             for name, chosen in (
                 ("", within),
                 (", at the rim", [row for row in within if row["at_rim"]]),
                 (", clear", [row for row in within if not row["at_rim"]]),
             ):
                 if len(chosen) >= FEWEST:
-                    line(f"{of}, {low} to {high}{name}", chosen, of)
+                    found = line(f"{of}, {low} to {high}{name}", chosen, of)
+                    band |= {} if name else {of: found}
+        bands += [band] if "depth" in band else []
+    return bands
 
 
 def main():
@@ -108,8 +115,8 @@ def main():
             print(f"{folder}: {error}")
             continue
         rows += [row_of(r, path) for path in files]
-    report(rows)
-    write(args.json, dict(rows=rows))
+    bands = report(rows)
+    write(args.json, dict(bands=bands, rows=rows))
 
 
 if __name__ == "__main__":

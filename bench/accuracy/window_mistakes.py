@@ -1,12 +1,13 @@
 """Forces of an inflated window when one number of its sensor file is wrong: the table of docs/own_window.md.
 
-python -m bench.accuracy.window_mistakes
+python -m bench.accuracy.window_mistakes [--json FILE]
 
 The window and the press of that page, and a ball pressed 2.5 mm into its middle, photographed by the simulator. For each row
 the sensor file is drafted from the rest photograph with one number wrong, as `torchmembrane init` does, and both photographs
 are reconstructed. Printed: forces found over true, and the rise of the pressure, hPa.
 """
 
+import argparse
 import re
 import tempfile
 from contextlib import redirect_stdout
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 
 import torchmembrane as tm
+from bench.data.record import write
 from torchmembrane.cli.main import main as command
 from torchmembrane.sensor.units import hectopascal
 
@@ -48,6 +50,9 @@ def drafted(path: Path, numbers: dict[str, str], more: str) -> None:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path)
+    args, rows = parser.parse_args(), []
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -56,7 +61,7 @@ def main() -> None:
         for press, options in PRESSES.items():
             run(f"simulate {folder}/real.toml --indenter sphere --radius 6 {options} --noise 40 --out {folder} --name {press}")
             truth = np.load(folder / f"{press}_truth.npz")
-            truths[press] = np.linalg.norm(truth["force"]), float(truth["p"] - truth["p0"]) / hectopascal("mm")
+            truths[press] = float(np.linalg.norm(truth["force"])), float(truth["p"] - truth["p0"]) / hectopascal("mm")
         print("true rise of the pressure, hPa:", ", ".join(f"{rise:.2f}" for _, rise in truths.values()))
         for row, wrong in ROWS.items():
             path = folder / f"{re.sub(r'[^a-z0-9]+', '_', row)}.toml"
@@ -66,8 +71,10 @@ def main() -> None:
                 found = reconstructor(reconstructor.read(*(folder / f"{press}.png" for press in PRESSES)))
             ratios = [float(f.norm()) / force for f, (force, _) in zip(found.force, truths.values(), strict=True)]
             rises = (found.pressure_change.double() / hectopascal("mm")).tolist()
+            rows.append(dict(wrong=row, forces=ratios, rises=rises, status=found.status.tolist()))
             cells = [row, *(f"{ratio:.2f}" for ratio in ratios), ", ".join(f"{rise:.2f}" for rise in rises)]
             print(f"| {' | '.join(cells)} | status {found.status.tolist()}", flush=True)
+    write(args.json, dict(true_rises=[rise for _, rise in truths.values()], rows=rows))
 
 
 if __name__ == "__main__":

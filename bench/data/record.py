@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import re
 import statistics
 import time
 from importlib.metadata import version
@@ -32,11 +33,19 @@ def write(path: Path | None, results: dict) -> None:
         print(f"written to {path}")
 
 
+def processor() -> str:
+    """Name of the processor and the widest vectors that torch uses on it, as in "Intel Xeon Processor, AVX512"."""
+    name, cpuinfo = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
+    if cpuinfo.exists() and (found := re.search(r"^model name\s*: (.+)", cpuinfo.read_text(), re.M)):
+        name = re.sub(r"\((R|TM)\)", "", found[1])
+    return f"{name}, {torch.backends.cpu.get_cpu_capability()}"
+
+
 def machine() -> dict:
     """The processor, and the versions of what was measured."""
     versions = {name: version(name) for name in ("torch", "kornia", "numpy", "scipy", "torchmembrane")}
     return dict(
-        processor=platform.processor() or platform.machine(),
+        processor=processor(),
         cores=os.cpu_count(),
         torch_threads=torch.get_num_threads(),
         python=platform.python_version(),

@@ -12,6 +12,7 @@ import warnings
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -55,7 +56,7 @@ def main() -> None:
     parser.add_argument("--lines", type=int, nargs="+", default=[17, 33])
     parser.add_argument("--widths", type=int, nargs="+", default=[640, 1920])
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 4, 16])
-    parser.add_argument("--json")
+    parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
     base = Simulator(dome(33, DOTS, 640))

@@ -1,11 +1,10 @@
-"""What a frame costs against grid lines, dots, image size and batch: a table, exponents, and with --page the page on it.
+"""What a frame costs against grid lines, dots, image size and batch, with exponents.
 
-python -m bench.speed.scaling [--turns 5] [--page docs/scaling.md] [--json FILE]
+python -m bench.speed.scaling [--turns 5] [--json FILE]
 
 A dome of radius 20 with a fisheye camera in it, pressed by a ball; of 33 x 33 lines, some 150 dots and 640 x 480 pixels but for
 what is varied. Markers (image to flow) and solve (flow to result, from rest) apart, one thread, processor time, the least of
-several turns. The exponent is the slope of a line through the logarithms of the upper half of a row. The page's figure is
-written to figures/scaling.png beside it.
+several turns. The exponent is the slope of a line through the logarithms of the upper half of a row.
 """
 
 import argparse
@@ -19,6 +18,7 @@ import torch
 
 import torchmembrane as tm
 from bench.data.record import write
+from bench.measure.scaling_tables import PARTS, exponent
 from torchmembrane.camera.model import Camera
 from torchmembrane.files.images import to_grey
 from torchmembrane.presets.design import dome_dots
@@ -38,28 +38,6 @@ SWEEPS = dict(
     width=(320, 640, 1280, 1920),
     batch=(1, 2, 4, 8, 16, 32, 64),
 )
-PARTS = ("markers", "solve")
-NAMES = dict(lines="grid lines per side", dots="dots", width="image width, px", batch="frames in a batch")
-PAGE = """# What a frame costs
-
-This page tells how the processor time of a frame grows with the grid lines, the dots, the image size and the number of frames
-in a batch. All times are of one thread of a shared core. The sensor is a dome of radius 20 pressed by a ball; it has 33 x 33
-vertices, about 150 dots and 640 x 480 pixels, except for the quantity that is varied. Every frame starts from rest. **Markers**
-is the time from the image to the markers' displacements, and **solve** the time from these to the result. The solve takes
-several times as long when a frame is [solved a second time](mathematics.md), as happened with 21 dots. This command makes the
-figure and the tables:
-
-    python -m bench.speed.scaling --page docs/scaling.md
-
-![Milliseconds per frame against grid lines, dots, image width and batch](figures/scaling.png)
-
-The exponent is the slope of a straight line fitted to the logarithms of the upper half of each series. For batches it refers to
-the time of the whole batch.
-
-{exponents}
-
-{costs}
-"""
 HEIGHT = {320: 240, 640: 480, 1280: 960, 1920: 1200}
 
 
@@ -106,63 +84,9 @@ def least_seconds(function, turns: int) -> float:
     return min(times[1:])
 
 
-def exponent(rows: list[dict], sweep: str, part: str) -> float:
-    """Of the cost of a part, over the upper half of a sweep; of a batch, of the whole batch."""
-    upper = rows[len(rows) // 2 :]
-    cost = [row[part] * (row["batch"] if sweep == "batch" else 1) for row in upper]
-    return float(np.polyfit(np.log([row[sweep] for row in upper]), np.log(cost), 1)[0])
-
-
-def page(table: dict[str, list[dict]]) -> str:
-    """The page of the documents."""
-    exponents = [[NAMES[sweep], *(f"{exponent(rows, sweep, part):z.1f}" for part in PARTS)] for sweep, rows in table.items()]
-    costs = [
-        [NAMES[sweep] if k == 0 else "", str(row[sweep]), *(f"{row[part]:.3g}" for part in PARTS)]
-        for sweep, rows in table.items()
-        for k, row in enumerate(rows)
-    ]
-    return PAGE.format(
-        exponents=markdown(["exponent of the cost in", *PARTS], exponents),
-        costs=markdown(["varied quantity", "value", *(f"{part}, ms per frame" for part in PARTS)], costs),
-    )
-
-
-def markdown(head: list[str], rows: list[list[str]]) -> str:
-    """A table."""
-    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])
-
-
-def draw(table: dict[str, list[dict]], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, len(table), figsize=(11, 3.2), sharey=True, layout="constrained")
-    for ax, (sweep, rows) in zip(axes, table.items(), strict=True):
-        for part, mark in zip(PARTS, "os", strict=True):
-            label = f"{part}: power {exponent(rows, sweep, part):z.1f}"
-            ax.loglog([row[sweep] for row in rows], [row[part] for row in rows], marker=mark, markersize=4, label=label)
-        values = [row[sweep] for row in rows]
-        shown = values if len(values) < 5 else values[::2]
-        ax.set(xlabel=NAMES[sweep])
-        ax.set_xticks(shown, [str(value) for value in shown])
-        ax.set_xticks([], minor=True)
-        ax.grid(alpha=0.3)
-        ax.legend(fontsize=8, loc="upper left")
-    low, high = axes[0].get_ylim()
-    axes[0].set_ylim(low, 3 * high)
-    ticks = [value for value in (1, 3, 10, 30, 100, 300, 1000) if low < value < high]
-    axes[0].set_yticks(ticks, [str(value) for value in ticks])
-    axes[0].set_yticks([], minor=True)
-    axes[0].set_ylabel("ms per frame")
-    figure.savefig(path, dpi=110)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--page", type=Path)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -175,9 +99,6 @@ def main() -> None:
         for row in table[sweep]:
             print(f"{sweep:6s} {row[sweep]:5d}: " + ", ".join(f"{part} {row[part]:.1f} ms" for part in PARTS), flush=True)
         print(f"exponents of {sweep}: " + ", ".join(f"{part} {exponent(table[sweep], sweep, part):.2f}" for part in PARTS))
-    if args.page:
-        draw(table, args.page.parent / "figures" / "scaling.png")
-        args.page.write_text(page(table))
     write(args.json, dict(rows=table))
 
 

@@ -12,7 +12,7 @@ from .errors import printable
 from .images import numbered
 from .results import write
 from .session import Session
-from .summary_row import NAMES, Column, cell, escaped, in_units, numbers
+from .summary_row import NAMES, Column, cell, completed, escaped, in_units, numbers
 
 SUMMARY, DICTIONARY = "summary.csv", "summary_columns.csv"
 UNREADABLE = -1
@@ -65,6 +65,6 @@ def _rows(path: Path) -> list[dict[str, str]]:
     try:
         text = path.read_text(encoding="utf-8", errors="replace").replace("\0", "")
         rows = csv.DictReader(io.StringIO(text, newline=""))
-        return [row for row in rows if tuple(row) == NAMES and None not in row.values()]
+        return [row for each in rows if None not in each.values() and (row := completed(each))]
     except (OSError, csv.Error):
         return []

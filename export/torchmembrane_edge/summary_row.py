@@ -76,6 +76,13 @@ COLUMNS = (
     Column("content_hash", "text", "BLAKE2b, 16 bytes, of the file"),
     Column("length_unit", "text", "of all lengths here"),
     Column("force_unit", "text", "of all forces here: N, or relative where the sensor file has no modulus"),
+    Column("gauge_pressure_hpa", "hPa", "what a gauge read, as a difference across the membrane; empty without a reading"),
+    *(
+        Column(
+            f"contact_{number}_at_rim", "code", f"contact patch {number}: 1 where it reaches the rim, its force a lower bound"
+        )
+        for number in range(1, CONTACTS + 1)
+    ),
 )
 NAMES = tuple(column.name for column in COLUMNS)
 TEXT = tuple(column.name for column in COLUMNS if column.unit == "text")
@@ -99,7 +106,7 @@ def numbers(frame: Mapping[str, Any], rest_normals: np.ndarray, length_unit: str
     """The numbers of a row that a frame's arrays give, NaN where nothing is known.
 
     Args:
-        frame: arrays by the names of `Reconstruction`; those that it lacks are unknown.
+        frame: arrays by the names of `Reconstruction`, and `gauge`, a reading; those that it lacks are unknown.
         rest_normals: `[V, 3]`, of the rest surface.
         length_unit: of its lengths.
         force_unit: of its forces.
@@ -118,6 +125,7 @@ def numbers(frame: Mapping[str, Any], rest_normals: np.ndarray, length_unit: str
     found |= {key: of(key) for key in ("coverage", "pressure", "pressure_change", "depth_deviation", "volume_error")}
     hectopascals = METRE[length_unit] ** 2 / 100 if force_unit == "N" and length_unit in METRE else np.nan
     found |= {f"{key}_hpa": found[key] * hectopascals for key in ("pressure", "pressure_change")}
+    found["gauge_pressure_hpa"] = of("gauge") * hectopascals
     force, wrench = of("force", 3), of("wrench", 6)
     found["force"] = np.linalg.norm(force)
     vector("force", force)
@@ -130,6 +138,8 @@ def numbers(frame: Mapping[str, Any], rest_normals: np.ndarray, length_unit: str
         vector(f"contact_{number}", place)
         vector(f"contact_{number}_force", push)
         found |= {f"contact_{number}_force": np.linalg.norm(push), f"contact_{number}_area": area[0]}
+    at_rim = _rows(of("contact_at_rim", 0), 1)[:, 0]
+    found |= {f"contact_{number}_at_rim": reaches for number, reaches in enumerate(at_rim, 1)}
     along = (of("displacement", len(rest_normals), 3) * rest_normals).sum(-1)
     is_known = along.size > 0 and np.isfinite(along).all()
     found["deepest"] = along.min() if is_known else np.nan
@@ -165,6 +175,19 @@ def escaped(name: str, text: str) -> str:
 def unescaped(name: str, text: str) -> str:
     """The cell that was written as this text."""
     return text[1:] if name in TEXT and text.startswith("'") and is_formula(text) else text
+
+
+def completed(row: Mapping[str, str]) -> dict[str, str] | None:
+    """A row of a table as of this version: one that was written before the last columns came lacks them; None for another's.
+
+    Example:
+        >>> row = completed(dict.fromkeys(NAMES[:-1], "1"))
+        >>> row[NAMES[-1]], completed({"name": "a"})
+        ('', None)
+    """
+    names = tuple(row)
+    is_known = "force_unit" in names and names == NAMES[: len(names)]
+    return {**dict.fromkeys(NAMES, ""), **row} if is_known else None
 
 
 def is_formula(text: str) -> bool:

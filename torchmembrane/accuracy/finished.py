@@ -1,4 +1,4 @@
-"""Series of trials that are finished, kept in a file until all are: an interrupted spec sheet goes on from there."""
+"""A file that keeps finished series of trials until all are finished, so that an interrupted spec sheet can be resumed."""
 
 import hashlib
 import json
@@ -17,7 +17,7 @@ EXPECTED = "series of trials as check --accuracy keeps them"
 
 
 class FinishedSeries(NamedTuple):
-    """The file that keeps finished series, and what it held when it was opened.
+    """The file that keeps finished series, and the series that it held when it was opened.
 
     Attributes:
         path: the file; it need not exist.
@@ -49,7 +49,7 @@ class FinishedSeries(NamedTuple):
         return cls(path, _read(path) if path.exists() else {})
 
     def keep(self, number: int, outcome: Outcome) -> None:
-        """Write the file anew with one more series, whole or not at all.
+        """Write the file anew with one more series, atomically.
 
         Args:
             number: of the series.

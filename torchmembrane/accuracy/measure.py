@@ -22,7 +22,7 @@ WORK = {REST: 0.5, STROKE: 1.0, PAIR: 0.5}
 
 
 class Series(NamedTuple):
-    """Trials that one process does in a row: frames at rest, a stroke, or the pairs of a direction."""
+    """Trials that one process runs one after another: frames at rest, a stroke, or the pairs of a direction."""
 
     kind: str
     number: int
@@ -40,7 +40,7 @@ def spec_sheet(
     finished: FinishedSeries | None = None,
     progress: Progress = silent,
 ) -> SpecSheet:
-    """What to expect of a sensor: trials on a simulated one, through images.
+    """Measure what to expect of a sensor, by trials on a simulated one, through images.
 
     Noise at rest, the lightest touch found, errors by force, how near two touches are told apart, the deepest press.
 
@@ -109,7 +109,7 @@ def spec_sheet(
 def _outcomes(
     rig: Rig, series: Sequence[Series], jobs: int, finished: FinishedSeries | None, progress: Progress
 ) -> list[Outcome]:
-    """What all series give, in their order: those finished before as they were kept, the others as they are tried now."""
+    """The outcomes of all series in their order: those finished earlier are read, the others are computed now."""
     outcomes = dict(finished.outcomes) if finished else {}
     waiting = [(k, series[k]) for k in range(len(series)) if k not in outcomes]
     progress(_share_done(series, outcomes), f"{len(waiting)} series of presses")
@@ -127,7 +127,7 @@ def _share_done(series: Sequence[Series], done: Iterable[int]) -> float:
 
 
 def outcome_of(rig: Rig, series: Series) -> Outcome:
-    """What a series of trials gives on this rig."""
+    """The outcome of a series of trials on this rig."""
     kind, number, effort, seed = series
     try:
         if kind == REST:
@@ -142,7 +142,7 @@ def outcome_of(rig: Rig, series: Series) -> Outcome:
 
 
 def _in_processes(rig: Rig, series: Sequence[tuple[int, Series]], jobs: int) -> Iterator[tuple[int, Outcome]]:
-    """Numbers of series and what they give, as they are done."""
+    """Numbers of series and their outcomes, as they are finished."""
     jobs = min(jobs, len(series))
     if jobs <= 1:
         yield from ((k, outcome_of(rig, each)) for k, each in series)

@@ -75,7 +75,7 @@ def stroke_states(simulator: Simulator, number: int, frames: int, offset: float,
     stroke = random_stroke(simulator, plan, rng, in_view(simulator))
     depth = DEEPEST * simulator.membrane.size
     path = [stroke.indenter.moved(share * depth * stroke.travel) for share in (0.0, *shares(frames, offset))]
-    states, reason = _followed(simulator, [path], stroke.friction)
+    states, reason = followed(simulator, [path], stroke.friction)
     touching = [state for state in states if state.contact.any()]
     if not touching:
         raise MembraneError(f"stroke {number + 1}: {reason or 'it never touches the membrane'}")
@@ -131,13 +131,14 @@ def _pair(simulator: Simulator, places: np.ndarray, ways: np.ndarray) -> list[Pa
     except MembraneError:
         return []
     paths = [[stroke.indenter, stroke.indenter.moved(stroke.depth * stroke.travel)] for stroke in strokes]
-    states, _ = _followed(simulator, paths, 0.0)
+    states, _ = followed(simulator, paths, 0.0)
     apart = [float((state.contact_points[0] - state.contact_points[1]).norm()) for state in states]
     return [PairPress(state, distance) for state, distance in zip(states, apart, strict=True) if np.isfinite(distance)]
 
 
-def _followed(simulator: Simulator, paths: Sequence[Sequence], friction: float) -> tuple[list[Press], str]:
-    """Equilibria at the poses after the first, as far as the membrane follows, and why no farther."""
+def followed(simulator: Simulator, paths: Sequence[Sequence], friction: float) -> tuple[list[Press], str]:
+    """The equilibria at the poses after the first one, as far as the membrane can follow, and the reason why it cannot follow
+    further."""
     states: list[Press] = []
     options = dict(friction=friction, increment=INCREMENT * simulator.membrane.size, **simulator.cavity)
     try:

@@ -1,4 +1,4 @@
-"""Whether a rest surface can be at rest: the forces that are left over, and the nearest sheet that is blown up in its rim."""
+"""Whether a rest surface can be in equilibrium: its residual forces, and the nearest sheet that is inflated in the same rim."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ LINES = 17  # of the sheet's grid: its shape is then right to some thousandths o
 
 
 class NearestSheet(NamedTuple):
-    """The nearest rest surface that is a sheet, blown up in the same rim, of the same rubber.
+    """The nearest rest surface that is a sheet of the same rubber, inflated in the same rim.
 
     Attributes:
         height: of its highest point above the rim's plane.
@@ -38,7 +38,7 @@ class NearestSheet(NamedTuple):
 
 
 class RestShape(NamedTuple):
-    """What a rest surface says of itself.
+    """The result of checking a rest surface.
 
     Attributes:
         pressure: that the fluid has over its surroundings by the model, force / length^2.
@@ -53,7 +53,7 @@ class RestShape(NamedTuple):
 
 
 def rest_shape(sensor: Sensor) -> RestShape:
-    """Compare a sensor's rest surface with what can be at rest.
+    """Compare a sensor's rest surface with surfaces that can be in equilibrium.
 
     Args:
         sensor: any.

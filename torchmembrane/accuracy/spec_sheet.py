@@ -1,4 +1,4 @@
-"""What a sensor's spec sheet holds: what its reconstructions are off by, trial by trial and summed up.
+"""The contents of a sensor's spec sheet: the errors of its reconstructions, trial by trial and summarised.
 
 Lengths are in the sensor's unit, forces and pressures in its force unit; errors over the truth have none.
 """
@@ -23,7 +23,7 @@ class Spread(NamedTuple):
 
 
 class PressTrial(NamedTuple):
-    """One frame of a stroke: what was true, and what the reconstruction was off by.
+    """One frame of a stroke: the truth and the errors of the reconstruction.
 
     Attributes:
         stroke: number of the stroke that it belongs to.
@@ -53,12 +53,12 @@ class PressTrial(NamedTuple):
 
     @property
     def relied_on(self) -> bool:
-        """Whether the result says of itself that its force can be relied on: status ok, no contact at the rim."""
+        """Whether the result reports that its force can be relied on: status ok and no contact at the rim."""
         return self.status == Status.OK and not self.at_rim
 
     @property
     def is_wrong(self) -> bool:
-        """Whether surface or force are off by more than `CLOSE`; a force that is said to be a lower bound is not."""
+        """Whether surface or force are off by more than `CLOSE`; a force that is reported as a lower bound does not count."""
         return self.surface_error > CLOSE or (self.force_error > CLOSE and not self.at_rim)
 
     def is_found(self, near: float) -> bool:
@@ -67,7 +67,7 @@ class PressTrial(NamedTuple):
 
     @property
     def failure(self) -> str:
-        """Why it does not count as reconstructed; empty where it does."""
+        """The reason why the frame does not count as reconstructed; empty if it does."""
         if self.status != Status.OK:
             return Status(self.status).name.lower().replace("_", " ")
         if self.lost > LOST:
@@ -76,7 +76,7 @@ class PressTrial(NamedTuple):
 
 
 class PairTrial(NamedTuple):
-    """Two touches at once.
+    """A pair of simultaneous touches.
 
     Attributes:
         direction: number of the line on which pairs are moved together.
@@ -108,7 +108,7 @@ class RestTrial(NamedTuple):
 
 
 class Effort(NamedTuple):
-    """How much is tried.
+    """The extent of the trials.
 
     Attributes:
         strokes: from the first touch on, towards random places.
@@ -126,7 +126,7 @@ class Effort(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What one series of trials gave; `reason` where it could not be simulated."""
+    """The outcome of one series of trials; `reason` says why it could not be simulated."""
 
     rest: Sequence[RestTrial] = ()
     presses: Sequence[PressTrial] = ()
@@ -135,7 +135,7 @@ class Outcome(NamedTuple):
 
 
 class RestFloor(NamedTuple):
-    """What frames at rest give that should give nothing.
+    """What is found in frames at rest, where nothing should be found.
 
     Attributes:
         frames: how many.
@@ -155,7 +155,7 @@ class RestFloor(NamedTuple):
 
 
 class LightestTouch(NamedTuple):
-    """From where on a growing press is found.
+    """The force and depth from which on a growing press is found.
 
     Attributes:
         strokes: in how many strokes.
@@ -195,7 +195,7 @@ class Band(NamedTuple):
 
 
 class ClosestPair(NamedTuple):
-    """How near each other two touches are told apart.
+    """The distance from which on two touches are resolved.
 
     Attributes:
         directions: in how many directions pairs were moved together.
@@ -213,7 +213,7 @@ class ClosestPair(NamedTuple):
 
 
 class DeepestPress(NamedTuple):
-    """How deep strokes are followed.
+    """The depth up to which strokes are reconstructed.
 
     Attributes:
         depths: of each stroke, the deepest press that is reconstructed, as all between it and the first one found.

@@ -1,4 +1,4 @@
-"""From trials to the figures of a spec sheet."""
+"""The figures of a spec sheet, computed from the trials."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 def rest_floor(trials: Sequence[RestTrial]) -> RestFloor:
-    """What frames at rest give."""
+    """The summary of frames at rest."""
     good = [trial for trial in trials if trial.status == Status.OK]
     return RestFloor(
         frames=len(trials),
@@ -77,7 +77,7 @@ def bands(trials: Sequence[PressTrial], near: float) -> list[Band]:
 
 
 def lightest_touch(trials: Sequence[PressTrial], near: float) -> LightestTouch:
-    """The first frame of every stroke in which the contact is found, and in the next one too, so that chance is no find.
+    """The first frame of every stroke in which, and in the next of which, the contact is found: a single find may be chance.
 
     Args:
         trials: the presses, those of a stroke as they follow each other.
@@ -90,7 +90,7 @@ def lightest_touch(trials: Sequence[PressTrial], near: float) -> LightestTouch:
 
 
 def deepest_press(trials: Sequence[PressTrial], near: float) -> DeepestPress:
-    """How deep every stroke is followed without a failure, from the first frame found on; 0 where none is.
+    """The depth up to which every stroke is reconstructed without a failure, from the first frame found on; 0 if none is.
 
     Args:
         trials: the presses, those of a stroke as they follow each other.
@@ -108,7 +108,7 @@ def deepest_press(trials: Sequence[PressTrial], near: float) -> DeepestPress:
 
 
 def closest_pair(trials: Sequence[PairTrial]) -> ClosestPair:
-    """The smallest distance of every direction at which a pair, and every wider one, is told apart."""
+    """For every direction, the smallest distance at which a pair and all wider pairs are resolved."""
     smallest = []
     directions = sorted({trial.direction for trial in trials})
     for direction in directions:

@@ -74,7 +74,8 @@ def pinhole_image(points: Tensor, distortion: Tensor) -> Tensor:
 
 
 def _pinhole_terms(distortion: Tensor) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
-    """Radial k1 k2 k3 and, of eight, k4 k5 k6; tangential p1, p2; the radius (tan of the angle) at which the former fold."""
+    """The radial coefficients k1 k2 k3 (and k4 k5 k6 if there are eight), the tangential ones p1, p2, and the radius (tangent
+    of the angle) at which the radial distortion folds."""
     k1, k2, p1, p2, *others = distortion.unbind()
     radial = [k1, k2, *others]
     angles = torch.linspace(0, math.radians(89.9), FOLD_SAMPLES, dtype=distortion.dtype, device=distortion.device)

@@ -111,7 +111,7 @@ class DotBoard:
 
     @property
     def radii(self) -> np.ndarray:
-        """Of the dots, `[D]`."""
+        """The radii of the dots, `[D]`."""
         return self.radius * np.where(self.large, LARGE, 1.0)
 
     @cached_property
@@ -138,7 +138,7 @@ class DotBoard:
 
 
 def _lattice(columns: int, rows: int) -> np.ndarray:
-    """Whole steps `[D, 3]` of a lattice, row by row, in the plane z = 0."""
+    """Integer coordinates `[D, 3]` of a lattice, row by row, in the plane z = 0."""
     j, i = np.mgrid[:rows, :columns]
     return np.stack([i.ravel(), j.ravel(), 0 * i.ravel()], -1).astype(float)
 

@@ -24,7 +24,7 @@ examples:
   torchmembrane check sensor.toml
   torchmembrane check sensor.toml --out sensor.png
   torchmembrane check sensor.toml --overpressure 12hPa
-  torchmembrane check sensor.toml --robot robot      # as URDF and MJCF
+  torchmembrane check sensor.toml --robot robot      # as URDF and MJCF, with its law of contact
   torchmembrane check preset:bubble --accuracy --out bubble.png
 
 The rest surface is tested where it can fail: what tension and pressure leave unbalanced, how far the nearest sheet is that is
@@ -45,7 +45,12 @@ def add_parser(commands: Any) -> None:
     add_sensor(add)
     add("--out", metavar="FIGURE.png", type=Path, help="draw it: side view with rays, rest surface, rest image, accuracy")
     add_force(add)
-    add("--robot", metavar="FOLDER", type=Path, help="write it for simulators of robots: URDF, MJCF, meshes (STL), in metres")
+    add(
+        "--robot",
+        metavar="FOLDER",
+        type=Path,
+        help="write it for simulators of robots: URDF, MJCF, meshes (STL), law of contact; SI",
+    )
     gauge = "what a gauge reads at rest, inside over outside, with its unit, as 12hPa: compared with the model's"
     add("--overpressure", metavar="P", type=pressure, help=gauge)
     add("--accuracy", action="store_true", help="also what to expect of it, from simulated presses")
@@ -84,7 +89,8 @@ def run(arguments: Namespace) -> int:
         from ..integrations.robot_model import write_robot_model
 
         folder = write_robot_model(sensor, arguments.robot)
-        print(f"{sensor.name}.urdf, {sensor.name}.xml (MJCF) and their meshes written to {folder}")
+        print(f"{sensor.name}.urdf, {sensor.name}.xml (MJCF) and their meshes written to {folder}", flush=True)
+        _write_contact(sensor, folder)
     finished = _finished(sensor, arguments) if arguments.accuracy and not problem else None
     sheet = _sheet(sensor, arguments, finished) if finished else None
     if sheet and sheet.range and not str(arguments.sensor).startswith(PREFIX):
@@ -100,6 +106,22 @@ def run(arguments: Namespace) -> int:
     if problem:
         raise problem
     return 0
+
+
+def _write_contact(sensor: "Sensor", folder: Path) -> None:
+    """The law of contact pressure beside the robot's model, and a line about it."""
+    from ..accuracy.contact_law import contact_law
+    from ..integrations.contact_files import write_contact_law
+
+    try:
+        with ProgressDisplay("check --robot") as progress:
+            law = contact_law(sensor, progress)
+        write_contact_law(law, sensor, folder)
+    except MembraneError as error:
+        print(f"contact.toml not written: {error}")
+        return
+    worst = abs(law.errors()).max(initial=0.0)
+    print(f"contact.toml, .csv, .png: contact pressure over depth, off by {worst:.1%} of the force at most in presses held out")
 
 
 def _keep(range: "WorkingRange", path: Path) -> None:

@@ -10,7 +10,7 @@ from ..camera.mode import Mode
 from ..camera.model import Camera
 from ..forming.sheet_energy import SheetEnergy
 from ..machine_code import using
-from ..markers.placement import in_view
+from ..markers.spacing import in_view
 from ..reconstruct import Reconstructor
 from ..results.reconstruction import Frame
 from ..results.status import Status

@@ -11,7 +11,8 @@ from ..camera.model import Camera
 from ..errors import MembraneError
 from ..files.images import read_image
 from ..markers.dots.pattern import find_dots
-from ..markers.placement import FEWEST_MARKERS, in_view
+from ..markers.placement import FEWEST_MARKERS
+from ..markers.spacing import in_view
 from ..presets.annotate import annotate
 from ..presets.blown_up import BlownUp, Stated, blown_up
 from ..presets.design import AIR

@@ -3,7 +3,8 @@
 import signal
 import sys
 import warnings
-from argparse import Namespace
+from argparse import ArgumentTypeError, Namespace
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -23,14 +24,16 @@ from .arguments import (
     check_device,
     count,
     number_from,
+    pressure,
     wants_rerun,
+    weight,
 )
 
 if TYPE_CHECKING:
     import numpy as np
 
     from ..camera.model import Camera
-    from ..live.loop import Seen, Tally
+    from ..live.loop import Request, Seen, Tally
     from ..live.streams import Stream
     from ..sensor.sensor import Sensor
 
@@ -47,8 +50,14 @@ The newest frame is taken; what came meanwhile is dropped and counted. Latency i
 image is read, a file's is due) to the result. `z` and Enter: nothing touches now, take this for rest. Ctrl-C or
 SIGTERM end it with a summary. In a terminal the line is rewritten in place, elsewhere there is one each second.
 
+A membrane that has softened is seen only with a known load. `200g` and Enter: this weight stands on the middle of the
+membrane now, alone. `12hPa` and Enter: a gauge reads this change since rest now. What is found is compared with it; after
+some comparisons a warning says where a calibration is due.
+
 exit code: 0 ended or stopped, 2 wrong usage, or a source that gives no images (any more)"""
-MODULUS = "a membrane that has softened is seen only with a known weight or a gauge: tm.Tracker.weigh, calibrate material"
+MODULUS = (
+    "a membrane that has softened is seen only with a known load: a weight or a gauge's reading, as 200g or 12hPa and Enter"
+)
 SOURCES = ("camera", "video", "images")
 OF_TORCH = ("grid", "energy", "flow", "smoothing", "locator")
 DEFAULTS = {"estimator": "force-balance", "device": "cpu"}
@@ -98,13 +107,13 @@ def run(arguments: Namespace) -> int:
     try:
         with ExitStack() as stack:
             watchers = _watchers(arguments, stream, sensor.camera.bits, stack, said)
-            stop, rezero = stack.enter_context(_stopped_by_signals()), _rezero_by_key()
+            stop, requests = stack.enter_context(_stopped_by_signals()), _requests_by_keys(sensor.length_unit)
             mailbox, tally, peaks = stack.enter_context(capture(images)), Tally(), Peaks(stream.mesh)
             watchers.append(lambda seen, _: peaks.add(seen.frame))
             if arguments.life is not None:
                 peaks.kept_in(arguments.life)  # nothing yet: another sensor's file is refused before the stream begins
             try:
-                follow(stream, mailbox, tally, [line, *watchers], stop, rezero, line.say)
+                follow(stream, mailbox, tally, [line, *watchers], stop, requests, line.say)
             finally:
                 if stop.is_set():
                     answer()
@@ -226,14 +235,37 @@ def _stopped_by_signals() -> Iterator[Event]:
             signal.signal(number, handler)
 
 
-def _rezero_by_key() -> Event:
-    """An event that a line `z` of the standard input sets."""
-    rezero = Event()
+def _requests_by_keys(length_unit: str) -> "deque[Request]":
+    """What lines of the standard input ask for."""
+    requests: deque[Request] = deque()
 
     def read() -> None:
         for text in sys.stdin or ():
-            if text.strip() == "z":
-                rezero.set()
+            if text.strip():
+                requests.append(request_of(text.strip(), length_unit))
 
     Thread(target=read, name="keys", daemon=True).start()
-    return rezero
+    return requests
+
+
+def request_of(text: str, length_unit: str) -> "Request":
+    """What a line asks for: `z`, a weight or a gauge's reading; anything else is answered by what is understood.
+
+    Example:
+        >>> request_of("q", "mm")(None)
+        "'q' is not understood; expected z (take this for rest), a weight as 200g, or a gauge's change since rest as 12hPa"
+    """
+    from ..live.loop import rezeroed
+    from ..sensor.units import hectopascal
+
+    if text == "z":
+        return rezeroed
+    try:
+        if text.lower().endswith("pa"):
+            change = pressure(text) * hectopascal(length_unit)
+            return lambda stream: stream.gauge(change)
+        force = weight(text)
+    except ArgumentTypeError:
+        known = "z (take this for rest), a weight as 200g, or a gauge's change since rest as 12hPa"
+        return lambda _: f"{text!r} is not understood; expected {known}"
+    return lambda stream: stream.weigh(force)

@@ -1,1 +1,1 @@
-"""Reading and writing files one can trust: within bounds, whole or not at all, with what they came from."""
+"""Safe reading and writing of files: reads are bounded, writes are atomic, and results record their source."""

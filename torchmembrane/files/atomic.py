@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, and what is said of one that cannot be written."""
+"""Atomic writing of files, and the errors for files that cannot be written."""
 
 import errno
 import os
@@ -29,7 +29,7 @@ REMEDIES = {
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
-    """A path beside `path` to write to; what is written there replaces `path` when the block ends well.
+    """Give a temporary path beside `path` to write to; its file replaces `path` when the block ends without an error.
 
     An interrupted or failing block leaves `path` as it was. The path to write to is hidden (`.*.partial`), so that readers of a
     folder pass over it, and short, so that it exists wherever `path` can; each process has its own. A symbolic link at `path`
@@ -68,7 +68,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
 
 
 def remove_partials(folder: Path, processes: Iterable[int | None]) -> None:
-    """Remove what processes that were ended had begun to write in a folder.
+    """Remove the unfinished files of processes that were killed while they wrote to a folder.
 
     Args:
         folder: any.
@@ -79,11 +79,11 @@ def remove_partials(folder: Path, processes: Iterable[int | None]) -> None:
 
 
 def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
-    """Write a file, whole or not at all.
+    """Write a file atomically: completely or not at all.
 
     Args:
         path: the file, in a folder that exists.
-        content: what it shall hold.
+        content: its bytes.
 
     Raises:
         MembraneError: as `whole_file`.
@@ -93,17 +93,17 @@ def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write text in UTF-8, whole or not at all; else as `write_bytes`."""
+    """Write text in UTF-8, as `write_bytes` does."""
     write_bytes(path, text.encode("utf-8"))
 
 
 @contextmanager
 def writing(path: Path, *others: Path) -> Iterator[None]:
-    """Within, an error of the system on writing names the file.
+    """Turn the system's errors in the block into errors that name the file.
 
     Args:
-        path: that is written.
-        *others: names under which the system knows it meanwhile.
+        path: the file that is written.
+        *others: temporary names of the file.
 
     Raises:
         MembraneError: in place of an `OSError` that names no file, or one of these.
@@ -151,7 +151,7 @@ def make_folder(path: str | Path) -> Path:
 
 
 def make_subfolder(path: Path) -> Path:
-    """Make a folder within a folder of results; one that a symbolic link puts elsewhere is refused.
+    """Make a folder within a folder of results; a symbolic link in its place is refused.
 
     Raises:
         MembraneError: as `make_folder`; or the folder is a symbolic link.
@@ -162,11 +162,11 @@ def make_subfolder(path: Path) -> Path:
 
 
 def refuse_other_kind(path: Path) -> None:
-    """Refuse to put a file in the place of a folder or a device.
+    """Refuse to replace a folder or a device by a file.
 
     Raises:
         MembraneError: there is one.
-        OSError: the path cannot be looked at, as its name is too long.
+        OSError: the path cannot be examined because its name is too long.
     """
     try:
         mode = path.lstat().st_mode
@@ -177,6 +177,6 @@ def refuse_other_kind(path: Path) -> None:
 
 
 def kind_of(mode: int) -> str:
-    """What is no regular file, in a word, by its mode as `os.stat` gives it."""
+    """A word for the kind of a file that is not a regular one, from its mode as in `os.stat`."""
     kinds = {stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket"}
     return kinds.get(stat.S_IFMT(mode), "device")

@@ -1,4 +1,4 @@
-"""Colour of cameras whose pixels see one colour each, in a Bayer pattern of 2 x 2 pixels."""
+"""Colours of cameras whose pixels measure one colour each, in a Bayer pattern of 2 x 2 pixels."""
 
 import numpy as np
 from scipy.ndimage import correlate
@@ -11,7 +11,7 @@ SQUARE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4
 
 
 def demosaiced(mosaic: np.ndarray, pattern: str) -> np.ndarray:
-    """Red, green and blue of every pixel, where a pixel has not its own: by bilinear interpolation, which moves no edge.
+    """Red, green and blue of every pixel; the two that it did not measure are interpolated bilinearly, which moves no edge.
 
     Args:
         mosaic: `[height, width]`, 2 x 2 or more, floating point.

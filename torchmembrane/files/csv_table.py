@@ -1,8 +1,8 @@
-"""Tables that people make, as CSV: one reader, which finds columns by their names, and one set of messages.
+"""One reader for CSV tables that users write; it finds columns by their names.
 
 What spreadsheets, editors and numpy leave in a file is passed over: a byte order mark, Windows' line ends, blank lines, lines
-of commas alone, commas and blanks at the ends of lines, quotes, capitals in names, comments after `#` and a blank. What may
-mean one thing or another is refused: semicolons, decimal commas, separators of thousands, a column twice, one too many.
+of commas alone, commas and blanks at the ends of lines, quotes, capitals in names, comments after `#` and a blank. What is
+ambiguous is refused: semicolons, decimal commas, thousands separators, and columns that are repeated or unknown.
 """
 
 import csv
@@ -25,7 +25,7 @@ COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven")
 
 
 class Columns(NamedTuple):
-    """What a table holds.
+    """The columns that a table may have.
 
     Attributes:
         forms: the names of columns that belong together; a table has those of one form, in any order.
@@ -56,7 +56,7 @@ class Columns(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """How large a number may be, either way, and what it is, for messages."""
+    """The largest magnitude that a number may have, and the number's name in messages."""
 
     most: float = math.inf
     what: str = "a number"
@@ -109,7 +109,7 @@ class Row(NamedTuple):
         return [self.number(column, limit) for column in columns]
 
     def choice(self, column: str, choices: Sequence[str]) -> str:
-        """One of some words, in capitals or not."""
+        """One of several words, in upper or lower case."""
         word = self.text(column).lower()
         if word not in choices:
             raise self.refusal(column, " or ".join(choices))
@@ -125,7 +125,7 @@ class Table(NamedTuple):
     """A table as it was read.
 
     Attributes:
-        form: that of the expected ones whose columns it has.
+        form: the expected form whose columns it has.
         rows: its lines below the header.
     """
 
@@ -134,7 +134,7 @@ class Table(NamedTuple):
 
 
 def read_table(path: Path, columns: Columns, most_bytes: int) -> Table:
-    """The lines of a table; cells are looked at when they are asked for.
+    """Read the lines of a table; a cell is checked when it is asked for.
 
     Args:
         path: of the file, CSV.
@@ -168,7 +168,7 @@ def read_table(path: Path, columns: Columns, most_bytes: int) -> Table:
 
 
 def _rows(lines: list[str]) -> tuple[list[tuple[int, list[str]]], str]:
-    """Lines that are not empty, each with its number and cells, and what ended them early, if anything did."""
+    """The lines that are not empty, each with its number and cells, and the damage that ended them early, or ""."""
     reader = csv.reader(("\n" if COMMENT.match(line) else line for line in lines), strict=True, skipinitialspace=True)
     rows = []
     try:
@@ -202,7 +202,7 @@ def _header(
 
 
 def _names(cells: Sequence[str]) -> list[str]:
-    """The names in a header, as they are compared; empty ones at its end are left out."""
+    """The names in a header, normalised for comparison and without empty ones at its end."""
     names = [re.sub(r"[\s-]+", "_", cell.strip().lower()) for cell in cells]
     while names and not names[-1]:
         names.pop()

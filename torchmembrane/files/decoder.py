@@ -1,4 +1,4 @@
-"""Image files decoded by Pillow: opened within bounds, values as they are stored, refused where damage shows."""
+"""Image files decoded by Pillow: bounded in size, with the values as stored; damaged files are refused."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -41,8 +41,8 @@ class Stored(NamedTuple):
 
     Attributes:
         values: `[height, width]` or `[height, width, 3]`.
-        bits: of a value, where the file says that of 16 fewer are used.
-        halved: whether the file's values have 16 bits, of which the upper 8 are left.
+        bits: used bits of a value, where the file states fewer than 16.
+        halved: whether only the upper 8 of the file's 16 bits are left.
     """
 
     values: np.ndarray
@@ -52,7 +52,7 @@ class Stored(NamedTuple):
 
 @contextmanager
 def opened(path: str | Path, file: IO[bytes]) -> Iterator[Image.Image]:
-    """An image whose header is read; whatever fails inside the block is an error that names the file.
+    """Open an image and read its header; any failure inside the block becomes an error that names the file.
 
     Args:
         path: what messages call it.
@@ -75,7 +75,7 @@ def opened(path: str | Path, file: IO[bytes]) -> Iterator[Image.Image]:
 
 
 def pictures(image: Image.Image) -> Iterator[int]:
-    """Go to each picture of an opened image in turn; the places of those that are pictures of their own.
+    """Go to each picture of an opened image in turn, and yield the indices of those that are frames.
 
     What belongs to a picture is passed over: previews and masks of a TIFF, pictures of other sizes in an MPO, which are its
     previews and gain maps.
@@ -111,7 +111,7 @@ def _belongs_to_another(image: Image.Image, size: tuple[int, int]) -> bool:
 
 
 def _told(image: Image.Image) -> int:
-    """Pictures that a TIFF of ImageJ says it has; ImageJ leaves the pages of large ones out."""
+    """The number of pictures that a TIFF of ImageJ declares; ImageJ omits the pages of large stacks."""
     if image.format != "TIFF":
         return 0
     image.seek(0)
@@ -155,13 +155,13 @@ def stored_size(image: Image.Image) -> tuple[int, int]:
 
 
 def _orientation(image: Image.Image) -> int:
-    """By which orientation Pillow turns the image when it loads it: a TIFF's, and no other's."""
+    """The orientation that Pillow applies when it loads an image: only that of a TIFF."""
     stated = image.tag_v2.get(ORIENTATION, 1) if image.format == "TIFF" else 1  # type: ignore[attr-defined]
     return stated if stated in UNTURNED else 1
 
 
 def refuse_damaged(image: Image.Image, content: bytes) -> None:
-    """Refuse what decoding passes over: wrong checksums of PNG and TIFF, what libjpeg remarks of a JPEG, lengths of a WebP.
+    """Refuse damage that the decoder ignores: wrong checksums of PNG and TIFF, warnings of libjpeg, wrong lengths in a WebP.
 
     Args:
         image: that was loaded.
@@ -177,7 +177,7 @@ def refuse_damaged(image: Image.Image, content: bytes) -> None:
         refuse_damaged_page(image.tag_v2, file := BytesIO(content))  # type: ignore[attr-defined]
         refuse_displaced(image.tag_v2, file)  # type: ignore[attr-defined]
     if image.format == "WEBP" and not _fills_its_file(content):
-        raise ValueError("its chunks do not fill the file")
+        raise ValueError("its chunks do not add up to the length of the file")
     if image.format in ("JPEG", "MPO"):
         if any(0 in steps for steps in image.quantization.values()):  # type: ignore[attr-defined]
             raise ValueError("a quantisation table of the JPEG holds 0")
@@ -186,7 +186,7 @@ def refuse_damaged(image: Image.Image, content: bytes) -> None:
 
 
 def _fills_its_file(riff: bytes) -> bool:
-    """Whether the chunks of a RIFF file, one behind the other, are as long as they say together."""
+    """Whether the declared lengths of a RIFF file's chunks add up to the length of the file."""
     at, end = 12, 8 + int.from_bytes(riff[4:8], "little")
     while at < end:
         size = int.from_bytes(riff[at + 4 : at + 8], "little")

@@ -1,4 +1,4 @@
-"""How many digits of a number are written: by its size, as lengths are in any unit."""
+"""How many digits of a number are written; it depends on the number's size, because lengths may be in any unit."""
 
 import math
 
@@ -9,7 +9,7 @@ STORED = 7
 
 
 def decimals(size: float, digits: int) -> int:
-    """Places after the decimal point with which a number of this size has so many digits; 0 of what is not finite, or zero.
+    """Decimal places with which a number of this size has `digits` digits; 0 for zero and for numbers that are not finite.
 
     Example:
         >>> decimals(24.0, 3), decimals(0.024, 3), decimals(24000.0, 3)
@@ -19,7 +19,7 @@ def decimals(size: float, digits: int) -> int:
 
 
 def together(values: np.ndarray, digits: int) -> str:
-    """Components of a vector with their signs, all with as many decimals as the largest needs for so many digits.
+    """Components of a vector with their signs; all have as many decimal places as the largest needs for `digits` digits.
 
     Example:
         >>> together(np.array([0.00123, -0.04567, 0.0]), 3)

@@ -1,4 +1,4 @@
-"""The right to write into a folder: one job has it, or several shards of one job."""
+"""Locks of folders: one job, or several shards of one job, may write into a folder."""
 
 import zlib
 from contextlib import suppress
@@ -11,13 +11,13 @@ from filelock import BaseFileLock, FileLock, Timeout
 from ..errors import MembraneError
 from .atomic import make_folder, writing
 
-GATE = ".gate.lock"
+WRITE_LOCK = ".gate.lock"  # the name that earlier versions lock, too
 PATIENCE = 600.0
-"""Seconds to wait for another shard to leave the gate: it opens the folder, or writes what it holds back."""
+"""Seconds to wait for the write lock while another shard opens the folder or writes its buffered frames."""
 
 
 class Shard(NamedTuple):
-    """One of `total` disjoint parts of a job, told by the frames' names: the same on every machine, in any order.
+    """One of `total` disjoint parts of a job. A frame's shard depends only on its name, so it is the same on every machine.
 
     Attributes:
         number: 1 to `total`.
@@ -33,7 +33,7 @@ class Shard(NamedTuple):
     total: int = 1
 
     def holds(self, name: str) -> bool:
-        """Whether a frame of this name is this shard's."""
+        """Whether a frame of this name belongs to this shard."""
         return zlib.crc32(name.encode()) % self.total == self.number - 1
 
 
@@ -41,18 +41,18 @@ WHOLE = Shard()
 """Not divided."""
 
 
-class Claim:
-    """A folder claimed for writing: `with Claim(folder, shard) as claim`, and `with claim.gate` while its files are changed.
+class FolderLock:
+    """A folder locked for writing: `with FolderLock(folder, shard) as lock`, and `with lock.write_lock` to change its files.
 
     The locks are the operating system's: they end with the process, however that ends.
 
     Args:
-        folder: made if need be.
+        folder: it is made if it does not exist.
         shard: which part of a job writes there; the shards of one division may write at once.
 
     Attributes:
-        gate: a lock that one shard holds at a time.
-        alone: whether no other shard was writing when the folder was claimed.
+        write_lock: a lock that one shard holds at a time.
+        alone: whether no other shard was writing when the folder was locked.
 
     Raises:
         MembraneError: on entering: another job, the same shard, or shards of another division are writing there.
@@ -61,12 +61,12 @@ class Claim:
     def __init__(self, folder: Path, shard: Shard):
         self.folder, self.shard = folder, shard
         make_folder(folder)
-        self.gate = FileLock(folder / GATE, timeout=PATIENCE)
+        self.write_lock = FileLock(folder / WRITE_LOCK, timeout=PATIENCE)
         self.alone = True
         self._own = FileLock(folder / _lock_name(shard), timeout=0)
 
-    def __enter__(self) -> "Claim":
-        with writing(self.folder, self.folder / GATE, self.folder / _lock_name(self.shard)), self.gate:
+    def __enter__(self) -> "FolderLock":
+        with writing(self.folder, self.folder / WRITE_LOCK, self.folder / _lock_name(self.shard)), self.write_lock:
             held = [path.name for path in self.folder.glob(".shard-*.lock") if _is_held(path)]
             self.alone = not held
             division = f"-of-{self.shard.total}.lock"
@@ -79,11 +79,11 @@ class Claim:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        with self.gate:
+        with self.write_lock:
             _remove(self._own)
             self._own.release()
             if not any(self.folder.glob(".shard-*.lock")):
-                _remove(self.gate)
+                _remove(self.write_lock)
 
 
 def _lock_name(shard: Shard) -> str:
@@ -96,7 +96,7 @@ def _said(lock: str) -> str:
 
 
 def _remove(lock: BaseFileLock) -> None:
-    """Delete the file of a held lock: whoever waits for it sees that it is gone, and makes a new one."""
+    """Delete the file of a held lock; a process that waits for it notices and makes a new one."""
     with suppress(OSError):  # Windows keeps open files
         Path(lock.lock_file).unlink()
 

@@ -1,4 +1,4 @@
-"""Images as cameras give them, as one grey batch."""
+"""Conversion of camera images to one batch of grey images."""
 
 from typing import Literal
 
@@ -29,12 +29,12 @@ def grey_batch(
 
     Args:
         images: torch or numpy, `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or `[B, H, W, 1 | 3]`; uint8, uint16 or
-            float in 0..1. Grey is 0.299 R + 0.587 G + 0.114 B. Three grey frames `[3, H, W]` might be the colours of one image,
-            and are warned of.
+            float in 0..1. Grey is 0.299 R + 0.587 G + 0.114 B. Three grey frames `[3, H, W]` might be the colours of one image
+            and cause a warning.
         size: width and height, px.
         channels: order of the three channels, "rgb" or "bgr".
         like: a tensor.
-        bits: of the camera, where uint16 images hold fewer: white is `2^bits - 1`.
+        bits: of the camera, if fewer than the 16 of uint16 images: white is `2^bits - 1`.
 
     Raises:
         MembraneError: another shape, size or type, or values beyond `bits`; says what came, what was expected, and how to
@@ -94,7 +94,7 @@ def _tensor(images: Tensor | np.ndarray) -> Tensor:
 
 
 def _planes(pixels: Tensor, size: tuple[int, int]) -> list[Tensor]:
-    """The channels, one or three, `[B, H, W]` each."""
+    """The one or three channels, `[B, H, W]` each."""
     shape = tuple(pixels.shape)
     if shape[-2:] == size and len(shape) == 2:
         return [pixels[None]]

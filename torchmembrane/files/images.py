@@ -1,4 +1,4 @@
-"""Images as grey values: 0.299 R + 0.587 G + 0.114 B in floating point, the same on every path."""
+"""Image files as grey values, 0.299 R + 0.587 G + 0.114 B in floating point, computed in the same way everywhere."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -27,9 +27,9 @@ GREY = (0.299, 0.587, 0.114)
 def read_image(path: str | Path, size: tuple[int, int] | None = None, bits: int | None = None) -> np.ndarray:
     """An image file's grey values, float32 `[height, width]` in 0..1.
 
-    Grey of 8 and 16 bits and of float (TIFF), RGB, palette, CMYK; alpha is ignored. EXIF orientation is not applied: pixels
-    are the camera's own. Colour of 16 bits arrives as 8 bits (Pillow's limit). Whatever the decoders remark is an error, but
-    for padding in a JPEG: checksums of PNG, corrupt or missing data in JPEG, lengths that do not add up in WebP.
+    Grey of 8 and 16 bits and of float (TIFF), RGB, palette, CMYK; alpha is ignored. EXIF orientation is not applied: pixels are
+    the camera's own. Colour of 16 bits arrives as 8 bits (Pillow's limit). Any warning of a decoder is an error, except for
+    padding in a JPEG: wrong checksums of PNG, corrupt or missing data in JPEG, inconsistent lengths in WebP.
 
     Args:
         path: a PNG, JPEG, BMP, TIFF or WebP file with one picture.
@@ -44,8 +44,7 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None, bits: int 
             pictures or values beyond `bits`; names the file and the cause.
 
     Limitations:
-        TIFF, BMP and WebP have no checksums, JPEG has none for what decodes without remark: damage that leaves the file well
-        formed is not seen here.
+        TIFF, BMP, WebP and JPEG have no checksums of their pixels: damage that leaves the file well formed is not noticed here.
 
     Example:
         >>> image = read_image("examples/rest.png")
@@ -130,7 +129,7 @@ def picture_count(path: Path, most: int = MOST_PICTURES) -> int:
 
 
 def stack_images(path: Path, size: tuple[int, int], bits: int | None = None) -> Iterator[np.ndarray | MembraneError]:
-    """The pictures of a file one after another, as `read_image` gives one; one that cannot be read is the reason why.
+    """The pictures of a file one after another, as `read_image` gives one; in place of one that cannot be read, the error.
 
     Args:
         path: a PNG, JPEG, BMP, TIFF or WebP file of one picture or more.
@@ -206,7 +205,7 @@ def _opened_single(path: str | Path, content: bytes) -> Iterator[Image.Image]:
 
 @contextmanager
 def _opened_stack(path: Path) -> Iterator[tuple[Image.Image, IO[bytes]]]:
-    """The image of a file that is read as far as pictures are asked for, and the file."""
+    """The image of a file, which is read only as far as pictures are asked for, and the file."""
     expected = "a readable image file"
     try:
         regular_size(path, MOST_STACK_BYTES, expected)
@@ -281,7 +280,7 @@ def to_grey(array: np.ndarray, bits: int | None = None) -> np.ndarray:
 def write_image(stem: str | Path, grey: np.ndarray, bits: int | None = None) -> Path:
     """Write grey values so that `read_image` gives the same numbers.
 
-    PNG of 8 or 16 bits where that holds the values exactly, else a TIFF of floats. The file is there whole or not at all.
+    PNG of 8 or 16 bits where that holds the values exactly, else a TIFF of floats. The file is written atomically.
 
     Args:
         stem: the file without its ending, `.png` or `.tiff`.
@@ -307,7 +306,7 @@ def write_image(stem: str | Path, grey: np.ndarray, bits: int | None = None) -> 
 
 
 def write_as_taken(stem: str | Path, image: np.ndarray, bits: int | None = None) -> Path:
-    """Write an image as a camera gave it, losslessly and fast; the file is there whole or not at all.
+    """Write an image as a camera gave it, losslessly, fast and atomically.
 
     Args:
         stem: the file without its ending, `.png` or `.tiff`.
@@ -333,7 +332,7 @@ def write_as_taken(stem: str | Path, image: np.ndarray, bits: int | None = None)
 
 
 def _written(path: Path, values: np.ndarray, **options: int) -> Path:
-    """Write an image, whole or not at all, in the format that the ending says."""
+    """Write an image atomically, in the format of the file name's ending."""
     with whole_file(path) as partial:
         Image.fromarray(np.ascontiguousarray(values)).save(partial, "TIFF" if path.suffix == ".tiff" else "PNG", **options)
     return path

@@ -23,7 +23,7 @@ LONGEST_SIDE = 65535
 
 
 def is_whole(content: bytes) -> bool:
-    """Whether a JPEG file's picture is complete: the decoder has nothing to remark, or nothing but padding.
+    """Whether a JPEG file's picture is complete: the decoder gives no warning, or only one about padding.
 
     Some cameras put bytes between the data of a picture, or of a restart interval, and the marker behind it: any number of them
     that are alike, or up to `MOST_ODD`. Such padding is no damage. What ends early, or is not decodable, is damaged.
@@ -32,8 +32,8 @@ def is_whole(content: bytes) -> bool:
         content: of the file, grey or of three colours.
 
     Limitations:
-        A decoder that loses its place in damaged data and ends up to `MOST_ODD` bytes early is not noticed, nor is damage of
-        which the decoder has nothing to remark.
+        A decoder that loses its place in damaged data and ends up to `MOST_ODD` bytes early is not noticed, nor is damage for
+        which the decoder gives no warning.
 
     Example:
         >>> from io import BytesIO
@@ -50,7 +50,7 @@ def is_whole(content: bytes) -> bool:
 
 
 def _is_decoded(content: bytes) -> bool:
-    """Whether libjpeg decodes a file without a remark."""
+    """Whether libjpeg decodes a file without a warning."""
     from kornia_rs.io import ImageDecoder
 
     try:
@@ -93,7 +93,7 @@ def _shorter(data: bytes) -> Iterator[bytes]:
 
 
 class _Header:
-    """What comes before the data of a file's first scan.
+    """The part of a file before the data of its first scan.
 
     Attributes:
         length: bytes.
@@ -111,7 +111,7 @@ class _Header:
 
     @classmethod
     def of(cls, content: bytes) -> "_Header | None":
-        """That of a file whose segments are in order; None of another one."""
+        """The header of a file whose segments are in order; None for another file."""
         at, frame, restart = 2, 0, 0
         while at + 4 <= len(content) and content[at] == 0xFF:
             marker, length = content[at + 1], int.from_bytes(content[at + 2 : at + 4], "big")

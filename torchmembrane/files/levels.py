@@ -1,4 +1,4 @@
-"""Levels of grey: which of them is white where a camera has fewer bits than its images are stored in."""
+"""Grey levels: which level is white if a camera has fewer bits than its images are stored with."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -65,12 +65,12 @@ def refuse_beyond(highest: Any, white: int) -> None:
         bits = (white + 1).bit_length() - 1
         raise MembraneError(
             f"values up to {int(highest)}; expected at most {white}, as bits = {bits} in the sensor file's [camera] says: "
-            "correct it, or leave it out where the values fill the 16 bits"
+            "correct it, or leave it out if the values use all 16 bits"
         )
 
 
 def telling_bits(find: Callable[Concatenate[np.ndarray, P], Found]) -> Callable[Concatenate[np.ndarray, P], Found]:
-    """The function `find`, whose refusals of an image, its first argument, end in what `too_few_bits` says of it."""
+    """Decorate a function of an image so that its errors end with the hint of `too_few_bits` on that image."""
 
     @wraps(find)
     def found(image: np.ndarray, /, *args: P.args, **kwargs: P.kwargs) -> Found:
@@ -83,8 +83,8 @@ def telling_bits(find: Callable[Concatenate[np.ndarray, P], Found]) -> Callable[
 
 
 def too_few_bits(image: np.ndarray) -> str:
-    """What to add to the refusal of an image that shows nothing: how high its values go, if they are those of a camera of fewer
-    bits, stored in 16; "" of all other images.
+    """A hint for the error on an image that shows nothing: how high its values go, if it looks like a camera's fewer bits
+    stored as 16; "" for all other images.
 
     Args:
         image: uint16, or grey in 0..1; also a mean of up to `MOST_AVERAGED` such images or pixels.

@@ -1,6 +1,6 @@
-"""Packages that may be missing: imported where they are used, with an error that names the extra to install.
+"""Optional packages: imported where they are used, with an error that names the extra to install.
 
-Each of these functions raises that error where the package is missing, and another one where it is there and broken.
+Each of these functions raises that error if the package is missing, and another one if it is installed but broken.
 """
 
 import os
@@ -38,7 +38,7 @@ def load_opencv(purpose: str = "calibration from boards needs OpenCV") -> Any:
     Raises:
         MembraneError: OpenCV is not installed.
     """
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what goes wrong is said in this package's own words
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # its failure is reported in this package's own words
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2 = _load("cv2", purpose, "calibrate")
     if hasattr(cv2, "setLogLevel"):
@@ -102,7 +102,7 @@ def load_rosbags() -> Any:
 def _load(module: str, purpose: str, extra: str) -> Any:
     try:
         return import_module(module)
-    except (ImportError, OSError) as error:  # OSError: of a library that a package brings or expects
+    except (ImportError, OSError) as error:  # OSError: from a shared library that a package contains or needs
         if isinstance(error, ModuleNotFoundError) and error.name == module:
             raise MembraneError(f'{purpose}, which is not installed: pip install "torchmembrane[{extra}]"') from error
         raise MembraneError(

@@ -1,4 +1,4 @@
-"""The order of frames by their names, and whether their times have another one."""
+"""The order of frames by their names, and a warning if their times have another order."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -14,7 +14,7 @@ APART = 1.0
 
 
 def in_order(name: str | Path) -> tuple[list[tuple[int, str]], str]:
-    """A key to sort names or paths by: numbers within them count as numbers, whatever their zeros before.
+    """A key that sorts names or paths with their numbers by value; leading zeros do not matter.
 
     Example:
         >>> sorted(["f_10", "f_2", "f_1", "e_11"], key=in_order)
@@ -26,7 +26,7 @@ def in_order(name: str | Path) -> tuple[list[tuple[int, str]], str]:
 
 
 def evenly(items: Sequence[Item], most: int) -> list[Item]:
-    """So many of some items at most, the first and the last among them.
+    """At most `most` of the items, evenly chosen, with the first and the last.
 
     Example:
         >>> evenly("abcdefg", 3), evenly("ab", 3)
@@ -39,10 +39,10 @@ def evenly(items: Sequence[Item], most: int) -> list[Item]:
 
 
 def warn_of_times(frames: Iterable[tuple[str, float]]) -> None:
-    """Warn where frames that are taken in the order of their names were made in another order.
+    """Warn if frames that are used in the order of their names were taken in another order.
 
     Args:
-        frames: name and time, s, of each, in the order in which they are taken.
+        frames: name and time (s) of each, in the order in which they are used.
 
     Example:
         >>> warn_of_times([("f_9", 100.0), ("f_10", 103.0), ("f_11", 102.5)])  # too little apart to tell
@@ -52,7 +52,7 @@ def warn_of_times(frames: Iterable[tuple[str, float]]) -> None:
         if time < at - APART:
             warn_user(
                 f"{name} follows {latest} by the numbers in their names, but is older by {at - time:.0f} s; the order of the "
-                "names is taken. Where the other one is meant, rename the files"
+                "names is taken. If the other order is meant, rename the files"
             )
             return
         if time > at:
@@ -60,5 +60,5 @@ def warn_of_times(frames: Iterable[tuple[str, float]]) -> None:
 
 
 def warn_of_file_times(paths: Iterable[Path]) -> None:
-    """The same by the times at which files were last changed; files that are not there are passed over."""
+    """The same with the times of the files' last changes; missing files are ignored."""
     warn_of_times((path.name, path.stat().st_mtime) for path in paths if path.exists())

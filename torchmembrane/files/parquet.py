@@ -1,4 +1,4 @@
-"""Tables of Parquet files, read within bounds: what a file declares is compared with them before memory is taken."""
+"""Bounded reading of Parquet files: the sizes that a file declares are checked before memory is allocated."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -70,6 +70,7 @@ def refusal(path: Path, what: str, expected: str, error: object) -> MembraneErro
 
 
 def _declared_bytes(metadata: Any) -> int:
-    """What all columns take in memory, as the file's footer says; what it says of one column may end the process if damaged."""
+    """The memory that all columns take, as the file's footer declares; reading the entry of one column of a damaged file may
+    end the process."""
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     return sum(max(group.total_byte_size, group.num_rows * group.num_columns * VALUE_BYTES) for group in groups)

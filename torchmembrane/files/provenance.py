@@ -1,4 +1,4 @@
-"""Where a frame came from and when it was taken, so that a new image under an old name is noticed."""
+"""The source file of a frame and its time, so that a new image under an old name is noticed."""
 
 import hashlib
 from functools import partial
@@ -11,14 +11,15 @@ DIGEST = partial(hashlib.blake2b, digest_size=16)
 
 
 class Origin(NamedTuple):
-    """The file of a frame as it was when the frame was reconstructed.
+    """The file of a frame as it was when the frame was reconstructed, and what was measured beside it.
 
     Attributes:
         path: as given.
         file_size: bytes; -1 where it is not known.
         file_modified: nanoseconds since 1970; -1 where it is not known.
-        content_hash: BLAKE2b of 16 bytes of what it held, hexadecimal; "" where it is not known.
+        content_hash: BLAKE2b hash of its content, 16 bytes as hexadecimal; "" if it is not known.
         time: when the frame was taken, seconds, as its name, video, bag or camera says; NaN where it is not known.
+        gauge: pressure across the membrane that a gauge read then, force unit / length unit^2; NaN where none did.
     """
 
     path: str = ""
@@ -26,10 +27,11 @@ class Origin(NamedTuple):
     file_modified: int = -1
     content_hash: str = ""
     time: float = float("nan")
+    gauge: float = float("nan")
 
     @classmethod
     def of(cls, file: Path) -> "Origin":
-        """That of a file as it is now.
+        """The origin of a file as it is now.
 
         Raises:
             OSError: it cannot be read.
@@ -45,12 +47,12 @@ class Origin(NamedTuple):
 
     @classmethod
     def of_bytes(cls, file: Path, content: bytes) -> "Origin":
-        """That of a file of which only this content is known."""
+        """The origin of a file of which only the content is known."""
         return cls(printable(str(file)), len(content), content_hash=DIGEST(content).hexdigest(), time=time_in(file.stem))
 
     def is_of(self, file: Path) -> bool:
-        """Whether a file holds what it held: by size and time, where these differ by its hash; True where that is not known,
-        or the file cannot be read."""
+        """Whether a file has not changed: its size and time are compared, and if these differ its hash. True if the hash is not
+        known or the file cannot be read."""
         try:
             stat = file.stat()
             if not self.content_hash or (stat.st_size, stat.st_mtime_ns) == (self.file_size, self.file_modified):
@@ -61,7 +63,7 @@ class Origin(NamedTuple):
 
 
 def printable(text: str) -> str:
-    r"""A path's text in UTF-8: bytes that are none are written out.
+    r"""A path's text in UTF-8; bytes that are not valid UTF-8 are escaped.
 
     Example:
         >>> printable("caf\udce9.png")

@@ -1,6 +1,6 @@
-"""Files that others wrote, read within bounds: what kind of file, how large and how nested it is, before memory is taken.
+"""Bounded reading of untrusted files: kind, size and nesting of a file are checked before memory is allocated.
 
-Whatever is wrong with one is a `MembraneError` of one line that names it. Files that a file names lie in its folder or below.
+Any fault is a `MembraneError` of one line that names the file. A file may name others only in its own folder or below.
 """
 
 import io
@@ -38,7 +38,7 @@ DAMAGE = (
 
 
 class LackingArray(MembraneError):
-    """A whole file of arrays without one that was asked for."""
+    """An intact file of arrays lacks one that was asked for."""
 
 
 def read_bytes(path: Path, most: int, expected: str) -> bytes:
@@ -72,7 +72,7 @@ def read_bytes(path: Path, most: int, expected: str) -> bytes:
 
 
 def regular_size(path: Path, most: int, expected: str) -> int:
-    """How many bytes a regular file holds; it is not opened.
+    """The size of a regular file in bytes; it is not opened.
 
     Args:
         path: as `read_bytes`.
@@ -173,7 +173,7 @@ def read_array(path: Path) -> np.ndarray:
 
 
 def lies_within(name: str) -> bool:
-    """Whether a file's name, as another file has it, leads into that file's folder or below on every system.
+    """Whether a file name that is written in another file leads into that file's folder or below, on every system.
 
     Example:
         >>> [lies_within(name) for name in ("dots.csv", "rest/a.png", "../dots.csv", "/etc/passwd", "C:\\\\dots.csv")]
@@ -186,7 +186,7 @@ def lies_within(name: str) -> bool:
 
 
 def shortened(text: str, most: int = 80) -> str:
-    """Text of at most so many characters, the middle left out.
+    """Text shortened to at most `most` characters by leaving out its middle.
 
     Example:
         >>> shortened("1234567890", 7)
@@ -197,7 +197,7 @@ def shortened(text: str, most: int = 80) -> str:
 
 
 def in_one_line(text: object) -> str:
-    """What something says, of at most 200 characters in one line: others' messages, and what others' files hold.
+    """A foreign message or content as one line of at most 200 characters.
 
     Example:
         >>> in_one_line("unexpected\\n  end\\a")
@@ -207,7 +207,7 @@ def in_one_line(text: object) -> str:
 
 
 def printable(text: object) -> str:
-    """Text with `?` for what cannot be printed in a line.
+    """Text with `?` in place of characters that cannot be printed in a line.
 
     Example:
         >>> printable("rest\\n.png")
@@ -226,7 +226,7 @@ def _refuse_large(size: int) -> None:
 
 
 def _unpacked(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """A member's content, of the size that the directory declares; its checksum is compared."""
+    """A member's content, which must have the size and the checksum that the directory declares."""
     if member.compress_type not in PLAIN_METHODS:
         raise ValueError(f"{member.filename} is compressed by method {member.compress_type}, not deflated")
     with file.open(member) as stream:
@@ -252,7 +252,7 @@ def _array(content: bytes, name: str, kinds: str) -> np.ndarray:
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether columns come first, and type."""
+    """Shape, whether the order is Fortran's, and type."""
     version = np.lib.format.read_magic(stream)
     if version == (1, 0):
         return np.lib.format.read_array_header_1_0(stream)

@@ -1,4 +1,4 @@
-"""Files that systems and programs leave beside those of their users: a folder or a pattern does not mean them."""
+"""Files that operating systems and programs leave in folders; they are not among the images of a folder or a pattern."""
 
 import re
 from pathlib import Path

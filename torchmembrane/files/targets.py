@@ -1,4 +1,4 @@
-"""The one rule by which commands spare the user's files: what is there already is written over only where that was said."""
+"""The rule by which commands protect the user's files: an existing file is overwritten only with `--force`."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -15,18 +15,18 @@ def refuse_overwriting(
     force: bool = False,
     is_own: Callable[[Path], bool] = lambda path: False,
 ) -> None:
-    """Refuse to write over files that are there.
+    """Refuse to overwrite existing files.
 
-    A file that the command reads is never written over. One that an earlier run of the same command made, as far as `is_own`
-    tells, is; all others are with `force` alone. A symbolic link counts as the file that it names, where that is read, else as
-    a file of its own.
+    A file that the command reads is never overwritten. A file that an earlier run of the same command made, according to
+    `is_own`, is overwritten; all others only with `force`. A symbolic link counts as the file that it names if that is read,
+    else as a file of its own.
 
     Args:
         command: as messages begin.
         targets: the files that the command is going to write.
         read: the files that it reads.
-        force: whether the user has said that others may be written over.
-        is_own: whether a file that is there is one that this command may make anew without being told.
+        force: whether the user allows other files to be overwritten.
+        is_own: whether this command may overwrite an existing file without `force`.
 
     Raises:
         MembraneError: names the first file that would be lost, or cannot be written at all, and the remedy.

@@ -1,4 +1,4 @@
-"""Numbers as callers give them, as tensors."""
+"""Conversion of the numbers that callers pass to tensors."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from ..errors import MembraneError, is_number
 
 
 def tensor_of(name: str, values: Any) -> Tensor:
-    """Real numbers as a tensor; what torch's default type is plays no part.
+    """Real numbers as a tensor; torch's default type has no influence.
 
     Args:
         name: what an error calls them.

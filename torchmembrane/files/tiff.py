@@ -1,4 +1,4 @@
-"""Damage of TIFF files that decoding passes over: wrong checksums, pixels pushed aside, compressed data that are too long."""
+"""Damage of TIFF files that decoders ignore: wrong checksums, displaced pixels, compressed data that are too long."""
 
 import re
 import struct
@@ -30,7 +30,7 @@ class _Entry(NamedTuple):
 
 
 def refuse_damaged_page(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
-    """Refuse a page whose compressed data do not have their checksum, or do not end with its pixels, after which decoders stop.
+    """Refuse a page whose compressed data have a wrong checksum or go on after its last pixel, where decoders stop.
 
     Args:
         tags: of the page.
@@ -57,9 +57,9 @@ def refuse_damaged_page(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
 
 
 def refuse_displaced(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
-    """Refuse an uncompressed file of one page with bytes behind all that it holds: some may have been pushed in before.
+    """Refuse an uncompressed file of one page with extra bytes at its end: bytes may have been inserted before them.
 
-    Bytes that are alike are taken for padding.
+    Equal bytes are taken for padding.
 
     Args:
         tags: of the page.
@@ -85,13 +85,13 @@ def refuse_displaced(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
 
 
 def _data(tags: ImageFileDirectory_v2) -> list[tuple[int, int]]:
-    """Place and length of each strip or tile; none where the file does not say the lengths."""
+    """Offset and length of each strip or tile; an empty list if the file does not state the lengths."""
     places, lengths = (next((tags[tag] for tag in pair if tag in tags), ()) for pair in (PLACES, LENGTHS))
     return list(zip(places, lengths, strict=False))
 
 
 def _sizes(tags: ImageFileDirectory_v2, number: int) -> tuple[int, ...]:
-    """Bytes that a strip, or a tile, may unpack to: the last strip may be as long as the others."""
+    """The number of bytes to which a strip or a tile may unpack; the last strip may be as long as the others."""
     bits = tags.get(BITS, (1,))[: 1 if tags.get(PLANES) == APART else None]
     if TILE[0] in tags:
         width, rows, left = tags[TILE[0]], tags[TILE[1]], tags[TILE[1]]
@@ -104,7 +104,7 @@ def _sizes(tags: ImageFileDirectory_v2, number: int) -> tuple[int, ...]:
 
 
 def _lzw_size(data: bytes) -> int:
-    """Bytes that LZW data of a TIFF unpack to, up to their end code."""
+    """The number of bytes to which LZW data of a TIFF unpack, up to their end code."""
     sizes, before, total, width, held, have = [1] * CLEAR + [0, 0], 0, 0, 9, 0, 0
     for byte in data:
         held, have = (held << 8 | byte) & 0xFFFFF, have + 8
@@ -129,7 +129,7 @@ def _lzw_size(data: bytes) -> int:
 
 
 def _packbits_size(data: bytes) -> int:
-    """Bytes that PackBits data unpack to."""
+    """The number of bytes to which PackBits data unpack."""
     at = total = 0
     while at < len(data):
         head = data[at]
@@ -141,7 +141,7 @@ def _packbits_size(data: bytes) -> int:
 
 
 def _entries(file: IO[bytes]) -> Iterator[_Entry]:
-    """All entries of all directories, with where the entry or its values end in the file."""
+    """All entries of all directories, each with the offset where it or its values end in the file."""
     file.seek(0)
     head = file.read(16)
     order, big = "<" if head[:2] == b"II" else ">", head[2:4] in (b"+\0", b"\0+")

@@ -1,4 +1,4 @@
-"""Videos as PyAV decodes them: whatever their names, and whatever of them is missing."""
+"""Videos decoded by PyAV, with any file name, also if they are damaged or cut off."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,7 +25,7 @@ WHOLE = 0.01
 
 
 def ffmpeg_name(path: Path) -> str:
-    """A file's name for FFmpeg, which takes what comes before a colon for a protocol.
+    """A file's name for FFmpeg, which would read the text before a colon as a protocol.
 
     Example:
         >>> ffmpeg_name(Path("12:30:05.mp4"))
@@ -35,9 +35,9 @@ def ffmpeg_name(path: Path) -> str:
 
 
 def video_pictures(path: Path, size: tuple[int, int]) -> Iterator[Any]:
-    """The pictures of a video one after another, as PyAV gives them; in place of a damaged one, the reason why.
+    """The pictures of a video one after another, as PyAV gives them; in place of a damaged one, the error.
 
-    A picture that follows a damaged one is damaged as well, up to the next that is coded by itself.
+    The pictures after a damaged one count as damaged too, up to the next key frame.
 
     Args:
         path: of the video.
@@ -47,8 +47,8 @@ def video_pictures(path: Path, size: tuple[int, int]) -> Iterator[Any]:
         `av.VideoFrame`, or a `MembraneError` that does not name the file.
 
     Raises:
-        MembraneError: PyAV is not installed; the file is no video, one of another size, or it ends early, and how many frames
-            of how many there are.
+        MembraneError: PyAV is not installed; the file is not a video, has another size, or ends early; the message then says
+            how many frames it holds and should hold.
     """
     av, number, damage = load_pyav(), 0, ""
     with _opened(path) as (container, stream):
@@ -92,7 +92,7 @@ def picture_values(picture: Any, bits: int | None = None) -> np.ndarray:
 
 
 def picture_rate(path: Path) -> float | None:
-    """The pictures a second that a video says it has, on average; None where it does not say, or is none.
+    """The average frame rate that a video declares; None if it declares none or is no video.
 
     Raises:
         MembraneError: PyAV is not installed.
@@ -101,7 +101,7 @@ def picture_rate(path: Path) -> float | None:
 
 
 def picture_total(path: Path) -> int | None:
-    """The number of pictures that a video says it has; None where it does not say, or is none.
+    """The number of pictures that a video declares; None if it declares none or is no video.
 
     Raises:
         MembraneError: PyAV is not installed.
@@ -110,7 +110,7 @@ def picture_total(path: Path) -> int | None:
 
 
 def _said(path: Path, of: Callable[[Any], Said | None]) -> Said | None:
-    """What a video says of itself; None of a file that is none."""
+    """A property that a video declares; None for a file that is no video."""
     load_pyav()
     try:
         with _opened(path) as (_, stream):
@@ -155,7 +155,7 @@ def _refuse_size(pictures: Any, size: tuple[int, int]) -> None:
 
 
 def _of_how_many(found: int, container: Any, stream: Any) -> str:
-    """How many pictures a video should have, in words, if it says that it has more than were found."""
+    """In words, how many pictures a video should have, if it declares more than were found."""
     told = stream.frames
     if not told and TIMED in container.format.name and container.duration and stream.average_rate:
         told = container.duration / 1e6 * float(stream.average_rate)

@@ -1,4 +1,4 @@
-"""Whether a video's file holds as many bytes as it says: Matroska, WebM, AVI, MP4, MOV and GIF."""
+"""Whether a video file is as long as it declares: Matroska, WebM, AVI, MP4, MOV and GIF."""
 
 from pathlib import Path
 from typing import BinaryIO
@@ -16,7 +16,7 @@ LONGEST_TAIL = 1024
 
 
 def missing_end(path: Path) -> str:
-    """What of a video's file is missing at its end, in words; "" where nothing is, or nothing tells.
+    """In words, what is missing at the end of a video file; "" if nothing is, or if that cannot be told.
 
     Args:
         path: of a regular file.
@@ -61,7 +61,7 @@ def _end_of_matroska(file: BinaryIO) -> int:
 
 
 def _variable(file: BinaryIO) -> int | None:
-    """A number of Matroska's, whose first byte says how many there are; None: unknown, as of a live recording."""
+    """A number of variable length in Matroska, whose first byte gives the length; None: unknown, as in a live recording."""
     first = file.read(1)
     count = 9 - first[0].bit_length() if first and first[0] else 0
     rest = file.read(count - 1) if count else b""

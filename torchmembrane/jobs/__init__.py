@@ -1,4 +1,4 @@
-"""Files in, results out."""
+"""Jobs: many image files reconstructed to folders of results."""
 
 from .frame_reconstructor import FrameReconstructor
 

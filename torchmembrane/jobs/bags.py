@@ -1,4 +1,4 @@
-"""Bags among the inputs of a job: what their cameras say, and a bag of the results."""
+"""ROS bags among the inputs of a job: checks of their CameraInfo messages, and a bag of the results."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def bag_remarks(inputs: Inputs, camera: Camera) -> Iterator[str]:
-    """What the bags' CameraInfos say otherwise than the sensor file.
+    """The differences between the bags' CameraInfo messages and the sensor file.
 
     Raises:
         MembraneError: a bag cannot be read, it is not clear which of its topics is meant, or it is of images of another size.
@@ -29,16 +29,16 @@ def bag_remarks(inputs: Inputs, camera: Camera) -> Iterator[str]:
 
 
 def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstructor", shard: Shard) -> BagWriter:
-    """Where the results of bags will be written to.
+    """The path of the bag to which results will be written.
 
     Raises:
         MembraneError: none of the inputs is a bag, only a shard of them is done, the estimator finds no forces or they are
             relative, or there is something else at the path.
     """
     if shard != WHOLE:
-        raise MembraneError("--bag with --shard: leave --bag out, and call once more for all when the shards are done")
+        raise MembraneError("--bag with --shard: leave --bag out, and write the bag by one more call when all shards are done")
     if not inputs.bags:
-        raise MembraneError(f"--bag {path}: none of the inputs is a bag, whose messages' times the results' would have")
+        raise MembraneError(f"--bag {path}: none of the inputs is a bag; expected one, whose times the results take")
     if not reconstructor.finds_tractions:
         raise MembraneError(f"--bag {path}: {mesh.estimator} finds no forces; expected force-balance")
     return BagWriter(path, SiUnits(mesh, reconstructor.sensor.gas_pressure), is_mcap(inputs.bags[0]))

@@ -35,7 +35,7 @@ Load: TypeAlias = Callable[["Reconstructor"], Tensor]
 
 
 class Picture(NamedTuple):
-    """A picture of a file of several: what gives its image, and when it was taken, seconds; NaN where that is not known."""
+    """A picture of a file with several: the function that loads its image, and its time in seconds, NaN if it is not known."""
 
     load: Load
     time: float = float("nan")
@@ -63,7 +63,7 @@ class DecodedFrame(NamedTuple):
     origin: Origin = Origin()
 
     def but(self, error: Exception) -> "DecodedFrame":
-        """The same without an image, because of an error."""
+        """The same frame without an image, because of an error."""
         return self._replace(image=None, reason=str(error).removeprefix(f"{self.file}: "))
 
 
@@ -128,7 +128,7 @@ def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch:
 
 
 def length_of(path: Path, topic: str | None) -> int | None:
-    """The number of frames that a video, bag or stack says it has; None where it does not say, or is none."""
+    """The number of frames that a video, bag or stack declares; None if it declares none or is none of these."""
     return image_topic(path, topic)[1] if is_bag(path) else picture_count(path) or picture_total(path)
 
 
@@ -137,7 +137,7 @@ def _read(path: Path, reconstructor: "Reconstructor") -> Tensor:
 
 
 def _frames(path: Path, pictures: Iterator[Picture]) -> Iterator[Source]:
-    """The frames of a file of several one after another; where no further one can be found, the reason is a frame as well."""
+    """The frames of a file with several, one after another; if the file breaks off, its error is the last frame."""
     number = -1
     try:
         origin = origin_of(path)
@@ -151,10 +151,10 @@ def _frames(path: Path, pictures: Iterator[Picture]) -> Iterator[Source]:
 
 
 def _pictures(path: Path, topic: str | None, reconstructor: "Reconstructor") -> Iterator[Picture]:
-    """The pictures of a file of several.
+    """The pictures of a file with several.
 
-    Those of a bag are of the time that their header says, or of their reception; those of a video of the time after its
-    beginning, which its name may say.
+    In a bag the time is that of the header, or else of the reception; in a video it counts from the beginning, whose time the
+    file name may give.
     """
     if is_bag(path):
         yield from (

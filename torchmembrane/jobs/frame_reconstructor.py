@@ -1,4 +1,4 @@
-"""Frames in, rows of results out: the state of one worker, whatever hands out the work."""
+"""The worker of a job: it turns frames into rows of results, whichever engine distributes the work."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -31,7 +31,7 @@ Gauge: TypeAlias = Mapping[str, float] | Callable[[str, float], float]
 
 
 class Outcome(NamedTuple):
-    """What became of a frame: its result, with what is to be added to its status, or the reason why it gave no image."""
+    """The outcome of a frame: its result with a remark on its status, or the reason why its image could not be read."""
 
     name: str
     file: Path
@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
 
     @property
     def status(self) -> int:
-        """Of the result, or `UNREADABLE`."""
+        """The status of the result, or `UNREADABLE`."""
         return UNREADABLE if self.stored is None else int(self.stored.frame["status"])
 
     @property
@@ -50,15 +50,16 @@ class Outcome(NamedTuple):
 
 
 class FrameReconstructor:
-    """A `Reconstructor` as clusters' engines take it: built once per worker, called with batches of rows.
+    """A `Reconstructor` in the form that cluster engines such as Ray expect: built once per worker, called with batches of
+    rows.
 
-    It can be pickled, with all that it holds.
+    It can be pickled.
 
     Args:
         reconstructor: of the sensor.
         rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
-        pressure: that a gauge reads, by the names of the frames, or what gives it by name and time (s), as `Reconstructor`
-            takes it.
+        pressure: readings of a gauge by the names of the frames, or a function of name and time (s); units as for
+            `Reconstructor`.
 
     Example:
         >>> from dataclasses import replace
@@ -108,7 +109,7 @@ class FrameReconstructor:
         return words | found
 
     def outcomes(self, group: list[DecodedFrame]) -> list[Outcome]:
-        """What becomes of each frame of a batch."""
+        """The outcome of each frame of a batch."""
         start = time.perf_counter()
         readable = [frame for frame in group if frame.image is not None]
         frames = iter(self._reconstructed(readable))
@@ -116,7 +117,7 @@ class FrameReconstructor:
         return [
             Outcome(frame.name, frame.file, None, frame.reason)
             if frame.image is None
-            else _outcome(frame, frame.image, Stored(next(frames), frame.origin, seconds))
+            else _outcome(frame, frame.image, Stored(next(frames), self._measured(frame), seconds))
             for frame in group
         ]
 
@@ -170,6 +171,10 @@ class FrameReconstructor:
         results = Reconstruction(*(field.cpu() for field in computed))
         return [results.frame(i) for i in range(len(images))]
 
+    def _measured(self, frame: DecodedFrame) -> Origin:
+        """A frame's origin, with what the gauge read."""
+        return frame.origin._replace(gauge=float(self._reading(frame.name, frame.origin.time)))
+
     def _reading(self, name: str, time: float) -> float:
         """What the gauge reads in a frame."""
         if callable(self.pressure):
@@ -178,7 +183,7 @@ class FrameReconstructor:
 
     @cached_property
     def _blank(self) -> Frame:
-        """What a file that gave no image has in place of a result."""
+        """The empty result of a file whose image could not be read."""
         width, height = self.reconstructor.image_size
         image = torch.zeros(1, 1, height, width).to(self.reconstructor.rest_pixels)
         (frame,) = self._reconstructed([DecodedFrame("", Path(), image)])
@@ -232,7 +237,7 @@ def _array(image: Any) -> np.ndarray:
 
 
 def outcomes_of(rows: dict[str, np.ndarray]) -> list[Outcome]:
-    """What `FrameReconstructor` gave as columns, frame by frame."""
+    """The columns that `FrameReconstructor` returned, converted to one outcome per frame."""
     frames = [dict(zip(rows, values, strict=True)) for values in zip(*rows.values(), strict=True)]
     outcomes = []
     for frame in frames:

@@ -1,4 +1,5 @@
-"""What a call names - files, globs, folders - as images, and as videos, bags and stacks of images, in the order of the call."""
+"""The inputs of a job: the files, globs and folders of a call, resolved to images, videos, bags and stacks of images in the
+order of the call."""
 
 import glob
 import os
@@ -35,7 +36,7 @@ class Inputs(NamedTuple):
 
     @property
     def bags(self) -> list[Path]:
-        """Those of the videos that are bags."""
+        """The videos that are bags."""
         return [path for path in self.videos if is_bag(path)]
 
     @property
@@ -80,7 +81,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
 
     Args:
         arguments: paths of files, folders (their images in name order, or the bag that it is) and glob patterns. Numbers in
-            names count as numbers: 2 before 10. Hidden files, and those that systems leave in folders, are passed over.
+            names count as numbers: 2 before 10. Hidden files and those that operating systems leave in folders are ignored.
         video: take every file for a video.
         topic: of the bags' images.
 
@@ -106,7 +107,9 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
     for name, count in Counter(map(frame_name, paths)).items():
         if count > 1:
             twins = ", ".join(printable(str(path)) for path in paths if frame_name(path) == name)
-            raise MembraneError(f"two inputs of the name {name!r} ({twins}); results bear it: rename, or use two calls")
+            raise MembraneError(
+                f"two inputs have the name {name!r} ({twins}), as would their results: rename one, or use two calls"
+            )
     for image in inputs.images:
         if of_video := inputs.video_of(frame_name(image)):
             raise MembraneError(f"{image}: a frame of {of_video} has the same name; use two calls")
@@ -116,7 +119,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
 
 
 def single_images(inputs: Inputs) -> list[Path]:
-    """The image files, where only images are meant that have a file each.
+    """The image files of inputs that may only be images with a file each.
 
     Raises:
         MembraneError: there are files of several pictures among the inputs.

@@ -1,4 +1,4 @@
-"""Images on disk to results on disk: in batches, restartable, one bad file never stops the rest."""
+"""The job on one machine: it reconstructs files in batches, can be resumed, and never stops for a bad file."""
 
 import sys
 from collections import Counter
@@ -34,7 +34,7 @@ FEW_FRAMES = 50
 
 
 class FrameCounts(NamedTuple):
-    """How many frames of a call were reconstructed (some of them not to be relied on, by status), failed, and were skipped as
+    """Numbers of frames of a call that were reconstructed (some with a status that is not ok), failed, or were skipped as
     finished."""
 
     reconstructed: int
@@ -122,7 +122,8 @@ def reconstruct_files(
 
 
 def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:
-    """Whether a job is solved by machine code, from its first frame to its last, which is said where that is not compiled yet.
+    """Whether a job is solved by machine code, from its first frame to its last; a message is printed if the code must be
+    compiled first.
 
     A few frames take less time by tensor operations than compiling does.
 
@@ -141,7 +142,7 @@ def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:
 
 
 def _kept(folder: ResultFolder, outcome: Outcome, report: Callable[[str], None]) -> int:
-    """Keep an outcome, and say why if it is no result; returns its status."""
+    """Store an outcome, print the reason if it is not a result, and return its status."""
     status = folder.keep(outcome)
     if status not in FINISHED:
         of_video = "" if outcome.name == frame_name(outcome.file) else f", {outcome.name}"

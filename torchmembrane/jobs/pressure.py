@@ -1,4 +1,4 @@
-"""A recording's pressure readings: a gauge's log, by the frames' names or by time."""
+"""Pressure readings of a recording: the log of a gauge, by the frames' names or by time."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -33,7 +33,7 @@ REACH, INTERVALS = 1.0, 1.5
 
 
 class PressureReadings(NamedTuple):
-    """What a gauge read, force unit / length unit^2.
+    """Readings of a gauge, force unit / length unit^2.
 
     Attributes:
         values: by the names of the frames; frames without a reading are left out.
@@ -58,11 +58,11 @@ class PressureReadings(NamedTuple):
 
     @property
     def reach(self) -> float:
-        """How far in time a reading may be from a frame, s."""
+        """The largest time between a frame and a reading that is used for it, s."""
         return max(REACH, INTERVALS * float(np.median(np.diff(self.times)))) if len(self.times) > 1 else REACH
 
     def plus(self, offset: float) -> "PressureReadings":
-        """The readings with something added to each."""
+        """The readings with a constant added to each."""
         values = {name: offset + value for name, value in self.values.items()}
         return self._replace(values=values, series=offset + self.series)
 
@@ -108,7 +108,7 @@ def read_pressures(path: Path, inputs: Inputs, sensor: Sensor) -> PressureReadin
     key, column = table.form
     known = Table(table.form, [row for row in table.rows if row.text(column).lower() not in UNKNOWN])
     if not known.rows:
-        raise MembraneError(f"{path}: no readings after the header but empty ones; expected {PRESSURES.expected}")
+        raise MembraneError(f"{path}: no readings after the header, only empty values; expected {PRESSURES.expected}")
     one, since_rest = hectopascal(sensor.length_unit), column == SINCE_REST
     if key == TIME:
         return _by_time(path, known, inputs, one, since_rest)
@@ -152,7 +152,7 @@ def _time(row: Row) -> float:
 
 
 def by_frame(table: Table, inputs: Inputs) -> tuple[dict[str, Row], list[Row]]:
-    """The lines of a table by the names of the frames that they tell of, and the lines that tell of none.
+    """The lines of a table by the names of their frames, and the lines that belong to no frame.
 
     Args:
         table: whose first column holds names of frames, or of their image files.
@@ -173,13 +173,13 @@ def by_frame(table: Table, inputs: Inputs) -> tuple[dict[str, Row], list[Row]]:
         lines = found if said in frames or inputs.video_of(name) else others
         if name in lines:
             quoted = shortened(repr(said))
-            raise MembraneError(f"{row.where}: {quoted} stands there twice, also in line {lines[name].line}; expected it once")
+            raise MembraneError(f"{row.where}: {quoted} is listed twice, also in line {lines[name].line}; expected it once")
         lines[name] = row
     return found, list(others.values())
 
 
 def refusal(row: Row, table: Table, inputs: Inputs) -> MembraneError:
-    """The error for a line that tells of no frame."""
+    """The error for a line that belongs to no frame."""
     column = table.form[0]
     names = [image.name for image in inputs.images[:1]] + [f"{frame_name(video)}_000000" for video in inputs.videos[:1]]
     quoted = shortened(repr(row.text(column)))

@@ -1,4 +1,4 @@
-"""Frames computed by the actors of a Ray cluster: the job's process hands out paths and writes what comes back."""
+"""Frames computed by the actors of a Ray cluster: the job's process distributes paths and writes the results."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -15,9 +15,9 @@ from .workers import Work, batch_for
 
 
 class RayEngine:
-    """Computes what becomes of all frames on the cluster that `RAY_ADDRESS` names, or on this machine.
+    """Computes the outcomes of all frames on the cluster that `RAY_ADDRESS` names, or on this machine.
 
-    A worker that dies is replaced, and what it was doing is done again.
+    A worker that dies is replaced, and its frames are computed again.
 
     Args:
         device: of each worker, "cpu" with one thread, or "cuda" with a GPU of its own.

@@ -1,4 +1,4 @@
-"""A recording's own rest: the markers in images of it without contact."""
+"""The rest state of a recording: the markers in its own images without contact."""
 
 from collections.abc import Iterator
 from itertools import islice
@@ -60,7 +60,7 @@ def _loaded(source: Source, reconstructor: "Reconstructor", said: str) -> Tensor
 
 
 def _warn_of_contact(reconstructor: "Reconstructor", rest: Tensor, said: str) -> None:
-    """Say where what is taken for rest is a press by the sensor's own rest image, or a drift that looks like one."""
+    """Warn if the images taken for rest show a press, compared with the sensor's rest image, or a drift that looks like one."""
     with torch.no_grad():
         result = reconstructor.from_pixels(rest)
     if Tracker(reconstructor).is_pressed(result):

@@ -1,4 +1,4 @@
-"""The folder of a job's results: what is finished, and the one place where frames, figures and summary.csv are written."""
+"""The folder of a job's results: it knows the finished frames, and writes frames, figures and summary.csv."""
 
 from collections.abc import Callable
 from functools import cache
@@ -6,7 +6,7 @@ from pathlib import Path
 from types import TracebackType
 
 from ..files.atomic import PARTIAL
-from ..files.folder_lock import Claim, Shard
+from ..files.folder_lock import FolderLock, Shard
 from ..files.optional import load_pyarrow
 from ..files.order import in_order
 from ..files.provenance import Origin, printable
@@ -18,7 +18,7 @@ from .inputs import Inputs, frame_name
 
 
 def files_at_risk(folder: Path, inputs: Inputs, figures: bool) -> list[Path]:
-    """Files that are in a folder and that a job would write over, if they are none of its own earlier results.
+    """Files in a folder that a job would overwrite and that are not its own earlier results.
 
     Args:
         folder: of the results.
@@ -33,7 +33,7 @@ def files_at_risk(folder: Path, inputs: Inputs, figures: bool) -> list[Path]:
 
 
 class ResultFolder:
-    """A folder of results, claimed for writing: `with ResultFolder(...) as folder`.
+    """A folder of results, locked for writing: `with ResultFolder(...) as folder`.
 
     Frames are on the disk `SAVE_SECONDS` after they are kept at most, summary.csv at the end; after a kill it is made anew from
     the frames.
@@ -63,25 +63,25 @@ class ResultFolder:
         self.finished: set[str] = set()
 
     def __enter__(self) -> "ResultFolder":
-        self._claim = Claim(self.path, self._shard)
-        self._claim.__enter__()
+        self._lock = FolderLock(self.path, self._shard)
+        self._lock.__enter__()
         try:
             self._open()
         except BaseException:
-            self._claim.__exit__(None, None, None)
+            self._lock.__exit__(None, None, None)
             raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        """Write what is held back."""
+        """Write all buffered frames."""
         try:
             self.frames.close()
             self.summary.write()
         finally:
-            self._claim.__exit__(kind, error, traceback)
+            self._lock.__exit__(kind, error, traceback)
 
     def keep(self, outcome: Outcome) -> int:
-        """Store a frame's result, or that it has none; returns its status."""
+        """Store a frame's result, or note that it has none; return its status."""
         if outcome.stored is None:
             self.frames.forget(outcome.name)
             self.summary.add_unreadable(outcome.name, outcome.file, outcome.reason)
@@ -91,16 +91,16 @@ class ResultFolder:
         return outcome.status
 
     def save(self) -> None:
-        """Write what has been held back for long."""
+        """Write the frames that have been buffered for long enough."""
         self.frames.save()
 
     def _open(self) -> None:
         """Read what is there: rows of summary.csv from the frames, and which of them are finished."""
-        if self._claim.alone:
+        if self._lock.alone:
             for left in [*self.path.glob(PARTIAL), *self.path.glob(f"frames/{PARTIAL}")]:
                 left.unlink(missing_ok=True)
-        self.frames = open_folder(self.path, self.mesh, self._claim.gate)
-        self.summary = Summary(self.path, self.mesh, self._claim.gate)
+        self.frames = open_folder(self.path, self.mesh, self._lock.write_lock)
+        self.summary = Summary(self.path, self.mesh, self._lock.write_lock)
         origins: dict[str, Origin] = {}
         for name, stored in self.frames.stored(self._shard.holds):
             if not stored.origin.path and (file := self._file_of(name)):
@@ -115,7 +115,7 @@ class ResultFolder:
         self._judge({name: origins[name] for name in self.finished})
 
     def _judge(self, origins: dict[str, Origin]) -> None:
-        """Take frames whose images have changed from the finished ones, and say what was found."""
+        """Remove frames whose images have changed from the finished ones, and report what was found."""
 
         @cache
         def is_of(origin: Origin, file: Path) -> bool:
@@ -132,8 +132,8 @@ class ResultFolder:
             self.report(f"{_listed(damaged)}: damaged, done again")
         if unknown:
             self.report(
-                f"{self.path}: {len(unknown)} results do not say what their images held (earlier version); kept, whether these "
-                "have changed or not"
+                f"{self.path}: {len(unknown)} results do not say which images they are of (earlier version); they are kept, "
+                "even if these have changed"
             )
 
     def _file_of(self, name: str) -> Path | None:

@@ -47,7 +47,7 @@ DRAWS = "reconstruct"
 
 
 class Work(NamedTuple):
-    """What is done with a batch of frames.
+    """The work that is done with each batch of frames.
 
     Attributes:
         reconstructor: makes their results.
@@ -76,13 +76,13 @@ class Work(NamedTuple):
 
 
 def outcomes_here(work: Work, sources: Iterator[Source], batch: int) -> Iterator[list[Outcome]]:
-    """What becomes of all frames, batch by batch, computed in this process while the next batch is decoded."""
+    """The outcomes of all frames, batch by batch, computed in this process while the next batch is decoded."""
     for group in read_ahead(sources, work.reconstructor.reconstructor, batch):
         yield work.outcomes(group)
 
 
 def outcomes_by(workers: int, work: Work, sources: Iterator[Source], batch: int) -> Iterator[list[Outcome]]:
-    """The same by worker processes, in the order of the sources; pictures of videos are decoded in this process.
+    """The outcomes computed by worker processes, in the order of the sources; pictures of videos are decoded in this process.
 
     Raises:
         MembraneError: a worker process has ended.
@@ -100,8 +100,8 @@ def outcomes_by(workers: int, work: Work, sources: Iterator[Source], batch: int)
                 yield waiting.popleft().result()
         except BrokenProcessPool as error:
             raise MembraneError(
-                f"one of {workers} worker processes has ended (out of memory?); what is done is kept: pass fewer --workers, or "
-                "a smaller --batch"
+                f"one of {workers} worker processes has ended (out of memory?); finished frames are kept: pass fewer "
+                "--workers, or a smaller --batch"
             ) from error
 
 
@@ -111,12 +111,12 @@ def cores() -> int:
 
 
 def workers_for(frames: int, device: str) -> int:
-    """How many worker processes are worth their start; 1 is this process."""
+    """The number of worker processes that is worth the time of their start; 1 means this process."""
     return max(1, min(cores(), frames // FRAMES_EACH)) if device == "cpu" else 1
 
 
 def batch_for(image_size: tuple[int, int], vertices: int, workers: int, device: str) -> int:
-    """How many frames to compute at once, by the memory that there is."""
+    """The number of frames to compute at once, given the available memory."""
     if device == "cuda":
         memory, largest = torch.cuda.mem_get_info()[0], LARGEST_GPU_BATCH
     else:
@@ -125,7 +125,7 @@ def batch_for(image_size: tuple[int, int], vertices: int, workers: int, device: 
 
 
 def memory_here() -> int:
-    """The machine's memory, or the container's where that has a bound, bytes."""
+    """The memory of the machine, or of the container if that has a limit, in bytes."""
     known = hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names
     machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if known else 2**32
     try:
@@ -135,7 +135,7 @@ def memory_here() -> int:
 
 
 def frame_bytes(image_size: tuple[int, int], vertices: int) -> int:
-    """Memory that a frame takes in computation, at most, bytes."""
+    """An upper bound of the memory that the computation of a frame takes, in bytes."""
     width, height = image_size
     return width * height * PIXEL_BYTES + vertices * VERTEX_BYTES
 
@@ -156,7 +156,7 @@ def _given(reason: str, image: object, reconstructor: "Reconstructor") -> Tensor
 
 @contextmanager
 def _pool(workers: int, work: Work) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes; when the block ends early, what they are doing is abandoned."""
+    """Worker processes; when the block ends early, their work is abandoned."""
     with handed_over(work) as path:
         pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (path,))
         try:
@@ -177,7 +177,7 @@ _work: Work
 
 
 def _start(path: Path) -> None:
-    """Start a worker process: its work, once."""
+    """Initialise a worker process with its work."""
     global _work
     _work = begin_worker(path)
 

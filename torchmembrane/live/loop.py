@@ -1,6 +1,7 @@
 """The loop: take the newest picture, compute, hand on what was seen; and what is counted on the way."""
 
 from array import array
+from collections import deque
 from collections.abc import Callable, Sequence
 from threading import Event
 from typing import NamedTuple
@@ -18,6 +19,8 @@ WAIT = 0.1
 """Seconds after which the loop looks whether it shall stop, though no picture comes."""
 RECENT = 100
 """Frames over which the rate and latency that are shown as they go are taken."""
+Request = Callable[[Stream], str]
+"""What is asked of a stream between two frames, such as to take the latest for rest; gives what became of it."""
 
 
 class Seen(NamedTuple):
@@ -103,7 +106,7 @@ def follow(
     tally: Tally,
     watchers: Sequence[Callable[[Seen, Tally], None]],
     stop: Event,
-    rezero: Event | None = None,
+    requests: deque[Request] | None = None,
     report: Callable[[str], None] = print,
 ) -> None:
     """Follow a camera until it ends or is stopped.
@@ -114,16 +117,15 @@ def follow(
         tally: is given every frame.
         watchers: called with every frame and the counts so far, at once: what takes long is theirs to put off.
         stop: set to end.
-        rezero: set to take the latest frame for rest; cleared when that is done.
+        requests: asked of the stream before the next frame, and taken out; one that is refused is said.
         report: called with what is to be said.
 
     Raises:
         MembraneError: an image of another size than the sensor's, or what the source raised.
     """
     while not stop.is_set():
-        if rezero is not None and rezero.is_set():
-            rezero.clear()
-            report(_rezeroed(stream))
+        while requests:
+            report(_answer(requests.popleft(), stream))
         picture = mailbox.take(WAIT)
         if picture is None:
             if mailbox.ended:
@@ -137,10 +139,14 @@ def follow(
             watcher(seen, tally)
 
 
-def _rezeroed(stream: Stream) -> str:
-    """What became of taking the latest frame for rest."""
+def _answer(request: Request, stream: Stream) -> str:
     try:
-        stream.rezero()
+        return request(stream)
     except MembraneError as error:
-        return f"not taken for rest: {error}"
+        return f"not done: {error}"
+
+
+def rezeroed(stream: Stream) -> str:
+    """Take the latest frame for rest."""
+    stream.rezero()
     return "the latest frame is taken for rest"

@@ -28,6 +28,12 @@ class Stream(Protocol):
     def rezero(self) -> None:
         """Take the latest frame for rest."""
 
+    def weigh(self, force: float) -> str:
+        """Compare the latest frame with a weight, N, that stands on the membrane; says what came of it."""
+
+    def gauge(self, pressure_change: float) -> str:
+        """Compare the latest frame with the change since rest, force unit / length unit^2, that a gauge reads; likewise."""
+
 
 class TrackedStream:
     """By a `Tracker`.
@@ -55,6 +61,20 @@ class TrackedStream:
             MembraneError: there is none, or it does not show the markers.
         """
         self.tracker.rezero()
+
+    def weigh(self, force: float) -> str:
+        """As `Tracker.weigh`, in words."""
+        return self._compared("force", self.tracker.weigh(force))
+
+    def gauge(self, pressure_change: float) -> str:
+        """As `Tracker.gauge`, in words."""
+        return self._compared("change of pressure", self.tracker.gauge(pressure_change))
+
+    def _compared(self, what: str, ratio: float) -> str:
+        watch = self.tracker.stiffness
+        due = "a calibration is due" if watch.is_due else "no change of the modulus is certain"
+        together = f"the latest comparisons together {watch.ratio:.3f}, {watch.deviation:.0%} uncertain"
+        return f"the {what} is found {ratio:.3f} times as large as known; {together}: {due}"
 
 
 class ModelStream:
@@ -99,3 +119,13 @@ class ModelStream:
             MembraneError: always: the rest state is baked into a model.
         """
         raise MembraneError("rezero: an exported model has its rest state baked in; leave --model out, or export it again")
+
+    def weigh(self, force: float) -> str:
+        """Refused, as `gauge`.
+
+        Raises:
+            MembraneError: always: loads are compared where torch computes.
+        """
+        raise MembraneError("a known load is not compared with an exported model's results; leave --model out")
+
+    gauge = weigh

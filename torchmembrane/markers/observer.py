@@ -80,7 +80,7 @@ class MarkerObserver(nn.Module):
         self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
         self.register_buffer("measured_rest", torch.from_numpy(markers.model_pixels))
         self.register_buffer("rest_covariance", isotropic(self.rest_pixels[:, 0], NOISE))
-        in_view = ((self.rest_pixels >= 0) & (self.rest_pixels <= torch.tensor(image_size) - 1)).all(-1)
+        in_view = torch.from_numpy(markers.in_view)
         if in_view.sum() < FEWEST_MARKERS:
             raise MembraneError(
                 f"sensor {name!r}: {int(in_view.sum())} of {len(in_view)} markers are in the camera's view; expected at least "
@@ -101,7 +101,7 @@ class MarkerObserver(nn.Module):
         nulled (5.2)."""
         with torch.no_grad():
             pixels, confidence, covariance = self.locator(image[None, None])
-        found = confidence > FOUND
+        found = (confidence > FOUND) & self.seen_at_rest  # what the model has outside cannot be one of the dots in view
         in_view = int(self.seen_at_rest.sum())
         if found.sum() < max(FEWEST_MARKERS, ALIKE_SHARE * in_view):
             raise MembraneError(

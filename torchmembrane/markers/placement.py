@@ -16,6 +16,7 @@ from ..surface.topology import rim_loop
 from .dots.locator import DotLocator
 from .dots.pattern import DotPattern, find_dots, measure_dots
 from .locator import Locator
+from .spacing import in_view, partly_in_view
 from .texture.locator import TextureLocator
 from .texture.patches import choose_patches
 
@@ -35,12 +36,14 @@ class PlacedMarkers:
         positions: `[D, 3]`, length unit, camera frame.
         model_pixels: `[D, 2]`, where the camera model projects them.
         points: the same as points of the membrane's triangles.
+        in_view: `[D]` bool, which of them reach into the image at rest.
         locator: finds them in images.
     """
 
     positions: np.ndarray
     model_pixels: np.ndarray
     points: SurfacePoints
+    in_view: np.ndarray
     locator: Locator
 
 
@@ -79,6 +82,7 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS
     anchors = vertex_pixels[sensor.membrane.fixed].numpy()
     markers, (width, height) = sensor.markers, sensor.camera.image_size
     built: Locator
+    pattern: DotPattern | None = None
     if markers.kind == "dots" and markers.positions is not None:
         positions = np.asarray(markers.positions, dtype=float)
         if len(positions) < FEWEST_MARKERS:
@@ -98,7 +102,9 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS
             positions, placed = _place_on_surface(sensor, pattern.pixels)
             pattern = DotPattern(*(field[placed] for field in pattern))
             built = of_dots(pattern, (width, height), markers.polarity, anchors)
-    return PlacedMarkers(positions, _model_pixels(sensor, positions), sensor.membrane.closest_points(positions), built)
+    pixels, points = _model_pixels(sensor, positions), sensor.membrane.closest_points(positions)
+    seen = in_view(pixels, (width, height)) if pattern is None else partly_in_view(pixels, pattern.shapes, (width, height))
+    return PlacedMarkers(positions, pixels, points, seen, built)
 
 
 def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]]:
@@ -110,16 +116,6 @@ def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]
 
         return SoftLocator, SoftTextureLocator
     raise MembraneError(f"Reconstructor: locator = {name!r}; expected one of {', '.join(LOCATORS)}")
-
-
-def in_view(pixels: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
-    """Which of `pixels [D, 2]` lie in an image of that width and height, `[D]` bool.
-
-    Example:
-        >>> in_view(np.array([[0.0, 479.0], [640.0, 3.0], [np.nan, 3.0]]), (640, 480)).tolist()
-        [True, False, False]
-    """
-    return np.all(np.logical_and(pixels >= 0, pixels <= np.array(image_size) - 1), axis=1)
 
 
 def _model_pixels(sensor: Sensor, positions: np.ndarray) -> np.ndarray:

@@ -53,6 +53,33 @@ def neighbours(points: np.ndarray, count: int) -> np.ndarray:
     return np.asarray(cKDTree(points).query(points, k=min(count + 1, len(points)))[1])[:, 1:]
 
 
+def in_view(pixels: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+    """Which of `pixels [D, 2]` lie in an image of that width and height, `[D]` bool.
+
+    Example:
+        >>> in_view(np.array([[0.0, 479.0], [640.0, 3.0], [np.nan, 3.0]]), (640, 480)).tolist()
+        [True, False, False]
+    """
+    return np.all(np.logical_and(pixels >= 0, pixels <= np.array(image_size) - 1), axis=1)
+
+
+def partly_in_view(pixels: np.ndarray, shapes: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+    """Which dots reach into an image of that width and height, `[D]` bool, also where the border cuts off a part of them.
+
+    Args:
+        pixels: centres `[D, 2]`, px.
+        shapes: `[D, 2, 2]` px, pixel = centre + shape @ (unit circle).
+        image_size: width, height.
+
+    Example:
+        >>> pixels, shapes = np.array([[-2.0, 5.0], [8.0, 5.0], [18.0, 5.0], [28.0, 5.0]]), np.tile(4 * np.eye(2), (4, 1, 1))
+        >>> partly_in_view(pixels, shapes, (16, 16)).tolist()
+        [True, True, True, False]
+    """
+    extent = np.linalg.norm(shapes, axis=2)
+    return np.all((pixels > -extent) & (pixels < np.array(image_size) - 1 + extent), axis=1)
+
+
 def thin_out(points: np.ndarray, gap: float) -> np.ndarray:
     """Every point of `points [N, 2]` farther than `gap` from those kept before it: `[M, 2]`."""
     kept: list[np.ndarray] = []

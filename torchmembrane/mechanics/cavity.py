@@ -1,4 +1,4 @@
-"""What the fluid asks of the enclosed volume: kept (liquid), pressure x volume kept (gas), or free at rest pressure (open)."""
+"""The law of the enclosed fluid: constant volume (liquid), constant pressure x volume (gas), or constant pressure (open)."""
 
 from typing import Protocol, TypeVar
 
@@ -48,7 +48,7 @@ class CavityLaw(nn.Module):
         membrane: the rest surface.
         rest_pressure: the pressure difference at rest, `[]`.
         filling: "liquid" (volume kept), "gas" (pressure x volume kept) or "open" (pressure stays at rest).
-        gas: of a gas, its absolute pressure at rest (force / length^2) and volume (length^3).
+        gas: absolute pressure at rest (force / length^2) and volume (length^3) of a gas.
 
     Raises:
         MembraneError: an unknown filling, or a gas without its numbers.
@@ -78,7 +78,7 @@ class CavityLaw(nn.Module):
     def condition(self, rise: Tensor, pressure: Tensor) -> tuple[Tensor, Tensor]:
         """Target `c [...]` and compliance `C` (a liquid's `[]`) of a step, `v.y + C (pressure step) = c`.
 
-        Arguments: the volume's `rise [...]` above that at rest, the pressure `[...]` there.
+        Arguments: the volume's `rise [...]` above its rest value, and the pressure `[...]`.
         """
         if self.filling == "liquid":
             return -rise, rise.new_zeros(())
@@ -86,7 +86,7 @@ class CavityLaw(nn.Module):
         return gas_law_step(rise, pressure, self.rest_pressure, absolute, volume)
 
     def target_volume(self, volume: Tensor, pressure: Tensor) -> Tensor:
-        """The volume that the law asks for at this pressure, `[...]` (an open cavity: any)."""
+        """The volume that the law requires at this pressure, `[...]` (an open cavity: any volume)."""
         if self.filling == "liquid":
             return self.rest_volume.expand(volume.shape)
         if self.filling == "open":
@@ -95,7 +95,7 @@ class CavityLaw(nn.Module):
         return self.rest_volume + gas * (absolute / (absolute + pressure - self.rest_pressure) - 1)
 
     def volume_error(self, volume: Tensor, pressure: Tensor) -> Tensor:
-        """How far the volume is from the one that the law asks for, over the rest volume, `[...]`."""
+        """The deviation of the volume from the one that the law requires, relative to the rest volume, `[...]`."""
         return (volume - self.target_volume(volume, pressure)) / self.rest_volume
 
 

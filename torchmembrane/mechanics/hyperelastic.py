@@ -1,8 +1,8 @@
 """Elastic energy of the membrane on linear triangles: harmonic, neo-Hookean, Mooney-Rivlin.
 
 With the rest metric `G` and the deformed metric `g` of a triangle's edges, `I = tr(G^-1 g)` and `D = det g / det G` are the
-invariants of `C = F^T F`; the energy per rest area is `W(I, D)`. Everything is in units of shear modulus x thickness (at rest,
-that is already stretched) unless these are given; the prestretch `l` is that of the rest state.
+invariants of `C = F^T F`; the energy per rest area is `W(I, D)`. Everything is in units of shear modulus x thickness (of the
+prestretched rest state) unless these are given; the prestretch `l` is that of the rest state.
 """
 
 from typing import NamedTuple
@@ -182,7 +182,7 @@ class ElasticEnergy(nn.Module):
         return Strain(edges, adjugate(g), first, determinant(g) / self.det)
 
     def principal_stretches(self, x: Tensor) -> Tensor:
-        """How much every triangle is stretched along its two principal directions, relative to the rest state.
+        """The stretches of every triangle along its two principal directions, relative to the rest state.
 
         The singular values of the deformation gradient F (eqs. 43, 44): with the invariants `I` and `D` of `C = F^T F` their
         squares are `(I + sqrt(I^2 - 4 D)) / 2` and `D` over that. Relative to the unstretched membrane: times the prestretch.
@@ -194,7 +194,7 @@ class ElasticEnergy(nn.Module):
             `[..., T, 2]`, largest first, triangles in the order of `Membrane.triangles`.
 
         Limitations:
-            Where both are equal they are not differentiable, and right to the root of the rounding error only.
+            Where both are equal they are not differentiable, and only accurate to the square root of the rounding error.
 
         Example:
             >>> from torchmembrane.surface.shapes import heightfield
@@ -216,7 +216,7 @@ class ElasticEnergy(nn.Module):
         return c1 * (l2 * I + 1 / (l2**2 * D) - 3) + c2 * (l2**2 * D + I / (l2 * D) - 3)
 
     def first_derivatives(self, I: Tensor, D: Tensor) -> tuple[Tensor, Tensor]:  # noqa: E741
-        """First derivatives of `density`, `dW/dI` and `dW/dD`; what is constant is a scalar."""
+        """First derivatives of `density`, `dW/dI` and `dW/dD`; constant ones are scalars."""
         l2, c1, c2 = self.prestretch**2, self.c1, self.c2
         if self.model == "harmonic":
             return c1 * l2, torch.zeros_like(l2)
@@ -227,7 +227,7 @@ class ElasticEnergy(nn.Module):
         return c1 * l2 + c2 / l2 * inverse, w_D - c2 / l2 * I * inverse * inverse + c2 * l2**2
 
     def derivatives(self, I: Tensor, D: Tensor) -> Derivatives:  # noqa: E741
-        """First and second derivatives of `density`; what is constant is a scalar."""
+        """First and second derivatives of `density`; constant ones are scalars."""
         l2, c1, c2 = self.prestretch**2, self.c1, self.c2
         zero, (w_I, w_D) = torch.zeros_like(l2), self.first_derivatives(I, D)
         if self.model == "harmonic":
@@ -250,8 +250,8 @@ class ElasticEnergy(nn.Module):
     def gradient_of_displaced(self, u: Tensor) -> Tensor:
         """`gradient` of the surface that is displaced from rest by `u [..., V, 3]`.
 
-        Its edges are those at rest and the differences of `u`: a float32 that holds positions rounds the strain of a short edge
-        far from the origin more than a slack sheet's tension strains it.
+        The edges are computed as those at rest plus the differences of `u`. Positions in float32 would round the strain of a
+        short edge far from the origin by more than the strain from a slack sheet's tension.
         """
         if torch.compiler.is_exporting():
             return self._gradient_by_rings(self.rest_sides + apply_stencil(u, self.sides, self.grid))
@@ -285,7 +285,7 @@ class ElasticEnergy(nn.Module):
         return (e[..., : 12 * V].reshape(*batch, 3, 12, V) * of_sides.reshape(*batch, 1, 12, V)).sum(-2).mT
 
     def stiffness_along(self, x: Tensor, directions: Tensor) -> Tensor:
-        """Positive semi-definite stiffness of displacements along one direction a vertex.
+        """Positive semi-definite stiffness for displacements along one direction at each vertex.
 
         Arguments: `x [..., V, 3]`, `directions [..., V, 3]`. Returns the corner matrices `[..., m-1, n-1, 4, 4]`, whose sum
         over quadrilaterals is `K_kl = d_k . H_kl d_l` with `H` the Hessian of `U`: exact where the membrane is in tension (for

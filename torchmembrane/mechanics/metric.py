@@ -1,4 +1,5 @@
-"""Edges of triangles, their metrics and what is constant in derivatives by the metric; symmetric 2 x 2 as (11, 12, 22)."""
+"""Edges of triangles, their metrics, and the constants of derivatives with respect to the metric. Symmetric 2 x 2 matrices are
+given as (11, 12, 22)."""
 
 import numpy as np
 import torch
@@ -35,7 +36,7 @@ def determinant(g: Tensor) -> Tensor:
 
 
 def metric_constants() -> dict[str, Tensor]:
-    """What is constant in second derivatives by the metric's entries 11, 12, 22.
+    """The constants of second derivatives with respect to the metric's entries 11, 12, 22.
 
     `twice_12 [3]`; `bend [9]`, those of the determinant; `metric_to_pairs [12, 9]`, from any such to `T_cd` of
     `ElasticEnergy._pairs`; `stress_to_pairs [3, 3]`, likewise for the stress.
@@ -64,7 +65,7 @@ def tensile_part(stress: Tensor) -> Tensor:
 
 
 def one_ring_constants() -> dict[str, Tensor]:
-    """What is constant in sums over the triangles around a vertex.
+    """The constants of sums over the triangles around a vertex.
 
     `around [12, 6, 2, 2]`: of the three pairs in the first and in the second triangles of the quadrilaterals about a vertex
     those that join it with `ONE_RING`, then those that do so the other way round, whose blocks count `transposed [10]`; `one
@@ -81,7 +82,7 @@ def one_ring_constants() -> dict[str, Tensor]:
 
 
 def products(a: Tensor, b: Tensor) -> Tensor:
-    """Of the entries of `[..., 3, T]`, each with each: `[..., 9, T]`."""
+    """All products of two entries of `[..., 3, T]`: `[..., 9, T]`."""
     return (a[..., :, None, :] * b[..., None, :, :]).flatten(-3, -2)
 
 

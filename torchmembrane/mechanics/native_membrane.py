@@ -1,7 +1,7 @@
 """The forces of a membrane and its fluid, and their tangent stiffness, triangle by triangle, by machine code.
 
-The formulas of `hyperelastic` and of `Membrane.volume` once more, for one surface without gradients: there each is a few tensor
-operations over all triangles, of which a grid has too few to make them worth their calls.
+The formulas of `hyperelastic` and of `Membrane.volume` once more, for one surface without gradients. There each formula is a
+few tensor operations over all triangles, and a grid has so few triangles that the calls themselves dominate.
 """
 
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ PAIRS = ((5, 6, 4), (6, 4, 5))
 
 
 class Surface(NamedTuple):
-    """What is constant of a membrane."""
+    """The constants of a membrane."""
 
     rest: Any
     """`[m, n, 3]`"""
@@ -44,7 +44,7 @@ class Surface(NamedTuple):
 
 
 def surface_of(membrane: Membrane, elasticity: ElasticEnergy, load: Tensor, dtype: np.dtype) -> Surface:
-    """Of a membrane and its material, in a precision; `load`: the rest load `[V, 3]`."""
+    """The constants of a membrane and its material in a precision; `load`: the rest load `[V, 3]`."""
     m, n = membrane.grid
     l2, c1, c2 = (float(value) for value in (elasticity.prestretch**2, elasticity.c1, elasticity.c2))
     law = [c1 * l2, 0.0 if elasticity.model == "harmonic" else c1 / l2**2, c2 / l2, c2 * l2**2, membrane.outward / 6]
@@ -70,8 +70,8 @@ def linearise(surface, u, pressure, force, A, volume):
     """The contact force, its tangent stiffness and the gradient of the volume, at the inner vertices; the volume.
 
     `u [m, n, 3]` the displacement, `pressure [1]`; `force [m, n, 3]`, `A [3, 21, m, n]` (of a component, in the components of
-    the stencil's vertices) and `volume [m, n, 3]` are filled, the last at the border with half a sum. Force and `A` are zero
-    at, `A` also in, vertices that are not free.
+    the stencil's vertices) and `volume [m, n, 3]` are filled, the last at the border with half a sum. At vertices that are not
+    free the force is zero, as are all entries of `A` in their rows and columns.
     """
     m, n = surface.free.shape
     e, spin, by_edge = np.empty((2, 3), u.dtype), np.empty(3, u.dtype), np.empty((4, 3), u.dtype)
@@ -109,9 +109,9 @@ def linearise(surface, u, pressure, force, A, volume):
 
 @compiled
 def _stiffness(surface, t, i, j, later, e, share, by_edge, A):
-    """The stress `S` of a triangle: force on edge a is `sum_b S_ab e_b`. Added to `A`, in those of its vertices that come later
-    than one (`later` is the earlier of the second and the third): its energy's second derivatives, less `share` times those of
-    the volume, which are cross products with edges."""
+    """The stress `S` of a triangle: force on edge a is `sum_b S_ab e_b`. The second derivatives of the triangle's energy, minus
+    `share` times those of the volume, which are cross products with edges, are added to `A`, for pairs of vertices in ascending
+    order only (`later` is the earlier of the second and the third vertex)."""
     s11, s12, s22, by_D, w_ID, w_DD = _of_energy(surface, t, i, j, e, by_edge)
     at_12, at_13, at_23 = 3 * PAIRS[t][0], 3 * PAIRS[t][1], 3 * PAIRS[t][2]
     for c in range(3):
@@ -149,8 +149,8 @@ def _stiffness(surface, t, i, j, later, e, share, by_edge, A):
 
 @compiled
 def _of_energy(surface, t, i, j, e, by_edge):
-    """Of a triangle: the stress `S`; `2 area dW/dD / det`; 4 area times the second derivatives of `W(I, D)`; in `by_edge
-    [4, 3]` halves of the derivatives of `I` and of `D` in its two edges."""
+    """For a triangle: the stress `S`; `2 area dW/dD / det`; 4 area times the second derivatives of `W(I, D)`; in `by_edge [4,
+    3]` halves of the derivatives of `I` and of `D` in its two edges."""
     area, det = surface.area[t, i, j], surface.det[t, i, j]
     i11, i12, i22 = surface.inverse[0, t, i, j], surface.inverse[1, t, i, j], surface.inverse[2, t, i, j]
     g11 = e[0, 0] * e[0, 0] + e[0, 1] * e[0, 1] + e[0, 2] * e[0, 2]
@@ -204,7 +204,7 @@ def _complete(free, force, A):
 
 @compiled
 def _surrounded(free, i, j):
-    """Whether all vertices around are free."""
+    """Whether all vertices around this one are free."""
     for s in range(LAST + 1):
         if not free[i + STENCIL[s][0], j + STENCIL[s][1]]:
             return False

@@ -1,4 +1,4 @@
-"""A model against the reconstructor that it was made of, on images of the sensor at rest and pressed."""
+"""Comparison of a model with the reconstructor from which it was exported, on images of the sensor at rest and pressed."""
 
 from copy import deepcopy
 from typing import NamedTuple
@@ -19,7 +19,7 @@ NUDGES = tuple(1 - k * 2.0**-24 for k in range(1, 7))  # of images: what float32
 
 
 class Agreement(NamedTuple):
-    """A model beside torch.
+    """Results of a model compared with torch.
 
     Attributes:
         distance: the largest between their vertices, length unit.
@@ -33,10 +33,10 @@ class Agreement(NamedTuple):
 
 
 def checked(model: bytes, reconstructor: Reconstructor) -> Agreement:
-    """Run a model and torch on the sensor at rest and pressed by its simulator.
+    """Run a model and torch on simulated images of the sensor at rest and pressed.
 
     Raises:
-        MembraneError: they disagree, by more than float32 makes of it.
+        MembraneError: they disagree by more than the rounding of float32 explains.
     """
     images = check_images(reconstructor)
     found, largest = compare(model, reconstructor, images), LARGEST * reconstructor.estimator.membrane.size
@@ -51,9 +51,9 @@ def checked(model: bytes, reconstructor: Reconstructor) -> Agreement:
 
 
 def rounding(reconstructor: Reconstructor, images: Tensor) -> float:
-    """How far torch's vertices in float32 are from those in float64, or of images `[B, 1, H, W]` that float32 just tells from
-    these: of a nearly unstretched sheet in a contact between markers, where little holds it, up to some per cent of the
-    displacement."""
+    """The largest distance of torch's vertices in float32 from those in float64, or from those of images `[B, 1, H, W]` that
+    differ by one rounding. For a nearly unstretched sheet with a contact between markers, which little constrains, it is up to
+    some per cent of the displacement."""
     with torch.no_grad():
         found = reconstructor.reconstruct_grey(images).vertices
         others = [reconstructor.reconstruct_grey(nudge * images).vertices for nudge in NUDGES]

@@ -45,7 +45,7 @@ class Known(Value):
 
 
 class Piece(nn.Module):
-    """A method with the module whose buffers it uses; `arranged` makes its arguments of the tensors among them."""
+    """A method with the module whose buffers it uses; `arranged` rebuilds its arguments from the tensors among them."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class Piece(nn.Module):
 
 
 class Tracer:
-    """What is called, repeated or skipped with a `Value`, appended to an `Assembly` one after another.
+    """Appends every call, loop and condition on a `Value` to an `Assembly`.
 
     Nodes are named after the part of the package that they come from.
     """
@@ -136,11 +136,11 @@ class Tracer:
         return self.traced[key], names, found
 
     def _whole(self, model: onnx.ModelProto) -> onnx.ModelProto:
-        """The model with the nodes of the `onnx_function`s that it holds."""
+        """The model with the nodes of its `onnx_function`s inlined."""
         return inlined(model, self._function)
 
     def _function(self, node: onnx.NodeProto) -> onnx.ModelProto:
-        """The model of a `onnx_function` for the sizes that a node has, but for the batch, and its precision."""
+        """The model of an `onnx_function` for the sizes of a node, apart from the batch, and its precision."""
         given = {attribute.name: attribute for attribute in node.attribute}
         name, sizes, width = node.op_type, tuple(given["sizes"].ints), given["bytes"].i
         if (name, sizes, width) not in self.traced:
@@ -244,7 +244,7 @@ def _finished(tracer: Tracer, inputs: list[Known], result: Any, reconstructor: R
 
 
 def metadata_of(reconstructor: Reconstructor) -> dict[str, str]:
-    """What a model says of its sensor, texts by key."""
+    """The metadata of a model on its sensor: texts by key."""
     mesh = Mesh.of(reconstructor, Settings.of(reconstructor, FORMATS[0]))._asdict()
     plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in mesh.items()}
     texts = {str(status.value): status.text for status in Status}

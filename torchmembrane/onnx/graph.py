@@ -1,4 +1,4 @@
-"""One ONNX graph from pieces, each traced once: a step that is repeated is neither traced nor stored again."""
+"""One ONNX graph assembled from pieces; each piece is traced and stored once, also if it is repeated."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -42,7 +42,7 @@ def inlined(model: onnx.ModelProto, function: Callable[[onnx.NodeProto], onnx.Mo
 
 
 def renamed(nodes: Iterable[onnx.NodeProto], known: dict[str, str], prefix: str) -> list[onnx.NodeProto]:
-    """Copies of nodes; `known`, extended by what they put out, are names that change, the others get a prefix."""
+    """Copies of nodes. Names in `known`, which is extended by their outputs, are replaced; the others get a prefix."""
     copies = [_bare(node) for node in nodes]
     for name in (name for node in copies for name in node.output):
         known.setdefault(name, f"{prefix}/{name}" if name else "")
@@ -147,10 +147,10 @@ class Assembly:
 
     @contextmanager
     def cond(self, condition: str, names: dict[Any, str], kinds: Sequence[int]) -> Iterator[None]:
-        """Pieces appended inside run where `condition` (bool) is false only.
+        """Pieces appended inside run only if `condition` (bool) is false.
 
-        `names` of values here, of such element types; inside they are to be given the names of what replaces them. On leaving
-        they become those of the one or the other.
+        `names` are values outside, with their element types; inside they are set to the names of their replacements. After the
+        block they name the chosen values.
         """
         k, before, outside = f"{self.part}/{self.pieces}", dict(names), self.nodes
         self.nodes = []
@@ -197,8 +197,8 @@ def described(name: str, kind: int = TensorProto.FLOAT, shape: Sequence[str | in
 
 
 def _shorten(graph: onnx.GraphProto, names: dict[str, str]) -> None:
-    """Number the values but those in `names`, which is extended, and the nodes behind their part; as written by their pieces
-    they would be a quarter of the file."""
+    """Replace the names of values by numbers, except those in `names`, which is extended, and number the nodes of each part.
+    The original names would be a quarter of the file."""
     parts = [node.name.partition("/")[0] for node in graph.node]
     for value in chain(graph.initializer, graph.input, graph.output):
         value.name = names.setdefault(value.name, f"v{len(names):x}")

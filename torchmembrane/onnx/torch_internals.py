@@ -53,7 +53,7 @@ __all__ = ["CHECKED", "TorchExporter", "empty_batches", "replaced", "tree_flatte
 
 
 def empty_batches(values: Iterable[Tensor], frames: int) -> tuple[Tensor, ...]:
-    """Tensors to trace with, that take no memory: like the values, but so many frames long (scalars have none)."""
+    """Tensors for tracing that take no memory: like the values, but with a batch of this length (scalars have none)."""
     with FakeTensorMode(allow_non_fake_inputs=True):
         return tuple(
             torch.empty(frames, *value.shape[1:], dtype=value.dtype) if value.ndim else torch.empty_like(value)
@@ -63,10 +63,10 @@ def empty_batches(values: Iterable[Tensor], frames: int) -> tuple[Tensor, ...]:
 
 @contextmanager
 def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """Give a module or a class another value of one of its names, and then the old one back.
+    """Replace an attribute of a module or a class within a block, and restore it afterwards.
 
     Raises:
-        MembraneError: it has no such name of its own.
+        MembraneError: it has no such attribute of its own.
     """
     if name not in vars(owner):
         raise MembraneError(
@@ -105,7 +105,7 @@ class TorchExporter:
 
     @cached_property
     def _decompositions(self) -> tuple[dict[Any, Any], ...]:
-        """What operators that ONNX lacks are made of: composite ones, and others."""
+        """Decompositions of operators that ONNX lacks."""
         table: dict[Any, Any] = create_onnx_friendly_decomposition_table(set(get_onnx_implemented_overloads(self._registry())))
         return _split_decomp_table_to_cia_and_python_decomp(table)
 
@@ -124,9 +124,9 @@ class TorchExporter:
 
     @contextmanager
     def at_work(self) -> Iterator[None]:
-        """Within, `torch.onnx.export` of a program that is `captured` leaves out what it would repeat.
+        """Make `torch.onnx.export` of a `captured` program skip the repeated work, within a block.
 
-        It may stand within another one, which has prepared everything then.
+        Blocks may be nested; the outer one then prepares everything.
         """
         if self._is_at_work:
             yield
@@ -155,7 +155,7 @@ def _captured_once(
     decompositions: dict[Any, Any],
     **_: Any,
 ) -> tuple[torch.fx.GraphModule, GraphSignature]:
-    """The operators of a module that changes none of its tensors, and what its inputs and outputs are.
+    """The operators of a module that changes none of its tensors, and descriptions of its inputs and outputs.
 
     Torch's own function runs the module a first time, to find what it changes.
     """
@@ -205,7 +205,7 @@ def _signature_of(name: str, domain: str, version: int) -> OpSignature:
 
 
 def _signature(schema: onnx.defs.OpSchema) -> OpSignature:
-    """What an operator of ONNX takes. Torch's exporter reads it anew for every node."""
+    """The signature of an ONNX operator, cached because torch's exporter reads it anew for every node."""
     return _signature_of(schema.name, schema.domain, schema.since_version)
 
 

@@ -1,4 +1,4 @@
-"""One piece of torch as an ONNX graph of its own, the length of the batch free."""
+"""A piece of torch code traced to an ONNX graph of its own with a free batch length."""
 
 import warnings
 from typing import Any

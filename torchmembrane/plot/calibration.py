@@ -68,7 +68,8 @@ def draw_correlations(axes: Axes, report: Report) -> None:
 
 
 def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarray, correction: Any, unit: str) -> Figure:
-    """Residuals in the image where there are any, and how far the surface was moved and how surely, seen along the axis.
+    """The residuals in the image, if there are any, and the correction of the surface with its standard deviation, seen along
+    the axis.
 
     Args:
         report: the calibration's numbers.

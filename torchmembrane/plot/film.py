@@ -1,4 +1,4 @@
-"""Figures one after another as a film: a video, or an animated GIF."""
+"""A sequence of figures as a film: a video or an animated GIF."""
 
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
@@ -35,7 +35,8 @@ def picture_of(drawing: Figure) -> np.ndarray:
 
 
 def check_film(path: Path, rate: float = 1.0) -> None:
-    """Refuse a name that is neither a video's nor a GIF's, a rate that it cannot have, and a video for want of PyAV.
+    """Refuse a file name that is neither a video's nor a GIF's, a rate that the format cannot have, and a video if PyAV is
+    missing.
 
     Raises:
         MembraneError: another ending or rate, or PyAV is not installed.
@@ -53,7 +54,7 @@ def check_film(path: Path, rate: float = 1.0) -> None:
 
 
 def write_film(path: str | Path, pictures: Iterable[np.ndarray], rate: float, last: float = 0.0) -> None:
-    """Write pictures as a film, whole or not at all.
+    """Write pictures as a film, atomically.
 
     Args:
         path: `.gif`, or a video (H.264): `.mp4`, `.mov`, `.mkv`; its folder is made if need be.

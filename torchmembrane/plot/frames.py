@@ -30,6 +30,7 @@ FORCE_ARROW = 0.2  # of the image's width: a force across the optical axis; shor
 MAGNIFICATIONS = (1, 2, 3, 5, 10, 20)
 LONGEST_ARROW, LEAST_SCALE = 0.07, 0.002  # of the image's width; of the surface's extent
 ARROWS_ACROSS = 22
+HIGHER, FULL = (1, 2, 5, 10), 0.85  # times that a side view may be drawn as high; height of a panel over its width
 HEADLINE, WIDEST_LETTER = 17, 0.64  # points; of a font's size, in the mean of a headline's letters at most
 LABEL_OFF, LOWEST = (34, 44), 62  # points, of a label from its point; its height over it where the image is as high as wide
 BAR_BELOW, BAR_HEIGHT, BAR_WIDTH = 0.52, 0.11, 3.8  # inches: of a colour bar, below its axes, whatever the image's shape
@@ -127,9 +128,25 @@ def draw_side(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
     if pressed:
         axes.plot(*x[vertex, plane], "o", ms=8, mfc="none", mec="k", mew=1.5)
     side_axes(axes, "xy"[across], mesh.length_unit)
+    times = _times_as_high(np.vstack([x, X])[:, plane])
+    axes.set_aspect(times, anchor="N")
     axes.set_ylabel(f"z [{mesh.length_unit}]")
-    axes.set_title(f"Surface, seen along {'yx'[across]}")
+    axes.set_title(f"Surface, seen along {'yx'[across]}" + (f", {times} times as high" if times > 1 else ""))
     legend_below(axes)
+
+
+def _times_as_high(points: np.ndarray) -> int:
+    """How many times as high as wide a side view's units are drawn, so that one of a flat sensor fills its panel.
+
+    Args:
+        points: `[N, 2]`, of the view.
+
+    Example:
+        >>> [_times_as_high(np.array([[0.0, 0.0], [10.0, high]])) for high in (9.0, 4.0, 1.0, 0.0)]
+        [1, 2, 5, 10]
+    """
+    wide, high = np.ptp(points, axis=0)
+    return max(times for times in HIGHER if times == 1 or times * high < FULL * wide)
 
 
 def draw_displacement(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
@@ -201,7 +218,7 @@ def _colour_bar(axes: Axes, shades: TriContourSet, ticks: np.ndarray | None = No
 
 
 def least_displacement(mesh: Mesh) -> float:
-    """The displacement under which nothing is marked and the colour scale does not shrink."""
+    """The displacement below which nothing is marked; the colour scale never covers less."""
     return LEAST_SCALE * float(np.ptp(mesh.rest_vertices, 0).max())
 
 
@@ -252,7 +269,7 @@ def _magnification(flow: np.ndarray, width: float) -> int:
 
 
 def _thinned(pixels: np.ndarray, pitch: float) -> np.ndarray:
-    """Which `[D]` of the points to draw: the first one in every cell of `pitch`, all of them where few would go."""
+    """Which of the points to draw, `[D]`: the first one in every cell of `pitch`, or all if few would be left out."""
     first = np.zeros(len(pixels), bool)
     first[np.unique(pixels // pitch, axis=0, return_index=True)[1]] = True
     return first if first.sum() < 0.6 * len(pixels) else np.ones(len(pixels), bool)

@@ -1,7 +1,4 @@
-"""A sensor as it was understood: its rays from the side, its rest surface in space, its markers in the rest image.
-
-Below them, where it was tried, what to expect of it.
-"""
+"""A drawing of a sensor: rays from the side, rest surface, markers in the rest image; below them, if tried, its spec sheet."""
 
 from typing import TYPE_CHECKING, Any
 

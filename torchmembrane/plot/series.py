@@ -1,6 +1,7 @@
 """Force, moment and pressure of recordings over time, with intervals and statuses: `view DIR --plot`."""
 
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,6 +19,8 @@ SHADES = ("#F0E442", "#CC79A7", "#56B4E9", "#E69F00", "#999999", "#8C564B")
 """Of the bands of statuses other than ok, in the order in which they appear."""
 WIDTH, HEIGHT = 9.0, 3.1
 """Inches, of a recording's column and of a row."""
+LONGEST = 1e8
+"""Seconds that no recording takes: a later time is one since 1970."""
 ABOVE, BELOW, LEFT, GAP = 0.75, 1.35, 1.05, 0.35
 """Inches: the title, the axis and legend, labels, between panels."""
 
@@ -72,7 +75,12 @@ def _rows(rows: Sequence[Mapping[str, str]]) -> list[tuple[str, str]]:
 def _draw(axes: Axes, times: np.ndarray, rows: Sequence[Mapping[str, str]], what: str) -> None:
     if what == "pressure change":
         key = "pressure_change_hpa" if rows[0]["force_unit"] == "N" else "pressure_change"
-        _line(axes, times, _numbers(rows, key), color="k", lw=1.6)
+        found = _numbers(rows, key)
+        _line(axes, times, found, color="k", lw=1.6)
+        gauge = _numbers(rows, "gauge_pressure_hpa") - _numbers(rows, "pressure_hpa") + found  # minus the pressure at rest
+        if np.isfinite(gauge).any():
+            axes.plot(times, gauge, ".", ms=4, color=VERMILION, label="read by a gauge")
+            axes.legend(frameon=False, fontsize=11.5)
         return
     for axis, colour in COLOURS.items():
         values = _numbers(rows, f"{what}_{axis}")
@@ -85,7 +93,7 @@ def _draw(axes: Axes, times: np.ndarray, rows: Sequence[Mapping[str, str]], what
 
 
 def _line(axes: Axes, times: np.ndarray, values: np.ndarray, **style) -> None:
-    """A line, with a point for each frame that has no neighbour."""
+    """A line, with a point for each frame without a neighbour."""
     known = np.isfinite(values)
     alone = known & ~np.append(False, known[:-1]) & ~np.append(known[1:], False)
     axes.plot(times, values, **style)
@@ -106,11 +114,22 @@ def _shade(axes: Axes, times: np.ndarray, rows: Sequence[Mapping[str, str]], sha
 
 
 def _times(rows: Sequence[Mapping[str, str]]) -> tuple[np.ndarray, str]:
-    """Times of the frames and what they are: seconds since the first, where all are known and in order; else numbers."""
+    """Times of the frames and the label of their axis: seconds since the first frame if all are known and in order, else frame
+    numbers."""
     times = _numbers(rows, "time")
     if np.isfinite(times).all() and (np.diff(times) > 0).all():
-        return times - times[0], "time [s]"
+        return times - times[0], f"time [s]{_since(times[0])}"
     return np.arange(len(rows), dtype=float), "frame"
+
+
+def _since(time: float) -> str:
+    """When a recording began; nothing where its times are since its own beginning.
+
+    Example:
+        >>> _since(1790509109.25), _since(3.0)
+        (' since 2026-09-27 11:38:29 UTC', '')
+    """
+    return datetime.fromtimestamp(time, UTC).strftime(" since %Y-%m-%d %H:%M:%S UTC") if time > LONGEST else ""
 
 
 def _numbers(rows: Sequence[Mapping[str, str]], key: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A folder's frames small on one sheet: `view DIR --sheet`."""
+"""The frames of a folder as small maps on one sheet: `view DIR --sheet`."""
 
 from collections.abc import Mapping
 from math import ceil, floor, log10

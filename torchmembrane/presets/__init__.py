@@ -1,4 +1,4 @@
-"""Sensors that come with the package, complete with marker list and rest image, to try things and to start one's own from."""
+"""Preset sensors, complete with marker list and rest image, for first trials and as templates for your own."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A sensor file with a word on every key: what `torchmembrane init` writes for people to go on from."""
+"""Comments in a drafted sensor file: `torchmembrane init` explains every key for users who continue from it."""
 
 import re
 from collections.abc import Sequence
@@ -79,7 +79,7 @@ OF_SHEETS = {
 
 
 def annotate(path: Path, said: Sequence[str], relative: bool, unit: str) -> None:
-    """Put words behind the keys of a sensor file, and what else may stand there at the end, commented out.
+    """Add comments to the keys of a sensor file, and further possible keys at its end, commented out.
 
     Args:
         path: what `Sensor.to_file` wrote.

@@ -1,4 +1,4 @@
-"""A sensor's sheet from a ruler and a gauge: its rim, height, overpressure, prestretch and stiffness, which belong together."""
+"""An inflated sheet from a ruler and a gauge: its rim, height, overpressure, prestretch and stiffness determine one another."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -164,7 +164,7 @@ def _in_words(formed: FormedSurface, unit: str) -> list[str]:
 
 
 def sheet_dots(surface: InflatedSurface, pitch: float) -> tuple[np.ndarray, list[str]]:
-    """A square pattern of large and small dots in turns, drawn on the sheet before it is blown up, within its rim.
+    """A square pattern of alternating large and small dots, drawn on the sheet within its rim before it is inflated.
 
     Args:
         surface: the rest surface.

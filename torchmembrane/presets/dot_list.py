@@ -1,4 +1,4 @@
-"""Dots as people list them, in any frame: on the membrane, in the camera's frame."""
+"""Dots as users list them in various frames, placed on the membrane in the camera's frame."""
 
 from pathlib import Path
 
@@ -74,8 +74,8 @@ def _refuse_heights(path: Path, surface: Surface, values: np.ndarray) -> None:
     off, off_as_heights = (membrane.closest_points(points).distance.max() for points in (values, values + [0.0, 0.0, base_z]))
     if off_as_heights < OFF_SURFACE * membrane.size < off:
         raise MembraneError(
-            f"{path}: z up to {values[:, 2].max():.4g} lies off the membrane, its rim {base_z:g} from the camera, but on it "
-            "where it is counted from the rim's plane; expected the header x,y,h for such heights"
+            f"{path}: z up to {values[:, 2].max():.4g} lies off the membrane, whose rim is {base_z:g} from the camera, but on "
+            "it if counted from the rim's plane; expected the header x,y,h for such heights"
         )
 
 

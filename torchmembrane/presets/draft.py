@@ -1,4 +1,5 @@
-"""A sensor from a few numbers: rest surface, camera on its axis, material in balance with its pressure, a pattern of dots."""
+"""A sensor drafted from a few numbers: rest surface, camera on its axis, material in balance with the pressure, a pattern of
+dots."""
 
 import math
 from collections.abc import Mapping
@@ -39,7 +40,7 @@ PRESSURE_UNITS = {"Pa": 0.01, "hPa": 1.0, "mbar": 1.0, "kPa": 10.0, "bar": 1000.
 
 
 def drafted_surface(shape: str, numbers: Mapping[str, float | list[float]], base_z: float) -> Surface:
-    """The rest surface of one of `SHAPES` that is no sheet.
+    """The rest surface of one of the `SHAPES` that are not inflated sheets.
 
     Args:
         shape: "dome" (half a sphere) | "cap" | "bubble" (a cap of gas) | "fingertip" (half an ellipsoid) | "half_cylinder".
@@ -103,7 +104,7 @@ class RimCircle:
 
 
 def focal_of_view(model: str, width: int, degrees: float) -> float:
-    """The focal length, px, of a lens that sees so many degrees across the image's width.
+    """The focal length in px of a lens with the given field of view, in degrees, across the image's width.
 
     Example:
         >>> focal_of_view("pinhole", 640, 90.0).__round__(6), focal_of_view("fisheye", 628, 180.0).__round__(2)
@@ -111,7 +112,9 @@ def focal_of_view(model: str, width: int, degrees: float) -> float:
     """
     half = math.radians(degrees) / 2
     if model == "pinhole" and not degrees < 180:
-        raise MembraneError(f"field of view {degrees:g} degrees; expected less than 180 of a pinhole lens: a fisheye sees more")
+        raise MembraneError(
+            f"field of view {degrees:g} degrees; expected less than 180 for a pinhole lens (a fisheye sees more)"
+        )
     if not degrees <= 360:
         raise MembraneError(f"field of view {degrees:g} degrees; expected at most 360")
     return width / 2 / (math.tan(half) if model == "pinhole" else half)
@@ -223,7 +226,7 @@ def pressure_in_hectopascal(text: str) -> float:
 
 
 def drafted_dots(surface: Surface, pitch: float | None = None) -> tuple[np.ndarray, list[str]]:
-    """A square pattern of large and small dots in turns, to be made on the membrane.
+    """A square pattern of alternating large and small dots, to be made on the membrane.
 
     Args:
         surface: one that `drafted_surface` gives.

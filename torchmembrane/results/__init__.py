@@ -1,1 +1,1 @@
-"""What a reconstruction is, and how a folder of them is kept and read."""
+"""The result of a reconstruction, and folders of results: how they are stored and read."""

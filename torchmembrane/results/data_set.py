@@ -1,4 +1,4 @@
-"""A folder of results as a data set in the layout of Hugging Face's `datasets`: frames, their images, and a card."""
+"""A folder of results exported as a data set in the layout of Hugging Face's `datasets`: frames, images, and a card."""
 
 import os
 import shutil
@@ -74,7 +74,7 @@ def write_data_set(results: Results, folder: Path, images: Mapping[str, Path], t
 
     Args:
         results: the frames.
-        folder: which must not exist.
+        folder: the folder to be made; it must not exist.
         images: files by name, of all frames or of none.
         times: of capture, seconds since 1970, by name; may be empty.
 

@@ -16,7 +16,7 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
 
 
 def shape_of(key: str, sizes: Mapping[str, int]) -> tuple[int, ...]:
-    """The shape of an array where there are so many vertices, markers and patches.
+    """The shape of an array for given numbers of vertices, markers and patches.
 
     Example:
         >>> shape_of("contact_force", {"P": 4})

@@ -1,4 +1,5 @@
-"""The frames of a folder of results as rows of one Parquet dataset: small parts as work goes on, merged into large ones."""
+"""The frames of a folder of results as rows of one Parquet dataset: small parts are written during the job and merged into
+large ones."""
 
 import json
 import re
@@ -43,15 +44,15 @@ class FrameTable:
     Args:
         folder: of the parts.
         mesh: what the frames share.
-        gate: held while parts are changed.
+        write_lock: held while parts are changed.
 
     Attributes:
         damaged: parts that could not be read, as far as `stored` has come; they were renamed.
     """
 
-    def __init__(self, folder: Path, mesh: Mesh, gate: AbstractContextManager[Any]):
+    def __init__(self, folder: Path, mesh: Mesh, write_lock: AbstractContextManager[Any]):
         self.arrow, self.parquet = load_pyarrow()
-        self.folder, self.mesh, self.gate = folder, mesh, gate
+        self.folder, self.mesh, self.write_lock = folder, mesh, write_lock
         self.metadata = {key: getattr(mesh, key) for key in ("length_unit", "force_unit", "name", "sensor", "record")}
         self.damaged: list[Path] = []
         self.part_rows = max(1, min(PART_ROWS, PART_BYTES // (60 * len(mesh.rest_vertices) + 30 * len(mesh.rest_pixels) + 300)))
@@ -60,16 +61,16 @@ class FrameTable:
         self._saved = time.monotonic()
 
     def names(self) -> set[str]:
-        """Of all frames, stored or held back."""
+        """The names of all frames, stored or buffered."""
         return set().union(self._waiting, *self._index().values())
 
     def stored(self, wanted: Callable[[str], bool]) -> Iterator[tuple[str, Stored]]:
-        """All frames whose names are wanted, each read whole.
+        """All frames with the wanted names.
 
-        Parts are put right on the way: what cannot be read is renamed to `*.damaged`, rows that an interrupted merge left
-        twice are taken out, parts of earlier versions are written anew.
+        Parts are repaired on the way: unreadable ones are renamed to `*.damaged`, duplicate rows left by an interrupted merge
+        are removed, and parts of earlier versions are rewritten.
         """
-        with self.gate:
+        with self.write_lock:
             seen: set[str] = set()
             for part in self._parts():
                 try:
@@ -103,33 +104,33 @@ class FrameTable:
         return [found[name] for name in names]
 
     def write(self, name: str, stored: Stored) -> None:
-        """Hold a frame back until there are `PART_ROWS` of them, or `save` finds that it is time."""
+        """Buffer a frame until there are `PART_ROWS` of them, or until `save` finds that it is time."""
         self._waiting[name] = stored
         if len(self._waiting) >= self.part_rows:
             self._flush()
 
     def forget(self, name: str) -> None:
-        """Take a frame away, if it is there."""
+        """Remove a frame, if it is there."""
         self._waiting.pop(name, None)
-        with self.gate:
+        with self.write_lock:
             self._drop([name])
 
     def save(self) -> None:
-        """Write the frames that are held back, if the last time was `SAVE_SECONDS` ago."""
+        """Write the buffered frames, if the last write was `SAVE_SECONDS` ago."""
         if time.monotonic() - self._saved >= SAVE_SECONDS:
             self._flush()
 
     def close(self) -> None:
-        """Write the frames that are held back, and merge small parts."""
+        """Write the buffered frames, and merge small parts."""
         self._flush()
-        with self.gate:
+        with self.write_lock:
             self._merge(least=2)
 
     def _flush(self) -> None:
         self._saved = time.monotonic()
         if not self._waiting:
             return
-        with self.gate:
+        with self.write_lock:
             make_subfolder(self.folder)
             self._drop(self._waiting)
             last = max((int(part.stem.rpartition("-")[2]) for part in self._parts()), default=-1)
@@ -157,7 +158,7 @@ class FrameTable:
                 part.unlink()
 
     def _drop(self, names: Collection[str]) -> None:
-        """Take rows out of the parts that hold them."""
+        """Remove rows from the parts that contain them."""
         for part, held in self._index().items():
             if held.isdisjoint(names):
                 continue
@@ -214,7 +215,7 @@ def _table(part: Path, columns: list[str] | None = None) -> Any:
 
 
 def _version(part: Path) -> tuple[int, int]:
-    """What changes when a part is replaced.
+    """A value that changes when a part is replaced.
 
     Raises:
         FileNotFoundError: it is not there any more.

@@ -1,4 +1,4 @@
-"""The frames of a folder of results, each as its own NAME.npz or as a row of one Parquet dataset: both speak alike."""
+"""The frames of a folder of results, each in its own NAME.npz or as a row of one Parquet dataset; both have one interface."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -18,29 +18,29 @@ from .store import MESH, Mesh, check_folder
 Frames: TypeAlias = "FrameFiles | FrameTable"
 
 
-def open_folder(folder: str | Path, mesh: Mesh, gate: AbstractContextManager[Any]) -> Frames:
-    """The frames of a folder that is made if need be, to be written.
+def open_folder(folder: str | Path, mesh: Mesh, write_lock: AbstractContextManager[Any]) -> Frames:
+    """Open the frames of a folder for writing; the folder is made if it does not exist.
 
     Args:
         folder: of the results.
         mesh: what they share.
-        gate: held while files are changed that other processes change as well.
+        write_lock: a lock that is held while files are changed that other processes change as well.
 
     Raises:
         MembraneError: what `check_folder` refuses.
     """
     folder = Path(folder)
-    with gate:
+    with write_lock:
         check_folder(folder, mesh.sensor, mesh.settings)
         if not (folder / MESH).exists():
             mesh.save(make_folder(folder) / MESH)
-    return frames_of(folder, mesh, gate)
+    return frames_of(folder, mesh, write_lock)
 
 
-def frames_of(folder: Path, mesh: Mesh, gate: AbstractContextManager[Any] | None = None) -> Frames:
+def frames_of(folder: Path, mesh: Mesh, write_lock: AbstractContextManager[Any] | None = None) -> Frames:
     """The frames of a folder whose mesh this is."""
     if mesh.format == "parquet":
-        return FrameTable(folder / "frames", mesh, gate or nullcontext())
+        return FrameTable(folder / "frames", mesh, write_lock or nullcontext())
     return FrameFiles(folder, mesh)
 
 
@@ -52,7 +52,7 @@ class FrameFiles:
         mesh: what the frames share.
 
     Attributes:
-        damaged: files that could not be read, of which `names` or `stored` told last.
+        damaged: files that the latest call of `names` or `stored` could not read.
     """
 
     def __init__(self, folder: Path, mesh: Mesh):
@@ -60,12 +60,12 @@ class FrameFiles:
         self.damaged: list[Path] = []
 
     def names(self) -> set[str]:
-        """Of all frames stored, damaged ones among them; files of other arrays are left out."""
+        """The names of all stored frames, including damaged ones; files with other arrays are left out."""
         self.damaged = []
         return {path.stem for path in self._files() if self._is_result(path)}
 
     def stored(self, wanted: Callable[[str], bool]) -> Iterator[tuple[str, Stored]]:
-        """All frames whose names are wanted, each read whole; `damaged` then lists what could not be."""
+        """All frames with the wanted names; `damaged` then lists those that could not be read."""
         self.damaged = []
         for path in self._files():
             if wanted(path.stem):
@@ -82,7 +82,7 @@ class FrameFiles:
         return [load_frame(self._path(name)) for name in names]
 
     def write(self, name: str, stored: Stored) -> None:
-        """Store a frame, in place of an earlier one of its name; what is no frame is renamed."""
+        """Store a frame and replace an earlier one of the same name; a file of that name that is not a frame is renamed."""
         path = self._path(name)
         if path in self.damaged:
             path.replace(path.with_suffix(".damaged"))
@@ -90,7 +90,7 @@ class FrameFiles:
         save_frame(path, stored.arrays())
 
     def forget(self, name: str) -> None:
-        """Take a frame away, if it is there."""
+        """Remove a frame, if it is there."""
         if os.path.exists(self._path(name)):
             self._path(name).unlink()
 

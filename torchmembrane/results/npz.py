@@ -1,4 +1,4 @@
-"""One frame as a file NAME.npz: its arrays, what they were found in, and the seconds that it took."""
+"""One frame as a file NAME.npz: its arrays, its source image, and the time that it took."""
 
 from io import BytesIO
 from pathlib import Path
@@ -24,7 +24,7 @@ EXPECTED = "a result NAME.npz, the arrays of Reconstruction"
 
 
 class Stored(NamedTuple):
-    """A frame as it is stored: its arrays, what they were found in, and the seconds that it took.
+    """A frame as it is stored: its arrays, its source image, and the time that it took.
 
     Attributes:
         frame: as `Reconstruction.frame` gives it.
@@ -38,7 +38,7 @@ class Stored(NamedTuple):
 
     @classmethod
     def of(cls, arrays: dict[str, Any]) -> "Stored":
-        """From all arrays of a file; those that it lacks are as unknown.
+        """A frame from all arrays of a file; what the file lacks is taken as unknown.
 
         Raises:
             KeyError: it lacks one that there always was.
@@ -54,7 +54,7 @@ class Stored(NamedTuple):
 
 
 def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
-    """Write one frame, whole or not at all.
+    """Write one frame atomically.
 
     Args:
         path: the file, `.npz`.
@@ -73,7 +73,7 @@ def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
     try:
         np.savez(content, **arrays)
     except ValueError as error:
-        if isinstance(error.__context__, KeyboardInterrupt):  # amid an entry, which zipfile then cannot close
+        if isinstance(error.__context__, KeyboardInterrupt):  # in the middle of an entry, which zipfile then cannot close
             raise error.__context__ from None
         raise
     write_bytes(path, content.getbuffer())
@@ -95,7 +95,7 @@ def load_frame(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def load_stored(path: Path) -> Stored:
-    """Read a frame, and what it was found in.
+    """Read a frame with its source and time.
 
     Raises:
         MembraneError: as `load_frame`.
@@ -108,7 +108,7 @@ def load_stored(path: Path) -> Stored:
 
 
 def completed(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """A frame that was stored before there were all of these arrays: those that it lacks are NaN.
+    """A frame of an earlier version with the arrays that it lacks filled with NaN.
 
     Raises:
         KeyError: it lacks one that there always was.

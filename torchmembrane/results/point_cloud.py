@@ -15,11 +15,11 @@ def save_contact_cloud(path: str | Path, frame: Frame) -> int:
     """Write the vertices that something touches as a point cloud, with their normals and tractions.
 
     Args:
-        path: the file, `.ply` (ASCII), whole or not at all.
+        path: the file, `.ply` (ASCII), written atomically.
         frame: as `Reconstruction.frame` gives it.
 
     Returns:
-        The number of points, those with `contact` above 0.5; none where there is no contact.
+        The number of points, those with `contact` above 0.5; 0 without a contact.
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""What a reconstruction holds: the schema of results."""
+"""The schema of results."""
 
 from typing import Any, NamedTuple, Protocol, TypeAlias
 

@@ -1,10 +1,10 @@
-"""What can be said of a frame."""
+"""The statuses of a frame."""
 
 from enum import IntEnum
 
 
 class Status(IntEnum):
-    """How the reconstruction of a frame ended; its value is what results store, `text` says it in words.
+    """How the reconstruction of a frame ended; results store its value, and `text` is the message.
 
     Example:
         >>> Status(4).name, Status.OK.text

@@ -24,7 +24,7 @@ OWN, NONE = "of the sensor", "not measured"
 
 
 class ResultMaker(Protocol):
-    """What makes the results of a folder: a `Reconstructor`."""
+    """The interface of a `Reconstructor` that a folder of results needs."""
 
     sensor: Any
     estimator: Any
@@ -173,7 +173,7 @@ class Mesh(NamedTuple):
             raise MembraneError(f"{path}: {said} as of its {MESH}: give the {MESH} of its folder, or reconstruct it again")
 
     def _refuse_unlike(self) -> None:
-        """Raise `ValueError` where fields do not go together."""
+        """Raise `ValueError` if the shapes of the fields do not fit together."""
         V = len(self.rest_vertices)
         wanted = {"rest_vertices": (V, 3), "rest_normals": (V, 3), "fixed": (V,), "grid": (2,), "image_size": (2,)}
         wanted |= {"triangles": (len(self.triangles), 3), "vertex_pixels": (V, 2), "rest_pixels": (len(self.rest_pixels), 2)}
@@ -191,7 +191,7 @@ class Mesh(NamedTuple):
             raise ValueError(f"its grid is {self.grid.tolist()}, its format {self.format!r}")
 
     def save(self, path: str | Path) -> None:
-        """Write `mesh.npz`, whole or not at all."""
+        """Write `mesh.npz` atomically."""
         save_frame(path, self._asdict())
 
     @property
@@ -236,7 +236,7 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
 
 
 def _rows(pose: Pose | None) -> np.ndarray:
-    """Rotation and translation side by side, `[3, 4]`; `[0, 4]` of no pose."""
+    """Rotation and translation side by side, `[3, 4]`; `[0, 4]` without a pose."""
     rows = np.zeros((0, 4)) if pose is None else np.column_stack([pose.rotation, pose.translation])
     return rows.astype(np.float32)
 

@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import MembraneError
 from ..files.atomic import whole_file
 from ..files.order import in_order
@@ -15,7 +17,7 @@ from ..files.safe_read import regular_size
 from .npz import Stored
 from .status import Status
 from .store import Mesh
-from .summary_row import NAMES, TEXT, Column, cell, escaped, in_units, numbers, unescaped
+from .summary_row import NAMES, TEXT, Column, cell, completed, escaped, in_units, numbers, unescaped
 
 SUMMARY, DICTIONARY = "summary.csv", "summary_columns.csv"
 EXPECTED = "a table of results: delete it, it is made from the frames"
@@ -33,18 +35,19 @@ class Summary:
     Args:
         folder: the folder of results.
         mesh: what its frames share.
-        gate: held while the files are changed.
+        write_lock: held while the files are changed.
     """
 
-    def __init__(self, folder: Path, mesh: Mesh, gate: AbstractContextManager[Any]):
-        self.path, self.mesh, self.gate = folder / SUMMARY, mesh, gate
+    def __init__(self, folder: Path, mesh: Mesh, write_lock: AbstractContextManager[Any]):
+        self.path, self.mesh, self.write_lock = folder / SUMMARY, mesh, write_lock
         self.rows: dict[str, dict[str, str]] = {}
 
     def add(self, name: str, stored: Stored) -> None:
         """A row from a stored frame."""
         frame, origin, seconds = stored
         mesh, status = self.mesh, int(frame["status"])
-        found = numbers(frame, mesh.rest_normals, mesh.length_unit, mesh.force_unit) | {"time": origin.time, "seconds": seconds}
+        found = numbers(frame | {"gauge": np.asarray(origin.gauge)}, mesh.rest_normals, mesh.length_unit, mesh.force_unit)
+        found |= {"time": origin.time, "seconds": seconds}
         texts = {"file": origin.path, "status_text": Status(status).text, "content_hash": origin.content_hash}
         self._set(name, status, texts | {key: cell(key, value) for key, value in found.items()})
 
@@ -54,7 +57,7 @@ class Summary:
 
     def write(self, kept: Callable[[dict[str, str]], bool] = lambda row: True) -> None:
         """Write the rows added since the last time beside those of the file that are kept, in name order."""
-        with self.gate:
+        with self.write_lock:
             rows = {row["name"]: row for row in _rows(self.path) if kept(row)} | self.rows
             lines = ({key: escaped(key, rows[name][key]) for key in NAMES} for name in sorted(rows, key=in_order))
             _write_table(self.path, NAMES, lines)
@@ -77,7 +80,7 @@ def read_summary(folder: Path) -> list[dict[str, str]]:
     if not rows:
         raise MembraneError(
             f"{folder / SUMMARY}: no rows with this version's columns; expected a folder of results: the same reconstruct "
-            "command again makes its table anew"
+            "command again writes its table anew"
         )
     return rows
 
@@ -95,7 +98,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
         regular_size(path, MOST_BYTES, EXPECTED)
         with open(path, newline="", encoding="utf-8", errors="replace") as file:
             lines = (line.replace("\0", "") for line in iter(partial(file.readline, LONGEST_LINE), ""))
-            found = [row for row in csv.DictReader(lines) if tuple(row) == NAMES and _is_whole(row)]
+            found = [row for each in csv.DictReader(lines) if _is_whole(each) and (row := completed(each))]
     except (FileNotFoundError, csv.Error):
         return []
     return [{key: unescaped(key, text) for key, text in row.items()} for row in found]

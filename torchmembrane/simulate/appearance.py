@@ -1,4 +1,4 @@
-"""Light and camera: how bright a white membrane is, and what lens and chip make of it."""
+"""The appearance of a rendered image: illumination of a white membrane, vignetting, blur and noise."""
 
 import math
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ RANGES = {
 @check_arguments
 @dataclass(frozen=True)
 class Appearance:
-    """Light, lens and chip of a rendered image.
+    """Lighting, lens and image sensor of a rendered image.
 
     Args:
         lights: positions `(x, y, z)` of point lights, length unit, camera frame; default: four around the camera, within the

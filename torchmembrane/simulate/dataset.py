@@ -1,4 +1,5 @@
-"""Random presses of one sensor: the same for the same seed and number, on all cores, continued where they were interrupted."""
+"""Data sets of random presses of one sensor: reproducible by seed and number, computed on all cores, and resumed after an
+interruption."""
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -27,7 +28,7 @@ NO_SLIDE = np.zeros(3)
 
 
 class Plan(NamedTuple):
-    """What the presses of a data set share.
+    """The settings that the presses of a data set share.
 
     Attributes:
         kinds: of indenters, some of `KINDS`.
@@ -47,7 +48,7 @@ class Plan(NamedTuple):
 
 
 class DatasetOutcome(NamedTuple):
-    """How many frames of a data set were made, failed, and were there before.
+    """Numbers of frames of a data set that were made, failed, or existed already.
 
     Attributes:
         made: now.
@@ -61,7 +62,7 @@ class DatasetOutcome(NamedTuple):
 
 
 def random_frame(simulator: Simulator, plan: Plan, number: int) -> SimulatedFrame:
-    """The data set's frame of that number. Strokes that the membrane cannot follow are drawn again.
+    """The frame of a data set with the given number. Strokes that the membrane cannot follow are drawn again.
 
     Raises:
         MembraneError: none of `ATTEMPTS` strokes could be followed.
@@ -170,7 +171,8 @@ def make_frames(
 ) -> DatasetOutcome:
     """Make the frames 0 to `count - 1` of a data set that `frames` does not hold yet.
 
-    A press that fails is reported and left out; the same call tries it again. Interrupted, what is done so far is kept.
+    A press that fails is reported and left out; the same call tries it again. After an interruption, the frames made so far are
+    kept.
 
     Args:
         simulator: that makes them.

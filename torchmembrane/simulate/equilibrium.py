@@ -31,7 +31,7 @@ class Filling(Protocol):
     """What fills the cavity: the law between its volume and the pressure difference across the membrane."""
 
     def gap(self, volume: float, pressure: float) -> tuple[float, float]:
-        """How much volume is missing at this pressure, and the compliance C: `v . dx + C dp = gap` in each Newton step."""
+        """The volume that is missing at this pressure, and the compliance C: `v . dx + C dp = gap` in each Newton step."""
 
 
 class Liquid(NamedTuple):
@@ -92,8 +92,8 @@ class Solution(NamedTuple):
 class EquilibriumProblem:
     """The equilibrium of one membrane, solved by Newton's method.
 
-    Element Hessians are exact; where the step they give does not descend, their convex part. The line search is on the slope
-    of the potential along the step, its volume term augmented; the bordered matrix is never factored.
+    Element Hessians are exact; if the resulting step does not descend, their convex part is used. The line search is on the
+    slope of the potential along the step, its volume term augmented; the bordered matrix is never factored.
 
     Args:
         membrane: at rest.
@@ -160,7 +160,7 @@ class EquilibriumProblem:
     def _step(
         self, x: Tensor, pressure: float, contacts: Sequence[FrictionalContact], positive: bool
     ) -> tuple[Tensor, float, list[FrictionalContact]] | None:
-        """One Newton step: vertices, pressure and contacts, or None where it does not descend."""
+        """One Newton step: vertices, pressure and contacts, or None if it does not descend."""
         active = [contact.active_set(x[self.free]) for contact in contacts]
         each = list(zip(contacts, active, strict=True))
         blocks = self.elasticity.hessian_blocks(x, positive) - pressure * self.membrane.volume_hessian_blocks(x)
@@ -194,7 +194,7 @@ class EquilibriumProblem:
 
 
 def _solved(K: csc_matrix, loads: np.ndarray) -> np.ndarray:
-    """`K^-1 loads` by a sparse LU factorisation; raises `RuntimeError` where K is exactly singular."""
+    """`K^-1 loads` by a sparse LU factorisation; raises `RuntimeError` if K is exactly singular."""
     return splu(K, "MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options={"SymmetricMode": True}).solve(loads)
 
 

@@ -70,15 +70,17 @@ class SimulatedFrames:
 class SimulatedFrameTable(SimulatedFrames):
     """Frames as rows of `frames/part-*.parquet`: `name`, `image` (a PNG file's bytes), and the truth, arrays as flat lists.
 
-    The schema's metadata hold the arrays' shapes (`shapes`, JSON). What is the same in all frames stands in `rest_truth.npz`.
-    Rows are held back until `PART_ROWS` of them make a file; `flush` writes the rest.
+    The schema's metadata hold the arrays' shapes (`shapes`) and the sensor's `[record]` (`record`), both JSON. What is the same
+    in all frames stands in `rest_truth.npz`. Rows are held back until `PART_ROWS` of them make a file; `flush` writes the rest.
 
     Args:
         folder: that exists.
+        record: of the sensor, as `Record.text`.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, record: str = "") -> None:
         super().__init__(folder)
+        self.record = record
         self.arrow, self.parquet = load_pyarrow()
         self.waiting: dict[str, SimulatedFrame] = {}
 
@@ -105,7 +107,7 @@ class SimulatedFrameTable(SimulatedFrames):
             flat = self.arrow.array(values.ravel())
             size = int(np.prod(shapes[key]))
             columns[key] = self.arrow.FixedSizeListArray.from_arrays(flat, size) if shapes[key] else flat
-        table = self.arrow.table(columns).replace_schema_metadata({"shapes": json.dumps(shapes)})
+        table = self.arrow.table(columns).replace_schema_metadata({"shapes": json.dumps(shapes), "record": self.record})
         part = self.folder / "frames" / f"part-{len(self._parts()):05d}.parquet"
         with whole_file(part) as partial:
             self.parquet.write_table(table, partial)
@@ -179,7 +181,8 @@ def open_frames(folder: Path, simulator: Simulator, settings: dict[str, Any], fo
         make_folder(folder)
         simulated(simulator).to_file(folder / SENSOR)
         write_bytes(folder / SETTINGS, json.dumps(settings, indent=1).encode())
-    return SimulatedFrameTable(folder) if format == "parquet" else SimulatedFrames(folder)
+    record = simulator.sensor.record.text
+    return SimulatedFrameTable(folder, record) if format == "parquet" else SimulatedFrames(folder)
 
 
 def simulated(simulator: Simulator) -> Sensor:

@@ -74,7 +74,7 @@ class FrictionalContact(NamedTuple):
     def carried_to(self, pose: Indenter, x: Tensor) -> "FrictionalContact":
         """The next increment: the indenter moves to `pose`, from an equilibrium `x` in which this contact held.
 
-        A vertex that it meets on the way is carried along only from where it is met.
+        A vertex that it meets on the way is carried along only from the point of contact on.
 
         Raises:
             MembraneError: the indenter may overtake a vertex, which then would end up inside it, or on another side.

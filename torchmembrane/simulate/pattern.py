@@ -1,4 +1,4 @@
-"""What is painted on the material: dots, speckle, or what a rest image shows. It moves with the membrane."""
+"""Patterns painted on the membrane, which move with it: dots, speckle, or the pattern in a rest image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ WAVES = 96  # of a speckle
 
 
 class Canvas(NamedTuple):
-    """The rest surface as it is painted on.
+    """The rest surface as a canvas for a pattern.
 
     Attributes:
         vertices: `[V, 3]`.
@@ -157,7 +157,7 @@ class Speckle:
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """What a rest image shows, taken onto the rest surface and freed of the light that falls on it.
+    """The pattern in a rest image, projected onto the rest surface and corrected for the illumination.
 
     Args:
         image: the rest image, `[height, width]`, grey 0..1.
@@ -185,7 +185,7 @@ class Painted:
 
 
 def pattern_of(sensor: Sensor, radii: Sequence[float] | None = None, missing: Sequence[int] = ()) -> Dots | Painted:
-    """A sensor's markers: the dots that it lists, else what its rest image shows.
+    """The pattern of a sensor: the dots that it lists, or else the pattern in its rest image.
 
     Args:
         sensor: the sensor.
@@ -210,7 +210,7 @@ def pattern_of(sensor: Sensor, radii: Sequence[float] | None = None, missing: Se
 
 
 def inside_unit_disc(place: Tensor, slope: Tensor) -> Tensor:
-    """How much of each sample lies within the unit disc, its outline taken as straight.
+    """The share of each sample that lies within the unit disc, whose outline is taken as straight.
 
     Args:
         place: of the samples, in units of the disc's radius, `[S, 2]`.

@@ -1,6 +1,7 @@
 """Anderson acceleration of a fixed-point iteration `x <- x + move(x)`, batched, static. Walker and Ni 2011.
 
-The last changes of the move are kept orthonormal, each with the change of `x + move` that went with it: no system to solve.
+The latest changes of the move are kept orthonormal, each together with its change of `x + move`, so that no system of equations
+has to be solved.
 """
 
 import torch
@@ -21,9 +22,9 @@ def first(x: Tensor, move: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def accelerated(x: Tensor, move: Tensor, latest: Tensor, changes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The iterate after `x`, and the history after it.
 
-    Arguments: `x`, `move [..., N]`; `latest [..., 1, 2 N]`, `(move, x + move)` before; `changes [..., DEPTH, 2 N]`
-    up to there, latest first, orthonormal in the move. Of all combinations of `(move, x + move)` and the changes, taken is the
-    one whose move, were it linear in `x`, is shortest; changes of no more than `x`'s rounding count for nothing.
+    Arguments: `x`, `move [..., N]`; `latest [..., 1, 2 N]`, `(move, x + move)` before; `changes [..., DEPTH, 2 N]` up to there,
+    latest first, orthonormal in the move. Of all combinations of `(move, x + move)` and the changes, the one with the shortest
+    move is taken, as if the move were linear in `x`; changes no larger than the rounding of `x` are ignored.
     """
     N = x.shape[-1]
     now = torch.cat([move, x + move], -1)[..., None, :]

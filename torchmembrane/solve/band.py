@@ -1,7 +1,8 @@
 """Symmetric positive definite band matrices on a processor, by LAPACK: one call for what block elimination does in hundreds.
 
-LAPACK takes one matrix at a time, by one thread: of matrices as small as these others would only wait. Operators of torch, so
-that a compiled graph may hold them; gradients take what is solved, not how, see `implicit.differentiable`.
+LAPACK takes one matrix at a time, with one thread, because for such small matrices further threads would only wait. The
+functions are operators of torch, so that a compiled graph may contain them; gradients are those of the solution, see
+`implicit.differentiable`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,19 +21,19 @@ RIDGES = (0.0, 1e-6, 1e-5, 1e-4)
 """Added, one instead of the other, to a diagonal about 1 of a matrix that rounding has left without a factor."""
 
 
-def takes(matrix: Tensor) -> bool:
+def is_supported(matrix: Tensor) -> bool:
     """Whether these operators can be used: on a processor, without gradients, and not in an exported model."""
     recorded = torch.is_grad_enabled() and matrix.requires_grad
     return matrix.device.type == "cpu" and not recorded and not torch.compiler.is_exporting()
 
 
 def factor(runs: Sequence[Tensor], starts: Sequence[int]) -> Tensor:
-    """Cholesky factors of matrices, NaN of one that is not positive.
+    """Cholesky factors of matrices; NaN for a matrix that is not positive definite.
 
     Args:
-        runs: of neighbouring diagonals, `[B, n, K]` each: row by row the entries on the diagonal and to the right of it. All
-            others are zero.
-        starts: how far the first diagonal of each is to the right, the first 0.
+        runs: runs of neighbouring diagonals, `[B, n, K]` each, with the entries of every row from left to right. All other
+            entries are zero.
+        starts: how far the first diagonal of each run is to the right of the main one; 0 for the first run.
 
     Returns:
         `[B, n, k + 1]`: with `L L^T` the matrix, row by row the columns of `L` from the diagonal on.

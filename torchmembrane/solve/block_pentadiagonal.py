@@ -1,8 +1,8 @@
 """Symmetric positive definite block-pentadiagonal systems, batched: elimination from both ends inwards, one block from each.
 
 Their number is odd. Blocks come in pairs, the first and the last, the second and the last but one, and so on; then the one in
-the middle. With the last pair it is solved for as a whole. Kept are inverse roots of the pivots: solving takes products alone.
-Both blocks of a pair are matrices of one batch: of `B` systems `[2 B, s, s]`, a system's two in turn.
+the middle. With the last pair it is solved for as a whole. Inverse roots of the pivots are kept, so that solving takes only
+products. Both blocks of a pair are matrices of one batch: of `B` systems `[2 B, s, s]`, a system's two in turn.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ class Factor(NamedTuple):
 
 
 def places(n: int) -> list[list[tuple[int, int]]]:
-    """Which blocks of the matrix, by row and column, an elimination takes at a time; (-1, -1) for one that is zero.
+    """Rows and columns of the blocks that each part of an elimination needs; (-1, -1) stands for a zero block.
 
     First those of the first pair, those between it and the second, and those of the second; with every pair that is eliminated
     those between it and the pair after the next, between the next two, and of the last of these, in the end the one in the
@@ -68,7 +68,7 @@ def _less(block: Tensor, left: Tensor, right: Tensor) -> Tensor:
 
 
 def _middle(pivot: Tensor, beside: Tensor, between: Tensor, across: Tensor) -> Tensor:
-    """The last pair and the block between, as one matrix."""
+    """The last pair and the block between them as one matrix."""
     (first, last), (of_first, of_last) = (pair.unflatten(0, (-1, 2)).unbind(1) for pair in (pivot, beside))
     own = between.unflatten(0, (-1, 2)).sum(1)
     rows = (first, across, of_first), (across.mT, last, of_last), (of_first.mT, of_last.mT, own)
@@ -97,5 +97,5 @@ def substitute(factor: Factor, b: Tensor) -> Tensor:
 
 
 def _transposed(block: Tensor) -> Tensor:
-    """`mT` of the input of a compiled region would be a second, aliased one."""
+    """The transpose, but not by `mT`, which would make a second, aliased input of an input of a compiled region."""
     return block.transpose(-2, -1)

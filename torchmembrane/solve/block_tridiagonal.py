@@ -1,8 +1,8 @@
 """Symmetric positive definite block-tridiagonal systems, batched: elimination from both ends inwards, two blocks at a time.
 
 Blocks come in the order of their elimination: the first, the last, the second, the last but one, and so on. They are eliminated
-in pairs, then the one or two in the middle, one after the other. Kept are inverse roots of the pivots: solving takes products
-alone.
+in pairs, then the one or two in the middle, one after the other. Inverse roots of the pivots are kept, so that solving takes
+only products.
 """
 
 import torch
@@ -21,13 +21,13 @@ def inwards(n: int) -> list[int]:
 
 
 def coupled(n: int) -> list[tuple[int, int]]:
-    """All but the last of `inwards(n)`, each with the block next to it further in."""
+    """All of `inwards(n)` except the last, each with the neighbouring block further in."""
     order = inwards(n)
     return [(order[k], order[min(k + 2, n - 1)]) for k in range(n - 1)]
 
 
 def parts(n: int) -> list[int]:
-    """How many blocks are eliminated at a time."""
+    """How many blocks each part of the elimination eliminates at once."""
     return [2] * ((n - 1) // 2) + [1] * (2 - n % 2)
 
 
@@ -53,7 +53,7 @@ def substitute(factor: Factor, b: Tensor) -> Tensor:
     roots, couplings = factor
     x = list(b.split(parts(b.shape[-3]), -3))
     for k, root in enumerate(roots):
-        x[k] = x[k] @ root.transpose(-2, -1)  # mT of an input would be a second, aliased one
+        x[k] = x[k] @ root.transpose(-2, -1)  # mT of an input would be a second, aliased input
         if k < len(couplings):
             subtract_further_in(x, k, x[k] @ couplings[k])
     for k in reversed(range(len(roots))):
@@ -64,7 +64,7 @@ def substitute(factor: Factor, b: Tensor) -> Tensor:
 
 
 def subtract_further_in(blocks: list[Tensor], k: int, change: Tensor) -> None:
-    """Subtract from the blocks that part `k` is coupled to what its elimination changes there."""
+    """Subtract the change that the elimination of part `k` makes from the blocks that it is coupled to."""
     if change.shape[-3] == blocks[k + 1].shape[-3]:
         blocks[k + 1] = blocks[k + 1] - change
     elif k + 2 < len(blocks):

@@ -46,8 +46,8 @@ class GridSystem(nn.Module):
         """What `substitute` needs.
 
         Args:
-            stencil: `[B, 13, N]`, the entries of `M` between every vertex and those at `UPPER` from it; what leads out of the
-                inner vertices, or to one that is not free, is passed over.
+            stencil: `[B, 13, N]`, the entries of `M` between every vertex and those at `UPPER` from it; entries for neighbours
+                outside the inner vertices, or for neighbours that are not free, are ignored.
         """
         scale = torch.where(self.free > 0, stencil[:, 0], 1.0).rsqrt()
         entries = torch.cat([stencil.flatten(1), torch.zeros_like(scale[:, :1]), torch.ones_like(scale[:, :1])], 1)
@@ -72,8 +72,8 @@ class GridSystem(nn.Module):
 
 
 def _scatter_index(size: tuple[int, int], free: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Where the entries of the blocks between `pairs [P, 2]` of grid row pairs are, `[P, s, s]`: in the stencil `[13, N]`, a
-    zero after it, a one after that."""
+    """Indices `[P, s, s]` of the entries of the blocks between `pairs [P, 2]` of grid row pairs: into the stencil `[13, N]`,
+    which is followed by a zero and a one."""
     N, s = len(free), 2 * size[1]
     number = np.full((5, 5), -1)
     for k, offset in enumerate(UPPER):

@@ -1,4 +1,4 @@
-"""Solutions of symmetric systems whose gradients take the solver, not its steps: `dx = A^-1 (db - dA x)`."""
+"""Solutions of symmetric systems, `dx = A^-1 (db - dA x)`, whose gradients do not differentiate the steps of the solver."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,8 +14,8 @@ Linear = Callable[[Tensor], Tensor]
 def differentiable(solve: Linear, apply: Linear, b: Tensor) -> Tensor:
     """`x = solve(b)` with the gradients of the exact solution of `A x = b`.
 
-    Those of `x` go through one more `solve`, `A` being symmetric, to the residual `b - A x`, and from there to `b` and to what
-    `A` is made of.
+    The gradient of `x` passes through one more `solve` (`A` is symmetric) to the residual `b - A x`, and from there to `b` and
+    to whatever `A` depends on.
 
     Args:
         solve: `A^-1`, itself without gradients.
@@ -23,7 +23,7 @@ def differentiable(solve: Linear, apply: Linear, b: Tensor) -> Tensor:
         b: `[..., N]`.
 
     Limitations:
-        Once: second derivatives raise a `MembraneError`, and forward-mode ones are not there. As exact as `solve` is.
+        First derivatives only: second ones raise a `MembraneError`, and there is no forward mode. They are as exact as `solve`.
 
     Example:
         >>> a, b = torch.tensor(2.0, requires_grad=True), torch.tensor([3.0])
@@ -40,7 +40,7 @@ def differentiable(solve: Linear, apply: Linear, b: Tensor) -> Tensor:
 
 
 class _Solution(torch.autograd.Function):
-    """`x`, its gradients those of `A^-1 residual`."""
+    """The identity on `x`, with the gradients of `A^-1 residual`."""
 
     generate_vmap_rule = True
 
@@ -62,7 +62,7 @@ class _Solution(torch.autograd.Function):
 
 
 class _Once(torch.autograd.Function):
-    """A gradient, and what it depends on: by that it has no derivatives."""
+    """The identity on a gradient that refuses to be differentiated again."""
 
     generate_vmap_rule = True
 

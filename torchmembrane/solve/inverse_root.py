@@ -1,7 +1,7 @@
 """Inverse roots of symmetric positive definite matrices, many at once: `R` with `R^T R = A^-1`.
 
-What is left of a system after an elimination, `C - B^T A^-1 B = C - (R B)^T R B`, then stays positive where `A^-1` itself would
-lose it to rounding: in float32 from conditions of some 1e5 on, as a contact on a nearly unstretched sheet has.
+The remainder of a system after an elimination, `C - B^T A^-1 B = C - (R B)^T R B`, then stays positive where rounding of `A^-1`
+itself would make it indefinite: in float32 from conditions of some 1e5 on, as a contact on a nearly unstretched sheet has.
 
 A matrix is split into 2 x 2 blocks down to `LEAF` rows, so that most of the work is matrix products; a leaf's root is by its
 Cholesky factor. Where a runtime has none (ONNX) it is split down to `ITERATED_LEAF` rows, whose roots are by products as well:
@@ -49,7 +49,7 @@ def inverse_root(matrix: Tensor) -> Tensor:
 
 
 def by_cholesky(matrix: Tensor) -> Tensor:
-    """The inverse of the Cholesky factor; where rounding has left a leaf without one, of that with a `RIDGE`."""
+    """The inverse of the Cholesky factor; if rounding has left a leaf without one, a `RIDGE` is added to its diagonal."""
     if matrix.shape[-1] > LEAF:
         return _by_parts(matrix, by_cholesky, LEAF)
     factor, info = torch.linalg.cholesky_ex(matrix)
@@ -62,7 +62,8 @@ def by_cholesky(matrix: Tensor) -> Tensor:
 
 @onnx_function
 def by_products(matrix: Tensor) -> Tensor:
-    """Too small in the directions of a leaf's eigenvalues below its largest over `LARGEST_CONDITION`."""
+    """`inverse_root` by matrix products; too small in the directions of eigenvalues below a leaf's largest over
+    `LARGEST_CONDITION`."""
     if matrix.shape[-1] > ITERATED_LEAF:
         return _by_parts(matrix, by_products, ITERATED_LEAF)
     condition = LARGEST_CONDITION[matrix.dtype]
@@ -108,7 +109,7 @@ class Steps(NamedTuple):
 
     @classmethod
     def to(cls, condition: float, rounding: float) -> "Steps":
-        """For matrices of a condition up to this, until the roots of eigenvalues are 1 but for rounding."""
+        """Steps for matrices with a condition number up to this, until the roots of all eigenvalues are 1 up to rounding."""
         steps = quintics(condition**-0.5, rounding)
         t = [1.0]
         for (_, _, c), (_, _, following) in zip(reversed(steps[:-1]), reversed(steps[1:]), strict=True):
@@ -120,7 +121,8 @@ class Steps(NamedTuple):
 
 
 def quintics(low: float, rounding: float) -> list[tuple[float, float, float]]:
-    """`a, b, c` of odd polynomials `a x + b x^3 + c x^5` that, composed, take all from `low` to 1 to 1 but for rounding."""
+    """`a, b, c` of odd polynomials `a x + b x^3 + c x^5` whose composition maps the interval from `low` to 1 to 1, up to
+    rounding."""
     found, high, error = [], 1.0, 1.0
     while error > rounding:
         a, b, c, error = _nearest_to_one(low, high)

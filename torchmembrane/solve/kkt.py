@@ -44,7 +44,7 @@ def constrained_minimum(
 
 
 class BorderedStep(NamedTuple):
-    """`step [..., N]` and what the second border's unknown rises by, `rise [...]`."""
+    """`step [..., N]`, and `rise [...]`, the increase of the second border's unknown."""
 
     step: Tensor
     rise: Tensor

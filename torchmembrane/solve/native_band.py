@@ -2,9 +2,9 @@
 
 Of `M = U^T U` the upper half is stored row by row, the entry at row `r`, column `c`, at `r ld + c - LANES floor(r / LANES)`: so
 columns of all rows are aligned alike. The rows of `U` are found `RANK` at a time; what they leave of the rows behind is worked
-out in vectors of `LANES` columns, `ROWS` rows at a time, and of the loads likewise. Left of the diagonal, and behind the last
-diagonal, lie numbers that mean nothing. LAPACK works on small blocks and takes loads one by one, which on bands of a few
-hundred is slower. `ROWS` divides `RANK`, and that `LANES`: rows that are worked out together lie at the same columns.
+out in vectors of `LANES` columns, `ROWS` rows at a time, and of the loads likewise. The numbers to the left of the diagonal and
+behind the last diagonal have no meaning. LAPACK works on small blocks and takes loads one by one, which is slower for bands of
+a few hundred. `ROWS` divides `RANK`, and that `LANES`: rows that are worked out together lie at the same columns.
 """
 
 from typing import Any

@@ -71,9 +71,9 @@ def apply_stencil(field: Tensor, kernels: Tensor, grid: tuple[int, int], border:
 
 
 def convolved(planes: Tensor, kernels: Tensor, padding: int = 0) -> Tensor:
-    """`F.conv2d`; where no gradient is recorded, of a few small planes on a processor by the kernel that begins at once:
-    oneDNN's, which it would take, works for 40 microseconds before. In exported models, which have no convolution in double
-    precision, that is a product.
+    """`F.conv2d`. For a few small planes on a processor without gradients, torch's native kernel is called, because oneDNN's,
+    the default, needs 40 microseconds before it starts. In exported models, which have no convolution in double precision, that
+    is a product.
 
     Args:
         planes: `[P, C, m, n]`.
@@ -125,7 +125,7 @@ def inner(field: Tensor, grid: tuple[int, int]) -> Tensor:
 
 
 def pad_border(field: Tensor, grid: tuple[int, int]) -> Tensor:
-    """A field of the inner vertices as one of all, zero on the border: the adjoint of `inner`.
+    """A field of the inner vertices extended to all vertices by zeros on the border: the adjoint of `inner`.
 
     Args:
         field: `[..., N, C]`.

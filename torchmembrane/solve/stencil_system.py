@@ -95,7 +95,7 @@ class StencilSystem(nn.Module):
 
     def factor(self, matrix: Matrix) -> Factor:
         """What `substitute` needs."""
-        way = self.band if band.takes(matrix.entries) else self.row_blocks
+        way = self.band if band.is_supported(matrix.entries) else self.row_blocks
         return Factor(way, way.factor(matrix.entries), matrix.scale)
 
     def substitute(self, factor: Factor, loads: Tensor) -> Tensor:

@@ -1,1 +1,1 @@
-"""The surface: shapes, the triangulated grid and who neighbours whom in it, its stencil, tangents, projection onto it."""
+"""The rest surface: shapes, the triangulated grid and its neighbourhoods, tangents, and projection onto the surface."""

@@ -1,6 +1,6 @@
-"""Fields of a grid's vertices at points between them, bicubic: of fourth order where triangles are of second.
+"""Bicubic interpolation of a grid's vertex fields: of fourth order, where linear triangles are of second order.
 
-The displacement of a pressed membrane turns within a few lines of the grid; a chord of it, as a triangle's, lies off by up to
+The displacement of a pressed membrane bends within a few lines of the grid; linear interpolation in a triangle is off by up to
 an eighth of its second difference.
 """
 
@@ -45,7 +45,7 @@ def bicubic_shares(points: SurfacePoints, grid: tuple[int, int], fixed: Tensor) 
 
 
 class Refinement(nn.Module):
-    """Fields of a grid's vertices on one with more lines, the border alike: cubic convolution.
+    """Refine fields of a grid to a grid with more lines and the same border, by cubic convolution.
 
     Args:
         grid: `m, n`.

@@ -1,4 +1,4 @@
-"""What a grid of vertices has to be to become a `Membrane`: finite, framed by a fixed rim, without folds, seen from inside."""
+"""Checks of a grid of vertices before it becomes a `Membrane`: finite, with a fixed rim, without folds, seen from inside."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,10 +59,10 @@ def checked_orientation(X: np.ndarray, triangles: np.ndarray, fixed: np.ndarray)
     Args:
         X: vertices `[V, 3]`.
         triangles: `[T, 3]`, their vertices.
-        fixed: `[V]` bool; triangles between fixed vertices alone are not looked at.
+        fixed: `[V]` bool; triangles whose vertices are all fixed are ignored.
 
     Returns:
-        +1 if the triangles already point away from the camera, -1 if all have to be turned.
+        +1 if the triangles already face away from the camera, -1 if all have to be flipped.
 
     Raises:
         MembraneError: the grid lies behind the camera, a triangle has no area, or the grid folds.

@@ -1,6 +1,6 @@
-"""Points and rays onto a triangulated surface: the closest material point, the first one that a ray meets.
+"""Projection onto a triangulated surface: the point closest to a given one, and the first point that a ray meets.
 
-Done once for a sensor, on the host, with numpy: exact on the linear triangles.
+It is done once for a sensor with numpy, and is exact on the linear triangles.
 """
 
 from typing import NamedTuple
@@ -47,7 +47,7 @@ def closest_points(X: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> 
         `SurfacePoints` with the distances.
 
     Limitations:
-        Looks among the `NEAREST` triangles by their middles: not for triangles of very different sizes.
+        Only the `NEAREST` triangles, by their centroids, are searched, so the triangles must be of similar size.
     """
     corners = X[triangles]
     near = np.asarray(cKDTree(corners.mean(1)).query(points, k=min(NEAREST, len(triangles)))[1])

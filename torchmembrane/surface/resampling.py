@@ -1,4 +1,4 @@
-"""A grid of vertices on other lines, equally spaced along the surface."""
+"""Resampling of a grid of vertices to other numbers of lines, equally spaced along the surface."""
 
 import numpy as np
 from scipy.interpolate import CubicSpline, RectBivariateSpline
@@ -12,8 +12,8 @@ FINE = 40  # samples between two lines, for arc lengths
 def resampled_grid(X: np.ndarray, fixed: np.ndarray, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """A grid's surface on another grid.
 
-    Bicubic in the grid's own coordinates, so that the rim stays where it is; the new lines are at equal steps of the mean
-    arc length: steep sides, where a file's grid is often coarse, get their share.
+    Bicubic in the grid's own coordinates, so that the rim stays where it is; the new lines are at equal steps of the mean arc
+    length, so that steep sides, where the grid of a file is often coarse, get enough of them.
 
     Args:
         X: vertices `[m, n, 3]`.
@@ -37,7 +37,7 @@ def resampled_grid(X: np.ndarray, fixed: np.ndarray, grid: tuple[int, int]) -> t
 
 
 def on_lines(X: np.ndarray, lines: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """A grid's values between its lines, bicubic in the numbers of these.
+    """A grid's values between its lines, by bicubic interpolation in the line numbers.
 
     Args:
         X: `[m, n, 3]`, 4 lines or more each way.

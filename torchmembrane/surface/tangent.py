@@ -1,8 +1,8 @@
 """Two unit vectors across a direction: the tangent frame of a normal, the two angles of a ray.
 
-Which two is free, as long as they are unit, orthogonal to the direction and to each other: any use of them must not depend on
-how they are turned about it. Two rules stand side by side, for torch and for numpy: calibrated surfaces and dots' outlines,
-sampled at points whose places follow the frame, stay what they were.
+Any two unit vectors that are orthogonal to the direction and to each other will do; no result may depend on their rotation
+about the direction. There is one rule for torch and another one for numpy. Both are kept, because the sampling points of
+calibrated surfaces and of dots' outlines follow these frames.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ ALONG_Z = 0.9  # directions with a larger |z| are crossed with the x axis, other
 
 
 def tangent_frame(directions: Tensor, dim: int = -1) -> Tensor:
-    """Two unit vectors across each unit direction, without a branch: exported models hold it.
+    """Two unit vectors across each unit direction, computed without a branch because exported models contain it.
 
     The first is `d x e / |d x e|` with the axis `e = z`, or `x` for directions close to `z`; the second `d x` the first.
 

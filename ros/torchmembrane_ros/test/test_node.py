@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from datetime import date, timedelta
 from functools import cache
@@ -16,16 +17,17 @@ import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Vector3Stamped, WrenchStamped
+from geometry_msgs.msg import TransformStamped, Vector3Stamped, WrenchStamped
 from PIL import Image as Picture
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.type_support import check_for_type_support
 from sensor_msgs.msg import CameraInfo, CompressedImage, FluidPressure, Image, PointCloud2
 from std_srvs.srv import Trigger
 from torchmembrane_ros.health import Health
-from torchmembrane_ros.node import FAILURE, SUCCESS, TrackerNode
+from torchmembrane_ros.node import FAILURE, SUCCESS, TrackerNode, main
 from torchmembrane_ros.outgoing import quaternion, transform_of
 from torchmembrane_ros.parameters import PARAMETERS
 
@@ -353,6 +355,59 @@ def test_the_transform_is_the_camera_s_pose_on_the_tool(sensor):
     ])  # fmt: skip
     np.testing.assert_allclose(turned, tool.rotation, atol=1e-9)
     assert np.linalg.norm(quaternion(np.eye(3))) == pytest.approx(1) and abs(quaternion(np.eye(3))[3]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_an_end_while_a_message_is_on_its_way_is_no_error(monkeypatch, ended):
+    """As rclpy has it: SIGTERM makes publishers invalid at once, also for a timer that is publishing."""
+
+    def spin(_):
+        raise RuntimeError("publisher's context is invalid")
+
+    nothing = lambda *_: None  # noqa: E731
+    stand_in = SimpleNamespace(init=nothing, spin=spin, try_shutdown=nothing, ok=lambda: not ended, executors=rclpy.executors)
+    monkeypatch.setattr("torchmembrane_ros.node.rclpy", stand_in)
+    given = SimpleNamespace(value=False)
+    node = SimpleNamespace(get_parameter=lambda _: given, stop=nothing, destroy_node=nothing)
+    monkeypatch.setattr("torchmembrane_ros.node.TrackerNode", lambda: node)
+    with nullcontext() if ended else pytest.raises(RuntimeError, match="context is invalid"):
+        main()
+
+
+class Sent(type(TransformStamped)):
+    """Of a stand-in for `tf2_msgs/TFMessage`, which PyPI has not: a message of its first transform."""
+
+    def __instancecheck__(cls, message):
+        return isinstance(message, TransformStamped)
+
+    def __call__(cls, transforms):
+        return transforms[0]
+
+
+class OneTransform(TransformStamped, metaclass=Sent):
+    pass
+
+
+def test_transforms_of_two_fingers_reach_a_listener_that_comes_later(system_of, sensor, monkeypatch):
+    check_for_type_support(TransformStamped)
+    messages = ModuleType("tf2_msgs.msg")
+    messages.TFMessage = OneTransform
+    monkeypatch.setitem(sys.modules, "tf2_msgs", ModuleType("tf2_msgs"))
+    monkeypatch.setitem(sys.modules, "tf2_msgs.msg", messages)
+    path = sensor.with_name("tool.toml")
+    path.write_text(sensor.read_text() + "\n[tool]\nrotation = [0, 90, 0]\ntranslation = [1.5, 0, 30]\n")
+    for finger in ("left", "right"):
+        system = system_of(path, finger, tool_frame=f"{finger}_flange", frame_id=f"{finger}_camera")
+        assert system.node.trigger_configure() == SUCCESS
+    kept = []
+    latched = QoSProfile(depth=10, reliability=RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    system.client.create_subscription(TransformStamped, "/tf_static", kept.append, latched)
+    system.until(lambda: len(kept) == 2)
+    assert {(each.header.frame_id, each.child_frame_id) for each in kept} == {
+        ("left_flange", "left_camera"),
+        ("right_flange", "right_camera"),
+    }
+    np.testing.assert_allclose(xyz(kept[0].transform.translation), [0.0015, 0, 0.03])
 
 
 def launched(name, monkeypatch, **arguments):

@@ -200,7 +200,11 @@ class TrackerNode(LifecycleNode):
         while not mailbox.ended and self.context.ok():
             picture = mailbox.take(WAIT)
             if picture is not None:
-                self.follow(picture.image)
+                try:
+                    self.follow(picture.image)
+                except Exception:
+                    if self.context.ok():  # else ROS was ended while a message was on its way
+                        raise
 
     def stop(self) -> None:
         """Let go of the images."""
@@ -234,6 +238,9 @@ def main() -> None:
         rclpy.spin(node)
     except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
         pass
+    except Exception:
+        if rclpy.ok():  # else ROS was ended while a message was on its way
+            raise
     finally:
         node.stop()
         node.destroy_node()

@@ -306,12 +306,14 @@ class ForceBalance(Estimator):
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: markers off their rays by noise and the model's error alone, neighbours not alike, hardly a pull or shear
-        that no push comes with, not pushed everywhere. How hard is no reason to doubt: a contact may have few markers."""
+        that no push comes with, of these two together not more than of one alone, not pushed everywhere. How hard is no reason
+        to doubt: a contact may have few markers."""
         settings, press = self.settings, self._press(found)
         misfit = (settings.largest_misfit + settings.misfit_of_press * press) * self.coarseness
         unexplained = (settings.largest_unexplained + settings.unexplained_of_press * press) * self.coarseness**2
-        doubtful = (found.pushed > settings.largest_pushed) | (found.unexplained > unexplained) | (found.misfit > misfit)
-        return torch.logical_not(doubtful | (found.shared_misfit > settings.largest_shared_misfit * self.coarseness))
+        shared = settings.largest_shared_misfit * self.coarseness
+        doubt = found.unexplained / unexplained + found.shared_misfit / shared
+        return torch.logical_not((found.pushed > settings.largest_pushed) | (doubt > 1) | (found.misfit > misfit))
 
     def _press(self, found: Equilibrium) -> Tensor:
         """Rms displacement over the size, `[B]`."""

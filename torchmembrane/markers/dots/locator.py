@@ -10,12 +10,12 @@ from ...control_flow import traced
 from ...errors import MembraneError
 from ..locator import LocatedMarkers
 from ..noise import pixel_noise
-from ..spacing import safe_length, spacing
+from ..spacing import partly_in_view, safe_length, spacing
 from .coherence import Coherence
 from .detect import BlobDetector
 from .ellipse import draw_dots, size_tolerance
 from .fit import EllipseFit
-from .match import DotMatcher
+from .match import KEPT, DotMatcher
 from .pattern import OUTLIER, DotPattern
 from .pyramid import mean_pyramid
 
@@ -24,11 +24,14 @@ DIGITS = 8.0  # float32 has 20 binary ones after the point beside it
 BLOB, SHARE, NOISE, CONFIDENCE = 1 / 8, 1 / 64, 2.0**-18, 1 / 256
 """Steps of the blobs' centres, px, of shares of one, of the noise, in grey, and of the confidence: nothing finer is known of
 what the fit starts from, and without rounding, which is each runtime's own, it starts alike in all."""
+REACH = 2.5  # pitches: how far a dot is looked for from where it is at rest
+UNSEEN = 7.0  # odds against a dot that is fitted where no blob is
 FEWEST = 0.2  # mean confidence of a frame that is half trusted
 
 
 def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tuple[int, int]) -> Tensor:
-    """`[1, 1, H, W]` 1 inside the rim and 2 pixels off it, else 0: the short triangles between dots and anchors.
+    """`[1, 1, H, W]` 1 where dots may be, 2 pixels off the rim, else 0: in the short triangles between dots and anchors, and in
+    those of a dot near dots.
 
     Raises:
         MembraneError: all of them lie outside the image.
@@ -42,7 +45,11 @@ def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tu
     longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max(1)
     pitch = np.append(spacing(pixels)[1], np.zeros(len(anchors)))[triangulation.simplices].max(1)
     kept = np.append(longest < 3 * pitch, False)
-    inside = kept[triangulation.find_simplex(np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1))]
+    place = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
+    triangle = triangulation.find_simplex(place)
+    distance, dot = cKDTree(pixels).query(place)
+    of_dot = np.append((triangulation.simplices < len(pixels)).any(1), False)
+    inside = kept[triangle] | (of_dot[triangle] & (distance < REACH * spacing(pixels)[1][dot]))
     inside = ndimage.binary_erosion(ndimage.binary_closing(inside, iterations=2), iterations=2)
     if not inside.any():
         raise MembraneError(
@@ -75,15 +82,15 @@ def rounded(value: Tensor, step: float) -> Tensor:
 class DotLocator(nn.Module):
     """Pixels of the pattern's dots in each frame of a batch, with a confidence.
 
-    Blobs at the pattern's scales, matched from where the dots were or else along the smooth flow inwards from the rim, then
-    a least-squares fit of a blurred ellipse on sloping background. A lost dot has confidence 0 and its predicted pixel.
+    Blobs at the pattern's scales, matched from where the dots were or else by a smooth flow on which neighbours agree, then a
+    least-squares fit of a blurred ellipse on sloping background. A lost dot has confidence 0 and its predicted pixel.
 
     Args:
         pattern: the markers in the rest image.
         image_size: width, height.
         polarity: "dark" or "light".
-        anchors: pixels `[A, 2]` of the rim, where nothing moves, closer together than the dots; without them the pattern's
-            own outline has to do.
+        anchors: pixels `[A, 2]` of the rim, closer together than the dots, beyond which no dot is looked for; default:
+            anywhere in the image.
 
     Attributes:
         follows: True; dots are followed from frame to frame.
@@ -93,12 +100,12 @@ class DotLocator(nn.Module):
 
     Limitations:
         The flow may change by at most about half a pitch from one dot to the next: wrong where the spacing is below about
-        half of that at rest, where the rotation or shear is more than about 25 degrees, or the flow more than two pitches.
-        Most such regions end in a seam and are lost with all that is near it; what is left is confidently a whole pitch
-        off, one-size patterns more often. Without anchors a pattern that moves as a whole by a pitch, two sizes by the
-        pitch of the large ones, looks as at rest: the two cannot be distinguished. A dot that is missing beside a blob of
-        its size may be taken for it. Where many dots are missing (20 %) and as many false ones stand among them, right
-        dots are lost as well.
+        half of that at rest, where the middle of the pattern turns by more than about 30 degrees against its outline, or where
+        a part of it moves by more than two and a half pitches. Most such regions end in a seam and are lost with all that is
+        near it; what is left is confidently a whole pitch off, one-size patterns more often. A lattice that moves as a whole by
+        one of its steps is told from one at rest by its outline: by dots that are lost, and found, there. A dot that is missing
+        beside a blob of its size may be taken for it. Where many dots are missing (20 %) and as many false ones stand among
+        them, right dots are lost as well.
 
     Example:
         >>> rest = 20.0 * np.stack(np.meshgrid([1, 2, 3, 4], [1, 2, 3]), -1).reshape(-1, 2)
@@ -134,7 +141,7 @@ class DotLocator(nn.Module):
         blobs, log_radius, strength = (x[0].numpy() for x in self.detect.double()(drawn))
         blobs, log_radius, strength = (x[strength > 1e-6] for x in (blobs, log_radius, strength))  # the rest fill up the count
         own = cKDTree(blobs).query(pixels)[1]
-        self.match = DotMatcher(pixels, log_radius[own], tolerance, anchors)
+        self.match = DotMatcher(pixels, log_radius[own], tolerance, partly_in_view(pixels, shapes, image_size))
         self.coherence = Coherence(pixels, log_radius[own], tolerance)
         self.register_buffer("strength", torch.as_tensor(strength[own]))
         self.register_buffer("rest", torch.as_tensor(pixels))
@@ -197,6 +204,8 @@ class DotLocator(nn.Module):
         deviation = safe_length(seen - predicted, -1) / self.match.nearest
         confidence = quality * torch.sigmoid(20 * (OUTLIER - deviation))
         confidence = confidence * self.coherence(seen, confidence, strain, predicted, blobs, log_radius, valid)
+        odds = 1 + (UNSEEN - 1) * (certainty < KEPT).to(confidence.dtype)
+        confidence = confidence / (confidence + (1 - confidence) * odds)
         confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST))
         confidence = self._alike(confidence, CONFIDENCE)
         return LocatedMarkers(torch.where(confidence[..., None] > 0.05, pixels, predicted), confidence, covariance)

@@ -1,4 +1,4 @@
-"""Matching: which blob of the frame is which dot, grown inwards from the rim along the smooth flow."""
+"""Matching: which blob of the frame is which dot, by a flow that is smooth."""
 
 from collections.abc import Sequence
 
@@ -8,12 +8,15 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...control_flow import cond, fori_loop, traced, where_rows
-from ..spacing import spacing, thin_out
+from ..spacing import spacing
+from .agreement import NeighbourAgreement
+from .alignment import Alignment
 from .deformation import FAR, LocalDeformation
 from .flow import SUPPORT, FlowAverages
 from .steps import NeighbourSteps, trust
 
-SETTLING = 6  # steps after the growth has reached every dot
+ROUNDS = 2  # in which neighbours agree
+SETTLING = 3  # steps after that
 DOUBTS, RESETTLING = 2, 3  # how often the dots that strayed are let go, and the steps in which all settle after it
 FOLLOWING = 1  # steps after dots are followed from where they were
 KEPT = 0.3  # certainty of a dot that could be followed
@@ -24,29 +27,21 @@ State = tuple[Tensor, Tensor, Tensor]
 """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""
 
 
-def sectors(pixels: np.ndarray) -> np.ndarray:
-    """`[7, D]` 0 or 1: the pattern cut into its middle and six outer parts."""
-    around = pixels - pixels.mean(0)
-    radius, angle = np.hypot(*around.T), np.arctan2(*around.T)
-    part = np.where(radius < np.quantile(radius, 1 / 7), 6, ((angle / (2 * np.pi) + 0.5) * 6).astype(int) % 6)
-    return (part == np.arange(7)[:, None]).astype(float)
-
-
 class DotMatcher(nn.Module):
     """Assigns blobs of a frame to the dots of the rest image.
 
-    The flow is smooth and, where `anchors` are given, zero at them. Dots are followed from where they were, or else, where
-    one cannot be, searched for from the anchors on: each of a fixed number of steps predicts every dot from the sure nodes
-    around it and the local deformation, takes the blob nearest to the prediction and of its size, and keeps it where the
-    choice is mutual. Without anchors each part of the pattern in turn is assumed to have moved least, and the start that
-    matches most is kept. Where some are lost, those that took another's blob are let go, and may find their own. What is
-    returned follows from which blob is which dot's alone, not from how that was found.
+    Nothing is known of the flow but that it is smooth. Dots are followed from where they were, or else, where one cannot be,
+    searched for: the pattern is laid on the blobs as a whole (`Alignment`), then neighbours agree on their blobs
+    (`NeighbourAgreement`), a second time from where the first time says. A few steps then predict every dot from the sure
+    ones around it and the local deformation, take the blob nearest to the prediction and of its size, and keep it where the
+    choice is mutual. Where some are lost, those that took another's blob are let go, and may find their own. What is returned
+    follows from which blob is which dot's alone, not from how that was found.
 
     Args:
         pixels: centres `[D, 2]` of the dots at rest, px.
         log_radius: `[D]`, as the blob detector finds it at rest.
         size_tolerance: standard deviation of a dot's log radius.
-        anchors: `[A, 2]` pixels of the rim, where nothing moves, or None.
+        seen: `[D]` bool, which of them are in the image at rest.
 
     Limitations:
         See `DotLocator`.
@@ -59,17 +54,18 @@ class DotMatcher(nn.Module):
     stiffness: Tensor
     slope: Tensor
     log_radius: Tensor
-    starts: Tensor
+    seen: Tensor
 
-    def __init__(self, pixels: np.ndarray, log_radius: np.ndarray, size_tolerance: float, anchors: np.ndarray | None = None):
+    def __init__(self, pixels: np.ndarray, log_radius: np.ndarray, size_tolerance: float, seen: np.ndarray):
         super().__init__()
         self.size_tolerance = size_tolerance
-        nearest, mean = spacing(pixels)
-        anchors = np.empty((0, 2)) if anchors is None else thin_out(np.asarray(anchors, float), 0.7 * np.median(mean))
-        nodes = np.concatenate([pixels, anchors])
+        nearest, _ = spacing(pixels)
+        self.alignment = Alignment(pixels - pixels.mean(0), seen)
+        self.agreement = NeighbourAgreement(pixels, seen)
         self.deformation = LocalDeformation(pixels)
-        self.averages = FlowAverages(pixels, nodes, WIDTH)
+        self.averages = FlowAverages(pixels, pixels, WIDTH)
         self.neighbour_steps = NeighbourSteps(pixels)
+        self.register_buffer("seen", torch.as_tensor(seen))
         self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
         self.register_buffer("pixels", torch.as_tensor(pixels - pixels.mean(0)))
         self.register_buffer("square", self.pixels.square().sum(-1))
@@ -77,9 +73,6 @@ class DotMatcher(nn.Module):
         self.register_buffer("stiffness", torch.as_tensor((TOLERANCE * nearest) ** -2.0))
         self.register_buffer("slope", -2 * self.stiffness)
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
-        starts = np.zeros((1, len(pixels))) if len(anchors) else sectors(pixels)
-        self.register_buffer("starts", torch.as_tensor(starts))
-        self.steps = self.averages.rings(np.column_stack([starts, np.ones((len(starts), len(anchors)))])) + 3
 
     def nearest_dots(self, blobs: Tensor) -> Tensor:
         """Which dot at rest is nearest to each of `blobs [B, K, 2]`, `[B, K]`."""
@@ -140,7 +133,7 @@ class DotMatcher(nn.Module):
         *followed, kept = self.follow(*unstrained, previous)
 
         def searched() -> Sequence[Tensor]:
-            return self.either(kept, *followed, *self.search(blobs, log_radius, valid))
+            return self.better(kept, *followed, *self.search(blobs, log_radius, valid, previous))
 
         weight, flow, strain = cond(kept, followed, searched)
         weight, flow, strain, complete = self.sure(weight, flow, strain, *unstrained)
@@ -152,22 +145,59 @@ class DotMatcher(nn.Module):
 
         return self.end(*cond(complete, (weight, flow, strain), doubted))
 
-    def search(self, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> State:
+    def search(self, blobs: Tensor, log_radius: Tensor, valid: Tensor, previous: Tensor | None = None) -> State:
         """Weight `[B, D]`, flow `[B, 2, D]` and strain `[B, 2, 2, D]` of the dots."""
-        known, base, *start = self.begin(*self.scene(self.deformation(blobs, valid), blobs, log_radius, valid))
-        grown = fori_loop(self.grow, self.steps, start, known, base)
-        return self.best(*fori_loop(self.settle, SETTLING, grown, known, base))
+        deformation = self.deformation(blobs, valid)
+        known, base = self.scene(deformation, blobs, log_radius, valid)
+        place, blobs, misfit = self.begin(blobs, log_radius, valid, previous)
+        place = self.alignment(place, blobs, misfit, deformation, valid)
+        for _ in range(ROUNDS):
+            place, support = self.expected(place, *self.agreement(place, blobs, misfit))
+        weight, flow, strain = fori_loop(self.settle, SETTLING, self.chosen(place, support, known, base), known, base)
+        return weight, flow, strain
+
+    @traced
+    def begin(
+        self, blobs: Tensor, log_radius: Tensor, valid: Tensor, previous: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Where the dots were `[B, D, 2]` and the blobs `[B, K, 2]`, px about the pattern's mean at rest, and the misfit of the
+        blobs' sizes `[B, D, K]`; without gradients."""
+        flow, found = self.flow_before(previous)
+        place, _ = self.expected(self.pixels.expand_as(flow), self.pixels + flow, found.to(flow.dtype))
+        misfit = self.misfit(log_radius, valid).detach()
+        place = torch.where(found[..., None], self.pixels + flow, place)
+        return place.expand(len(blobs), -1, -1), (blobs - self.origin).detach(), misfit
+
+    @traced
+    def expected(self, place: Tensor, blob: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the dots are expected `[B, D, 2]` by those around them that are `found [B, D]` on their `blob [B, D, 2]`, from
+        how far these are off the `place [B, D, 2]` where they were expected before; and how many these are `[B, D]`."""
+        flow = (found[..., None] * (blob - place)).mT
+        gradient = self.averages.gradient(found, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1))
+        away, support = self.averages.along(found, flow, gradient)
+        return torch.where((support > SUPPORT)[..., None], place + away.mT, place), support
+
+    @traced
+    def chosen(self, place: Tensor, support: Tensor, known: Tensor, base: Tensor) -> State:
+        """The blobs nearest to the `place [B, D, 2]` where dots are expected."""
+        return self.choose((place - self.pixels).mT, support, known, base)
+
+    def flow_before(self, previous: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Flow `[B, D, 2]` of the dots in the frames before, and which were found `[B, D]`; without these or where half were
+        lost, none, and those seen at rest."""
+        found, flow = self.seen[None], torch.zeros_like(self.pixels[None])
+        if previous is None:
+            return flow, found
+        finite = previous.isfinite().all(-1)
+        enough = finite.to(flow.dtype).mean(-1, keepdim=True) > 0.5
+        flow = torch.where((finite & enough)[..., None], previous - self.pixels - self.origin, flow)
+        return flow, (finite & enough) | (found & ~enough)  # onnxruntime chooses between numbers only
 
     @traced
     def follow(self, known: Tensor, base: Tensor, previous: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As `search`, from the frames before, in the scene that is `unstrained`; and in which frames `[B]` all dots that were
         found could be followed."""
-        found, flow = torch.ones_like(self.nearest[None]) > 0, torch.zeros_like(self.pixels[None])
-        if previous is not None:
-            finite = previous.isfinite().all(-1)
-            enough = finite.to(base.dtype).mean(-1, keepdim=True) > 0.5
-            flow = torch.where((finite & enough)[..., None], previous - self.pixels - self.origin, flow)
-            found = finite | ~enough
+        flow, found = self.flow_before(previous)
         weight, flow = found.to(base.dtype), flow.mT
         state = self.grow(weight, flow, torch.zeros_like(flow[:, None]).expand(-1, 2, -1, -1), known, base)
         for _ in range(FOLLOWING):
@@ -181,7 +211,7 @@ class DotMatcher(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What the dots that are found say, the same to the last digit whether they were followed or searched for; and in which
         frames `[B]` all are found, so that none can be on another's blob."""
-        complete = (weight >= KEPT).all(-1)
+        complete = ((weight >= KEPT) | ~self.seen).all(-1)
         weight, flow, strain = self.from_sure(weight, flow, strain, known, base)
         return weight, flow, self.averages.gradient(weight, flow, strain), complete
 
@@ -204,23 +234,21 @@ class DotMatcher(nn.Module):
         return weight, flow, strain
 
     @traced
+    def better(self, kept: Tensor, weight: Tensor, flow: Tensor, strain: Tensor, *others: Tensor) -> State:
+        """These dots in the frames `kept [B]` and where the others are not more or surer, the others elsewhere."""
+        return self.either(kept | (weight.sum(-1) >= others[0].sum(-1)), weight, flow, strain, *others)
+
+    @traced
     def scene(self, deformation: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """What `choose` needs to know of the blobs: `[B, 7, K]`, `[B, D, K]`."""
         strain = deformation - torch.eye(2, dtype=blobs.dtype, device=blobs.device)[..., None]
         position = (blobs - self.origin).mT
         known = torch.cat([torch.ones_like(position[:, :1]), position, strain.flatten(1, 2)], 1)
-        misfit = ((self.log_radius[:, None] - (log_radius + 3 * (1 - valid))[:, None]) / self.size_tolerance).square()
-        return known, misfit + self.stiffness[:, None] * position.square().sum(1, keepdim=True)
+        return known, self.misfit(log_radius, valid) + self.stiffness[:, None] * position.square().sum(1, keepdim=True)
 
-    @traced
-    def begin(self, known: Tensor, base: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The scene of every start; weight, flow and strain of the dots before the first step."""
-        starts = self.starts.shape[0]
-        if starts > 1:
-            known, base = (x[:, None].expand(-1, starts, -1, -1).flatten(0, 1) for x in (known, base))
-        flow = torch.zeros_like(self.pixels.mT).expand(known.shape[0], -1, -1)
-        weight, flow, strain = self.choose(flow, FAR + flow[:, 0], known, base)
-        return known, base, (weight.unflatten(0, (-1, starts)) * self.starts).flatten(0, 1), flow, strain
+    def misfit(self, log_radius: Tensor, valid: Tensor) -> Tensor:
+        """How ill the blobs' sizes fit the dots, squared standard deviations `[B, D, K]`; what is no dot fits none."""
+        return ((self.log_radius[:, None] - (log_radius + 3 * (1 - valid))[:, None]) / self.size_tolerance).square()
 
     @traced
     def grow(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
@@ -240,20 +268,6 @@ class DotMatcher(nn.Module):
         for _ in range(RESETTLING):
             state = self.settle(*state, known, base)
         return state
-
-    @traced
-    def best(self, weight: Tensor, flow: Tensor, strain: Tensor) -> State:
-        """The best start's."""
-        starts = self.starts.shape[0]
-        if starts == 1:
-            return weight, flow, strain
-        weight, flow, strain = (x.unflatten(0, (-1, starts)) for x in (weight, flow, strain))
-        best = weight.sum(-1).argmax(-1)[:, None]
-
-        def of_best(x: Tensor) -> Tensor:
-            return torch.take_along_dim(x, best.reshape(-1, *(1,) * (x.ndim - 1)), 1).squeeze(1)
-
-        return of_best(weight), of_best(flow), of_best(strain)
 
     @traced
     def end(self, weight: Tensor, flow: Tensor, strain: Tensor) -> tuple[Tensor, Tensor, Tensor]:

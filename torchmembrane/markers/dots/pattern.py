@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ...files.levels import telling_bits
-from ..spacing import neighbours
+from ..spacing import neighbours, partly_in_view
 from .blobs import check_count, find_blobs
 from .ellipse import log_radii, rms_half_axes, size_tolerance
 from .fit import EllipseFit
@@ -152,7 +152,7 @@ def measure_dots(image: np.ndarray, pixels: np.ndarray, shapes: np.ndarray, size
     expected = unit + np.array([radius[size] for size in sizes])
     scaled = shapes * np.exp(expected - unit)[:, None, None]
     tolerance = size_tolerance(scaled, sizes)
-    match = DotMatcher(pixels, expected, tolerance)
+    match = DotMatcher(pixels, expected, tolerance, partly_in_view(pixels, scaled, dark.shape[::-1]))
     blob_radius = torch.as_tensor(log_radius)[None]
     position, certainty, strain = match(torch.as_tensor(found)[None], blob_radius, torch.ones_like(blob_radius))
     centre, growth, quality = refine(dark, position[0].numpy(), scaled, tolerance)

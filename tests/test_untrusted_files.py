@@ -1,4 +1,4 @@
-"""Results, summaries and readings that others wrote or damaged: one line that names the file, or done again."""
+"""Untrusted results, summaries and readings are refused in one line or made anew."""
 
 import os
 import subprocess

@@ -1,0 +1,99 @@
+"""Tables in the documents: between markers, from the records in docs/measured, with revision, date and processor.
+
+A page holds `<!-- measured: NAME -->`, a table, a line that says where it comes from, and `<!-- end of NAME -->`.
+"""
+
+import json
+import re
+import subprocess
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+RECORDS = ROOT / "docs" / "measured"
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"(<!-- measured: ([\w-]+) -->\n)(.*?)(\n<!-- end of \2 -->)", re.S)
+SOURCE = re.compile(r"^\*(?:Measured|Published) at revision (\w+), ", re.M)
+AGED = "\n\n*This table is old: {} later commits have changed what it measures.*"
+
+
+def record(part: str) -> dict | None:
+    """What was measured for a part, or None."""
+    path = RECORDS / f"{part}.json"
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def markdown(rows: list[list[str]]) -> str:
+    """A table, whose first row is its head.
+
+    >>> print(markdown([["", "ms"], ["one", "22"]]))
+    | | ms |
+    |---|---|
+    | one | 22 |
+    """
+    lines = ["|" + "|".join(f" {cell} " if cell else " " for cell in row) + "|" for row in rows]
+    return "\n".join([lines[0], "|---" * len(rows[0]) + "|", *lines[1:]])
+
+
+def source(found: dict) -> str:
+    """One sentence: revision, date, processor and command of a record, of times the load as well."""
+    how, where = ("Measured at", found["processor"]) if found["seconds"] else ("Published at", "processor not recorded")
+    if found["load"] and " bench.speed." in found["command"]:
+        where += f", {found['cores']} cores under a load of {found['load']:.1f}"
+    return f"*{how} revision {found['revision']}, {found['date']}, {where}: `{found['command']}`*"
+
+
+def block(parts: tuple[str, ...], make: Callable[..., list[list[str]]]) -> str:
+    """What stands between the markers of a table."""
+    found = [record(part) for part in parts]
+    rows = make(*(each["results"] for each in found))
+    return "\n" + markdown(rows) + "\n\n" + "\n".join(source(each) for each in found) + "\n"
+
+
+def blocks(page: str) -> dict[str, str]:
+    """What stands in a page between the markers of every table.
+
+    >>> blocks("<!-- measured: a -->\\n| 1 |\\n<!-- end of a -->")
+    {'a': '| 1 |'}
+    """
+    return {match[2]: match[3] for match in BLOCK.finditer(page)}
+
+
+def filled(page: str, made: dict[str, str]) -> str:
+    """A page with its tables made anew.
+
+    >>> filled("<!-- measured: a -->\\n| 1 |\\n<!-- end of a -->", {"a": "| 2 |"})
+    '<!-- measured: a -->\\n| 2 |\\n<!-- end of a -->'
+    """
+    return BLOCK.sub(lambda match: match[1] + made[match[2]] + match[4], page)
+
+
+def aged(page: str, paths_of: dict[str, tuple[str, ...]]) -> str:
+    """A page that says under every table whether what it measures has changed since.
+
+    Args:
+        page: Markdown.
+        paths_of: of every table the paths that its figures depend on.
+    """
+
+    def noted(match: re.Match[str]) -> str:
+        revisions = SOURCE.findall(match[3])
+        changes = {change for revision in revisions for change in changes_since(revision, paths_of[match[2]])}
+        return match[0] + (AGED.format(len(changes)) if changes else "")
+
+    return BLOCK.sub(noted, page)
+
+
+@cache
+def changes_since(revision: str, paths: tuple[str, ...]) -> list[str]:
+    """Commits after a revision that changed any of the paths; none where git does not know the revision."""
+    command = ["git", "log", "--format=%h", "--no-merges", f"{revision}..HEAD", "--", *paths]
+    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    return found.stdout.split() if found.returncode == 0 else []
+
+
+def uncommitted(paths: tuple[str, ...]) -> list[str]:
+    """Files below the paths that differ from the last commit."""
+    command = ["git", "status", "--porcelain", "--", *paths]
+    return [line[3:] for line in subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout.splitlines()]

@@ -1,0 +1,133 @@
+"""Tables of time and size: rows of cells, the first of which is the head, from the results of parts."""
+
+from bench.measure.accuracy_tables import Rows, default_accuracy
+
+TRACKED = "tracked, from the frame before"
+
+
+def readme(independent: dict, frame: dict) -> Rows:
+    head, surface, contact, force, _ = default_accuracy(independent)
+    rows = frame["rows"]
+    times = " / ".join(f"{rows[name]['median']:.0f}" for name in ("one image", "in batches of 16", TRACKED))
+    return [
+        head,
+        ["shape, relative to the displacement", *surface[1:]],
+        contact,
+        force,
+        ["processor time of one image / in batches / tracked", f"{times} ms", ""],
+    ]
+
+
+def frame_times(frame: dict, models: dict) -> Rows:
+    rows = frame["rows"]
+    exported = {row["kind"]: row["median"] for row in models["rows"] if row["grid"] == 33}
+    alone, tracking = exported["force balance"], exported["the same, tracking"]
+    return [
+        ["", "processor time"],
+        ["one image", f"{rows['one image']['median']:.0f} ms"],
+        ["in batches of 16, each", f"{rows['in batches of 16']['median']:.0f} ms"],
+        ["tracked: its dots followed from the frame before", f"{rows[TRACKED]['median']:.0f} ms"],
+        ["[exported](export.md), in onnxruntime / also tracked", f"{alone:.0f} / {tracking:.0f} ms"],
+    ]
+
+
+def frame_units(frame: dict) -> Rows:
+    """Time in the unit of work that other machines can do."""
+    rows = frame["rows"]
+    names = {
+        "one image": "one image",
+        "in batches of 16": "a frame in batches of 16",
+        TRACKED: "a tracked frame",
+        "markers alone": "the markers alone",
+        "markers alone, followed": "the markers alone, followed",
+    }
+    return [
+        ["", "ms", "times the unit"],
+        ["the unit: 0.45 GFLOP as products of 186 x 186 matrices", f"{rows['unit']['median']:.2g}", "1"],
+        *([text, f"{rows[name]['median']:.2g}", f"{rows[name]['units']:.1f}"] for name, text in names.items()),
+    ]
+
+
+def times(row: dict) -> str:
+    """Median and least.
+
+    >>> times(dict(median=46.1, least=9.66))
+    '46 (9.7)'
+    """
+    return f"{row['median']:.2g} ({row['least']:.2g})"
+
+
+def exported_models(models: dict) -> Rows:
+    return [
+        ["", "grid", "MB", "export, s", "time per frame, ms: median (least)"],
+        *(
+            [
+                row["kind"],
+                f"{row['grid']} x {row['grid']}",
+                f"{row['megabytes']:.1f}",
+                f"{row['export_seconds']:.0f}",
+                times(row),
+            ]
+            for row in models["rows"]
+        ),
+    ]
+
+
+def training(found: dict) -> Rows:
+    names = {"images": "images", "markers": "markers' pixels (`from_pixels`)"}
+    return [
+        ["input", "forward without gradients", "training step", "ratio"],
+        *(
+            [names[row["of"]], f"{row['forward']:.2f} s", f"{row['step']:.2f} s", f"{row['ratio']:.1f}"]
+            for row in found["rows"]
+        ),
+    ]
+
+
+def solve_by_batch(energy: dict, balance: dict) -> Rows:
+    """Markers and flow, and the solves of minimum energy, 33 x 33, and of force balance, 17 x 17."""
+    chosen = [row for row in energy["rows"] if row["estimator"] == "the sensor's material" and "solve_alone" not in row]
+    solve, names = balance_times(balance), ("markers", "flow", "solve")
+    return [
+        ["", "markers", "flow", "minimum energy, 33 x 33", "force balance, 17 x 17"],
+        *(
+            [
+                f"batch {row['batch']}",
+                *(f"{row['milliseconds_a_frame'][name][0]:.2g}" for name in names),
+                f"{solve['batch {batch}, cold'.format(**row)]:.2g}",
+            ]
+            for row in chosen
+        ),
+    ]
+
+
+def balance_times(found: dict) -> dict[str, float]:
+    return {row["what"]: row["milliseconds_a_frame"] for row in found["rows"] if row["estimator"] == "force balance"}
+
+
+def balance_against_scipy(found: dict) -> Rows:
+    each = balance_times(found)
+    twin = each.pop("scipy twin, cold")
+    return [
+        ["", "ms", "of the twin"],
+        ["scipy twin", f"{twin:.0f}", "1"],
+        *([name.removesuffix(", cold"), f"{value:.2g}", f"{value / twin:.2f}"] for name, value in each.items()),
+    ]
+
+
+def paper_stages(found: dict) -> Rows:
+    each = {row["what"]: row["milliseconds_a_frame"] for row in found["rows"] if row["estimator"] == "the paper"}
+    names = {
+        "dots": "dots (`--locator soft`)",
+        "flow and rays (eq. 2)": "flow and rays (eq. 2)",
+        "first contacts (eq. 29)": "first contacts (eq. 29)",
+        "Q, Q^T Q, smoother, volume (eqs. 18, 21, 28)": "Q, `Q^T Q`, smoother, volume (eqs. 18, 21, 28), per round",
+        "factor": "factorisation, per round",
+        "two solves (eqs. 25-27)": "two solves (eqs. 25-27), per round",
+        "the solve, all of these three": "these three together",
+        "scipy twin of the solve": "the same in scipy (`bench/speed/paper_twin.py`): sparse assembly, `splu`",
+        "contacts of the surface": "contacts of the surface, per round",
+        "the whole loop": "the whole loop of two rounds",
+        "image to result": "image to result",
+    }
+    return [["stage", "ms"], *([text, f"{each[name]:.2g}"] for name, text in names.items())]

@@ -1,0 +1,119 @@
+"""Measured tables in the documents are those that their records give."""
+
+import json
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from bench.measure import measure, pages
+from bench.measure.parts import PARTS, Part, words
+from bench.measure.tables import FIGURES, TABLES
+
+IDENTITY = ("-c", "user.name=A", "-c", "user.email=a@b.c")
+IN_PAGES = {(page.name, name): text for page in pages.PAGES for name, text in pages.blocks(page.read_text()).items()}
+
+
+@pytest.mark.parametrize("page, name", IN_PAGES)
+def test_a_table_in_a_page_is_the_one_of_its_record(page, name):
+    assert IN_PAGES[page, name] == pages.block(*TABLES[name])
+
+
+def test_every_table_and_record_is_in_a_page():
+    assert {name for _, name in IN_PAGES} == set(TABLES)
+    used = {part for parts, _ in TABLES.values() for part in parts}
+    assert {path.stem for path in pages.RECORDS.glob("*.json")} == used and used <= set(PARTS)
+    assert {part for part, _ in FIGURES.values()} <= used
+
+
+def test_a_marker_that_does_not_end_is_noticed():
+    for page in pages.PAGES:
+        text = page.read_text()
+        assert len(re.findall("<!-- measured: ", text)) == len(re.findall("<!-- end of ", text)) == len(pages.blocks(text))
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_what_a_part_measures_exists(name):
+    part = PARTS[name]
+    assert not [path for path in part.paths if not (pages.ROOT / path).exists()]
+    assert (part.data is None) == (words(part.command, "out") == part.command.split())
+
+
+@pytest.mark.parametrize("path", sorted(pages.RECORDS.glob("*.json")), ids=lambda path: path.stem)
+def test_a_record_says_where_it_comes_from(path):
+    found = json.loads(path.read_text())
+    assert re.fullmatch("[0-9a-f]{7}", found["revision"]) and re.fullmatch(r"2\d{3}-\d\d-\d\d", found["date"])
+    assert found["command"].startswith("python -m bench.") and (found["seconds"] is None or found["processor"])
+
+
+def test_numbers_of_another_record_change_the_table(monkeypatch):
+    """What is written by hand into a page does not survive, and is noticed."""
+    page = "<!-- measured: training -->\nby hand\n<!-- end of training -->\n"
+    made = pages.block(*TABLES["training"])
+    assert pages.blocks(pages.filled(page, {"training": made})) == {"training": made} != {"training": "by hand"}
+    faster = pages.record("training")
+    faster["results"]["rows"][0]["ratio"] = 77.7
+    monkeypatch.setattr(pages, "record", lambda part: faster)
+    assert "77.7" in pages.block(*TABLES["training"]) and "77.7" not in made
+
+
+@pytest.fixture
+def commit(tmp_path, monkeypatch):
+    """Commits a change of one file to a repository of its own; gives the revision."""
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", *IDENTITY, *words], cwd=tmp_path, check=True, capture_output=True, text=True
+        ).stdout.strip()
+
+    def change(name: str) -> str:
+        with (tmp_path / name).open("a") as file:
+            file.write("# changed\n")
+        git("add", name)
+        git("commit", "--quiet", "--message", name)
+        return git("rev-parse", "--short", "HEAD")
+
+    git("init", "--quiet")
+    return change
+
+
+def test_a_table_says_that_it_is_old_once_its_paths_change(commit, tmp_path):
+    measured = commit("measured.py")
+    page = f"<!-- measured: a -->\n| 1 |\n\n*Measured at revision {measured}, 2026-11-27, A: `b`*\n<!-- end of a -->"
+    commit("other.py")
+    for path, said in (("other.py", "1 later commits"), ("measured.py", None)):
+        aged = pages.aged(page, {"a": (path,)})
+        assert aged.startswith(page) and (said in aged if said else aged == page)
+    (tmp_path / "measured.py").write_text("not committed")
+    assert pages.uncommitted(("measured.py", "other.py")) == ["measured.py"]
+    assert pages.changes_since("0000000", ("measured.py",)) == []
+
+
+MADE = """
+import json, sys
+machine = dict(processor="A", torch="2.13")
+json.dump(dict(machine=machine, rows=[dict(ms=1.2345678, each=[1, 2])]), open(sys.argv[sys.argv.index("--json") + 1], "w"))
+"""
+
+
+def test_a_part_leaves_a_record_of_what_was_measured_where_and_when(commit, tmp_path, monkeypatch):
+    for name, value in dict(ROOT=tmp_path, RECORDS=tmp_path / "records", OUT=Path("out")).items():
+        monkeypatch.setattr(measure, name, value)
+    monkeypatch.setattr(pages, "RECORDS", tmp_path / "records")
+    monkeypatch.setattr(measure, "PARTS", {"made": Part("made --turns 5", ())})
+    (tmp_path / "made.py").write_text(MADE)
+    with pytest.raises(SystemExit, match=r"commit made\.py first"):
+        measure.measure("made", None)
+    assert measure.is_due("made") and measure.state("made") == "never measured"
+    revision = commit("made.py")
+    (tmp_path / "out").mkdir()
+    measure.measure("made", None)
+    found = pages.record("made")
+    assert found["command"] == "python -m made --turns 5" and found["revision"] == revision and found["processor"] == "A"
+    assert found["results"] == {"rows": [{"ms": 1.2346, "each": [1, 2]}]}
+    assert not measure.is_due("made") and measure.state("made").endswith("; current")
+    later = commit("made.py")
+    pages.changes_since.cache_clear()
+    assert later != revision and measure.is_due("made") and "old: 1 commits" in measure.state("made")

@@ -1,0 +1,125 @@
+"""Which blob is which dot, so that neighbours agree on where they went: belief propagation on the pattern's triangles."""
+
+import numpy as np
+import torch
+from scipy.spatial import Delaunay
+from torch import Tensor, nn
+
+from ...control_flow import fori_loop, traced
+from ..spacing import spacing, square_distance
+
+CANDIDATES = 24  # blobs among which a dot chooses
+REACH = 2.5  # pitches, of a candidate from where the dot is expected
+PULL = 2.0  # pitches: standard deviation of a dot from where it is expected; wide, it only decides between equals
+STRETCH = 0.3  # standard deviation of a step to a neighbour from the one expected, over its length
+DOUBT = 5.0  # what a dot costs that is lost, and a step that is wrong at most, as half the square of standard deviations
+SIZE = 4.5  # what a wrong size costs at most
+EXCHANGES = 20
+DAMPING = 0.3  # of the messages
+LONGEST = 2.5  # pitches, of an edge between neighbours
+FAR = 1e3
+
+
+def edges(pixels: np.ndarray) -> np.ndarray:
+    """Pairs `[E, 2]` of the neighbours among `pixels [D, 2]`: the edges of the Delaunay triangles, without the long ones."""
+    corners = Delaunay(pixels, qhull_options="QJ Pp").simplices  # joggled: dots may be in one row
+    pairs = np.unique(np.sort(corners[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), 1), axis=0)
+    length, pitch = np.linalg.norm(np.diff(pixels[pairs], axis=1)[:, 0], axis=1), spacing(pixels)[1]
+    return np.asarray(pairs[length < LONGEST * pitch[pairs].max(1)])
+
+
+class NeighbourAgreement(nn.Module):
+    """Assigns blobs to the dots of a pattern so that the steps between neighbours are as expected.
+
+    Minimises over every dot's choice `k`, one of its candidates or none, `sum_d c_d(k_d) + sum_(d,e) min(|r_de|^2 / 2 s_de^2,
+    DOUBT)`. `r_de` is the step from blob `k_d` to blob `k_e` less the one expected, `s_de` is `STRETCH` times its length at
+    rest.
+    Loopy min-sum belief propagation (Pearl 1988; Weiss and Freeman 2001): messages along the edges are exchanged a fixed number
+    of times. It knows no membrane: any flow will do whose steps change by up to about half from one dot to the next.
+
+    Args:
+        pixels: centres `[D, 2]` of the dots at rest, px.
+        seen: `[D]` bool, which of them are in the image at rest: for the others it costs nothing to be lost.
+
+    Limitations:
+        The choice of least cost is found as a rule, not always. Where the pattern is a lattice, one that has moved by a step
+        of the lattice is told from one at rest by its outline alone.
+    """
+
+    source: Tensor
+    target: Tensor
+    reverse: Tensor
+    incoming: Tensor
+    narrowness: Tensor
+    pull: Tensor
+    reach: Tensor
+    lost: Tensor
+
+    def __init__(self, pixels: np.ndarray, seen: np.ndarray):
+        super().__init__()
+        pairs, pitch = edges(pixels), spacing(pixels)[1]
+        count, length = len(pairs), np.linalg.norm(pixels[pairs[:, 0]] - pixels[pairs[:, 1]], axis=1)
+        source, target = np.concatenate([pairs, pairs[:, ::-1]]).T
+        order, degree = np.argsort(target, kind="stable"), np.bincount(target, minlength=len(pixels))
+        incoming = np.full((len(pixels), degree.max()), 2 * count)  # the last is a message that says nothing
+        incoming[np.arange(degree.max()) < degree[:, None]] = order
+        self.register_buffer("source", torch.as_tensor(source.copy()))
+        self.register_buffer("target", torch.as_tensor(target.copy()))
+        self.register_buffer("reverse", torch.as_tensor(np.roll(np.arange(2 * count), count)))
+        self.register_buffer("incoming", torch.as_tensor(incoming))
+        self.register_buffer("narrowness", torch.as_tensor(0.5 / (STRETCH * np.tile(length, 2)) ** 2)[:, None, None])
+        self.register_buffer("pull", torch.as_tensor(0.5 / (PULL * pitch) ** 2)[:, None])
+        self.register_buffer("lost", torch.as_tensor(DOUBT * seen.astype(float))[:, None])
+        self.register_buffer("reach", torch.as_tensor((REACH * pitch) ** 2)[:, None])
+
+    def forward(self, expected: Tensor, blobs: Tensor, misfit: Tensor) -> tuple[Tensor, Tensor]:
+        """Each dot's blob.
+
+        Args:
+            expected: where the dots are expected `[B, D, 2]`, px.
+            blobs: `[B, K, 2]`, px.
+            misfit: `[B, D, K]`, of the blobs' sizes, squared standard deviations.
+
+        Returns:
+            The blobs `[B, D, 2]` px; which dots have one `[B, D]`, 0 or 1.
+        """
+        places, own, pair, messages = self.begin(expected, blobs, misfit)
+        (messages,) = fori_loop(self.exchange, EXCHANGES, (messages,), own, pair)
+        return self.end(messages, own, places)
+
+    @traced
+    def begin(self, expected: Tensor, blobs: Tensor, misfit: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Candidates `[B, D, C, 2]`, what each costs and at last what none does `[B, D, C + 1]`, what pairs of them cost
+        `[B, E, C + 1, C + 1]`, first messages `[B, E, C + 1]`."""
+        middle = expected.mean(1, keepdim=True)
+        square = square_distance(expected - middle, blobs - middle)
+        cost = square * self.pull + (0.5 * misfit).clamp(max=SIZE) + FAR * (square > self.reach).to(square.dtype)
+        value, index = cost.topk(min(CANDIDATES, cost.shape[-1]), largest=False)
+        places = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
+        offset = places - expected[:, :, None]
+        pair = square_distance(offset.index_select(1, self.source), offset.index_select(1, self.target)) * self.narrowness
+        one_lost = torch.full_like(pair[..., :1], DOUBT / 2)
+        pair = torch.cat([pair.clamp(max=DOUBT), one_lost], -1)
+        both_lost = torch.cat([torch.full_like(pair[..., :1, :-1], DOUBT / 2), torch.zeros_like(pair[..., :1, :1])], -1)
+        own = torch.cat([value, self.lost.expand_as(value[..., :1])], -1)
+        return places, own, torch.cat([pair, both_lost], -2), torch.zeros_like(pair[:, :, 0])
+
+    @traced
+    def exchange(self, messages: Tensor, own: Tensor, pair: Tensor) -> tuple[Tensor]:
+        """The next messages `[B, E, C + 1]`: what each choice of an edge's end costs its beginning and all behind that."""
+        behind = self.beliefs(messages, own).index_select(1, self.source) - messages.index_select(1, self.reverse)
+        told = (behind[..., None] + pair).amin(-2)
+        return (DAMPING * messages + (1 - DAMPING) * (told - told.amin(-1, keepdim=True)),)
+
+    def beliefs(self, messages: Tensor, own: Tensor) -> Tensor:
+        """What each choice costs in all, `[B, D, C + 1]`."""
+        told = torch.cat([messages, torch.zeros_like(messages[:, :1])], 1)
+        return own + told.index_select(1, self.incoming.flatten()).unflatten(1, self.incoming.shape).sum(2)
+
+    @traced
+    def end(self, messages: Tensor, own: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+        """The choices of least cost, as `forward` returns them."""
+        choice = self.beliefs(messages, own).argmin(-1)
+        found = choice < places.shape[2]
+        taken = choice.clamp(max=places.shape[2] - 1)[..., None, None].expand(-1, -1, 1, 2)
+        return places.gather(2, taken)[:, :, 0], found.to(places.dtype)

@@ -1,0 +1,96 @@
+"""Where a pattern is as a whole: the shift on which most dots agree, then an affine map."""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ...control_flow import traced
+from ...solve.elimination import solve_dense
+from ..neighbourhood import weighted_median
+from ..spacing import spacing, square_distance
+
+VOTERS = 32  # blobs near a dot that vote for a shift
+SHIFTS = 2.25  # pitches, the largest shift
+VOTE = 0.25  # pitches, width of a vote and distance of the shifts
+HOME = 4.0  # pitches: of two shifts with alike many votes the smaller is taken
+BETTER = 1.1  # votes of a start over those of the one before, to be taken
+WIDTHS = (0.5, 0.46, 0.42, 0.38, 0.34)  # pitches, in which the affine map looks for blobs
+STIFFNESS = 0.05  # of the affine map, per dot
+FAR = 1e3
+
+
+class Alignment(nn.Module):
+    """Lays a pattern on the blobs of a frame as a whole.
+
+    There are two starts: where the dots were, and the rest pattern under the median of the deformation measured at the blobs.
+    For each, all pairs of a dot and a blob vote for a shift. The start with the most votes is brought onto the blobs by an
+    affine map, in a few steps of expectation and maximisation (after Myronenko and Song 2010).
+
+    Args:
+        pixels: centres `[D, 2]` of the dots at rest about their mean, px.
+        seen: `[D]` bool, which of them are in the image at rest: no other has a vote.
+    """
+
+    pixels: Tensor
+    unit: Tensor
+    shifts: Tensor
+    home: Tensor
+    ridge: Tensor
+    seen: Tensor
+
+    def __init__(self, pixels: np.ndarray, seen: np.ndarray):
+        super().__init__()
+        shifts = np.arange(-SHIFTS, SHIFTS + VOTE / 2, VOTE)
+        self.register_buffer("pixels", torch.as_tensor(pixels))
+        self.register_buffer("unit", torch.as_tensor(np.median(spacing(pixels)[0])))
+        self.register_buffer("shifts", torch.as_tensor(shifts))
+        self.register_buffer("home", torch.as_tensor(np.exp(-(shifts[:, None] ** 2 + shifts**2) / (2 * HOME**2))))
+        self.register_buffer("seen", torch.as_tensor(seen.astype(float))[:, None])
+        self.register_buffer("ridge", torch.diag(torch.tensor([STIFFNESS, STIFFNESS, 1e-3], dtype=torch.float64)))
+
+    @traced
+    def forward(self, before: Tensor, blobs: Tensor, misfit: Tensor, deformation: Tensor, valid: Tensor) -> Tensor:
+        """Where the dots are expected.
+
+        Args:
+            before: where they were `[B, D, 2]`, px about the pattern's mean at rest, as all places here.
+            blobs: `[B, K, 2]`, px.
+            misfit: `[B, D, K]`, of the blobs' sizes, squared standard deviations.
+            deformation: at the blobs `[B, 2, 2, K]`.
+            valid: how surely each is a dot `[B, K]`, in 0..1.
+
+        Returns:
+            `[B, D, 2]`, px.
+        """
+        weight = torch.exp(-0.5 * misfit) * self.seen
+        typical = weighted_median(deformation.flatten(1, 2).mT, valid).unflatten(-1, (2, 2))
+        before, votes = self.shifted(before, blobs, weight)
+        mapped, others = self.shifted(self.pixels @ typical.mT, blobs, weight)
+        place = torch.where((others > BETTER * votes)[:, None, None], mapped, before)
+        for width in WIDTHS:
+            place = self.mapped(place, blobs, weight, width * self.unit)
+        return place
+
+    def shifted(self, place: Tensor, blobs: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """`place [B, D, 2]` after the shift with the most votes, and these `[B]`."""
+        square = square_distance(place, blobs)
+        index = (square + FAR * self.unit**2 * (1 - weight)).topk(min(VOTERS, blobs.shape[1]), largest=False).indices
+        there = blobs.gather(1, index.flatten(1)[..., None].expand(-1, -1, 2)).unflatten(1, index.shape[1:])
+        offset = ((there - place[:, :, None]) / self.unit).flatten(1, 2)
+        along_u, along_v = torch.exp(-((offset[..., None] - self.shifts) / VOTE).square() / 2).unbind(2)
+        votes = ((along_u * weight.gather(2, index).flatten(1)[..., None]).mT @ along_v * self.home).flatten(1)
+        most, best = votes.max(-1)
+        count = len(self.shifts)
+        shift = self.shifts[torch.stack([best // count, best % count], -1)]
+        return place + self.unit * shift[:, None], most
+
+    def mapped(self, place: Tensor, blobs: Tensor, weight: Tensor, width: Tensor) -> Tensor:
+        """`place [B, D, 2]` after a step of an affine map onto the blobs within about `width` px."""
+        near = torch.exp(-square_distance(place, blobs) / (2 * width**2)) * weight
+        near = near / (near.sum(-1, keepdim=True) + 0.1)
+        near = near / near.sum(1, keepdim=True).clamp_min(1)  # a blob is one dot's
+        total = near.sum(-1, keepdim=True)
+        away = near @ blobs - total * place
+        one = torch.cat([place / self.unit, torch.ones_like(total)], -1)
+        normal = (total * one).mT @ one + self.ridge * total.sum(1, keepdim=True).clamp_min(1)
+        return place + one @ solve_dense(normal, one.mT @ away)
