@@ -182,7 +182,7 @@ def test_where_contacts_push_nearly_everywhere_nothing_is_explained(dented):
 
 
 def test_what_neighbouring_markers_have_in_common_is_a_reason_to_doubt_what_each_has_alone_is_none():
-    """Off by 0.9 and 1.1 deviations, all alike, but that what is across a ray turns with it; by 50 alike, of which 10 count;
+    """Off by 1.2 and 1.5 deviations, all alike, but that what is across a ray turns with it; by 50 alike, of which 10 count;
     every second the other way; each its own way; a quarter alike, the others at rest; that quarter not trusted."""
     one = estimator()
     rest, noise = one.equations.bearings.positions, one.equations.bearings.noise
@@ -194,7 +194,7 @@ def test_what_neighbouring_markers_have_in_common_is_a_reason_to_doubt_what_each
     even, part = 1.0 - 2 * ((row + column) % 2), ((row < 5) & (column < 6)).double()
     own = torch.randn(2, 121, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     alike = torch.stack(
-        [torch.full((121,), 0.9), torch.full((121,), 1.1), torch.full((121,), 50.0), 3 * even, 3 * own[0], 9 * part, 9 * part]
+        [torch.full((121,), 1.2), torch.full((121,), 1.5), torch.full((121,), 50.0), 3 * even, 3 * own[0], 9 * part, 9 * part]
     )
     other = torch.zeros(7, 121).double()
     other[4] = 3 * own[1]
@@ -204,7 +204,7 @@ def test_what_neighbouring_markers_have_in_common_is_a_reason_to_doubt_what_each
     measured = one.equations.bearings.measured(observation)
     state = one.at_rest(measured.weight)
     found = one.equilibrium(*state, state.u, measured)
-    expected = torch.tensor([0.9, 1.1, SETTINGS.far, 0.0]).double()
+    expected = torch.tensor([1.2, 1.5, SETTINGS.far, 0.0]).double()
     torch.testing.assert_close(found.shared_misfit[:4], expected, rtol=0.06, atol=0)
     assert found.shared_misfit[4] < 1.0 < found.misfit[4]
     assert 9 * 0.8 * (30 / 121) ** 0.5 < found.shared_misfit[5] < 9 * (30 / 121) ** 0.5 and found.shared_misfit[6] < 1e-9
@@ -257,7 +257,7 @@ def test_a_converged_solution_gives_way_to_a_likelier_one_only(dented):
     steps = torch.tensor([1.5e-3, 1.5e-3, 3e-3, 1.5e-3, 1.5e-3], dtype=torch.float64)
     misfit = torch.tensor([0.5, 0.5, 0.5, 9.0, 0.5], dtype=torch.float64)
     first = first._replace(volume=one.membrane.volume(first.vertices), relative_step=steps, misfit=misfit)
-    first = first._replace(objective=torch.full_like(steps, 2.0), unexplained=torch.full_like(steps, 1.0))
+    first = first._replace(objective=torch.full_like(steps, 2.0), unexplained=torch.full_like(steps, 2.0))
     second = first._replace(vertices=first.vertices + 1.0, objective=torch.tensor([3.0, 1.79, 3.0, 3.0, 1.81]).double())
     assert one.is_converged(first).tolist() == [True, True, False, True, True]
     assert one.is_explained(first).tolist() == [True, True, True, False, True]
@@ -277,7 +277,7 @@ def test_unlikely_solutions_are_tried_again_and_what_no_push_is_the_reason_of_ex
         likely = min(least + SETTINGS.likely_of_press * moved, most) * error
         first = type(found)(*(value[1:].repeat(4, *[1] * (value.ndim - 1)) for value in found))
         objective = torch.tensor([0.9 * likely, 1.1 * likely, 0.9 * likely, 100 * largest]).double()
-        unexplained = torch.tensor([0.0, 0.9 * largest, 1.1 * largest, 0.0]).double()
+        unexplained = torch.tensor([0.0, 0.75 * largest, 1.1 * largest, 0.0]).double()
         first = first._replace(objective=objective, unexplained=unexplained, misfit=0 * objective, relative_step=0 * objective)
         first = first._replace(volume=one.membrane.volume(first.vertices), shared_misfit=0 * objective)
         rows = type(dented)(*(None if value is None else value[1:].expand(4, *value.shape[1:]) for value in dented))
@@ -286,17 +286,20 @@ def test_unlikely_solutions_are_tried_again_and_what_no_push_is_the_reason_of_ex
         assert one.is_done(first, measured).tolist() == [True, False, False, False]
 
 
-def test_pulls_and_neighbours_that_deviate_alike_add_up(dented):
-    """Six tenths of what is allowed of either explain the markers, of both together they do not."""
+def test_pulls_and_neighbours_that_deviate_alike_add_up_but_for_a_rest_image_that_has_aged(dented):
+    """Half of what is allowed of either explains the markers of a press, of both together it does not; while the surface moves
+    by a two-thousandth of its size, it does; more of one than is allowed never does."""
     one = estimator()
+    moved = torch.tensor([0.05, 0.05, 0.05, 5e-4, 5e-4, 5e-4]).double()
+    share = torch.tensor([[0.5, 0.25], [0.25, 0.5], [0.5, 0.5], [0.5, 0.5], [1.01, 0.1], [0.1, 1.01]]).double()
+    up = torch.tensor([0.0, 0.0, 1.0]).double()
     found = one(dented)
-    first = type(found)(*(value[:1].repeat(3, *[1] * (value.ndim - 1)) for value in found))
-    press = (first.vertices - one.membrane.rest).square().sum(-1).mean(-1).sqrt() / one.size
-    share = torch.tensor([[0.6, 0.3], [0.3, 0.6], [0.6, 0.6]]).double()
-    pulls = share[:, 0] * (SETTINGS.largest_unexplained + SETTINGS.unexplained_of_press * press)
+    found = type(found)(*(value[:1].repeat(6, *[1] * (value.ndim - 1)) for value in found))
+    found = found._replace(vertices=one.membrane.rest + one.size * moved[:, None, None] * up)
+    pulls = share[:, 0] * (SETTINGS.largest_unexplained + SETTINGS.unexplained_of_press * moved)
     alike = share[:, 1] * SETTINGS.largest_shared_misfit
-    first = first._replace(unexplained=pulls, shared_misfit=alike, misfit=0 * pulls, pushed=0 * pulls)
-    assert one.is_explained(first).tolist() == [True, True, False]
+    found = found._replace(unexplained=pulls, shared_misfit=alike, misfit=0 * pulls, pushed=0 * pulls)
+    assert one.is_explained(found).tolist() == [True, True, False, True, False, False]
 
 
 def test_a_press_may_be_further_off_its_markers_than_a_sensor_at_rest(dented):

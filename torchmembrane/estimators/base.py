@@ -30,7 +30,7 @@ class Problem(NamedTuple):
     rest_pixels      [D, 2]  where the camera model sees the markers at rest, px
     vertex_pixels    [V, 2]  where the camera model sees the grid's vertices at rest, px
     rest_covariance  [D, 2, 2]  px^2, noise of the markers' displacements in a frame like the rest image
-    rest_confidence  [D]  1 of markers whose rays at rest count
+    rest_confidence  [D]  1 of markers whose rays at rest count, 0 of others; None: all count
     views            W, how many views see the markers: each marker is then listed once for each view, D is all of these, and
                      the camera is a `Rig`
     """
@@ -45,7 +45,7 @@ class Problem(NamedTuple):
     rest_pixels: Tensor
     vertex_pixels: Tensor
     rest_covariance: Tensor
-    rest_confidence: Tensor
+    rest_confidence: Tensor | None = None
     views: int = 1
 
     def cavity_law(self) -> CavityLaw:

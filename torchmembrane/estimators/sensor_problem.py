@@ -21,7 +21,6 @@ def problem_of(seen: Sightings, membrane: Membrane, elasticity: ElasticEnergy, c
         cavity: what fills it.
     """
     views = len(seen.positions) // len(seen.markers.positions)
-    counts = torch.ones_like(seen.positions[:, 0]) if views == 1 else seen.observer.seen_at_rest.double()
     return Problem(
         camera=seen.camera,
         membrane=membrane,
@@ -33,6 +32,6 @@ def problem_of(seen: Sightings, membrane: Membrane, elasticity: ElasticEnergy, c
         rest_pixels=seen.rest_pixels,
         vertex_pixels=seen.vertex_pixels,
         rest_covariance=2 * seen.observer.rest_covariance.double() + LEAST_ERROR**2 * torch.eye(2).double(),
-        rest_confidence=counts,
+        rest_confidence=None if views == 1 else seen.observer.seen_at_rest.double(),
         views=views,
     )

@@ -26,7 +26,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...camera.model import Rays
 from ...control_flow import retry_rows, traced, where_rows
 from ...mechanics.cavity import CavityLaw, rest_balance
 from ...mechanics.hyperelastic import ElasticEnergy
@@ -121,9 +120,9 @@ class ForceBalance(Estimator):
     @classmethod
     def from_problem(cls, problem: Problem, settings: ForceBalanceSettings | None = None) -> Self:
         """The estimator of a sensor."""
-        variance = problem.rest_covariance.diagonal(dim1=-2, dim2=-1).mean()
-        noise = float(variance.sqrt() / problem.camera.focal.mean())
-        sure = problem.rest_confidence[None]
+        noise = float(problem.rest_covariance.diagonal(dim1=-2, dim2=-1).mean().sqrt() / problem.camera.focal.mean())
+        counts = problem.rest_confidence
+        sure = torch.ones_like(problem.rest_pixels[None, :, 0]) if counts is None else counts[None]
         rest = marker_rays(problem.camera, problem.rest_pixels[None], problem.positions, sure, problem.rest_covariance[None])
         surface = problem.membrane, problem.elasticity, problem.markers, problem.positions
         return cls(*surface, noise, problem.filling, problem.gas, settings, rest, problem.views)
@@ -169,8 +168,8 @@ class ForceBalance(Estimator):
     def prepare(self, camera: Any, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
         """The rays of the markers seen at `pixels [B, D, 2]`, each with its own noise where its `covariance` is given."""
         if covariance is None:
-            rays: Rays = camera.pixel_to_ray(pixels)
-            return Observation(*rays, confidence)
+            origins, directions = camera.pixel_to_ray(pixels)
+            return Observation(origins, directions, confidence)
         return marker_rays(camera, pixels, self.equations.bearings.positions, confidence, covariance)
 
     def check_gauge(self) -> None:
@@ -248,8 +247,8 @@ class ForceBalance(Estimator):
     @traced
     def at_rest(self, confidence: Tensor) -> State:
         """The rest surface and pressure and cameras that have not moved, for every row of `confidence [B, D]`."""
-        frames, pressure, motions = confidence.shape[0], self.rest_pressure, 4 * self.equations.bearings.views
-        still = (0 * pressure).repeat(frames, motions)
+        frames, pressure = confidence.shape[0], self.rest_pressure
+        still = (0 * pressure).repeat(frames, 4 * self.equations.bearings.views)
         return State(torch.zeros_like(self.membrane.rest).repeat(frames, 1, 1), pressure.repeat(frames), still)
 
     @traced
@@ -309,14 +308,13 @@ class ForceBalance(Estimator):
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: markers off their rays by noise and the model's error alone, neighbours not alike, hardly a pull or shear
-        that no push comes with, of these two together not more than of one alone, not pushed everywhere. How hard is no reason
-        to doubt: a contact may have few markers."""
+        that no push comes with, little of both together, not pushed everywhere. How hard is no reason to doubt."""
         settings, press = self.settings, self._press(found)
-        misfit = (settings.largest_misfit + settings.misfit_of_press * press) * self.coarseness
-        unexplained = (settings.largest_unexplained + settings.unexplained_of_press * press) * self.coarseness**2
-        shared = settings.largest_shared_misfit * self.coarseness
-        doubt = found.unexplained / unexplained + found.shared_misfit / shared
-        return torch.logical_not((found.pushed > settings.largest_pushed) | (doubt > 1) | (found.misfit > misfit))
+        misfit = found.misfit / (settings.largest_misfit + settings.misfit_of_press * press) / self.coarseness
+        pulls = found.unexplained / (settings.largest_unexplained + settings.unexplained_of_press * press) / self.coarseness**2
+        alike, (most, aged) = found.shared_misfit / settings.largest_shared_misfit / self.coarseness, settings.largest_doubt
+        doubtful = (misfit.maximum(pulls).maximum(alike) > 1) | (pulls + alike > most + aged / press)
+        return torch.logical_not(doubtful | (found.pushed > settings.largest_pushed))
 
     def _press(self, found: Equilibrium) -> Tensor:
         """Rms displacement over the size, `[B]`."""

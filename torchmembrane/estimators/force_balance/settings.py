@@ -64,8 +64,10 @@ class ForceBalanceSettings:
             sensor explains them; as before.
         unexplained_of_press: so much more for a surface that has moved by its size (rms), as of the misfit.
         largest_shared_misfit: as much of the misfit as neighbouring markers have in common, of a surface that explains them, in
-            standard deviations: a torn or sheared image moves neighbours alike, as no surface follows. Its share of this and
-            that of `largest_unexplained` add up: a skin that is no membrane has some of both.
+            standard deviations: a torn or sheared image moves neighbours alike, as no surface follows.
+        largest_doubt: sum of the shares in `largest_unexplained` and `largest_shared_misfit`, of a surface that explains the
+            markers, for a skin that is no membrane has some of both; and how much larger it may be, times the size over the
+            displacement (rms): a rest image that has aged looks the same while the surface hardly moves.
         largest_pushed: share of the surface that contacts push, of a surface that explains the markers: where all is pushed,
             nothing tells the fluid's pressure from a contact's.
         likely_objective: what is minimised, over the markers seen, of a solution that is not solved again: of a contact where
@@ -122,9 +124,10 @@ class ForceBalanceSettings:
     largest_volume_error: float = 1e-3
     largest_misfit: float = 1.5
     misfit_of_press: float = 2.0
-    largest_unexplained: float = 1.5
+    largest_unexplained: float = 2.0
     unexplained_of_press: float = 30.0
-    largest_shared_misfit: float = 1.0
+    largest_shared_misfit: float = 1.35
+    largest_doubt: tuple[float, float] = (0.8, 5e-4)
     largest_pushed: float = 0.55
     likely_objective: tuple[float, float, float] = (0.45, 0.95, 1.8)
     likely_of_press: float = 80.0
