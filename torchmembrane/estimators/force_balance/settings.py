@@ -127,7 +127,7 @@ class ForceBalanceSettings:
     largest_unexplained: float = 2.0
     unexplained_of_press: float = 30.0
     largest_shared_misfit: float = 1.35
-    largest_doubt: tuple[float, float] = (0.8, 5e-4)
+    largest_doubt: tuple[float, float] = (1.0, 5e-4)
     largest_pushed: float = 0.55
     likely_objective: tuple[float, float, float] = (0.45, 0.95, 1.8)
     likely_of_press: float = 80.0
