@@ -287,8 +287,8 @@ def test_unlikely_solutions_are_tried_again_and_what_no_push_is_the_reason_of_ex
 
 
 def test_pulls_and_neighbours_that_deviate_alike_add_up_but_for_a_rest_image_that_has_aged(dented):
-    """A press may have six tenths of what is allowed of either, but not of both; a surface that moves by a two-thousandth of its
-    size may have both; none may have more of one than is allowed."""
+    """A press may have six tenths of what is allowed of either, but not of both; a surface that moves by a two-thousandth of
+    its size may have both; none may have more of one than is allowed."""
     one = estimator()
     moved = torch.tensor([0.05, 0.05, 0.05, 5e-4, 5e-4, 5e-4]).double()
     share = torch.tensor([[0.6, 0.3], [0.3, 0.6], [0.6, 0.6], [0.6, 0.6], [1.01, 0.1], [0.1, 1.01]]).double()
