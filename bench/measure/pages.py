@@ -38,7 +38,7 @@ def markdown(rows: list[list[str]]) -> str:
 
 def source(found: dict) -> str:
     """One sentence: revision, date, processor and command of a record, of times the load as well."""
-    how, where = ("Measured at", found["processor"]) if found["seconds"] else ("Published at", "processor not recorded")
+    how, where = "Measured at" if found["seconds"] else "Published at", found["processor"] or "processor not recorded"
     if found["load"] and " bench.speed." in found["command"]:
         where += f", {found['cores']} cores under a load of {found['load']:.1f}"
     return f"*{how} revision {found['revision']}, {found['date']}, {where}: `{found['command']}`*"
