@@ -8,6 +8,7 @@ import torch
 from PIL import Image
 
 import torchmembrane as tm
+from torchmembrane.calibrate.material import material_from_pixels
 from torchmembrane.camera.rig import Rig
 from torchmembrane.cli.describe import described, rest_frame
 from torchmembrane.cli.main import main
@@ -280,3 +281,15 @@ def test_simulate_writes_an_image_for_each_view(press, tmp_path, capsys):
     names = {path.name for path in (tmp_path / "out").glob("*.png")}
     assert names == {"press_left.png", "press_right.png", "sensor_rest_left.png", "sensor_rest_right.png"}
     assert len(tm.Sensor.from_file(tmp_path / "out" / "sensor.toml").views) == 2
+
+
+@pytest.mark.parametrize("step", ["rest", "material"])
+def test_calibrations_of_one_camera_refuse_several_views(press, tmp_path, capsys, step):
+    """What is found of one camera would leave the others as they were."""
+    path = press[0].at_rest().to_file(tmp_path)
+    arguments = ["calibrate", step, str(path), str(tmp_path / "sensor_rest_left.png"), "--out", str(tmp_path / "out")]
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert "has 2 views; expected one" in said and "Traceback" not in said and not (tmp_path / "out").exists()
+    with pytest.raises(MembraneError, match="calibrate material: views is 2; expected 1"):
+        material_from_pixels(press[0].sensor, torch.as_tensor(press[2]["uv_deformed"])[None])

@@ -209,9 +209,9 @@ class Reconstructor(nn.Module):
         """Reconstruct from marker centres located elsewhere; those that belong with no neighbour get confidence 0.
 
         Args:
-            pixels: `[B, D, 2]` or `[D, 2]` in the sensor file's order, NaN where lost.
-            confidence: `[B, D]` or `[D]` in 0..1; default: 1 where finite.
-            rest_pixels: `[D, 2]`, the same markers located in the rest image; default: the model's rest pixels.
+            pixels: `[B, D, 2]` or `[D, 2]` in the sensor file's order, NaN where lost; of W views `[B, W, D, 2]`.
+            confidence: `[B, D]` or `[D]` in 0..1, of W views `[B, W, D]`; default: 1 where finite.
+            rest_pixels: `[D, 2]`, of W views `[W, D, 2]`, the same markers in the rest image; default: the model's rest pixels.
             pressure: as for images.
             noise: standard deviation of one marker's u and v, px; default: 0.05 in these images, and at rest the rest image's.
 

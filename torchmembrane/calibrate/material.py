@@ -149,15 +149,14 @@ def material_from_pixels(
         end.
     """
     reconstructor = _reconstructor(sensor)
-    observer, shape = reconstructor.observer, reconstructor.rest_pixels.shape
     pixels = tensor_of("calibrate material: pixels", pixels).to(reconstructor.rest_pixels)
-    expected = f"[B, {', '.join(map(str, shape))}], one for each marker"
-    expect(pixels.shape[1:] == shape, "calibrate material: pixels", f"a tensor {list(pixels.shape)}", expected)
-    pixels = observer.sighted(pixels)
+    known = pixels.ndim == 3 and pixels.shape[1:] == reconstructor.rest_pixels.shape
+    expected = f"[B, {len(reconstructor.rest_pixels)}, 2], one for each marker"
+    expect(known, "calibrate material: pixels", f"a tensor {list(pixels.shape)}", expected)
     lost = ~pixels.isfinite().all(-1)
-    displacement = torch.where(lost[..., None], 0.0, pixels - observer.rest_pixels)
+    displacement = torch.where(lost[..., None], 0.0, pixels - reconstructor.rest_pixels)
     confidence = (~lost).to(pixels)
-    covariance = None if noise is None else observer.covariance_of(noise, confidence)
+    covariance = None if noise is None else reconstructor.observer.covariance_of(noise, confidence)  # type: ignore[operator]
     measured = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure, rest_error, covariance)
     return _material(sensor, reconstructor, measured, progress)
 
@@ -286,6 +285,8 @@ def _is_settled(sensor: Sensor, made: Sensor) -> bool:
 
 
 def _reconstructor(sensor: Sensor) -> Reconstructor:
+    views = max(1, len(sensor.views))
+    expect(views == 1, "calibrate material: views", views, "1: calibrate sensor.in_view(0), the first view by itself")
     if sensor.material.model == "harmonic":
         raise MembraneError(
             "calibrate material: a harmonic membrane has one shape at any prestretch; expected neo_hookean or mooney_rivlin"

@@ -64,8 +64,6 @@ class Coverage(nn.Module):
         `facing [B, D]`."""
         turned = facing < TURNED_AWAY * self.facing
         if self.views > 1:  # from every view that saw it at rest
-            turned = (
-                (turned | ~self.seen).unflatten(1, (self.views, -1)).all(1, keepdim=True).expand(-1, self.views, -1).flatten(1)
-            )
+            turned = (turned | ~self.seen).unflatten(1, (self.views, -1)).all(1).repeat(1, self.views)
         counted: Tensor = self(torch.where(turned, 1.0, confidence))
         return counted

@@ -105,11 +105,6 @@ class ViewsObserver(nn.Module):
         each = zip(self.each, pixels.unbind(1), sure, rests, strict=True)
         return self._together([observer.from_pixels(*given, noise) for observer, *given in each])  # type: ignore[operator]
 
-    def covariance_of(self, noise: float | None, confidence: Tensor) -> Tensor:
-        """As of `MarkerObserver`, of the sightings `[B, N]`."""
-        parts = zip(self.each, self.by_view(confidence).unbind(1), strict=True)
-        return torch.cat([observer.covariance_of(noise, part) for observer, part in parts], 1)  # type: ignore[operator]
-
     @traced
     def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
         """Displacements, confidence and status `[B]`: a view that fails is left out where another one does not."""

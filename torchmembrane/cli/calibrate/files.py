@@ -46,8 +46,18 @@ FILES = ("image", "depth", "motions", "forces", "pressure", "pixels")
 
 
 def read_sensor(arguments: Namespace) -> Sensor:
-    """The sensor that the arguments name."""
-    return Sensor.from_file(sensor_file(arguments.sensor))
+    """The sensor that the arguments name.
+
+    Raises:
+        MembraneError: it cannot be read, or has several views: what is found of one would not be that of the others.
+    """
+    sensor = Sensor.from_file(sensor_file(arguments.sensor))
+    if sensor.views:
+        raise MembraneError(
+            f"calibrate: {arguments.sensor} has {len(sensor.views)} views; expected one: calibrate each in a file of its own "
+            "with [camera], and put the values that are found into its [[camera]]"
+        )
+    return sensor
 
 
 def spare_files(step: str, arguments: Namespace) -> None:
