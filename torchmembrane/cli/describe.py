@@ -191,7 +191,7 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
     markers = sensor.markers
     lines, heights = [f"{markers.kind}, {markers.polarity}"], np.atleast_1d(markers.height)
     if markers.stand_off:
-        lines.append(f"they stand off the inner side by {_range(heights)} {sensor.length_unit}")
+        lines.append(f"they stand off the inner side by {_extent(heights)} {sensor.length_unit}")
     if markers.positions is not None:
         listed, large = len(markers.positions), sum(size == "large" for size in markers.sizes or ())
         lines[0] += f", {listed} listed: {large} large, {listed - large} small"
@@ -221,7 +221,7 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
     return [*lines, *reconstructed]
 
 
-def _range(values: np.ndarray) -> str:
+def _extent(values: np.ndarray) -> str:
     """The least and the largest value, or the one that all are."""
     low, high = values.min(), values.max()
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"

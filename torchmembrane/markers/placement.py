@@ -12,6 +12,7 @@ from ..errors import MembraneError
 from ..sensor.sensor import Sensor
 from ..sensor.views import SurfaceInView
 from ..surface.levers import inward_levers
+from ..surface.membrane import Membrane
 from ..surface.projection import SurfacePoints, ray_points
 from ..surface.tangent import tangent_axes
 from ..surface.topology import rim_loop
@@ -118,10 +119,17 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS
 
 def listed_levers(sensor: Sensor) -> np.ndarray | None:
     """From a sensor's listed dots to their tips, at rest, `[D, 3]`; None where all lie on the surface."""
-    markers, membrane = sensor.markers, sensor.membrane
+    markers = sensor.markers
     if markers.positions is None or not markers.stand_off:
         return None
-    return inward_levers(membrane, membrane.closest_points(markers.positions), markers.heights(len(markers.positions)))
+    smooth = _smooth_surface(sensor)
+    return inward_levers(smooth, smooth.closest_points(markers.positions), markers.heights(len(markers.positions)))
+
+
+def _smooth_surface(sensor: Sensor) -> Membrane:
+    m, n = sensor.membrane.grid
+    assert sensor.surface is not None  # `Sensor` has set it
+    return sensor.surface.membrane((max(m, SMOOTH_GRID), max(n, SMOOTH_GRID)))
 
 
 def _tips(positions: np.ndarray, levers: np.ndarray | None) -> np.ndarray:
@@ -166,9 +174,7 @@ def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, n
     """The markers `[M, 3]` whose tips are where the rays of `pixels [D, 2]` in the rest image first meet the surface of all
     tips; their levers `[M, 3]`, None where that is the rest surface; and which of the rays meet it, `[D]` bool."""
     rays = sensor.camera.pixel_to_ray(torch.from_numpy(pixels))
-    m, n = sensor.membrane.grid
-    assert sensor.surface is not None  # `Sensor` has set it
-    smooth = sensor.surface.membrane((max(m, SMOOTH_GRID), max(n, SMOOTH_GRID)))
+    smooth = _smooth_surface(sensor)
     X, height = smooth.rest.numpy(), float(sensor.markers.height)
     levers = -height * smooth.rest_normals.numpy()
     hits = ray_points(X + levers, smooth.triangles.numpy(), *(r.numpy() for r in rays))
