@@ -3,38 +3,25 @@
 from dataclasses import replace
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
+from pinned_cap import CAMERA, HEIGHT, SURFACE, cap
 from scipy.spatial.transform import Rotation
 
 import torchmembrane as tm
-from torchmembrane.calibrate.material import material_from_pixels
-from torchmembrane.calibrate.rest import rest_from_image
-from torchmembrane.cli.describe import described
-from torchmembrane.errors import MembraneError
 from torchmembrane.estimators.force_balance.lever_bearings import LeverBearings
+from torchmembrane.estimators.force_balance.marker_residuals import Bearings
+from torchmembrane.onnx.export import Piece
+from torchmembrane.onnx.trace import traced_model
 from torchmembrane.pose import ViewPose
-from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
-from torchmembrane.sensor.sensor import Sensor
+from torchmembrane.sensor.parts import Markers
 from torchmembrane.sensor.views import View
 from torchmembrane.simulate import Dots, Renderer, Simulator, Sphere
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.quasi_static import carried
 from torchmembrane.surface.bicubic import bicubic_shares, bicubic_slopes
 from torchmembrane.surface.levers import Levers, inward_levers
-
-CAMERA = tm.Camera("pinhole", (320, 240), (200, 200), (159.5, 119.5))
-SURFACE = Surface("spherical_cap", {"rim_radius": 8.0, "height": 4.0, "base_z": 14.0})
-HEIGHT = 1.5
-
-
-def cap(height, grid=(13, 13)):
-    """A cap with 49 dots."""
-    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-4.8, 4.8, 7)] * 2))
-    dots = np.stack([x, y, 8 + np.sqrt(100 - x**2 - y**2)], -1)
-    material = Material("neo_hookean", 1.3, shear_modulus=0.3, thickness=0.4)
-    markers = Markers("dots", "dark", dots, height=height)
-    return Sensor("cap", "mm", CAMERA, SURFACE.membrane(grid), material, Cavity("liquid"), markers, SURFACE)
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +179,7 @@ def test_a_press_is_found_by_the_height_and_not_without_it(simulator, reconstruc
     assert blind[0] > 4 * surface and blind[1] > 4 * force
 
 
-def test_pixels_of_a_gauged_press_have_gradients(reconstructor, press):
+def test_the_surface_has_gradients_in_the_pixels(reconstructor, press):
     """By one difference: what steps of tips are solved by is differentiated too."""
     made = tm.Reconstructor(reconstructor.sensor, dtype=torch.float64)
     pixels = torch.from_numpy(press[0].truth["uv_deformed"]).double()
@@ -289,54 +276,37 @@ def test_two_views_see_tips(press):
     np.testing.assert_allclose(tips, expected, atol=5e-3)
 
 
-@pytest.mark.parametrize("height", [2.0, np.linspace(0.5, 2.0, 49)], ids=["all", "each"])
-def test_the_file_keeps_heights(height, tmp_path):
-    sensor = cap(height)
-    again = Sensor.from_file(sensor.to_file(tmp_path))
-    np.testing.assert_array_equal(again.markers.height, height)
-    assert again.fingerprint == sensor.fingerprint != cap(0.0).fingerprint
-    assert any("stand off the inner side by" in line for line in described(sensor, None, None))
+def test_the_equations_of_tips_agree_with_torch_where_they_are_exported(simulator):
+    """The tips, the derivatives of their angles in the vertices around them, and the matrix that is solved."""
+    made = tm.Reconstructor(replace(simulator.at_rest(), membrane=SURFACE.membrane((9, 9))))
+    equations, pixels = made.estimator.equations, made.rest_pixels
+    moved = 2 * torch.exp(-(((pixels - 160) / 40) ** 2).sum(-1, keepdim=True)) * torch.tensor([1.0, -0.5, 0.7])[:, None, None]
+    measured = equations.bearings.measured(made.observation(moved.expand(3, 49, 2), torch.ones(3, 49)))
+    generator = torch.Generator().manual_seed(3)
+    u = 0.3 * torch.rand(3, 81, 3, generator=generator) * equations.forces.free
+    inputs = {"u": u, "pressure": made.rest_pressure.repeat(3)}
+    inputs |= {name: value for name, value in measured._asdict().items() if value is not None}
+
+    def linearised(owner, u, pressure, *rays):
+        still = torch.zeros_like(rays[-1][:, 0, :, 0])
+        _, normal, loads, _, motion, _ = owner.linearised(u, pressure, still, Bearings(*rays), 0.4, 2.5)
+        return loads, owner.matrix(normal, 1e-3).entries, motion.coupling
+
+    piece, names = Piece(equations, linearised), ["loads", "matrix", "coupling"]
+    with torch.no_grad():
+        expected = piece(*inputs.values())
+    model = traced_model(piece, {name: value[:2] for name, value in inputs.items()}, names)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    for count in (1, 3):
+        found = session.run(names, {name: value[:count].numpy() for name, value in inputs.items()})
+        for got, value in zip(found, expected, strict=True):
+            value = value[:count].numpy()
+            np.testing.assert_allclose(got, value, rtol=1e-3, atol=1e-4 * abs(value).max())
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("height = 2.0", 'height = "2"', "height = \"2\"; expected a finite number"),
-        ("height = 2.0", "height = -2.0", "expected 0 or more, along the inward normal"),
-        ("height = 2.0", "height = 9.0", "at most"),
-        ('kind = "dots"', 'kind = "texture"', "none for texture"),
-    ],
-)  # fmt: skip
-def test_a_wrong_height_is_refused_in_words(old, new, said, tmp_path):
-    path = cap(2.0).to_file(tmp_path)
-    text = path.read_text()
-    head, table, rest = text.partition("[markers]")
-    assert old in rest
-    path.write_text(head + table + rest.replace(old, new))
-    with pytest.raises(MembraneError, match=str(path)) as caught:
-        Sensor.from_file(path)
-    assert said in str(caught.value)
-
-
-def test_heights_are_given_once(tmp_path):
-    path = cap(np.linspace(0.5, 2.0, 49)).to_file(tmp_path)
-    path.write_text(path.read_text().replace('kind = "dots"', 'kind = "dots"\nheight = 1.0'))
-    with pytest.raises(MembraneError, match="has a column of that name: remove one of them"):
-        Sensor.from_file(path)
-    dots = tmp_path / "sensor_dots.csv"
-    dots.write_text(dots.read_text().replace(",0.5\n", ",-0.5\n"))
-    with pytest.raises(MembraneError, match="line 2: height = -0.5; expected 0 or more"):
-        Sensor.from_file(path)
-    with pytest.raises(MembraneError, match="an array of 49, one for each listed dot"):
-        cap(np.ones(3))
-
-
-def test_what_takes_no_heights_says_so(simulator):
-    sensor = simulator.at_rest()
-    for name in ("minimum-energy", "paper"):
-        with pytest.raises(MembraneError, match=f"height of the markers for {name} is 1.5; expected 0, markers on the surface"):
-            tm.Reconstructor(sensor, name)
-    with pytest.raises(MembraneError, match="calibrate rest: height of the markers is 1.5"):
-        rest_from_image(sensor, sensor.markers.rest_image)
-    with pytest.raises(MembraneError, match="calibrate material: height of the markers is 1.5"):
-        material_from_pixels(sensor, np.zeros((1, 49, 2)))
+@pytest.mark.full
+@pytest.mark.parametrize("tracking", [False, True])
+def test_the_whole_model_agrees_with_torch(simulator, tmp_path, tracking):
+    """Or `export` refuses to write it: from image to result, at rest and pressed."""
+    sensor = replace(simulator.at_rest(), membrane=SURFACE.membrane((9, 9)))
+    tm.export(tm.Reconstructor(sensor), tmp_path / "pins.onnx", tracking=tracking)
