@@ -239,7 +239,7 @@ def _read_height(row: Row) -> float:
 def _write_dots(path: Path, markers: Markers) -> None:
     assert markers.positions is not None and markers.sizes is not None  # or there is no file of dots
     rows = [[*map(repr, position), size] for position, size in zip(markers.positions.tolist(), markers.sizes, strict=True)]
-    header = DOTS_HEADER
+    header: tuple[str, ...] = DOTS_HEADER
     if not isinstance(markers.height, float):
         header = (*DOTS_HEADER, HEIGHT)
         rows = [[*row, repr(height)] for row, height in zip(rows, markers.height.tolist(), strict=True)]

@@ -82,7 +82,8 @@ def triangle_slopes(points: SurfacePoints, grid: tuple[int, int]) -> np.ndarray:
 
 def _products(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Shares `[D, m n]` of the vertices, of those of the lines in both directions."""
-    return (rows[:, :, None] * columns[:, None]).reshape(len(rows), -1)
+    products: np.ndarray = (rows[:, :, None] * columns[:, None]).reshape(len(rows), -1)
+    return products
 
 
 def _is_kinked(shares: np.ndarray, grid: tuple[int, int], fixed: Tensor) -> np.ndarray:

@@ -127,8 +127,8 @@ class ForceBalance(Estimator):
         """The estimator of a sensor."""
         rest, noise = rest_rays(problem)
         surface = problem.membrane, problem.elasticity, problem.markers, problem.positions
-        others = problem.filling, problem.gas, settings, rest, problem.views
-        return cls(*surface, noise, *others, levers=problem.levers)
+        sensor = noise, problem.filling, problem.gas
+        return cls(*surface, *sensor, settings, rest, problem.views, levers=problem.levers)
 
     def _coarser(self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerBearings, **others: Any) -> Self | None:
         grid, positions = membrane.grid, bearings.positions

@@ -50,6 +50,7 @@ class LeverBearings(MarkerBearings):
         levers: `[D, 3]`, from feet to tips at rest.
     """
 
+    tips_at_rest: Tensor
     ring_shares: Tensor
     sources: Tensor
     first: Tensor
@@ -103,7 +104,8 @@ class LeverBearings(MarkerBearings):
 
     def joined(self, values: Tensor) -> Tensor:
         """The sum `[..., D]` over the three fields."""
-        return values.unflatten(-1, (FIELDS, -1)).sum(-2)
+        joined: Tensor = values.unflatten(-1, (FIELDS, -1)).sum(-2)
+        return joined
 
     def blocks(self, jacobian: Tensor, weighted: Tensor) -> Tensor:
         """The markers' blocks `[B, 3, 3, 28 D]` between the pairs of the seven vertices around each."""
@@ -111,13 +113,15 @@ class LeverBearings(MarkerBearings):
             (each.unflatten(-1, (FIELDS, -1))[..., None] * self.ring_shares).sum(3).index_select(4, slots)
             for each, slots in ((jacobian, self.first), (weighted, self.second))
         )
-        return (here[:, :, :, None] * there[:, :, None]).sum(1).flatten(3)
+        blocks: Tensor = (here[:, :, :, None] * there[:, :, None]).sum(1).flatten(3)
+        return blocks
 
     def near(self, blocks: Tensor) -> Tensor:
         """As of `MarkerBearings`, at all `OFFSETS`."""
         zero = torch.zeros_like(blocks[..., :1])
         each = torch.cat([blocks, zero], -1).index_select(3, self.sources.flatten())
-        return each.unflatten(3, self.sources.shape).sum(-1).unflatten(3, (len(OFFSETS), -1))
+        near: Tensor = each.unflatten(3, self.sources.shape).sum(-1).unflatten(3, (len(OFFSETS), -1))
+        return near
 
     def diagonal(self, blocks: Tensor) -> Tensor:
         """As of `MarkerBearings`."""

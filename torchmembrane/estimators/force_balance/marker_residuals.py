@@ -200,7 +200,8 @@ class MarkerBearings(nn.Module):
 
     def near(self, blocks: Tensor) -> Tensor:
         """The blocks between the inner vertices and those at the first `OFFSETS` from them, `[B, 3, 3, K, N]`."""
-        return (blocks @ self.pair_shares).unflatten(-1, (len(NEAR), -1))
+        near: Tensor = (blocks @ self.pair_shares).unflatten(-1, (len(NEAR), -1))
+        return near
 
     def diagonal(self, blocks: Tensor) -> Tensor:
         """The diagonals `[B, 3, N]` of the blocks between the inner vertices and themselves."""
