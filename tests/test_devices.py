@@ -8,7 +8,6 @@ import dataclasses
 
 import pytest
 import torch
-
 from torch.overrides import TorchFunctionMode
 
 import torchmembrane as tm
@@ -57,6 +56,9 @@ class NoCopies(TorchFunctionMode):
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         assert function not in (torch.tensor, torch.Tensor.new_tensor), f"{function.__name__}{args}"
+        if function is torch.Tensor.__getitem__:
+            indices = args[1] if isinstance(args[1], tuple) else (args[1],)
+            assert not any(isinstance(index, list) for index in indices), f"a list as an index: {indices}"
         result = function(*args, **(kwargs or {}))
         if function in (torch.as_tensor, torch.Tensor.to, torch.Tensor.copy_):
             given = args[1] if function is torch.Tensor.copy_ else args[0]

@@ -1,6 +1,7 @@
 """Frames a second from image files to results in the steady state: one thread of one process, and worker processes.
 
-    OMP_NUM_THREADS=1 python -m bench.speed.throughput SENSOR.toml IMAGE [--workers 2] [--frames 300] [--format parquet] [--device cuda]
+    OMP_NUM_THREADS=1 python -m bench.speed.throughput SENSOR.toml IMAGE [--workers 2] [--frames 300] [--format parquet]
+        [--device cuda]
 
 Runs the command on copies of an image, once on N and once on 3 N of them; the rate is that of the difference, so that starting
 does not count. Processor time, of all processes together, is given beside the time on the clock: on a shared machine it alone

@@ -104,7 +104,7 @@ def linearise(
     of_force = equations.forces.change(at.stiffness, one).flatten(2)
     solution = LinearisedSolution(
         lambda loads: motion.eased(equations.system.substitute(factor, loads), of_motion),
-        loads[:, [2, 0]],
+        torch.stack([loads[:, 2], loads[:, 0]], 1),
         (vWv, compliance.expand_as(vWv)) if closed else None,
         of_force,
         at.volume.sum(-1),
