@@ -153,9 +153,9 @@ class Markers:
             raise MembraneError("rest_image is missing; expected for texture, whose patches are chosen in it: add one")
         elif self.positions is None:
             raise MembraneError("file and rest_image are missing; expected dots, an image that shows them, or both")
-        self._set_height(0 if self.positions is None else len(self.positions))
         if self.positions is None:
             expect(self.sizes is None, "sizes", self.sizes, "none without positions")
+            self._set_height(0)
             return
         positions = np.asarray(self.positions, dtype=np.float64)
         right = positions.ndim == 2 and positions.shape[1] == 3 and len(positions) > 0
@@ -167,6 +167,7 @@ class Markers:
         expect(right, "sizes", sizes, f"{len(positions)} times 'small' or 'large'")
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "sizes", sizes)
+        self._set_height(len(positions))
 
     def _set_height(self, count: int) -> None:
         """Keep one number for all where they have the same."""
