@@ -113,6 +113,7 @@ def calibration_grids(request, monkeypatch):
     if request.param == "coarse":
         monkeypatch.setattr(explained, "GRID", (9, 9))
         monkeypatch.setattr(presses, "PRESSURE_GRID", (17, 17))
-        monkeypatch.setattr(presses, "STRETCHES", np.geomspace(1.05, 1.7, 6))
+        for module in (explained, presses):
+            monkeypatch.setattr(module, "STRETCHES", np.geomspace(1.05, 1.7, 6))
         monkeypatch.setattr(presses, "BETWEEN", 3)
     return request.param

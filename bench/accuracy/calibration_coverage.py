@@ -137,6 +137,7 @@ def calibrated(made: Drawn, rng: np.random.Generator) -> dict:
     return dict(
         off=made.off,
         height=window.height / made.size,
+        height_found=[found.height[0] / window.height - 1, found.height[1] / window.height],
         height_error=made.error,
         rest_error=rest_error,
         true=[sheet.stretch, sheet.modulus, float(forces[-1])],

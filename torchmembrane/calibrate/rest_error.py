@@ -20,11 +20,11 @@ from ..surface.topology import rim_loop
 HEIGHT_ERROR = 0.05
 """Standard deviation of the rest surface's height over its rim, relative, where nothing is said of it."""
 MOST_ERROR = 0.5
-LEAST_HEIGHT_ERROR = 0.01
+LEAST_HEIGHT_ERROR = 0.03
 """Standard deviation of the height that presses tell, relative, however little noise there is: the grid's and the model's."""
 SETTLED = 1.0  # of its standard deviation that the height may still change by
 LEAST_REACH, LOWEST = 0.1, 0.5  # of a step of the height, in stated standard deviations; of a height over the one before
-MOST_REACH = 1.5  # of a step of the height, in those by which it was tried
+SHRINKING = 0.6  # of the reach from one round to the next, at least
 MOST_SHIFT = 3.0  # of the prestretch by the height, in standard deviations by the losses: beyond, a loss is no parabola
 
 
@@ -156,7 +156,7 @@ class StatedHeight(NamedTuple):
             StatedHeight(error=0.1111111111111111, mean=1.0, reach=0.4)
         """
         error = self.error / max(LOWEST, 1 + self.error * height)
-        return StatedHeight(error, self.mean - height, float(np.clip(2 * deviation, LEAST_REACH, 1.0)))
+        return StatedHeight(error, self.mean - height, float(np.clip(2 * deviation, LEAST_REACH, SHRINKING * self.reach)))
 
     def is_settled(self, height: float, deviation: float) -> bool:
         """Whether a height found, known to `deviation`, is about the surface's, and was looked for about as closely."""
@@ -188,7 +188,7 @@ def height_told(
     information = max(0.0, bent - k**2 * variance)
     share = 1 / (1 + information * (LEAST_HEIGHT_ERROR / stated.error) ** 2)
     information, gradient = share * information, share * slope.mean()
-    mean = np.clip((stated.mean - gradient) / (1 + information), -MOST_REACH * d, MOST_REACH * d)
+    mean = np.clip((stated.mean - gradient) / (1 + information), -d, d)
     return HeightEffect(
         shift=float(np.clip(-variance * k, -bound, bound)),
         by_stretch=float(np.log(own.forces[1] / own.forces[0]).mean()) / 2,
