@@ -144,12 +144,12 @@ def joined(
 def _summed(
     evidence: Sequence[ModulusEvidence], rows: np.ndarray, values: np.ndarray, about: tuple[float, float], least: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean and covariance of shift, log modulus and height, and what the mean misses, rows as of `joined`, where logarithms of
-    moduli are parabolas: of each shift the best modulus and height, by least squares, with its probability."""
+    """Mean and covariance of shift, log modulus and height, and what is missed at the mean shift, rows as of `joined`, where
+    logarithms of moduli are parabolas: of each shift the best modulus and height, by least squares, with its probability."""
     t = about[0] + about[1] * np.linspace(-REACH, REACH, SHIFTS)
     t = t[t >= least] if (t >= least).any() else np.array([least, least + 1e-9])
 
-    def told(t: np.ndarray) -> np.ndarray:
+    def wanted_at(t: np.ndarray) -> np.ndarray:
         """What modulus and height are to fulfil at these shifts, `[n, R]`."""
         wanted = values - t[:, None] * rows[:, 0]
         for i, one in enumerate(evidence):
@@ -161,15 +161,17 @@ def _summed(
 
     others = rows[:, 1:]
     covariance = np.linalg.inv(others.T @ others)
-    best = told(t) @ others @ covariance
-    loss = ((best @ others.T - told(t)) ** 2).sum(1) / 2
+    solved = others @ covariance
+    best, off = (wanted := wanted_at(t)) @ solved, wanted @ (solved @ others.T) - wanted
+    loss = (off**2).sum(1) / 2
     weight = np.exp(loss.min() - loss)
     weight /= weight.sum()
     x = np.column_stack([t, best])
     mean = weight @ x
     spread = (weight[:, None] * (x - mean)).T @ (x - mean)
     spread[1:, 1:] += covariance
-    return mean, spread, others @ mean[1:] - told(mean[:1])[0]
+    at_mean = wanted_at(mean[:1])[0]
+    return mean, spread, at_mean @ (solved @ others.T) - at_mean
 
 
 def odd_ones(ratios: np.ndarray, deviations: np.ndarray) -> list[tuple[int, float, float]]:
