@@ -152,8 +152,8 @@ class StatedHeight(NamedTuple):
         """The same about the surface that is higher by `height`, which is known to `deviation`, in stated standard deviations.
 
         Example:
-            >>> StatedHeight(0.1).after(-1.0, 0.2)
-            StatedHeight(error=0.1111111111111111, mean=1.0, reach=0.4)
+            >>> StatedHeight(0.25).after(1.0, 0.2)
+            StatedHeight(error=0.2, mean=-1.0, reach=0.4)
         """
         error = self.error / max(LOWEST, 1 + self.error * height)
         return StatedHeight(error, self.mean - height, float(np.clip(2 * deviation, LEAST_REACH, SHRINKING * self.reach)))
