@@ -15,7 +15,7 @@ from .errors import MembraneError, check_arguments, expect
 from .estimators.base import Equilibrium, Estimator, Observation, StandardDeviations
 from .estimators.contacts import Contacts
 from .estimators.precision import PRECISIONS, check_precision, full_precision
-from .estimators.registry import built_estimator, estimator_kind
+from .estimators.registry import built_estimator, estimator_kind, refuse_unfit
 from .estimators.sensor_problem import LEAST_ERROR, problem_of
 from .files.grayscale import CHANNELS, Channels, grey_batch
 from .files.images import read_image
@@ -32,6 +32,7 @@ from .sensor.sensor import Sensor
 from .sensor.view_images import grey_views, read_views
 from .state_dict import drop_derived_buffers
 from .surface.bicubic import bicubic_shares
+from .surface.levers import Levers
 
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
 LARGEST_RESIDUAL = 1.5  # px, of a plausible answer, however noisy its image
@@ -91,19 +92,20 @@ class Reconstructor(nn.Module):
         self.sensor, self.estimator_name, self.locator_name, self.channels = sensor, name, locator, channels
         self.image_size, self.model = sensor.image_size, model or sensor.material.model
         self.range = sensor.range.of(sensor.fingerprint)
-        views, membrane = max(1, len(sensor.views)), copy.deepcopy(sensor.membrane)
-        expected = "1, as of sensor.in_view(0), or force-balance"
-        expect(views == 1 or kind.takes_views, f"Reconstructor: views for {name}", views, expected)
+        refuse_unfit(sensor, name, kind)
+        membrane = copy.deepcopy(sensor.membrane)
         seen = sightings(sensor, locator, dtype, kind.needs_every_vertex, check_rest)
         cavity = cavity_filling(sensor, membrane, warn=True)
         self.observer, self.camera, self.marker_points = seen.observer, seen.camera, seen.markers.points
-        positions = torch.from_numpy(seen.markers.positions)
+        positions, levers = torch.from_numpy(seen.markers.positions), seen.markers.levers
+        self.levers = None if levers is None else Levers(membrane, self.marker_points, torch.from_numpy(levers))
         problem = problem_of(seen, membrane, elastic_energy(sensor, membrane, model), cavity)
         self.register_buffer("vertex_pixels", seen.vertex_pixels)
         self.register_buffer("rest_markers", positions)
         shares = bicubic_shares(self.marker_points, membrane.grid, membrane.fixed)
         self.register_buffer("marker_shares", torch.from_numpy(shares))
-        facing = self._facings(positions, self.marker_shares @ membrane.rest_normals)
+        tips = positions if levers is None else positions + torch.from_numpy(levers)
+        facing = self._facings(tips, self.marker_shares @ membrane.rest_normals)
         self.coverage = Coverage(membrane, positions, self.observer.seen_at_rest, facing)
         self.to(dtype)
         self._solve_by(built_estimator(problem, name, kind, settings), dtype)
@@ -253,6 +255,7 @@ class Reconstructor(nn.Module):
         membrane, lost, x = self.estimator.membrane, confidence <= FOUND, found.vertices
         u = x - membrane.rest
         markers = self.rest_markers + self.marker_shares @ u.to(self.marker_shares)
+        markers = markers if self.levers is None else markers + self.levers(u.to(markers)).levers
         pixels, by_view = self.observer.rest_pixels + displacement, self.observer.by_view
         modelled = self.camera.point_to_pixel(self.observer.seen_by_each(markers)) + self.camera.shift_of(found.moved, pixels)
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))

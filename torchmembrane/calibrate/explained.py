@@ -174,6 +174,7 @@ def coarse_reconstructor(sensor: Sensor) -> Reconstructor:
     """The sensor's, on `GRID`; refused where its presses tell no prestretch."""
     views = max(1, len(sensor.views))
     expect(views == 1, "calibrate material: views", views, "1: calibrate sensor.in_view(0), the first view by itself")
+    sensor.refuse_heights("calibrate material")
     if sensor.material.model == "harmonic":
         raise MembraneError(
             "calibrate material: a harmonic membrane has one shape at any prestretch; expected neo_hookean or mooney_rivlin"

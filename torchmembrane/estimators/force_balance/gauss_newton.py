@@ -112,7 +112,7 @@ class Descent(nn.Module):
 
     def is_native(self, *values: Any) -> bool:
         """Whether steps of these tensors are taken by machine code."""
-        return self.equations.bearings.views == 1 and takes(*values, self.equations.forces.elasticity.prestretch)
+        return self.equations.bearings.in_machine_code and takes(*values, self.equations.forces.elasticity.prestretch)
 
     @traced
     def _unweighted(self, u: Tensor) -> Tensor:

@@ -144,7 +144,7 @@ def noise_loads(
 ) -> Tensor:
     """What noise adds to the equations, the camera's motion eliminated: `[B, 2 D, 3 N]`, of independent noises that turn each
     marker's angles by `turned [B, D, 2, 2]` (noise, angle): `J^T w e - B' T^-1 K^T w e`."""
-    loads = torch.einsum("bdra,bacd,dn->bdrcn", turned, normal.weighted_jacobian, equations.bearings.vertex_shares)
+    loads = equations.bearings.loads_alone(turned, normal.weighted_jacobian)
     slopes = torch.einsum("bdra,bakd,bd->bdrk", turned, measured.motion, normal.marker_weights)
     return motion.without(loads.flatten(3).flatten(1, 2), slopes.flatten(1, 2))
 
@@ -328,7 +328,7 @@ def spreads_of(
         y, rise = solve_bordered(loads, solutions, c[:, None], by_pressure, compliance[:, None], zero)
         of_gauge = of_gauge if solution.gauge is None else rise * solution.gauge[:, None]
     at_markers = y.unflatten(-1, (3, -1)) @ equations.bearings.vertex_shares.mT
-    of_angles = (normal.weighted_jacobian[:, None] * at_markers[:, :, None]).sum(3)
+    of_angles = equations.bearings.joined((normal.weighted_jacobian[:, None] * at_markers[:, :, None]).sum(3))
     of_camera = solution.motion.turning(y)[..., None, :, None] * normal.marker_weights[:, None, None, None]
     of_markers = (of_angles - (measured.motion[:, None] * of_camera).sum(3)).square().sum((2, 3))
     spread: Tensor = (of_markers + of_gauge.square()).sqrt()
