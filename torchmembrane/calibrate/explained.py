@@ -137,8 +137,8 @@ def _at_told_height(sensor: Sensor, presses: Presses, known: MeasuredPresses, pr
         shapes = by_shapes(profile := presses.profile_at(stretches, within(of_round, 0.0, 1 - HEIGHT_SHARE)))
         of_round(1 - HEIGHT_SHARE, "prestretch at other heights of the rest surface")
         lower, higher = (presses.at_height(side * height.reach * height.error) for side in (-1, 1))
-        own, *others = (each.told(shapes.around[::2]) for each in (presses, lower, higher))
-        by = height_told(own, *others, shapes.deviation, shapes.by_losses**2, height)
+        own, below, above = (each.told(shapes.around[::2]) for each in (presses, lower, higher))
+        by = height_told(own, below, above, shapes.deviation, shapes.by_losses**2, height)
         found = ExplainedPresses(sensor, presses, higher, profile, shapes, by, height)
         if k + 1 == HEIGHT_ROUNDS or (is_close and height.is_settled(by.mean, by.deviation)):
             break

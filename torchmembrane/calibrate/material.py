@@ -227,7 +227,8 @@ def _with_own_markers(fit: MaterialFit, sensor: Sensor) -> MaterialFit:
     made, markers = replace(sensor, material=material), sensor.markers
     if markers.positions is None:
         return fit._replace(sensor=replace(made, surface=surface, membrane=fit.sensor.membrane))
-    raised, kept = changed_height(made, markers.positions, surface.formed.height / made.surface.formed.height - 1)
+    before = sensor.surface.made_of(material, sensor.length_unit).formed.height
+    raised, kept = changed_height(made, markers.positions, surface.formed.height / before - 1)
     sizes = list(np.array(markers.sizes)[kept])
     markers = replace(markers, positions=raised.markers.positions, sizes=sizes)
     return fit._replace(sensor=replace(raised, markers=markers))
@@ -247,15 +248,16 @@ class _Evidence:
     def gather(self, known: MeasuredPresses, progress: Progress) -> None:
         """From what is known."""
         if known.forces is not None:
-            modulus, *told, sides, self.magnitudes, odd = self.presses.modulus(*self.at, known.forces, progress)
-            self._add(ModulusEvidence("the forces", modulus, *told, -self.by.by_height * modulus, sides))
+            modulus, sd, change, sides, self.magnitudes, odd = self.presses.modulus(*self.at, known.forces, progress)
+            self._add(ModulusEvidence("the forces", modulus, sd, change, -self.by.by_height * modulus, sides))
             self.said += [
                 f"image {i + 1}: its force is {r:.2f} of what the others' tell, {z:.1f} standard deviations apart"
                 for i, r, z in odd
             ]
         if known.pressures is not None:
-            *told, by_height, self.gauged = self.presses.gauge_modulus(*self.at, known.pressures, self.other, progress)
-            self._add(ModulusEvidence("the gauge under presses", *told, by_height / self.reach))
+            told = self.presses.gauge_modulus(*self.at, known.pressures, self.other, progress)
+            modulus, sd, change, by_height, self.gauged = told
+            self._add(ModulusEvidence("the gauge under presses", modulus, sd, change, by_height / self.reach))
         if known.overpressure is not None:
             sensor, moved = (presses.reconstructor.sensor for presses in (self.presses, self.other))
             at_rest = modulus_at_rest(sensor, *self.at, known.overpressure, moved)
