@@ -92,7 +92,7 @@ def test_presses_mend_a_height_that_was_stated_wrongly():
     known = KnownForces(np.array(forces)[:, None])
     seen = torch.stack(pixels)[:, kept]
     found = material_from_pixels(sensor, seen, known, overpressure=gauge, noise=0.05, rest_error=0.24)
-    assert abs(found.height[0] - HEIGHT) < 2 * found.height[1] < 0.6, found.height
+    assert abs(found.height[0] - HEIGHT) < 2 * found.height[1] < 1.0, found.height
     assert (np.abs(found.values - [STRETCH, MODULUS]) < 2 * found.deviations).all(), (found.values, found.deviations)
     made = found.sensor
     assert made.surface.formed.height == pytest.approx(found.height[0], rel=1e-3)
