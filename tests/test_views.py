@@ -238,11 +238,6 @@ def test_noise_spreads_from_all_views(reconstructor, found):
     assert float(both.vertices.max()) < 0.8 * float(one.vertices.max())
 
 
-def test_what_takes_one_view_says_so(reconstructor):
-    with pytest.raises(tm.MembraneError, match="Tracker: views is 2; expected one camera"):
-        tm.Tracker(reconstructor)
-
-
 def test_check_says_and_draws_each_view(reconstructor, press):
     sensor = reconstructor.sensor
     frame = rest_frame(reconstructor)
