@@ -269,6 +269,26 @@ def test_commands_take_an_image_of_each_view(press, tmp_path, capsys):
         of_first_view(Inputs([tmp_path / "press_left.png", tmp_path / "other.png"], []), ["left", "right"])
 
 
+def test_a_changed_image_of_any_view_is_done_again(press, tmp_path, capsys):
+    """The hash in a frame's result is that of all views' files."""
+    out, found = tmp_path / "out", tmp_path / "found"
+    press[0].at_rest().to_file(out)
+    files = [out / f"press_{name}.png" for name in ("left", "right")]
+    for file, image in zip(files, press[1], strict=True):
+        Image.fromarray(image).save(file)
+    call = ["reconstruct", str(out / "sensor.toml"), f"{out}/press*.png", "--out", str(found), "--workers", "1"]
+    assert main(call) == 0
+    first = tm.read_results(found)["press_left"]["residual"]
+    assert main(call) == 0
+    said = capsys.readouterr()
+    assert "done again" not in said.out + said.err
+    Image.fromarray(np.roll(press[1][1], 1, axis=1)).save(files[1])
+    assert main(call) == 0
+    said = capsys.readouterr()
+    assert "press_left.png: changed, done again" in said.out + said.err
+    assert not np.array_equal(tm.read_results(found)["press_left"]["residual"], first)
+
+
 def test_simulate_writes_an_image_for_each_view(press, tmp_path, capsys):
     file = press[0].sensor.to_file(tmp_path / "sensor")
     call = f"simulate {file} --indenter sphere --radius 3 --depth 0.5 --out {tmp_path / 'out'}".split()
