@@ -243,7 +243,8 @@ class Reconstructor(nn.Module):
         square = (found * displacement.square().sum(-1)).sum(-1) / found.sum(-1).clamp_min(1)
         one = torch.eye(2, dtype=covariance.dtype, device=covariance.device)
         error = (LEAST_ERROR**2 + MODEL_ERROR**2 * square)[:, None, None, None] * one
-        return self.estimator.prepare(self.camera, self.observer.rest_pixels + displacement, confidence, covariance + error)
+        pixels = self.observer.with_rays(self.observer.rest_pixels + displacement, confidence)
+        return self.estimator.prepare(self.camera, pixels, confidence, covariance + error)
 
     @traced
     def result(
@@ -338,7 +339,8 @@ class Reconstructor(nn.Module):
             raise MembraneError(f"standard_deviations: result is a {type(result).__name__}; expected a tm.Reconstruction")
         sighted, markers = self.observer.sighted, self.observer.seen_by_each(result.markers)
         pixels = sighted(torch.where(result.pixels.isfinite(), result.pixels, self.rest_pixels))
-        noise = turns_by_noise(self.camera, pixels, markers, 2 * self.observer.rest_covariance)
+        seen = self.observer.with_rays(pixels, sighted(result.confidence))
+        noise = turns_by_noise(self.camera, seen, markers, 2 * self.observer.rest_covariance)
         observation = self._gauged(self.observation(pixels - self.observer.rest_pixels, sighted(result.confidence)), pressure)
         vertices = torch.where(result.vertices.isfinite(), result.vertices, self.estimator.membrane.rest)
         pressure = torch.where(result.pressure.isfinite(), result.pressure, self.estimator.rest_pressure)
