@@ -327,7 +327,8 @@ def test_markers_that_a_view_does_not_see_at_rest_count_for_nothing():
     sure = torch.stack([torch.ones(49), seen.float()])
     expected = both.from_pixels(pixels.nan_to_num(), sure)
     wild = torch.where(seen[:, None], pixels[1], 1e4 * torch.rand(49, 2, dtype=torch.float64))
-    for given, confidence in ((wild, None), (wild, torch.ones(2, 49)), (torch.where(seen[:, None], wild, torch.nan), None)):
+    beside = torch.where(seen[:, None], pixels[1], both.rest_pixels[1] + 1.0)
+    for given, confidence in ((wild, torch.ones(2, 49)), (beside, None), (torch.where(seen[:, None], wild, torch.nan), None)):
         got = both.from_pixels(torch.stack([pixels[0], given]), confidence)
         for name, value in expected._asdict().items():
             torch.testing.assert_close(getattr(got, name), value, rtol=0, atol=0, equal_nan=True, msg=name)
