@@ -8,6 +8,7 @@ import dataclasses
 
 import pytest
 import torch
+from torch.overrides import TorchFunctionMode
 
 import torchmembrane as tm
 
@@ -48,6 +49,30 @@ def test_frames_are_tracked_gauged_and_taken_from_markers(sensor, settings):
     followed = reconstructor(images, first, pressure=torch.empty(2, device="meta"))
     located = reconstructor.from_pixels(first.pixels, first.confidence)
     assert followed.force.shape == located.force.shape == (2, 3)
+
+
+class NoCopies(TorchFunctionMode):
+    """Refuses tensors that come from the processor: a GPU waits for each such copy, and no CUDA graph can hold one."""
+
+    def __torch_function__(self, function, types, args=(), kwargs=None):
+        assert function not in (torch.tensor, torch.Tensor.new_tensor), f"{function.__name__}{args}"
+        if function is torch.Tensor.__getitem__:
+            indices = args[1] if isinstance(args[1], tuple) else (args[1],)
+            assert not any(isinstance(index, list) for index in indices), f"a list as an index: {indices}"
+        result = function(*args, **(kwargs or {}))
+        if function in (torch.as_tensor, torch.Tensor.to, torch.Tensor.copy_):
+            given = args[1] if function is torch.Tensor.copy_ else args[0]
+            assert getattr(given, "device", None) == result.device, f"{function.__name__}{args}"
+        return result
+
+
+@pytest.mark.parametrize("estimator", ["force-balance", "minimum-energy"])
+def test_nothing_is_copied_to_the_device_for_a_frame(sensor, few_steps, estimator):
+    settings = few_steps if estimator == "force-balance" else None
+    reconstructor = tm.Reconstructor(sensor, estimator, settings=settings).to("meta")
+    with NoCopies(), torch.no_grad():
+        first = reconstructor(torch.empty(2, 1, 480, 640, device="meta"))
+        reconstructor(torch.empty(2, 1, 480, 640, device="meta"), first)
 
 
 def test_a_tensor_left_on_the_cpu_is_refused(sensor):

@@ -15,16 +15,8 @@ from torchmembrane.errors import MembraneError
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.factories import cavity_filling, elastic_energy
-from torchmembrane.sensor.parts import (
-    LEAST_APART,
-    OFF_SURFACE,
-    Cavity,
-    Markers,
-    Material,
-    Surface,
-    refuse_coincident,
-    refuse_off_surface,
-)
+from torchmembrane.sensor.marker_checks import LEAST_APART, OFF_SURFACE, refuse_coincident, refuse_off_surface
+from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.surface.shapes import spherical_cap
 

@@ -44,7 +44,7 @@ def calls(sensor, made, image, result):
         "Camera.pixel_to_ray": (sensor.camera.pixel_to_ray, dict(pixels=torch.zeros(2, 2))),
         "Camera.point_to_pixel": (sensor.camera.point_to_pixel, dict(points=torch.ones(2, 3))),
         "Cavity": (tm.Cavity, dict(filling="gas", pressure=1013.0)),
-        "Markers": (tm.Markers, dict(kind="dots", polarity="dark", positions=dots)),
+        "Markers": (tm.Markers, dict(kind="dots", polarity="dark", positions=dots, height=1.0)),
         "Material": (tm.Material, dict(model="neo_hookean", prestretch=1.3, shear_modulus=0.3)),
         "Membrane": (tm.Membrane, dict(vertices=mesh.numpy())),
         "Membrane.resampled": (sensor.membrane.resampled, dict(grid=(9, 9))),

@@ -15,7 +15,7 @@ from .errors import MembraneError, check_arguments, expect
 from .estimators.base import Equilibrium, Estimator, Observation, StandardDeviations
 from .estimators.contacts import Contacts
 from .estimators.precision import PRECISIONS, check_precision, full_precision
-from .estimators.registry import built_estimator, estimator_kind
+from .estimators.registry import built_estimator, estimator_kind, refuse_unfit
 from .estimators.sensor_problem import LEAST_ERROR, problem_of
 from .files.grayscale import CHANNELS, Channels, grey_batch
 from .files.images import read_image
@@ -32,6 +32,7 @@ from .sensor.sensor import Sensor
 from .sensor.view_images import grey_views, read_views
 from .state_dict import drop_derived_buffers
 from .surface.bicubic import bicubic_shares
+from .surface.levers import Levers
 
 MODEL_ERROR = 0.004  # of a marker's place in the model, over the rms displacement of all markers
 LARGEST_RESIDUAL = 1.5  # px, of a plausible answer, however noisy its image
@@ -91,19 +92,20 @@ class Reconstructor(nn.Module):
         self.sensor, self.estimator_name, self.locator_name, self.channels = sensor, name, locator, channels
         self.image_size, self.model = sensor.image_size, model or sensor.material.model
         self.range = sensor.range.of(sensor.fingerprint)
-        views, membrane = max(1, len(sensor.views)), copy.deepcopy(sensor.membrane)
-        expected = "1, as of sensor.in_view(0), or force-balance"
-        expect(views == 1 or kind.takes_views, f"Reconstructor: views for {name}", views, expected)
+        refuse_unfit(sensor, name, kind)
+        membrane = copy.deepcopy(sensor.membrane)
         seen = sightings(sensor, locator, dtype, kind.needs_every_vertex, check_rest)
         cavity = cavity_filling(sensor, membrane, warn=True)
         self.observer, self.camera, self.marker_points = seen.observer, seen.camera, seen.markers.points
-        positions = torch.from_numpy(seen.markers.positions)
+        positions, levers = torch.from_numpy(seen.markers.positions), seen.markers.levers
+        self.levers = None if levers is None else Levers(membrane, self.marker_points, torch.from_numpy(levers))
         problem = problem_of(seen, membrane, elastic_energy(sensor, membrane, model), cavity)
         self.register_buffer("vertex_pixels", seen.vertex_pixels)
         self.register_buffer("rest_markers", positions)
         shares = bicubic_shares(self.marker_points, membrane.grid, membrane.fixed)
         self.register_buffer("marker_shares", torch.from_numpy(shares))
-        facing = self._facings(positions, self.marker_shares @ membrane.rest_normals)
+        tips = positions if levers is None else positions + torch.from_numpy(levers)
+        facing = self._facings(tips, self.marker_shares @ membrane.rest_normals)
         self.coverage = Coverage(membrane, positions, self.observer.seen_at_rest, facing)
         self.to(dtype)
         self._solve_by(built_estimator(problem, name, kind, settings), dtype)
@@ -254,6 +256,7 @@ class Reconstructor(nn.Module):
         membrane, lost, x = self.estimator.membrane, confidence <= FOUND, found.vertices
         u = x - membrane.rest
         markers = self.rest_markers + self.marker_shares @ u.to(self.marker_shares)
+        markers = markers if self.levers is None else markers + self.levers(u.to(markers)).levers
         pixels, by_view = self.observer.rest_pixels + displacement, self.observer.by_view
         modelled = self.camera.point_to_pixel(self.observer.seen_by_each(markers)) + self.camera.shift_of(found.moved, pixels)
         miss2 = torch.where(lost, 0.0, ((modelled - pixels) ** 2).sum(-1))
@@ -308,8 +311,7 @@ class Reconstructor(nn.Module):
 
     def _facings(self, points: Tensor, normals: Tensor) -> Tensor:
         """How the markers at `points [..., D, 3]` face what sees them, for each sighting."""
-        each = self.observer.seen_by_each
-        return facings(self.camera.lines_of_sight(each(points)), each(normals))
+        return facings(self.camera.lines_of_sight(self.observer.seen_by_each(points)), self.observer.seen_by_each(normals))
 
     def _gauged(self, observation: Observation, pressure: Tensor | float | None) -> Observation:
         """The observation with what a gauge reads, if one does."""
@@ -335,13 +337,12 @@ class Reconstructor(nn.Module):
         Raises:
             MembraneError: the estimator knows none.
         """
-        if not isinstance(result, Reconstruction):
-            raise MembraneError(f"standard_deviations: result is a {type(result).__name__}; expected a tm.Reconstruction")
-        sighted, markers = self.observer.sighted, self.observer.seen_by_each(result.markers)
-        pixels = sighted(torch.where(result.pixels.isfinite(), result.pixels, self.rest_pixels))
-        seen = self.observer.with_rays(pixels, sighted(result.confidence))
-        noise = turns_by_noise(self.camera, seen, markers, 2 * self.observer.rest_covariance)
-        observation = self._gauged(self.observation(pixels - self.observer.rest_pixels, sighted(result.confidence)), pressure)
+        expect(isinstance(result, Reconstruction), "standard_deviations: result", type(result).__name__, "a tm.Reconstruction")
+        observer, confidence = self.observer, self.observer.sighted(result.confidence)
+        pixels = observer.sighted(torch.where(result.pixels.isfinite(), result.pixels, self.rest_pixels))
+        seen = self.camera, observer.with_rays(pixels, confidence), observer.seen_by_each(result.markers)
+        noise = turns_by_noise(*seen, 2 * observer.rest_covariance)
+        observation = self._gauged(self.observation(pixels - observer.rest_pixels, confidence), pressure)
         vertices = torch.where(result.vertices.isfinite(), result.vertices, self.estimator.membrane.rest)
         pressure = torch.where(result.pressure.isfinite(), result.pressure, self.estimator.rest_pressure)
         moved = self.camera.motion_in_pixels(result.camera_motion).nan_to_num()

@@ -1,7 +1,7 @@
 """Marker and surface accuracy on rendered cases with truth.
 
 python -m bench.data.cases CASES
-python -m bench.accuracy.accuracy CASES [--only NAME ...] [--json FILE]
+python -m bench.accuracy.accuracy CASES [--only NAME ...] [--device cuda] [--json FILE]
 
 CASES holds index.json, a list of cases with `sensor`, `images` (files), `truth` (npz with `uv_deformed [D, 2]`, `dots_nominal`
 and `dots_deformed [D, 3]`, optionally `visible_deformed [D]`), `folder`, `case`; or it is a folder like examples/, with
@@ -43,6 +43,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", type=Path)
     parser.add_argument("--only", nargs="*", choices=ESTIMATORS, default=list(ESTIMATORS))
+    parser.add_argument("--device", default="cpu", type=torch.device)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -50,7 +51,7 @@ def main():
     markers, surface = {}, {}
     for name in sorted({case["sensor"] for case in cases}):
         for label in args.only:
-            reconstructor = tm.Reconstructor.from_file(args.cases / name, **ESTIMATORS[label])
+            reconstructor = tm.Reconstructor.from_file(args.cases / name, **ESTIMATORS[label]).to(args.device)
             for case in (c for c in cases if c["sensor"] == name):
                 score(reconstructor, args.cases, case, label, markers, surface)
     table = []
@@ -75,12 +76,15 @@ def score(reconstructor: tm.Reconstructor, root: Path, case: dict, label: str, m
     def relative(result: tm.Reconstruction) -> float:
         return float(np.sqrt(((result.markers[0].numpy() - Y) ** 2).sum() / ((Y - X) ** 2).sum()))
 
-    exact = torch.from_numpy(truth["uv_deformed"].astype(np.float32))
+    def cpu(result: tm.Reconstruction) -> tm.Reconstruction:
+        return tm.Reconstruction(*(values.cpu() for values in result))
+
+    exact = torch.from_numpy(truth["uv_deformed"].astype(np.float32)).to(reconstructor.rest_pixels.device)
     with torch.no_grad():
-        surface.setdefault((label, "exact markers"), []).append(relative(reconstructor.from_pixels(exact)))
+        surface.setdefault((label, "exact markers"), []).append(relative(cpu(reconstructor.from_pixels(exact))))
         for image in case["images"]:
             kind = Path(image).stem.rpartition("_")[2] if "_" in case["images"][0] and len(case["images"]) > 1 else "images"
-            result = reconstructor(reconstructor.read(root / image))
+            result = cpu(reconstructor(reconstructor.read(root / image)))
             if reconstructor.finds_tractions:
                 for name, value in contact_errors(result, truth).items():
                     surface.setdefault((f"{label}: {name}", kind), []).append(value)

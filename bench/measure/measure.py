@@ -17,6 +17,8 @@ import sys
 import time
 from pathlib import Path
 
+import torch
+
 from bench.measure.pages import PAGES, RECORDS, ROOT, block, blocks, changes_since, filled, record, uncommitted
 from bench.measure.parts import MADE, PARTS, words
 from bench.measure.tables import FIGURES, SUMMARIES, TABLES
@@ -70,6 +72,9 @@ def measure(name: str, independent: Path | None) -> None:
     if folder is None:
         print(f"{name}: left out, its data are not distributed; --independent FOLDER names them")
         return
+    if part.needs_gpu and not torch.cuda.is_available():
+        print(f"{name}: left out, torch finds no GPU here")
+        return
     made, result = MADE[part.data] if part.data else (), OUT / f"{name}.json"
     began, load = time.perf_counter(), os.getloadavg()[0]
     for command in (*made, f"{part.command} --json {result}"):
@@ -84,7 +89,7 @@ def measure(name: str, independent: Path | None) -> None:
             ["git", "rev-parse", "--short=7", "HEAD"], cwd=ROOT, capture_output=True, text=True
         ).stdout.strip(),
         date=datetime.date.today().isoformat(),
-        processor=machine["processor"],
+        processor=machine["cuda"] if part.needs_gpu else machine["processor"],
         cores=os.cpu_count(),
         load=max(load, os.getloadavg()[0]),
         seconds=round(seconds),

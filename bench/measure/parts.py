@@ -31,11 +31,13 @@ class Part(NamedTuple):
         command: a module of bench and its arguments. CASES or DATA stands for the folder of data.
         measures: paths that the figures depend on, besides the module itself.
         data: which folder of `MADE` the command needs.
+        needs_gpu: whether it is left out on a machine without a GPU.
     """
 
     command: str
     measures: tuple[str, ...] = FRAME
     data: str | None = None
+    needs_gpu: bool = False
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -71,6 +73,7 @@ PARTS = {
     "window-mistakes": Part("bench.accuracy.window_mistakes", (*CLI, "torchmembrane/forming")),
     "cli-errors": Part("bench.robustness.cli_errors", CLI),
     "memory": Part("bench.speed.memory", (*FRAME, "torchmembrane/jobs/workers.py")),
+    "gpu": Part("bench.speed.gpu --batches 1 4 16 64 256 1024 2048", needs_gpu=True),
     "independent": Part("bench.accuracy.accuracy CASES", data="independent"),
     "simulator-independent": Part("bench.accuracy.simulator CASES", SIMULATOR, data="independent"),
     "cases": Part("bench.accuracy.accuracy CASES", CASES, data="cases"),

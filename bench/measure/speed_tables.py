@@ -101,6 +101,21 @@ def solve_by_batch(energy: dict, balance: dict) -> Rows:
     ]
 
 
+def gpu(found: dict) -> Rows:
+    return [
+        ["batch", "markers, ms", "solve, ms", "both, ms", "frames per second", "memory"],
+        *(
+            [
+                str(row["batch"]),
+                *(f"{float(f'{row[name]:.2g}'):g}" for name in ("markers", "solve", "whole")),
+                f"{1000 / row['whole']:.0f}",
+                f"{row['megabytes']:.0f} MB",
+            ]
+            for row in found["rows"]
+        ),
+    ]
+
+
 def balance_times(found: dict) -> dict[str, float]:
     return {row["what"]: row["milliseconds_a_frame"] for row in found["rows"] if row["estimator"] == "force balance"}
 

@@ -23,6 +23,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows]]] = {
     "exported-models": (("exported-models",), speed.exported_models),
     "training": (("training",), speed.training),
     "solve-by-batch": (("minimum-energy", "force-balance"), speed.solve_by_batch),
+    "gpu": (("gpu",), speed.gpu),
     "solve-against-scipy": (("force-balance",), speed.balance_against_scipy),
     "paper-stages": (("paper-chain",), speed.paper_stages),
     "locators": (("locators",), paper.locators),

@@ -1,11 +1,12 @@
 """What a frame costs on a GPU, markers and solve apart, against the batch: time, kernels, memory; graphs of kernels.
 
-python -m bench.speed.gpu [--device cuda] [--sensor FILE] [--images FILES] [--batches 1 4 16 64 256 1024] [--compiled]
-    [--json FILE]
+python -m bench.speed.gpu [--device cuda] [--sensor FILE] [--images FILES] [--batches 1 4 16 64 256 1024] [--graph]
+    [--compiled] [--json FILE]
 
 Wall time, the device waited for, the median of `--repeats` calls, over the batch. Kernels are those of one call (on the CPU,
-for a try without a GPU, the operators). `graph`: images to results recorded once as a CUDA graph and replayed; `compiled`:
-`torch.compile` of the same, minutes to compile. The first batch that does not fit ends the table.
+for a try without a GPU, the operators). --graph: images to results recorded once as a CUDA graph and replayed, in which the
+second tries of all frames are computed; --compiled: `torch.compile` of the same, minutes to compile. The first batch that does
+not fit ends the table.
 """
 
 import argparse
@@ -69,7 +70,7 @@ def recorded(run: Callable[[], object], device: torch.device) -> Callable[[], ob
     return graph.replay
 
 
-def measured(reconstructor: tm.Reconstructor, images: torch.Tensor, repeats: int, compiled: bool) -> dict:
+def measured(reconstructor: tm.Reconstructor, images: torch.Tensor, repeats: int, graph: bool, compiled: bool) -> dict:
     """One row."""
     device, batch = images.device, len(images)
     if device.type == "cuda":
@@ -85,6 +86,7 @@ def measured(reconstructor: tm.Reconstructor, images: torch.Tensor, repeats: int
     row |= {f"{name}_kernels": kernels(run, device) for name, run in parts.items()}
     if device.type == "cuda":
         row["megabytes"] = torch.cuda.max_memory_allocated(device) / 2**20
+    if graph:
         row["graph"] = milliseconds(recorded(parts["whole"], device), device, repeats) / batch
     if compiled:
         one = torch.compile(reconstructor)
@@ -99,6 +101,7 @@ def main() -> None:
     parser.add_argument("--images", nargs="+", default=IMAGES)
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 4, 16, 64, 256, 1024])
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--graph", action="store_true")
     parser.add_argument("--compiled", action="store_true")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
@@ -112,7 +115,7 @@ def main() -> None:
         images = few.repeat(batch // len(few) + 1, 1, 1, 1)[:batch].to(args.device)
         try:
             with torch.no_grad():
-                rows.append(measured(reconstructor, images, args.repeats, args.compiled))
+                rows.append(measured(reconstructor, images, args.repeats, args.graph, args.compiled))
         except torch.cuda.OutOfMemoryError:
             print(f"batch {batch}: does not fit")
             break

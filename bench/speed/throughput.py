@@ -1,6 +1,7 @@
 """Frames a second from image files to results in the steady state: one thread of one process, and worker processes.
 
     OMP_NUM_THREADS=1 python -m bench.speed.throughput SENSOR.toml IMAGE [--workers 2] [--frames 300] [--format parquet]
+        [--device cuda]
 
 Runs the command on copies of an image, once on N and once on 3 N of them; the rate is that of the difference, so that starting
 does not count. Processor time, of all processes together, is given beside the time on the clock: on a shared machine it alone
@@ -34,6 +35,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--format", default="parquet")
+    parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
     with TemporaryDirectory() as name:
         folder, few, many = Path(name), arguments.frames, 3 * arguments.frames
@@ -47,7 +49,8 @@ def main() -> None:
             for count in (few, many):
                 out = folder / f"out{workers}_{count}"
                 base = [sys.executable, "-m", "torchmembrane", "reconstruct", arguments.sensor, str(folder / str(count))]
-                times.append(timed([*base, "--out", str(out), "--format", arguments.format, "--workers", str(workers)]))
+                options = ["--format", arguments.format, "--workers", str(workers), "--device", arguments.device]
+                times.append(timed([*base, "--out", str(out), *options]))
             clock, spent = (b - a for a, b in zip(*times, strict=True))
             rates.append((many - few) / clock)
             print(

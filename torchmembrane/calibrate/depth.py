@@ -73,6 +73,7 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, pro
         >>> bool(np.abs(found.surface.offsets).max() < 0.1), len(found.sensor.markers.positions)
         (True, 121)
     """
+    sensor.refuse_heights("calibrate depth")
     depth = check_image("calibrate depth: the depth image", depth, sensor.camera.image_size)
     image = check_image("calibrate depth: the image", image, sensor.camera.image_size)
     progress(0.0, "depths on the designed surface")

@@ -287,6 +287,7 @@ def _is_settled(sensor: Sensor, made: Sensor) -> bool:
 def _reconstructor(sensor: Sensor) -> Reconstructor:
     views = max(1, len(sensor.views))
     expect(views == 1, "calibrate material: views", views, "1: calibrate sensor.in_view(0), the first view by itself")
+    sensor.refuse_heights("calibrate material")
     if sensor.material.model == "harmonic":
         raise MembraneError(
             "calibrate material: a harmonic membrane has one shape at any prestretch; expected neo_hookean or mooney_rivlin"

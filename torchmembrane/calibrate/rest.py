@@ -85,6 +85,7 @@ def rest_from_image(
     """
     if sensor.markers.positions is None:
         raise MembraneError("calibrate rest: the sensor lists no dots; expected [markers] file, or use views or depth")
+    sensor.refuse_heights("calibrate rest")
     if isinstance(sensor.surface, InflatedSurface):
         from .rest_of_sheet import rest_of_sheet  # here: it builds on this module
 

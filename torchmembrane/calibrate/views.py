@@ -93,6 +93,7 @@ def rest_from_views(
     Limitations:
         What moves the surface within itself, and its rim outside the dots, is not observed. At least two views must differ.
     """
+    sensor.refuse_heights("calibrate views")
     motions = np.asarray(motions, float)
     images = [check_image("calibrate views: an image", image, sensor.camera.image_size) for image in images]
     if len(images) < 2 or motions.shape != (len(images), 6) or np.abs(motions[0]).max() > 0:

@@ -192,7 +192,9 @@ def _cavity(sensor: Sensor) -> list[str]:
 
 def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame | None) -> list[str]:
     markers = sensor.markers
-    lines = [f"{markers.kind}, {markers.polarity}"]
+    lines, heights = [f"{markers.kind}, {markers.polarity}"], np.atleast_1d(markers.height)
+    if markers.stand_off:
+        lines.append(f"they stand off the inner side by {_extent(heights)} {sensor.length_unit}")
     if markers.positions is not None:
         listed, large = len(markers.positions), sum(size == "large" for size in markers.sizes or ())
         lines[0] += f", {listed} listed: {large} large, {listed - large} small"
@@ -220,6 +222,12 @@ def _markers(sensor: Sensor, reconstructor: Reconstructor | None, frame: Frame |
         rms = np.sqrt((off**2).mean())
         lines.append(f"they lie {rms:.2f} px (rms; at most {off.max():.2f} px) from where the model has them")
     return [*lines, *reconstructed]
+
+
+def _extent(values: np.ndarray) -> str:
+    """The least and the largest value, or the one that all are."""
+    low, high = values.min(), values.max()
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def _of_views(sensor: Sensor, reconstructor: Reconstructor, frame: Frame) -> list[str]:

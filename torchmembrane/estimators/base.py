@@ -26,13 +26,14 @@ class Problem(NamedTuple):
     filling          of the cavity: "liquid", "gas" or "open"
     gas              of a gas: its absolute pressure at rest, force / length^2, and its volume, length^3; else None
     markers          the markers as points of the rest surface's triangles
-    positions        [D, 3]  rest positions of the markers, length unit
+    positions        [D, 3]  rest positions of the markers on the surface, length unit
     rest_pixels      [D, 2]  where the camera model sees the markers at rest, px
     vertex_pixels    [V, 2]  where the camera model sees the grid's vertices at rest, px
     rest_covariance  [D, 2, 2]  px^2, noise of the markers' displacements in a frame like the rest image
     rest_confidence  [D]  1 of markers whose rays at rest count, 0 of others; None: all count
     views            W, how many views see the markers: each marker is then listed once for each view, D is all of these, and
                      the camera is a `Rig`
+    levers           [D, 3]  from the positions to what the camera sees of the markers at rest; None: they lie on the surface
     """
 
     camera: Camera | Rig
@@ -47,6 +48,7 @@ class Problem(NamedTuple):
     rest_covariance: Tensor
     rest_confidence: Tensor | None = None
     views: int = 1
+    levers: Tensor | None = None
 
     def cavity_law(self) -> CavityLaw:
         """What the fluid asks of the enclosed volume; the rest pressure is the one that balances the membrane's tension."""
@@ -183,6 +185,7 @@ class Estimator(nn.Module, ABC):
             true is refused.
         finds_tractions: whether `forward` finds tractions, and with them forces.
         takes_views: whether it can be given several views, as of `Problem.views`; refused otherwise.
+        takes_heights: whether it can be given markers that stand off the surface, as of `Problem.levers`; refused otherwise.
         in_parts: whether `forward` is put together of methods marked `control_flow.traced`; an exported model holds any other
             `forward` as one part, which must consist of torch operations that ONNX has.
         name: the one by which it was asked for; set by `Reconstructor`.
@@ -218,6 +221,7 @@ class Estimator(nn.Module, ABC):
     finds_tractions: ClassVar[bool] = False
     in_parts: ClassVar[bool] = False
     takes_views: ClassVar[bool] = False
+    takes_heights: ClassVar[bool] = False
     name: str = ""
 
     def __init__(self, membrane: Membrane, cavity: CavityLaw, settings: Any = None, spacing: float = 0.0):

@@ -83,7 +83,8 @@ def _summits(height: Tensor) -> Tensor:
     m, n = height.shape[1:]
     wide = F.pad(height, (1, 1, 1, 1), value=-torch.inf)
     around = torch.stack([wide[:, 1 + i : 1 + i + m, 1 + j : 1 + j + n] for i, j in AROUND], 1).flatten(2)
-    steps = torch.tensor([i * n + j for i, j in AROUND], device=height.device)
+    beside = torch.arange(-1, 2, device=height.device)
+    steps = (n * beside[:, None] + beside).flatten()
     vertex = torch.arange(m * n, device=height.device)
     up = (vertex + steps[around.max(1).indices]).clamp(0, m * n - 1)
     for _ in range((m * n).bit_length()):  # each time twice as far

@@ -4,7 +4,8 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
-from ..errors import MembraneError
+from ..errors import MembraneError, expect
+from ..sensor.sensor import Sensor
 from ..sensor.synonyms import did_you_mean
 from .base import Estimator, Problem
 from .force_balance.estimator import ForceBalance
@@ -89,6 +90,25 @@ def check_protocol(kind: Any, given: str) -> None:
         lacking.append("@dataclass(frozen=True) at Settings")
     if lacking:
         raise MembraneError(f"{given} lacks {', '.join(lacking)}; see torchmembrane.Estimator for what an estimator defines")
+
+
+def refuse_unfit(sensor: Sensor, name: str, kind: type[Estimator]) -> None:
+    """Refuse a sensor that an estimator cannot take.
+
+    Args:
+        sensor: the sensor.
+        name: of the estimator, for messages.
+        kind: its class.
+
+    Raises:
+        MembraneError: several views, or markers that stand off the surface, for an estimator that does not take them.
+    """
+    views, markers = max(1, len(sensor.views)), sensor.markers
+    expected = "1, as of sensor.in_view(0), or force-balance"
+    expect(views == 1 or kind.takes_views, f"Reconstructor: views for {name}", views, expected)
+    expected = "0, markers on the surface, or force-balance"
+    right = kind.takes_heights or not markers.stand_off
+    expect(right, f"Reconstructor: height of the markers for {name}", markers.height, expected)
 
 
 def built_estimator(problem: Problem, name: str, kind: type[Estimator], settings: Any = None) -> Estimator:

@@ -34,4 +34,5 @@ def problem_of(seen: Sightings, membrane: Membrane, elasticity: ElasticEnergy, c
         rest_covariance=2 * seen.observer.rest_covariance.double() + LEAST_ERROR**2 * torch.eye(2).double(),
         rest_confidence=None if views == 1 else seen.observer.seen_at_rest.double(),
         views=views,
+        levers=seen.levers,
     )

@@ -11,7 +11,9 @@ from torch import Tensor
 from ..errors import MembraneError
 from ..sensor.sensor import Sensor
 from ..sensor.views import SurfaceInView
-from ..surface.projection import SurfacePoints
+from ..surface.levers import inward_levers
+from ..surface.membrane import Membrane
+from ..surface.projection import SurfacePoints, ray_points
 from ..surface.tangent import tangent_axes
 from ..surface.topology import rim_loop
 from .dots.locator import DotLocator
@@ -39,10 +41,11 @@ class PlacedMarkers:
 
     Attributes:
         positions: `[D, 3]`, length unit, camera frame.
-        model_pixels: `[D, 2]`, where the camera model projects them.
+        model_pixels: `[D, 2]`, where the camera model projects them, or their tips where they stand off the surface.
         points: the same as points of the membrane's triangles.
         in_view: `[D]` bool, which of them reach into the image at rest.
         locator: finds them in images.
+        levers: `[D, 3]`, from the positions to the tips; None: all lie on the surface.
     """
 
     positions: np.ndarray
@@ -50,6 +53,7 @@ class PlacedMarkers:
     points: SurfacePoints
     in_view: np.ndarray
     locator: Locator
+    levers: np.ndarray | None = None
 
 
 def imaged_vertices(sensor: Sensor, vertex_pixels: Tensor, whole: bool) -> Tensor:
@@ -92,7 +96,8 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS
         positions = np.asarray(markers.positions, dtype=float)
         if len(positions) < FEWEST_MARKERS:
             raise MembraneError(f"sensor {sensor.name!r}: {len(positions)} dots; expected at least {FEWEST_MARKERS}: list more")
-        pattern = _listed_pattern(sensor, positions)
+        levers = listed_levers(sensor)
+        pattern = _listed_pattern(sensor, _tips(positions, levers))
         anchors = anchors[np.isfinite(anchors).all(1)]
         built = of_dots(pattern, (width, height), markers.polarity, anchors)
     else:
@@ -100,16 +105,36 @@ def place_markers(sensor: Sensor, vertex_pixels: Tensor, locator: str = LOCATORS
         assert image is not None  # or `Markers` has refused it
         if markers.kind == "texture":
             patches = choose_patches(image, mask)
-            positions, placed = _place_on_surface(sensor, patches)
+            positions, levers, placed = _place_on_surface(sensor, patches)
             built = of_texture(image, patches[placed], anchors)
         else:
             pattern = find_dots(image, markers.polarity, mask)
-            positions, placed = _place_on_surface(sensor, pattern.pixels)
+            positions, levers, placed = _place_on_surface(sensor, pattern.pixels)
             pattern = DotPattern(*(field[placed] for field in pattern))
             built = of_dots(pattern, (width, height), markers.polarity, anchors)
-    pixels, points = _model_pixels(sensor, positions), sensor.membrane.closest_points(positions)
+    pixels, points = _model_pixels(sensor, _tips(positions, levers)), sensor.membrane.closest_points(positions)
     seen = in_view(pixels, (width, height)) if pattern is None else partly_in_view(pixels, pattern.shapes, (width, height))
-    return PlacedMarkers(positions, pixels, points, seen, built)
+    return PlacedMarkers(positions, pixels, points, seen, built, levers)
+
+
+def listed_levers(sensor: Sensor) -> np.ndarray | None:
+    """From a sensor's listed dots to their tips, at rest, `[D, 3]`; None where all lie on the surface."""
+    markers = sensor.markers
+    if markers.positions is None or not markers.stand_off:
+        return None
+    smooth = _smooth_surface(sensor)
+    return inward_levers(smooth, smooth.closest_points(markers.positions), markers.heights(len(markers.positions)))
+
+
+def _smooth_surface(sensor: Sensor) -> Membrane:
+    m, n = sensor.membrane.grid
+    assert sensor.surface is not None  # `Sensor` has set it
+    return sensor.surface.membrane((max(m, SMOOTH_GRID), max(n, SMOOTH_GRID)))
+
+
+def _tips(positions: np.ndarray, levers: np.ndarray | None) -> np.ndarray:
+    """What the camera sees of markers, `[D, 3]`."""
+    return positions if levers is None else positions + levers
 
 
 def _locators(name: str) -> tuple[Callable[..., Locator], Callable[..., Locator]]:
@@ -145,20 +170,22 @@ def visible(sensor: Sensor, positions: np.ndarray) -> np.ndarray:
     return turned & ~(nearest < distance - BEHIND * membrane.size)
 
 
-def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the rays of `pixels [D, 2]` in the rest image meet the rest surface, `[M, 3]`; and which of them do, `[D]` bool."""
+def _place_on_surface(sensor: Sensor, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """The markers `[M, 3]` whose tips are where the rays of `pixels [D, 2]` in the rest image first meet the surface of all
+    tips; their levers `[M, 3]`, None where that is the rest surface; and which of the rays meet it, `[D]` bool."""
     rays = sensor.camera.pixel_to_ray(torch.from_numpy(pixels))
-    m, n = sensor.membrane.grid
-    assert sensor.surface is not None  # `Sensor` has set it
-    smooth = sensor.surface.membrane((max(m, SMOOTH_GRID), max(n, SMOOTH_GRID)))
-    hits = smooth.ray_points(*(r.numpy() for r in rays))
+    smooth = _smooth_surface(sensor)
+    X, height = smooth.rest.numpy(), float(sensor.markers.height)
+    levers = -height * smooth.rest_normals.numpy()
+    hits = ray_points(X + levers, smooth.triangles.numpy(), *(r.numpy() for r in rays))
     placed = np.isfinite(hits.distance)
     if placed.sum() < FEWEST_MARKERS:
         raise MembraneError(
             f"sensor {sensor.name!r}: {placed.sum()} markers found in the rest image lie on the rest surface; expected at "
             f"least {FEWEST_MARKERS}: check the camera, the rest surface and the polarity"
         )
-    return (smooth.rest.numpy()[hits.vertices] * hits.weights[..., None]).sum(1)[placed], placed
+    feet, to_tips = ((each[hits.vertices] * hits.weights[..., None]).sum(1)[placed] for each in (X, levers))
+    return feet, to_tips if height else None, placed
 
 
 def markers_in_view(sensor: Sensor) -> np.ndarray:
@@ -172,7 +199,8 @@ def markers_in_view(sensor: Sensor) -> np.ndarray:
         >>> bool(markers_in_view(preset("bubble")).all())
         True
     """
-    return in_view(_model_pixels(sensor, np.asarray(sensor.markers.positions, dtype=float)), sensor.camera.image_size)
+    positions = np.asarray(sensor.markers.positions, dtype=float)
+    return in_view(_model_pixels(sensor, _tips(positions, listed_levers(sensor))), sensor.camera.image_size)
 
 
 def refuse_blind(sensor: Sensor, name: str) -> None:

@@ -28,6 +28,7 @@ class Sightings(NamedTuple):
         points: the same N as points of the membrane's triangles.
         rest_pixels: `[N, 2]`, where the model sees them; of several views the principal point where one does not.
         vertex_pixels: `[V, 2]`, where the first view sees the grid's vertices.
+        levers: `[N, 3]`, from the positions to the tips that are seen; None: all markers lie on the surface.
     """
 
     observer: MarkerObserver | ViewsObserver
@@ -37,6 +38,7 @@ class Sightings(NamedTuple):
     points: SurfacePoints
     rest_pixels: Tensor
     vertex_pixels: Tensor
+    levers: Tensor | None = None
 
 
 def sightings(sensor: Sensor, locator: str, dtype: torch.dtype, whole: bool, check_rest: bool) -> Sightings:
@@ -54,9 +56,10 @@ def sightings(sensor: Sensor, locator: str, dtype: torch.dtype, whole: bool, che
     """
     observer, markers, vertex_pixels = _of_one_view(sensor.in_view(0), sensor.name, locator, dtype, whole, check_rest)
     positions, rest_pixels = torch.from_numpy(markers.positions), torch.from_numpy(markers.model_pixels)
+    levers = None if markers.levers is None else torch.from_numpy(markers.levers)
     if not sensor.views:
         camera = copy.deepcopy(sensor.camera)
-        return Sightings(observer, camera, markers, positions, markers.points, rest_pixels, vertex_pixels)
+        return Sightings(observer, camera, markers, positions, markers.points, rest_pixels, vertex_pixels, levers)
     observers, pixels = [observer], [rest_pixels]
     for number, view in enumerate(sensor.views[1:], 1):
         name = f"{sensor.name}, view {view.name}"
@@ -71,7 +74,8 @@ def sightings(sensor: Sensor, locator: str, dtype: torch.dtype, whole: bool, che
     rig = Rig([view.camera for view in sensor.views], [view.pose for view in sensor.views], outside)
     points = SurfacePoints(*(np.concatenate([field] * len(observers)) for field in markers.points))
     repeated = positions.repeat(len(observers), 1)
-    return Sightings(together, rig, markers, repeated, points, rays, vertex_pixels)
+    levers = None if levers is None else levers.repeat(len(observers), 1)
+    return Sightings(together, rig, markers, repeated, points, rays, vertex_pixels, levers)
 
 
 def _of_one_view(

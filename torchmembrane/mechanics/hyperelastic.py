@@ -351,7 +351,7 @@ class ElasticEnergy(nn.Module):
     @property
     def tension(self) -> Tensor:
         """Rest tension (force / length): the isotropic stress resultant at `x = X`."""
-        two, one = self.prestretch.new_tensor(2.0), self.prestretch.new_tensor(1.0)
+        two, one = self.prestretch.new_full((), 2.0), self.prestretch.new_full((), 1.0)
         w = self.derivatives(two, one)
         return 2 * (w.I + w.D)
 

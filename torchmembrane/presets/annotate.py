@@ -51,6 +51,7 @@ WORDS = {
         "kind": "dots | texture",
         "polarity": "dark | light, the marks against their ground",
         "file": "x,y,z,size of every dot at rest, camera's frame, length unit",
+        "height": "by which the dots stand off the inner side (pins), length unit",
         "rest_image": "nothing touches; or a list of images, or a pattern with *, averaged",
     },
 }

@@ -11,7 +11,8 @@ from ..files.csv_table import ANGLE, ANY, Columns, read_table
 from ..files.digits import rounded
 from ..markers.placement import FEWEST_MARKERS
 from ..sensor.inflated import InflatedSurface
-from ..sensor.parts import OFF_SURFACE, Surface
+from ..sensor.marker_checks import OFF_SURFACE
+from ..sensor.parts import Surface
 from ..sensor.toml import COORDINATE, MOST_DOTS, MOST_DOTS_BYTES, SIZES
 
 FINE = (97, 97)  # vertices of the surface on which dots are put

@@ -3,13 +3,12 @@
 Lengths are in the sensor's unit, in the camera's frame. Pressures are in hPa, as in the file.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..camera.model import Camera
 from ..errors import MembraneError, check_arguments, expect
@@ -25,11 +24,9 @@ from .working_range import GENERAL, WorkingRange
 if TYPE_CHECKING:
     from .views import View
 
-OFF_SURFACE = 0.05  # largest distance of a dot from the rest surface, in the surface's size
 MOST_PRESTRETCH, MOST_C2_RATIO = 10.0, 1e3
 POSITIVE = {"shear_modulus": (1e-12, 1e12), "thickness": (1e-6, 1e5), "pressure": (1e-3, 1e6), "volume": (1e-12, 1e18)}
 """What such a quantity of a membrane can be, in the file's units with any of the length units."""
-LEAST_APART = 1e-3  # of two dots, in the surface's size
 FILLINGS = ("liquid", "gas", "open")
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 SHAPES_BY_NUMBERS = {
@@ -127,6 +124,8 @@ class Markers:
         positions: `[D, 3]` of the dots at rest, length unit, camera frame; None: found in the rest image.
         sizes: D times "small" | "large"; None: all small.
         rest_image: an array as `to_grey` takes it, kept as grey float32 `[height, width]`; or a path, which is read.
+        height: of dots that stand off the inner side, as pins' tips do, along the inward normal, length unit: one number for
+            all, or `[D]`, one for each listed dot, whose position is then that of its foot on the surface.
 
     Raises:
         MembraneError: names the value, what came and what was expected.
@@ -141,6 +140,7 @@ class Markers:
     positions: np.ndarray | None = None
     sizes: list[str] | None = None
     rest_image: np.ndarray | None = None
+    height: float | np.ndarray = 0.0
 
     def __post_init__(self) -> None:
         expect(self.kind in ("dots", "texture"), "kind", self.kind, "'dots' or 'texture'")
@@ -155,6 +155,7 @@ class Markers:
             raise MembraneError("file and rest_image are missing; expected dots, an image that shows them, or both")
         if self.positions is None:
             expect(self.sizes is None, "sizes", self.sizes, "none without positions")
+            self._set_height(0)
             return
         positions = np.asarray(self.positions, dtype=np.float64)
         right = positions.ndim == 2 and positions.shape[1] == 3 and len(positions) > 0
@@ -166,6 +167,26 @@ class Markers:
         expect(right, "sizes", sizes, f"{len(positions)} times 'small' or 'large'")
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "sizes", sizes)
+        self._set_height(len(positions))
+
+    def _set_height(self, count: int) -> None:
+        """Keep one number for all where they have the same."""
+        heights = np.asarray(self.height, dtype=np.float64)
+        right = heights.shape in ((), (count,)) and bool(np.isfinite(heights).all())
+        expect(right, "height", self.height, f"a finite number, or an array of {count}, one for each listed dot")
+        alike = heights.ndim == 0 or bool((heights == heights[:1]).all())
+        object.__setattr__(self, "height", float(heights.flat[0]) if alike and heights.size else heights)
+        standing = self.kind == "dots" or not self.stand_off
+        expect(standing, "height", self.height, "none for texture, which lies on the surface: remove it")
+
+    @property
+    def stand_off(self) -> bool:
+        """Whether any of the markers stands off the surface."""
+        return bool(np.any(self.height))
+
+    def heights(self, count: int) -> np.ndarray:
+        """Heights `[count]` of so many markers."""
+        return np.broadcast_to(np.asarray(self.height, dtype=np.float64), (count,))
 
 
 @check_arguments
@@ -286,48 +307,6 @@ def refuse_other_size(size: tuple[int, int], camera: Camera) -> None:
         raise MembraneError(f"{came}; expected the same: where the camera's mode crops or bins, give crop and binning")
     how = f"of crop {list(mode.crop)} and binning {list(mode.binning)}"
     raise MembraneError(f"{came} {how}; expected the same, or the calibrated {list(mode.image_size)}")
-
-
-def refuse_off_surface(membrane: Membrane, positions: np.ndarray, names: Sequence[str]) -> None:
-    """Refuse the first dot that is not near the rest surface.
-
-    Args:
-        membrane: the rest surface.
-        positions: `[D, 3]`.
-        names: of the D dots, as the message begins.
-
-    Raises:
-        MembraneError: with its name, position, distance and what was expected.
-    """
-    distance = membrane.closest_points(positions).distance
-    limit = OFF_SURFACE * membrane.size
-    if not (distance <= limit).all():
-        i = int(np.flatnonzero(~(distance <= limit))[0])
-        raise MembraneError(
-            f"{names[i]} at {positions[i].tolist()} is {distance[i]:.4g} off the rest surface; expected at most {limit:.4g}: "
-            "give positions at rest, in the camera's frame and the sensor's length unit"
-        )
-
-
-def refuse_coincident(membrane: Membrane, positions: np.ndarray, names: Sequence[str]) -> None:
-    """Refuse the first dot that lies on another one.
-
-    Args:
-        membrane: the rest surface.
-        positions: `[D, 3]`.
-        names: of the D dots, as the message begins.
-
-    Raises:
-        MembraneError: with the names and positions of both, and what was expected.
-    """
-    limit = LEAST_APART * membrane.size
-    pairs = cKDTree(positions).query_pairs(limit, output_type="ndarray")
-    if len(pairs):
-        i, j = pairs[np.lexsort(pairs.T)[0]]
-        raise MembraneError(
-            f"{names[j]} at {positions[j].tolist()} lies on that at {positions[i].tolist()} ({names[i]}); expected dots more "
-            f"than {limit:.3g} apart: remove one"
-        )
 
 
 def _expect_positive(**values: float | None) -> None:

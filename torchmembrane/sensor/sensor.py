@@ -15,14 +15,13 @@ from ..errors import MembraneError, check_arguments, expect
 from ..pose import Pose
 from ..surface.membrane import Membrane
 from .inflated import InflatedSurface
+from .marker_checks import refuse_coincident, refuse_off_surface, refuse_tall
 from .parts import (
     Cavity,
     Markers,
     Material,
     SensorParts,
     Surface,
-    refuse_coincident,
-    refuse_off_surface,
     refuse_other_size,
 )
 from .record import Record
@@ -88,6 +87,7 @@ class Sensor:
             names = [f"Sensor: markers.positions[{i}]" for i in range(len(self.markers.positions))]
             refuse_off_surface(self.membrane, self.markers.positions, names)
             refuse_coincident(self.membrane, self.markers.positions, names)
+        refuse_tall(self.membrane, self.markers)
         if self.views:
             first = replace(self.views[0], camera=self.camera, rest_image=self.markers.rest_image)
             object.__setattr__(self, "views", (first, *self.views[1:]))
@@ -116,7 +116,7 @@ class Sensor:
             self,
             camera=view.camera,
             membrane=view.membrane(self.membrane),
-            markers=replace(markers, positions=positions, rest_image=view.rest_image),
+            markers=replace(markers, positions=positions, rest_image=view.rest_image, height=view.height(markers.height)),
             surface=SurfaceInView(self.surface, view),
             tool=None,
             views=(),
@@ -132,6 +132,18 @@ class Sensor:
             MembraneError: with the remedy.
         """
         expect(not self.views, f"{owner}: views", len(self.views), "one camera, as of sensor.in_view(0)")
+
+    def refuse_heights(self, owner: str) -> None:
+        """Refuse a sensor whose markers stand off the surface where they must lie on it.
+
+        Args:
+            owner: what needs them there, as the message begins.
+
+        Raises:
+            MembraneError: with the remedy.
+        """
+        height, expected = self.markers.height, "0: markers must lie on the surface for this; a pin's height is not known to it"
+        expect(not self.markers.stand_off, f"{owner}: height of the markers", height, expected)
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -181,6 +193,7 @@ class Sensor:
         markers = self.markers
         arrays: dict[str, np.ndarray | None] = {**self.surface.arrays()}
         arrays |= {"positions": markers.positions, "rest_image": markers.rest_image}
+        arrays |= {"height": None if isinstance(markers.height, float) else markers.height}
         arrays |= {f"rest_image {view.name}": view.rest_image for view in self.views[1:]}
         words = dict(tables_of(self.parts), sizes=markers.sizes)
         digest = hashlib.sha256(json.dumps(_as_numbers(words), sort_keys=True).encode())

@@ -11,7 +11,7 @@ import numpy as np
 from ..camera.model import Camera
 from ..errors import MembraneError
 from ..files.atomic import make_folder, write_bytes, write_text
-from ..files.csv_table import Columns, Limit, read_table
+from ..files.csv_table import Columns, Limit, Row, read_table
 from ..files.images import image_size, mean_image, write_image
 from ..files.safe_read import read_arrays
 from ..pose import Pose
@@ -20,6 +20,7 @@ from ..surface.membrane import Membrane
 from .camera_tables import camera_table, read_cameras, refuse_folded, view_tables, with_rest_images, write_cameras
 from .inflated import SHAPE as INFLATED
 from .inflated import read_inflated, rim_lines
+from .marker_checks import refuse_coincident, refuse_off_surface, refuse_tall
 from .parts import (
     SHAPES_BY_ARRAYS,
     SHAPES_BY_NUMBERS,
@@ -28,8 +29,6 @@ from .parts import (
     Material,
     SensorParts,
     Surface,
-    refuse_coincident,
-    refuse_off_surface,
     refuse_other_size,
 )
 from .record import Record, read_record
@@ -45,8 +44,9 @@ MOST_VERTICES = 2**18
 MOST_DOTS, MOST_DOTS_BYTES = 2000, 2**20
 SIZES = ("small", "large")
 DOTS_HEADER = ("x", "y", "z", "size")
+HEIGHT = "height"
 COORDINATE = Limit(FARTHEST, "a coordinate", "the length unit")
-DOTS = Columns([DOTS_HEADER], "dot", most=MOST_DOTS)
+DOTS = Columns([DOTS_HEADER], "dot", HEIGHT, most=MOST_DOTS)
 
 
 def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
@@ -86,6 +86,8 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
         names = [f"{line}: the dot" for line in lines]
         refuse_off_surface(membrane, markers.positions, names)
         refuse_coincident(membrane, markers.positions, names)
+    with file.table("markers").naming(HEIGHT):
+        refuse_tall(membrane, markers)
     refuse_folded(file, camera, views, membrane)
     tool = _read_tool(file.table("tool")) if "tool" in file else None
     record = read_record(file.table("record")) if "record" in file else Record()
@@ -118,7 +120,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
         write_text(path.with_name(tables["membrane"]["outline"]), rim_lines(surface.values["outline"]))
     if markers.positions is not None:
         tables["markers"]["file"] = f"{path.stem}_dots.csv"
-        _write_dots(path.with_name(tables["markers"]["file"]), markers.positions, markers.sizes or [])
+        _write_dots(path.with_name(tables["markers"]["file"]), markers)
     rest_image = shared if parts.views else markers.rest_image
     if rest_image is not None:
         tables["markers"]["rest_image"] = write_image(path.with_name(f"{path.stem}_rest"), rest_image, parts.camera.bits).name
@@ -139,6 +141,8 @@ def tables_of(parts: SensorParts) -> dict[str, Any]:
         "cavity": asdict(cavity),
         "markers": {"kind": markers.kind, "polarity": markers.polarity},
     }
+    if isinstance(markers.height, float) and markers.stand_off:
+        tables["markers"][HEIGHT] = markers.height
     tool = parts.tool
     return tables if tool is None else tables | {"tool": {key: value.tolist() for key, value in vars(tool).items()}}
 
@@ -191,17 +195,25 @@ def _read_cavity(table: Table) -> Cavity:
 
 def _read_markers(table: Table, camera: Camera) -> tuple[Markers, list[str]]:
     """The markers, and of each listed dot where it stands: file and line."""
-    table.allow(("kind", "file", "rest_image", "polarity"))
+    table.allow(("kind", "file", "rest_image", "polarity", HEIGHT))
     kind = table.text("kind", ("dots", "texture"))
     polarity = table.text("polarity", ("dark", "light")) if kind == "dots" or "polarity" in table else "dark"
     dots, images = table.file("file") if "file" in table else None, table.files("rest_image") if "rest_image" in table else []
     if dots and kind == "texture":
         raise table.refuse("file", "none for texture, whose patches are chosen in the rest image: remove it")
-    positions, sizes, lines = _read_dots(dots) if dots else (None, None, [])
+    height = table.number(HEIGHT) if HEIGHT in table else 0.0
+    if height < 0:
+        raise table.refuse(HEIGHT, "0 or more, along the inward normal")
+    if height and kind == "texture":
+        raise table.refuse(HEIGHT, "none for texture, which lies on the surface: remove it")
+    positions, sizes, lines, heights = _read_dots(dots) if dots else (None, None, [], None)
+    if heights is not None and HEIGHT in table:
+        raise table.refuse(HEIGHT, f"none, as {dots} has a column of that name: remove one of them")
     with table.naming("rest_image"):
         for path in images[:1]:  # the others are of the same size, or refused
             refuse_other_size(image_size(path), camera)
-        return Markers(kind, polarity, positions, sizes, mean_image(images, camera.bits) if images else None), lines
+        image = mean_image(images, camera.bits) if images else None
+        return Markers(kind, polarity, positions, sizes, image, height if heights is None else heights), lines
 
 
 def _dots_to_come(table: Table) -> Markers:
@@ -209,16 +221,29 @@ def _dots_to_come(table: Table) -> Markers:
     return Markers(table.text("kind", ("dots",)), table.text("polarity", ("dark", "light")), np.zeros((1, 3)))
 
 
-def _read_dots(path: Path) -> tuple[np.ndarray, list[str], list[str]]:
-    """Positions `[D, 3]`, sizes, and where each dot stands."""
+def _read_dots(path: Path) -> tuple[np.ndarray, list[str], list[str], np.ndarray | None]:
+    """Positions `[D, 3]`, sizes, where each dot stands, and heights `[D]` if there is a column of them."""
     rows = read_table(path, DOTS, MOST_DOTS_BYTES).rows
     positions = np.array([row.numbers("xyz", COORDINATE) for row in rows])
-    return positions, [row.choice("size", SIZES) for row in rows], [row.where for row in rows]
+    heights = np.array([_read_height(row) for row in rows]) if HEIGHT in rows[0].places else None
+    return positions, [row.choice("size", SIZES) for row in rows], [row.where for row in rows], heights
 
 
-def _write_dots(path: Path, positions: np.ndarray, sizes: list[str]) -> None:
-    rows = [[*map(repr, position), size] for position, size in zip(positions.tolist(), sizes, strict=True)]
-    write_text(path, "\n".join(map(",".join, [DOTS_HEADER, *rows])) + "\n")
+def _read_height(row: Row) -> float:
+    height = row.number(HEIGHT, COORDINATE)
+    if height < 0:
+        raise row.refusal(HEIGHT, "0 or more, along the inward normal")
+    return height
+
+
+def _write_dots(path: Path, markers: Markers) -> None:
+    assert markers.positions is not None and markers.sizes is not None  # or there is no file of dots
+    rows = [[*map(repr, position), size] for position, size in zip(markers.positions.tolist(), markers.sizes, strict=True)]
+    header: tuple[str, ...] = DOTS_HEADER
+    if not isinstance(markers.height, float):
+        header = (*DOTS_HEADER, HEIGHT)
+        rows = [[*row, repr(height)] for row, height in zip(rows, markers.height.tolist(), strict=True)]
+    write_text(path, "\n".join(map(",".join, [header, *rows])) + "\n")
 
 
 def _read_membrane(table: Table, markers: Markers, material: Material, length_unit: str) -> tuple[Surface, Membrane]:

@@ -70,6 +70,10 @@ class View:
         """The membrane in the view's frame; its outward normals point away from the view's camera, also of one outside."""
         return membrane.in_frame(self.pose.inverse, outside=self.side == "outside")
 
+    def height(self, height: float | np.ndarray) -> float | np.ndarray:
+        """The markers' height along the normals that point to the view's camera: of one outside the other way."""
+        return -height if self.side == "outside" else height
+
     def described(self) -> dict[str, Any]:
         """Name, pose, region and side, as keys of the sensor's file."""
         return {

@@ -36,7 +36,8 @@ class Canvas(NamedTuple):
 class Dots:
     """Discs of `ink` on a ground, both as reflectances in 0..1.
 
-    A disc is all material whose rest distance from `positions[d]`, in the tangent plane there, is at most `radii[d]`.
+    A disc is all material whose rest distance from `positions[d]`, in the tangent plane there, is at most `radii[d]`; at a
+    height it is the tip of a pin, across the inward normal at `positions[d]`, and the pin itself is not drawn.
 
     Args:
         positions: centres at rest, `[D, 3]`, length unit.
@@ -44,6 +45,7 @@ class Dots:
         missing: dots that are not painted.
         ink: reflectance of the discs.
         ground: reflectance around them.
+        heights: `[D]`, above the surface along its inward normal, length unit; None: all lie on it.
 
     Raises:
         MembraneError: radii, reflectances or missing dots that make no sense.
@@ -58,6 +60,7 @@ class Dots:
     missing: Sequence[int] = ()
     ink: float = 0.12
     ground: float = 1.0
+    heights: np.ndarray | None = None
     cell = 2.0
 
     def __post_init__(self) -> None:
@@ -68,6 +71,10 @@ class Dots:
         count = len(self.positions)
         if self.radii.shape != (count,) or not (self.radii > 0).all():
             raise MembraneError(f"Dots: radii {self.radii.tolist()}; expected {count} positive lengths, one for each dot")
+        heights = np.zeros(count) if self.heights is None else np.asarray(self.heights, float)
+        object.__setattr__(self, "heights", heights)
+        right = heights.shape == (count,) and bool(np.isfinite(heights).all())
+        expect(right, "Dots: heights", heights.tolist(), f"{count} lengths, one for each dot")
         if not (0 <= self.ink <= 1 and 0 < self.ground <= 1):
             raise MembraneError(f"Dots: ink = {self.ink}, ground = {self.ground}; expected reflectances in 0..1, ground not 0")
         if not all(0 <= d < count for d in self.missing):
@@ -86,14 +93,16 @@ class Dots:
         default = [share * spacing for share in DOT_RADIUS.values()]
         radius = dict(zip(DOT_RADIUS, default if radii is None else radii, strict=True))
         tones = {"dark": (0.12, 1.0), "light": (1.0, 0.2)}[sensor.markers.polarity]
-        made = cls(positions, np.array([radius[size] for size in sizes]), tuple(missing), *tones)
+        heights = sensor.markers.heights(len(positions))
+        made = cls(positions, np.array([radius[size] for size in sizes]), tuple(missing), *tones, heights)
         if radii is not None:
             _refuse_overlap(made)
         return made
 
     def described(self) -> dict[str, Any]:
         """What a data set's settings keep of the pattern."""
-        return {"dot_radii": sorted(set(self.radii.tolist())), "missing": list(self.missing), "ink": self.ink}
+        told = {"dot_radii": sorted(set(self.radii.tolist())), "missing": list(self.missing), "ink": self.ink}
+        return told | ({"heights": self.heights.tolist()} if np.any(self.heights) else {})  # type: ignore[union-attr]
 
     def albedo(self, canvas: Canvas) -> Tensor:
         """Reflectance `[V]` of the ground; discs are drawn sample by sample."""

@@ -16,7 +16,9 @@ from torch import Tensor, nn
 
 from ..errors import MembraneError, check_arguments
 from ..sensor.sensor import Sensor
+from ..surface.tangent import tangent_frame
 from .appearance import BRIGHT, DEFAULT_APPEARANCE, Appearance, blurred, diffuse_light, specular_light, vignette
+from .discs import draw_discs
 from .pattern import Canvas, Dots, Painted, Speckle, dot_coordinates, inside_unit_disc, pattern_of
 from .raster import LinearOnTriangles, visible_triangles
 
@@ -27,7 +29,7 @@ class RenderedDots(NamedTuple):
     """Dots of a deformed membrane.
 
     Attributes:
-        positions: of their centres, `[..., D, 3]`.
+        positions: of their centres, `[..., D, 3]`; of dots at a height of their tips.
         pixels: of their centres, `[..., D, 2]`.
         visible: `[..., D]` bool, in the image and not hidden.
     """
@@ -68,6 +70,8 @@ class Renderer(nn.Module):
     dot_vertices: Tensor
     dot_weights: Tensor
     dot_rest: Tensor
+    heights: Tensor
+    pin_radii: Tensor
     inked: Tensor
     dot_place: Tensor
     dot_row: Tensor
@@ -117,7 +121,11 @@ class Renderer(nn.Module):
         self.register_buffer("dot_vertices", torch.from_numpy(points.vertices))
         self.register_buffer("dot_weights", torch.from_numpy(points.weights))
         self.register_buffer("dot_rest", torch.from_numpy(positions))
-        painted = [d for d in range(len(positions)) if d not in missing]
+        self.register_buffer("heights", torch.from_numpy(np.array(dots.heights, float)))
+        there = [d for d in range(len(positions)) if d not in missing]
+        painted, self.pins = ([d for d in there if bool(self.heights[d]) == stands] for stands in (False, True))
+        self.register_buffer("pin_radii", torch.from_numpy(dots.radii[self.pins]))
+        self.pin_ink = dots.ink
         inked, place = torch.zeros(len(corners), dtype=torch.bool), torch.zeros(0, 3, 2, dtype=torch.float64)
         if painted:
             self.ink = dots.ink / dots.ground
@@ -145,13 +153,21 @@ class Renderer(nn.Module):
     def dots(self, vertices: Tensor) -> RenderedDots:
         """Where the centres of the pattern's dots are and which of them are visible, of the membrane at `[..., V, 3]`."""
         x = self.fine_vertices(vertices)
-        displacement = ((x - self.surface.rest)[..., self.dot_vertices, :] * self.dot_weights[..., None]).sum(-2)
-        positions = self.dot_rest + displacement
+        positions, inward = self._standing(x)
         pixels = self.camera.point_to_pixel(positions)
         hidden = [self._visible_range(*pair) < 0.99 * p.norm(dim=-1) for *pair, p in _each(x, pixels, positions)]
         size = pixels.new_tensor(self.camera.image_size)
         visible = ((pixels > -0.5) & (pixels < size - 0.5)).all(-1) & ~torch.stack(hidden).view(pixels.shape[:-1])
-        return RenderedDots(positions, pixels, visible)
+        turned = (self.heights != 0) & ((inward * positions).sum(-1) >= 0)
+        return RenderedDots(positions, pixels, visible & ~turned)
+
+    def _standing(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Centres of the dots, or of their tips, on the refined surface `x [..., W, 3]`, and its inward normals under them,
+        `[..., D, 3]` each."""
+        fields = x - self.surface.rest, self.surface.normals(x)
+        displacement, outward = ((a[..., self.dot_vertices, :] * self.dot_weights[..., None]).sum(-2) for a in fields)
+        inward = -F.normalize(outward, dim=-1)
+        return self.dot_rest + displacement + self.heights[:, None] * inward, inward
 
     def forward(self, vertices: Tensor) -> Tensor:
         """Images without noise.
@@ -237,7 +253,22 @@ class Renderer(nn.Module):
             grey[near] *= 1 + (self.ink - 1) * covered
         image = torch.full(visible.shape, self.appearance.outside, dtype=grey.dtype, device=visible.device)
         image.view(-1)[sample] = grey + shine
+        if self.pins:
+            self._draw_pins(image, x, light)
         return F.avg_pool2d(image[None, None], self.samples)[0, 0]
+
+    def _draw_pins(self, image: Tensor, x: Tensor, light: Tensor) -> None:
+        """Draw the tips of pins into the samples of an image, the nearest last."""
+        feet, weights = self.dot_vertices[self.pins], self.dot_weights[self.pins, :, None]
+        tips, inward = (each[self.pins] for each in self._standing(x))
+        across = self.pin_radii[:, None, None] * tangent_frame(inward)
+        centres, (ahead, behind) = self.camera.point_to_pixel(tips), (tips[:, None] + sign * across for sign in (1, -1))
+        radii = (self.camera.point_to_pixel(ahead) - self.camera.point_to_pixel(behind)) / 2
+        hidden = self._visible_range(x, centres) < 0.99 * tips.norm(dim=-1)
+        order = torch.nonzero(~hidden & ((inward * tips).sum(-1) < 0) & radii.isfinite().all((1, 2))).squeeze(-1)
+        order = order[tips[order].norm(dim=-1).argsort(descending=True)]
+        grey = self.pin_ink * (light[feet, :1] * weights).sum((1, 2))
+        draw_discs(image, ((centres + 0.5) * self.samples - 0.5)[order], self.samples * radii[order], grey[order])
 
 
 def render(

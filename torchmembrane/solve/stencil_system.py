@@ -9,10 +9,13 @@ from torch import Tensor, nn
 
 from . import band
 from .stencil import STENCIL
-from .stencil_layouts import NEAR, OFFSETS, Band, Inner, RowBlocks
+from .stencil_layouts import OFFSETS, Band, Inner, RowBlocks
 
 SLOTS = sorted(range(len(STENCIL)), key=STENCIL.__getitem__)
 """Of a stencil, in the order of the vertices: from one to a later one leads an offset, never its opposite."""
+
+PAIRS = [(a, b) for k, a in enumerate(SLOTS) for b in SLOTS[k:]]
+"""Of a stencil's vertices, each with itself and with the later ones."""
 
 
 class Matrix(NamedTuple):
@@ -61,11 +64,12 @@ class StencilSystem(nn.Module):
         Args:
             stencils: `A [B, 3, 3, 7, N]`, of every vertex's three numbers, in the three of every vertex of its stencil.
             weights: `W [B, 3, 3, N]`, symmetric.
-            near: `[B, 3, 3, 4, N]`, the further blocks, between the vertices and those at `NEAR` from them.
+            near: `[B, 3, 3, K, N]`, the further blocks, between the vertices and those at the first `K` of `OFFSETS` from them.
             damping: a share of the diagonal that is added.
         """
         blocks = self._blocks(stencils, weights)
-        blocks = torch.cat([blocks[:, :, :, : len(NEAR)] + near, blocks[:, :, :, len(NEAR) :]], 3)
+        close = near.shape[3]
+        blocks = torch.cat([blocks[:, :, :, :close] + near, blocks[:, :, :, close:]], 3)
         diagonal = blocks[:, :, :, 0].flatten(1, 2)[:, ::4]
         scale = (diagonal * (1 + damping) + self.fixed).rsqrt()
         there = scale.flatten(1).index_select(1, self.ends).reshape(-1, 1, 3, *blocks.shape[3:])
@@ -114,5 +118,5 @@ def _ends(inner_grid: tuple[int, int]) -> np.ndarray:
 
 def _offsets_of_pairs() -> Tensor:
     """`[10, 28]`: 1 where an offset is that between a pair of a stencil's vertices, the first by `SLOTS`, then the second."""
-    pairs = [(STENCIL[a], STENCIL[b]) for k, a in enumerate(SLOTS) for b in SLOTS[k:]]
+    pairs = [(STENCIL[a], STENCIL[b]) for a, b in PAIRS]
     return torch.tensor([[float((q[0] - p[0], q[1] - p[1]) == offset) for p, q in pairs] for offset in OFFSETS]).double()

@@ -32,16 +32,74 @@ def bicubic_shares(points: SurfacePoints, grid: tuple[int, int], fixed: Tensor) 
         >>> (bicubic_shares(points, (4, 4), torch.zeros(16, dtype=bool)) @ np.stack([row, row * column], 1)).tolist()
         [[0.5, 0.125]]
     """
-    (m, n), rows = grid, np.arange(len(points.vertices))[:, None]
-    place = (points.weights[..., None] * np.stack(np.divmod(points.vertices, n), -1)).sum(1)
-    shares: np.ndarray = (_along(place[:, 0], m)[:, :, None] * _along(place[:, 1], n)[:, None]).reshape(len(rows), m * n)
+    (m, n), place = grid, grid_coordinates(points, grid)
+    shares = _products(_along(place[:, 0], m), _along(place[:, 1], n))
+    kinked = _is_kinked(shares, grid, fixed)
+    shares[kinked] = _linear(points.vertices, points.weights, m * n)[kinked]
+    return shares
+
+
+def bicubic_slopes(points: SurfacePoints, grid: tuple[int, int], fixed: Tensor) -> np.ndarray:
+    """The shares of the vertices in a field's derivatives at points of the surface, along the grid's rows and columns.
+
+    Args:
+        points: as of `bicubic_shares`.
+        grid: as of `bicubic_shares`.
+        fixed: as of `bicubic_shares`.
+
+    Returns:
+        `[2, D, V]`, rows that sum to zero: the derivatives of what `bicubic_shares` interpolates, per step of the grid.
+
+    Example:
+        >>> points = SurfacePoints(np.array([[0, 4, 5]]), np.array([[0.5, 0.25, 0.25]]), np.zeros(1))
+        >>> row, column = np.divmod(np.arange(16.0), 4)
+        >>> (bicubic_slopes(points, (4, 4), torch.zeros(16, dtype=bool)) @ (row * column)).round(9).tolist()
+        [[0.25], [0.5]]
+    """
+    (m, n), place = grid, grid_coordinates(points, grid)
+    rows, columns = _along(place[:, 0], m), _along(place[:, 1], n)
+    along_rows = _products(_along(place[:, 0], m, slopes=True), columns)
+    slopes = np.stack([along_rows, _products(rows, _along(place[:, 1], n, slopes=True))])
+    kinked = _is_kinked(abs(slopes).sum(0), grid, fixed)
+    flat = [_linear(points.vertices, weights, m * n) for weights in triangle_slopes(points, grid)]
+    slopes[:, kinked] = np.stack(flat)[:, kinked]
+    return slopes
+
+
+def grid_coordinates(points: SurfacePoints, grid: tuple[int, int]) -> np.ndarray:
+    """Row and column, `[D, 2]`, of points of the surface, between the grid's lines."""
+    place: np.ndarray = (points.weights[..., None] * np.stack(np.divmod(points.vertices, grid[1]), -1)).sum(1)
+    return place
+
+
+def triangle_slopes(points: SurfacePoints, grid: tuple[int, int]) -> np.ndarray:
+    """Weights `[2, D, 3]` of the corners of the points' triangles in the derivatives of a field that is linear in each."""
+    corners = np.stack(np.divmod(points.vertices, grid[1]), -1).astype(float)
+    inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])
+    slopes: np.ndarray = np.concatenate([-inverse.sum(-1, keepdims=True), inverse], -1).swapaxes(0, 1)
+    return slopes
+
+
+def _products(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Shares `[D, m n]` of the vertices, of those of the lines in both directions."""
+    products: np.ndarray = (rows[:, :, None] * columns[:, None]).reshape(len(rows), -1)
+    return products
+
+
+def _is_kinked(shares: np.ndarray, grid: tuple[int, int], fixed: Tensor) -> np.ndarray:
+    """Which points have shares of fixed vertices that are not on the border, `[D]` bool."""
+    m, n = grid
     inside = np.zeros((m, n), bool)
     inside[1:-1, 1:-1] = fixed.numpy().reshape(m, n)[1:-1, 1:-1]
-    linear = np.zeros_like(shares)
-    np.add.at(linear, (rows, points.vertices), points.weights)
-    kinked = (abs(shares) @ inside.ravel()) > 0
-    shares[kinked] = linear[kinked]
-    return shares
+    kinked: np.ndarray = (abs(shares) @ inside.ravel()) > 0
+    return kinked
+
+
+def _linear(vertices: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
+    """Shares `[D, count]` that are the weights `[D, 3]` of triangles' corners."""
+    linear = np.zeros((len(vertices), count))
+    np.add.at(linear, (np.arange(len(vertices))[:, None], vertices), weights)
+    return linear
 
 
 class Refinement(nn.Module):
@@ -72,11 +130,14 @@ class Refinement(nn.Module):
         return finer.permute(0, 2, 3, 1).flatten(1, 2)
 
 
-def _along(place: np.ndarray, count: int) -> np.ndarray:
-    """Shares `[D, count]` of the lines of one direction: Lagrange's polynomials of the four around."""
+def _along(place: np.ndarray, count: int, slopes: bool = False) -> np.ndarray:
+    """Shares `[D, count]` of the lines of one direction: Lagrange's polynomials of the four around, or their derivatives."""
     first = np.clip(np.floor(place).astype(int), 0, count - 2)
     t = place - first
     cubic = -t * (t - 1) * (t - 2) / 6, (t + 1) * (t - 1) * (t - 2) / 2, -(t + 1) * t * (t - 2) / 2, (t + 1) * t * (t - 1) / 6
+    if slopes:
+        outer, inner = -(3 * t**2 - 6 * t + 2) / 6, (3 * t**2 - 4 * t - 1) / 2
+        cubic = outer, inner, -(3 * t**2 - 2 * t - 2) / 2, (3 * t**2 - 1) / 6
     shares, rows = np.zeros((len(place), count + 2)), np.arange(len(place))
     for k, share in enumerate(cubic):
         shares[rows, first + k] = share  # a line beyond the border at each end

@@ -38,7 +38,8 @@ from ..contacts import Contacts
 from .contact_force import ContactForce
 from .gauss_newton import Descent, State
 from .kernels.steps import compiled
-from .marker_residuals import Bearings, MarkerBearings, marker_rays, seen_from_origin
+from .lever_bearings import bearings_of
+from .marker_residuals import Bearings, MarkerBearings, marker_rays, rest_rays, seen_from_origin
 from .normal_equations import BalanceEquations
 from .pressure_gauge import gauge_reading, refuse_open
 from .settings import ForceBalanceSettings
@@ -71,6 +72,7 @@ class ForceBalance(Estimator):
         rest: the markers' rays at rest with their noise; None: from the origin, with `noise`.
         views: how many views see the markers, which are listed once for each.
         is_coarse: whether a finer grid follows.
+        levers: `[D, 3]`, from the markers to their tips, which are seen, at rest; None: they lie on the surface.
 
     Limitations:
         The press must not be so shallow that its tractions drown in noise; two contacts within `reach` are one.
@@ -81,6 +83,7 @@ class ForceBalance(Estimator):
     finds_tractions: ClassVar[bool] = True
     in_parts: ClassVar[bool] = True
     takes_views: ClassVar[bool] = True
+    takes_heights: ClassVar[bool] = True
     settings: ForceBalanceSettings
 
     def __init__(
@@ -96,6 +99,7 @@ class ForceBalance(Estimator):
         rest: Observation | None = None,
         views: int = 1,
         is_coarse: bool = False,
+        levers: Tensor | None = None,
     ):
         settings, spacing = settings or ForceBalanceSettings(), membrane.size / (len(positions) // views) ** 0.5
         super().__init__(membrane, CavityLaw(membrane, rest_balance(membrane, elasticity)[0], filling, gas), settings, spacing)
@@ -103,8 +107,9 @@ class ForceBalance(Estimator):
         self._far = settings.far * self.coarseness
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
-        bearings = MarkerBearings(membrane, markers, positions, noise, rest, views)
-        self.coarse = self._coarser(membrane, elasticity, bearings, rest=rest, filling=filling, gas=gas, views=views)
+        bearings = bearings_of(membrane, markers, positions, noise, rest, views, levers)
+        others: dict[str, Any] = dict(rest=rest, filling=filling, gas=gas, views=views, levers=levers)
+        self.coarse = self._coarser(membrane, elasticity, bearings, **others)
         self.refinement = None if self.coarse is None else Refinement(self.coarse.membrane.grid, membrane.grid)
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
@@ -114,18 +119,16 @@ class ForceBalance(Estimator):
         self.settling = 1 if is_coarse or self.coarse is not None else ALONE
         first = settings.coarse_steps if is_coarse else settings.steps
         self.steps = first if self.coarse is None else settings.finer_steps if self.dent is None else settings.fine_steps
-        rest = seen_from_origin(bearings.positions) if rest is None else rest
+        rest = seen_from_origin(bearings.seen_at_rest) if rest is None else rest
         loss.push_noise, loss.noise_gain = noise_effects(self.equations, self.cavity, rest, settings.camera_motion)
 
     @classmethod
     def from_problem(cls, problem: Problem, settings: ForceBalanceSettings | None = None) -> Self:
         """The estimator of a sensor."""
-        noise = float(problem.rest_covariance.diagonal(dim1=-2, dim2=-1).mean().sqrt() / problem.camera.focal.mean())
-        counts = problem.rest_confidence
-        sure = torch.ones_like(problem.rest_pixels[None, :, 0]) if counts is None else counts[None]
-        rest = marker_rays(problem.camera, problem.rest_pixels[None], problem.positions, sure, problem.rest_covariance[None])
+        rest, noise = rest_rays(problem)
         surface = problem.membrane, problem.elasticity, problem.markers, problem.positions
-        return cls(*surface, noise, problem.filling, problem.gas, settings, rest, problem.views)
+        sensor = noise, problem.filling, problem.gas
+        return cls(*surface, *sensor, settings, rest, problem.views, levers=problem.levers)
 
     def _coarser(self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerBearings, **others: Any) -> Self | None:
         grid, positions = membrane.grid, bearings.positions
@@ -141,7 +144,8 @@ class ForceBalance(Estimator):
     def must_compile(self) -> bool:
         """Whether the first frame waits for machine code to be compiled."""
         rest = self.membrane.rest
-        return rest.device.type == "cpu" and not compiled.is_compiled(np.dtype(str(rest.dtype).removeprefix("torch.")))
+        taken = rest.device.type == "cpu" and self.equations.bearings.in_machine_code
+        return taken and not compiled.is_compiled(np.dtype(str(rest.dtype).removeprefix("torch.")))
 
     @property
     def solves_in_double(self) -> bool:
@@ -170,18 +174,14 @@ class ForceBalance(Estimator):
         if covariance is None:
             origins, directions = camera.pixel_to_ray(pixels)
             return Observation(origins, directions, confidence)
-        return marker_rays(camera, pixels, self.equations.bearings.positions, confidence, covariance)
+        return marker_rays(camera, pixels, self.equations.bearings.seen_at_rest, confidence, covariance)
 
     def check_gauge(self) -> None:
         """Refuse a gauge where it tells nothing."""
         refuse_open(self.cavity.filling)
 
     def gauged(self, observation: Observation, pressure: Tensor | float) -> Observation:
-        """The observation with the pressure `[B]` or `[]` that a gauge reads, NaN where there is no reading.
-
-        Raises:
-            MembraneError: the cavity is open, or the pressure of another shape.
-        """
+        """The observation with the pressure `[B]` or `[]` that a gauge reads, NaN where there is no reading."""
         self.check_gauge()
         deviation = self.settings.pressure_noise * self.reference
         return observation._replace(gauge=gauge_reading(pressure, self.rest_pressure, deviation, observation.confidence))

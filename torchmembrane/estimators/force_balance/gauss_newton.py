@@ -112,7 +112,7 @@ class Descent(nn.Module):
 
     def is_native(self, *values: Any) -> bool:
         """Whether steps of these tensors are taken by machine code."""
-        return self.equations.bearings.views == 1 and takes(*values, self.equations.forces.elasticity.prestretch)
+        return self.equations.bearings.in_machine_code and takes(*values, self.equations.forces.elasticity.prestretch)
 
     @traced
     def _unweighted(self, u: Tensor) -> Tensor:
@@ -184,7 +184,7 @@ class Descent(nn.Module):
         if self.is_native(*state, weights, *measured):
             *after, _, weights = self.native.take(*self._given, state, weights, measured, [scales])
             return State(*after), weights
-        numbers = Scales(*(torch.as_tensor(scale, dtype=state.u.dtype, device=state.u.device) for scale in scales))
+        numbers = Scales(*(scale if isinstance(scale, Tensor) else state.u.new_full((), scale) for scale in scales))
         step = self.step if torch.compiler.is_exporting() or torch.is_grad_enabled() else self._compiled_once
         taken: tuple[State, Tensor] = step(state, weights, measured, numbers)
         return taken

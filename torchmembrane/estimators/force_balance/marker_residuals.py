@@ -16,7 +16,7 @@ from ...surface.bicubic import bicubic_shares
 from ...surface.membrane import Membrane
 from ...surface.projection import SurfacePoints
 from ...surface.tangent import tangent_frame
-from ..base import Observation
+from ..base import Observation, Problem
 
 NEIGHBOURS = 4
 """Of a marker, that are asked whether they are off their rays alike."""
@@ -76,6 +76,15 @@ def marker_rays(camera: Camera | Rig, pixels: Tensor, positions: Tensor, confide
     return Observation(origins[:, 0], directions[:, 0], confidence, across, motion)
 
 
+def rest_rays(problem: Problem) -> tuple[Observation, float]:
+    """The rays of a sensor's markers at rest, and their noise in the mean, radians."""
+    noise = float(problem.rest_covariance.diagonal(dim1=-2, dim2=-1).mean().sqrt() / problem.camera.focal.mean())
+    counts, seen = problem.rest_confidence, problem.positions
+    sure = torch.ones_like(problem.rest_pixels[None, :, 0]) if counts is None else counts[None]
+    seen = seen if problem.levers is None else seen + problem.levers
+    return marker_rays(problem.camera, problem.rest_pixels[None], seen, sure, problem.rest_covariance[None]), noise
+
+
 def seen_from_origin(positions: Tensor) -> Observation:
     """Markers at `positions [D, 3]` as a camera without ports sees them."""
     directions = F.normalize(positions, dim=-1)[None]
@@ -131,6 +140,16 @@ class MarkerBearings(nn.Module):
         spread = torch.full_like(self.positions[:, 0], noise**2) if across is None else _spread(across)[0]
         self.register_buffer("rest_spread", spread)
 
+    @property
+    def in_machine_code(self) -> bool:
+        """Whether the steps of one view's markers that lie on the surface can be taken by machine code."""
+        return self.views == 1
+
+    @property
+    def seen_at_rest(self) -> Tensor:
+        """What the camera sees of the markers at rest, `[D, 3]`."""
+        return self.positions
+
     @traced
     def measured(self, observation: Observation) -> Bearings:
         """The markers' rays as `angles` takes them."""
@@ -154,13 +173,49 @@ class MarkerBearings(nn.Module):
     def angles(self, u: Tensor, measured: Bearings, moved: Tensor) -> tuple[Tensor, Tensor]:
         """Angles across the measured rays `[B, 2, D]`, and the bearing Jacobian: their derivatives in the markers' positions,
         `[B, 2, 3, D]`; `moved [B, 4 W]`: of the views' cameras."""
-        to_marker = self.markers(u).mT - measured.origins
+        return self._seen(self.markers(u), measured, moved)
+
+    def _seen(self, places: Tensor, measured: Bearings, moved: Tensor) -> tuple[Tensor, Tensor]:
+        """As `angles`, of markers at `places [B, D, 3]`."""
+        to_marker = places.mT - measured.origins
         distance = torch.linalg.vector_norm(to_marker, dim=1, keepdim=True)
         along = (to_marker / distance)[:, None]
         angle = (measured.across * along).sum(2, keepdim=True)
         jacobian = (measured.across - angle * along) / distance[:, None]
         angle = angle.squeeze(2)
         return angle + (measured.motion * moved[:, None, :, None]).sum(2), jacobian
+
+    def repeated(self, values: Tensor) -> Tensor:
+        """Values `[..., D]` of the markers for each of the fields that their places follow, of which `vertex_shares` holds the
+        shares, one after the other: here for one, the displacement."""
+        return values
+
+    def joined(self, values: Tensor) -> Tensor:
+        """The sum `[..., D]` of values for each of these fields."""
+        return values
+
+    def blocks(self, jacobian: Tensor, weighted: Tensor) -> Tensor:
+        """The markers' blocks `J^T w J [B, 3, 3, D]`, from `J` and `w J`, `[B, 2, 3, D]` each."""
+        return (jacobian[:, :, :, None] * weighted[:, :, None]).sum(1)
+
+    def near(self, blocks: Tensor) -> Tensor:
+        """The blocks between the inner vertices and those at the first `OFFSETS` from them, `[B, 3, 3, K, N]`."""
+        near: Tensor = (blocks @ self.pair_shares).unflatten(-1, (len(NEAR), -1))
+        return near
+
+    def diagonal(self, blocks: Tensor) -> Tensor:
+        """The diagonals `[B, 3, N]` of the blocks between the inner vertices and themselves."""
+        own: Tensor = blocks.diagonal(dim1=1, dim2=2).mT @ self.pair_shares[:, : self.vertex_shares.shape[1]]
+        return own
+
+    def product(self, blocks: Tensor, u: Tensor) -> Tensor:
+        """What the blocks give, `[B, C, 3, N]`, for `u` of that shape."""
+        shares = self.vertex_shares
+        return weighed(blocks[:, None], u @ shares.transpose(0, 1)) @ shares
+
+    def loads_alone(self, turned: Tensor, weighted: Tensor) -> Tensor:
+        """`J^T w e [B, D, 2, 3, N]` of every marker by itself, its angles turned by `turned [B, D, 2, 2]` (noise, angle)."""
+        return torch.einsum("bdra,bacd,dn->bdrcn", turned, weighted, self.vertex_shares)
 
     def misfits(self, angles: Tensor, measured: Bearings, outlier: float, far: float) -> tuple[Tensor, Tensor]:
         """How far the markers are off their rays, in standard deviations, and as much of it as neighbours have in common.
@@ -198,3 +253,8 @@ def _shares(membrane: Membrane, markers: SurfacePoints) -> tuple[Tensor, Tensor]
     here = share[:, 1:-1, 1:-1]
     near = [(here * share[:, 1 + i : m - 1 + i, 1 + j : n - 1 + j]).flatten(1) for i, j in NEAR]
     return here.flatten(1), torch.cat(near, 1)
+
+
+def weighed(blocks: Tensor, field: Tensor) -> Tensor:
+    """Blocks `[..., 3, 3, N]` times a field `[..., 3, N]`."""
+    return (blocks * field[..., None, :, :]).sum(-2)

@@ -9,11 +9,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ...solve.stencil_layouts import NEAR
 from ...solve.stencil_system import Matrix, StencilSystem
 from .camera_motion import CameraMotion
 from .contact_force import ContactForce, Linearised
-from .marker_residuals import Bearings, MarkerBearings
+from .marker_residuals import Bearings, MarkerBearings, weighed
 from .robust import Cauchy
 from .traction_loss import Memory, TractionLoss
 
@@ -26,7 +25,8 @@ little holds it between its markers that float32 moves it by per cents of a pres
 
 class NormalEquations(NamedTuple):
     """`M = A^T W A + J^T w J`: the forces' tangent stiffness `A [B, 3, 3, 7, N]` and weights `W [B, 3, 3, N]`; the weighted
-    bearing Jacobian `w J [B, 2, 3, D]` and the markers' blocks `J^T w J [B, 3, 3, D]`, in the markers' positions; `w [B, D]`"""
+    bearing Jacobian `w J [B, 2, 3, D]` and the markers' blocks `J^T w J [B, 3, 3, D]`, in the markers' positions; `w [B, D]`.
+    Of markers that stand off the surface both are longer, as `LeverBearings` has them."""
 
     stiffness: Tensor
     weights: Tensor
@@ -74,14 +74,15 @@ class BalanceEquations(nn.Module):
 
     def normal_equations(self, at: Linearised, W: Tensor, jacobian: Tensor, weight: Tensor) -> NormalEquations:
         """Of forces weighted by `W [B, 3, 3, N]` and angles by `weight [B, D]`, with the bearing Jacobian of the angles."""
-        weighted = weight[:, None, None] * jacobian
-        return NormalEquations(at.stiffness, W, weighted, (jacobian[:, :, :, None] * weighted[:, :, None]).sum(1), weight)
+        weighted = self.bearings.repeated(weight)[:, None, None] * jacobian
+        return NormalEquations(at.stiffness, W, weighted, self.bearings.blocks(jacobian, weighted), weight)
 
     def loads(self, normal: NormalEquations, at: Linearised, angle: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """`v`, `A^T W f + J^T w r` and `-A^T W v`, `[B, 3, 3 N]`; `f^T W v` and `v^T W v`, `[B]`."""
         W, v = normal.weights, at.volume
-        weighted = _weighed(W[:, None], torch.stack([at.force, -v], 1))
+        weighted = weighed(W[:, None], torch.stack([at.force, -v], 1))
         of_forces, of_fluid = self.forces.change(at.stiffness, weighted).split(1, 1)
+        angle = self.bearings.repeated(angle)
         of_markers = (normal.weighted_jacobian * angle[:, :, None]).sum(1) @ self.bearings.vertex_shares
         loads = torch.cat([v[:, None], of_forces + of_markers[:, None], of_fluid], 1).flatten(2)
         of_force, of_volume = (weighted * v[:, None]).sum((2, 3)).unbind(1)
@@ -90,24 +91,24 @@ class BalanceEquations(nn.Module):
     def motion(self, normal: NormalEquations, measured: Bearings, angle: Tensor) -> CameraMotion:
         """The camera's motion in the equations, with the angles `r [B, 2, D]`."""
         K, w = measured.motion, normal.marker_weights
-        coupling = (K[:, :, :, None] * normal.weighted_jacobian[:, :, None]).sum(1) @ self.bearings.vertex_shares
+        of_each = self.bearings.repeated(K)[:, :, :, None] * normal.weighted_jacobian[:, :, None]
+        coupling = of_each.sum(1) @ self.bearings.vertex_shares
         weighted = (K * w[:, None, None]).movedim(2, 1).flatten(2)
         own, slope = weighted @ K.movedim(2, 1).flatten(2).mT, (weighted @ angle.flatten(1)[..., None])[..., 0]
         return CameraMotion(coupling.flatten(2), own, slope)
 
     def matrix(self, normal: NormalEquations, damping: float | Tensor = DAMPING) -> Matrix:
         """`M` as `system.factor` takes it, with a share of its diagonal added."""
-        near = (normal.marker_blocks @ self.bearings.pair_shares).unflatten(-1, (len(NEAR), -1))
+        near = self.bearings.near(normal.marker_blocks)
         return self.system.matrix(normal.stiffness, normal.weights, near, damping)
 
     def product(self, normal: NormalEquations, u: Tensor, damping: float | Tensor | None = None) -> Tensor:
         """`M u` for `u [B, C, 3 N]`, without the matrix; with `damping` as of `matrix`."""
         if damping is not None:
             return self.product(normal, u) + damping * self._diagonal(normal).flatten(1)[:, None] * u
-        u, change, shares = u.unflatten(-1, (3, -1)), self.forces.change, self.bearings.vertex_shares
-        of_forces = change(normal.stiffness, _weighed(normal.weights[:, None], change(normal.stiffness, u)))
-        of_markers = _weighed(normal.marker_blocks[:, None], u @ shares.transpose(0, 1)) @ shares
-        return (of_forces + of_markers).flatten(2)
+        u, change = u.unflatten(-1, (3, -1)), self.forces.change
+        of_forces = change(normal.stiffness, weighed(normal.weights[:, None], change(normal.stiffness, u)))
+        return (of_forces + self.bearings.product(normal.marker_blocks, u)).flatten(2)
 
     def _diagonal(self, normal: NormalEquations) -> Tensor:
         """Of `M`, `[B, 3, N]`."""
@@ -115,10 +116,4 @@ class BalanceEquations(nn.Module):
         squares = (A * (normal.weights[:, :, :, None, None] * A[:, None]).sum(2)).sum(1)
         planes = squares.unflatten(-1, (m - 2, n - 2)).flatten(0, 1)
         of_forces = F.conv_transpose2d(planes, self.forces.kernels[:, None], padding=1).reshape(-1, 3, squares.shape[-1])
-        of_markers = normal.marker_blocks.diagonal(dim1=1, dim2=2).mT @ self.bearings.pair_shares[:, : squares.shape[-1]]
-        return of_forces + of_markers
-
-
-def _weighed(blocks: Tensor, field: Tensor) -> Tensor:
-    """Blocks `[..., 3, 3, N]` times a field `[..., 3, N]`."""
-    return (blocks * field[..., None, :, :]).sum(-2)
+        return of_forces + self.bearings.diagonal(normal.marker_blocks)

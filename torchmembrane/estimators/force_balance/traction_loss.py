@@ -107,7 +107,7 @@ class TractionLoss(nn.Module):
         around = top * (((push2 / top) ** POWER) @ self.wider).clamp_min(TINY) ** (1 / POWER)
         noise2 = (settings.noise_share * noise_level[:, None] * self.push_noise).square()
         expected = torch.maximum((settings.scale_share**2 * around).maximum(settings.far_share**2 * top), noise2)
-        tau = torch.as_tensor(tau, dtype=push2.dtype, device=push2.device)
+        tau = tau if isinstance(tau, Tensor) else push2.new_full((), tau)
         least = (settings.decrease * (tau / last - 1) + settings.least_scale).clamp_max(1.0)
         return (expected / last**2).maximum(least**2).clamp_max(1.0)
 

@@ -100,11 +100,11 @@ def linearise(
     motion = motion.held(state.moved, play)
     of_motion = equations.system.substitute(factor, motion.coupling)
     closed = cavity.filling != "open"
-    one = torch.eye(3).to(state.u)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
+    one = torch.eye(3, dtype=state.u.dtype, device=state.u.device)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
     of_force = equations.forces.change(at.stiffness, one).flatten(2)
     solution = LinearisedSolution(
         lambda loads: motion.eased(equations.system.substitute(factor, loads), of_motion),
-        loads[:, [2, 0]],
+        torch.stack([loads[:, 2], loads[:, 0]], 1),
         (vWv, compliance.expand_as(vWv)) if closed else None,
         of_force,
         at.volume.sum(-1),
@@ -130,7 +130,7 @@ def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observat
     still = torch.zeros_like(membrane.rest[:1, :1]).expand(1, measured.motion.shape[2])
     state = State(torch.zeros_like(membrane.rest[None]), cavity.rest_pressure[None], still)
     at, normal, solution = linearise(equations, cavity, state, measured, (torch.inf, torch.inf), play)
-    alone = torch.eye(2).to(measured.weight).expand(1, measured.weight.shape[1], 2, 2)
+    alone = torch.eye(2, dtype=measured.weight.dtype, device=measured.weight.device).expand(1, measured.weight.shape[1], 2, 2)
     loads = noise_loads(equations, normal, measured, solution.motion, alone)
     dx, dp = changes(solution, loads)
     dq = equations.forces.change(at.stiffness, dx.unflatten(-1, (3, -1))) - dp[..., None, None] * at.volume[:, None]
@@ -144,7 +144,7 @@ def noise_loads(
 ) -> Tensor:
     """What noise adds to the equations, the camera's motion eliminated: `[B, 2 D, 3 N]`, of independent noises that turn each
     marker's angles by `turned [B, D, 2, 2]` (noise, angle): `J^T w e - B' T^-1 K^T w e`."""
-    loads = torch.einsum("bdra,bacd,dn->bdrcn", turned, normal.weighted_jacobian, equations.bearings.vertex_shares)
+    loads = equations.bearings.loads_alone(turned, normal.weighted_jacobian)
     slopes = torch.einsum("bdra,bakd,bd->bdrk", turned, measured.motion, normal.marker_weights)
     return motion.without(loads.flatten(3).flatten(1, 2), slopes.flatten(1, 2))
 
@@ -328,7 +328,7 @@ def spreads_of(
         y, rise = solve_bordered(loads, solutions, c[:, None], by_pressure, compliance[:, None], zero)
         of_gauge = of_gauge if solution.gauge is None else rise * solution.gauge[:, None]
     at_markers = y.unflatten(-1, (3, -1)) @ equations.bearings.vertex_shares.mT
-    of_angles = (normal.weighted_jacobian[:, None] * at_markers[:, :, None]).sum(3)
+    of_angles = equations.bearings.joined((normal.weighted_jacobian[:, None] * at_markers[:, :, None]).sum(3))
     of_camera = solution.motion.turning(y)[..., None, :, None] * normal.marker_weights[:, None, None, None]
     of_markers = (of_angles - (measured.motion[:, None] * of_camera).sum(3)).square().sum((2, 3))
     spread: Tensor = (of_markers + of_gauge.square()).sqrt()

@@ -77,8 +77,8 @@ def polar_angle(directions: Tensor) -> Tensor:
 
 def growing_polar_angle(directions: Tensor) -> Tensor:
     """Unit vector across each unit direction along which the polar angle grows, `[..., 3]`; zero on the axis."""
-    axis = directions.new_tensor([0.0, 0.0, 1.0])
-    return torch.nn.functional.normalize(directions[..., 2:] * directions - axis, dim=-1)
+    across, along = (directions[..., 2:] * directions).split([2, 1], -1)
+    return torch.nn.functional.normalize(torch.cat([across, along - 1], -1), dim=-1)
 
 
 class Segmentation(nn.Module):

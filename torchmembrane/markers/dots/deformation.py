@@ -39,6 +39,8 @@ class LocalDeformation(nn.Module):
     around: Tensor
     pitch: Tensor
     monomial_map: Tensor
+    ridge: Tensor
+    identity: Tensor
 
     def __init__(self, pixels: np.ndarray):
         super().__init__()
@@ -49,6 +51,8 @@ class LocalDeformation(nn.Module):
         self.register_buffer("around", torch.as_tensor(np.stack([u, v, u * u, u * v, v * v, np.ones_like(u)], 1)))
         self.register_buffer("pitch", torch.as_tensor(pitch))
         self.register_buffer("monomial_map", monomial_map())
+        self.register_buffer("ridge", torch.tensor([[0.2], [0.0], [0.2], [0.0]], dtype=torch.float64))
+        self.register_buffer("identity", torch.tensor([[1e-6], [0.0], [0.0], [1e-6], [1e-6]], dtype=torch.float64))
 
     def forward(self, blobs: Tensor, valid: Tensor) -> Tensor:
         """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, 2, 2, K]`."""
@@ -94,9 +98,9 @@ class LocalDeformation(nn.Module):
         target = target / (target[:, :, 2:] + 0.1)  # weight times position, weight: [B, K, 3, M]
         sums = (target @ around.mT).flatten(-2).mT.unflatten(1, (3, 6))
         load = sums[:, :2, :2] + 0.2 * gradient
-        uu, uv, vv, weight = (sums[:, 2, 2:] + sums.new_tensor([0.2, 0, 0.2, 0])[:, None]).unbind(1)
+        uu, uv, vv, weight = (sums[:, 2, 2:] + self.ridge).unbind(1)
         fitted = load * torch.stack([vv, uu], 1)[:, None] - load.flip(2) * uv[:, None, None]
         quality = valid * (weight / around.shape[-1]).square()
         scaled = fitted.flatten(1, 2) * (quality / (uu * vv - uv * uv))[:, None]
-        average = torch.cat([scaled, quality[:, None]], 1) @ nearby + sums.new_tensor([1e-6, 0, 0, 1e-6, 1e-6])[:, None]
+        average = torch.cat([scaled, quality[:, None]], 1) @ nearby + self.identity
         return ((average[:, :4] / average[:, 4:]).unflatten(1, (2, 2)),)
