@@ -245,7 +245,8 @@ class Reconstructor(nn.Module):
         square = (found * displacement.square().sum(-1)).sum(-1) / found.sum(-1).clamp_min(1)
         one = torch.eye(2, dtype=covariance.dtype, device=covariance.device)
         error = (LEAST_ERROR**2 + MODEL_ERROR**2 * square)[:, None, None, None] * one
-        return self.estimator.prepare(self.camera, self.observer.rest_pixels + displacement, confidence, covariance + error)
+        pixels = self.observer.with_rays(self.observer.rest_pixels + displacement, confidence)
+        return self.estimator.prepare(self.camera, pixels, confidence, covariance + error)
 
     @traced
     def result(
@@ -310,8 +311,7 @@ class Reconstructor(nn.Module):
 
     def _facings(self, points: Tensor, normals: Tensor) -> Tensor:
         """How the markers at `points [..., D, 3]` face what sees them, for each sighting."""
-        each = self.observer.seen_by_each
-        return facings(self.camera.lines_of_sight(each(points)), each(normals))
+        return facings(self.camera.lines_of_sight(self.observer.seen_by_each(points)), self.observer.seen_by_each(normals))
 
     def _gauged(self, observation: Observation, pressure: Tensor | float | None) -> Observation:
         """The observation with what a gauge reads, if one does."""
@@ -337,12 +337,12 @@ class Reconstructor(nn.Module):
         Raises:
             MembraneError: the estimator knows none.
         """
-        if not isinstance(result, Reconstruction):
-            raise MembraneError(f"standard_deviations: result is a {type(result).__name__}; expected a tm.Reconstruction")
-        sighted, markers = self.observer.sighted, self.observer.seen_by_each(result.markers)
-        pixels = sighted(torch.where(result.pixels.isfinite(), result.pixels, self.rest_pixels))
-        noise = turns_by_noise(self.camera, pixels, markers, 2 * self.observer.rest_covariance)
-        observation = self._gauged(self.observation(pixels - self.observer.rest_pixels, sighted(result.confidence)), pressure)
+        expect(isinstance(result, Reconstruction), "standard_deviations: result", type(result).__name__, "a tm.Reconstruction")
+        observer, confidence = self.observer, self.observer.sighted(result.confidence)
+        pixels = observer.sighted(torch.where(result.pixels.isfinite(), result.pixels, self.rest_pixels))
+        seen = self.camera, observer.with_rays(pixels, confidence), observer.seen_by_each(result.markers)
+        noise = turns_by_noise(*seen, 2 * observer.rest_covariance)
+        observation = self._gauged(self.observation(pixels - observer.rest_pixels, confidence), pressure)
         vertices = torch.where(result.vertices.isfinite(), result.vertices, self.estimator.membrane.rest)
         pressure = torch.where(result.pressure.isfinite(), result.pressure, self.estimator.rest_pressure)
         moved = self.camera.motion_in_pixels(result.camera_motion).nan_to_num()

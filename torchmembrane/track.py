@@ -1,12 +1,12 @@
 """One stream of images: dots are followed from frame to frame, and drift of the rest image is detected."""
 
 from math import isfinite
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from .camera.motion import in_pixels, shift_of
 from .errors import MembraneError, expect, is_number
 from .markers.drift import ENOUGH, DriftWatch
 from .reconstruct import Reconstructor
@@ -15,7 +15,7 @@ from .results.status import Status
 from .stiffness import StiffnessWatch
 from .user_warnings import warn_user
 
-LOOKED_AT = (Status.OK, Status.UNEXPLAINED, Status.OUT_OF_RANGE)
+LOOKED_AT = (Status.OK, Status.UNEXPLAINED, Status.OUT_OF_RANGE, Status.VIEW_LEFT_OUT)
 """Of frames that tell of a drift: a camera that moved may leave them unexplained."""
 STEADY = 100
 """Frames in which a contact holds still from the beginning before it is said that it may be a drift."""
@@ -26,7 +26,7 @@ LARGEST_STEADY = 0.3
 
 
 class Tracker:
-    """Reconstructs the frames of one camera one after another.
+    """Reconstructs the frames of one sensor one after another.
 
     Dots are looked for where the frame before had them, a texture as in a frame alone. All else is as for a frame alone, and so
     are its answers, to the last digit where the same dots are found: they do not hang on where a stream began. After a frame
@@ -66,7 +66,6 @@ class Tracker:
     def __init__(self, reconstructor: Reconstructor):
         if not hasattr(reconstructor, "observer"):
             raise MembraneError(f"Tracker: reconstructor is a {type(reconstructor).__name__}; expected a tm.Reconstructor")
-        reconstructor.sensor.refuse_views("Tracker")
         self.reconstructor = reconstructor
         self.time: float | None = None
         self.stiffness, self._said_due = StiffnessWatch(), False
@@ -76,11 +75,12 @@ class Tracker:
         self._rest_pixels: Tensor | None = None
         self._watch_from(reconstructor.observer.rest_covariance)
 
-    def __call__(self, frame: Tensor | np.ndarray, pressure: float | None = None, time: float | None = None) -> Reconstruction:
+    def __call__(self, frame: Any, pressure: float | None = None, time: float | None = None) -> Reconstruction:
         """The frame's result, a batch of one.
 
         Args:
-            frame: `[H, W]`, `[1 | 3, H, W]` or `[H, W, 1 | 3]`, or a batch of one as for `Reconstructor`.
+            frame: `[H, W]`, `[1 | 3, H, W]` or `[H, W, 1 | 3]`, or a batch of one as for `Reconstructor`; of views that have
+                images of their own a list of these, or `[W, H, W']`.
             pressure: that a gauge reads, as for `Reconstructor`.
             time: when the frame was taken, seconds of any clock; kept in `time`, later than that of the frame before.
 
@@ -114,10 +114,12 @@ class Tracker:
     def warm_up(self) -> None:
         """Do now what the first frame would wait for: machine code is compiled where there is none yet, which takes a minute or
         more (`machine_code`). A stream's frames do not wait for it then; what the tracker has seen stays as it was."""
-        width, height = self.reconstructor.image_size
+        r = self.reconstructor
+        images = [torch.zeros(height, width) for width, height in r.camera.image_sizes if r.sensor.views_apart]
+        width, height = r.image_size
         with torch.no_grad():
-            self.reconstructor.from_pixels(self.reconstructor.rest_pixels)
-            self.reconstructor(torch.zeros(height, width))
+            r.from_pixels(r.rest_pixels)
+            r(images or torch.zeros(height, width))
 
     def reset(self) -> None:
         """Forget the frames before, what `rezero` took for rest, the drift and the time."""
@@ -186,7 +188,7 @@ class Tracker:
             warn_user(stiffness_in_words(self.stiffness))
         return found / known
 
-    def rezero(self, frame: Tensor | np.ndarray | None = None) -> None:
+    def rezero(self, frame: Any = None) -> None:
         """Take a frame without contact, default the latest, for the rest state: what drifted since the rest image is nulled.
 
         Markers that are not found in it keep their places in the sensor's rest image. Where a contact is found in the frame, it
@@ -210,9 +212,9 @@ class Tracker:
         self._watch_from(rest.covariance)
 
     def _watch_from(self, rest_covariance: Tensor) -> None:
-        """Begin to look for a drift from a rest state with this noise, `[D, 2, 2]` px^2."""
-        r = self.reconstructor
-        rest = r.rest_pixels, rest_covariance, r.observer.seen_at_rest, r.image_size
+        """Begin to look for a drift from a rest state with this noise, `[N, 2, 2]` px^2."""
+        observer = self.reconstructor.observer
+        rest = observer.rest_pixels, rest_covariance, observer.seen_at_rest, *self.reconstructor.camera.image_sizes
         self._watch, self._steady, self._said = DriftWatch(*rest), DriftWatch(*rest), False
 
     def is_pressed(self, result: Reconstruction) -> bool:
@@ -223,8 +225,9 @@ class Tracker:
         return touched and not self._watch.is_near(*moved)
 
     def _moved(self, result: Reconstruction) -> tuple[Tensor, Tensor]:
-        """How far the markers are off their rest, `[D, 2]` px, and their confidence `[D]`."""
-        return result.pixels[0] - self.reconstructor.rest_pixels, result.confidence[0]
+        """How far the markers are off their rest, `[N, 2]` px, and their confidence `[N]`, one view after the other."""
+        observer = self.reconstructor.observer
+        return observer.sighted(result.pixels)[0] - observer.rest_pixels, observer.sighted(result.confidence)[0]
 
     def _look_for_drift(self, result: Reconstruction) -> None:
         moved = self._moved(result)
@@ -237,23 +240,30 @@ class Tracker:
             self._steady.add(*moved)
         if not self._said and (self._is_steady() or self._watch.drift().is_certain):
             self._said = True
-            warn_user(drift_in_words(self.drift, self._camera_motion(result), self._is_steady()))
+            warn_user(drift_in_words(self.drift, *self._camera_motion(result), self._is_steady()))
 
     def _is_steady(self) -> bool:
         """Whether a contact that was there from the beginning has held still, and moves the markers as a drift does."""
         found, was_free = self._steady.drift(), self._watch.frames >= ENOUGH
         return not was_free and self._steady.frames >= STEADY and found.is_certain and found.size < LARGEST_STEADY
 
-    def _camera_motion(self, result: Reconstruction) -> Tensor | None:
-        """The camera's motion `[4]` in a frame, if that is most of the drift."""
+    def _camera_motion(self, result: Reconstruction) -> tuple[Tensor | None, str]:
+        """The camera's motion `[4]` in a frame, if that is most of the drift; of several views that of the one whose markers it
+        moves most, and its name."""
         r, motion = self.reconstructor, result.camera_motion
-        shift = shift_of(in_pixels(motion, r.image_size), r.rest_pixels, r.image_size)[0, r.observer.seen_at_rest]
-        return motion[0] if float(shift.square().sum(-1).mean().sqrt()) > self.drift / 2 else None
+        shift = r.camera.shift_of(r.camera.motion_in_pixels(motion), r.observer.rest_pixels)
+        shift2 = torch.where(r.observer.seen_at_rest, shift.square().sum(-1), torch.nan)
+        if not float(shift2.nanmean().sqrt()) > self.drift / 2:
+            return None, ""
+        if not r.sensor.views:
+            return motion[0], ""
+        view = int(r.observer.by_view(shift2).nanmean(-1)[0].argmax())
+        return motion[0, view], r.sensor.views[view].name
 
-    def _one(self, frame: Tensor | np.ndarray) -> Tensor:
+    def _one(self, frame: Any) -> Tensor:
         width, height = self.reconstructor.image_size
-        is_colour = np.shape(frame) == (3, height, width)  # of a batch, these would be three grey frames
-        images = self.reconstructor.grey(frame[None] if is_colour else frame)
+        is_colour = not self.reconstructor.sensor.views_apart and np.shape(frame) == (3, height, width)
+        images = self.reconstructor.grey(frame[None] if is_colour else frame)  # of a batch, these would be three grey frames
         if len(images) != 1:
             raise MembraneError(f"Tracker: {len(images)} frames; expected one, each call is the next one of a stream")
         return images
@@ -273,17 +283,20 @@ def press_in_words(force: float, unit: str) -> str:
     )
 
 
-def drift_in_words(size: float, camera_motion: Tensor | None = None, is_steady: bool = False) -> str:
+def drift_in_words(size: float, camera_motion: Tensor | None = None, view: str = "", is_steady: bool = False) -> str:
     """A drift and its remedy.
 
     Args:
         size: px.
         camera_motion: du, dv (px), rotation (degrees) and scale, `[4]`, where it is that.
+        view: whose, of several.
         is_steady: whether it was found in frames with a contact.
     """
     camera = ""
     if camera_motion is not None:
-        camera = "; it is a moved camera's: {:z.1f}, {:z.1f} px, {:z.2f} degrees, scale {:.4f}".format(*camera_motion.tolist())
+        whose = f"the moved camera's of view {view!r}" if view else "a moved camera's"
+        motion = "{:z.1f}, {:z.1f} px, {:z.2f} degrees, scale {:.4f}".format(*camera_motion.tolist())
+        camera = f"; it is {whose}: {motion}"
     where = f"in a contact that has held still from the beginning, for {STEADY} frames," if is_steady else "without contact"
     aged = "if nothing touches, it" if is_steady else "it"
     return (

@@ -161,6 +161,24 @@ def gauge_summary(results: dict) -> dict:
     return dict(bands=[band for band in bands if band["frames"]])
 
 
+def views(found: dict) -> Rows:
+    """Errors of one view, of two, and of two from each of which a third of the dots is hidden."""
+    names = {"one": "one view", "two": "two views", "hidden": "two, a third of the dots hidden from each"}
+    rows = [
+        [row["group"], names[row["seen"]], str(row["presses"]), str(row["ok"])]
+        + spans({key: row[key] for key in ("shape", "depth", "force")}, 3)
+        for row in found["bands"]
+    ]
+    return [["presses", "seen by", "number", "ok", "shape: median / 90 %", "depth", "force"], *rows]
+
+
+def views_summary(results: dict) -> dict:
+    """Medians and 90 % quantiles of the errors."""
+    from bench.accuracy.views import bands
+
+    return dict(bands=bands(results["presses"]))
+
+
 def working_range(found: dict) -> Rows:
     """Shares of presses that are right and wrong with status ok, by what the sensor and the press are like."""
     rows = [

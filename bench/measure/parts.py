@@ -83,6 +83,7 @@ PARTS = {
     "monge": Part("bench.accuracy.monge CASES", CASES, data="cases"),
     "ablation": Part("bench.accuracy.ablation CASES", CASES, data="cases"),
     "gauge": Part("bench.accuracy.gauge DATA", RANDOM, data="gauge"),
+    "views": Part("bench.accuracy.views --first 1 --sensors 20 --presses 3", (*RANDOM, "torchmembrane/simulate")),
     "light": Part("bench.accuracy.range DATA --only light", RANDOM, data="light"),
     "intervals": Part(f"bench.accuracy.intervals {' '.join(f'DATA/{seed}' for seed in SEEDS)}", RANDOM, data="intervals"),
     "range": Part("bench.accuracy.range DATA", RANDOM, data="range"),

@@ -7,7 +7,7 @@ import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from itertools import islice
@@ -17,7 +17,7 @@ import numpy as np
 
 from . import results
 from .errors import EdgeError, printable
-from .images import Frame, frame_name, frames, numbered, pictures
+from .images import Frame, frame_name, frames, numbered, pictures, view_frames
 from .session import MOST_THREADS, Session, model_file
 from .summary import UNREADABLE, Summary
 from .summary_row import AXES, CONTACTS, numbers
@@ -134,14 +134,14 @@ def reconstruct(session: Session, paths: list[Path], out: Path, batch: int) -> i
     """
     results.begin(out, session.mesh)
     summary = Summary(out, session)
-    waiting = (frame for path in paths for frame in frames(path, session.image_size, session.bits))
+    waiting = (frame for path in first_views(paths, session.views) for frame in _frames(path, session))
     done, found = Counter(), None
     try:
         while group := list(islice(waiting, batch)):
             start = time.perf_counter()
             images = [frame.image for frame in group if frame.image is not None]
             if images:
-                found = session.run(np.concatenate(images), found)
+                found = session.run(_joined(images), found)
             seconds = (time.perf_counter() - start) / max(len(images), 1)
             rows = ({key: values[row] for key, values in found.items()} for row in range(len(images)))
             for frame in group:
@@ -153,6 +153,36 @@ def reconstruct(session: Session, paths: list[Path], out: Path, batch: int) -> i
     summary.write()
     print(f"frames: {done[True]} reconstructed, {done[False]} failed; results in {printable(out)}")
     return 1 if done[False] else 0
+
+
+def _joined(images: list) -> np.ndarray | list[np.ndarray]:
+    """The images of frames as one batch; of several views one of each."""
+    if isinstance(images[0], list):
+        return [np.concatenate(view) for view in zip(*images, strict=True)]
+    return np.concatenate(images)
+
+
+def _frames(path: Path, session: Session) -> Iterator[Frame]:
+    """The frames of a file, with the images of all views that have files of their own."""
+    if not session.views:
+        return frames(path, session.image_size, session.bits)
+    return view_frames(path, session.views, session.image_sizes, session.bits)
+
+
+def first_views(paths: list[Path], views: Sequence[str]) -> list[Path]:
+    """The first view's files among those of all `views`, NAME_VIEW; all paths where the views have no files of their own.
+
+    Raises:
+        EdgeError: a file is of none of the views, or none is the first one's beside it.
+    """
+    if not views:
+        return paths
+    firsts = [path for path in paths if path.stem.endswith(f"_{views[0]}")]
+    names = {path.stem.removesuffix(views[0]) for path in firsts}
+    for path in paths:
+        if not any(path.stem.endswith(f"_{view}") and path.stem.removesuffix(view) in names for view in views):
+            raise EdgeError(f"{printable(path)}: expected images NAME_{', NAME_'.join(views)} of each frame")
+    return firsts
 
 
 def _kept(session: Session, frame: Frame, result: dict | None, seconds: float, summary: Summary) -> int:
@@ -176,6 +206,8 @@ def watch(session: Session, camera: int, frames: int | None) -> int:
     """Images of a camera, a line each: what was found and how long it took; Ctrl-C ends it."""
     import cv2
 
+    if session.views:
+        raise EdgeError(f"--camera {camera} of a model with the views {', '.join(session.views)}; expected image files")
     if hasattr(cv2, "setLogLevel"):
         cv2.setLogLevel(0)  # what goes wrong is said in this package's own words
     width, height = session.image_size

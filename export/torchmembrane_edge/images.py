@@ -4,7 +4,7 @@ import io
 import re
 import struct
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from hashlib import blake2b
 from itertools import count
@@ -42,12 +42,12 @@ IMAGEJ = re.compile(r"ImageJ=.*^images=(\d+)", re.DOTALL | re.MULTILINE)
 
 
 class Frame(NamedTuple):
-    """A frame to compute: `image [1, height, width]`, grey in 0..1, or the reason why there is none; `origin`: of its file, as
-    results hold it."""
+    """A frame to compute: `image [1, height, width]`, grey in 0..1, of several views a list of them, or the reason why there is
+    none; `origin`: of its file, as results hold it."""
 
     name: str
     path: Path
-    image: np.ndarray | None
+    image: np.ndarray | list[np.ndarray] | None
     reason: str = ""
     origin: Mapping[str, Any] = {}
 
@@ -83,6 +83,31 @@ def frames(path: Path, size: tuple[int, int], bits: int | None = None) -> Iterat
                 yield Frame(names[-1], path, None, f"the file ends early; whole pictures: {len(numbers)}")
     except EdgeError as error:
         yield Frame(name, path, None, str(error))
+
+
+def view_frames(path: Path, views: Sequence[str], sizes: Sequence[tuple[int, int]], bits: int | None) -> Iterator[Frame]:
+    """The same of several views that have files of their own, NAME_VIEW: an image of each, for `path`, the first view's.
+
+    Raises:
+        EdgeError: the file is not named after the first view.
+    """
+    ending = f"_{views[0]}"
+    if not path.stem.endswith(ending):
+        raise EdgeError(f"{printable(path)}: expected the first view's image, NAME{ending}{path.suffix}, beside the others'")
+    files = [path.with_name(f"{path.stem.removesuffix(ending)}_{view}{path.suffix}") for view in views]
+    for each in zip(*(frames(file, size, bits) for file, size in zip(files, sizes, strict=True)), strict=False):
+        failed = next((frame for frame in each if frame.image is None), None)
+        if failed is not None:
+            yield failed._replace(name=each[0].name)
+        else:
+            yield each[0]._replace(image=[frame.image for frame in each], origin=each[0].origin | _joined(files))
+
+
+def _joined(files: Sequence[Path]) -> dict[str, Any]:
+    """Size, time and digest of all views' files, as `_origin` has those of one."""
+    stats, digest = [file.stat() for file in files], blake2b(b"".join(file.read_bytes() for file in files), digest_size=16)
+    sizes = {"file_size": sum(stat.st_size for stat in stats), "file_modified": max(stat.st_mtime_ns for stat in stats)}
+    return sizes | {"content_hash": digest.hexdigest()}
 
 
 def frame_name(path: Path) -> str:

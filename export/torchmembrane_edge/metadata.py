@@ -111,6 +111,8 @@ def _array(key: str, value: Any, sizes: dict[str, int]) -> np.ndarray:
     """An array of the mesh; `sizes` collects the lengths that letters stand for."""
     (kinds, dtype), shape = MESH_ARRAYS[key]
     array = np.array(value)
+    if key == "rest_pixels" and array.ndim == 3:  # of several views
+        shape = ("W", array.shape[1], 2)
     if not array.size:
         array = np.zeros((0, *shape[1:]), dtype)  # none is `[]` in JSON, whatever its shape
     rows = sizes.setdefault(shape[0], len(array)) if array.ndim and isinstance(shape[0], str) else shape[0]

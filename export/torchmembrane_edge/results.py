@@ -13,7 +13,7 @@ from .errors import EdgeError, in_one_line, printable
 
 MESH = "mesh.npz"
 SETTINGS = ("estimator", "energy", "element", "format", "volume", "flow", "smoothing", "locator", "rest", "pressure",
-            "pressure_noise")  # fmt: skip
+            "pressure_noise", "fields")  # fmt: skip
 """Of the mesh: what all results of a folder share beside the sensor. Files written earlier lack some."""
 
 

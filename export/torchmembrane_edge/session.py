@@ -13,6 +13,8 @@ from .metadata import EXPECTED, Metadata
 
 GREY = (0.299, 0.587, 0.114)
 SHAPES = "[H, W], [H, W, 3], [B, H, W], [B, 1 | 3, H, W] or [B, H, W, 1 | 3]"
+IMAGE = "image"
+"""The input of images; of views that have images of their own one for each, `image_NAME`."""
 TYPES = {"tensor(float)": np.float32, "tensor(int32)": np.int32}
 NEEDED = ("vertices", "displacement", "force", "status")
 """Outputs without which there is no result."""
@@ -29,7 +31,8 @@ class Session:
 
     Attributes: `name` of the sensor, `length_unit`, `force_unit`, `status_texts` (code to text), `mesh` (what `mesh.npz`
     holds: rest_vertices, triangles, fixed ...), `image_size` (width, height), `tracks`: whether it follows dots; `bits` of the
-    camera, where images of 16 bits hold fewer, else None.
+    camera, where images of 16 bits hold fewer, else None; `views`, the names of views that have images of their own, none of a
+    single view or of parts of one image; `image_sizes`, of each of them.
 
     Raises: `EdgeError`: no such file, no model of `torchmembrane export`, or a provider that onnxruntime lacks.
     """
@@ -51,38 +54,55 @@ class Session:
             raise EdgeError(f"{model}: not readable as a model ({cause}); expected {EXPECTED}") from error
         said = Metadata.of(known, model)
         self.name, self.length_unit, self.force_unit, self.status_texts, self.mesh, self.bits = said
-        self.image_size = tuple(self.mesh["image_size"].tolist())
         self._outputs = {given.name: (TYPES.get(given.type), given.shape[1:]) for given in self._session.get_outputs()}
         inputs = {given.name: given.shape for given in self._session.get_inputs()}
-        self._state = {name: shape[1:] for name, shape in inputs.items() if name != "image"}
+        self._images = [name for name in inputs if name == IMAGE or name.startswith(f"{IMAGE}_")]
+        self.views = tuple(name.removeprefix(f"{IMAGE}_") for name in self._images if name != IMAGE)
+        self._state = {name: shape[1:] for name, shape in inputs.items() if name not in self._images}
         self.tracks = bool(self._state)
-        if wrong := self._unlike(inputs.get("image", [])):
+        if wrong := self._unlike([inputs[name] for name in self._images]):
             raise EdgeError(f"{model}: {wrong}; expected {EXPECTED}")
+        self.image_sizes = [(inputs[name][3], inputs[name][2]) for name in self._images]
+        self.image_size = self.image_sizes[0]
 
     def run(self, images: Any, previous: Mapping[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
         """Results of a batch, by name, one row per frame: vertices `[B, V, 3]`, ..., status `[B]`.
 
         `images`: `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or `[B, H, W, 1 | 3]`, grey or RGB; uint8, uint16 (of
-        `bits`) or float in 0..1. A frame that cannot be reconstructed has a status and NaN.
+        `bits`) or float in 0..1. A frame that cannot be reconstructed has a status and NaN. Of `views` a list of these, one for
+        each.
         `previous`, for a model that tracks: the results of the frames before, where its dots are looked for first.
 
         Raises `EdgeError`: images of another shape, size or type, or results of other frames.
         """
         if missing := [name for name in NEEDED if name not in self._outputs]:
             raise EdgeError(f"the model of {self.name!r} gives no {missing[0]}; expected {EXPECTED}")
-        images = grey(_arranged(_array(images), self.image_size), self.bits)
-        if not len(images):
+        feed = self._fed(images)
+        count = len(feed[self._images[0]])
+        if not count:
             return {name: np.zeros((0, *shape), dtype) for name, (dtype, shape) in self._outputs.items()}
-        feed = {"image": images[:, None]}
         for key, shape in self._state.items():
-            feed[key] = _state(key.removeprefix(PREVIOUS), (len(images), *shape), previous)
+            feed[key] = _state(key.removeprefix(PREVIOUS), (count, *shape), previous)
         try:
             results = dict(zip(self._outputs, self._session.run(None, feed), strict=True))
         except Exception as error:  # as above
-            raise EdgeError(f"onnxruntime cannot run the model on {len(images)} images ({in_one_line(error)})") from error
-        if any(values.shape[:1] != (len(images),) for values in results.values()):
+            raise EdgeError(f"onnxruntime cannot run the model on {count} images ({in_one_line(error)})") from error
+        if any(values.shape[:1] != (count,) for values in results.values()):
             raise EdgeError(f"the model of {self.name!r} gives other than a row for each image; expected {EXPECTED}")
         return results
+
+    def _fed(self, images: Any) -> dict[str, np.ndarray]:
+        """The inputs of images, by their names."""
+        views = ", ".join(self.views)
+        if self.views and not (isinstance(images, list | tuple) and len(images) == len(self.views)):
+            raise EdgeError(f"images are no list of {len(self.views)}; expected one with those of the views {views}")
+        each = images if self.views else [images]
+        parts = [
+            grey(_arranged(_array(part), size), self.bits)[:, None] for part, size in zip(each, self.image_sizes, strict=True)
+        ]
+        if len({len(part) for part in parts}) > 1:
+            raise EdgeError(f"{[len(part) for part in parts]} images of the views {views}; expected as many of each")
+        return dict(zip(self._images, parts, strict=True))
 
     def track(self, images: Any) -> Iterator[dict[str, np.ndarray]]:
         """Results of a video's images, one after another, dots followed from each to the next (a generator)."""
@@ -94,7 +114,8 @@ class Session:
             raise EdgeError(f"track: {type(images).__name__}; expected a video's images, one after another")
         previous = None
         for image in images:
-            previous = self.run(_array(image)[None], previous)
+            alone = [_array(each)[None] for each in image] if self.views else _array(image)[None]
+            previous = self.run(alone, previous)
             yield previous
 
     def status_text(self, code: int) -> str:
@@ -115,11 +136,14 @@ class Session:
         force, moment = wrench[:, :3] @ rotation.T, wrench[:, 3:] @ rotation.T
         return np.concatenate([force, moment + np.cross(translation, force)], -1)
 
-    def _unlike(self, image: Sequence[Any]) -> str:
+    def _unlike(self, images: Sequence[Sequence[Any]]) -> str:
         """What its inputs and outputs are not; "" of a model of `torchmembrane export`."""
-        width, height = self.image_size
-        if list(image[1:]) != [1, height, width]:
-            return f"its image is {image or 'missing'}, not [batch, 1, {height}, {width}] as its mesh says"
+        width, height = self.mesh["image_size"].tolist()
+        whole = self.mesh["rest_pixels"].ndim == 3  # parts of it are the views, of which the mesh has the first one's size
+        for image in images or [[]]:
+            sized = len(image) == 4 and image[1] == 1 and all(isinstance(size, int) and size > 0 for size in image[2:])
+            if not sized or not (whole or list(image[2:]) == [height, width]):
+                return f"its image is {image or 'missing'}, not [batch, 1, {height}, {width}] as its mesh says"
         for name, (dtype, shape) in self._outputs.items():
             if dtype is None or not all(isinstance(size, int) for size in shape):
                 return f"its output {name!r} is {dtype} {list(shape)}"

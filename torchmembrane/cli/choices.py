@@ -9,6 +9,7 @@ ENERGIES = ("harmonic", "neo_hookean", "mooney_rivlin")
 FLOWS = ("smooth", "bilinear")
 ENGINES = ("local", "ray")
 RESULT_FORMATS = ("npz", "parquet")
+FIELDS = ("stretch", "tension")
 
 DRAFTS = ("dome", "cap", "bubble", "fingertip", "half_cylinder", "rectangle", "ellipse")
 OUTLINE = "outline"  # the shape of --outline

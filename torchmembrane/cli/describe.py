@@ -20,7 +20,9 @@ from ..sensor.factories import elastic_energy
 from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
 from ..sensor.units import hectopascal
+from ..sensor.views import FEWEST_LINES
 
+COARSE = f"  coarse for several views, whose forces want {FEWEST_LINES} lines or more: give a finer grid"
 LISTED = 12
 """Missing markers that are named one by one."""
 FILLINGS = {
@@ -140,6 +142,7 @@ def _membrane(sensor: Sensor) -> list[str]:
         *_sheet(sensor),
         f"area {float(membrane.rest_area.sum()):.4g} {unit}², volume over the rim {membrane.cavity_volume:.4g} {unit}³",
         f"grid {membrane.grid[0]} x {membrane.grid[1]}: {len(X)} vertices, {int(membrane.fixed.sum())} of them fixed",
+        *[COARSE] * (bool(sensor.views) and min(membrane.grid) < FEWEST_LINES),
     ]
 
 

@@ -17,7 +17,7 @@ from .arguments import (
     positive,
     share,
 )
-from .choices import ENGINES, RESULT_FORMATS
+from .choices import ENGINES, FIELDS, RESULT_FORMATS
 from .film import FrameImages, draw_film
 
 if TYPE_CHECKING:
@@ -83,6 +83,8 @@ def add_parser(commands: Any) -> None:
     add("--pressure-noise", metavar="SHARE", type=positive, help=noise)
     one = "one .npz per frame, or one dataset (default: npz; of --engine ray: parquet)"
     add("--format", choices=RESULT_FORMATS, help=one)
+    principal = "also the principal stretches or tensions (force / length) at the vertices, [V, 2] each (npz)"
+    add("--fields", nargs="+", choices=FIELDS, default=[], help=principal)
     film = "also a film of all frames in DIR, in name order: .mp4, .mov, .mkv (extra video) or .gif; as view DIR --video-out"
     add("--video-out", metavar="FILE", type=Path, help=film)
     add("--figures", action="store_true", help="also NAME.png: flow, side view and displacement of every frame")
@@ -110,7 +112,8 @@ def run(arguments: Namespace) -> int:
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
     format = arguments.format or ("parquet" if by_ray else "npz")
-    settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""))
+    fields = [name for name in FIELDS if name in arguments.fields]
+    settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""), fields)
     check_folder(arguments.out, sensor.fingerprint, settings)
     for remark in bag_remarks(inputs, sensor.camera):
         print(f"torchmembrane: {remark}", file=sys.stderr)
@@ -129,6 +132,7 @@ def run(arguments: Namespace) -> int:
         figures=arguments.figures,
         rest_pixels=rest,
         pressure=pressure,
+        fields=fields,
     )
     if bag is not None:
         print(f"messages of {write_bag(bag, inputs, arguments.out)} frames in {arguments.bag}")
@@ -157,6 +161,8 @@ def _check(arguments: Namespace) -> None:
 
     if arguments.engine == "local":
         check_device(arguments.device)
+    if arguments.fields and (arguments.engine == "ray" or arguments.format == "parquet"):
+        raise MembraneError("--fields with a Parquet dataset, whose columns are fixed; expected --format npz")
     if arguments.engine == "ray" and arguments.format == "npz":
         raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
     if arguments.video_out is not None:

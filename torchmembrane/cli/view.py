@@ -55,6 +55,8 @@ def add_parser(commands: Any) -> None:
         help="write all frames and their images as a data set of Hugging Face (extra parquet)",
     )
     add("--ply", metavar="FILE.ply", type=Path, help="write the touched vertices as a point cloud, and draw nothing")
+    mesh = "write the whole surface as a mesh, .ply or .vtk, with what --fields kept of it, and draw nothing"
+    add("--surface", metavar="FILE", type=Path, help=mesh)
     add_force(add)
 
 
@@ -65,7 +67,7 @@ def run(arguments: Namespace) -> int:
     from ..results.read import read_results
 
     rerun, folders = wants_rerun(arguments), arguments.result
-    others = arguments.out, arguments.video_out, arguments.sheet, arguments.save, arguments.ply
+    others = arguments.out, arguments.video_out, arguments.sheet, arguments.save, arguments.ply, arguments.surface
     alone = not rerun and all(made is None for made in (*others, arguments.dataset))
     if len(folders) > 1 and not (alone and arguments.plot):
         raise MembraneError(f"view: {len(folders)} results; expected one, or --plot FILE.png alone, which draws several")
@@ -140,6 +142,7 @@ def _draw(arguments: Namespace) -> int:
     from ..results.point_cloud import save_contact_cloud
     from ..results.read import read_frame
     from ..results.store import MESH, Mesh
+    from ..results.surface_file import save_surface
 
     name, frame, home = read_frame(arguments.result, arguments.frame)
     if arguments.ply:
@@ -147,6 +150,10 @@ def _draw(arguments: Namespace) -> int:
         return 0
     mesh = Mesh.load(arguments.mesh or home / MESH)
     mesh.check(frame, arguments.result)
+    if arguments.surface:
+        fields = save_surface(arguments.surface, frame, mesh)
+        print(f"{name}: surface with {', '.join(fields)} in {arguments.surface}")
+        return 0
     image = read_image(arguments.image) if arguments.image else None
     drawing = figure(frame, mesh, image, name)
     if arguments.out is None and _has_display():

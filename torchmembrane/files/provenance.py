@@ -13,11 +13,13 @@ DIGEST = partial(hashlib.blake2b, digest_size=16)
 class Origin(NamedTuple):
     """The file of a frame as it was when the frame was reconstructed, and what was measured beside it.
 
+    Of views that have images of their own, a frame has a file for each.
+
     Attributes:
-        path: as given.
-        file_size: bytes; -1 where it is not known.
-        file_modified: nanoseconds since 1970; -1 where it is not known.
-        content_hash: BLAKE2b hash of its content, 16 bytes as hexadecimal; "" if it is not known.
+        path: as given, of the first view.
+        file_size: bytes, of all files; -1 where it is not known.
+        file_modified: nanoseconds since 1970, of the file that was modified last; -1 where it is not known.
+        content_hash: BLAKE2b hash of the content of all files, 16 bytes as hexadecimal; "" if it is not known.
         time: when the frame was taken, seconds, as its name, video, bag or camera says; NaN where it is not known.
         gauge: pressure across the membrane that a gauge read then, force unit / length unit^2; NaN where none did.
     """
@@ -30,34 +32,38 @@ class Origin(NamedTuple):
     gauge: float = float("nan")
 
     @classmethod
-    def of(cls, file: Path) -> "Origin":
-        """The origin of a file as it is now.
+    def of(cls, file: Path, *further: Path) -> "Origin":
+        """The origin of a file as it is now; `further`: of the other views, in their order.
 
         Raises:
-            OSError: it cannot be read.
+            OSError: one cannot be read.
 
         Example:
             >>> Origin.of(Path("examples/rest.png")).content_hash == Origin.of(Path("examples/flat_plate.png")).content_hash
             False
         """
-        stat = file.stat()
-        with open(file, "rb") as content:
-            digest = hashlib.file_digest(content, DIGEST).hexdigest()
-        return cls(printable(str(file)), stat.st_size, stat.st_mtime_ns, digest, time_in(file.stem))
+        digest, size, modified = DIGEST(), 0, 0
+        for each in (file, *further):
+            stat = each.stat()
+            size, modified = size + stat.st_size, max(modified, stat.st_mtime_ns)
+            with open(each, "rb") as content:
+                hashlib.file_digest(content, lambda: digest)
+        return cls(printable(str(file)), size, modified, digest.hexdigest(), time_in(file.stem))
 
     @classmethod
     def of_bytes(cls, file: Path, content: bytes) -> "Origin":
         """The origin of a file of which only the content is known."""
         return cls(printable(str(file)), len(content), content_hash=DIGEST(content).hexdigest(), time=time_in(file.stem))
 
-    def is_of(self, file: Path) -> bool:
-        """Whether a file has not changed: its size and time are compared, and if these differ its hash. True if the hash is not
-        known or the file cannot be read."""
+    def is_of(self, *files: Path) -> bool:
+        """Whether a file, or those of all views, have not changed: size and time are compared, and if these differ the hash.
+        True if the hash is not known or a file cannot be read."""
         try:
-            stat = file.stat()
-            if not self.content_hash or (stat.st_size, stat.st_mtime_ns) == (self.file_size, self.file_modified):
+            stats = [file.stat() for file in files]
+            size, modified = sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
+            if not self.content_hash or (size, modified) == (self.file_size, self.file_modified):
                 return True
-            return stat.st_size == self.file_size and Origin.of(file).content_hash == self.content_hash
+            return size == self.file_size and Origin.of(*files).content_hash == self.content_hash
         except OSError:
             return True
 

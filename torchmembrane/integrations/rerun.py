@@ -9,20 +9,21 @@ import numpy as np
 
 from ..files.atomic import whole_file
 from ..files.optional import load_rerun
-from ..results.frame_shapes import of_first_view
+from ..results.frame_shapes import FIELDS, of_first_view
 from ..results.reconstruction import Frame
 from ..results.status import Status
 from ..results.store import Mesh
 from ..surface.topology import rim_loop
 
 BLUE, VERMILION, GREY, DARK = (0, 114, 178), (213, 94, 0), (184, 184, 184), (60, 60, 60)
-TRACTION_MAP = "Oranges"
+TRACTION_MAP, FIELD_MAP = "Oranges", "viridis"
 LONGEST_TRACTION, LONGEST_FORCE = 0.15, 0.35
 """Of the surface's extent: the arrows of the largest traction and of the largest force so far."""
 LEAST_TRACTION = 0.1
 """Of the largest traction so far: smaller ones get no arrow."""
 LONGER = 5.0
 """As long as the markers' motion: its arrows."""
+TINY = 1e-12
 QUALITY = 90
 """Of the images' JPEG."""
 
@@ -32,8 +33,9 @@ class RerunLog:
 
     Entities: `camera/image`, with `rest`, `flow` (`LONGER` times as long) and `lost` markers; `surface/now`, coloured by
     compressive normal traction, with `traction`, `contacts` and `forces`, beside `surface/rest`; the curves `force`, `moment`
-    and `pressure`; `status`, when it changes. Timelines: `frame`, and `time` where it is known. Colours and arrows run to the
-    largest value so far.
+    and `pressure`; `status`, when it changes; of frames that hold them, `fields/stretch` and `fields/tension`, the surface
+    coloured by the larger principal value, and the curves `largest/stretch` and `largest/tension`. Timelines: `frame`, and
+    `time` where it is known. Colours and arrows run to the largest value so far.
 
     Args:
         mesh: what the frames share.
@@ -86,6 +88,7 @@ class RerunLog:
         if status.has_surface:
             self._add_surface(frame)
             self._add_contacts(frame)
+            self._add_fields(frame)
             self._add_curves(frame)
         else:
             self._log("surface/now", self._rr.Clear(recursive=True))
@@ -124,16 +127,31 @@ class RerunLog:
         sizes = np.linalg.norm(traction, axis=1)
         largest = self._larger("traction", sizes)
         colours = (255 * colormaps[TRACTION_MAP](compressive / largest)).astype(np.uint8)
-        surface = rr.Mesh3D(
+        self._log("surface/now", self._surface(frame, colours))
+        shown = sizes > LEAST_TRACTION * largest
+        vectors = traction[shown] * (LONGEST_TRACTION * self._extent / largest)
+        self._log("surface/now/traction", rr.Arrows3D(origins=frame["vertices"][shown], vectors=vectors, colors=VERMILION))
+
+    def _surface(self, frame: Frame, colours: np.ndarray) -> Any:
+        return self._rr.Mesh3D(
             vertex_positions=frame["vertices"],
             triangle_indices=self._mesh.triangles,
             vertex_normals=frame["normals"],
             vertex_colors=colours,
         )
-        self._log("surface/now", surface)
-        shown = sizes > LEAST_TRACTION * largest
-        vectors = traction[shown] * (LONGEST_TRACTION * self._extent / largest)
-        self._log("surface/now/traction", rr.Arrows3D(origins=frame["vertices"][shown], vectors=vectors, colors=VERMILION))
+
+    def _add_fields(self, frame: Frame) -> None:
+        """The surface once more for each field that the frame holds, coloured by the larger principal value, from the frame's
+        least to its largest."""
+        from matplotlib import colormaps
+
+        for name in FIELDS:
+            if name in frame:
+                values = frame[name].max(1)
+                share = (values - values.min()) / max(float(np.ptp(values)), TINY)
+                colours = (255 * colormaps[FIELD_MAP](share)).astype(np.uint8)
+                self._log(f"fields/{name}", self._surface(frame, colours))
+                self._log(f"largest/{name}", self._rr.Scalars([float(values.max())]))
 
     def _add_contacts(self, frame: Frame) -> None:
         rr, found = self._rr, np.isfinite(frame["contact_points"]).all(1)

@@ -21,6 +21,7 @@ from ..files.timestamps import time_in
 from ..files.video import picture_total, picture_values, video_pictures
 from ..integrations.messages import grey_of
 from ..integrations.rosbag import image_topic, is_bag, messages
+from ..sensor.view_images import view_files
 from .inputs import Inputs, frame_name, picture_name
 
 if TYPE_CHECKING:
@@ -86,24 +87,25 @@ def decoded(source: Source, reconstructor: "Reconstructor") -> DecodedFrame:
     try:
         if len(source.name.encode()) > LONGEST_NAME:
             raise MembraneError(f"its name has {len(source.name.encode())} bytes; expected {LONGEST_NAME} at most: rename it")
-        origin = source.origin or origin_of(source.file)
+        origin = source.origin or origin_of(*view_files(source.file, reconstructor.sensor.views_apart))
         return frame._replace(image=source.load(reconstructor), origin=origin)
     except MembraneError as error:
         return frame.but(error)
 
 
-def origin_of(path: Path) -> Origin:
-    """The origin of a frame in this file.
+def origin_of(*paths: Path) -> Origin:
+    """The origin of a frame in this file, or in those of all views.
 
     Raises:
-        MembraneError: it is not a regular file (a pipe would be waited for), or cannot be read.
+        MembraneError: one is not a regular file (a pipe would be waited for), or cannot be read.
     """
     try:
-        if not path.is_file():
-            raise MembraneError(f"{path}: not a regular file; expected an image or a video")
-        return Origin.of(path)
+        for path in paths:
+            if not path.is_file():
+                raise MembraneError(f"{path}: not a regular file; expected an image or a video")
+        return Origin.of(*paths)
     except OSError as error:
-        raise MembraneError(f"{path}: not readable ({error})") from error
+        raise MembraneError(f"{error.filename or paths[0]}: not readable ({error})") from error
 
 
 def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch: int) -> Iterator[list[DecodedFrame]]:

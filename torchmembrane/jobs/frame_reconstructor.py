@@ -1,7 +1,7 @@
 """The worker of a job: it turns frames into rows of results, whichever engine distributes the work."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -60,6 +60,7 @@ class FrameReconstructor:
         rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
         pressure: readings of a gauge by the names of the frames, or a function of name and time (s); units as for
             `Reconstructor`.
+        fields: of the surface that frames hold as well, as of `Reconstructor.fields`: "stretch", "tension".
 
     Example:
         >>> from dataclasses import replace
@@ -76,15 +77,16 @@ class FrameReconstructor:
         reconstructor: "Reconstructor",
         rest_pixels: Tensor | None = None,
         pressure: Gauge | None = None,
+        fields: Sequence[str] = (),
     ):
         if not hasattr(reconstructor, "rest_pixels"):
             raise MembraneError(f"FrameReconstructor: reconstructor is a {_kind(reconstructor)}; expected a tm.Reconstructor")
-        self.reconstructor, self.rest_pixels, self.pressure = reconstructor, rest_pixels, pressure
+        self.reconstructor, self.rest_pixels, self.pressure, self.fields = reconstructor, rest_pixels, pressure, fields
 
     def on(self, device: str) -> "FrameReconstructor":
         """The same on a device, "cpu" or "cuda"."""
         rest_pixels = None if self.rest_pixels is None else self.rest_pixels.to(device)
-        return FrameReconstructor(self.reconstructor.to(device), rest_pixels, self.pressure)
+        return FrameReconstructor(self.reconstructor.to(device), rest_pixels, self.pressure, self.fields)
 
     def __call__(self, rows: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Reconstruct a batch of rows.
@@ -169,7 +171,9 @@ class FrameReconstructor:
             options["pressure"] = torch.tensor(readings, dtype=torch.float64)
         computed = self.reconstructor(torch.cat(images), **options)
         results = Reconstruction(*(field.cpu() for field in computed))
-        return [results.frame(i) for i in range(len(images))]
+        fields = self.reconstructor.fields(computed, self.fields) if self.fields else {}
+        arrays = {name: values.cpu().numpy().astype(np.float32) for name, values in fields.items()}
+        return [results.frame(i) | {name: values[i] for name, values in arrays.items()} for i in range(len(images))]
 
     def _measured(self, frame: DecodedFrame) -> Origin:
         """A frame's origin, with what the gauge read."""

@@ -28,11 +28,13 @@ class Inputs(NamedTuple):
         videos: files of several frames: videos, image files of several pictures, and bags, which are their `metadata.yaml`
             or a storage file.
         topic: of the bags' images; None: the only one.
+        views: names of the views that have images of their own; `images` are then the first one's.
     """
 
     images: list[Path]
     videos: list[Path]
     topic: str | None = None
+    views: Sequence[str] = ()
 
     @property
     def bags(self) -> list[Path]:
@@ -141,7 +143,7 @@ def of_first_view(inputs: Inputs, views: Sequence[str]) -> Inputs:
         stem = next((path.stem.removesuffix(view) for view in views if path.stem.endswith(f"_{view}")), None)
         if stem not in names:
             raise MembraneError(f"{path}: of no view, or of none of the frames; expected NAME_{', NAME_'.join(views)} of each")
-    return inputs._replace(images=firsts)
+    return inputs._replace(images=firsts, views=views)
 
 
 def single_images(inputs: Inputs) -> list[Path]:

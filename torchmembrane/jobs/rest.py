@@ -62,7 +62,7 @@ def _loaded(source: Source, reconstructor: "Reconstructor", said: str) -> Tensor
 def _warn_of_contact(reconstructor: "Reconstructor", rest: Tensor, said: str) -> None:
     """Warn if the images taken for rest show a press, compared with the sensor's rest image, or a drift that looks like one."""
     with torch.no_grad():
-        result = reconstructor.from_pixels(rest)
+        result = reconstructor.from_pixels(reconstructor.observer.by_view(rest[None]))
     if Tracker(reconstructor).is_pressed(result):
         known = (
             f"of {float(result.force[0].norm()):.3g} {reconstructor.sensor.force_unit} "

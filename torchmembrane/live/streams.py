@@ -48,6 +48,7 @@ class TrackedStream:
     """
 
     def __init__(self, reconstructor: Reconstructor):
+        reconstructor.sensor.refuse_views("live")
         self.tracker = Tracker(reconstructor)
         self.mesh = Mesh.of(reconstructor, Settings.of(reconstructor, "npz"))
 

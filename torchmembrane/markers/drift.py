@@ -58,10 +58,10 @@ class DriftWatch:
     """The markers' mean displacement over the latest frames in which nothing touches.
 
     Args:
-        rest_pixels: `[D, 2]`, the markers at rest.
+        rest_pixels: `[D, 2]`, the markers at rest; of several views those of the first, then those of the second, and so on.
         rest_covariance: `[D, 2, 2]` px^2, of the noise frozen in what is taken for rest.
         seen: `[D]` bool, which markers were seen there.
-        image_size: width and height.
+        image_sizes: width and height of each view's image. Each has polynomials and a camera's motion of its own.
 
     Limitations:
         A touch that is too light or too wide for `LARGEST_ROUGHNESS` to tell, held for tens of frames, looks like a drift.
@@ -76,14 +76,16 @@ class DriftWatch:
         (0.14, True)
     """
 
-    def __init__(self, rest_pixels: Tensor, rest_covariance: Tensor, seen: Tensor, image_size: tuple[int, int]):
+    def __init__(self, rest_pixels: Tensor, rest_covariance: Tensor, seen: Tensor, *image_sizes: tuple[int, int]):
         self.seen = seen.cpu()
         root = torch.linalg.cholesky(rest_covariance.cpu().double()[self.seen])
-        pixels = rest_pixels.cpu().double()[self.seen]
-        terms = _polynomials(pixels, image_size)
+        of_views = zip(rest_pixels.cpu().double().chunk(len(image_sizes)), self.seen.chunk(len(image_sizes)), strict=True)
+        views = list(zip((pixels[seen] for pixels, seen in of_views), image_sizes, strict=True))
+        terms = torch.block_diag(*(_polynomials(*view) for view in views))
         self.whitening = torch.linalg.inv(root)
-        moved_camera = self.whitening @ motion_of_pixels(pixels, image_size)
-        self.rigid: Tensor = torch.linalg.qr(moved_camera.flatten(0, 1)).Q  # [2 D, 4]
+        motion = torch.block_diag(*(motion_of_pixels(*view).flatten(0, 1) for view in views))
+        moved_camera = self.whitening @ motion.unflatten(0, (-1, 2))
+        self.rigid: Tensor = torch.linalg.qr(moved_camera.flatten(0, 1)).Q  # [2 D, 4 W]
         whitened = (self.whitening[..., None] * terms[:, None, None]).flatten(-2).flatten(0, 1)
         self.smooth: Tensor = torch.linalg.qr(whitened).Q  # [2 D, k]
         self.fields = root @ self.smooth.unflatten(0, (len(root), 2))  # [D, 2, k], px

@@ -118,6 +118,10 @@ class MarkerObserver(nn.Module):
         """Values of the markers for each view that sees them."""
         return values
 
+    def with_rays(self, pixels: Tensor, confidence: Tensor) -> Tensor:
+        """Pixels `[B, D, 2]` as they are; of several views, `ViewsObserver` has some without a ray."""
+        return pixels
+
     def _in_rest_image(self, image: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor]:
         """The markers in the rest image, their covariance, which are found: subtracted from every frame's, rest offsets are
         nulled (5.2)."""

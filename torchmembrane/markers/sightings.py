@@ -26,7 +26,7 @@ class Sightings(NamedTuple):
         markers: the D markers on the rest surface, with the first view's locator.
         positions: `[N, 3]` at rest, length unit.
         points: the same N as points of the membrane's triangles.
-        rest_pixels: `[N, 2]`, where the model sees them.
+        rest_pixels: `[N, 2]`, where the model sees them; of several views the principal point where one does not.
         vertex_pixels: `[V, 2]`, where the first view sees the grid's vertices.
         levers: `[N, 3]`, from the positions to the tips that are seen; None: all markers lie on the surface.
     """
@@ -67,13 +67,15 @@ def sightings(sensor: Sensor, locator: str, dtype: torch.dtype, whole: bool, che
         observers.append(observer)
         pixels.append(torch.from_numpy(of_view.model_pixels))
     regions = [view.region for view in sensor.views if view.region is not None]
-    together = ViewsObserver(observers, [view.name for view in sensor.views], regions or None)
+    principal = torch.stack([view.camera.centre.double() for view in sensor.views])
+    together = ViewsObserver(observers, [view.name for view in sensor.views], regions or None, principal)
+    rays = together.with_rays(torch.cat(pixels)[None], together.seen_at_rest.double()[None])[0]
     outside = [view.side == "outside" for view in sensor.views]
     rig = Rig([view.camera for view in sensor.views], [view.pose for view in sensor.views], outside)
     points = SurfacePoints(*(np.concatenate([field] * len(observers)) for field in markers.points))
     repeated = positions.repeat(len(observers), 1)
     levers = None if levers is None else levers.repeat(len(observers), 1)
-    return Sightings(together, rig, markers, repeated, points, torch.cat(pixels), vertex_pixels, levers)
+    return Sightings(together, rig, markers, repeated, points, rays, vertex_pixels, levers)
 
 
 def _of_one_view(

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..control_flow import traced
+from ..control_flow import Value, traced
 from ..errors import MembraneError
 from ..files.tensors import tensor_of
 from ..results.status import Status
@@ -26,14 +26,22 @@ class ViewsObserver(nn.Module):
         observers: of the views.
         names: of the views, for messages.
         regions: left, top, width, height of each view in the image that they share; None: each has a channel of its own.
+        principal: `[W, 2]` px, the views' principal points.
     """
 
+    principal: Tensor
+
     def __init__(
-        self, observers: Sequence[MarkerObserver], names: Sequence[str], regions: Sequence[tuple[int, int, int, int]] | None
+        self,
+        observers: Sequence[MarkerObserver],
+        names: Sequence[str],
+        regions: Sequence[tuple[int, int, int, int]] | None,
+        principal: Tensor,
     ):
         super().__init__()
         self.each, self.names, self.regions = nn.ModuleList(observers), list(names), regions
         self.count, self.views = len(observers[0].rest_pixels), len(observers)
+        self.register_buffer("principal", principal)
 
     def _joined(self, name: str) -> Tensor:
         return torch.cat([getattr(observer, name) for observer in self.each])
@@ -58,6 +66,12 @@ class ViewsObserver(nn.Module):
         """Which of the sightings there are at rest, `[N]` bool."""
         return self._joined("seen_at_rest")
 
+    def with_rays(self, pixels: Tensor, confidence: Tensor) -> Tensor:
+        """Pixels `[B, N, 2]`, those without confidence `[B, N]` at their view's principal point: a view may have no ray for a
+        marker that it does not see, and no weight makes a number of what is none."""
+        nowhere = self.principal.repeat_interleave(self.count, 0).to(pixels)
+        return torch.where((confidence > 0)[..., None], pixels, nowhere)
+
     @property
     def follows(self) -> bool:
         """Whether markers are looked for first where they were in the frame before."""
@@ -72,6 +86,7 @@ class ViewsObserver(nn.Module):
         """Values `[B, N, ...]` as `[B, W, D, ...]`."""
         return values.unflatten(1, (self.views, self.count))
 
+    @traced
     def sighted(self, values: Tensor) -> Tensor:
         """Values `[B, W, D, ...]` as `[B, N, ...]`."""
         return values.flatten(1, 2)
@@ -80,14 +95,21 @@ class ViewsObserver(nn.Module):
         """Values of the markers, `[..., D, C]`, for each sighting, `[..., N, C]`."""
         return torch.cat([values] * self.views, -2)
 
-    def images(self, grey: Tensor) -> list[Tensor]:
-        """Each view's images `[B, 1, height, width]`, of grey images `[B, 1, ...]` of the regions, or `[B, W, ...]`."""
+    def images(self, grey: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
+        """Each view's images `[B, 1, height, width]`, of grey images `[B, 1, ...]` of the regions, or `[B, W, ...]`; a sequence
+        of these is taken as it is."""
+        return self._parts(grey) if isinstance(grey, (Tensor, Value)) else grey
+
+    @traced
+    def _parts(self, grey: Tensor) -> list[Tensor]:
         if self.regions is None:
             sizes = [observer.image_size for observer in self.each]
             return [grey[:, w : w + 1, :height, :width] for w, (width, height) in enumerate(sizes)]  # type: ignore[misc]
         return [grey[:, :, v : v + height, u : u + width] for u, v, width, height in self.regions]
 
-    def forward(self, images: Tensor, previous: Tensor | None = None, rest_pixels: Tensor | None = None) -> MarkerFlow:
+    def forward(
+        self, images: Tensor | Sequence[Tensor], previous: Tensor | None = None, rest_pixels: Tensor | None = None
+    ) -> MarkerFlow:
         """What grey images show, as of `MarkerObserver`; `status [B, W]` is each view's."""
         befores, rests = self._split(previous, 1), self._split(rest_pixels, 0)
         each = zip(self.each, self.images(images), befores, rests, strict=True)
@@ -107,7 +129,9 @@ class ViewsObserver(nn.Module):
 
     @traced
     def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
-        """Displacements, confidence and status `[B]`: a view that fails is left out where another one does not."""
+        """Displacements, confidence and status `[B]`: a view that fails is left out where another one does not, and so is a
+        marker that a view does not see at rest, of which it knows no displacement."""
+        confidence = confidence * self.seen_at_rest
         parts = zip(
             *(self.by_view(each).unbind(1) for each in (displacement, confidence, covariance)), status.unbind(1), strict=True
         )
@@ -151,9 +175,11 @@ class ViewsObserver(nn.Module):
             raise MembraneError(f"Reconstructor: previous has {came}; expected {expected}: an earlier result for each image")
         return self.sighted(given.to(self.rest_pixels))
 
+    @traced
     def _split(self, values: Tensor | None, axis: int) -> Sequence[Tensor | None]:
         return [None] * self.views if values is None else values.chunk(self.views, axis)
 
+    @traced
     def _together(self, flows: Sequence[MarkerFlow]) -> MarkerFlow:
         displacement, confidence, covariance, status = zip(*flows, strict=True)
         return MarkerFlow(

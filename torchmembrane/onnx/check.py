@@ -11,7 +11,7 @@ from torch import Tensor
 from ..errors import MembraneError
 from ..reconstruct import Reconstructor
 from ..simulate.dataset import Plan, random_frame
-from ..simulate.simulator import Simulator
+from ..simulate.simulator import REST_NOISE, Simulator
 
 LARGEST = 3e-5  # distance between the vertices of both, over the surface's size
 ROUNDING = 8.0  # or over that which float32 makes in torch: a batch's length alone may make it several times as much
@@ -62,15 +62,18 @@ def rounding(reconstructor: Reconstructor, images: Tensor) -> float:
 
 
 def check_images(reconstructor: Reconstructor) -> Tensor:
-    """The sensor at rest, pressed, and at rest, `[3, 1, H, W]`; once at rest where its simulator finds no press."""
+    """The sensor at rest, pressed, and at rest, `[3, 1, H, W]`, of views that have images of their own `[3, W, H, W']`; once
+    at rest where its simulator finds no press."""
     simulator = Simulator(reconstructor.sensor)
-    images = [simulator.rest_image()]
+    rest = simulator.images(simulator.membrane.rest, np.random.default_rng(REST_NOISE))
+    frames = [rest]
     try:
         with torch.enable_grad():  # the simulator's, whatever the caller's
-            images += [random_frame(simulator, Plan(kinds=("sphere",)), 0).image, images[0]]
+            pressed = random_frame(simulator, Plan(kinds=("sphere",)), 0)
+        frames += [[pressed.image, *pressed.further], rest]
     except MembraneError:
         pass
-    return torch.cat([reconstructor.grey(image) for image in images])
+    return torch.cat([reconstructor.grey(frame if reconstructor.sensor.views_apart else frame[0]) for frame in frames])
 
 
 def compare(model: bytes, reconstructor: Reconstructor, images: Tensor) -> Agreement:
@@ -79,15 +82,19 @@ def compare(model: bytes, reconstructor: Reconstructor, images: Tensor) -> Agree
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # its warnings are of its own optimiser
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    tracks = "previous_pixels" in [given.name for given in session.get_inputs()]
+    names = [given.name for given in session.get_inputs()]
+    tracks = "previous_pixels" in names
+    names = [name for name in names if name != "previous_pixels"]
     status: list[int] = []
     expected_status: list[int] = []
     distances = [0.0]
     before = images.new_full((len(images), *reconstructor.rest_pixels.shape), torch.nan) if tracks else None
+    given = [image.numpy() for image in (reconstructor.observer.images(images) if len(names) > 1 else [images])]
     for _ in range(2 if tracks else 1):
         with torch.no_grad():
-            expected = reconstructor.reconstruct_grey(images, before)
-        feed = {"image": images.numpy()} | ({} if before is None else {"previous_pixels": before.numpy()})
+            sighted = None if before is None else reconstructor.observer.sighted(before)
+            expected = reconstructor.reconstruct_grey(images, sighted)
+        feed = dict(zip(names, given, strict=True)) | ({} if before is None else {"previous_pixels": before.numpy()})
         for frames in (len(images), 1):
             vertices, statuses = session.run(["vertices", "status"], {name: value[:frames] for name, value in feed.items()})
             apart = np.linalg.norm(vertices - expected.vertices[:frames].numpy(), axis=-1).max(-1)

@@ -9,7 +9,7 @@ from hashlib import sha256
 from inspect import unwrap
 from pathlib import Path
 from types import MethodType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import onnx
@@ -33,6 +33,7 @@ from .trace import EXPORTER, traced_model
 FORMAT = 1
 SEAL = "SHA-256: "
 CHECK, NODES = 0.65, 11_500  # share of the time before the check, and how many nodes are traced, of the default estimator
+IMAGE, PREVIOUS = "image", "previous_pixels"
 EXAMPLES = 2  # frames with which a piece is traced; the batch stays free
 
 
@@ -187,8 +188,9 @@ def export(
         progress: is told how far it is, and the names of the pieces, some thirty; the last step is the check.
 
     Returns:
-        The model. Input `image [batch, 1, height, width]`, grey in 0..1; with `tracking`, of dots, also `previous_pixels
-        [batch, D, 2]`, NaN to start from rest. Outputs as `Reconstruction`.
+        The model. Input `image [batch, 1, height, width]`, grey in 0..1, of views that have images of their own one for each,
+        `image_NAME`; with `tracking`, of dots, also `previous_pixels [batch, D, 2]`, of W views `[batch, W, D, 2]`, NaN to
+        start from rest. Outputs as `Reconstruction`.
 
     Raises:
         MembraneError: a folder that does not exist, a reconstructor of another precision than float32, or one that cannot be
@@ -196,24 +198,37 @@ def export(
     """
     if not Path(path).parent.is_dir():
         raise MembraneError(f"export: {path}: the folder {Path(path).parent} does not exist; make it first")
+    if len({view.camera.bits for view in reconstructor.sensor.views}) > 1:
+        raise MembraneError("export: views whose cameras differ in bits; expected the same of all")
     if reconstructor.rest_pixels.dtype != torch.float32:
         raise MembraneError(f"export: the reconstructor is {reconstructor.rest_pixels.dtype}; expected torch.float32")
-    reconstructor.sensor.refuse_views("export")
     progress(0.0, "image")
-    width, height = reconstructor.image_size
-    image = torch.rand(EXAMPLES, 1, height, width, generator=torch.Generator().manual_seed(0)).to(reconstructor.rest_pixels)
-    tracer = Tracer(within(progress, 0.0, CHECK))
-    inputs = [tracer.given("image", image)]
+    tracer, generator = Tracer(within(progress, 0.0, CHECK)), torch.Generator().manual_seed(0)
+    images = [
+        tracer.given(name, torch.rand(EXAMPLES, 1, height, width, generator=generator).to(reconstructor.rest_pixels))
+        for name, (width, height) in image_inputs(reconstructor).items()
+    ]
+    before = []
     if tracking and reconstructor.observer.follows:
-        inputs.append(tracer.given("previous_pixels", reconstructor.rest_pixels.repeat(EXAMPLES, 1, 1)))
-    values: Any = inputs  # stand for tensors
+        rest = reconstructor.rest_pixels
+        before.append(tracer.given(PREVIOUS, rest.expand(EXAMPLES, *rest.shape).contiguous()))
+    inputs, values = images + before, cast(Any, images)  # stand for tensors
     with EXPORTER.at_work():
-        result: Any = reconstructor.reconstruct_grey(*values)
+        given = [reconstructor.observer.sighted(pixels) for pixels in cast(Any, before)]
+        result: Any = reconstructor.reconstruct_grey(values[0] if len(values) == 1 else values, *given)
     model = _finished(tracer, inputs, result, reconstructor)
     progress(CHECK, "check against torch")
     checked(model.SerializeToString(), reconstructor)
     write_bytes(path, sealed(model.SerializeToString()))
     return model
+
+
+def image_inputs(reconstructor: Reconstructor) -> dict[str, tuple[int, int]]:
+    """Names of a model's images, each with width and height: one, or of each view that has images of its own."""
+    apart = reconstructor.sensor.views_apart
+    if not apart:
+        return {IMAGE: reconstructor.image_size}
+    return {f"{IMAGE}_{name}": size for name, size in zip(apart, reconstructor.camera.image_sizes, strict=True)}
 
 
 def sealed(content: bytes) -> bytes:

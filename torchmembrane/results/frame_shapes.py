@@ -14,6 +14,8 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     **{"force_deviation": (3,), "depth_deviation": ()},
 }
 
+FIELDS: dict[str, tuple[str | int, ...]] = {"stretch": ("V", 2), "tension": ("V", 2)}
+"""Of arrays that a frame holds where they are asked for: principal values, the larger stretch's direction first."""
 OF_EACH_VIEW = ("pixels", "confidence", "residual", "camera_motion")
 """Of several views these begin with an axis `W`."""
 
@@ -25,7 +27,7 @@ def shape_of(key: str, sizes: Mapping[str, int]) -> tuple[int, ...]:
         >>> shape_of("contact_force", {"P": 4})
         (4, 3)
     """
-    alone = tuple(sizes[length] if isinstance(length, str) else length for length in SHAPES[key])
+    alone = tuple(sizes[length] if isinstance(length, str) else length for length in (SHAPES | FIELDS)[key])
     return (sizes["W"], *alone) if key in OF_EACH_VIEW and sizes.get("W") else alone
 
 

@@ -11,7 +11,7 @@ from ..errors import MembraneError
 from ..files.atomic import write_bytes
 from ..files.provenance import Origin
 from ..files.safe_read import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays
-from .frame_shapes import shape_of
+from .frame_shapes import FIELDS, shape_of
 from .reconstruction import Frame, Reconstruction
 from .status import Status
 
@@ -119,7 +119,8 @@ def completed(frame: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         raise MembraneError(f"status is {unknown.pop()}; expected {known}: it is damaged, or of a later version")
     sizes = {"P": len(frame["contact_points"])}
     added = {key: np.full(shape_of(key, sizes), np.nan, np.float32) for key in ADDED if key not in frame}
-    return {key: added[key] if key in added else frame[key] for key in Reconstruction._fields}
+    fields = [key for key in FIELDS if key in frame]
+    return {key: added[key] if key in added else frame[key] for key in (*Reconstruction._fields, *fields)}
 
 
 def stack_frames(frames: list[dict[str, np.ndarray]]) -> Reconstruction:

@@ -1,5 +1,6 @@
 """A folder of results: the settings that all its frames share, and `mesh.npz`, which holds them beside the rest surface."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -20,7 +21,8 @@ FORMATS = ("npz", "parquet")
 MESH = "mesh.npz"
 FIXED = ("element", "volume")
 """Settings that no option of the command chooses: each estimator has its own."""
-OWN, NONE = "of the sensor", "not measured"
+ELSE = {"pressure": "not measured", "fields": "none"}
+"""Of settings that are empty; of all others what the sensor has."""
 
 
 class ResultMaker(Protocol):
@@ -51,11 +53,14 @@ class Settings(NamedTuple):
     rest: str = ""
     pressure: str = ""
     pressure_noise: float = 0.0
+    fields: str = ""
 
     @classmethod
-    def of(cls, reconstructor: ResultMaker, format: str, rest: str = "", pressure: str = "") -> "Settings":
+    def of(
+        cls, reconstructor: ResultMaker, format: str, rest: str = "", pressure: str = "", fields: Sequence[str] = ()
+    ) -> "Settings":
         """Those of results that a reconstructor makes; `rest`: what was taken for rest in place of the sensor's rest image,
-        `pressure`: the file of a gauge's readings."""
+        `pressure`: the file of a gauge's readings, `fields`: of the surface that frames hold as well."""
         estimator = reconstructor.estimator
         return cls(
             estimator=reconstructor.estimator_name,
@@ -69,6 +74,7 @@ class Settings(NamedTuple):
             rest=rest,
             pressure=pressure,
             pressure_noise=getattr(estimator.settings, "pressure_noise", 0.0) if pressure else 0.0,
+            fields=" ".join(fields),
         )
 
 
@@ -85,7 +91,8 @@ class Mesh(NamedTuple):
     image_size      [2]     int64, width and height, px
     length_unit, force_unit, name    of the sensor
     sensor          fingerprint of its file
-    estimator, energy, element, format, volume, flow, smoothing, locator, rest, pressure, pressure_noise    the `Settings`
+    estimator, energy, element, format, volume, flow, smoothing, locator, rest, pressure, pressure_noise, fields   the
+                            `Settings`
     camera_in_tool  [3, 4]  rotation and translation from the camera's frame to the tool's, `p_tool = R p + t`; [0, 4] where the
                             sensor file has no `[tool]`; `tool` gives it as a `Pose`
     record          `[record]` of the sensor file as JSON: serial, calibrated, images, by, uncertainty; empty without
@@ -114,6 +121,7 @@ class Mesh(NamedTuple):
     rest: str = ""
     pressure: str = ""
     pressure_noise: float = 0.0
+    fields: str = ""
     camera_in_tool: np.ndarray = np.zeros((0, 4), np.float32)
     record: str = ""
 
@@ -236,7 +244,7 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
     for option, before, now in zip(Settings._fields, mesh.settings, settings, strict=True):
         if before != now:
             held = in_one_line(before) if before else ""
-            name, none = option.replace("_", "-"), NONE if option == "pressure" else OWN
+            name, none = option.replace("_", "-"), ELSE.get(option, "of the sensor")
             remedy = f", or pass --{name} {held}" if held else f", or leave --{name} out"
             raise MembraneError(
                 f"--out {folder}: was made with {name} {held or none}, this call asks for {now or none}; choose another "

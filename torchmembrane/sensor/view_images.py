@@ -58,20 +58,39 @@ def read_views(path: Path, views: Sequence[View], like: Tensor) -> Tensor:
     """A frame's images of all views, `[1, W, height, width]`, as of `grey_views`.
 
     Args:
-        path: of the first view's image, NAME_VIEW and an ending; the others have the same name and ending, with their view's.
+        path: of the first view's image, as of `view_files`.
         views: of the sensor.
         like: a tensor of the precision and device.
 
     Raises:
         MembraneError: the file is not named after the first view, or a view's cannot be read.
     """
-    first = f"_{views[0].name}"
+    files = view_files(path, [view.name for view in views])
+    images = [read_image(file, view.camera.image_size, view.camera.bits) for file, view in zip(files, views, strict=True)]
+    return grey_views(images, views, "rgb", like)
+
+
+def view_files(path: Path, names: Sequence[str]) -> list[Path]:
+    """The image files of a frame, of all views.
+
+    Args:
+        path: of the first view's image, NAME_VIEW and an ending; the others have the same name and ending, with their view's.
+        names: of the views that have images of their own; none of one view, or of regions of one image.
+
+    Raises:
+        MembraneError: the file is not named after the first view.
+
+    Example:
+        >>> [file.name for file in view_files(Path("press_left.png"), ["left", "right"])]
+        ['press_left.png', 'press_right.png']
+    """
+    if not names:
+        return [path]
+    first = f"_{names[0]}"
     if not path.stem.endswith(first):
         raise MembraneError(f"{path}: expected the first view's image, NAME{first}{path.suffix}, beside those of the others")
     stem = path.stem.removesuffix(first)
-    files = [path.with_name(f"{stem}_{view.name}{path.suffix}") for view in views]
-    images = [read_image(file, view.camera.image_size, view.camera.bits) for file, view in zip(files, views, strict=True)]
-    return grey_views(images, views, "rgb", like)
+    return [path.with_name(f"{stem}_{name}{path.suffix}") for name in names]
 
 
 def first_view_image(grey: Tensor, views: Sequence[View]) -> Tensor:

@@ -15,6 +15,8 @@ from .parts import Surface
 
 SIDES = ("inside", "outside")
 MOST_VIEWS = 8
+FEWEST_LINES = 25
+"""Of the solver's grid: two views see the shape so well that on fewer lines the grid's own error is what forces are off by."""
 SAME_PLACE = 1e-9
 """Largest entry by which the first view's pose may differ from none."""
 
