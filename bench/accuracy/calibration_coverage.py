@@ -129,8 +129,10 @@ def calibrated(made: Drawn, rng: np.random.Generator) -> dict:
     found = material_from_pixels(sensor, pixels[:-1], known, overpressure=gauge, noise=NOISE, rest_error=rest_error)
     seconds = time.process_time() - began
     written = replace(found.sensor, record=Record(uncertainty=found.force_deviation))
+    reconstructor = tm.Reconstructor(written)
+    there = torch.cdist(reconstructor.rest_pixels.double(), rest_pixels).argmin(1)  # dots whose rays meet the surface found
     with torch.no_grad():
-        result = tm.Reconstructor(written).from_pixels(pixels[-1:], rest_pixels=rest_pixels, noise=NOISE).frame(0)
+        result = reconstructor.from_pixels(pixels[-1:, there], rest_pixels=rest_pixels[there], noise=NOISE).frame(0)
     F = result["force"].astype(float)
     magnitude = float(np.linalg.norm(F))
     of_force = float(np.linalg.norm(result["force_deviation"] * F)) / magnitude
