@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from torchmembrane.calibrate import material, presses
+from torchmembrane.calibrate import explained, presses
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.markers.dots import pattern
@@ -111,8 +111,9 @@ def small_images(small_sensor):
 def calibration_grids(request, monkeypatch):
     """Those of `calibrate material`: coarser ones and fewer prestretches; with the mark `full` its own."""
     if request.param == "coarse":
-        monkeypatch.setattr(material, "GRID", (9, 9))
+        monkeypatch.setattr(explained, "GRID", (9, 9))
         monkeypatch.setattr(presses, "PRESSURE_GRID", (17, 17))
-        monkeypatch.setattr(presses, "STRETCHES", np.geomspace(1.05, 1.7, 6))
+        for module in (explained, presses):
+            monkeypatch.setattr(module, "STRETCHES", np.geomspace(1.05, 1.7, 6))
         monkeypatch.setattr(presses, "BETWEEN", 3)
     return request.param

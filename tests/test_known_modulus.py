@@ -63,6 +63,29 @@ def test_an_uncertain_height_of_the_rest_surface_enters_prestretch_and_modulus()
     assert found.modulus == pytest.approx(0.5, rel=0.003) and found.covariance[2, 2] < 0.01 and not found.contradictions
 
 
+def test_a_modulus_that_rises_faster_and_faster_is_summed_over_the_prestretches():
+    """`log m = log m_1 + s n + g t + q t^2`, `t` and `n` normal: mean `log m_1 + q`, variance `s^2 + g^2 + 2 q^2`."""
+    s, g, q = 0.05, -0.4, 0.15
+    one = ModulusEvidence("gauge", 0.5, s * 0.5, -0.3, 0.0, (0.5 * np.exp(q - g), 0.5 * np.exp(q + g)))
+    found = joined([one])
+    assert np.log(found.modulus / 0.5) == pytest.approx(q, abs=1e-6) and found.shift == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(found.covariance[:2, :2], [[1.0, g], [g, s**2 + g**2 + 2 * q**2]], atol=1e-6)
+    straight = one._replace(change=0.5 * g, sides=None)
+    alike = joined([straight._replace(sides=(0.5 * np.exp(-g), 0.5 * np.exp(g)))], 0.3, (0.4, 0.7))
+    np.testing.assert_allclose(alike.covariance, joined([straight], 0.3, (0.4, 0.7)).covariance, atol=1e-9)
+    assert alike.modulus == pytest.approx(joined([straight], 0.3, (0.4, 0.7)).modulus)
+    half = joined([one], least=0.0)  # of half a normal distribution
+    assert half.shift == pytest.approx((2 / np.pi) ** 0.5, abs=0.02)
+
+
+def test_a_height_that_is_known_otherwise_enters_with_its_mean():
+    """`log m = log m_1 + c h` with `h` of mean 0.4 and deviation 0.7."""
+    found = joined([ModulusEvidence("gauge", 0.5, 0.01, 0.0, 0.05)], 0.3, (0.4, 0.7))
+    assert (found.height, found.shift) == pytest.approx((0.4, 0.3 * 0.4))
+    assert np.log(found.modulus / 0.5) == pytest.approx(0.1 * 0.4)
+    assert found.covariance[1, 1] == pytest.approx(0.02**2 + (0.1 * 0.7) ** 2)
+
+
 def test_each_force_that_the_others_contradict_is_named():
     ratios = np.array([1.0, 1.05, 0.97, 1.55, 1.02, 0.6])
     assert [i for i, _, _ in odd_ones(ratios, np.full(6, 0.1))] == [3, 5]

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from torchmembrane import MembraneError
+from torchmembrane.calibrate.explained import _log_stretch
 from torchmembrane.calibrate.known_modulus import KnownForces
-from torchmembrane.calibrate.material import _log_stretch, material_from_pixels
+from torchmembrane.calibrate.material import material_from_pixels
 from torchmembrane.calibrate.presses import STRETCHES, Presses
 from torchmembrane.calibrate.report import Report
 from torchmembrane.camera.model import Camera

@@ -136,7 +136,7 @@ def heavy(*_, **__):
         (
             lambda sensor, told: material.material_from_images(sensor, IMAGE[None, None], progress=told),
             material,
-            "_reconstructor",
+            "coarse_reconstructor",
         ),
         (lambda sensor, told: spec_sheet(sensor, noise=40.0, progress=told), measure, "Rig"),
         (lambda sensor, told: export.export(Reconstructor(sensor), "a", progress=told), Reconstructor, "reconstruct_grey"),

@@ -46,7 +46,7 @@ def test_the_height_moves_the_minimum_of_a_parabola_and_the_forces():
         for m, h in ((0.0, 0), (0.02, 1))
     )
     found = height_effect(own, higher, step, variance)
-    assert found == pytest.approx((0.02, 2 * step, 0.3))
+    assert found[:3] == pytest.approx((0.02, 2 * step, 0.3)) and found[3:] == (0.0, 1.0)
     assert height_effect(own, higher._replace(losses=1e3 * z), step, variance).shift == pytest.approx(-3 * 0.03)
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import torchmembrane as tm
-from torchmembrane.calibrate import material, presses
+from torchmembrane.calibrate import explained, presses
 from torchmembrane.cli import main as cli
 from torchmembrane.integrations.frame_messages import SiUnits
 from torchmembrane.live.line import described
@@ -131,7 +131,7 @@ def tours(tmp_path_factory):
     def tour(unit, capsys):
         if unit not in made:
             with pytest.MonkeyPatch.context() as patched:
-                patched.setattr(material, "GRID", (9, 9))
+                patched.setattr(explained, "GRID", (9, 9))
                 patched.setattr(presses, "STRETCHES", np.geomspace(1.05, 1.7, 5))
                 patched.setattr(presses, "BETWEEN", 2)
                 made[unit] = Tour(unit, tmp_path_factory.mktemp(unit)).go(capsys)

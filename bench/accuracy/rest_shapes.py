@@ -52,13 +52,18 @@ def main() -> None:
 def sheet(kind: int, rng: np.random.Generator) -> tuple[FormedSurface, float]:
     """A sheet on a random rim, and its prestretch."""
     a, b = 40 * rng.uniform(0.8, 1.25, 2)
-    rim = rectangle((a, b), 0.15 * min(a, b)) if kind == 0 else ellipse((a, b))
-    if kind == 2:
-        angle = 2 * np.pi * np.arange(360) / 360
-        radius = 0.5 * min(a, b) * (1 + 0.1 * np.cos(3 * angle))
-        rim = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
+    rim = flat_rim(kind, a, b)
     stretch, height = float(rng.uniform(1.02, 1.3)), float(rng.uniform(0.1, 0.25) * (a * b) ** 0.5)
     return formed_surface(np.insert(rim, 2, 60.0, axis=1), SheetMaterial("neo_hookean", stretch), height=height), stretch
+
+
+def flat_rim(kind: int, a: float, b: float) -> np.ndarray:
+    """Points once around a rectangle, an ellipse or a rounded triangle, `[K, 2]`."""
+    if kind < 2:
+        return rectangle((a, b), 0.15 * min(a, b)) if kind == 0 else ellipse((a, b))
+    angle = 2 * np.pi * np.arange(360) / 360
+    radius = 0.5 * min(a, b) * (1 + 0.1 * np.cos(3 * angle))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
 
 
 def with_wave(formed: FormedSurface, stretch: float, wrong: float, rng: np.random.Generator) -> tm.Sensor:

@@ -1,6 +1,6 @@
 """From rendered photographs of windows to newtons, prestretch and modulus, by the documented commands alone.
 
-python -m bench.accuracy.window_commands [--rims rectangle ...] [--keep DIR]
+python -m bench.accuracy.window_commands [--rims rectangle ...] [--keep DIR] [--json FILE]
 
 The windows of `bench.accuracy.windows`: truth on an unstructured mesh, by another solver. Photographs, at rest and of each
 press, are drawn from the mesh: shaded triangles, and round dots of two sizes on the sheet, with noise of 40 dB. Then:
@@ -30,6 +30,7 @@ from torch import Tensor
 
 import torchmembrane as tm
 from bench.accuracy.windows import GAUGE, MODULUS, PITCH, STRETCH, Twin, centres, rims
+from bench.data.record import write
 from torchmembrane.forming.outline import encloses, outline_of
 from torchmembrane.sensor.inflated import rim_lines
 
@@ -91,8 +92,8 @@ def command(folder: Path, line: str) -> str:
     return done.stdout
 
 
-def measured(name: str, rim: np.ndarray, folder: Path, rng: np.random.Generator) -> list[tuple[float, float]]:
-    """Simulate a window, run the commands, print what they give; relative errors of force and depth of each press."""
+def measured(name: str, rim: np.ndarray, folder: Path, rng: np.random.Generator) -> dict:
+    """Simulate a window, run the commands, print what they give: forces and depths found over true, and the material."""
     twin = Twin(rim)
     rest = twin.blown_up()
     paint, gas = Paint(twin), float(twin.volume(rest) - twin.volume(twin.sheet))
@@ -112,16 +113,16 @@ def measured(name: str, rim: np.ndarray, folder: Path, rng: np.random.Generator)
     print(f"{name}: {modulus}", flush=True)
     files = " ".join(f"press_{k}.png" for k in range(len(presses)))
     command(folder, f"reconstruct mine.toml {files} --out results")
-    errors = []
+    forces, depths, statuses = [], [], []
     summary = {row["name"]: row for row in csv.DictReader((folder / "results" / "summary.csv").open())}
     for k, (x, force) in enumerate(presses):
         with np.load(folder / "results" / f"press_{k}.npz") as found:
             lowered, said_force = float(-found["displacement"][:, 2].min()), found["force"]
         depth = float((rest[:, 2] - x[:, 2]).max())
-        ratio = float(np.linalg.norm(said_force) / force.norm())
-        errors.append((abs(ratio - 1), abs(lowered / depth - 1)))
-        status = summary[f"press_{k}"]["status_text"]
-        said = f"force {float(force.norm()):.4f} N x {ratio:.3f}, depth {depth:.2f} mm x {lowered / depth:.3f}, {status}"
+        forces.append(float(np.linalg.norm(said_force) / force.norm()))
+        depths.append(lowered / depth)
+        statuses.append(summary[f"press_{k}"]["status_text"])
+        said = f"force {float(force.norm()):.4f} N x {forces[-1]:.3f}, depth {depth:.2f} mm x {depths[-1]:.3f}, {statuses[-1]}"
         print(f"  press {k}: {said}", flush=True)
     command(folder, f"init unknown.toml {known} --prestretch {WRONG_STRETCH:g}")
     command(folder, f"calibrate material unknown.toml {files} --forces forces.csv --overpressure {GAUGE:g}hPa --out material")
@@ -130,23 +131,26 @@ def measured(name: str, rim: np.ndarray, folder: Path, rng: np.random.Generator)
     off = {key: (v["value"], v["deviation"], (v["value"] - TRUTH[key]) / v["deviation"]) for key, v in found}
     said = ", ".join(f"{key} {value:.4g} ± {sd:.2g} (off by {z:+.1f})" for key, (value, sd, z) in off.items())
     print(f"  {said}", flush=True)
-    return errors
+    return dict(rim=name, forces=forces, depths=depths, statuses=statuses, **{key: [*v[:2]] for key, v in off.items()})
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rims", nargs="+", choices=list(rims()), default=list(rims()))
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the files")
+    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    errors, rng = [], np.random.default_rng(0)
+    rows, rng = [], np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as temporary:
         for name in arguments.rims:
             folder = (arguments.keep or Path(temporary)) / name
             folder.mkdir(parents=True)
-            errors += measured(name, rims()[name], folder, rng)
-    force, depth = np.median(errors, 0)
-    print(f"median error of force {force:.1%}, of depth {depth:.1%}")
+            rows.append(measured(name, rims()[name], folder, rng))
+    off = {key: [abs(ratio - 1) for row in rows for ratio in row[key]] for key in ("forces", "depths")}
+    median, most = ({key: float(of(errors)) for key, errors in off.items()} for of in (np.median, np.max))
+    print(f"median error of forces {median['forces']:.1%}, of depths {median['depths']:.1%}")
+    write(arguments.json, dict(rows=rows, median=median, most=most))
 
 
 if __name__ == "__main__":

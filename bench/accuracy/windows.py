@@ -13,6 +13,7 @@ from both presses with their forces, known to 3 %, and the gauge at rest, and pr
 
 import argparse
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -47,10 +48,19 @@ def rims() -> dict[str, np.ndarray]:
     return found | {"saddle": bent}
 
 
+class Sheet(NamedTuple):
+    """A sheet as it is made: prestretch, modulus x thickness (N/mm), and the overpressure that blows it up (hPa)."""
+
+    stretch: float = STRETCH
+    modulus: float = MODULUS
+    gauge: float = GAUGE
+
+
 class Twin:
     """A sheet on an unstructured mesh, reference by metrics."""
 
-    def __init__(self, rim: np.ndarray) -> None:
+    def __init__(self, rim: np.ndarray, made: Sheet | None = None) -> None:
+        self.made = made or Sheet()
         outline = outline_of(rim)
         border = outline.camera_frame(outline.sampled(int(outline.length / STEP)))
         i, j = np.meshgrid(*(np.arange(-40, 41),) * 2)
@@ -103,7 +113,8 @@ class Twin:
     def elastic(self, x: Tensor) -> Tensor:
         g = self._metric(x)
         first = (self.inverse * g).sum((1, 2))
-        return (self.area * MODULUS / 2 * (STRETCH**2 * first + self.det / torch.linalg.det(g) / STRETCH**4 - 3)).sum()
+        stretch, modulus, _ = self.made
+        return (self.area * modulus / 2 * (stretch**2 * first + self.det / torch.linalg.det(g) / stretch**4 - 3)).sum()
 
     def at(self, wanted: np.ndarray) -> tuple[Tensor, Tensor]:
         """Points of the sheet `[D, 2]` on the mesh, those outside left out: the vertices around each `[D, 3]`, and weights."""
@@ -122,24 +133,24 @@ class Twin:
 
         def potential(free: Tensor) -> Tensor:
             y = torch.cat([self.border, free.reshape(-1, 3)])
-            return self.elastic(y) - GAUGE * 1e-4 * self.volume(y)
+            return self.elastic(y) - self.made.gauge * 1e-4 * self.volume(y)
 
         x[self.fixed :] = least(potential, x[self.fixed :].flatten()).reshape(-1, 3)
         self.rest_volume = float(self.volume(x))
         return x
 
-    def pressed(self, x: Tensor, centre: Tensor, gas: float) -> tuple[Tensor, Tensor]:
-        """Vertices and force under a ball outside the membrane."""
-        P = (AIR + GAUGE) * 1e-4
+    def pressed(self, x: Tensor, centre: Tensor, gas: float, ball: float = BALL) -> tuple[Tensor, Tensor]:
+        """Vertices and force under a ball of a radius outside the membrane."""
+        p0, P = (pressure * 1e-4 for pressure in (self.made.gauge, AIR + self.made.gauge))
 
         def contact(y: Tensor) -> Tensor:
-            depth = (BALL - (y - centre).norm(dim=1)).clamp_min(0)
+            depth = (ball - (y - centre).norm(dim=1)).clamp_min(0)
             return STIFFNESS / 2 * (self.at_nodes * depth**2).sum()
 
         def potential(free: Tensor) -> Tensor:
             y = torch.cat([self.border, free.reshape(-1, 3)])
             rise = self.volume(y) - self.rest_volume
-            fluid = (GAUGE * 1e-4 - P) * rise + P * gas * torch.log1p(rise / gas)
+            fluid = (p0 - P) * rise + P * gas * torch.log1p(rise / gas)
             return self.elastic(y) - fluid + contact(y)
 
         y = x.clone()

@@ -71,6 +71,7 @@ PARTS = {
     "simulator": Part("bench.accuracy.simulator", SIMULATOR),
     "one-dimension": Part("bench.accuracy.one_dimension", ("torchmembrane/estimators/paper/studies",)),
     "window-mistakes": Part("bench.accuracy.window_mistakes", (*CLI, "torchmembrane/forming")),
+    "windows": Part("bench.accuracy.window_commands", (*CLI, "torchmembrane/forming", "bench/accuracy/windows.py")),
     "cli-errors": Part("bench.robustness.cli_errors", CLI),
     "memory": Part("bench.speed.memory", (*FRAME, "torchmembrane/jobs/workers.py")),
     "gpu": Part("bench.speed.gpu --batches 1 4 16 64 256 1024 2048", needs_gpu=True),

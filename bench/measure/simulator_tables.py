@@ -98,6 +98,21 @@ def window_mistakes(found: dict) -> Rows:
     return [["wrong", "pressed at an angle", "pressed in the middle", f"rise of the pressure, hPa (true {true})"], *rows]
 
 
+RIMS = {"triangle": "triangle with rounded corners", "bean": "bean (concave)", "saddle": "saddle (not planar)"}
+
+
+def windows(found: dict) -> Rows:
+    """Forces and depths found over true of membranes on several rims, and the material that is calibrated."""
+    rows = []
+    for row in found["rows"]:
+        ratios = [", ".join(f"{ratio:.2f}" for ratio in row[key]) for key in ("forces", "depths")]
+        material = [f"{value:.3f} ± {deviation:.3f}" for value, deviation in (row["prestretch"], row["modulus"])]
+        rows.append([RIMS.get(row["rim"], row["rim"]), *ratios, *material])
+    errors = [f"{found[of][key]:.1%}".replace("%", " %") for of in ("median", "most") for key in ("forces", "depths")]
+    rows.append(["error, median (largest)", f"{errors[0]} ({errors[2]})", f"{errors[1]} ({errors[3]})", "", ""])
+    return [["rim", "force found over true", "depth found over true", "prestretch", "modulus, N/mm"], *rows]
+
+
 def cli_errors(found: dict) -> Rows:
     """Force and depth of the tutorial's press where one number of `init` is wrong."""
     rows = [[row["wrong"], f"{row['force']:.2f}", f"{row['deepest']:.2f}"] for row in found["rows"]]

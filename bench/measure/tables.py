@@ -39,6 +39,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows]]] = {
     "simulator-seconds": (("simulator",), simulator.simulator_seconds),
     "agreement": (("simulator-independent",), simulator.agreement),
     "window-mistakes": (("window-mistakes",), simulator.window_mistakes),
+    "windows": (("windows",), simulator.windows),
     "cli-errors": (("cli-errors",), simulator.cli_errors),
     "memory": (("memory",), simulator.memory),
     "ablation": (("ablation",), accuracy.ablation),

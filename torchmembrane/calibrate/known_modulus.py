@@ -14,6 +14,7 @@ from ..sensor.units import hectopascal
 
 REST_ERROR = 0.05  # of the modulus from a gauge at rest, relative: that of the grid and of the reading
 FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known force (docs/calibration.md)
+REACH, SHIFTS = 8.0, 401  # standard deviations of the prestretch to either side, over which probabilities are summed; steps
 CONTRADICTING = 2.5  # standard deviations between two measurements, above which it is said
 
 
@@ -57,6 +58,8 @@ class ModulusEvidence(NamedTuple):
         deviation: standard deviation, at the prestretch found.
         change: with one standard deviation of the prestretch.
         by_height: change with one standard deviation of the rest surface's height.
+        sides: the modulus with a prestretch one standard deviation lower and higher; its logarithm is then a parabola, else a
+            straight line.
     """
 
     source: str
@@ -64,6 +67,7 @@ class ModulusEvidence(NamedTuple):
     deviation: float
     change: float
     by_height: float = 0.0
+    sides: tuple[float, float] | None = None
 
 
 class JoinedEvidence(NamedTuple):
@@ -72,30 +76,40 @@ class JoinedEvidence(NamedTuple):
     Attributes:
         shift: of the logarithm of the prestretch, in its standard deviations.
         modulus: force / length.
-        covariance: `[3, 3]` of the shift, of the logarithm of the modulus, and of the rest surface's height in its standard
-            deviations.
+        height: of the rest surface, above what it is, in its standard deviations.
+        covariance: `[3, 3]` of the shift, of the logarithm of the modulus, and of the height.
         contradictions: a sentence for each two kinds of measurement that contradict one another.
     """
 
     shift: float
     modulus: float
+    height: float
     covariance: np.ndarray
     contradictions: list[str]
 
 
-def joined(evidence: Sequence[ModulusEvidence], by_height: float = 0.0) -> JoinedEvidence:
+def joined(
+    evidence: Sequence[ModulusEvidence],
+    by_height: float = 0.0,
+    height: tuple[float, float] = (0.0, 1.0),
+    least: float = -np.inf,
+) -> JoinedEvidence:
     """The prestretch's shift `t` and the modulus `m` that several measurements agree on, by weighted least squares:
 
-        (t - b h)^2 + h^2 + sum_i (log m - log m_i - g_i t - c_i h)^2 / s_i^2,    s_i = deviation / modulus,
-                                                                    g_i = change / modulus,  c_i = by_height / modulus
+        (t - b h)^2 + (h - h0)^2 / s0^2 + sum_i (log m - log m_i(t) - c_i h)^2 / s_i^2,
+        log m_i(t) = log m_i + g_i t,    s_i = deviation / modulus,  g_i = change / modulus,  c_i = by_height / modulus
 
     What the presses' shapes say of the prestretch is the first term. All of it is said at the file's rest surface, which may be
     higher by `h` of its standard deviations. Each measurement's modulus depends on prestretch and height in its own way, so
-    that two of them tell these, too. Where they cannot agree, the covariance grows by their scatter.
+    that two of them tell these, too. Where they cannot agree, the covariance grows by their scatter. Where `log m_i` is a
+    parabola, as of a slack sheet, whose modulus rises ever faster as its prestretch falls to 1, the probability
+    `exp(-least squares / 2)` is summed over `t`.
 
     Args:
         evidence: of each measurement.
         by_height: `b`, the shift that the presses' shapes tell, with one standard deviation of the height.
+        height: `h0` and `s0`, its mean and standard deviation without the evidence.
+        least: shift that is possible.
 
     Example:
         >>> by_force, at_rest = ModulusEvidence("forces", 0.5, 0.05, 0.0), ModulusEvidence("gauge", 0.3, 0.02, 0.0)
@@ -103,14 +117,18 @@ def joined(evidence: Sequence[ModulusEvidence], by_height: float = 0.0) -> Joine
         >>> round(found.modulus, 2), found.contradictions[0].split(":")[0]
         (0.35, 'forces and gauge contradict one another')
     """
-    modulus, deviation, change, raised = (np.array([one[k] for one in evidence]) for k in (1, 2, 3, 4))
-    s, g, c = deviation / modulus, change / modulus, raised / modulus
-    rows = np.vstack([[1.0, 0.0, -by_height], [0.0, 0.0, 1.0], np.stack([-g, np.ones(len(s)), -c], 1) / s[:, None]])
-    values = np.concatenate([[0.0, 0.0], np.log(modulus) / s])
+    modulus, deviation, change, higher = (np.array([one[k] for one in evidence]) for k in (1, 2, 3, 4))
+    s, g, c = deviation / modulus, change / modulus, higher / modulus
+    mean, spread = height
+    rows = np.vstack([[1.0, 0.0, -by_height], [0.0, 0.0, 1 / spread], np.stack([-g, np.ones(len(s)), -c], 1) / s[:, None]])
+    values = np.concatenate([[0.0, mean / spread], np.log(modulus) / s])
     covariance = np.linalg.inv(rows.T @ rows)
-    shift, logarithm, height = covariance @ rows.T @ values
-    scatter = ((rows @ [shift, logarithm, height] - values) ** 2).sum() / max(len(s) - 1, 1)
-    said, at = [], np.log(modulus) + g * shift + c * height
+    x = covariance @ rows.T @ values
+    off = rows @ x - values
+    if any(one.sides for one in evidence):
+        x, covariance, off = _summed(evidence, rows, values, (x[0], covariance[0, 0] ** 0.5), least)
+    at = x[1] - s * off[2:]
+    scatter, said = (off**2).sum() / max(len(s) - 1, 1), []
     for i, one in enumerate(evidence):
         for k in range(i + 1, len(evidence)):
             apart = abs(at[i] - at[k]) / np.hypot(s[i], s[k])
@@ -120,7 +138,40 @@ def joined(evidence: Sequence[ModulusEvidence], by_height: float = 0.0) -> Joine
                     f"{one.source} and {evidence[k].source} contradict one another: moduli of {' and '.join(told)}, "
                     f"{apart:.1f} standard deviations apart: one of them, or the rest shape, is wrong"
                 )
-    return JoinedEvidence(float(shift), float(np.exp(logarithm)), covariance * max(1.0, scatter), said)
+    return JoinedEvidence(float(x[0]), float(np.exp(x[1])), float(x[2]), covariance * max(1.0, scatter), said)
+
+
+def _summed(
+    evidence: Sequence[ModulusEvidence], rows: np.ndarray, values: np.ndarray, about: tuple[float, float], least: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean and covariance of shift, log modulus and height, and what is missed at the mean shift, rows as of `joined`, where
+    logarithms of moduli are parabolas: of each shift the best modulus and height, by least squares, with its probability."""
+    t = about[0] + about[1] * np.linspace(-REACH, REACH, SHIFTS)
+    t = t[t >= least] if (t >= least).any() else np.array([least, least + 1e-9])
+
+    def wanted_at(t: np.ndarray) -> np.ndarray:
+        """What modulus and height are to fulfil at these shifts, `[n, R]`."""
+        wanted = values - t[:, None] * rows[:, 0]
+        for i, one in enumerate(evidence):
+            if one.sides:
+                low, high = np.log(np.array(one.sides) / one.modulus)
+                parabola = np.log(one.modulus) + (high - low) / 2 * t + (high + low) / 2 * t**2
+                wanted[:, 2 + i] = parabola * one.modulus / one.deviation
+        return wanted
+
+    others = rows[:, 1:]
+    covariance = np.linalg.inv(others.T @ others)
+    solved = others @ covariance
+    best, off = (wanted := wanted_at(t)) @ solved, wanted @ (solved @ others.T) - wanted
+    loss = (off**2).sum(1) / 2
+    weight = np.exp(loss.min() - loss)
+    weight /= weight.sum()
+    x = np.column_stack([t, best])
+    mean = weight @ x
+    spread = (weight[:, None] * (x - mean)).T @ (x - mean)
+    spread[1:, 1:] += covariance
+    at_mean = wanted_at(mean[:1])[0]
+    return mean, spread, at_mean @ (solved @ others.T) - at_mean
 
 
 def odd_ones(ratios: np.ndarray, deviations: np.ndarray) -> list[tuple[int, float, float]]:
@@ -172,4 +223,4 @@ def modulus_at_rest(
     found, low, high = (modulus(float(np.exp(log_stretch + s * deviation))) for s in (0, -1, 1))
     change = float(np.sign(high - low) * max(abs(low - found), abs(high - found)))
     by_height = 0.0 if other is None else modulus(float(np.exp(log_stretch)), other) - found
-    return ModulusEvidence("the gauge at rest", found, REST_ERROR * found, change, by_height)
+    return ModulusEvidence("the gauge at rest", found, REST_ERROR * found, change, by_height, (low, high))

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from ..errors import MembraneError, check_arguments, expect
@@ -14,19 +13,17 @@ from ..files.tensors import tensor_of
 from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
 from ..results.status import Status
+from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
+from .explained import HEIGHT_SHARE, ExplainedPresses, MeasuredPresses, coarse_reconstructor, explained, with_material
 from .known_modulus import KnownForces, KnownPressures, ModulusEvidence, joined, modulus_at_rest
-from .presses import GAS_ROUNDS, LossProfile, Presses
-from .rest_error import HEIGHT_ERROR, HeightEffect, height_effect
+from .presses import GAS_ROUNDS, LossProfile
+from .rest_error import HEIGHT_ERROR, StatedHeight, changed_height
 
-GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
-PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the loss's, alike in all images
-WRONG = 0.02  # probability that an image is explained wrongly altogether and carries no information
 GAS_SETTLED = 0.1  # change of a gas' modulus, relative, that changes the prestretch by less than its deviation
-FINE = 4001  # prestretches over which the probability is summed
 # What takes how much of the time, measured: of all, the markers in the images; of a round, the losses with pressures, forces or
-# neither known, and the same on a rest surface of another height.
-IMAGES_SHARE, PROFILE_SHARE, HEIGHT_SHARE = 0.05, (0.5, 0.65, 0.85), 0.15
+# neither known.
+IMAGES_SHARE, PROFILE_SHARE = 0.05, (0.5, 0.65, 0.85)
 
 
 class MaterialFit(NamedTuple):
@@ -42,6 +39,7 @@ class MaterialFit(NamedTuple):
         pressures: `[B, 2]` changes since rest found and measured, N per length unit squared, NaN where not known.
         contradictions: sentences about measurements that contradict one another.
         force_deviation: relative standard deviation of the scale of forces that the sensor then says; None without a modulus.
+        height: `[2]` of an inflated rest surface over its rim, and its standard deviation, length unit; None of any other.
     """
 
     sensor: Sensor
@@ -53,6 +51,7 @@ class MaterialFit(NamedTuple):
     pressures: np.ndarray
     contradictions: Sequence[str] = ()
     force_deviation: float | None = None
+    height: np.ndarray | None = None
 
     @property
     def deviations(self) -> np.ndarray:
@@ -90,15 +89,15 @@ def material_from_images(
         MembraneError: an image shows too few markers, or as of `material_from_pixels`.
     """
     progress(0.0, f"markers of {len(images)} images")
-    reconstructor = _reconstructor(sensor)
+    reconstructor = coarse_reconstructor(sensor)
     grey = reconstructor.grey(images)
     with torch.no_grad():
         flow = reconstructor.observer.judge(*reconstructor.observer(grey))
     displacement, confidence, _, status = flow
     for i in np.flatnonzero(status != Status.OK):
         raise MembraneError(f"calibrate material: image {i + 1}: {Status(int(status[i])).text}; leave it out")
-    known = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure, rest_error)
-    return _material(sensor, reconstructor, known, within(progress, IMAGES_SHARE, 1.0))
+    known = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure, StatedHeight(rest_error))
+    return _with_own_markers(_material(sensor, reconstructor, known, within(progress, IMAGES_SHARE, 1.0)), sensor)
 
 
 @check_arguments
@@ -148,7 +147,7 @@ def material_from_pixels(
         equally stretched in both directions, and the rest surface right. A prestretch outside `STRETCHES` is found near their
         end.
     """
-    reconstructor = _reconstructor(sensor)
+    reconstructor = coarse_reconstructor(sensor)
     pixels = tensor_of("calibrate material: pixels", pixels).to(reconstructor.rest_pixels)
     known = pixels.ndim == 3 and pixels.shape[1:] == reconstructor.rest_pixels.shape
     expected = f"[B, {len(reconstructor.rest_pixels)}, 2], one for each marker"
@@ -157,56 +156,13 @@ def material_from_pixels(
     displacement = torch.where(lost[..., None], 0.0, pixels - reconstructor.rest_pixels)
     confidence = (~lost).to(pixels)
     covariance = None if noise is None else reconstructor.observer.covariance_of(noise, confidence)  # type: ignore[operator]
-    measured = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure, rest_error, covariance)
-    return _material(sensor, reconstructor, measured, progress)
-
-
-class MeasuredPresses(NamedTuple):
-    """What is known of presses: the markers' displacement `[B, D, 2]` px and confidence `[B, D]`, forces or pressures as of
-    `material_from_pixels`, the displacements' covariance (default: the rest image's)."""
-
-    displacement: Tensor
-    confidence: Tensor
-    forces: KnownForces | None
-    pressures: KnownPressures | None
-    overpressure: float | None
-    rest_error: float
-    covariance: Tensor | None = None
-
-    @property
-    def tells_modulus(self) -> bool:
-        """Whether anything but the shapes is known."""
-        return any(given is not None for given in (self.forces, self.pressures, self.overpressure))
+    height = StatedHeight(rest_error)
+    measured = MeasuredPresses(displacement, confidence, _known(forces), pressures, overpressure, height, covariance)
+    return _with_own_markers(_material(sensor, reconstructor, measured, progress), sensor)
 
 
 def _known(forces: np.ndarray | KnownForces | None) -> KnownForces | None:
     return forces if forces is None or isinstance(forces, KnownForces) else KnownForces(np.asarray(forces, float))
-
-
-class _ByShapes(NamedTuple):
-    """What the presses' shapes say of the logarithm of the prestretch: its mean and standard deviation, that of the losses
-    alone, and mean and variance by each image `[B]`."""
-
-    mean: float
-    deviation: float
-    by_losses: float
-    each: np.ndarray
-    variances: np.ndarray
-
-    @property
-    def around(self) -> np.ndarray:
-        """One deviation below, the mean, and one above, `[3]`."""
-        found: np.ndarray = self.mean + self.deviation * np.array([-1.0, 0.0, 1.0])
-        return found
-
-
-def _by_shapes(profile: LossProfile) -> _ByShapes:
-    each, own = np.array([_log_stretch(profile.stretches, losses[:, None]) for losses in profile.losses.T]).T
-    mean, by_losses = _log_stretch(profile.stretches, profile.losses)
-    variances = own**2 + PRESTRETCH_ERROR**2
-    contradiction = ((each - mean) ** 2 / variances).sum() / max(len(each) - 1, 1)
-    deviation = float(np.hypot(by_losses * np.sqrt(max(1.0, contradiction)), PRESTRETCH_ERROR))
-    return _ByShapes(mean, deviation, by_losses, each, variances)
 
 
 def _material(
@@ -214,65 +170,108 @@ def _material(
 ) -> MaterialFit:
     if known.pressures is not None:
         reconstructor.estimator.check_gauge()
-    presses = Presses(reconstructor, known.displacement, known.confidence, known.covariance)
     of_round, later = _shares(sensor, known.tells_modulus, rounds, progress)
     of_profile = PROFILE_SHARE[0 if known.pressures is not None else 1 if known.forces is not None else 2]
-    shapes = _by_shapes(profile := presses.profile(within(of_round, 0.0, of_profile)))
-    of_round(of_profile, "prestretch with the rest surface's error")
-    other = presses.at_other_height(known.rest_error)
-    by = height_effect(presses.told(shapes.around), other.told(shapes.around), shapes.deviation, shapes.by_losses**2)
-    evidence = _Evidence(presses, other, shapes, by)
+    at = explained(sensor, reconstructor, known, within(of_round, 0.0, of_profile + HEIGHT_SHARE))
+    evidence = _Evidence(at)
     evidence.gather(known, within(of_round, of_profile + HEIGHT_SHARE, 1.0))
-    values = np.exp([shapes.mean])
-    covariance, of_force, material = values**2 * (shapes.deviation**2 + by.shift**2), None, sensor.material
-    covariance, said = covariance[:, None], evidence.said
-    if evidence.found:
-        found = joined(evidence.found, by.shift / shapes.deviation)
-        along = np.array([by.by_stretch, 1.0, by.by_height])
-        of_force = float(along @ found.covariance @ along) ** 0.5
-        values = np.array([np.exp(shapes.mean + found.shift * shapes.deviation), found.modulus])
-        scale = values * [shapes.deviation, 1.0]
-        covariance, said = scale[:, None] * found.covariance[:2, :2] * scale, said + found.contradictions
-        thickness = material.thickness or 1.0
-        material = replace(material, shear_modulus=found.modulus / thickness, thickness=thickness)
-    made = replace(sensor, material=replace(material, prestretch=max(1.0, float(values[0]))))
-    if rounds and not _is_settled(sensor, made):
-        return _material(made, _reconstructor(made), known, later, rounds - 1)
+    found = _found(at, evidence)
+    made, inflated = with_material(at.sensor, found.values), isinstance(sensor.surface, InflatedSurface)
+    is_rough = not inflated or at.sensor.force_unit == "relative"  # the modulus with which the presses were explained
+    if rounds and is_rough and not _is_settled(at.sensor, made):
+        displacement, confidence, covariance = at.presses.measured
+        known = known._replace(displacement=displacement, confidence=confidence, covariance=covariance, height=at.height)
+        return _material(made, coarse_reconstructor(made), known, later, rounds - 1)
+    height = None
+    if isinstance(made.surface, InflatedSurface):
+        height = made.surface.formed.height * np.array([1 + at.height.error * found.height, at.height.error * found.spread])
+        made = at.raised(made, found.height)[0]
+    shapes = at.shapes
     alone = np.exp(shapes.each)[:, None] * np.stack([np.ones(len(shapes.each)), np.sqrt(shapes.variances)], -1)
-    return MaterialFit(made, values, covariance, profile, alone, evidence.magnitudes, evidence.gauged, said, of_force)
+    told = (evidence.magnitudes, evidence.gauged, evidence.said + found.contradictions, found.of_force)
+    return MaterialFit(made, found.values, found.covariance, at.profile, alone, *told, height)
+
+
+class _Found(NamedTuple):
+    """What one round finds: values and covariance as of `MaterialFit`, the forces' relative standard deviation (None without a
+    modulus), sentences, and the rest surface's height above what it was, and its standard deviation, in those stated."""
+
+    values: np.ndarray
+    covariance: np.ndarray
+    of_force: float | None
+    contradictions: list[str]
+    height: float
+    spread: float
+
+
+def _found(at: ExplainedPresses, evidence: "_Evidence") -> _Found:
+    shapes, by = at.shapes, at.by
+    if not evidence.found:
+        values = np.exp([shapes.mean + by.shift * by.mean])
+        variance = values**2 * (shapes.deviation**2 + (by.shift * by.deviation) ** 2)
+        return _Found(values, variance[:, None], None, [], by.mean, by.deviation)
+    found = joined(evidence.found, by.shift / shapes.deviation, (by.mean, by.deviation), -shapes.mean / shapes.deviation)
+    along = np.array([by.by_stretch, 1.0, by.by_height])
+    of_force = float(along @ found.covariance @ along) ** 0.5
+    values = np.array([np.exp(shapes.mean + found.shift * shapes.deviation), found.modulus])
+    scale = values * [shapes.deviation, 1.0]
+    covariance = scale[:, None] * found.covariance[:2, :2] * scale
+    return _Found(values, covariance, of_force, found.contradictions, found.height, float(found.covariance[2, 2]) ** 0.5)
+
+
+def _with_own_markers(fit: MaterialFit, sensor: Sensor) -> MaterialFit:
+    """The fit's sensor with the markers of the sensor's file, on the rest surface found."""
+    surface, material = fit.sensor.surface, fit.sensor.material
+    if not isinstance(surface, InflatedSurface) or not isinstance(sensor.surface, InflatedSurface):
+        return fit
+    made, markers = replace(sensor, material=material), sensor.markers
+    if markers.positions is None:
+        return fit._replace(sensor=replace(made, surface=surface, membrane=fit.sensor.membrane))
+    before = sensor.surface.made_of(material, sensor.length_unit).formed.height
+    raised, kept = changed_height(made, markers.positions, surface.formed.height / before - 1)
+    sizes = list(np.array(markers.sizes)[kept])
+    markers = replace(markers, positions=raised.markers.positions, sizes=sizes)
+    return fit._replace(sensor=replace(raised, markers=markers))
 
 
 class _Evidence:
     """What forces and gauges tell of the modulus: `found`; magnitudes and pressures found and measured, `[B, 2]`, NaN where not
     known; sentences about measurements that the others contradict."""
 
-    def __init__(self, presses: Presses, other: Presses, shapes: _ByShapes, by: HeightEffect) -> None:
-        self.presses, self.other, self.by, self.at = presses, other, by, (shapes.mean, shapes.deviation)
-        self.magnitudes, self.gauged = np.full((2, len(shapes.each), 2), np.nan)
+    def __init__(self, at: ExplainedPresses) -> None:
+        self.presses, self.other, self.by, self.reach = at.presses, at.other, at.by, at.height.reach
+        self.at, self.bent = (at.shapes.mean, at.shapes.deviation), isinstance(at.sensor.surface, InflatedSurface)
+        self.magnitudes, self.gauged = np.full((2, len(at.shapes.each), 2), np.nan)
         self.found: list[ModulusEvidence] = []
         self.said: list[str] = []
 
     def gather(self, known: MeasuredPresses, progress: Progress) -> None:
         """From what is known."""
         if known.forces is not None:
-            modulus, deviation, change, self.magnitudes, odd = self.presses.modulus(*self.at, known.forces, progress)
-            self.found.append(ModulusEvidence("the forces", modulus, deviation, change, -self.by.by_height * modulus))
+            modulus, sd, change, sides, self.magnitudes, odd = self.presses.modulus(*self.at, known.forces, progress)
+            self._add(ModulusEvidence("the forces", modulus, sd, change, -self.by.by_height * modulus, sides))
             self.said += [
                 f"image {i + 1}: its force is {r:.2f} of what the others' tell, {z:.1f} standard deviations apart"
                 for i, r, z in odd
             ]
         if known.pressures is not None:
-            *told, self.gauged = self.presses.gauge_modulus(*self.at, known.pressures, self.other, progress)
-            self.found.append(ModulusEvidence("the gauge under presses", *told))
+            told = self.presses.gauge_modulus(*self.at, known.pressures, self.other, progress)
+            modulus, sd, change, by_height, self.gauged = told
+            self._add(ModulusEvidence("the gauge under presses", modulus, sd, change, by_height / self.reach))
         if known.overpressure is not None:
             sensor, moved = (presses.reconstructor.sensor for presses in (self.presses, self.other))
-            self.found.append(modulus_at_rest(sensor, *self.at, known.overpressure, moved))
+            at_rest = modulus_at_rest(sensor, *self.at, known.overpressure, moved)
+            self._add(at_rest._replace(by_height=at_rest.by_height / self.reach))
+
+    def _add(self, evidence: ModulusEvidence) -> None:
+        self.found.append(evidence if self.bent else evidence._replace(sides=None))
 
 
 def _shares(sensor: Sensor, with_modulus: bool, rounds: int, progress: Progress) -> tuple[Progress, Progress]:
-    """The progress of one round and of those after it: a gas' modulus, first unknown, is expected to settle in the second."""
+    """The progress of one round and of those after it: a gas' modulus, first unknown, is expected to settle in the second; the
+    rounds of an inflated surface are looked after by themselves."""
     again = sensor.cavity.filling == "gas" and with_modulus and rounds == GAS_ROUNDS and sensor.force_unit == "relative"
-    share = 0.5 if again else 1.0
+    share = 0.5 if again and not isinstance(sensor.surface, InflatedSurface) else 1.0
     return within(progress, 0.0, share), within(progress, share, 1.0)
 
 
@@ -282,25 +281,3 @@ def _is_settled(sensor: Sensor, made: Sensor) -> bool:
     if made.cavity.filling != "gas" or made.force_unit == "relative":
         return True
     return sensor.force_unit != "relative" and abs(made.material.modulus / sensor.material.modulus - 1) < GAS_SETTLED
-
-
-def _reconstructor(sensor: Sensor) -> Reconstructor:
-    views = max(1, len(sensor.views))
-    expect(views == 1, "calibrate material: views", views, "1: calibrate sensor.in_view(0), the first view by itself")
-    sensor.refuse_heights("calibrate material")
-    if sensor.material.model == "harmonic":
-        raise MembraneError(
-            "calibrate material: a harmonic membrane has one shape at any prestretch; expected neo_hookean or mooney_rivlin"
-        )
-    return Reconstructor(replace(sensor, membrane=sensor.surface.membrane(GRID)), dtype=torch.float64)
-
-
-def _log_stretch(stretches: np.ndarray, losses: np.ndarray) -> tuple[float, float]:
-    """Mean and standard deviation of the logarithm of the prestretch, from losses `[S, B]` at `stretches [S]`."""
-    z = np.log(stretches)
-    fine = np.linspace(z[0], z[-1], FINE)
-    loss = PchipInterpolator(z, losses)(fine)
-    alone = np.exp(loss.min(0) - loss)
-    weight = (WRONG + (1 - WRONG) * alone / alone.mean(0)).prod(1)
-    mean = (weight * fine).sum() / weight.sum()
-    return mean, np.sqrt((weight * (fine - mean) ** 2).sum() / weight.sum())

@@ -11,15 +11,17 @@ from ..estimators.force_balance.estimator import ForceBalance
 from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
 from ..sensor.factories import elastic_energy
+from ..sensor.sensor import Sensor
 from .gauge import UNSURE, FoundPressures, GaugeModulus, modulus_from_pressures
 from .known_modulus import KnownForces, KnownPressures, odd_ones
-from .rest_error import PressesTold, at_other_height
+from .rest_error import PressesTold, at_other_height, changed_height
 from .stretch_loss import Explained, continued
 
 PRESSURE_GRID = (33, 33)  # on coarser ones pressure changes are off by up to a tenth
 STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it
 BETWEEN = 5  # prestretches tried on either side of the lowest
 GAS_ROUNDS = 4
+GAS_SETTLED = 1e-3  # change of a gas' modulus, relative, that changes the forces by less than a thousandth
 CONTINUED = 0.1  # of a solve from rest takes each step from a neighbour's solution, measured
 
 
@@ -55,8 +57,20 @@ class Presses:
 
     def at_other_height(self, share: float) -> "Presses":
         """The same markers where the rest surface's height differs by a share."""
-        r = self.reconstructor
-        sensor, kept = at_other_height(r.sensor, r.rest_markers.double().numpy(), share)
+        return self._on(*at_other_height(self.reconstructor.sensor, self.rest_markers, share))
+
+    def at_height(self, share: float) -> "Presses":
+        """The same markers where an inflated rest surface is higher by a share."""
+        return self._on(*changed_height(self.reconstructor.sensor, self.rest_markers, share))
+
+    @property
+    def rest_markers(self) -> np.ndarray:
+        """`[D, 3]`."""
+        positions: np.ndarray = self.reconstructor.rest_markers.double().numpy()
+        return positions
+
+    def _on(self, sensor: Sensor, kept: np.ndarray) -> "Presses":
+        """Presses of a sensor that has some of the markers."""
         return Presses(Reconstructor(sensor, dtype=torch.float64, check_rest=False), *(a[:, kept] for a in self.measured))
 
     def explained(self, stretch: float, modulus: float, grid: tuple[int, int] | None = None) -> Explained:
@@ -72,6 +86,11 @@ class Presses:
         )
         with torch.no_grad():
             return estimator, estimator(self.observation)
+
+    def profile_at(self, stretches: np.ndarray, progress: Progress) -> LossProfile:
+        """The presses' losses at given prestretches."""
+        solutions = self._solutions(stretches, within(progress, 0.0, 1 - CONTINUED))
+        return self._profile(solutions, within(progress, 1 - CONTINUED, 1.0))
 
     def profile(self, progress: Progress) -> LossProfile:
         """The presses' losses at `STRETCHES`, and closer together around the lowest."""
@@ -99,7 +118,7 @@ class Presses:
         return LossProfile(np.array(stretches), np.array([(seen * found.unexplained).numpy() for _, found in best]))
 
     def told(self, log_stretches: np.ndarray) -> PressesTold:
-        """Losses and forces at three prestretches."""
+        """Losses and forces at these prestretches."""
         explained = [self.explained(float(np.exp(z)), self.reconstructor.sensor.material.modulus) for z in log_stretches]
         losses = np.array([float((self.observation.confidence.sum(-1) * found.unexplained).sum()) for _, found in explained])
         return PressesTold(losses, np.stack([np.linalg.norm(_forces(each), axis=1) for each in explained]))
@@ -142,7 +161,7 @@ class Presses:
 
     def modulus(
         self, log_stretch: float, deviation: float, known: KnownForces, progress: Progress = silent
-    ) -> tuple[float, float, float, np.ndarray, list[tuple[int, float, float]]]:
+    ) -> tuple[float, float, float, tuple[float, float], np.ndarray, list[tuple[int, float, float]]]:
         """The modulus from presses of known force.
 
         A gas resists in newtons: there the presses are explained anew with each modulus.
@@ -155,8 +174,9 @@ class Presses:
 
         Returns:
             The modulus; its standard deviation at this prestretch; its change with one deviation of the prestretch, the larger
-            of those to either side, negative, as under more tension at rest a softer membrane presses as hard; magnitudes of
-            the forces found and measured, `[B, 2]`; and images whose forces the others contradict, as of `odd_ones`.
+            of those to either side, negative, as under more tension at rest a softer membrane presses as hard; the moduli on
+            either side; magnitudes of the forces found and measured, `[B, 2]`; and images whose forces the others contradict,
+            as of `odd_ones`.
         """
         forces, relative = known.forces, known.relative
         weight = relative**-2.0 / (relative**-2.0).sum()
@@ -166,6 +186,8 @@ class Presses:
         for _ in range(GAS_ROUNDS if self.reconstructor.estimator.cavity.filling == "gas" else 1):
             ratios, magnitudes = self._ratios(np.exp(log_stretch), modulus, forces)
             modulus = float((weight * ratios).sum() * modulus)
+            if abs((weight * ratios).sum() - 1) < GAS_SETTLED:
+                break
         progress(0.5, "modulus with the prestretch's error")
         sides = [(weight * self._ratios(np.exp(log_stretch + s * deviation), modulus, forces)[0]).sum() for s in (-1, 1)]
         change = -modulus * np.abs(np.array(sides) - 1).max()
@@ -173,7 +195,8 @@ class Presses:
         scatter = (((ratios / mean - 1) / relative) ** 2).sum() / max(len(ratios) - 1, 1)
         images = np.flatnonzero(np.isfinite(forces).all(1))
         odd = [(int(images[i]), ratio, apart) for i, ratio, apart in odd_ones(ratios, relative)]
-        return modulus, modulus * sure * max(1.0, scatter) ** 0.5, change, magnitudes, odd
+        low, high = (modulus * float(side) for side in sides)
+        return modulus, modulus * sure * max(1.0, scatter) ** 0.5, change, (low, high), magnitudes, odd
 
     def _refuse_unpressed(self, stretch: float, modulus: float, known: np.ndarray) -> None:
         """Refuse images of known force `[B]` in which the markers show hardly any."""

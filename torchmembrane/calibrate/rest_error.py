@@ -20,6 +20,11 @@ from ..surface.topology import rim_loop
 HEIGHT_ERROR = 0.05
 """Standard deviation of the rest surface's height over its rim, relative, where nothing is said of it."""
 MOST_ERROR = 0.5
+LEAST_HEIGHT_ERROR = 0.03
+"""Standard deviation of the height that presses tell, relative, however little noise there is: the grid's and the model's."""
+SETTLED = 1.0  # of its standard deviation that the height may still change by
+LEAST_REACH, LOWEST = 0.1, 0.5  # of a step of the height, in stated standard deviations; of a height over the one before
+SHRINKING = 0.6  # of the reach from one round to the next, at least
 MOST_SHIFT = 3.0  # of the prestretch by the height, in standard deviations by the losses: beyond, a loss is no parabola
 
 
@@ -59,7 +64,7 @@ def at_other_height(sensor: Sensor, positions: np.ndarray, share: float) -> tupl
     expect(right, "calibrate material: rest error", share, f"more than 0, at most {MOST_ERROR:g}, of the height")
     for change in (-share, share):
         try:
-            return _changed(sensor, positions, change)
+            return changed_height(sensor, positions, change)
         except MembraneError as error:
             refused = error
     raise MembraneError(
@@ -68,7 +73,8 @@ def at_other_height(sensor: Sensor, positions: np.ndarray, share: float) -> tupl
     )
 
 
-def _changed(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
+def changed_height(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
+    """The sensor whose rest surface is higher over its rim by a share, else as of `at_other_height`."""
     surface = sensor.surface
     if isinstance(surface, InflatedSurface):
         surface = surface.of_height((1 + share) * surface.formed.height)
@@ -91,16 +97,20 @@ class HeightEffect(NamedTuple):
         shift: of the logarithm of the prestretch that they tell.
         by_stretch: change of the forces' logarithm with one standard deviation of the prestretch, in the mean.
         by_height: with the height.
+        mean: of the height, by what was stated of it and what the presses tell, in stated standard deviations.
+        deviation: of the height, in stated ones.
     """
 
     shift: float
     by_stretch: float
     by_height: float
+    mean: float = 0.0
+    deviation: float = 1.0
 
 
 class PressesTold(NamedTuple):
-    """What presses tell at three prestretches, one standard deviation apart: their loss in sum, `[3]`, and the magnitudes of
-    the forces found, `[3, B]`."""
+    """What presses tell at some prestretches, one standard deviation from the best and there: their loss in sum, `[S]`, and the
+    magnitudes of the forces found, `[S, B]`."""
 
     losses: np.ndarray
     forces: np.ndarray
@@ -123,3 +133,66 @@ def height_effect(own: PressesTold, other: PressesTold, step: float, variance: f
     shift = float(np.clip(-variance * (added[2] - added[0]) / (2 * step), -bound, bound))
     low, middle, high = np.log(own.forces).mean(1)
     return HeightEffect(shift, float(high - low) / 2, float(np.log(other.forces[1]).mean() - middle))
+
+
+class StatedHeight(NamedTuple):
+    """What is said of the height of a rest surface over its rim.
+
+    Attributes:
+        error: standard deviation of what was stated, over the surface's height.
+        mean: what was stated, above the surface's height, in these.
+        reach: how far to either side the height's effect is looked at, in these.
+    """
+
+    error: float
+    mean: float = 0.0
+    reach: float = 1.0
+
+    def after(self, height: float, deviation: float) -> "StatedHeight":
+        """The same about the surface that is higher by `height`, which is known to `deviation`, in stated standard deviations.
+
+        Example:
+            >>> StatedHeight(0.25).after(1.0, 0.2)
+            StatedHeight(error=0.2, mean=-1.0, reach=0.4)
+        """
+        error = self.error / max(LOWEST, 1 + self.error * height)
+        return StatedHeight(error, self.mean - height, float(np.clip(2 * deviation, LEAST_REACH, SHRINKING * self.reach)))
+
+    def is_settled(self, height: float, deviation: float) -> bool:
+        """Whether a height found, known to `deviation`, is about the surface's, and was looked for about as closely."""
+        return abs(height) <= SETTLED * deviation and self.reach <= max(LEAST_REACH, 4 * deviation)
+
+
+def height_told(
+    own: PressesTold, lower: PressesTold, higher: PressesTold, step: float, variance: float, stated: StatedHeight
+) -> HeightEffect:
+    """What presses tell of the height `h` itself, and otherwise with it, where it can be changed both ways; all at two
+    prestretches, one step below and above the lowest loss.
+
+    Near its minimum over the prestretch's logarithm `z` the loss is a parabola in both,
+    `z^2 / (2 variance) + k z h + g h + c h^2 / 2`; least over `z` it is `g h + (c - k^2 variance) h^2 / 2`. What was stated
+    adds `(h - mean)^2 / 2`.
+
+    Args:
+        own: on the sensor's surface.
+        lower: on one that is lower by `stated.reach` standard deviations.
+        higher: on one that is as much higher.
+        step: of the prestretch's logarithm.
+        variance: of the prestretch's logarithm by the presses' losses.
+        stated: of the height.
+    """
+    d = stated.reach
+    slope = (higher.losses - lower.losses) / (2 * d)
+    bent = (higher.losses - 2 * own.losses + lower.losses).mean() / d**2
+    k, bound = (slope[1] - slope[0]) / (2 * step), MOST_SHIFT * variance**0.5
+    information = max(0.0, bent - k**2 * variance)
+    share = 1 / (1 + information * (LEAST_HEIGHT_ERROR / stated.error) ** 2)
+    information, gradient = share * information, share * slope.mean()
+    mean = np.clip((stated.mean - gradient) / (1 + information), -d, d)
+    return HeightEffect(
+        shift=float(np.clip(-variance * k, -bound, bound)),
+        by_stretch=float(np.log(own.forces[1] / own.forces[0]).mean()) / 2,
+        by_height=float(np.log(higher.forces / lower.forces).mean()) / (2 * d),
+        mean=float(mean),
+        deviation=float(1 + information) ** -0.5,
+    )

@@ -18,6 +18,7 @@ from ...jobs.pressure import read_pressures
 from ...plot.calibration import material_figure
 from ...reconstruct import Reconstructor
 from ...results.status import Status
+from ...sensor.inflated import InflatedSurface
 from ...sensor.sensor import Sensor
 from ..progress import ProgressDisplay
 from .files import read_forces, read_sensor, read_sensor_image, write_calibrated
@@ -42,6 +43,12 @@ def material(arguments: Namespace) -> int:
         notes.append(f"the prestretch may be larger: {STRETCHES[-1]:g} is the largest that was tried")
     if n == 2:
         notes.append("modulus: shear modulus x thickness; the sensor file's thickness is kept, or 1 where it has none")
+    if found.height is not None and isinstance(sensor.surface, InflatedSurface):
+        height, deviation = found.height
+        notes.append(
+            f"the rest surface is {height:.4g} ± {deviation:.2g} {unit} high, by the presses and by what was stated of it; the "
+            f"file said {sensor.surface.formed.height:.4g}; the calibrated sensor has the height found"
+        )
     notes += [_by_name(sentence, paths) for sentence in found.contradictions]
     notes += _of_forces(arguments, found, weighed)
     if weighed is None:
