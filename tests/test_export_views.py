@@ -15,6 +15,8 @@ from torchmembrane.sensor.views import View
 from torchmembrane.simulate import Simulator, Sphere
 from torchmembrane.simulate.dataset import stroke_to
 
+pytestmark = pytest.mark.full  # an export of two views takes some 90 s of processor time, opening its session 25
+
 
 @pytest.fixture(scope="module")
 def frames():
@@ -40,7 +42,9 @@ def agrees(got, expected):
     assert got.keys() == expected._asdict().keys()
     for name, value in expected._asdict().items():
         scale = float(value.nan_to_num().abs().max())
-        np.testing.assert_allclose(got[name], value.numpy(), rtol=0, atol=2e-3 * scale + 1e-4, err_msg=name)
+        pressed = expected.displacement.norm(dim=-1).amax(-1) > 0.1  # where nothing moves, any point is the deepest
+        rows = pressed if name == "depth_deviation" else torch.ones_like(pressed)
+        np.testing.assert_allclose(got[name][rows], value[rows].numpy(), rtol=0, atol=2e-3 * scale + 1e-4, err_msg=name)
 
 
 def test_a_model_of_two_views_gives_what_torch_gives(frames, made):

@@ -112,7 +112,7 @@ def run(arguments: Namespace) -> int:
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
     format = arguments.format or ("parquet" if by_ray else "npz")
-    fields = [name for name in FIELDS if name in arguments.fields]
+    fields = sorted(set(arguments.fields), key=FIELDS.index)
     settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""), fields)
     check_folder(arguments.out, sensor.fingerprint, settings)
     for remark in bag_remarks(inputs, sensor.camera):
@@ -132,7 +132,6 @@ def run(arguments: Namespace) -> int:
         figures=arguments.figures,
         rest_pixels=rest,
         pressure=pressure,
-        fields=fields,
     )
     if bag is not None:
         print(f"messages of {write_bag(bag, inputs, arguments.out)} frames in {arguments.bag}")

@@ -2,7 +2,7 @@
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -59,7 +59,6 @@ def reconstruct_files(
     figures: bool = False,
     rest_pixels: Tensor | None = None,
     pressure: Gauge | None = None,
-    fields: Sequence[str] = (),
     report: Callable[[str], None] | None = None,
 ) -> FrameCounts:
     """Reconstruct all frames of `inputs` that have no finished result in the folder `out` yet.
@@ -81,7 +80,6 @@ def reconstruct_files(
         figures: also NAME.png for every frame; a finished frame that lacks its figure is done again.
         rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
         pressure: that a gauge reads, by the names of the frames or by name and time, as `Reconstructor` takes it.
-        fields: of the surface that frames hold as well, "stretch", "tension"; those of `settings`, in npz files.
         report: called with one line per failed frame (default: the line is written to stderr, above the progress bar).
 
     Returns:
@@ -107,7 +105,8 @@ def reconstruct_files(
     if inputs.need_pyav:
         load_pyav()
     done: Counter[int] = Counter()
-    work = Work(FrameReconstructor(reconstructor, rest_pixels, pressure, fields), (out, mesh) if figures else None)
+    computed = FrameReconstructor(reconstructor, rest_pixels, pressure, settings.fields.split())
+    work = Work(computed, (out, mesh) if figures else None)
     with ResultFolder(out, mesh, inputs, shard, figures, report) as folder:
         mine = (source for source in sources(inputs, reconstructor) if shard.holds(source.name))
         waiting = (source for source in mine if source.name not in folder.finished)
