@@ -20,7 +20,7 @@ from torchmembrane.files.images import read_image, to_grey
 from torchmembrane.files.levels import too_few_bits
 from torchmembrane.integrations.messages import grey_of
 from torchmembrane.live.line import described
-from torchmembrane.live.loop import Seen, Tally
+from torchmembrane.live.loop import LiveFrame, StreamStats
 from torchmembrane.live.recording import Recording
 from torchmembrane.live.sources import folder_images
 from torchmembrane.live.streams import ModelStream, TrackedStream
@@ -214,7 +214,7 @@ def test_a_recording_of_such_a_camera_is_read_as_it_was_followed(folder, tmp_pat
     images = [values, np.repeat(values[..., None], 3, -1), to_grey(values, 12)]
     with Recording(tmp_path / "day", stream.mesh, 12) as recording:
         for k, image in enumerate(images):
-            recording.keep(Seen(k, float(k), image, stream(image, float(k)), 0.0))
+            recording.keep(LiveFrame(k, float(k), image, stream(image, float(k)), 0.0))
     for path in sorted((tmp_path / "day" / "images").iterdir()):
         np.testing.assert_allclose(reconstructor.read(path)[0, 0], to_grey(values, 12), atol=1e-6)
 
@@ -222,9 +222,9 @@ def test_a_recording_of_such_a_camera_is_read_as_it_was_followed(folder, tmp_pat
 def test_the_line_of_live_says_what_bits_a_blank_image_looks_like(folder):
     stream = TrackedStream(tm.Reconstructor.from_file(folder / "sensor8.toml"))
     for image in (np.asarray(Image.open(folder / "press10.png")), read_image(folder / "press10.png")):
-        seen, tally = Seen(0, 0.0, image, stream(image, 0.0), 0.1), Tally()
-        tally.add(seen)
-        assert "blank or saturated" in (said := described(seen, tally, stream.mesh)) and "as of a camera of 10 bits" in said
+        seen, stats = LiveFrame(0, 0.0, image, stream(image, 0.0), 0.1), StreamStats()
+        stats.add(seen)
+        assert "blank or saturated" in (said := described(seen, stats, stream.mesh)) and "as of a camera of 10 bits" in said
         stream.tracker.reset()
 
 

@@ -10,7 +10,7 @@ from test_light import CAMERAS
 
 from torchmembrane import Reconstructor, Status, Tracker
 from torchmembrane.camera.motion import in_pixels, in_words, shift_of
-from torchmembrane.estimators.force_balance.camera_motion import RARE, CameraMotion
+from torchmembrane.estimators.force_balance.camera_motion import PRIOR_WEIGHT, CameraMotion
 from torchmembrane.estimators.force_balance.marker_residuals import marker_rays
 from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
@@ -34,13 +34,13 @@ def test_elimination_solves_the_whole_system():
     expected = torch.linalg.solve(whole, torch.cat([loads, pull], 2).mT)
     torch.testing.assert_close(following, -expected[:, 30:])
     torch.testing.assert_close(products, loads @ expected[:, :30])
-    kept = motion.without(loads[:, 1:2], k[:, None])
+    kept = motion.project_out(loads[:, 1:2], k[:, None])
     torch.testing.assert_close(kept @ torch.linalg.inv(M - B.mT @ torch.linalg.solve(T, B)), expected[:, :30, 1:2].mT)
 
 
 def test_what_holds_the_camera_is_the_slope_of_its_loss():
     moved = torch.tensor([[0.2, -0.1, 0.05, 0.3]], dtype=torch.float64, requires_grad=True)
-    loss = RARE / 2 * torch.log(0.1**2 + moved.square().sum())
+    loss = PRIOR_WEIGHT / 2 * torch.log(0.1**2 + moved.square().sum())
     (slope,) = torch.autograd.grad(loss, moved)
     none = CameraMotion(torch.zeros(1, 4, 3), torch.zeros(1, 4, 4), torch.zeros(1, 4))
     held = none.held(moved.detach(), 0.1)

@@ -7,7 +7,7 @@ import pytest
 import torchmembrane as tm
 from torchmembrane.cli.main import main
 from torchmembrane.files.images import read_image
-from torchmembrane.live.loop import Seen
+from torchmembrane.live.loop import LiveFrame
 from torchmembrane.live.recording import Recording
 from torchmembrane.live.streams import TrackedStream
 
@@ -22,7 +22,7 @@ def recording(small_sensor, small_images, tmp_path_factory):
     press = read_image(small_images[1])
     with Recording(folder, stream.mesh) as kept:
         for k, image in enumerate((press, 0 * press, press)):
-            kept.keep(Seen(k, 1e9 + k / 2, image, stream(image, float(k)), 0.01))
+            kept.keep(LiveFrame(k, 1e9 + k / 2, image, stream(image, float(k)), 0.01))
     return folder
 
 

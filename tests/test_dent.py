@@ -36,12 +36,12 @@ def dented(estimator: ForceBalance, middles: list[int], push: float = 1.0) -> to
     tractions = -push * estimator.reference * inner(near.double()[:, None], DOME.grid).mT * normal, normal
     rays = torch.nn.functional.normalize(estimator.equations.bearings.positions, dim=-1)[None]
     measured = estimator.equations.bearings.measured(Observation(torch.zeros_like(rays), rays, torch.ones_like(rays[..., 0])))
-    held = estimator.descent.tractions
-    estimator.descent.tractions = lambda u, pressure: tractions
+    held = estimator.gauss_newton.tractions
+    estimator.gauss_newton.tractions = lambda u, pressure: tractions
     try:
         return estimator.dent(*estimator.at_rest(measured.weight), measured).u[0]
     finally:
-        estimator.descent.tractions = held
+        estimator.gauss_newton.tractions = held
 
 
 def vertex_near(x: float, y: float) -> int:

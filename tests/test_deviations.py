@@ -14,12 +14,12 @@ from torchmembrane.estimators.contacts import Contacts
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.estimators.force_balance.uncertainty import (
-    AT_RIM,
     DEPTH,
-    DIP,
     FORCE,
     FORCE_SHARE,
-    UNSEEN,
+    RIM_ERROR,
+    SAG,
+    UNDETECTED,
     changes,
     depths,
     gap_around,
@@ -201,7 +201,7 @@ def test_spreads_by_the_transposed_equations_are_those_of_every_noise_by_itself(
     found = estimator(observation)
     net, state = estimator.coarse, estimator.coarsened(found.vertices - estimator.membrane.rest, found.pressure, found.moved)
     settings, equations = estimator.settings, net.equations
-    of_force, of_depth = spreads(net.descent, settings, state, observation)
+    of_force, of_depth = spreads(net.gauss_newton, settings, state, observation)
     measured = equations.bearings.measured(observation)
     scales = settings.tau[1], settings.outlier
     _, normal, solution = linearise(equations, net.cavity, state, measured, scales, settings.camera_motion, curvature=True)
@@ -235,15 +235,15 @@ def test_deviations_of_an_answer_are_its_spreads_and_what_the_model_leaves_out()
     close(of(spread, at_rim=0, lines=33).force, FORCE * spread[0])
     close(of(spread, at_rim=0, lines=13).force, 4 * FORCE * spread[0])
     close(of(spread, gap=0.0).depth, spread[1])
-    close(of(spread, depth=4.0).depth, (4 + DEPTH**2 * 6 + (DIP * 3.3) ** 2) ** 0.5 * torch.ones(1))
-    close(of(spread, depth=4.0, lines=13).depth, (64 + DEPTH**2 * 24 + (DIP * 3.3) ** 2) ** 0.5 * torch.ones(1))
+    close(of(spread, depth=4.0).depth, (4 + DEPTH**2 * 6 + (SAG * 3.3) ** 2) ** 0.5 * torch.ones(1))
+    close(of(spread, depth=4.0, lines=13).depth, (64 + DEPTH**2 * 24 + (SAG * 3.3) ** 2) ** 0.5 * torch.ones(1))
     close(of(nothing, (0.0, -5.0, 0.0), at_rim=0).force, torch.tensor([[0.0, 5 * FORCE_SHARE, 0.0]]))
     rim = of(nothing, (3.0, 0.0, 4.0), 2.0, at_rim=1)
     own = FORCE_SHARE * torch.tensor([[3.0, 0.0, 4.0]])
-    close(rim.force, (own**2 + (5 * AT_RIM) ** 2).sqrt())
-    close(rim.depth, torch.tensor([DIP * 2.1]))
-    close(of(nothing, unseen=7.0).force, torch.full((1, 3), 7 * UNSEEN))
-    close(of(nothing).depth, torch.tensor([DIP * 0.9]))
+    close(rim.force, (own**2 + (5 * RIM_ERROR) ** 2).sqrt())
+    close(rim.depth, torch.tensor([SAG * 2.1]))
+    close(of(nothing, unseen=7.0).force, torch.full((1, 3), 7 * UNDETECTED))
+    close(of(nothing).depth, torch.tensor([SAG * 0.9]))
 
 
 def test_depths_are_along_the_rest_normals_however_the_surface_tilts():

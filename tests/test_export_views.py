@@ -9,7 +9,7 @@ from test_views import BESIDE, CAMERA, cap
 from torchmembrane_edge.cli import main
 
 import torchmembrane as tm
-from torchmembrane.files.provenance import Origin
+from torchmembrane.files.provenance import SourceFile
 from torchmembrane.onnx.export import export
 from torchmembrane.sensor.views import View
 from torchmembrane.simulate import Simulator, Sphere
@@ -91,7 +91,7 @@ def test_the_command_takes_an_image_of_each_view(frames, made, tmp_path, capsys)
         np.testing.assert_array_equal(results[name]["vertices"], expected["vertices"][0])
     files = [tmp_path / f"press1_{name}.png" for name in ("left", "right")]
     row = next(row for row in (out / "summary.csv").read_text().splitlines() if row.startswith("press1_left"))
-    assert Origin.of(*files).content_hash in row
+    assert SourceFile.of(*files).content_hash in row
     files[1].unlink()
     assert main([str(made[1]), f"{tmp_path}/press*.png", "--out", str(out)]) == 1
     assert "press1_right.png" in capsys.readouterr().err

@@ -12,7 +12,7 @@ import torchmembrane as tm
 from torchmembrane.cli.main import main
 from torchmembrane.files.images import read_image
 from torchmembrane.integrations.rerun import LONGER, LONGEST_FORCE, RerunLog
-from torchmembrane.live.loop import Seen
+from torchmembrane.live.loop import LiveFrame
 from torchmembrane.live.recording import Recording
 from torchmembrane.live.streams import TrackedStream
 from torchmembrane.plot.film import GIF_RATES, RATES, write_film
@@ -35,7 +35,7 @@ def recording(stream, small_images, tmp_path_factory):
     images = [*map(read_image, small_images), np.zeros((120, 160), np.float32)]
     with Recording(folder, stream.mesh) as kept:
         for k, image in enumerate(images):
-            kept.keep(Seen(k, 1e9 + k / 2, image, stream(image, float(k)), 0.01))
+            kept.keep(LiveFrame(k, 1e9 + k / 2, image, stream(image, float(k)), 0.01))
     return folder
 
 

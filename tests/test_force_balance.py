@@ -11,10 +11,10 @@ import torch
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.contacts import contact_indicator, contact_points
-from torchmembrane.estimators.force_balance import gauss_newton as descent
+from torchmembrane.estimators.force_balance import gauss_newton as gauss_newton
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
 from torchmembrane.estimators.force_balance.gauss_newton import State
-from torchmembrane.estimators.force_balance.marker_residuals import Bearings, MarkerBearings
+from torchmembrane.estimators.force_balance.marker_residuals import MarkerResiduals, MeasuredRays
 from torchmembrane.estimators.force_balance.robust import Cauchy
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.estimators.force_balance.traction_loss import TractionLoss
@@ -156,7 +156,7 @@ def test_normal_equations_are_those_of_the_dense_jacobians(hole):
     u, p = bent(dome) - dome.rest, torch.tensor([0.3], dtype=torch.float64)
     directions = torch.nn.functional.normalize(positions + 0.3, dim=-1)[None]
     motion = torch.rand(1, 2, 4, directions.shape[1], generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    measured = Bearings(
+    measured = MeasuredRays(
         0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, directions.shape[1]).double(), ONE, motion
     )
     moved = torch.tensor([[0.3, -0.2, 0.1, 0.5]], dtype=torch.float64)
@@ -211,7 +211,7 @@ def test_the_bearing_jacobian_is_the_derivative_of_the_angles():
     bearings = estimator.equations.bearings
     directions = torch.nn.functional.normalize(bearings.positions + 0.3, dim=-1)[None]
     motion = torch.rand(1, 2, 4, directions.shape[1], generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    measured = Bearings(
+    measured = MeasuredRays(
         0.1 * directions.mT, tangent_frame(directions.mT, dim=1), torch.ones(1, directions.shape[1]).double(), ONE, motion
     )
     moved = torch.tensor([[0.3, -0.2, 0.1, 0.5]], dtype=torch.float64)
@@ -231,7 +231,7 @@ def test_steps_take_the_cone_they_are_given(pressed):
     for one, cone in ((steep, None), (usual, 0.0), (usual, None)):
         measured = one.equations.bearings.measured(seen(origins, directions))
         schedule = SETTINGS.gnc_schedule(4, SETTINGS.tau)
-        found.append(one.descent(one.at_rest(measured.weight), measured, schedule, cone=cone)[0].u)
+        found.append(one.gauss_newton(one.at_rest(measured.weight), measured, schedule, cone=cone)[0].u)
     torch.testing.assert_close(found[1], found[0], rtol=0, atol=0)
     assert (found[2] - found[0]).abs().max() > 0.01
 
@@ -277,7 +277,7 @@ def test_the_noise_of_a_frame_is_over_that_of_its_own_markers_at_rest():
     sure = 1e3 * torch.ones(len(y), 1, 1, dtype=torch.float64)
     sure[3] /= 1e3  # badly seen at rest: its turns are hardly any of its standard deviations
     at_rest = seen(torch.zeros_like(directions), directions)._replace(across=tangent_frame(directions) * sure)
-    bearings = MarkerBearings(estimator.membrane, estimator.membrane.closest_points(y.numpy()), y, 1e-3, at_rest)
+    bearings = MarkerResiduals(estimator.membrane, estimator.membrane.closest_points(y.numpy()), y, 1e-3, at_rest)
     frames = Observation(*(None if value is None else value.repeat(4, *[1] * (value.ndim - 1)) for value in at_rest))
     across, confidence = frames.across / 2, frames.confidence.clone()
     confidence[1, 3], confidence[2], across[3, 5] = 0.0, 0.0, across[3, 5] / 100
@@ -483,7 +483,7 @@ def test_a_batch_in_parts_is_what_it_is_at_once(pressed, monkeypatch):
     turned = torch.nn.functional.normalize(directions + 2e-3 * torch.arange(5).double()[:, None, None], dim=-1)
     frames = seen(origins.expand(5, -1, -1), turned)
     at_once = estimator(frames)
-    monkeypatch.setattr(descent, "VERTICES", 2 * 81)
+    monkeypatch.setattr(gauss_newton, "VERTICES", 2 * 81)
     torch.testing.assert_close(estimator(frames).vertices, at_once.vertices, rtol=0, atol=1e-7)
     assert (at_once.vertices.diff(dim=0).flatten(1).norm(dim=1) > 1e-3).all()
 
@@ -566,12 +566,12 @@ def test_the_objective_is_the_misfit_of_the_markers_and_the_loss_of_the_traction
     estimator = make()
     observation = seen(origins, directions)
     found, rest = estimator(observation), estimator.at_rest(observation.confidence)
-    bearings, descent = estimator.equations.bearings, estimator.descent
+    bearings, gauss_newton = estimator.equations.bearings, estimator.gauss_newton
     measured = bearings.measured(observation)
     misfit = bearings.angles(found.vertices - estimator.membrane.rest, measured, found.moved)[0].square().sum(1)
     expected = Cauchy(SETTINGS.outlier).loss(misfit).sum(1)
     state = State(found.vertices - estimator.membrane.rest, found.pressure, found.moved)
-    traction, normal = descent.tractions(*state[:2])
-    torch.testing.assert_close(descent.objective(state, 0 * traction, normal, measured), expected)
-    assert (descent.objective(state, traction, normal, measured) > expected).all()
+    traction, normal = gauss_newton.tractions(*state[:2])
+    torch.testing.assert_close(gauss_newton.objective(state, 0 * traction, normal, measured), expected)
+    assert (gauss_newton.objective(state, traction, normal, measured) > expected).all()
     assert (found.objective < estimator.equilibrium(*rest, rest.u, measured).objective).all()

@@ -124,8 +124,10 @@ def test_the_objective_holds_half_the_squared_reading_over_its_noise(strokes):
             estimator.equations.bearings,
         )
         with_it, without = (bearings.measured(each) for each in (estimator.gauged(observation, reading), observation))
-        tractions = estimator.descent.tractions(*state[:2])
-        more = estimator.descent.objective(state, *tractions, with_it) - estimator.descent.objective(state, *tractions, without)
+        tractions = estimator.gauss_newton.tractions(*state[:2])
+        more = estimator.gauss_newton.objective(state, *tractions, with_it) - estimator.gauss_newton.objective(
+            state, *tractions, without
+        )
     expected = ((found.pressure - reading) / (0.02 * estimator.reference)).square() / 2
     torch.testing.assert_close(more, expected.nan_to_num())
 

@@ -19,7 +19,7 @@ from test_batch import CONTRACT, NPZ, PARQUET, Denting, grey_image, reconstruct,
 from torchmembrane.cli.main import main
 from torchmembrane.errors import MembraneError
 from torchmembrane.files.folder_lock import WHOLE, FolderLock, Shard
-from torchmembrane.files.provenance import Origin
+from torchmembrane.files.provenance import SourceFile
 from torchmembrane.jobs import workers
 from torchmembrane.jobs.inputs import find_inputs
 from torchmembrane.jobs.workers import (
@@ -99,7 +99,7 @@ def test_a_new_image_under_an_old_name_is_done_again(images, tmp_path, settings)
     outcome, lines, _ = reconstruct(images, tmp_path / "out", settings)
     assert outcome == (1, 0, 0, 0, 0, 0, 4) and lines == [f"{images[1]}: changed, done again"]
     assert float(read_results(tmp_path / "out")["i1"]["pressure"]) == pytest.approx(200 / 255, abs=1e-5)
-    assert summary_of(tmp_path / "out")["i1"]["content_hash"] == Origin.of(images[1]).content_hash
+    assert summary_of(tmp_path / "out")["i1"]["content_hash"] == SourceFile.of(images[1]).content_hash
     assert reconstruct(images, tmp_path / "out", settings)[0] == (0, 0, 0, 0, 0, 0, 5)
 
 

@@ -10,8 +10,8 @@ from pinned_cap import CAMERA, HEIGHT, SURFACE, cap
 from scipy.spatial.transform import Rotation
 
 import torchmembrane as tm
-from torchmembrane.estimators.force_balance.lever_bearings import LeverBearings
-from torchmembrane.estimators.force_balance.marker_residuals import Bearings
+from torchmembrane.estimators.force_balance.lever_residuals import LeverResiduals
+from torchmembrane.estimators.force_balance.marker_residuals import MeasuredRays
 from torchmembrane.onnx.export import Piece
 from torchmembrane.onnx.trace import traced_model
 from torchmembrane.pose import ViewPose
@@ -126,7 +126,7 @@ def test_the_jacobian_is_the_derivative_of_the_angles(equations):
     that of the places, which is linear in the equations."""
     made, measured, u = equations
     bearings = made.bearings
-    assert isinstance(bearings, LeverBearings)
+    assert isinstance(bearings, LeverResiduals)
     still = torch.zeros_like(measured.motion[:, 0, :, 0])
     rows, columns = (a.flatten() / 5 - 1 for a in torch.meshgrid(*[torch.arange(11).double()] * 2, indexing="ij"))
     quadratic = torch.stack([rows * columns, 0.3 * rows**2 - columns, columns**2 + rows], -1)[None]
@@ -219,7 +219,7 @@ def test_levers_of_no_length_are_as_good_as_none(simulator, press):
     heights = np.append(np.zeros(49), 1.0)
     with_lever, without = (replace(cap(0.0), markers=Markers("dots", "dark", dots, height=height)) for height in (heights, 0.0))
     one, two = (tm.Reconstructor(sensor) for sensor in (with_lever, without))
-    assert isinstance(one.estimator.equations.bearings, LeverBearings)
+    assert isinstance(one.estimator.equations.bearings, LeverResiduals)
     pixels = two.rest_pixels + 3 * torch.exp(-(((two.rest_pixels - 160) / 40) ** 2).sum(-1, keepdim=True))
     sure = torch.from_numpy(np.append(np.ones(49), 0.0))
     found, expected = (made.from_pixels(pixels, sure, rest_pixels=two.rest_pixels) for made in (one, two))
@@ -289,7 +289,7 @@ def test_the_equations_of_tips_agree_with_torch_where_they_are_exported(simulato
 
     def linearised(owner, u, pressure, *rays):
         still = torch.zeros_like(rays[-1][:, 0, :, 0])
-        _, normal, loads, _, motion, _ = owner.linearised(u, pressure, still, Bearings(*rays), 0.4, 2.5)
+        _, normal, loads, _, motion, _ = owner.linearised(u, pressure, still, MeasuredRays(*rays), 0.4, 2.5)
         return loads, owner.matrix(normal, 1e-3).entries, motion.coupling
 
     piece, names = Piece(equations, linearised), ["loads", "matrix", "coupling"]

@@ -11,7 +11,7 @@ from torchmembrane import Reconstructor
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance.gauss_newton import Scales
 from torchmembrane.estimators.force_balance.marker_residuals import marker_rays
-from torchmembrane.estimators.force_balance.traction_loss import stands_out
+from torchmembrane.estimators.force_balance.traction_loss import is_significant
 from torchmembrane.markers.noise import pixel_noise
 from torchmembrane.presets import preset
 from torchmembrane.simulate import Simulator, Sphere, Stroke
@@ -93,7 +93,7 @@ def test_the_noise_of_pushes_is_what_noisy_markers_make(options):
     state = estimator.at_rest(torch.ones(2 * D, 1, dtype=torch.float64))
     scales = Scales(*torch.tensor((torch.inf, torch.inf, SETTINGS.cone, 1.0, 0.0), dtype=torch.float64))
     unweighted = torch.ones(1, len(estimator.equations.loss.area), dtype=torch.float64)
-    (u, pressure, moved), *_ = estimator.descent.step(state, unweighted, measured, scales)
+    (u, pressure, moved), *_ = estimator.gauss_newton.step(state, unweighted, measured, scales)
     traction = estimator.equilibrium(u, pressure, moved, u, measured).traction
     _, normal = at_rest(estimator)
     push = (inner(traction, estimator.membrane.grid) * normal).sum(-1) / estimator.reference / small
@@ -129,12 +129,14 @@ def test_pushes_are_no_contact_where_the_surface_at_rest_explains_the_markers_as
     x, pressure = (value[:1].expand(2, *value.shape[1:]) for value in estimator(markers)[:2])
     measured, u = bearings.measured(markers), x - membrane.rest
     found = estimator.equilibrium(u, pressure, torch.zeros(2, 4).double(), u, measured)
-    gain = estimator.descent.objective_at_rest(measured) / measured.weight.sum(-1) - found.objective
+    gain = estimator.gauss_newton.objective_at_rest(measured) / measured.weight.sum(-1) - found.objective
     assert gain[0] > SETTINGS.evidence * loss.noise_gain > gain[1]
-    is_contact = stands_out(found.reference / estimator.reference) & ~membrane.fixed
+    is_contact = is_significant(found.reference / estimator.reference) & ~membrane.fixed
     assert is_contact[0].any() and not is_contact[1].any()
     at_rest_found = estimator.equilibrium(*estimator.at_rest(measured.weight), u, measured)
-    torch.testing.assert_close(estimator.descent.objective_at_rest(measured), at_rest_found.objective * measured.weight.sum(-1))
+    torch.testing.assert_close(
+        estimator.gauss_newton.objective_at_rest(measured), at_rest_found.objective * measured.weight.sum(-1)
+    )
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)

@@ -25,11 +25,11 @@ from PIL import Image
 import torchmembrane as tm
 from torchmembrane.cli.live import _stopped_by_signals, request_of
 from torchmembrane.cli.main import main
-from torchmembrane.files.grayscale import grey_batch
+from torchmembrane.files.grayscale import to_grayscale_batch
 from torchmembrane.files.images import read_image, write_as_taken
 from torchmembrane.live.background import Background
-from torchmembrane.live.line import Line, described, summary
-from torchmembrane.live.loop import RECENT, Seen, Tally, follow, rezeroed
+from torchmembrane.live.line import StatusLine, described, summary
+from torchmembrane.live.loop import RECENT, LiveFrame, StreamStats, follow, rezeroed
 from torchmembrane.live.mailbox import Mailbox, capture
 from torchmembrane.live.recording import Recording, times_of
 from torchmembrane.live.sources import MOST_MISSED, Timed, camera_images, folder_images, paced, video_images
@@ -53,8 +53,8 @@ def frame_of(status: int = 0) -> dict[str, np.ndarray]:
     return {"status": np.array(status), "wrench": np.arange(6.0), "pressure_change": np.array(0.002)}
 
 
-def seen(number: int, status: int = 0) -> Seen:
-    return Seen(number, 0.1 * number, np.zeros((2, 2), np.uint8), frame_of(status), 0.05)
+def seen(number: int, status: int = 0) -> LiveFrame:
+    return LiveFrame(number, 0.1 * number, np.zeros((2, 2), np.uint8), frame_of(status), 0.05)
 
 
 class Slow:
@@ -78,20 +78,20 @@ def numbered(count: int, rate: float):
 
 def test_the_newest_frame_is_taken_and_no_lag_builds_up():
     """At ten times the rate that can be kept up: latency is that of one computation and the wait for the one before."""
-    stream, tally = Slow(0.05), Tally()
+    stream, stats = Slow(0.05), StreamStats()
     with capture(numbered(200, 200.0)) as mailbox:
-        follow(stream, mailbox, tally, [], Event())
-    assert tally.captured == 200 and stream.numbers == sorted(set(stream.numbers)) and stream.numbers[-1] == 199
-    assert 5 <= tally.followed <= 24 and tally.dropped == 200 - tally.followed
-    assert min(tally.latencies) >= 0.05 and tally.latency(80) < 0.15
-    assert 5 < tally.rate() < 21
+        follow(stream, mailbox, stats, [], Event())
+    assert stats.captured == 200 and stream.numbers == sorted(set(stream.numbers)) and stream.numbers[-1] == 199
+    assert 5 <= stats.followed <= 24 and stats.dropped == 200 - stats.followed
+    assert min(stats.latencies) >= 0.05 and stats.latency(80) < 0.15
+    assert 5 < stats.rate() < 21
 
 
 def test_every_frame_is_taken_where_there_is_time():
-    stream, tally = Slow(0.0), Tally()
+    stream, stats = Slow(0.0), StreamStats()
     with capture(numbered(10, 10.0)) as mailbox:
-        follow(stream, mailbox, tally, [], Event())
-    assert stream.numbers == list(range(10)) and tally.dropped == 0 and 9 < tally.rate() < 11
+        follow(stream, mailbox, stats, [], Event())
+    assert stream.numbers == list(range(10)) and stats.dropped == 0 and 9 < stats.rate() < 11
 
 
 def test_what_breaks_the_source_is_raised_after_its_last_frame():
@@ -99,10 +99,10 @@ def test_what_breaks_the_source_is_raised_after_its_last_frame():
         yield np.zeros((2, 2))
         raise tm.MembraneError("the camera is gone")
 
-    stream, tally = Slow(0.05), Tally()
+    stream, stats = Slow(0.05), StreamStats()
     with pytest.raises(tm.MembraneError, match="the camera is gone"), capture(broken()) as mailbox:
-        follow(stream, mailbox, tally, [], Event())
-    assert stream.numbers == [0] and tally.followed == 1
+        follow(stream, mailbox, stats, [], Event())
+    assert stream.numbers == [0] and stats.followed == 1
 
 
 def test_a_stop_ends_an_endless_source_at_once():
@@ -118,18 +118,18 @@ def test_a_stop_ends_an_endless_source_at_once():
 
     start = time.monotonic()
     with capture(endless()) as mailbox:
-        follow(Slow(0.0), mailbox, Tally(), [lambda seen, _: seen.number > 5 and stop.set()], stop)
+        follow(Slow(0.0), mailbox, StreamStats(), [lambda seen, _: seen.number > 5 and stop.set()], stop)
     assert time.monotonic() - start < 1.0 and closed.wait(1.0)
 
 
 def test_requests_are_answered_once_between_frames_and_a_refusal_is_said(stream):
     asked, said, slow = deque([rezeroed]), [], Slow(0.0)
     with capture(numbered(3, 100.0)) as mailbox:
-        follow(slow, mailbox, Tally(), [], Event(), asked, said.append)
+        follow(slow, mailbox, StreamStats(), [], Event(), asked, said.append)
     assert slow.zeroed == 1 and said == ["the latest frame is taken for rest"] and not asked
     asked.extend(request_of(text, "mm") for text in ("z", "200g", "12hPa", "q"))
     with capture(iter(())) as mailbox:
-        follow(stream, mailbox, Tally(), [], Event(), asked, said.append)
+        follow(stream, mailbox, StreamStats(), [], Event(), asked, said.append)
     for answer, name in zip(said[1:4], ("rezero", "weigh", "gauge"), strict=True):
         assert answer.startswith(f"not done: Tracker.{name}: no frame yet")
     assert said[4].startswith("'q' is not understood; expected z") and len(said) == 5
@@ -245,7 +245,7 @@ def test_a_recording_that_cannot_be_closed_says_so_beside_another_error(stream, 
         with warnings.catch_warnings(record=True) as said, expected:
             warnings.simplefilter("always")
             with Recording(folder, stream.mesh) as recording:
-                recording.keep(Seen(0, 0.0, image, stream(image, 0.0), 0.0))
+                recording.keep(LiveFrame(0, 0.0, image, stream(image, 0.0), 0.0))
                 stream.tracker.reset()
                 shutil.rmtree(folder)
                 folder.touch()
@@ -265,7 +265,7 @@ def test_rezero_of_live_says_that_a_contact_was_found(stream, small_images, recw
         yield image
 
     with capture(pressed()) as mailbox:
-        follow(stream, mailbox, Tally(), [], Event(), asked, said.append)
+        follow(stream, mailbox, StreamStats(), [], Event(), asked, said.append)
     assert said == ["the latest frame is taken for rest"]
     assert any("a contact of" in str(each.message) and "reads as none from now on" in str(each.message) for each in recwarn)
 
@@ -367,7 +367,7 @@ def test_frames_of_every_layout_are_the_picture_and_are_kept_as_it(layout, monke
     np.testing.assert_array_equal(seen, expected)
     assert seen.dtype == expected.dtype
     one = torch.zeros((), dtype=torch.float64)
-    grey = grey_batch(seen, (8, 6), "rgb", one)[0, 0].numpy()
+    grey = to_grayscale_batch(seen, (8, 6), "rgb", one)[0, 0].numpy()
     kept = read_image(write_as_taken(tmp_path / "kept", seen), (8, 6))
     np.testing.assert_allclose(kept, grey, atol=0.51 / 255 if seen.dtype == np.uint8 and seen.ndim == 3 else 1e-5)
 
@@ -494,28 +494,28 @@ def test_a_tracker_keeps_the_time_of_its_latest_frame_and_refuses_an_earlier_one
 
 
 def test_the_line_says_rate_latency_status_and_wrench(stream):
-    tally = Tally()
+    stats = StreamStats()
     for k in (0, 2, 4):
-        tally.add(seen(k))
-    text = described(seen(4), tally, stream.mesh)
+        stats.add(seen(k))
+    text = described(seen(4), stats, stream.mesh)
     assert text == (
         "5.0 Hz, 50 ms (95 %: 50), 2 dropped | ok | force +0.000 +1.000 +2.000 N | moment +3.000 +4.000 +5.000 N mm | "
         "pressure +0.002 N/mm²"
     )
-    blank = described(seen(6, status=int(tm.Status.BLANK)), tally, stream.mesh)
+    blank = described(seen(6, status=int(tm.Status.BLANK)), stats, stream.mesh)
     assert "blank or saturated image" in blank and "force" not in blank
-    assert summary(Tally()) == "no frame was captured"
-    tally.add(seen(6, status=int(tm.Status.BLANK)))
-    assert "7 captured, 4 followed, 1 of them without a surface, 3 dropped" in summary(tally)
+    assert summary(StreamStats()) == "no frame was captured"
+    stats.add(seen(6, status=int(tm.Status.BLANK)))
+    assert "7 captured, 4 followed, 1 of them without a surface, 3 dropped" in summary(stats)
 
 
 def test_rate_and_latency_of_the_line_are_of_the_latest_frames_and_of_the_summary_of_all(stream):
-    tally = Tally()
+    stats = StreamStats()
     for k in range(3 * RECENT):
         at, latency = (k, 0.5) if k < 2 * RECENT else (2 * RECENT + 0.1 * (k - 2 * RECENT), 0.05)
-        tally.add(seen(k)._replace(time=float(at), latency=latency))
-    assert described(seen(3 * RECENT), tally, stream.mesh).startswith("10.0 Hz, 50 ms (95 %: 50), 0 dropped | ok")
-    assert "latency 500 ms in the median, 500 ms at 95 %" in summary(tally)
+        stats.add(seen(k)._replace(time=float(at), latency=latency))
+    assert described(seen(3 * RECENT), stats, stream.mesh).startswith("10.0 Hz, 50 ms (95 %: 50), 0 dropped | ok")
+    assert "latency 500 ms in the median, 500 ms at 95 %" in summary(stats)
 
 
 def test_the_line_is_rewritten_in_a_terminal_and_plain_elsewhere(stream, monkeypatch):
@@ -530,13 +530,13 @@ def test_the_line_is_rewritten_in_a_terminal_and_plain_elsewhere(stream, monkeyp
             pass
 
     monkeypatch.setenv("COLUMNS", "60")
-    tally = Tally()
-    tally.add(seen(0))
+    stats = StreamStats()
+    stats.add(seen(0))
     for terminal in (True, False):
         screen = Screen(terminal)
-        line = Line(stream.mesh, screen)
-        line(seen(0), tally)
-        line(seen(0), tally)  # too soon
+        line = StatusLine(stream.mesh, screen)
+        line(seen(0), stats)
+        line(seen(0), stats)  # too soon
         line.say("said")
         shown, said = screen.written
         assert ("\n" in shown) != terminal and shown.startswith("\r\x1b[K") == terminal and said.endswith("said\n")
@@ -549,7 +549,7 @@ def test_a_recording_reads_back_as_results_and_reconstructs_to_the_same(reconstr
         for k, path in enumerate(small_images):
             grey = np.asarray(Image.open(path).convert("L"))
             image = np.repeat(grey[..., None], 3, -1) if k % 2 else read_image(path)
-            kept.append(Seen(3 * k, 1e9 + k, image, stream(image, float(k)), 0.01))
+            kept.append(LiveFrame(3 * k, 1e9 + k, image, stream(image, float(k)), 0.01))
             recording.keep(kept[-1])
     results = tm.read_results(tmp_path / "day")
     assert results.names == ["000000", "000003", "000006"]

@@ -76,9 +76,9 @@ def problem(balance, frames=3, gauge=False, dtype=torch.float64):
 
 def taken(balance, state, weights, measured, *rows):
     """State and weights after steps; of one, as `SCALES` says."""
-    descent = balance.descent
-    given = descent.equations, descent.cavity, state, weights, measured
-    *after, _, renewed = descent.native.take(*given, rows or (SCALES,))
+    gauss_newton = balance.gauss_newton
+    given = gauss_newton.equations, gauss_newton.cavity, state, weights, measured
+    *after, _, renewed = gauss_newton.native.take(*given, rows or (SCALES,))
     return *after, renewed
 
 
@@ -86,7 +86,7 @@ def expected(balance, state, weights, measured, scales=SCALES):
     """By tensor operations."""
     numbers = Scales(*(torch.tensor(scale, dtype=state.u.dtype) for scale in scales))
     with torch.no_grad():
-        after, renewed = balance.descent.step(state, weights, measured, numbers)
+        after, renewed = balance.gauss_newton.step(state, weights, measured, numbers)
     return *after, renewed
 
 
@@ -120,11 +120,11 @@ def test_deviations_are_those_of_tensor_operations(filling, gauge, hole):
     balance = estimator("mooney_rivlin", filling=filling, hole=hole)
     state, _, measured = problem(balance, gauge=gauge and filling != "open")
     flat = State(torch.where(torch.arange(3)[:, None, None] == 1, 0.0, state.u), *state[1:])
-    descent = balance.descent
-    settings = replace(descent.settings, outlier=3.5)  # of the finest grid, on a coarser one
+    gauss_newton = balance.gauss_newton
+    settings = replace(gauss_newton.settings, outlier=3.5)  # of the finest grid, on a coarser one
     for at in (state, flat):
-        force, depth = spreads_by_tensors(descent.equations, descent.cavity, settings, at, measured)
-        found = descent.native.spread(descent.equations, descent.cavity, at, measured, settings.outlier)
+        force, depth = spreads_by_tensors(gauss_newton.equations, gauss_newton.cavity, settings, at, measured)
+        found = gauss_newton.native.spread(gauss_newton.equations, gauss_newton.cavity, at, measured, settings.outlier)
         assert_same([found], [torch.cat([force, depth[:, None]], 1)])
         assert found.min() > 0 or filling == "open"
 
@@ -132,8 +132,8 @@ def test_deviations_are_those_of_tensor_operations(filling, gauge, hole):
 def test_several_steps_are_one_after_the_other():
     balance, rows = estimator(), [(4.0, 50.0, 5.0, 1.0, 3e-5), SCALES, SCALES]
     state, weights, measured = problem(balance)
-    descent = balance.descent
-    found = descent.native.take(descent.equations, descent.cavity, state, weights, measured, rows)
+    gauss_newton = balance.gauss_newton
+    found = gauss_newton.native.take(gauss_newton.equations, gauss_newton.cavity, state, weights, measured, rows)
     for row in rows:
         before = state
         *state, weights = taken(balance, State(*state), weights, measured, row)
@@ -150,7 +150,7 @@ def test_every_setting_is_heard_of():
     for name, value in changed.items():
         other = estimator()
         settings = replace(ForceBalanceSettings(), **{name: value})
-        other.descent.settings = other.equations.loss.settings = settings
+        other.gauss_newton.settings = other.equations.loss.settings = settings
         other.equations.loss.shear = type(other.equations.loss.shear)(settings.slip)
         found = taken(other, *given, scales)
         assert_same(found, expected(other, *given, scales))
@@ -243,9 +243,9 @@ def test_frames_of_a_batch_are_shared_out_among_threads(threads, monkeypatch):
     """Of five, each by one of them, all at the same time; nothing of a result hangs on it."""
     balance, used, entered = estimator(), set(), threading.Barrier(min(threads, 5))
     given = problem(balance, frames=5)
-    descent = balance.descent
-    spread = descent.equations, descent.cavity, given[0], given[2], 2.5
-    alone = *taken(balance, *given), descent.native.spread(*spread)
+    gauss_newton = balance.gauss_newton
+    spread = gauss_newton.equations, gauss_newton.cavity, given[0], given[2], 2.5
+    alone = *taken(balance, *given), gauss_newton.native.spread(*spread)
     frames = native.frames
 
     def watched(*arguments):
@@ -255,7 +255,7 @@ def test_frames_of_a_batch_are_shared_out_among_threads(threads, monkeypatch):
 
     monkeypatch.setattr(native, "frames", watched)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    assert_same((*taken(balance, *given), descent.native.spread(*spread)), alone, rtol=0)
+    assert_same((*taken(balance, *given), gauss_newton.native.spread(*spread)), alone, rtol=0)
     assert len(used) >= min(threads, 5) and threading.get_ident() not in used
 
 

@@ -7,7 +7,7 @@ import torch
 
 from torchmembrane.control_flow import retry_rows
 from torchmembrane.estimators.base import Equilibrium, Observation
-from torchmembrane.estimators.force_balance.estimator import ALONE, ForceBalance
+from torchmembrane.estimators.force_balance.estimator import SINGLE_GRID_SETTLING_STEPS, ForceBalance
 from torchmembrane.estimators.force_balance.gauss_newton import Scales, State
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
 from torchmembrane.estimators.force_balance.traction_loss import BEYOND
@@ -54,7 +54,7 @@ def test_a_step_changes_no_edge_by_more_than_its_share(dented, tau):
     start = State(x - one.membrane.rest, *one.at_rest(measured.weight)[1:])
     unweighted = torch.ones(2, len(one.equations.loss.area)).double()
     scales = Scales(*torch.tensor((tau, 50.0, SETTINGS.cone, 1.0, SETTINGS.damping)))
-    after = one.descent.step(start, unweighted, measured, scales)[0]
+    after = one.gauss_newton.step(start, unweighted, measured, scales)[0]
     before, now = edges(x, DOME), edges(one.membrane.rest + after.u, DOME)
     share = ((now - before).norm(dim=-1) / before.norm(dim=-1)).amax(-1)
     assert (share < SETTINGS.largest_stretch * (1 + 1e-6)).all() and (share > 0.01).all()
@@ -101,8 +101,8 @@ def test_a_second_try_settles_on_the_grids_that_are_finer_than_its_dents_damped_
         first, second = one.schedule(), one.schedule(patient=True)
         assert len(second) == SETTINGS.patience * len(first) + settling
         assert second[len(second) - settling :] == [second[-1]] * settling
-    steps = fine.descent.forward
-    monkeypatch.setattr(fine.descent, "forward", lambda *given, damping, **_: damped.append(damping) or steps(*given))
+    steps = fine.gauss_newton.forward
+    monkeypatch.setattr(fine.gauss_newton, "forward", lambda *given, damping, **_: damped.append(damping) or steps(*given))
     for patient in (False, True):
         fine._stepped(fine.equations.bearings.measured(dented), patient)
     assert damped == [SETTINGS.settling_damping, SETTINGS.patient_damping] and damped[1] > damped[0]
@@ -116,7 +116,7 @@ def test_coarser_grids_lose_fewer_markers():
         (fine.coarse, SETTINGS.coarse_outlier),
         (fine.coarse.coarse, SETTINGS.coarse_outlier),
     ):
-        assert one.descent.settings.outlier == last < 2.1 * SETTINGS.outlier
+        assert one.gauss_newton.settings.outlier == last < 2.1 * SETTINGS.outlier
         assert [one.schedule(patient)[-1] for patient in (False, True)] == 2 * [(0.4, last)]
     assert fine.coarse.coarse.schedule()[0] == (4.0, pytest.approx(20 * SETTINGS.coarse_outlier, rel=0.01))
 
@@ -138,30 +138,30 @@ def test_normal_weights_are_the_geometric_mean_with_those_of_the_step_before(den
 
 def test_weights_are_remembered_while_the_losses_stay_and_the_last_steps_are_damped():
     """With `tau` declining all are new; a step alone is neither."""
-    descent, kept = estimator().descent, SETTINGS.renewal
+    gauss_newton, kept = estimator().gauss_newton, SETTINGS.renewal
     taus = [4.0, 1.6, 0.4, 0.4, 0.4]
-    steps = [descent._numbers(taus[: k + 1], (k >= 3) * SETTINGS.settling_damping) for k in range(5)]
+    steps = [gauss_newton._numbers(taus[: k + 1], (k >= 3) * SETTINGS.settling_damping) for k in range(5)]
     assert [renewal for renewal, _ in steps] == [1.0, 1.0, 1.0, kept, kept]
     least = [SETTINGS.damping * (tau / 0.4) ** 2 for tau in taus[:3]]
     assert [damping for _, damping in steps] == pytest.approx([*least, *2 * [SETTINGS.settling_damping]])
-    assert kept < 1 and descent._numbers([0.4], 1.0) == (1.0, SETTINGS.damping)
+    assert kept < 1 and gauss_newton._numbers([0.4], 1.0) == (1.0, SETTINGS.damping)
     several, alone = estimator(spherical_cap(12, 9, 3, (17, 17))), estimator(spherical_cap(12, 9, 3, (9, 9)))
-    assert (several.settling, several.coarse.settling, alone.settling) == (1, 1, ALONE)
+    assert (several.settling, several.coarse.settling, alone.settling) == (1, 1, SINGLE_GRID_SETTLING_STEPS)
 
 
 def test_of_the_steps_that_settle_the_likeliest_state_is_kept(dented, monkeypatch):
     """Two frames; of the last four of nine steps, one of which breaks down. Where one settles, the last: none is judged."""
     one, judged = estimator(), []
     likely = iter(torch.tensor([[3.0, 1.0], [2.0, 2.0], [torch.nan, 3.0], [4.0, 4.0]]).double())
-    monkeypatch.setattr(one.descent, "objective", lambda state, *_: judged.append(state) or next(likely))
+    monkeypatch.setattr(one.gauss_newton, "objective", lambda state, *_: judged.append(state) or next(likely))
     measured, schedule = one.equations.bearings.measured(dented), 9 * [(0.4, 5.0)]
-    state, before = one.descent(one.at_rest(measured.weight), measured, schedule, settling=4)
+    state, before = one.gauss_newton(one.at_rest(measured.weight), measured, schedule, settling=4)
     assert len(judged) == 4
     for kept, at in zip(state, zip(*judged, strict=True), strict=True):
         torch.testing.assert_close(kept, torch.stack([at[1][0], at[0][1]]), rtol=0, atol=0)
     torch.testing.assert_close(before[0], judged[0].u[0], rtol=0, atol=0)
     assert 0 < (before[1] - judged[0].u[1]).abs().max() < 0.1 * one.size
-    one.descent(one.at_rest(measured.weight), measured, schedule)
+    one.gauss_newton(one.at_rest(measured.weight), measured, schedule)
     assert len(judged) == 4
 
 
@@ -350,7 +350,7 @@ def test_contacts_that_push_around_their_middle_only_are_tried_again(dented, lin
     x = rest.expand(4, -1, -1)
     volume, moved = one.membrane.volume(x), torch.zeros(4, 4, dtype=torch.float64)
     found = Equilibrium(x, one.rest_pressure.expand(4), volume, traction, zero, reference, zero, moved, zero, zero, zero, zero)
-    assert one.dents.is_hollow(found, one.membrane).tolist() == [False, True, False, False]
+    assert one.dents.is_ring_shaped(found, one.membrane).tolist() == [False, True, False, False]
     measured = one.equations.bearings.measured(Observation(*(value[:1].expand(4, *value.shape[1:]) for value in dented[:3])))
     assert one.is_done(found, measured).tolist() == [True, False, True, True]
 
@@ -361,8 +361,8 @@ def test_the_objective_of_a_solution_is_over_the_markers_seen(dented):
     for observation in (dented, half):
         found, measured, seen = one(observation), one.equations.bearings.measured(observation), observation.confidence.sum(-1)
         state = State(found.vertices - one.membrane.rest, found.pressure, found.moved)
-        traction, normal = one.descent.tractions(*state[:2])
-        objective = one.descent.objective(state, traction, normal, measured)
+        traction, normal = one.gauss_newton.tractions(*state[:2])
+        objective = one.gauss_newton.objective(state, traction, normal, measured)
         pushes = one.equations.loss(traction, normal, measured.noise_level).pushes
         torch.testing.assert_close(found.objective, objective / seen)
         torch.testing.assert_close(found.unexplained, (objective - pushes) / seen)

@@ -59,9 +59,9 @@ def test_pushes_cost_nothing_and_pulls_what_they_cost(light):
     estimator, found = solutions[4]
     measured, seen = estimator.equations.bearings.measured(observation), observation.confidence.sum(-1)
     state = State(found.vertices - estimator.membrane.rest, found.pressure, found.moved)
-    traction, normal = estimator.descent.tractions(*state[:2])
+    traction, normal = estimator.gauss_newton.tractions(*state[:2])
     angles = estimator.equations.bearings.angles(state.u, measured, state.moved)[0]
-    misfit = estimator.descent.misfit(angles, state.pressure, measured)
+    misfit = estimator.gauss_newton.misfit(angles, state.pressure, measured)
     _, _, pushes, others = estimator.equations.loss(traction, normal, measured.noise_level)
     beside = misfit + others
     torch.testing.assert_close((found.unexplained, found.objective), (beside / seen, (beside + pushes) / seen))

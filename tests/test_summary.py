@@ -10,7 +10,7 @@ import torch
 from test_batch import Denting, grey_image, reconstruct, summary_of, write_video
 
 from torchmembrane.files import timestamps
-from torchmembrane.files.provenance import Origin
+from torchmembrane.files.provenance import SourceFile
 from torchmembrane.files.timestamps import time_in
 from torchmembrane.integrations.rosbag import StampedMessage
 from torchmembrane.results import summary_row
@@ -101,7 +101,7 @@ def test_each_column_holds_what_the_frame_s_arrays_say(table):
     for key, value in expected.items():
         assert row[key] == "" if np.isnan(value) else float(row[key]) == pytest.approx(float(value), rel=2e-5), key
     texts = {"name": image.stem, "file": str(image), "status_text": "ok", "length_unit": "mm", "force_unit": "N"}
-    texts["content_hash"] = Origin.of(image).content_hash
+    texts["content_hash"] = SourceFile.of(image).content_hash
     assert {key: row[key] for key in texts} == texts and float(row["seconds"]) > 0
     assert set(expected) | set(texts) | {"seconds"} == set(NAMES)
 

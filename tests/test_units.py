@@ -18,7 +18,7 @@ from torchmembrane.calibrate import explained, presses
 from torchmembrane.cli import main as cli
 from torchmembrane.integrations.frame_messages import SiUnits
 from torchmembrane.live.line import described
-from torchmembrane.live.loop import Seen, Tally
+from torchmembrane.live.loop import LiveFrame, StreamStats
 from torchmembrane.machine_code import using
 from torchmembrane.sensor.units import millimetre
 from torchmembrane.simulate.render import Renderer
@@ -219,9 +219,9 @@ def test_the_live_line_shows_digits_in_every_unit(pair):
     for tour in pair:
         results = tm.read_results(tour.folder / "press" / "results")
         frame = results["press"]
-        tally = Tally()
-        tally.add(Seen(0, 0.0, np.zeros((2, 2), np.uint8), frame, 0.05))
-        line = described(Seen(0, 0.0, np.zeros((2, 2), np.uint8), frame, 0.05), tally, results.mesh)
+        stats = StreamStats()
+        stats.add(LiveFrame(0, 0.0, np.zeros((2, 2), np.uint8), frame, 0.05))
+        line = described(LiveFrame(0, 0.0, np.zeros((2, 2), np.uint8), frame, 0.05), stats, results.mesh)
         force, moment = (re.search(rf"{key} (\S+) (\S+) (\S+) N", line).groups() for key in ("force", "moment"))
         lines.append(np.array([*map(float, force), *(float(part) / tour.one for part in moment)]))
     sizes = np.repeat([np.abs(half).max() for half in lines[0].reshape(2, 3)], 3)

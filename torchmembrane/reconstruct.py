@@ -17,7 +17,7 @@ from .estimators.contacts import Contacts
 from .estimators.precision import PRECISIONS, check_precision, full_precision
 from .estimators.registry import built_estimator, estimator_kind, refuse_unfit
 from .estimators.sensor_problem import LEAST_ERROR, problem_of
-from .files.grayscale import CHANNELS, Channels, grey_batch
+from .files.grayscale import CHANNELS, Channels, to_grayscale_batch
 from .files.images import read_image
 from .files.tensors import tensor_of
 from .markers.coverage import LEAST_COVERAGE, Coverage, facings
@@ -150,7 +150,7 @@ class Reconstructor(nn.Module):
         if self.sensor.views_apart:
             return torch.cat([read_views(Path(path), self.sensor.views, self.rest_pixels) for path in paths])
         images = [read_image(path, self.image_size, self.sensor.camera.bits) for path in paths]
-        return torch.cat([grey_batch(image, self.image_size, "rgb", self.rest_pixels) for image in images])
+        return torch.cat([to_grayscale_batch(image, self.image_size, "rgb", self.rest_pixels) for image in images])
 
     def forward(
         self,
@@ -187,7 +187,7 @@ class Reconstructor(nn.Module):
         """Images as `forward` takes them as grey ones, `[B, 1, height, width]` in 0..1."""
         if self.sensor.views_apart:
             return grey_views(images, self.sensor.views, self.channels, self.rest_pixels)
-        return grey_batch(images, self.image_size, self.channels, self.rest_pixels, self.sensor.camera.bits)
+        return to_grayscale_batch(images, self.image_size, self.channels, self.rest_pixels, self.sensor.camera.bits)
 
     def reconstruct_grey(
         self,

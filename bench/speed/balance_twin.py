@@ -10,7 +10,7 @@ from scipy.sparse.linalg import splu
 
 from torchmembrane.estimators.base import Observation
 from torchmembrane.estimators.force_balance.estimator import ForceBalance
-from torchmembrane.estimators.force_balance.marker_residuals import Bearings
+from torchmembrane.estimators.force_balance.marker_residuals import MeasuredRays
 from torchmembrane.estimators.force_balance.robust import Cauchy
 from torchmembrane.solve.stencil import inner, pad_border
 from torchmembrane.surface.topology import corners, triangles_of
@@ -52,7 +52,7 @@ class BalanceTwin:
             u, pressure = self.step(u, pressure, measured, tau, outlier)
         return u[0].numpy(), float(pressure)
 
-    def step(self, u: torch.Tensor, pressure, measured: Bearings, tau: float, outlier: float):
+    def step(self, u: torch.Tensor, pressure, measured: MeasuredRays, tau: float, outlier: float):
         e, free, count = self.estimator, self.free, self.count
         x = e.membrane.rest + u
         forces, bearings, loss = e.equations.forces, e.equations.bearings, e.equations.loss

@@ -28,7 +28,7 @@ import torch
 import torchmembrane as tm
 from bench.data.record import write
 from torchmembrane.live.background import Background
-from torchmembrane.live.loop import Tally, follow
+from torchmembrane.live.loop import StreamStats, follow
 from torchmembrane.live.mailbox import capture
 from torchmembrane.live.recording import Recording
 from torchmembrane.live.sources import Timed, paced
@@ -56,7 +56,7 @@ def to_and_fro(images: list[np.ndarray]) -> Iterator[np.ndarray]:
 
 def measured(stream: Stream, images: list[np.ndarray], seconds: float, record: bool) -> dict:
     """One run."""
-    tally, dropped, began = Tally(), 0, time.process_time()
+    stats, dropped, began = StreamStats(), 0, time.process_time()
     with ExitStack() as stack:
         watchers = []
         if record:
@@ -65,22 +65,22 @@ def measured(stream: Stream, images: list[np.ndarray], seconds: float, record: b
             watchers.append(lambda seen, _: later(seen))
         played = islice(to_and_fro(images), round(seconds * RATE))
         mailbox = stack.enter_context(capture(paced(Timed(k / RATE, image) for k, image in enumerate(played))))
-        follow(stream, mailbox, tally, watchers, Event())
+        follow(stream, mailbox, stats, watchers, Event())
         dropped = later.dropped if record else None
-    milliseconds, times = 1000 * np.asarray(tally.latencies), np.asarray(tally.times) - tally.times[0]
+    milliseconds, times = 1000 * np.asarray(stats.latencies), np.asarray(stats.times) - stats.times[0]
     first, last = (milliseconds[(times >= a * seconds) & (times < b * seconds)] for a, b in ((0, 0.25), (0.75, 1)))
     return dict(
-        captured=tally.captured,
-        followed=tally.followed,
-        dropped=tally.dropped,
-        failed=tally.failed,
+        captured=stats.captured,
+        followed=stats.followed,
+        dropped=stats.dropped,
+        failed=stats.failed,
         not_recorded=dropped,
-        rate=tally.rate(),
+        rate=stats.rate(),
         median=float(np.median(milliseconds)),
         percent_95=float(np.percentile(milliseconds, 95)),
         first_quarter=float(np.median(first)),
         last_quarter=float(np.median(last)),
-        processor=1000 * (time.process_time() - began) / tally.followed,
+        processor=1000 * (time.process_time() - began) / stats.followed,
         load=os.getloadavg()[0],
     )
 

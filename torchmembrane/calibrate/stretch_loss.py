@@ -42,7 +42,7 @@ def _better(own: Explained, neighbour: Explained, observation: Observation) -> E
     )
     state: State
     with torch.no_grad():
-        state, before = estimator.descent(start, measured, estimator.schedule()[-1:] * STEPS)
+        state, before = estimator.gauss_newton(start, measured, estimator.schedule()[-1:] * STEPS)
         tried = estimator.equilibrium(*state, before, measured)
     lower = estimator.is_converged(tried) & (tried.objective < found.objective)
     rows = (torch.where(lower.reshape(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in zip(tried, found, strict=True))

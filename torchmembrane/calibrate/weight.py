@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MembraneError, check_arguments, expect
-from ..files.grayscale import grey_batch
+from ..files.grayscale import to_grayscale_batch
 from ..progress import Progress, silent, within
 from ..reconstruct import Reconstructor
 from ..results.reconstruction import Reconstruction
@@ -66,7 +66,7 @@ def material_from_weight(sensor: Sensor, images: Tensor, weight: float, *, progr
         the material's errors are others (docs/recipes.md).
     """
     expect(0 < weight < np.inf, "calibrate material: weight", weight, "a positive force, N")
-    images = grey_batch(images, sensor.camera.image_size, "rgb", torch.zeros((), dtype=torch.float64))
+    images = to_grayscale_batch(images, sensor.camera.image_size, "rgb", torch.zeros((), dtype=torch.float64))
     known = np.full((len(images), 1), weight)
     material = material_from_images(sensor, images, known, progress=within(progress, 0.0, MATERIAL_SHARE))
     progress(MATERIAL_SHARE, "modulus from the weight")

@@ -50,7 +50,7 @@ ARRAYS = ("heightfield", "grid")
 def _shape(text: str) -> str:
     if text in DRAFTS:
         return text
-    from ..sensor.synonyms import did_you_mean
+    from ..sensor.suggestions import did_you_mean
 
     of_arrays = f"any other surface goes into the file as arrays: shape = {' or '.join(map(repr, ARRAYS))}, with file"
     meant = did_you_mean(text, (*DRAFTS, *ARRAYS))

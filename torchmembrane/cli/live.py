@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..camera.model import Camera
-    from ..live.loop import Request, Seen, Tally
+    from ..live.loop import LiveFrame, Request, StreamStats
     from ..live.streams import Stream
     from ..sensor.sensor import Sensor
 
@@ -90,8 +90,8 @@ def add_parser(commands: Any) -> None:
 def run(arguments: Namespace) -> int:
     """Follow the source until it ends or is stopped; returns the exit code."""
     from ..interruption import answer
-    from ..live.line import Line, summary
-    from ..live.loop import Tally, follow
+    from ..live.line import StatusLine, summary
+    from ..live.loop import StreamStats, follow
     from ..live.mailbox import capture
     from ..live.peaks import Peaks
     from ..presets import sensor_file
@@ -101,26 +101,26 @@ def run(arguments: Namespace) -> int:
     _spare_files(arguments)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     images, stream = _images(arguments, sensor.camera), _stream(arguments, sensor)
-    line = Line(stream.mesh, sys.stdout)
+    line = StatusLine(stream.mesh, sys.stdout)
     warnings.showwarning = lambda message, *_: line.say(f"torchmembrane: warning: {message}")  # main restores it
     said: list[Callable[[], str]] = []
     try:
         with ExitStack() as stack:
             watchers = _watchers(arguments, stream, sensor.camera.bits, stack, said)
             stop, requests = stack.enter_context(_stopped_by_signals()), _requests_by_keys(sensor.length_unit)
-            mailbox, tally, peaks = stack.enter_context(capture(images)), Tally(), Peaks(stream.mesh)
+            mailbox, stats, peaks = stack.enter_context(capture(images)), StreamStats(), Peaks(stream.mesh)
             watchers.append(lambda seen, _: peaks.add(seen.frame))
             if arguments.life is not None:
                 peaks.kept_in(arguments.life)  # nothing yet: another sensor's file is refused before the stream begins
             try:
-                follow(stream, mailbox, tally, [line, *watchers], stop, requests, line.say)
+                follow(stream, mailbox, stats, [line, *watchers], stop, requests, line.say)
             finally:
                 if stop.is_set():
                     answer()
                 line.say(f"{peaks.said}; {MODULUS}")
                 if arguments.life is not None:
                     line.say(peaks.kept_in(arguments.life))
-                line.say(summary(tally))
+                line.say(summary(stats))
     finally:
         for each in said:
             line.say(each())
@@ -185,14 +185,14 @@ def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
 
 def _watchers(
     arguments: Namespace, stream: "Stream", bits: int | None, stack: ExitStack, said: "list[Callable[[], str]]"
-) -> "list[Callable[[Seen, Tally], None]]":
+) -> "list[Callable[[LiveFrame, StreamStats], None]]":
     """What else is given the frames; to `said` is added what tells of it in the end."""
     from ..integrations.rerun import RerunLog
     from ..live.recording import Recording
 
-    watchers: list[Callable[[Seen, Tally], None]] = []
+    watchers: list[Callable[[LiveFrame, StreamStats], None]] = []
 
-    def add(keep: "Callable[[Seen], None]", done: str) -> None:
+    def add(keep: "Callable[[LiveFrame], None]", done: str) -> None:
         later = stack.enter_context(Background(keep, tell=_warn))
         watchers.append(lambda seen, _: later(seen))
         said.append(lambda: f"{done}; {_left_out(later)}")
@@ -210,7 +210,7 @@ def _warn(error: BaseException) -> None:
     warn_user(f"{error}; frames that cannot be kept are left out and counted")
 
 
-def _left_out(later: "Background[Seen]") -> str:
+def _left_out(later: "Background[LiveFrame]") -> str:
     failed = f", {later.failed} frames that could not be kept" if later.failed else ""
     return f"{later.late} frames left out, for want of time{failed}"
 

@@ -31,7 +31,7 @@ class CommandParser(ArgumentParser):
         self.exit(2, f"usage: {self.prog} --help lists all arguments\n{self.prog}: error: {message}{self._meant(message)}\n")
 
     def _meant(self, message: str) -> str:
-        from ..sensor.synonyms import did_you_mean  # here: torch comes with the package
+        from ..sensor.suggestions import did_you_mean  # here: torch comes with the package
 
         if wrong := re.match(r"argument (.*): invalid choice: '?(.*?)'? \(choose from (.*)\)", message):
             return _appended(did_you_mean(wrong[2], re.findall(r"[\w-]+", wrong[3])))

@@ -6,7 +6,7 @@ from typing import Any
 
 from ..errors import MembraneError, expect
 from ..sensor.sensor import Sensor
-from ..sensor.synonyms import did_you_mean
+from ..sensor.suggestions import did_you_mean
 from .base import Estimator, Problem
 from .force_balance.estimator import ForceBalance
 from .minimum_energy.estimator import MinimumEnergy

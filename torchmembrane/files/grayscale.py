@@ -22,7 +22,7 @@ THREE_FRAMES = (
 )
 
 
-def grey_batch(
+def to_grayscale_batch(
     images: Tensor | np.ndarray, size: tuple[int, int], channels: Channels, like: Tensor, bits: int | None = None
 ) -> Tensor:
     """Grey images `[B, 1, height, width]` in 0..1, of the precision and on the device of `like`.
@@ -42,7 +42,7 @@ def grey_batch(
 
     Example:
         >>> photograph = np.zeros((480, 640, 3), np.uint8)
-        >>> list(grey_batch(photograph, (640, 480), "bgr", torch.zeros(())).shape)
+        >>> list(to_grayscale_batch(photograph, (640, 480), "bgr", torch.zeros(())).shape)
         [1, 1, 480, 640]
     """
     pixels = _tensor(images)

@@ -10,7 +10,7 @@ from .timestamps import time_in
 DIGEST = partial(hashlib.blake2b, digest_size=16)
 
 
-class Origin(NamedTuple):
+class SourceFile(NamedTuple):
     """The file of a frame as it was when the frame was reconstructed, and what was measured beside it.
 
     Of views that have images of their own, a frame has a file for each.
@@ -32,14 +32,15 @@ class Origin(NamedTuple):
     gauge: float = float("nan")
 
     @classmethod
-    def of(cls, file: Path, *further: Path) -> "Origin":
+    def of(cls, file: Path, *further: Path) -> "SourceFile":
         """The origin of a file as it is now; `further`: of the other views, in their order.
 
         Raises:
             OSError: one cannot be read.
 
         Example:
-            >>> Origin.of(Path("examples/rest.png")).content_hash == Origin.of(Path("examples/flat_plate.png")).content_hash
+            >>> rest, press = (SourceFile.of(Path("examples") / name) for name in ("rest.png", "flat_plate.png"))
+            >>> rest.content_hash == press.content_hash
             False
         """
         digest, size, modified = DIGEST(), 0, 0
@@ -51,7 +52,7 @@ class Origin(NamedTuple):
         return cls(printable(str(file)), size, modified, digest.hexdigest(), time_in(file.stem))
 
     @classmethod
-    def of_bytes(cls, file: Path, content: bytes) -> "Origin":
+    def of_bytes(cls, file: Path, content: bytes) -> "SourceFile":
         """The origin of a file of which only the content is known."""
         return cls(printable(str(file)), len(content), content_hash=DIGEST(content).hexdigest(), time=time_in(file.stem))
 
@@ -63,7 +64,7 @@ class Origin(NamedTuple):
             size, modified = sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
             if not self.content_hash or (size, modified) == (self.file_size, self.file_modified):
                 return True
-            return size == self.file_size and Origin.of(*files).content_hash == self.content_hash
+            return size == self.file_size and SourceFile.of(*files).content_hash == self.content_hash
         except OSError:
             return True
 

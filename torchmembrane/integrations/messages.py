@@ -125,7 +125,7 @@ def mode_of(info: Any) -> Mode:
     return Mode((info.width, info.height), (f, g), (u, v), crop, binning)
 
 
-def unlike(info: Any, camera: Camera) -> str | None:
+def camera_mismatch(info: Any, camera: Camera) -> str | None:
     """By how many pixels the lens of a `sensor_msgs/CameraInfo` is off the sensor file's, in words.
 
     None: by no more than `SAME`, or it is not calibrated. Distortion counts, ports do not: a CameraInfo knows none.

@@ -19,7 +19,7 @@ from ..interruption import unfinished
 from ..results.reconstruction import Frame
 from .bounded_rosbags import bounded_rosbags, refuse_large
 from .frame_messages import Message, SiUnits, has_wrench
-from .messages import info_topic, size_of, unlike
+from .messages import camera_mismatch, info_topic, size_of
 
 BAGS, ROS_1, METADATA = (".mcap", ".db3"), ".bag", "metadata.yaml"
 MOST_METADATA_BYTES = 2**20
@@ -116,7 +116,7 @@ def camera_remark(bag: Path, topic: str, camera: Camera) -> str | None:
     """
     first = next(messages(bag, info_topic(topic), (INFO_TYPE,)), None)
     try:
-        return None if first is None else unlike(first.message, camera)
+        return None if first is None else camera_mismatch(first.message, camera)
     except MembraneError as error:
         image = next(messages(bag, topic), None)
         if image is not None and size_of(image.message) == camera.image_size:

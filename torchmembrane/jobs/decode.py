@@ -16,7 +16,7 @@ from torch import Tensor
 from ..camera.model import Camera
 from ..errors import MembraneError
 from ..files.images import picture_count, stack_images, to_grey
-from ..files.provenance import Origin
+from ..files.provenance import SourceFile
 from ..files.timestamps import time_in
 from ..files.video import picture_total, picture_values, video_pictures
 from ..integrations.messages import grey_of
@@ -52,7 +52,7 @@ class Source(NamedTuple):
     name: str
     file: Path
     load: Load
-    origin: Origin | None = None
+    origin: SourceFile | None = None
 
 
 class DecodedFrame(NamedTuple):
@@ -62,7 +62,7 @@ class DecodedFrame(NamedTuple):
     file: Path
     image: Tensor | None
     reason: str = ""
-    origin: Origin = Origin()
+    origin: SourceFile = SourceFile()
 
     def but(self, error: Exception) -> "DecodedFrame":
         """The same frame without an image, because of an error."""
@@ -87,13 +87,13 @@ def decoded(source: Source, reconstructor: "Reconstructor") -> DecodedFrame:
     try:
         if len(source.name.encode()) > LONGEST_NAME:
             raise MembraneError(f"its name has {len(source.name.encode())} bytes; expected {LONGEST_NAME} at most: rename it")
-        origin = source.origin or origin_of(*view_files(source.file, reconstructor.sensor.views_apart))
+        origin = source.origin or source_file_of(*view_files(source.file, reconstructor.sensor.views_apart))
         return frame._replace(image=source.load(reconstructor), origin=origin)
     except MembraneError as error:
         return frame.but(error)
 
 
-def origin_of(*paths: Path) -> Origin:
+def source_file_of(*paths: Path) -> SourceFile:
     """The origin of a frame in this file, or in those of all views.
 
     Raises:
@@ -103,7 +103,7 @@ def origin_of(*paths: Path) -> Origin:
         for path in paths:
             if not path.is_file():
                 raise MembraneError(f"{path}: not a regular file; expected an image or a video")
-        return Origin.of(*paths)
+        return SourceFile.of(*paths)
     except OSError as error:
         raise MembraneError(f"{error.filename or paths[0]}: not readable ({error})") from error
 
@@ -143,14 +143,14 @@ def _frames(path: Path, pictures: Iterator[Picture]) -> Iterator[Source]:
     """The frames of a file with several, one after another; if the file breaks off, its error is the last frame."""
     number = -1
     try:
-        origin = origin_of(path)
+        origin = source_file_of(path)
         for number, picture in enumerate(pictures):
             yield Source(picture_name(path, number), path, picture.load, origin._replace(time=picture.time))
         if number < 0:
             raise MembraneError("holds no picture")
     except MembraneError as error:
         refusal = partial(_refuse, str(error).removeprefix(f"{path}: "))
-        yield Source(picture_name(path, number + 1), path, refusal, Origin())
+        yield Source(picture_name(path, number + 1), path, refusal, SourceFile())
 
 
 def _pictures(path: Path, topic: str | None, reconstructor: "Reconstructor") -> Iterator[Picture]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..errors import MembraneError, expect
 from ..files.levels import too_few_bits
-from ..files.provenance import Origin, printable
+from ..files.provenance import SourceFile, printable
 from ..files.safe_read import in_one_line
 from ..results.npz import Stored
 from ..results.reconstruction import Frame, Reconstruction
@@ -104,7 +104,7 @@ class FrameReconstructor:
             MembraneError: `rows` has no column `path`, columns of several lengths, or is neither a dict nor a DataFrame.
         """
         outcomes = self.outcomes([self._frame(*row) for row in _rows(rows)])
-        stored = [outcome.stored or Stored(self._blank, Origin(printable(str(outcome.file)))) for outcome in outcomes]
+        stored = [outcome.stored or Stored(self._blank, SourceFile(printable(str(outcome.file)))) for outcome in outcomes]
         arrays = [each.arrays() for each in stored or [Stored(self._blank)]]
         found = {key: np.stack([row[key] for row in arrays])[: len(stored)] for key in arrays[0]}
         words = {key: np.array([getattr(outcome, key) for outcome in outcomes], str) for key in ("name", "status_text")}
@@ -137,7 +137,7 @@ class FrameReconstructor:
                     raise MembraneError(f"bytes are a {_kind(content)}; expected bytes, what is in the file")
                 data = bytes(content)
                 grey = self._read(data)
-            return frame._replace(image=grey, origin=Origin.of_bytes(file, data))
+            return frame._replace(image=grey, origin=SourceFile.of_bytes(file, data))
         except MembraneError as error:
             return frame.but(error)
 
@@ -175,7 +175,7 @@ class FrameReconstructor:
         arrays = {name: values.cpu().numpy().astype(np.float32) for name, values in fields.items()}
         return [results.frame(i) | {name: values[i] for name, values in arrays.items()} for i in range(len(images))]
 
-    def _measured(self, frame: DecodedFrame) -> Origin:
+    def _measured(self, frame: DecodedFrame) -> SourceFile:
         """A frame's origin, with what the gauge read."""
         return frame.origin._replace(gauge=float(self._reading(frame.name, frame.origin.time)))
 

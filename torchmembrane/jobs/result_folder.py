@@ -9,7 +9,7 @@ from ..files.atomic import PARTIAL
 from ..files.folder_lock import FolderLock, Shard
 from ..files.optional import load_pyarrow
 from ..files.order import in_order
-from ..files.provenance import Origin, printable
+from ..files.provenance import SourceFile, printable
 from ..results.frames import open_folder
 from ..results.store import FINISHED, MESH, Mesh, check_folder
 from ..results.summary import SUMMARY, UNREADABLE, Summary
@@ -102,7 +102,7 @@ class ResultFolder:
                 left.unlink(missing_ok=True)
         self.frames = open_folder(self.path, self.mesh, self._lock.write_lock)
         self.summary = Summary(self.path, self.mesh, self._lock.write_lock)
-        origins: dict[str, Origin] = {}
+        origins: dict[str, SourceFile] = {}
         for name, stored in self.frames.stored(self._shard.holds):
             if not stored.origin.path and (file := self._file_of(name)):
                 stored = stored._replace(origin=stored.origin._replace(path=printable(str(file))))
@@ -115,12 +115,12 @@ class ResultFolder:
         self.summary.write(lambda row: not holds(row["name"]) or (row["status"] == unreadable and row["name"] not in origins))
         self._judge({name: origins[name] for name in self.finished})
 
-    def _judge(self, origins: dict[str, Origin]) -> None:
+    def _judge(self, origins: dict[str, SourceFile]) -> None:
         """Remove frames whose images have changed from the finished ones, and report what was found."""
         firsts = set(self._inputs.images)
 
         @cache
-        def is_of(origin: Origin, file: Path) -> bool:
+        def is_of(origin: SourceFile, file: Path) -> bool:
             return origin.is_of(*(view_files(file, self._inputs.views) if file in firsts else [file]))
 
         files = {name: file for name in sorted(origins, key=in_order) if (file := self._file_of(name))}

@@ -8,14 +8,14 @@ from ..files.digits import together
 from ..files.levels import too_few_bits
 from ..results.status import Status
 from ..results.store import Mesh
-from .loop import RECENT, Seen, Tally
+from .loop import RECENT, LiveFrame, StreamStats
 
 TERMINAL_SECONDS, PLAIN_SECONDS = 0.1, 1.0
 """Between two lines, at least."""
 DIGITS = 4  # of the largest component of force and moment
 
 
-class Line:
+class StatusLine:
     """Shows the latest frame, with rate and latency over the last `RECENT` frames.
 
     Args:
@@ -27,13 +27,13 @@ class Line:
         self._mesh, self._file, self._in_place = mesh, file, file.isatty()
         self._next = 0.0
 
-    def __call__(self, seen: Seen, tally: Tally) -> None:
+    def __call__(self, seen: LiveFrame, stats: StreamStats) -> None:
         """Show a frame, if it is time."""
         at = time.monotonic()
         if at < self._next:
             return
         self._next = at + (TERMINAL_SECONDS if self._in_place else PLAIN_SECONDS)
-        text = described(seen, tally, self._mesh)
+        text = described(seen, stats, self._mesh)
         if self._in_place:
             self._write(f"\r\x1b[K{text[: shutil.get_terminal_size().columns - 1]}")
         else:
@@ -48,11 +48,11 @@ class Line:
         self._file.flush()
 
 
-def described(seen: Seen, tally: Tally, mesh: Mesh) -> str:
+def described(seen: LiveFrame, stats: StreamStats, mesh: Mesh) -> str:
     """Rate, latency, dropped pictures, status, wrench and change of pressure in one line."""
-    milliseconds = [1000 * tally.latency(percent, RECENT) for percent in (50, 95)]
-    rate = f"{tally.rate(RECENT):.1f} Hz, " if tally.followed > 1 else ""
-    pace = rate + "{:.0f} ms (95 %: {:.0f}), {} dropped".format(*milliseconds, tally.dropped)
+    milliseconds = [1000 * stats.latency(percent, RECENT) for percent in (50, 95)]
+    rate = f"{stats.rate(RECENT):.1f} Hz, " if stats.followed > 1 else ""
+    pace = rate + "{:.0f} ms (95 %: {:.0f}), {} dropped".format(*milliseconds, stats.dropped)
     status = Status(int(seen.frame["status"]))
     if not status.has_surface:
         return f"{pace} | {status.text}{too_few_bits(seen.image)}"
@@ -63,13 +63,13 @@ def described(seen: Seen, tally: Tally, mesh: Mesh) -> str:
     return f"{pace} | {words} | force {force} {unit} | moment {moment} {unit} {mesh.length_unit} | pressure {pressure}"
 
 
-def summary(tally: Tally) -> str:
+def summary(stats: StreamStats) -> str:
     """What became of all pictures."""
-    if not tally.followed:
+    if not stats.followed:
         return "no frame was captured"
-    without = f", {tally.failed} of them without a surface" if tally.failed else ""
-    milliseconds = [1000 * tally.latency(percent) for percent in (50, 95)]
+    without = f", {stats.failed} of them without a surface" if stats.failed else ""
+    milliseconds = [1000 * stats.latency(percent) for percent in (50, 95)]
     return (
-        f"frames: {tally.captured} captured, {tally.followed} followed{without}, {tally.dropped} dropped for newer ones; "
-        "{:.1f} Hz, latency {:.0f} ms in the median, {:.0f} ms at 95 %".format(tally.rate(), *milliseconds)
+        f"frames: {stats.captured} captured, {stats.followed} followed{without}, {stats.dropped} dropped for newer ones; "
+        "{:.1f} Hz, latency {:.0f} ms in the median, {:.0f} ms at 95 %".format(stats.rate(), *milliseconds)
     )

@@ -23,7 +23,7 @@ Request = Callable[[Stream], str]
 """What is asked of a stream between two frames, such as to take the latest for rest; gives what became of it."""
 
 
-class Seen(NamedTuple):
+class LiveFrame(NamedTuple):
     """A frame as it was followed.
 
     Attributes:
@@ -45,13 +45,13 @@ class Seen(NamedTuple):
         """Of the frame in a recording: its number.
 
         Example:
-            >>> Seen(12, 0.0, np.zeros((1, 1)), {}, 0.0).name
+            >>> LiveFrame(12, 0.0, np.zeros((1, 1)), {}, 0.0).name
             '000012'
         """
         return f"{self.number:06d}"
 
 
-class Tally:
+class StreamStats:
     """Counts of a run.
 
     Attributes:
@@ -61,10 +61,10 @@ class Tally:
         latencies: of the same, seconds.
 
     Example:
-        >>> tally = Tally()
+        >>> stats = StreamStats()
         >>> for k in range(5):
-        ...     tally.add(Seen(2 * k, 0.1 * k, np.zeros((1, 1)), {"status": np.array(0)}, 0.02))
-        >>> tally.followed, tally.captured, tally.dropped, round(tally.rate(), 6), tally.latency(50)
+        ...     stats.add(LiveFrame(2 * k, 0.1 * k, np.zeros((1, 1)), {"status": np.array(0)}, 0.02))
+        >>> stats.followed, stats.captured, stats.dropped, round(stats.rate(), 6), stats.latency(50)
         (5, 9, 4, 10.0, 0.02)
     """
 
@@ -72,7 +72,7 @@ class Tally:
         self.captured = self.failed = 0
         self.times, self.latencies = array("d"), array("d")
 
-    def add(self, seen: Seen) -> None:
+    def add(self, seen: LiveFrame) -> None:
         """One more frame."""
         self.captured = seen.number + 1
         self.failed += not Status(int(seen.frame["status"])).has_surface
@@ -103,8 +103,8 @@ class Tally:
 def follow(
     stream: Stream,
     mailbox: Mailbox,
-    tally: Tally,
-    watchers: Sequence[Callable[[Seen, Tally], None]],
+    stats: StreamStats,
+    watchers: Sequence[Callable[[LiveFrame, StreamStats], None]],
     stop: Event,
     requests: deque[Request] | None = None,
     report: Callable[[str], None] = print,
@@ -114,7 +114,7 @@ def follow(
     Args:
         stream: computes.
         mailbox: has the newest picture.
-        tally: is given every frame.
+        stats: is given every frame.
         watchers: called with every frame and the counts so far, at once: what takes long is theirs to put off.
         stop: set to end.
         requests: asked of the stream before the next frame, and taken out; one that is refused is said.
@@ -133,10 +133,10 @@ def follow(
             continue
         with frame_in_work():
             frame = stream(picture.image, picture.time)
-        seen = Seen(picture.number, picture.time, picture.image, frame, now() - picture.time)
-        tally.add(seen)
+        seen = LiveFrame(picture.number, picture.time, picture.image, frame, now() - picture.time)
+        stats.add(seen)
         for watcher in watchers:
-            watcher(seen, tally)
+            watcher(seen, stats)
 
 
 def _answer(request: Request, stream: Stream) -> str:

@@ -18,7 +18,7 @@ def now() -> float:
     return EPOCH + time.perf_counter()
 
 
-class Picture(NamedTuple):
+class CapturedFrame(NamedTuple):
     """An image as it was captured.
 
     Attributes:
@@ -49,14 +49,14 @@ class Mailbox:
 
     def __init__(self) -> None:
         self.captured, self.ended = 0, False
-        self._picture: Picture | None = None
+        self._picture: CapturedFrame | None = None
         self._error: BaseException | None = None
         self._changed = Condition()
 
     def put(self, image: np.ndarray) -> None:
         """A picture captured now."""
         with self._changed:
-            self._picture = Picture(self.captured, image, now())
+            self._picture = CapturedFrame(self.captured, image, now())
             self.captured += 1
             self._changed.notify()
 
@@ -66,7 +66,7 @@ class Mailbox:
             self.ended, self._error = True, self._error or error
             self._changed.notify()
 
-    def take(self, seconds: float) -> Picture | None:
+    def take(self, seconds: float) -> CapturedFrame | None:
         """The picture that waits, or the next one if it comes within so many seconds.
 
         Raises:

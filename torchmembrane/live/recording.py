@@ -8,7 +8,7 @@ from ..errors import MembraneError
 from ..files.atomic import make_subfolder, writing
 from ..files.folder_lock import WHOLE
 from ..files.images import write_as_taken
-from ..files.provenance import Origin
+from ..files.provenance import SourceFile
 from ..files.safe_read import in_one_line, read_text
 from ..files.system_files import is_of_system
 from ..jobs.frame_reconstructor import Outcome
@@ -17,7 +17,7 @@ from ..jobs.result_folder import ResultFolder
 from ..results.npz import Stored
 from ..results.store import Mesh
 from ..user_warnings import warn_user
-from .loop import Seen
+from .loop import LiveFrame
 
 IMAGES, TIMES = "images", "times.csv"
 COLUMNS = ("name", "time", "latency")
@@ -66,10 +66,10 @@ class Recording:
                 raise MembraneError(f"{said}; the recording cannot be finished, what was written before is kept") from failure
             warn_user(f"{said}; the recording cannot be finished")
 
-    def keep(self, seen: Seen) -> None:
+    def keep(self, seen: LiveFrame) -> None:
         """Write a frame."""
         path = write_as_taken(self.folder / IMAGES / seen.name, seen.image, self.bits)
-        stored = Stored(seen.frame, Origin.of(path)._replace(time=seen.time), seen.latency)
+        stored = Stored(seen.frame, SourceFile.of(path)._replace(time=seen.time), seen.latency)
         self._results.keep(Outcome(seen.name, path, stored))
         with writing(self.folder / TIMES):
             csv.writer(self._times).writerow((seen.name, f"{seen.time:.6f}", f"{seen.latency:.6f}"))

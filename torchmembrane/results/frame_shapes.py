@@ -43,11 +43,11 @@ def of_first_view(frame: Mapping[str, np.ndarray], key: str) -> np.ndarray:
     return first
 
 
-def unlike(frame: Mapping[str, np.ndarray], vertices: int, markers: int, views: int = 0) -> str:
+def shape_mismatch(frame: Mapping[str, np.ndarray], vertices: int, markers: int, views: int = 0) -> str:
     """What of a frame is not as of a surface with so many vertices and markers; "" where all is. `views`: 0 of a single one.
 
     Example:
-        >>> unlike({key: np.zeros(shape_of(key, {"V": 9, "D": 2, "P": 4})) for key in SHAPES}, 9, 3)
+        >>> shape_mismatch({key: np.zeros(shape_of(key, {"V": 9, "D": 2, "P": 4})) for key in SHAPES}, 9, 3)
         'markers is float64 (2, 3), expected numbers (3, 3)'
     """
     sizes = {"V": vertices, "D": markers, "P": len(np.atleast_1d(frame["contact_points"])), "W": views}

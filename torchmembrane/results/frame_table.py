@@ -15,7 +15,7 @@ from ..files.atomic import make_subfolder, whole_file
 from ..files.optional import load_pyarrow
 from ..files.order import in_order
 from ..files.parquet import nested, read_table, refusal
-from ..files.provenance import Origin
+from ..files.provenance import SourceFile
 from ..files.safe_read import DAMAGE
 from .npz import Stored
 from .reconstruction import Frame, Reconstruction
@@ -31,7 +31,7 @@ SAVE_SECONDS = 5.0
 PART = re.compile(r"part-\d+")
 A_PART = "a part of torchmembrane's results"
 AS_WRITTEN = "it as it was written: the same reconstruct command again sets it aside and does its frames again"
-COLUMNS = ("name", "status_text", *Origin._fields, "seconds", *Reconstruction._fields)
+COLUMNS = ("name", "status_text", *SourceFile._fields, "seconds", *Reconstruction._fields)
 
 
 class FrameTable:
@@ -188,7 +188,9 @@ class FrameTable:
 
     def _table_of(self, rows: dict[str, Stored]) -> Any:
         arrays = [stored.arrays() for stored in rows.values()]
-        values = {key: np.stack([row[key] for row in arrays]) for key in (*Origin._fields, "seconds", *Reconstruction._fields)}
+        values = {
+            key: np.stack([row[key] for row in arrays]) for key in (*SourceFile._fields, "seconds", *Reconstruction._fields)
+        }
         shapes = {key: list(values[key].shape[1:]) for key in Reconstruction._fields}
         columns = {key: nested(value) for key, value in values.items()}
         words = [Status(status).text for status in values["status"]]
@@ -243,6 +245,6 @@ def _stored_rows(table: Any, part: Path) -> dict[str, Stored]:
         while hasattr(values, "flatten") and hasattr(values.type, "list_size"):
             values = values.flatten()
         columns[key] = values.to_numpy(zero_copy_only=False).reshape(len(table), *shape)
-    known = {key: table[key].to_pylist() for key in (*Origin._fields, "seconds") if key in table.column_names}
+    known = {key: table[key].to_pylist() for key in (*SourceFile._fields, "seconds") if key in table.column_names}
     names = _names(table, part)
     return {name: Stored.of({key: values[i] for key, values in (columns | known).items()}) for i, name in enumerate(names)}

@@ -9,7 +9,7 @@ import torch
 
 from ..errors import MembraneError
 from ..files.atomic import write_bytes
-from ..files.provenance import Origin
+from ..files.provenance import SourceFile
 from ..files.safe_read import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays
 from .frame_shapes import FIELDS, shape_of
 from .reconstruction import Frame, Reconstruction
@@ -33,7 +33,7 @@ class Stored(NamedTuple):
     """
 
     frame: Frame
-    origin: Origin = Origin()
+    origin: SourceFile = SourceFile()
     seconds: float = float("nan")
 
     @classmethod
@@ -43,8 +43,10 @@ class Stored(NamedTuple):
         Raises:
             KeyError: it lacks one that there always was.
         """
-        known = {key: arrays[key] for key in Origin._fields if key in arrays}
-        origin = Origin()._replace(**{key: value.item() if hasattr(value, "item") else value for key, value in known.items()})
+        known = {key: arrays[key] for key in SourceFile._fields if key in arrays}
+        origin = SourceFile()._replace(
+            **{key: value.item() if hasattr(value, "item") else value for key, value in known.items()}
+        )
         return cls(completed(arrays), origin, float(arrays.get("seconds", np.nan)))
 
     def arrays(self) -> Frame:

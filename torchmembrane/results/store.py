@@ -11,7 +11,7 @@ from ..errors import MembraneError
 from ..files.safe_read import DAMAGE, NUMBERS, TEXT, in_one_line, read_arrays
 from ..files.system_files import is_of_system
 from ..pose import Pose
-from .frame_shapes import unlike
+from .frame_shapes import shape_mismatch
 from .npz import save_frame
 from .status import Status
 
@@ -177,7 +177,7 @@ class Mesh(NamedTuple):
         Raises:
             MembraneError: an array is of another shape or type than here.
         """
-        if said := unlike(frame, len(self.rest_vertices), self.rest_pixels.shape[-2], self.views):
+        if said := shape_mismatch(frame, len(self.rest_vertices), self.rest_pixels.shape[-2], self.views):
             raise MembraneError(f"{path}: {said} as of its {MESH}: give the {MESH} of its folder, or reconstruct it again")
 
     @property

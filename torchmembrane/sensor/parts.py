@@ -18,7 +18,7 @@ from ..surface import shapes
 from ..surface.checks import FARTHEST
 from ..surface.membrane import Membrane
 from .record import Record
-from .synonyms import did_you_mean
+from .suggestions import did_you_mean
 from .working_range import GENERAL, WorkingRange
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ import numpy as np
 from ..errors import MembraneError
 from ..files.safe_read import lies_within, printable, read_text, shortened
 from ..files.system_files import is_of_system
-from .synonyms import did_you_mean
+from .suggestions import did_you_mean
 
 MOST_BYTES, LONGEST_LINE = 2**15, 2000
 """Of a sensor file: the time that TOML takes grows as the square of a line's length."""

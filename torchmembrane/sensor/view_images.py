@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import MembraneError
-from ..files.grayscale import Channels, grey_batch
+from ..files.grayscale import Channels, to_grayscale_batch
 from ..files.images import read_image
 from .views import View
 
@@ -18,7 +18,7 @@ def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Ten
     """Grey images `[B, W, height, width]` in 0..1; a smaller view's are dark beyond its own size.
 
     Args:
-        images: of W views, the first view's first: a list of W batches, each as `grey_batch` takes them; or stacked,
+        images: of W views, the first view's first: a list of W batches, each as `to_grayscale_batch` takes them; or stacked,
             `[W, height, width]` or `[B, W, height, width]`, colour with its three channels last.
         views: of the sensor.
         channels: order of the channels of colour images.
@@ -44,7 +44,7 @@ def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Ten
     if len(images) != count:
         raise MembraneError(f"images of {len(images)} views; expected {count}: {', '.join(view.name for view in views)}")
     each = [
-        grey_batch(_as_batch(batch), view.camera.image_size, channels, like, view.camera.bits)
+        to_grayscale_batch(_as_batch(batch), view.camera.image_size, channels, like, view.camera.bits)
         for batch, view in zip(images, views, strict=True)
     ]
     frames = [len(batch) for batch in each]

@@ -27,7 +27,7 @@ from std_srvs.srv import Trigger
 
 import torchmembrane as tm
 from torchmembrane.integrations.frame_messages import TOPICS, SiUnits
-from torchmembrane.integrations.messages import grey_of, info_topic, unlike
+from torchmembrane.integrations.messages import camera_mismatch, grey_of, info_topic
 from torchmembrane.live.mailbox import Mailbox
 from torchmembrane.results.store import Mesh, Settings
 
@@ -108,7 +108,7 @@ class TrackerNode(LifecycleNode):
         if not self.compared:
             self.compared = True
             try:
-                remark = unlike(info, self.camera)
+                remark = camera_mismatch(info, self.camera)
             except tm.MembraneError as error:
                 remark = str(error)
             if remark:

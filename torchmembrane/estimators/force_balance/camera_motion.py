@@ -20,12 +20,13 @@ from ...solve.elimination import solve_dense
 
 Scalar = TypeVar("Scalar", float, Tensor)
 
-RARE = 100.0
-"""How much less likely a camera moves than that it stays, a power: a tenfold motion has a likelihood `10^-RARE` times."""
+PRIOR_WEIGHT = 100.0
+"""How unlikely it is that a camera moves: a motion that is ten times larger is `10^PRIOR_WEIGHT` times less likely."""
 
 
 def camera_stiffness(play: Any, moved2: Scalar) -> Scalar:
-    """The weight of the parabola that touches the loss `RARE / 2 log(play^2 + |m|^2)` of a motion `m` with `|m|^2 = moved2`.
+    """The weight of the parabola that touches the loss `w / 2 log(play^2 + |m|^2)` of a motion `m` with `|m|^2 = moved2`, where
+    `w` is `PRIOR_WEIGHT`.
 
     Args:
         play: px, below which a motion hardly counts.
@@ -38,7 +39,7 @@ def camera_stiffness(play: Any, moved2: Scalar) -> Scalar:
         >>> camera_stiffness(3.0, 16.0)
         4.0
     """
-    stiffness: Scalar = RARE / (play**2 + moved2)
+    stiffness: Scalar = PRIOR_WEIGHT / (play**2 + moved2)
     return stiffness
 
 
@@ -49,16 +50,16 @@ class CameraMotion(NamedTuple):
     own: Tensor
     slope: Tensor
 
-    def held(self, moved: Tensor, play: float | Tensor) -> "CameraMotion":
-        """With the loss `RARE / 2 log(play^2 + |m|^2)` of each view's motion `m` in `moved [B, 4 W]`: a camera rarely moves,
-        and then by any amount."""
+    def with_prior(self, moved: Tensor, play: float | Tensor) -> "CameraMotion":
+        """With the loss of `camera_stiffness` of each view's motion in `moved [B, 4 W]`: a camera rarely moves, and then by any
+        amount."""
         each = moved.unflatten(-1, (-1, 4))
         stiffness = camera_stiffness(play, each.square().sum(-1))[..., None].expand_as(each).flatten(-2)
         one = torch.eye(moved.shape[-1], dtype=moved.dtype, device=moved.device)
         own, slope = self.own + stiffness[..., None] * one, self.slope + stiffness * moved
         return CameraMotion(self.coupling, own, slope)
 
-    def eased(self, solved: Tensor, of_motion: Tensor) -> Tensor:
+    def eliminate_camera(self, solved: Tensor, of_motion: Tensor) -> Tensor:
         """`(M - B' T^-1 B)^-1` of loads whose `M^-1` is `solved [B, L, 3 N]`; `of_motion [B, 4, 3 N]`: that of the coupling."""
         share = solve_dense(self.own - self.coupling @ of_motion.mT, self.coupling @ solved.mT)
         eased: Tensor = solved + share.mT @ of_motion
@@ -76,12 +77,12 @@ class CameraMotion(NamedTuple):
         following = solve_dense(self.own - coupling[:, 3:], pulled)
         return loads[:, :3] + coupling[:, :3] @ following, following
 
-    def without(self, loads: Tensor, slopes: Tensor) -> Tensor:
+    def project_out(self, loads: Tensor, slopes: Tensor) -> Tensor:
         """Loads `[B, L, 3 N]` on the surface alone, of those that pull the camera by `slopes [B, L, 4 W]` as well."""
         kept: Tensor = loads - solve_dense(self.own, slopes.mT).mT @ self.coupling
         return kept
 
-    def turning(self, y: Tensor) -> Tensor:
+    def response(self, y: Tensor) -> Tensor:
         """`T^-1 B y`, `[B, L, 4 W]`, of fields `y [B, L, 3 N]`."""
         turned: Tensor = solve_dense(self.own, self.coupling @ y.mT).mT
         return turned

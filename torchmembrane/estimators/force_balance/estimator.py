@@ -36,21 +36,21 @@ from ...surface.projection import SurfacePoints
 from ..base import Deviations, Equilibrium, Estimator, Observation, Problem, StandardDeviations
 from ..contacts import Contacts
 from .contact_force import ContactForce
-from .gauss_newton import Descent, State
+from .gauss_newton import GaussNewton, State
 from .kernels.steps import compiled
-from .lever_bearings import bearings_of
-from .marker_residuals import Bearings, MarkerBearings, marker_rays, rest_rays, seen_from_origin
+from .lever_residuals import residuals_of
+from .marker_residuals import MarkerResiduals, MeasuredRays, marker_rays, rest_rays, seen_from_origin
 from .normal_equations import BalanceEquations
 from .pressure_gauge import gauge_reading, refuse_open
 from .settings import ForceBalanceSettings
 from .starts import Dent
-from .traction_loss import TractionLoss, stands_out
+from .traction_loss import TractionLoss, is_significant
 from .uncertainty import depths, gap_around, noise_effects, of_presses, shares_of_deepest, spreads, standard_deviations
 
-RESOLVED = 17
+MIN_RESOLVED_LINES = 17
 """Lines of a grid whose own error is small beside the markers'; a coarser one's grows as the square of its step."""
 
-ALONE = 3
+SINGLE_GRID_SETTLING_STEPS = 3
 """Last steps that are damped to settle, on a grid that none precedes and none follows."""
 
 
@@ -103,20 +103,20 @@ class ForceBalance(Estimator):
     ):
         settings, spacing = settings or ForceBalanceSettings(), membrane.size / (len(positions) // views) ** 0.5
         super().__init__(membrane, CavityLaw(membrane, rest_balance(membrane, elasticity)[0], filling, gas), settings, spacing)
-        self.size, self.coarseness = membrane.size, max(1.0, (RESOLVED - 1) / (min(membrane.grid) - 1)) ** 2
+        self.size, self.coarseness = membrane.size, max(1.0, (MIN_RESOLVED_LINES - 1) / (min(membrane.grid) - 1)) ** 2
         self._far = settings.far * self.coarseness
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
-        bearings = bearings_of(membrane, markers, positions, noise, rest, views, levers)
+        bearings = residuals_of(membrane, markers, positions, noise, rest, views, levers)
         others: dict[str, Any] = dict(rest=rest, filling=filling, gas=gas, views=views, levers=levers)
         self.coarse = self._coarser(membrane, elasticity, bearings, **others)
         self.refinement = None if self.coarse is None else Refinement(self.coarse.membrane.grid, membrane.grid)
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
-        self.descent = Descent(self.equations, self.cavity, settings)
-        self.dent = Dent(self.descent) if self.coarse is not None and self.coarse.coarse is None else None
-        self.settling = 1 if is_coarse or self.coarse is not None else ALONE
+        self.gauss_newton = GaussNewton(self.equations, self.cavity, settings)
+        self.dent = Dent(self.gauss_newton) if self.coarse is not None and self.coarse.coarse is None else None
+        self.settling = 1 if is_coarse or self.coarse is not None else SINGLE_GRID_SETTLING_STEPS
         first = settings.coarse_steps if is_coarse else settings.steps
         self.steps = first if self.coarse is None else settings.finer_steps if self.dent is None else settings.fine_steps
         rest = seen_from_origin(bearings.seen_at_rest) if rest is None else rest
@@ -130,7 +130,7 @@ class ForceBalance(Estimator):
         sensor = noise, problem.filling, problem.gas
         return cls(*surface, *sensor, settings, rest, problem.views, levers=problem.levers)
 
-    def _coarser(self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerBearings, **others: Any) -> Self | None:
+    def _coarser(self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerResiduals, **others: Any) -> Self | None:
         grid, positions = membrane.grid, bearings.positions
         if any(count % 2 == 0 or count < 2 * self.settings.coarsest - 1 for count in grid):
             return None
@@ -194,7 +194,7 @@ class ForceBalance(Estimator):
 
     def _patiently(self, *measured: Any) -> Equilibrium:
         """In many small steps: deep presses need them."""
-        return self._solved(Bearings(*measured), patient=True)
+        return self._solved(MeasuredRays(*measured), patient=True)
 
     @traced
     def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
@@ -204,11 +204,11 @@ class ForceBalance(Estimator):
         stands = self.is_converged(first) & self.is_explained(first) & is_worse
         return Equilibrium(*where_rows(done | stands | second.objective.isnan(), first, second))
 
-    def _solved(self, measured: Bearings, patient: bool = False) -> Equilibrium:
+    def _solved(self, measured: MeasuredRays, patient: bool = False) -> Equilibrium:
         state, before = self._stepped(measured, patient)
         return self.equilibrium(*state, before, measured)
 
-    def _stepped(self, measured: Bearings, patient: bool) -> tuple[State, Tensor]:
+    def _stepped(self, measured: MeasuredRays, patient: bool) -> tuple[State, Tensor]:
         """The state after all steps, on coarser grids too, and the surface before the last."""
         schedule = self.schedule(patient)
         last = schedule[-1:] * len(schedule)
@@ -217,23 +217,23 @@ class ForceBalance(Estimator):
             settling, damping = self.settling, self.settings.settling_damping
             if patient and self.coarse is not None:
                 settling, damping = self.settings.settling_steps, self.settings.patient_damping
-            found = self.descent(self._begun(measured, patient), measured, schedule, settling=settling, damping=damping)
+            found = self.gauss_newton(self._begun(measured, patient), measured, schedule, settling=settling, damping=damping)
         elif patient:
             quick, slow = (self._undented(measured, patient) for patient in (False, True))
-            found = self.dent.sought(quick, slow, self.at_rest(measured.weight), measured, last)
+            found = self.dent.best_of_starts(quick, slow, self.at_rest(measured.weight), measured, last)
         else:
-            found = self.descent(self.dent(*self._undented(measured), measured), measured, last)
+            found = self.gauss_newton(self.dent(*self._undented(measured), measured), measured, last)
         return found
 
-    def _begun(self, measured: Bearings, patient: bool) -> State:
+    def _begun(self, measured: MeasuredRays, patient: bool) -> State:
         """At what is found on the coarser grid, without one at rest."""
         if self.coarse is None:
             return self.at_rest(measured.weight)
         return State(*self.refined(*self.coarse._stepped(measured, patient)[0]))
 
-    def _undented(self, measured: Bearings, patient: bool = False) -> State:
+    def _undented(self, measured: MeasuredRays, patient: bool = False) -> State:
         """The state after a first step, whose pushes say where to dent it."""
-        return State(*self.descent(self._begun(measured, patient), measured, self.schedule(patient)[:1])[0])
+        return State(*self.gauss_newton(self._begun(measured, patient), measured, self.schedule(patient)[:1])[0])
 
     def schedule(self, patient: bool = False) -> list[tuple[float, float]]:
         """`tau` and `R` of every step on this grid; `patient`: a second time."""
@@ -268,20 +268,20 @@ class ForceBalance(Estimator):
         return self.rest_pressure - self.coarse.rest_pressure
 
     @traced
-    def equilibrium(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: Bearings) -> Equilibrium:
+    def equilibrium(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: MeasuredRays) -> Equilibrium:
         """What this state amounts to; `before`: the displacement a step earlier."""
         membrane, loss, x = self.membrane, self.equations.loss, self.membrane.rest + u
         step = (u - before).square().sum(-1).mean(-1).sqrt() / self.size
         traction = self.equations.forces(u, pressure) / membrane.rest_area[:, None]
         within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
-        judged, seen = loss(*within, measured.noise_level), measured.weight.sum(-1).clamp_min(1)
+        terms, seen = loss(*within, measured.noise_level), measured.weight.sum(-1).clamp_min(1)
         angles = self.equations.bearings.angles(u, measured, moved)[0]
-        unexplained = (self.descent.misfit(angles, pressure, measured) + judged.others) / seen
-        objective = unexplained + judged.pushes / seen
-        gain = self.descent.objective_at_rest(measured) / seen - objective
-        scale = 1 + pad_border(loss.contact_scale(judged, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
+        unexplained = (self.gauss_newton.misfit(angles, pressure, measured) + terms.others) / seen
+        objective = unexplained + terms.pushes / seen
+        gain = self.gauss_newton.objective_at_rest(measured) / seen - objective
+        scale = 1 + pad_border(loss.contact_scale(terms, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
         misfit, shared = self.equations.bearings.misfits(angles, measured, self.settings.outlier, self._far)
-        reasons = misfit, moved, objective, unexplained, loss.pushed(judged.push2), shared
+        reasons = misfit, moved, objective, unexplained, loss.pushed(terms.push2), shared
         return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *reasons)
 
     @traced
@@ -296,15 +296,15 @@ class ForceBalance(Estimator):
         return (found.relative_step < self.settings.settled_step) & self.is_converged(found) & self.is_explained(found)
 
     @traced
-    def is_done(self, found: Equilibrium, measured: Bearings) -> Tensor:
+    def is_done(self, found: Equilibrium, measured: MeasuredRays) -> Tensor:
         """`[B]` bool: settled, likely, no mound for a pit, hardly a marker outside, as beside a contact steps went past."""
         settings, (least, most, untouched) = self.settings, self.settings.likely_objective
         outlying = self.equations.bearings.outlying(found.vertices - self.membrane.rest, measured, found.moved, self._far)
         likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most)
-        pushed = (stands_out(found.reference / self.reference) & ~self.membrane.fixed).any(-1)
+        pushed = (is_significant(found.reference / self.reference) & ~self.membrane.fixed).any(-1)
         likely = torch.where(pushed, likely, untouched) * self.coarseness**2
         done: Tensor = self.is_settled(found) & (found.objective <= likely) & (outlying <= settings.largest_outlying)
-        return done if self.dents is None else done & ~self.dents.is_hollow(found, self.membrane)
+        return done if self.dents is None else done & ~self.dents.is_ring_shaped(found, self.membrane)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: markers off their rays by noise and the model's error alone, neighbours not alike, hardly a pull or shear
@@ -330,7 +330,7 @@ class ForceBalance(Estimator):
         net, state = (self, State(u, *whole)) if self.coarse is None else (self.coarse, self.coarsened(u, *whole))
         force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, u)
         with torch.no_grad():
-            spread = spreads(net.descent, self.settings, state, observation)
+            spread = spreads(net.gauss_newton, self.settings, state, observation)
             positions = self.equations.bearings.positions
             gap = gap_around(shares_of_deepest(depth), positions, observation.confidence, self.membrane)
         unseen = self.equations.loss.push_noise.mean() * self.reference * self.size**2

@@ -14,12 +14,12 @@ from ...solve.implicit import differentiable
 from ...solve.kkt import border_unknowns
 from ...solve.stencil import inner
 from .kernels.steps import NativeSteps, takes
-from .marker_residuals import Bearings
+from .marker_residuals import MeasuredRays
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
 from .robust import Cauchy
 from .settings import ForceBalanceSettings
-from .traction_loss import Judged
+from .traction_loss import LossTerms
 
 VERTICES = 9000
 """Of a batch's surfaces that are worked on at a time, but for a frame for every thread that takes steps by machine code: what a
@@ -46,7 +46,7 @@ class Scales(NamedTuple):
     damping: Tensor
 
 
-class Descent(nn.Module):
+class GaussNewton(nn.Module):
     """Reweighted Gauss-Newton steps by a schedule of the losses' scales.
 
     Args:
@@ -65,7 +65,7 @@ class Descent(nn.Module):
     def forward(
         self,
         state: State,
-        measured: Bearings,
+        measured: MeasuredRays,
         schedule: list[tuple[float, float]],
         cone: float | None = None,
         settling: int = 1,
@@ -98,7 +98,7 @@ class Descent(nn.Module):
         """The state after the steps, and the displacement before the last; `given`: what is measured, the steps' scales, how
         many of them settle."""
         *of_markers, rows, settling = given
-        measured, last = Bearings(*of_markers), rows[-settling:] if settling > 1 else []
+        measured, last = MeasuredRays(*of_markers), rows[-settling:] if settling > 1 else []
         state: Sequence[Any] = (u, pressure, moved, u, self._unweighted(u))
         first = rows[: len(rows) - len(last)]
         if self.is_native(*state, *of_markers):
@@ -124,19 +124,19 @@ class Descent(nn.Module):
         """The objective of no state, `[B]`."""
         return torch.full_like(pressure, torch.inf)
 
-    def objective(self, state: State, traction: Tensor, normal: Tensor, measured: Bearings) -> Tensor:
+    def objective(self, state: State, traction: Tensor, normal: Tensor, measured: MeasuredRays) -> Tensor:
         """What the last steps minimise, `[B]`: the misfit of the markers and of a gauge, and the loss of the tractions."""
-        judged: Judged = self.equations.loss(traction, normal, measured.noise_level)
+        terms: LossTerms = self.equations.loss(traction, normal, measured.noise_level)
         angles = self.equations.bearings.angles(state.u, measured, state.moved)[0]
-        return self.misfit(angles, state.pressure, measured) + judged.others + judged.pushes
+        return self.misfit(angles, state.pressure, measured) + terms.others + terms.pushes
 
-    def objective_at_rest(self, measured: Bearings) -> Tensor:
+    def objective_at_rest(self, measured: MeasuredRays) -> Tensor:
         """The same of the surface at rest and a camera that has not moved; there are no tractions."""
         still, none = torch.zeros_like(self.membrane.rest[None]), torch.zeros_like(measured.noise_level)
         angles = self.equations.bearings.angles(still, measured, none[:, None].expand(-1, measured.motion.shape[2]))[0]
         return self.misfit(angles, none + self.cavity.rest_pressure, measured)
 
-    def misfit(self, angles: Tensor, pressure: Tensor, measured: Bearings) -> Tensor:
+    def misfit(self, angles: Tensor, pressure: Tensor, measured: MeasuredRays) -> Tensor:
         """The part `[B]` of markers, seen at `angles [B, 2, D]`, and of a gauge."""
         misfit = measured.weight * angles.square().sum(1)
         of_markers: Tensor = Cauchy(self.settings.outlier).loss(misfit).sum(-1)
@@ -156,7 +156,7 @@ class Descent(nn.Module):
         moved: Tensor,
         before: Tensor,
         weights: Tensor,
-        measured: Bearings,
+        measured: MeasuredRays,
         *scales: float,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """The state, the displacement before, and the weights of normal tractions."""
@@ -177,7 +177,9 @@ class Descent(nn.Module):
         is_lower = objective < lowest
         return [*state, u, weights, *where_rows(is_lower, (*state, u, objective), (*kept, lowest))]
 
-    def _traced_once(self, state: State, weights: Tensor, measured: Bearings, scales: Sequence[float]) -> tuple[State, Tensor]:
+    def _traced_once(
+        self, state: State, weights: Tensor, measured: MeasuredRays, scales: Sequence[float]
+    ) -> tuple[State, Tensor]:
         """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.
 
         With gradients every step is: those of a nested region come with strides that torch 2.13 does not follow."""
@@ -190,10 +192,10 @@ class Descent(nn.Module):
         return taken
 
     @torch.compiler.nested_compile_region
-    def _compiled_once(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
+    def _compiled_once(self, state: State, weights: Tensor, measured: MeasuredRays, scales: Scales) -> tuple[State, Tensor]:
         return self.step(state, weights, measured, scales)
 
-    def step(self, state: State, weights: Tensor, measured: Bearings, scales: Scales) -> tuple[State, Tensor]:
+    def step(self, state: State, weights: Tensor, measured: MeasuredRays, scales: Scales) -> tuple[State, Tensor]:
         """One reweighted Gauss-Newton step, the volume linearised, the longest vertex step capped.
 
         Args:
@@ -214,7 +216,7 @@ class Descent(nn.Module):
         first, last = self.settings.tau
         blunt = (tau.clamp_max(first) / last) ** 2  # 1 as tau ends
         solved = self._solved(normal, loads, damping)
-        motion = motion.held(moved, self.settings.camera_motion * blunt)
+        motion = motion.with_prior(moved, self.settings.camera_motion * blunt)
         products, following = motion.eliminated(loads @ solved.mT)
         corner = pulled(corner, measured.gauge, pressure - self.cavity.rest_pressure)
         shares = self._shares(u, pressure, products, corner)

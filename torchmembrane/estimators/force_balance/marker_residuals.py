@@ -1,4 +1,4 @@
-"""Bearings: the angles between the markers' measured rays and where the surface has the markers."""
+"""Residuals of the markers: the angles between the markers' measured rays and where the surface has the markers."""
 
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ NEIGHBOURS = 4
 """Of a marker, that are asked whether they are off their rays alike."""
 
 
-class Bearings(NamedTuple):
+class MeasuredRays(NamedTuple):
     """Measured marker rays, and what a gauge reads.
 
     origins      `[B, 3, D]`
@@ -97,7 +97,7 @@ def _spread(across: Tensor) -> Tensor:
     return 1 / area
 
 
-class MarkerBearings(nn.Module):
+class MarkerResiduals(nn.Module):
     """The markers of a surface, and how they are seen off their measured rays.
 
     Args:
@@ -151,7 +151,7 @@ class MarkerBearings(nn.Module):
         return self.positions
 
     @traced
-    def measured(self, observation: Observation) -> Bearings:
+    def measured(self, observation: Observation) -> MeasuredRays:
         """The markers' rays as `angles` takes them."""
         origins, directions, confidence, across, motion, gauge = observation.to(self.positions.dtype)
         if across is None:
@@ -162,7 +162,7 @@ class MarkerBearings(nn.Module):
         excess = torch.where(found > 0, _spread(across) / self.rest_spread, 1.0).log()
         noise_level = (excess.sum(-1) / found.sum(-1).clamp_min(1) / 2).exp()
         turned = across.movedim(1, -1).contiguous(), confidence, noise_level, motion.movedim(1, -1).contiguous()
-        return Bearings(origins.mT.contiguous(), *turned, gauge)
+        return MeasuredRays(origins.mT.contiguous(), *turned, gauge)
 
     def markers(self, u: Tensor) -> Tensor:
         """The markers' positions on the surface displaced by `u [B, V, 3]`, `[B, D, 3]`: their displacement is bicubic between
@@ -170,12 +170,12 @@ class MarkerBearings(nn.Module):
         are not."""
         return self.positions + self.smooth_shares @ inner(u, self.grid)
 
-    def angles(self, u: Tensor, measured: Bearings, moved: Tensor) -> tuple[Tensor, Tensor]:
+    def angles(self, u: Tensor, measured: MeasuredRays, moved: Tensor) -> tuple[Tensor, Tensor]:
         """Angles across the measured rays `[B, 2, D]`, and the bearing Jacobian: their derivatives in the markers' positions,
         `[B, 2, 3, D]`; `moved [B, 4 W]`: of the views' cameras."""
         return self._seen(self.markers(u), measured, moved)
 
-    def _seen(self, places: Tensor, measured: Bearings, moved: Tensor) -> tuple[Tensor, Tensor]:
+    def _seen(self, places: Tensor, measured: MeasuredRays, moved: Tensor) -> tuple[Tensor, Tensor]:
         """As `angles`, of markers at `places [B, D, 3]`."""
         to_marker = places.mT - measured.origins
         distance = torch.linalg.vector_norm(to_marker, dim=1, keepdim=True)
@@ -217,7 +217,7 @@ class MarkerBearings(nn.Module):
         """`J^T w e [B, D, 2, 3, N]` of every marker by itself, its angles turned by `turned [B, D, 2, 2]` (noise, angle)."""
         return torch.einsum("bdra,bacd,dn->bdrcn", turned, weighted, self.vertex_shares)
 
-    def misfits(self, angles: Tensor, measured: Bearings, outlier: float, far: float) -> tuple[Tensor, Tensor]:
+    def misfits(self, angles: Tensor, measured: MeasuredRays, outlier: float, far: float) -> tuple[Tensor, Tensor]:
         """How far the markers are off their rays, in standard deviations, and as much of it as neighbours have in common.
 
         Args:
@@ -238,7 +238,7 @@ class MarkerBearings(nn.Module):
         shared = (here * beside).sum((1, 2)) / (weight * seen).sum(-1).clamp_min(1)
         return ((weight * counted).sum(-1) / weight.sum(-1).clamp_min(1)).sqrt(), shared.clamp_min(0).sqrt()
 
-    def outlying(self, u: Tensor, measured: Bearings, moved: Tensor, limit: float) -> Tensor:
+    def outlying(self, u: Tensor, measured: MeasuredRays, moved: Tensor, limit: float) -> Tensor:
         """The share `[B]` of the markers that are seen and more than `limit` standard deviations off their rays."""
         far = self.angles(u, measured, moved)[0].square().sum(1) > limit**2
         return (measured.weight * far).mean(-1)

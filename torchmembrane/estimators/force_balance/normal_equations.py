@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ...solve.stencil_system import Matrix, StencilSystem
 from .camera_motion import CameraMotion
 from .contact_force import ContactForce, Linearised
-from .marker_residuals import Bearings, MarkerBearings, weighed
+from .marker_residuals import MarkerResiduals, MeasuredRays, weighed
 from .robust import Cauchy
 from .traction_loss import Memory, TractionLoss
 
@@ -26,7 +26,7 @@ little holds it between its markers that float32 moves it by per cents of a pres
 class NormalEquations(NamedTuple):
     """`M = A^T W A + J^T w J`: the forces' tangent stiffness `A [B, 3, 3, 7, N]` and weights `W [B, 3, 3, N]`; the weighted
     bearing Jacobian `w J [B, 2, 3, D]` and the markers' blocks `J^T w J [B, 3, 3, D]`, in the markers' positions; `w [B, D]`.
-    Of markers that stand off the surface both are longer, as `LeverBearings` has them."""
+    Of markers that stand off the surface both are longer, as `LeverResiduals` has them."""
 
     stiffness: Tensor
     weights: Tensor
@@ -44,7 +44,7 @@ class BalanceEquations(nn.Module):
         loss: the loss of tractions.
     """
 
-    def __init__(self, forces: ContactForce, bearings: MarkerBearings, loss: TractionLoss):
+    def __init__(self, forces: ContactForce, bearings: MarkerResiduals, loss: TractionLoss):
         super().__init__()
         self.forces, self.bearings, self.loss = forces, bearings, loss
         self.system = StencilSystem(forces.membrane.grid, forces.inner_free > 0)
@@ -56,7 +56,7 @@ class BalanceEquations(nn.Module):
         u: Tensor,
         pressure: Tensor,
         moved: Tensor,
-        measured: Bearings,
+        measured: MeasuredRays,
         tau: Tensor | float,
         outlier: Tensor | float,
         cone: Tensor | float | None = None,
@@ -88,7 +88,7 @@ class BalanceEquations(nn.Module):
         of_force, of_volume = (weighted * v[:, None]).sum((2, 3)).unbind(1)
         return loads, (of_force, -of_volume)
 
-    def motion(self, normal: NormalEquations, measured: Bearings, angle: Tensor) -> CameraMotion:
+    def motion(self, normal: NormalEquations, measured: MeasuredRays, angle: Tensor) -> CameraMotion:
         """The camera's motion in the equations, with the angles `r [B, 2, D]`."""
         K, w = measured.motion, normal.marker_weights
         of_each = self.bearings.repeated(K)[:, :, :, None] * normal.weighted_jacobian[:, :, None]

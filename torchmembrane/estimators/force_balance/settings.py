@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from ...errors import MembraneError
 
-NARROWING = 1.3
+OUTLIER_DECAY_POWER = 1.3
 """Power of tau's decline with which that of the markers' scale goes: where tau begins it is twenty times the last."""
 
 
@@ -58,7 +58,7 @@ class ForceBalanceSettings:
         largest_relative_step: rms of the last step of a converged solution.
         largest_volume_error: volume error of a converged solution, over the rest volume.
         largest_misfit: rms of the markers' angles off their rays where a surface of this sensor explains them, over their
-            noise and the model's error; on grids of fewer than `force_balance.RESOLVED` lines more.
+            noise and the model's error; on grids of fewer than `force_balance.MIN_RESOLVED_LINES` lines more.
         misfit_of_press: so much more for a surface that has moved by its size (rms): the grid's error grows with the press.
         largest_unexplained: what is minimised but for the loss of pushes, over the markers seen, where a surface of this
             sensor explains them; as before.
@@ -150,4 +150,4 @@ class ForceBalanceSettings:
         """Scales of the losses in every step, graduated non-convexity: of compressive tractions (tau), of markers."""
         first, last = tau
         taus = [first * (last / first) ** min(1.0, k / (self.decline * (steps - 1))) for k in range(steps)]
-        return [(tau, self.outlier * (tau / last) ** NARROWING) for tau in taus]
+        return [(tau, self.outlier * (tau / last) ** OUTLIER_DECAY_POWER) for tau in taus]

@@ -15,9 +15,9 @@ from ...solve.stencil import pad_border
 from ...surface.membrane import Membrane
 from ..base import Equilibrium
 from ..precision import shortened
-from .gauss_newton import Descent, State
-from .marker_residuals import Bearings
-from .traction_loss import stands_out
+from .gauss_newton import GaussNewton, State
+from .marker_residuals import MeasuredRays
+from .traction_loss import is_significant
 
 DEPTH = 0.05  # over the surface's size
 WIDTH = 0.1  # standard deviation, over the size
@@ -39,39 +39,39 @@ class Dent(nn.Module):
     """Dents contacts in.
 
     Args:
-        descent: of the grid, which knows the pushes.
+        gauss_newton: of the grid, which knows the pushes.
     """
 
     around: Tensor
     area: Tensor
     free: Tensor
 
-    def __init__(self, descent: Descent):
+    def __init__(self, gauss_newton: GaussNewton):
         super().__init__()
-        self.descent, self.membrane = descent, descent.membrane
+        self.gauss_newton, self.membrane = gauss_newton, gauss_newton.membrane
         rest, size = self.membrane.rest, self.membrane.size
         self.register_buffer("around", shortened(torch.exp(-(torch.cdist(rest, rest) ** 2) / (2 * (REACH * size) ** 2))))
         self.register_buffer("area", self.membrane.rest_area / size**2)
         self.register_buffer("free", (~self.membrane.fixed).double())
 
     @traced
-    def forward(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
+    def forward(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays) -> State:
         """The state, its surface dented where the middle of the pushes around, weighted by their squares, is near."""
         return self._dented(u, pressure, moved, measured, DEPTH, WIDTH)
 
     @traced
-    def deep(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
+    def deep(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays) -> State:
         """The state, dented deeper."""
         return self._dented(u, pressure, moved, measured, *DEEP)
 
     @traced
-    def wide(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings) -> State:
+    def wide(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays) -> State:
         """The state, dented deeper and wider."""
         return self._dented(u, pressure, moved, measured, *WIDE)
 
-    def _dented(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: Bearings, depth: float, width: float) -> State:
-        membrane, loss = self.membrane, self.descent.equations.loss
-        push2 = loss.parts(*self.descent.tractions(u, pressure))[2]
+    def _dented(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays, depth: float, width: float) -> State:
+        membrane, loss = self.membrane, self.gauss_newton.equations.loss
+        push2 = loss.parts(*self.gauss_newton.tractions(u, pressure))[2]
         weight = (pad_border(push2[..., None], membrane.grid)[..., 0] + TINY) * self.area
         middle = (weight[..., None] * membrane.rest).mT @ self.around / (weight @ self.around)[:, None]
         off2 = (middle.mT - membrane.rest).square().sum(-1) / membrane.size**2
@@ -80,12 +80,12 @@ class Dent(nn.Module):
         inwards = depth * membrane.size * share * torch.exp(-off2 / (2 * width**2)) * self.free
         return State(u - inwards[..., None] * membrane.normals(membrane.rest + u), pressure, moved)
 
-    def is_hollow(self, found: Equilibrium, membrane: Membrane) -> Tensor:
+    def is_ring_shaped(self, found: Equilibrium, membrane: Membrane) -> Tensor:
         """`[B]` bool: hardly anything pushes in the middle of what pushes, as where a mound ringed by pushes stands for a pit,
         or two contacts are close; `membrane`: of the finer grid it is found on."""
-        p0 = self.descent.equations.loss.reference
+        p0 = self.gauss_newton.equations.loss.reference
         pushes = (-(found.traction * membrane.normals(found.vertices)).sum(-1) / p0).clamp_min(0)
-        pushes = torch.where(stands_out(found.reference / p0), pushes, 0.0)
+        pushes = torch.where(is_significant(found.reference / p0), pushes, 0.0)
         lines = (membrane.grid[0] - 1) // (self.membrane.grid[0] - 1)
         pushes = pushes.unflatten(1, membrane.grid)[:, ::lines, ::lines].flatten(1) + TINY
         rest, size = self.membrane.rest, self.membrane.size
@@ -95,24 +95,24 @@ class Dent(nn.Module):
         near = torch.exp(-off2 / (2 * MIDDLE**2)) * self.area
         return torch.lt((near * pushes).sum(-1) / near.sum(-1), HOLLOW * pushes.amax(-1))
 
-    def sought(self, quick: State, slow: State, rest: State, measured: Bearings, schedule: Schedule) -> Found:
+    def best_of_starts(self, quick: State, slow: State, rest: State, measured: MeasuredRays, schedule: Schedule) -> Found:
         """The best of what the steps of a schedule make of several dents in two states and of two states found from `rest` on
         this grid, and the displacement a step before; the first of those that are about as good, for answers must not jump
         between them. The two from rest: by a sharp loss from the start, and without a cone, where shear is dear even under a
         push."""
-        settings = self.descent.settings
+        settings = self.gauss_newton.settings
         steps = 2 * settings.steps
         starts = [
             self(*slow, measured),
             self.deep(*slow, measured),
             self.wide(*slow, measured),
             self.deep(*quick, measured),
-            self.descent(rest, measured, settings.gnc_schedule(steps, settings.sharp_tau))[0],
-            self.descent(rest, measured, settings.gnc_schedule(steps, settings.tau), cone=0.0)[0],
+            self.gauss_newton(rest, measured, settings.gnc_schedule(steps, settings.sharp_tau))[0],
+            self.gauss_newton(rest, measured, settings.gnc_schedule(steps, settings.tau), cone=0.0)[0],
         ]
 
-        def stepped(start: Sequence[Tensor], measured: Bearings) -> Sequence[Tensor]:
-            state, before = self.descent(State(*start), measured, schedule)
+        def stepped(start: Sequence[Tensor], measured: MeasuredRays) -> Sequence[Tensor]:
+            state, before = self.gauss_newton(State(*start), measured, schedule)
             return *state, before
 
         best, *others = stacked(stepped, starts, measured)
@@ -121,10 +121,11 @@ class Dent(nn.Module):
         return State(*best[:3]), best[3]
 
     @traced
-    def lower(self, kept: Stepped, other: Stepped, measured: Bearings) -> Stepped:
+    def lower(self, kept: Stepped, other: Stepped, measured: MeasuredRays) -> Stepped:
         """`other` in the rows where its objective is lower than that of `kept`, or `kept` has none."""
         of_kept, of_other = (
-            self.descent.objective(State(*each[:3]), *self.descent.tractions(*each[:2]), measured) for each in (kept, other)
+            self.gauss_newton.objective(State(*each[:3]), *self.gauss_newton.tractions(*each[:2]), measured)
+            for each in (kept, other)
         )
         is_lower = of_other < torch.where(of_kept.isnan(), torch.inf, LOWER * of_kept)
         u, pressure, moved, before = where_rows(is_lower, other, kept)

@@ -29,7 +29,7 @@ from .robust import GemanMcClure, PseudoHuber
 from .settings import ForceBalanceSettings
 
 POWER = 4  # of squared pushes, in the mean that stands for the largest around
-BEYOND = 1e6  # over p0: no push comes near it
+NO_CONTACT_SCALE = 1e6  # over p0: no push comes near it
 NEGLIGIBLE = 1e-6  # weight of a vertex far away, over that of the one in the middle
 TINY = 1e-12  # keeps roots and quotients of what vanishes finite
 
@@ -37,7 +37,7 @@ Memory = tuple[Tensor, Tensor | float]
 """The weights `w_n [B, N]` of the step before, and the share of a step's own in their geometric mean."""
 
 
-class Judged(NamedTuple):
+class LossTerms(NamedTuple):
     """Of tractions at the last scale: `push2` `S^2 [B, N]`, `scale2` `rho^2 [B, N]`, and the loss `[B]` in two parts, of the
     `pushes`, and of the `others`, pulls and shear."""
 
@@ -111,18 +111,18 @@ class TractionLoss(nn.Module):
         least = (settings.decrease * (tau / last - 1) + settings.least_scale).clamp_max(1.0)
         return (expected / last**2).maximum(least**2).clamp_max(1.0)
 
-    def contact_scale(self, judged: Judged, noise_level: Tensor, gain: Tensor) -> Tensor:
+    def contact_scale(self, terms: LossTerms, noise_level: Tensor, gain: Tensor) -> Tensor:
         """What a push that is a contact is measured against, over `p0`, `[B, N]`: `rho`, or where noise explains it, or
-        all that is found, `BEYOND`.
+        all that is found, `NO_CONTACT_SCALE`.
 
         Args:
-            judged: the tractions of a solution.
+            terms: the tractions of a solution.
             noise_level: `[B]`, of the frames over that at rest.
             gain: `[B]`, by how much the objective is below that of the surface at rest, over the markers seen.
         """
-        above = judged.push2 > (self.settings.contact_noise * noise_level[:, None] * self.push_noise).square()
+        above = terms.push2 > (self.settings.contact_noise * noise_level[:, None] * self.push_noise).square()
         above = above & (gain > self.settings.evidence * self.noise_gain)[:, None]
-        return torch.where(above, judged.scale2.sqrt(), BEYOND)
+        return torch.where(above, terms.scale2.sqrt(), NO_CONTACT_SCALE)
 
     def weights(
         self,
@@ -161,7 +161,7 @@ class TractionLoss(nn.Module):
         along = (scale * (w_n - w_t))[:, None] * normal
         return along[:, :, None] * normal[..., None, :, :] + (scale * w_t)[:, None, None] * one, w_n
 
-    def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> Judged:
+    def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> LossTerms:
         """The loss of tractions `[B, 3, N]` at the last scale `tau`, each push judged by itself."""
         q_n, shear2, push2 = self.parts(traction, normal)
         rho2 = self.scale2(push2, noise_level, self.settings.tau[-1])
@@ -169,12 +169,12 @@ class TractionLoss(nn.Module):
         pushes = GemanMcClure(self.settings.tau[-1]).loss((-q_n).clamp_min(0) ** 2)
         others = q_n.clamp_min(0) ** 2 / 2 + self.shear_weight(push2 / rho2) * self.shear.loss(shear2)
         unit = self.settings.sparsity / self.size**2 * self.area
-        return Judged(push2, rho2, pushes @ unit, others @ unit)
+        return LossTerms(push2, rho2, pushes @ unit, others @ unit)
 
 
-def stands_out(scale: Tensor) -> Tensor:
+def is_significant(scale: Tensor) -> Tensor:
     """Bool, of the shape of a `contact_scale`: where noise does not explain a push."""
-    return scale < BEYOND / 2
+    return scale < NO_CONTACT_SCALE / 2
 
 
 def _gaussian_mean(membrane: Membrane, reach: float) -> Tensor:

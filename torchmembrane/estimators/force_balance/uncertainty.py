@@ -21,9 +21,9 @@ grid, which costs little and knows as much. Every marker's noise is what the sol
 displacements in it for the grid and the material; but these err together over many markers, so the spread is too small. What is
 missing was fitted to presses of random sensors (`bench/accuracy/intervals.py`), as standard deviations that add up:
 
-    of the force    FORCE x spread,  FORCE_SHARE of the force along itself,  AT_RIM of it where a contact reaches the rim,
-                    where no contact is found UNSEEN of what a patch as pushed as the noise pushes would bear
-    of the depth    spread,  DEPTH sqrt(spread gap),  DIP gap (gap + 2 depth) / size
+    of the force    FORCE x spread,  FORCE_SHARE of the force along itself,  RIM_ERROR of it where a contact reaches the rim,
+                    where no contact is found UNDETECTED of what a patch as pushed as the noise pushes would bear
+    of the depth    spread,  DEPTH sqrt(spread gap),  SAG gap (gap + 2 depth) / size
 
 with `gap` the distance to the markers around the deepest point. What lies between them is not seen: it may dip as much further
 as the surface's curvature and the dent's make of `gap`. The mean of spread and gap has no such reason: it is what fits.
@@ -45,8 +45,8 @@ from ..base import Deviations, Observation, StandardDeviations
 from ..contacts import Contacts
 from .camera_motion import CameraMotion
 from .contact_force import Linearised
-from .gauss_newton import Descent, State
-from .marker_residuals import Bearings
+from .gauss_newton import GaussNewton, State
+from .marker_residuals import MeasuredRays
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import pulled
 from .settings import ForceBalanceSettings
@@ -77,7 +77,7 @@ def linearise(
     equations: BalanceEquations,
     cavity: CavityLaw,
     state: State,
-    measured: Bearings,
+    measured: MeasuredRays,
     scales: tuple[float, float],
     play: float,
     curvature: bool = False,
@@ -97,13 +97,13 @@ def linearise(
     vWv = pulled(corner, measured.gauge, state.pressure - cavity.rest_pressure)[1]
     factor, membrane = equations.system.factor(equations.matrix(normal)), equations.forces.membrane
     compliance = cavity.condition(membrane.volume(membrane.rest + state.u) - membrane.rest_volume, state.pressure)[1]
-    motion = motion.held(state.moved, play)
+    motion = motion.with_prior(state.moved, play)
     of_motion = equations.system.substitute(factor, motion.coupling)
     closed = cavity.filling != "open"
     one = torch.eye(3, dtype=state.u.dtype, device=state.u.device)[None, ..., None].expand(1, 3, 3, at.force.shape[-1])
     of_force = equations.forces.change(at.stiffness, one).flatten(2)
     solution = LinearisedSolution(
-        lambda loads: motion.eased(equations.system.substitute(factor, loads), of_motion),
+        lambda loads: motion.eliminate_camera(equations.system.substitute(factor, loads), of_motion),
         torch.stack([loads[:, 2], loads[:, 0]], 1),
         (vWv, compliance.expand_as(vWv)) if closed else None,
         of_force,
@@ -140,13 +140,13 @@ def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observat
 
 
 def noise_loads(
-    equations: BalanceEquations, normal: NormalEquations, measured: Bearings, motion: CameraMotion, turned: Tensor
+    equations: BalanceEquations, normal: NormalEquations, measured: MeasuredRays, motion: CameraMotion, turned: Tensor
 ) -> Tensor:
     """What noise adds to the equations, the camera's motion eliminated: `[B, 2 D, 3 N]`, of independent noises that turn each
     marker's angles by `turned [B, D, 2, 2]` (noise, angle): `J^T w e - B' T^-1 K^T w e`."""
     loads = equations.bearings.loads_alone(turned, normal.weighted_jacobian)
     slopes = torch.einsum("bdra,bakd,bd->bdrk", turned, measured.motion, normal.marker_weights)
-    return motion.without(loads.flatten(3).flatten(1, 2), slopes.flatten(1, 2))
+    return motion.project_out(loads.flatten(3).flatten(1, 2), slopes.flatten(1, 2))
 
 
 def changes(solution: LinearisedSolution, noise_loads: Tensor) -> tuple[Tensor, Tensor]:
@@ -212,8 +212,8 @@ def _root_sum_square(changes: Tensor) -> Tensor:
     return changes.square().sum(1).sqrt()
 
 
-FORCE, FORCE_SHARE, AT_RIM, UNSEEN = 0.85, 0.026, 0.12, 0.002
-DEPTH, DIP = 0.43, 0.23
+FORCE, FORCE_SHARE, RIM_ERROR, UNDETECTED = 0.85, 0.026, 0.12, 0.002
+DEPTH, SAG = 0.43, 0.23
 AROUND = 4
 """Markers around a point."""
 FINE = 25
@@ -244,8 +244,8 @@ def of_presses(
     of_force, of_depth = (coarse * spread for spread in noise)
     none = (~contacts.points[..., 0].isfinite().any(1)).to(depth.dtype)
     at_rim = (contacts.at_rim == 1).any(1).to(depth.dtype)
-    around = (AT_RIM * at_rim).square() * force.square().sum(-1) + (UNSEEN * unseen * none).square()
-    dip = DIP * gap * (gap + 2 * depth) / membrane.size
+    around = (RIM_ERROR * at_rim).square() * force.square().sum(-1) + (UNDETECTED * unseen * none).square()
+    dip = SAG * gap * (gap + 2 * depth) / membrane.size
     return Deviations(
         ((FORCE * of_force).square() + FORCE_SHARE**2 * force.square() + around[:, None]).sqrt(),
         (of_depth.square() + DEPTH**2 * of_depth * gap + dip.square()).sqrt(),
@@ -280,17 +280,19 @@ def shares_of_deepest(depth: Tensor) -> Tensor:
     return shares
 
 
-def spreads(descent: Descent, settings: ForceBalanceSettings, state: State, observation: Observation) -> tuple[Tensor, Tensor]:
+def spreads(
+    gauss_newton: GaussNewton, settings: ForceBalanceSettings, state: State, observation: Observation
+) -> tuple[Tensor, Tensor]:
     """Of the force `[B, 3]` and the depth `[B]` at a solution, by the noise that the solve takes the markers to have."""
-    measured = descent.equations.bearings.measured(observation)
-    if descent.is_native(*state, *measured):
-        both = descent.native.spread(descent.equations, descent.cavity, state, measured, settings.outlier)
+    measured = gauss_newton.equations.bearings.measured(observation)
+    if gauss_newton.is_native(*state, *measured):
+        both = gauss_newton.native.spread(gauss_newton.equations, gauss_newton.cavity, state, measured, settings.outlier)
         return both[:, :3], both[:, 3]
-    return spreads_by_tensors(descent.equations, descent.cavity, settings, state, measured)
+    return spreads_by_tensors(gauss_newton.equations, gauss_newton.cavity, settings, state, measured)
 
 
 def spreads_by_tensors(
-    equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, state: State, measured: Bearings
+    equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings, state: State, measured: MeasuredRays
 ) -> tuple[Tensor, Tensor]:
     """The same by tensor operations."""
     membrane = equations.forces.membrane
@@ -309,7 +311,7 @@ def spreads_of(
     equations: BalanceEquations,
     normal: NormalEquations,
     solution: LinearisedSolution,
-    measured: Bearings,
+    measured: MeasuredRays,
     wanted: Tensor,
     by_pressure: Tensor,
 ) -> Tensor:
@@ -329,7 +331,7 @@ def spreads_of(
         of_gauge = of_gauge if solution.gauge is None else rise * solution.gauge[:, None]
     at_markers = y.unflatten(-1, (3, -1)) @ equations.bearings.vertex_shares.mT
     of_angles = equations.bearings.joined((normal.weighted_jacobian[:, None] * at_markers[:, :, None]).sum(3))
-    of_camera = solution.motion.turning(y)[..., None, :, None] * normal.marker_weights[:, None, None, None]
+    of_camera = solution.motion.response(y)[..., None, :, None] * normal.marker_weights[:, None, None, None]
     of_markers = (of_angles - (measured.motion[:, None] * of_camera).sum(3)).square().sum((2, 3))
     spread: Tensor = (of_markers + of_gauge.square()).sqrt()
     return spread

@@ -231,7 +231,7 @@ def _add_products(total, first, count, a, of_a, b, of_b, at):
 
 @compiled
 def load_markers(c, work, u, moved, seen, outlier, own, slope):
-    """`MarkerBearings.angles` and what they add to the loads and to the camera's equations, `own [4, 4]` and `slope [4]`; the
+    """`MarkerResiduals.angles` and what they add to the loads and to the camera's equations, `own [4, 4]` and `slope [4]`; the
     markers' blocks.
 
     `seen`: origins `[3, D]`, across `[2, 3, D]`, weight `[D]`, motion `[2, 4, D]`."""
@@ -273,7 +273,7 @@ def load_markers(c, work, u, moved, seen, outlier, own, slope):
 
 @compiled
 def _place(c, u, d, place):
-    """`MarkerBearings.markers`: where marker d is on the surface."""
+    """`MarkerResiduals.markers`: where marker d is on the surface."""
     n, (numbers, shares) = c.surface.free.shape[1], c.smooth
     for a in range(3):
         place[a] = c.positions[d, a]

@@ -1,7 +1,7 @@
-"""A step of force balance by machine code: what `Descent.step` does, frame by frame, without gradients.
+"""A step of force balance by machine code: what `GaussNewton.step` does, frame by frame, without gradients.
 
 On a processor the tensor operations of a step, some six hundred, take longer to begin than to work.
-The formulas are those of `descent`, `camera_motion`, `cavity` and `kkt`.
+The formulas are those of `gauss_newton`, `camera_motion`, `cavity` and `kkt`.
 """
 
 import numpy as np
@@ -126,7 +126,7 @@ def _camera_eliminated(k, products, own, slope, moved, tau):
 
 @compiled
 def _shares(k, products, rise, pressure, fWv, vWv, gauge):
-    """`Descent._shares`: of the volume's multiplier, the forces and the pressure's change in a step."""
+    """`GaussNewton._shares`: of the volume's multiplier, the forces and the pressure's change in a step."""
     if k.is_open:
         return 0.0, 1.0, 0.0
     fWv, vWv = fWv - gauge[1] * (pressure - k.rest_pressure - gauge[0]), vWv + gauge[1]
@@ -154,7 +154,7 @@ def border_unknowns(products, vWv, compliance, of_fluid, of_volume):
 
 @compiled
 def _share(c, u, move):
-    """`Descent._share`: so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
+    """`GaussNewton._share`: so that no vertex goes far and no line of the grid is stretched or shrunk by much."""
     (m, n), rest, k, tiny = c.surface.free.shape, c.surface.rest, c.numbers, 1e-30
     far2, stretch2 = 0.0, 0.0
     here = np.zeros(3)

@@ -16,7 +16,7 @@ from ....mechanics.native_membrane import Surface, surface_of
 from ....solve import native_band, symmetric_2x2
 from ....solve.stencil import inner
 from .. import camera_motion, robust
-from ..marker_residuals import Bearings
+from ..marker_residuals import MeasuredRays
 from ..normal_equations import DAMPING, BalanceEquations
 from . import equations, gauss_newton, spread
 from .equations import Constants, Numbers, Workspace, workspace
@@ -41,11 +41,11 @@ class NativeSteps:
         cavity: CavityLaw,
         state: tuple[Tensor, Tensor, Tensor],
         weights: Tensor,
-        measured: Bearings,
+        measured: MeasuredRays,
         rows: Sequence[Sequence[float]],
     ) -> list[Tensor]:
         """Displacement, pressure and camera after the steps, the displacement before the last, and the weights; arguments as of
-        `Descent.step`, `rows`: the numbers of every step."""
+        `GaussNewton.step`, `rows`: the numbers of every step."""
         constants, fixed = self._prepared(equations, cavity, measured)
         changing = [value.clone(memory_format=torch.contiguous_format) for value in (*state, weights)]
         changing.append(changing[0].clone())
@@ -63,7 +63,7 @@ class NativeSteps:
         equations: BalanceEquations,
         cavity: CavityLaw,
         state: tuple[Tensor, Tensor, Tensor],
-        measured: Bearings,
+        measured: MeasuredRays,
         outlier: float,
     ) -> Tensor:
         """Standard deviations of force and depth, `[B, 4]`; arguments as of `deviations.spreads`."""
@@ -76,7 +76,7 @@ class NativeSteps:
         return torch.from_numpy(found)
 
     def _prepared(
-        self, equations: BalanceEquations, cavity: CavityLaw, measured: Bearings
+        self, equations: BalanceEquations, cavity: CavityLaw, measured: MeasuredRays
     ) -> tuple[Constants, list[np.ndarray]]:
         """What is constant, and what is measured, as arrays."""
         gauge = torch.zeros_like(measured.motion[:, 0, :2, 0]) if measured.gauge is None else measured.gauge
@@ -195,8 +195,8 @@ def _entry(sources: str) -> Any:
         steps; `before [B, m, n, 3]` the displacement before the last; `found [B, 4]` the standard deviations of force and depth
         by the last of the rows, with which no step is taken; `[0, 4]` where they are not asked for.
 
-        c: `Constants`, work: a `Workspace`, origins to gauge: `Bearings`, rows: of every step tau, outlier, cone, renewal and
-        damping, `[S, 5]`.
+        c: `Constants`, work: a `Workspace`, origins to gauge: `MeasuredRays`, rows: of every step tau, outlier, cone, renewal
+        and damping, `[S, 5]`.
         """
         count = len(rows) - (len(found) > 0)
         for b in range(len(u) if sources else 0):

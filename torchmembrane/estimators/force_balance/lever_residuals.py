@@ -1,4 +1,4 @@
-"""Bearings of markers that stand off the surface: the angles of their tips, which turn with the surface under them.
+"""Residuals of markers that stand off the surface: the angles of their tips, which turn with the surface under them.
 
 A tip `x + h n` follows three fields of the surface's displacement: the displacement itself and its derivatives along the grid's
 two directions, which turn the tangents. With the dual basis `a*, b*` of these and the Jacobian `J` of the angles in a place
@@ -24,7 +24,7 @@ from ...surface.levers import Levers
 from ...surface.membrane import Membrane
 from ...surface.projection import SurfacePoints
 from ..base import Observation
-from .marker_residuals import Bearings, MarkerBearings
+from .marker_residuals import MarkerResiduals, MeasuredRays
 
 FIELDS = 3
 """That a tip follows: displacement, and its two derivatives."""
@@ -37,16 +37,16 @@ QUADRATIC = 0.5 * np.array(
 """`[2, 3, 7]`: from a field at the vertices of `STENCIL` its two derivatives, and theirs in both directions."""
 
 
-class LeverBearings(MarkerBearings):
+class LeverResiduals(MarkerResiduals):
     """The tips of markers that stand off a surface, and how they are seen off their measured rays.
 
     Args:
         membrane: the rest surface on the solver's grid.
         markers: the markers' feet as points of it.
         positions: `[D, 3]` their rest positions.
-        noise: as of `MarkerBearings`.
+        noise: as of `MarkerResiduals`.
         rest: the tips' rays at rest; None: from the origin, with that noise.
-        views: as of `MarkerBearings`.
+        views: as of `MarkerResiduals`.
         levers: `[D, 3]`, from feet to tips at rest.
     """
 
@@ -90,7 +90,7 @@ class LeverBearings(MarkerBearings):
         """The tips at rest, `[D, 3]`."""
         return self.tips_at_rest
 
-    def angles(self, u: Tensor, measured: Bearings, moved: Tensor) -> tuple[Tensor, Tensor]:
+    def angles(self, u: Tensor, measured: MeasuredRays, moved: Tensor) -> tuple[Tensor, Tensor]:
         """Angles of the tips across the measured rays, `[B, 2, D]`, and their Jacobians `[B, 2, 3, 3 D]`."""
         levers, normal, dual = self.levers(u)
         angle, jacobian = self._seen(self.markers(u) + levers, measured, moved)
@@ -117,18 +117,18 @@ class LeverBearings(MarkerBearings):
         return blocks
 
     def near(self, blocks: Tensor) -> Tensor:
-        """As of `MarkerBearings`, at all `OFFSETS`."""
+        """As of `MarkerResiduals`, at all `OFFSETS`."""
         zero = torch.zeros_like(blocks[..., :1])
         each = torch.cat([blocks, zero], -1).index_select(3, self.sources.flatten())
         near: Tensor = each.unflatten(3, self.sources.shape).sum(-1).unflatten(3, (len(OFFSETS), -1))
         return near
 
     def diagonal(self, blocks: Tensor) -> Tensor:
-        """As of `MarkerBearings`."""
+        """As of `MarkerResiduals`."""
         return self.near(blocks)[:, :, :, 0].diagonal(dim1=1, dim2=2).mT
 
     def product(self, blocks: Tensor, u: Tensor) -> Tensor:
-        """As of `MarkerBearings`: by the blocks at the `OFFSETS`, and by their transposes the other way."""
+        """As of `MarkerResiduals`: by the blocks at the `OFFSETS`, and by their transposes the other way."""
         grid = self.grid[0] - 2, self.grid[1] - 2
         near, field, parts = self.near(blocks).unflatten(-1, grid), u.unflatten(-1, grid), []
         for k, (i, j) in enumerate(OFFSETS):
@@ -140,12 +140,12 @@ class LeverBearings(MarkerBearings):
         return torch.stack(parts).sum(0).flatten(-2)
 
     def loads_alone(self, turned: Tensor, weighted: Tensor) -> Tensor:
-        """As of `MarkerBearings`."""
+        """As of `MarkerResiduals`."""
         weighted, shares = (each.unflatten(axis, (FIELDS, -1)) for each, axis in ((weighted, -1), (self.vertex_shares, 0)))
         return torch.einsum("bdra,bacpd,pdn->bdrcn", turned, weighted, shares)
 
 
-def bearings_of(
+def residuals_of(
     membrane: Membrane,
     markers: SurfacePoints,
     positions: Tensor,
@@ -153,10 +153,10 @@ def bearings_of(
     rest: Observation | None,
     views: int,
     levers: Tensor | None,
-) -> MarkerBearings:
-    """The bearings of markers on a surface, or of tips where there are `levers`; arguments as of `LeverBearings`."""
+) -> MarkerResiduals:
+    """The residuals of markers on a surface, or of tips where there are `levers`; arguments as of `LeverResiduals`."""
     given = membrane, markers, positions, noise, rest, views
-    return MarkerBearings(*given) if levers is None else LeverBearings(*given, levers)
+    return MarkerResiduals(*given) if levers is None else LeverResiduals(*given, levers)
 
 
 def _ring_shares(membrane: Membrane, markers: SurfacePoints) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,7 @@
 import difflib
 from collections.abc import Iterable
 
-MEANT = {
+ALIASES = {
     "spherical_cap": ("half_sphere", "hemisphere", "sphere", "dome", "bubble", "cap", "spherical"),
     "ellipsoid_cap": ("half_ellipsoid", "ellipsoid", "fingertip", "finger"),
     "half_cylinder": ("cylinder", "cylindrical", "semi_cylinder", "tube"),
@@ -69,7 +69,7 @@ def did_you_mean(word: object, choices: Iterable[str], otherwise: str = "") -> s
         ("did you mean 'spherical_cap' (half a sphere has rim_radius = height)?", "did you mean 'neo_hookean'?")
     """
     plain, choices = str(word).strip().lower().replace("-", "_").replace(" ", "_"), list(choices)
-    known = [choice for choice in choices if plain == choice or plain in MEANT.get(choice, ())]
+    known = [choice for choice in choices if plain == choice or plain in ALIASES.get(choice, ())]
     found = known or difflib.get_close_matches(plain, choices, 1)
     if not found:
         return otherwise
