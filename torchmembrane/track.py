@@ -214,8 +214,8 @@ class Tracker:
     def _watch_from(self, rest_covariance: Tensor) -> None:
         """Begin to look for a drift from a rest state with this noise, `[N, 2, 2]` px^2."""
         observer = self.reconstructor.observer
-        rest = observer.rest_pixels, rest_covariance, observer.seen_at_rest, *self.reconstructor.camera.image_sizes
-        self._watch, self._steady, self._said = DriftWatch(*rest), DriftWatch(*rest), False
+        rest, sizes = (observer.rest_pixels, rest_covariance, observer.seen_at_rest), self.reconstructor.camera.image_sizes
+        self._watch, self._steady, self._said = DriftWatch(*rest, *sizes), DriftWatch(*rest, *sizes), False
 
     def is_pressed(self, result: Reconstruction) -> bool:
         """Whether the one frame of a result has a contact that is neither a moved camera's nor a drift that frames without one

@@ -1,7 +1,7 @@
 """Comparison of a model with the reconstructor from which it was exported, on images of the sensor at rest and pressed."""
 
 from copy import deepcopy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import onnxruntime
@@ -66,7 +66,7 @@ def check_images(reconstructor: Reconstructor) -> Tensor:
     at rest where its simulator finds no press."""
     simulator = Simulator(reconstructor.sensor)
     rest = simulator.images(simulator.membrane.rest, np.random.default_rng(REST_NOISE))
-    frames = [rest]
+    frames: list[Any] = [rest]
     try:
         with torch.enable_grad():  # the simulator's, whatever the caller's
             pressed = random_frame(simulator, Plan(kinds=("sphere",)), 0)
@@ -89,10 +89,11 @@ def compare(model: bytes, reconstructor: Reconstructor, images: Tensor) -> Agree
     expected_status: list[int] = []
     distances = [0.0]
     before = images.new_full((len(images), *reconstructor.rest_pixels.shape), torch.nan) if tracks else None
-    given = [image.numpy() for image in (reconstructor.observer.images(images) if len(names) > 1 else [images])]
+    observer: Any = reconstructor.observer
+    given = [image.numpy() for image in (observer.images(images) if len(names) > 1 else [images])]
     for _ in range(2 if tracks else 1):
         with torch.no_grad():
-            sighted = None if before is None else reconstructor.observer.sighted(before)
+            sighted = None if before is None else observer.sighted(before)
             expected = reconstructor.reconstruct_grey(images, sighted)
         feed = dict(zip(names, given, strict=True)) | ({} if before is None else {"previous_pixels": before.numpy()})
         for frames in (len(images), 1):
