@@ -43,7 +43,7 @@ def test_what_holds_the_camera_is_the_slope_of_its_loss():
     loss = PRIOR_WEIGHT / 2 * torch.log(0.1**2 + moved.square().sum())
     (slope,) = torch.autograd.grad(loss, moved)
     none = CameraMotion(torch.zeros(1, 4, 3), torch.zeros(1, 4, 4), torch.zeros(1, 4))
-    held = none.held(moved.detach(), 0.1)
+    held = none.with_prior(moved.detach(), 0.1)
     torch.testing.assert_close(held.slope, slope)
     assert torch.linalg.eigvalsh(held.own).min() > 0
 

@@ -11,7 +11,16 @@ from PIL import Image
 from torchmembrane import Camera, MembraneError
 from torchmembrane.files.bayer import PATTERNS, demosaiced
 from torchmembrane.files.images import GREY
-from torchmembrane.integrations.messages import MOSAICS, PLANES, grey_of, info_topic, mode_of, projected, size_of, unlike
+from torchmembrane.integrations.messages import (
+    MOSAICS,
+    PLANES,
+    camera_mismatch,
+    grey_of,
+    info_topic,
+    mode_of,
+    projected,
+    size_of,
+)
 
 SIZE = WIDTH, HEIGHT = 10, 6
 LEVELS = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH), np.uint8)
@@ -225,7 +234,7 @@ def test_region_and_binning_see_what_a_camera_in_that_mode_sees(lens, mode):
     rays = camera.pixel_to_ray(torch.from_numpy(pixels)).direction.numpy()
     assert mode_of(info).size == camera.image_size
     np.testing.assert_allclose(projected(info, rays), pixels, atol=1e-6)  # px
-    assert unlike(info, camera) is None
+    assert camera_mismatch(info, camera) is None
 
 
 @pytest.mark.parametrize("mode", ["binned", "a region", "a region, binned"])
@@ -234,7 +243,7 @@ def test_what_disagrees_in_a_mode_is_said_in_its_pixels(mode):
     camera = full_camera("plumb_bob").in_mode(region or (0, 0, *FULL), binning)
     info = camera_info("plumb_bob", region, binning)
     info.k[2] += 8  # of the full image
-    assert f"{8 / binning[0]:.1f} px off" in unlike(info, camera)
+    assert f"{8 / binning[0]:.1f} px off" in camera_mismatch(info, camera)
 
 
 @pytest.mark.parametrize(
@@ -255,7 +264,7 @@ def test_what_disagrees_in_a_mode_is_said_in_its_pixels(mode):
 def test_another_mode_than_the_file_s_is_refused_with_the_remedy(region, binning, size, camera_mode, said):
     camera = full_camera("plumb_bob").in_mode(*camera_mode)
     with pytest.raises(MembraneError, match=f"CameraInfo is {said}.*say so in the file's .camera"):
-        unlike(camera_info("plumb_bob", region, binning, size), camera)
+        camera_mismatch(camera_info("plumb_bob", region, binning, size), camera)
 
 
 @pytest.mark.parametrize("topic", ["/finger/image_raw", "/finger/image_raw/compressed", "/finger/image", "/finger/image_mono"])

@@ -14,7 +14,7 @@ from PIL import Image
 from torchmembrane import Camera, MembraneError, Sensor, Status
 from torchmembrane.cli.main import main
 from torchmembrane.integrations.frame_messages import CONTACT_FIELDS, POINT_FIELDS, cloud
-from torchmembrane.integrations.messages import CHANNELS, grey_of, projected, unlike
+from torchmembrane.integrations.messages import CHANNELS, camera_mismatch, grey_of, projected
 from torchmembrane.integrations.rosbag import camera_remark
 from torchmembrane.results.read import read_results
 from torchmembrane.sensor.parts import Cavity
@@ -258,16 +258,18 @@ def test_a_cloud_is_dense_where_all_of_its_values_are_finite():
 
 def test_a_camera_info_that_disagrees_is_said(small_sensor):
     camera = Sensor.from_file(small_sensor / "sensor.toml").camera
-    assert unlike(camera_info(camera)[1], camera) is None
-    assert unlike(camera_info(camera, focal=(0.0, 0.0))[1], camera) is None  # not calibrated
+    assert camera_mismatch(camera_info(camera)[1], camera) is None
+    assert camera_mismatch(camera_info(camera, focal=(0.0, 0.0))[1], camera) is None  # not calibrated
     u, v = camera.centre.tolist()
-    assert unlike(camera_info(camera, centre=(u + 0.6, v - 0.7))[1], camera) is None
-    said = unlike(camera_info(camera, centre=(u + 3, v - 4))[1], camera)
+    assert camera_mismatch(camera_info(camera, centre=(u + 0.6, v - 0.7))[1], camera) is None
+    said = camera_mismatch(camera_info(camera, centre=(u + 3, v - 4))[1], camera)
     assert "5.0 px off (rms over the image, at most 5.0); used is the sensor file" in said
-    assert "distortion_model 'double_sphere' is not compared" in unlike(camera_info(camera, lens="double_sphere")[1], camera)
+    assert "distortion_model 'double_sphere' is not compared" in camera_mismatch(
+        camera_info(camera, lens="double_sphere")[1], camera
+    )
     small = SimpleNamespace(width=64, height=48, k=np.eye(3).ravel(), distortion_model="plumb_bob")
     with pytest.raises(MembraneError, match="CameraInfo is of 64 x 48 px images"):
-        unlike(small, camera)
+        camera_mismatch(small, camera)
 
 
 PINHOLE = ("pinhole", (640, 480), (400, 410), (318, 243))
@@ -280,9 +282,9 @@ FISHEYE = ("fisheye", (640, 480), (200, 205), (318, 243))
 )
 def test_a_camera_info_s_distortion_is_compared_without_the_ports(lens, distortion, ports):
     camera = Camera(*lens, distortion, ports=ports)
-    assert unlike(camera_info(camera)[1], camera) is None
+    assert camera_mismatch(camera_info(camera)[1], camera) is None
     stronger = [0.05, *np.zeros(4)] if not distortion else [distortion[0] + 0.05, *distortion[1:]]
-    assert "px off" in unlike(camera_info(camera, distortion=stronger)[1], camera)
+    assert "px off" in camera_mismatch(camera_info(camera, distortion=stronger)[1], camera)
 
 
 RATIONAL = [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, -0.02, 0.004]
@@ -292,9 +294,9 @@ RATIONAL = [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, -0.02, 0.004]
 def test_a_sensor_s_eight_coefficients_are_compared_with_a_camera_info_s(zeros):
     camera = Camera(*PINHOLE, RATIONAL)
     info = camera_info(camera, distortion=[*RATIONAL, *[0.0] * zeros], lens="rational_polynomial")[1]
-    assert unlike(info, camera) is None
+    assert camera_mismatch(info, camera) is None
     five = camera_info(camera, distortion=RATIONAL[:5], lens="rational_polynomial")[1]
-    assert "px off" in unlike(five, camera)
+    assert "px off" in camera_mismatch(five, camera)
 
 
 @pytest.mark.parametrize(
@@ -306,7 +308,7 @@ def test_a_sensor_s_eight_coefficients_are_compared_with_a_camera_info_s(zeros):
     ],
 )
 def test_a_camera_info_with_more_coefficients_than_are_modelled_is_not_compared(lens, model, distortion, known):
-    said = unlike(camera_info(Camera(*model), distortion=distortion, lens=lens)[1], Camera(*model))
+    said = camera_mismatch(camera_info(Camera(*model), distortion=distortion, lens=lens)[1], Camera(*model))
     assert f"{lens} with coefficients after the first {known} (thin prisms, tilt) is not compared" in said
 
 

@@ -10,7 +10,7 @@ from torchmembrane.estimators.base import Equilibrium, Observation
 from torchmembrane.estimators.force_balance.estimator import SINGLE_GRID_SETTLING_STEPS, ForceBalance
 from torchmembrane.estimators.force_balance.gauss_newton import Scales, State
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
-from torchmembrane.estimators.force_balance.traction_loss import BEYOND
+from torchmembrane.estimators.force_balance.traction_loss import NO_CONTACT_SCALE
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.surface.membrane import Membrane
 from torchmembrane.surface.shapes import spherical_cap
@@ -345,7 +345,7 @@ def test_contacts_that_push_around_their_middle_only_are_tried_again(dented, lin
     off = torch.stack([(rest - rest[one.membrane.grid[1] * (lines // 2) + k]).norm(dim=-1) for k in (lines // 2, lines // 8)])
     disc, ring = (torch.exp(-(((off[0] - r) / (0.05 * one.size)) ** 2)) for r in (0.0, 0.2 * one.size))
     pushes = torch.stack([disc, ring, ring, disc + torch.exp(-((off[1] / (0.05 * one.size)) ** 2))])
-    reference = one.reference * torch.tensor([1.0, 1.0, BEYOND, 1.0])[:, None].expand(4, len(rest))
+    reference = one.reference * torch.tensor([1.0, 1.0, NO_CONTACT_SCALE, 1.0])[:, None].expand(4, len(rest))
     traction = -one.reference * pushes[..., None] * normals
     x = rest.expand(4, -1, -1)
     volume, moved = one.membrane.volume(x), torch.zeros(4, 4, dtype=torch.float64)
