@@ -67,8 +67,8 @@ def _load_wanted(c, work, u):
 
 @compiled
 def _camera_eased(products, own):
-    """`CameraMotion.eased`: how the camera follows each load, `[4, LOADS]`; of the cavity's the products with all become those
-    with it."""
+    """`CameraMotion.eliminate_camera`: how the camera follows each load, `[4, LOADS]`; of the cavity's the products with all
+    become those with it."""
     system = np.empty((4, 4 + LOADS))
     for a in range(4):
         for b in range(4):
