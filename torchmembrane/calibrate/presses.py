@@ -21,7 +21,7 @@ PRESSURE_GRID = (33, 33)  # on coarser ones pressure changes are off by up to a 
 STRETCHES = np.geomspace(1.01, 2.0, 10)  # beyond, the shape hardly depends on it
 BETWEEN = 5  # prestretches tried on either side of the lowest
 GAS_ROUNDS = 4
-GAS_SETTLED = 1e-3  # change of a gas' modulus, relative, that changes the forces by less than a thousandth
+MODULUS_SETTLED = 1e-3  # change of a gas' modulus, relative, that changes the forces by less than a thousandth
 CONTINUED = 0.1  # of a solve from rest takes each step from a neighbour's solution, measured
 
 
@@ -186,7 +186,7 @@ class Presses:
         for _ in range(GAS_ROUNDS if self.reconstructor.estimator.cavity.filling == "gas" else 1):
             ratios, magnitudes = self._ratios(np.exp(log_stretch), modulus, forces)
             modulus = float((weight * ratios).sum() * modulus)
-            if abs((weight * ratios).sum() - 1) < GAS_SETTLED:
+            if abs((weight * ratios).sum() - 1) < MODULUS_SETTLED:
                 break
         progress(0.5, "modulus with the prestretch's error")
         sides = [(weight * self._ratios(np.exp(log_stretch + s * deviation), modulus, forces)[0]).sum() for s in (-1, 1)]

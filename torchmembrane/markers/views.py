@@ -41,7 +41,7 @@ class ViewsObserver(nn.Module):
         super().__init__()
         self.each, self.names, self.regions = nn.ModuleList(observers), list(names), regions
         self.count, self.views = len(observers[0].rest_pixels), len(observers)
-        self.register_buffer("principal", principal)
+        self.register_buffer("principal", principal.repeat_interleave(self.count, 0))
 
     def _joined(self, name: str) -> Tensor:
         return torch.cat([getattr(observer, name) for observer in self.each])
@@ -69,8 +69,7 @@ class ViewsObserver(nn.Module):
     def with_rays(self, pixels: Tensor, confidence: Tensor) -> Tensor:
         """Pixels `[B, N, 2]`, those without confidence `[B, N]` at their view's principal point: a view may have no ray for a
         marker that it does not see, and no weight makes a number of what is none."""
-        nowhere = self.principal.repeat_interleave(self.count, 0).to(pixels)
-        return torch.where((confidence > 0)[..., None], pixels, nowhere)
+        return torch.where((confidence > 0)[..., None], pixels, self.principal.to(pixels))
 
     @property
     def follows(self) -> bool:

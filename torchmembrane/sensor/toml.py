@@ -44,7 +44,7 @@ MOST_VERTICES = 2**18
 MOST_DOTS, MOST_DOTS_BYTES = 2000, 2**20
 SIZES = ("small", "large")
 DOTS_HEADER = ("x", "y", "z", "size")
-HEIGHT = "height"
+HEIGHT, UPWARDS = "height", "0 or more, along the inward normal"
 COORDINATE = Limit(FARTHEST, "a coordinate", "the length unit")
 DOTS = Columns([DOTS_HEADER], "dot", HEIGHT, most=MOST_DOTS)
 
@@ -203,7 +203,7 @@ def _read_markers(table: Table, camera: Camera) -> tuple[Markers, list[str]]:
         raise table.refuse("file", "none for texture, whose patches are chosen in the rest image: remove it")
     height = table.number(HEIGHT) if HEIGHT in table else 0.0
     if height < 0:
-        raise table.refuse(HEIGHT, "0 or more, along the inward normal")
+        raise table.refuse(HEIGHT, UPWARDS)
     if height and kind == "texture":
         raise table.refuse(HEIGHT, "none for texture, which lies on the surface: remove it")
     positions, sizes, lines, heights = _read_dots(dots) if dots else (None, None, [], None)
@@ -232,7 +232,7 @@ def _read_dots(path: Path) -> tuple[np.ndarray, list[str], list[str], np.ndarray
 def _read_height(row: Row) -> float:
     height = row.number(HEIGHT, COORDINATE)
     if height < 0:
-        raise row.refusal(HEIGHT, "0 or more, along the inward normal")
+        raise row.refusal(HEIGHT, UPWARDS)
     return height
 
 
