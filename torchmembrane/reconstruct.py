@@ -145,10 +145,10 @@ class Reconstructor(nn.Module):
     @check_arguments
     def read(self, *paths: str | Path) -> Tensor:
         """Image files, one or more, as a batch `[B, 1, height, width]` in 0..1, of this module's precision and device. Of views
-        with images of their own those of the first view, NAME_VIEW; the others', which lie beside them, are read too."""
+        with images of their own those of the first view, NAME_VIEW; the others lie beside them, what cannot be read is NaN."""
         expect(len(paths) > 0, "Reconstructor.read: paths", list(paths), "one image file or more")
         if self.sensor.views_apart:
-            return torch.cat([read_views(Path(path), self.sensor.views, self.rest_pixels) for path in paths])
+            return torch.cat([read_views(Path(path), self.sensor.views, self.rest_pixels).grey for path in paths])
         images = [read_image(path, self.image_size, self.sensor.camera.bits) for path in paths]
         return torch.cat([to_grayscale_batch(image, self.image_size, "rgb", self.rest_pixels) for image in images])
 
@@ -163,7 +163,7 @@ class Reconstructor(nn.Module):
 
         Args:
             images: torch or numpy, uint8, uint16 or float in 0..1: `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or
-                `[B, H, W, 1 | 3]`. Grey is 0.299 R + 0.587 G + 0.114 B.
+                `[B, H, W, 1 | 3]`; of W views a list of W of these, None without. Grey is 0.299 R + 0.587 G + 0.114 B.
             previous: results of the frames before, where dots are looked for first; a texture is looked for as from rest.
             rest_pixels: `[D, 2]`, the markers as `locate` finds them without contact; default: in the sensor's rest image.
             pressure: `[B]` or a number, difference across the membrane that a gauge reads, unit as of the result's, NaN where

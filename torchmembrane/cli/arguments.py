@@ -3,7 +3,7 @@
 import math
 import re
 from argparse import Action, ArgumentTypeError, Namespace, RawDescriptionHelpFormatter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -148,6 +148,33 @@ def camera(text: str) -> int | str:
     (0, '/dev/video0')
     """
     return int(text) if text.isdecimal() else text
+
+
+def of_each_view(option: str, kind: str, given: Sequence[str], views: Sequence[str]) -> list[str]:
+    """What an option that may be repeated says of each view, VIEW=..., in the views' order; of one view what it says.
+
+    Args:
+        option: as `--camera`.
+        kind: of what it gives, as `NUMBER`.
+        given: what it was given.
+        views: names of the views that have images of their own; none of one view, or of regions of one image.
+
+    Raises:
+        MembraneError: more than one of one view, a view without, or one that there is not.
+
+    Example:
+        >>> of_each_view("--camera", "NUMBER", ["right=2", "left=0"], ["left", "right"])
+        ['0', '2']
+    """
+    if not views:
+        if len(given) > 1:
+            raise MembraneError(f"{option} {' '.join(given)}: {len(given)} of one camera; expected one {kind}")
+        return list(given)
+    named = dict(text.partition("=")[::2] for text in given)
+    if given and (len(given) != len(views) or set(named) != set(views)):
+        expected = " ".join(f"{option} {view}={kind}" for view in views)
+        raise MembraneError(f"{option} {' '.join(given)}: a sensor of several views; expected {expected}")
+    return [named[view] for view in views if given]
 
 
 def file_name(text: str) -> str:

@@ -24,16 +24,15 @@ from .arguments import (
     check_device,
     count,
     number_from,
+    of_each_view,
     pressure,
     wants_rerun,
     weight,
 )
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from ..camera.model import Camera
     from ..live.loop import LiveFrame, Request, StreamStats
+    from ..live.mailbox import Captured
     from ..live.streams import Stream
     from ..sensor.sensor import Sensor
 
@@ -45,6 +44,7 @@ examples:
   torchmembrane live sensor.toml --camera 0 --model video.onnx         # of torchmembrane export --tracking: faster
   torchmembrane live sensor.toml --video press.mp4                     # at its own pace; --rate 10 for another
   torchmembrane live sensor.toml --images frames/ --rate 30
+  torchmembrane live pair.toml --camera left=0 --camera right=2        # of several views
 
 The newest frame is taken; what came meanwhile is dropped and counted. Latency is from the capture (the camera's
 image is read, a file's is due) to the result. `z` and Enter: nothing touches now, take this for rest. Ctrl-C or
@@ -68,9 +68,10 @@ def add_parser(commands: Any) -> None:
     """Add the command's parser."""
     add = add_command(commands, "live", run, PURPOSE, EXAMPLES)
     add_sensor(add)
-    opened = "a camera, by OpenCV: its number, 0 the first, or its path or address"
-    add("--camera", metavar="NUMBER|PATH", type=camera, help=opened)
-    add("--video", metavar="FILE", type=Path, help="a video, as if it came from a camera (extra video)")
+    opened = "a camera, by OpenCV: its number, 0 the first, or its path or address; of several views one each, named"
+    add("--camera", metavar="[VIEW=]NUMBER|PATH", action="append", help=opened)
+    recorded = "a video, as if it came from a camera (extra video); of several views the first one's, NAME_VIEW"
+    add("--video", metavar="FILE", type=Path, help=recorded)
     add("--images", metavar="FOLDER", type=Path, help="the images of a folder in name order, likewise")
     add("--rate", metavar="HZ", type=number_from(0.001, 1e6), help="pace of files (default: a video's own; of images 30)")
     add("--grid", metavar=("M", "N"), nargs=2, type=count, help="solver grid (default: the sensor file's)")
@@ -100,13 +101,13 @@ def run(arguments: Namespace) -> int:
     _check(arguments)
     _spare_files(arguments)
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
-    images, stream = _images(arguments, sensor.camera), _stream(arguments, sensor)
+    images, stream = _images(arguments, sensor), _stream(arguments, sensor)
     line = StatusLine(stream.mesh, sys.stdout)
     warnings.showwarning = lambda message, *_: line.say(f"torchmembrane: warning: {message}")  # main restores it
     said: list[Callable[[], str]] = []
     try:
         with ExitStack() as stack:
-            watchers = _watchers(arguments, stream, sensor.camera.bits, stack, said)
+            watchers = _watchers(arguments, stream, sensor, stack, said)
             stop, requests = stack.enter_context(_stopped_by_signals()), _requests_by_keys(sensor.length_unit)
             mailbox, stats, peaks = stack.enter_context(capture(images)), StreamStats(), Peaks(stream.mesh)
             watchers.append(lambda seen, _: peaks.add(seen.frame))
@@ -154,15 +155,25 @@ def _spare_files(arguments: Namespace) -> None:
         refuse_overwriting("live --save", [arguments.save], read, arguments.force)
 
 
-def _images(arguments: Namespace, camera: "Camera") -> "Iterator[np.ndarray]":
+def _images(arguments: Namespace, sensor: "Sensor") -> "Iterator[Captured]":
     from ..live.sources import IMAGE_RATE, camera_images, folder_images, paced, video_images
+    from ..live.view_sources import moments_of_cameras, moments_of_folder, moments_of_videos
 
-    size, bits = camera.image_size, camera.bits
+    names, views, size, bits = sensor.views_apart, sensor.views, sensor.image_size, sensor.camera.bits
+    rate = arguments.rate or IMAGE_RATE
     if arguments.camera is not None:
-        return camera_images(arguments.camera, size)
+        opened = [camera(given) for given in of_each_view("--camera", "NUMBER", arguments.camera, names)]
+        if not names:
+            return camera_images(opened[0], size)
+        each = zip(names, opened, views, strict=True)
+        return moments_of_cameras({name: camera_images(given, view.camera.image_size) for name, given, view in each})
+    if names and arguments.video is not None:
+        return paced(moments_of_videos(arguments.video, views, arguments.rate))
+    if names:
+        return paced(moments_of_folder(arguments.images, views, rate))
     if arguments.video is not None:
         return paced(video_images(arguments.video, size, arguments.rate, bits))
-    return paced(folder_images(arguments.images, size, arguments.rate or IMAGE_RATE, bits))
+    return paced(folder_images(arguments.images, size, rate, bits))
 
 
 def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
@@ -184,11 +195,12 @@ def _stream(arguments: Namespace, sensor: "Sensor") -> "Stream":
 
 
 def _watchers(
-    arguments: Namespace, stream: "Stream", bits: int | None, stack: ExitStack, said: "list[Callable[[], str]]"
+    arguments: Namespace, stream: "Stream", sensor: "Sensor", stack: ExitStack, said: "list[Callable[[], str]]"
 ) -> "list[Callable[[LiveFrame, StreamStats], None]]":
     """What else is given the frames; to `said` is added what tells of it in the end."""
     from ..integrations.rerun import RerunLog
     from ..live.recording import Recording
+    from ..sensor.view_images import first_view_picture
 
     watchers: list[Callable[[LiveFrame, StreamStats], None]] = []
 
@@ -198,11 +210,15 @@ def _watchers(
         said.append(lambda: f"{done}; {_left_out(later)}")
 
     if arguments.record is not None:
-        recording = stack.enter_context(Recording(arguments.record, stream.mesh, bits))
+        recording = stack.enter_context(Recording(arguments.record, stream.mesh, sensor.camera.bits))
         add(recording.keep, f"recorded in {arguments.record}")
     if wants_rerun(arguments):
         log = stack.enter_context(RerunLog(stream.mesh, arguments.save))
-        add(lambda seen: log.add(seen.number, seen.frame, seen.image, seen.time), "shown in Rerun")
+
+        def show(seen: "LiveFrame") -> None:
+            log.add(seen.number, seen.frame, first_view_picture(seen.image, sensor.views), seen.time)
+
+        add(show, "shown in Rerun")
     return watchers
 
 

@@ -14,6 +14,7 @@ from .arguments import (
     check_device,
     count,
     count_or_auto,
+    of_each_view,
     positive,
     share,
 )
@@ -70,7 +71,8 @@ def add_parser(commands: Any) -> None:
         action="store_true",
         help="treat every input as a video (mp4, mov, avi, mkv, webm, gif always are); extra video",
     )
-    add("--topic", metavar="TOPIC", help="of the images in bags of ROS 2 (default: the only one; needs the extra ros)")
+    of_bags = "of the images in bags of ROS 2 (default: the only one; needs the extra ros); of several views one each, named"
+    add("--topic", metavar="[VIEW=]TOPIC", action="append", default=[], help=of_bags)
     messages = "also a bag of their results, a folder: wrenches, tractions, of a gas pressures, in N, N m, m and Pa"
     add("--bag", metavar="BAG", type=Path, help=messages)
     own = "images of this recording without contact, or first:N, its first N frames: their mean is rest (default: the sensor's)"
@@ -94,7 +96,7 @@ def run(arguments: Namespace) -> int:
     """Reconstruct; returns the exit code."""
     from ..files.folder_lock import Shard
     from ..jobs.bags import bag_remarks, result_bag, write_bag
-    from ..jobs.inputs import find_inputs, frame_name, of_first_view
+    from ..jobs.inputs import frame_name
     from ..jobs.local import reconstruct_files
     from ..jobs.ray_engine import RayEngine
     from ..jobs.rest import recording_rest
@@ -107,7 +109,7 @@ def run(arguments: Namespace) -> int:
     _check(arguments)
     by_ray = arguments.engine == "ray"
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
-    inputs = of_first_view(find_inputs(arguments.images, arguments.video, arguments.topic), sensor.views_apart)
+    inputs = _inputs(arguments, sensor.views_apart)
     _spare_files(arguments, inputs)
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
@@ -115,7 +117,7 @@ def run(arguments: Namespace) -> int:
     fields = sorted(set(arguments.fields), key=FIELDS.index)
     settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""), fields)
     check_folder(arguments.out, sensor.fingerprint, settings)
-    for remark in bag_remarks(inputs, sensor.camera):
+    for remark in bag_remarks(inputs, [view.camera for view in sensor.views] if sensor.views_apart else [sensor.camera]):
         print(f"torchmembrane: {remark}", file=sys.stderr)
     mesh, shard = Mesh.of(reconstructor, settings), Shard(*arguments.shard)
     bag = result_bag(arguments.bag, inputs, mesh, reconstructor, shard) if arguments.bag else None
@@ -141,6 +143,14 @@ def run(arguments: Namespace) -> int:
         draw_film(read_results(arguments.out), images, arguments.video_out)
     print(f"frames: {_said(counts)}; results in {arguments.out}")
     return 1 if counts.failed else 0
+
+
+def _inputs(arguments: Namespace, views: "list[str]") -> "Inputs":
+    """What is to be reconstructed; of several views what there is of the first one."""
+    from ..jobs.inputs import find_inputs, of_first_view
+
+    topics = of_each_view("--topic", "TOPIC", arguments.topic, views)
+    return of_first_view(find_inputs(arguments.images, arguments.video, next(iter(topics), None)), views, topics)
 
 
 def _pressures(log: Path, reconstructor: "Reconstructor", inputs: "Inputs") -> "Gauge":
@@ -187,7 +197,7 @@ def _spare_files(arguments: Namespace, inputs: "Inputs") -> None:
 
 def _said(counts: "FrameCounts") -> str:
     doubts = {"not converged": counts.not_converged, "unexplained": counts.unexplained, "partly hidden": counts.hidden}
-    doubts["out of range"] = counts.out_of_range
+    doubts |= {"out of range": counts.out_of_range, "without one of the views": counts.view_left_out}
     said = ", ".join(f"{count} {doubt}" for doubt, count in doubts.items() if count)
     unsure = f" ({said})" if said else ""
     return f"{counts.reconstructed} reconstructed{unsure}, {counts.failed} failed, {counts.skipped} finished before"

@@ -12,6 +12,7 @@ from ..errors import MembraneError
 from ..results.reconstruction import Frame
 from ..results.status import Status
 from ..results.store import Mesh
+from ..results.view_status import status_in_words
 from ..sensor.units import METRE
 
 TOPICS = {
@@ -76,7 +77,7 @@ class SiUnits:
                 f"forces of {mesh.name} are relative, messages are in newtons: add shear_modulus and thickness to the sensor "
                 "file, or find them by `torchmembrane calibrate material --weight`"
             )
-        self.name, self.metre = mesh.name, METRE[mesh.length_unit]
+        self.name, self.metre, self.views = mesh.name, METRE[mesh.length_unit], mesh.view_names.split()
         self.gas_pressure = gas_pressure
 
     def topics(self) -> list[str]:
@@ -128,11 +129,11 @@ class SiUnits:
         status = Status(int(frame["status"]))
         values = {
             "status": str(int(status)),
-            "residual, px": f"{frame['residual']:.3f}",
+            "residual, px": ", ".join(f"{residual:.3f}" for residual in np.atleast_1d(frame["residual"])),
             "coverage": f"{frame['coverage']:.3f}",
         }
         level = GOOD if status == Status.OK else DOUBTFUL if status.has_surface else FAILED
-        return diagnosis(level, self.name, status.text, values)
+        return diagnosis(level, self.name, status_in_words(frame, self.views), values)
 
 
 def diagnosis(level: int, name: str, text: str, values: dict[str, str]) -> Message:

@@ -1,6 +1,6 @@
 """ROS bags among the inputs of a job: checks of their CameraInfo messages, and a bag of the results."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,24 +8,30 @@ from ..camera.model import Camera
 from ..errors import MembraneError
 from ..files.folder_lock import WHOLE, Shard
 from ..integrations.frame_messages import SiUnits
-from ..integrations.rosbag import BagWriter, camera_remark, image_topic, is_mcap, messages
+from ..integrations.rosbag import BagWriter, StampedMessage, camera_remark, image_topic, is_mcap, messages
 from ..results.read import read_results
 from ..results.store import Mesh
 from .inputs import Inputs, picture_name
+from .moments import TimedPicture, moments
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
 
 
-def bag_remarks(inputs: Inputs, camera: Camera) -> Iterator[str]:
+def bag_remarks(inputs: Inputs, cameras: Sequence[Camera]) -> Iterator[str]:
     """The differences between the bags' CameraInfo messages and the sensor file.
+
+    Args:
+        inputs: of the job.
+        cameras: of the topics of images.
 
     Raises:
         MembraneError: a bag cannot be read, it is not clear which of its topics is meant, or it is of images of another size.
     """
     for path in inputs.bags:
-        if remark := camera_remark(path, image_topic(path, inputs.topic)[0], camera):
-            yield f"{path}: {remark}"
+        for topic, camera in zip(inputs.topics or [inputs.topic], cameras, strict=True):
+            if remark := camera_remark(path, image_topic(path, topic)[0], camera):
+                yield f"{path}: {remark}"
 
 
 def result_bag(path: Path, inputs: Inputs, mesh: Mesh, reconstructor: "Reconstructor", shard: Shard) -> BagWriter:
@@ -50,9 +56,13 @@ def write_bag(writer: BagWriter, inputs: Inputs, results: Path) -> int:
     names = set(found.names)
     with writer:
         for path in inputs.bags:
-            topic, _ = image_topic(path, inputs.topic)
-            for number, image in enumerate(messages(path, topic)):
+            topics = [image_topic(path, topic)[0] for topic in inputs.topics or [inputs.topic]]
+            for number, moment in enumerate(moments([_timed(messages(path, topic)) for topic in topics])):
                 name = picture_name(path, number)
                 if name in names:
-                    writer.add(image, found[name])
+                    writer.add(next(each.picture for each in moment if each is not None), found[name])
     return writer.written
+
+
+def _timed(found: Iterator[StampedMessage]) -> Iterator[TimedPicture[StampedMessage]]:
+    return (TimedPicture(each.time, each) for each in found)

@@ -1,7 +1,7 @@
 """Frames decoded in the background: images, and the pictures of videos, bags and stacks of images, a batch ahead of the one
 that is computed."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import islice
@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..camera.model import Camera
 from ..errors import MembraneError
 from ..files.images import picture_count, stack_images, to_grey
 from ..files.provenance import SourceFile
@@ -21,8 +20,10 @@ from ..files.timestamps import time_in
 from ..files.video import picture_total, picture_values, video_pictures
 from ..integrations.messages import grey_of
 from ..integrations.rosbag import image_topic, is_bag, messages
-from ..sensor.view_images import view_files
+from ..sensor.view_images import grey_views, read_views, view_files
+from ..sensor.views import View
 from .inputs import Inputs, frame_name, picture_name
+from .moments import TimedPicture, moments
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
@@ -32,8 +33,15 @@ LONGEST_NAME = 251
 """Bytes of a frame's name, so that there can be a file NAME.npz."""
 
 
-Load: TypeAlias = Callable[["Reconstructor"], Tensor]
-"""Gives a frame's image `[1, 1, height, width]` or raises `MembraneError`."""
+class Loaded(NamedTuple):
+    """A frame's image `[1, 1, height, width]`, or its images of all views `[1, W, ...]`; and why views lack theirs, by name."""
+
+    image: Tensor
+    lacking: Mapping[str, str] = {}
+
+
+Load: TypeAlias = Callable[["Reconstructor"], Loaded]
+"""Gives a frame's image or raises `MembraneError`."""
 
 
 class Picture(NamedTuple):
@@ -44,7 +52,7 @@ class Picture(NamedTuple):
 
 
 class Source(NamedTuple):
-    """A frame still to be decoded: `load(reconstructor)` gives its image `[1, 1, height, width]` or raises `MembraneError`.
+    """A frame still to be decoded: `load(reconstructor)` gives its image or raises `MembraneError`.
 
     Those of image files can be sent to another process.
     """
@@ -56,13 +64,14 @@ class Source(NamedTuple):
 
 
 class DecodedFrame(NamedTuple):
-    """A frame to reconstruct: `image [1, 1, height, width]`, or the reason why there is none."""
+    """A frame to reconstruct: its image, as of `Loaded`, or the reason why there is none."""
 
     name: str
     file: Path
     image: Tensor | None
     reason: str = ""
     origin: SourceFile = SourceFile()
+    lacking: Mapping[str, str] = {}
 
     def but(self, error: Exception) -> "DecodedFrame":
         """The same frame without an image, because of an error."""
@@ -72,8 +81,12 @@ class DecodedFrame(NamedTuple):
 def sources(inputs: Inputs, reconstructor: "Reconstructor") -> Iterator[Source]:
     """All frames of the inputs: the images, then the pictures of videos, bags and stacks, which are called STEM_NUMBER."""
     yield from map(source_of, inputs.images)
+    sensor = reconstructor.sensor
     for path in inputs.videos:
-        yield from _frames(path, _pictures(path, inputs.topic, reconstructor))
+        if sensor.views_apart:
+            yield from _frames(path, _pictures_of_views(path, inputs, sensor.views), files_of(path, inputs))
+        else:
+            yield from _frames(path, _pictures(path, inputs.topic, reconstructor.image_size, sensor.camera.bits), [path])
 
 
 def source_of(path: Path) -> Source:
@@ -87,8 +100,9 @@ def decoded(source: Source, reconstructor: "Reconstructor") -> DecodedFrame:
     try:
         if len(source.name.encode()) > LONGEST_NAME:
             raise MembraneError(f"its name has {len(source.name.encode())} bytes; expected {LONGEST_NAME} at most: rename it")
-        origin = source.origin or source_file_of(*view_files(source.file, reconstructor.sensor.views_apart))
-        return frame._replace(image=source.load(reconstructor), origin=origin)
+        origin = source.origin or source_file_of(*_there(source.file, reconstructor.sensor.views_apart))
+        image, lacking = source.load(reconstructor)
+        return frame._replace(image=image, origin=origin, lacking=lacking)
     except MembraneError as error:
         return frame.but(error)
 
@@ -130,20 +144,34 @@ def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch:
             yield group
 
 
-def length_of(path: Path, topic: str | None) -> int | None:
-    """The number of frames that a video, bag or stack declares; None if it declares none or is none of these."""
-    return image_topic(path, topic)[1] if is_bag(path) else picture_count(path) or picture_total(path)
+def length_of(path: Path, inputs: Inputs) -> int | None:
+    """The number of frames that a video, bag or stack declares, of views the largest; None if it declares none or is none."""
+    if is_bag(path):
+        return max(image_topic(path, topic)[1] for topic in inputs.topics or [inputs.topic])
+    return max((picture_count(file) or picture_total(file) or 0 for file in files_of(path, inputs)), default=0) or None
 
 
-def _read(path: Path, reconstructor: "Reconstructor") -> Tensor:
-    return reconstructor.read(path)
+def files_of(path: Path, inputs: Inputs) -> list[Path]:
+    """The files that hold what a file of several pictures shows: of views a video each, of a bag itself."""
+    return [path] if is_bag(path) else view_files(path, inputs.views)
 
 
-def _frames(path: Path, pictures: Iterator[Picture]) -> Iterator[Source]:
+def _there(path: Path, views: Sequence[str]) -> list[Path]:
+    """Those of a frame's image files that there are."""
+    return [file for file in view_files(path, views) if file.is_file()] or [path]
+
+
+def _read(path: Path, reconstructor: "Reconstructor") -> Loaded:
+    if reconstructor.sensor.views_apart:
+        return Loaded(*read_views(path, reconstructor.sensor.views, reconstructor.rest_pixels))
+    return Loaded(reconstructor.read(path))
+
+
+def _frames(path: Path, pictures: Iterator[Picture], files: Sequence[Path]) -> Iterator[Source]:
     """The frames of a file with several, one after another; if the file breaks off, its error is the last frame."""
     number = -1
     try:
-        origin = source_file_of(path)
+        origin = source_file_of(*files)
         for number, picture in enumerate(pictures):
             yield Source(picture_name(path, number), path, picture.load, origin._replace(time=picture.time))
         if number < 0:
@@ -153,45 +181,77 @@ def _frames(path: Path, pictures: Iterator[Picture]) -> Iterator[Source]:
         yield Source(picture_name(path, number + 1), path, refusal, SourceFile())
 
 
-def _pictures(path: Path, topic: str | None, reconstructor: "Reconstructor") -> Iterator[Picture]:
+def _pictures(path: Path, topic: str | None, size: tuple[int, int], bits: int | None) -> Iterator[Picture]:
     """The pictures of a file with several.
 
     In a bag the time is that of the header, or else of the reception; in a video it counts from the beginning, whose time the
     file name may give.
     """
     if is_bag(path):
-        _only_camera(path, reconstructor)
-        yield from (
-            Picture(partial(_bag_image, each.message), each.time) for each in messages(path, image_topic(path, topic)[0])
-        )
+        for each in messages(path, image_topic(path, topic)[0]):
+            yield Picture(partial(_bag_image, each.message, size, bits), each.time)
         return
-    camera, of_stack, begun = _only_camera(path, reconstructor), picture_count(path, 1) > 0, time_in(path.stem)
+    of_stack, begun = picture_count(path, 1) > 0, time_in(path.stem)
     begun = 0.0 if isnan(begun) else begun
-    for picture in stack_images(path, camera.image_size, camera.bits) if of_stack else video_pictures(path, camera.image_size):
+    for picture in stack_images(path, size, bits) if of_stack else video_pictures(path, size):
         if isinstance(picture, MembraneError):
             yield Picture(partial(_refuse, str(picture)))
         else:
             after = getattr(picture, "time", None)  # an array has none
-            yield Picture(partial(_image, picture), nan if after is None else begun + after)
+            yield Picture(partial(_image, picture, bits), nan if after is None else begun + after)
 
 
-def _only_camera(path: Path, reconstructor: "Reconstructor") -> Camera:
-    """The camera whose images a file of several pictures holds."""
-    if reconstructor.sensor.views:
-        raise MembraneError(f"{path}: holds several pictures; of a sensor with several views expected images, NAME_VIEW.png")
-    return reconstructor.sensor.camera
+def _pictures_of_views(path: Path, inputs: Inputs, views: Sequence[View]) -> Iterator[Picture]:
+    """What a bag or the views' videos show, moment by moment; `path`: the bag's, or the first view's video."""
+    files = [path] * len(views) if is_bag(path) else view_files(path, inputs.views)
+    topics = inputs.topics or [None] * len(views)
+    each = zip(files, topics, views, strict=True)
+    streams = [_timed(_pictures(file, topic, view.camera.image_size, view.camera.bits)) for file, topic, view in each]
+    for moment in moments(streams):
+        loads = [None if picture is None else picture.picture.load for picture in moment]
+        yield Picture(partial(_moment, loads), min(picture.time for picture in moment if picture is not None))
 
 
-def _bag_image(message: Any, reconstructor: "Reconstructor") -> Tensor:
-    grey = grey_of(message, reconstructor.sensor.camera.image_size, reconstructor.sensor.camera.bits)
-    return torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels)
+def _timed(pictures: Iterator[Picture]) -> Iterator[TimedPicture[Picture]]:
+    """Pictures with their times, one without at the latest interval after the one before it; an error is the last picture."""
+    time, interval = -1.0, 1.0
+    try:
+        for picture in pictures:
+            now = time + interval if isnan(picture.time) else picture.time
+            interval, time = (now - time if time >= 0 else interval), now
+            yield TimedPicture(time, picture)
+    except MembraneError as error:
+        yield TimedPicture(time + interval, Picture(partial(_refuse, str(error))))
 
 
-def _image(picture: Any, reconstructor: "Reconstructor") -> Tensor:
+def _moment(loads: Sequence[Load | None], reconstructor: "Reconstructor") -> Loaded:
+    """The images of a moment, of the views that have one."""
+    views, lacking = reconstructor.sensor.views, {}
+    images: list[Tensor | None] = []
+    for load, view in zip(loads, views, strict=True):
+        try:
+            images.append(_absent() if load is None else load(reconstructor).image)
+        except MembraneError as error:
+            images.append(None)
+            lacking[view.name] = str(error)
+    if len(lacking) == len(views):
+        raise MembraneError("; ".join(f"view {name}: {said}" for name, said in lacking.items()))
+    return Loaded(grey_views(images, views, "rgb", reconstructor.rest_pixels), lacking)
+
+
+def _absent() -> NoReturn:
+    raise MembraneError("no picture at this moment")
+
+
+def _bag_image(message: Any, size: tuple[int, int], bits: int | None, reconstructor: "Reconstructor") -> Loaded:
+    return Loaded(torch.from_numpy(grey_of(message, size, bits))[None, None].to(reconstructor.rest_pixels))
+
+
+def _image(picture: Any, bits: int | None, reconstructor: "Reconstructor") -> Loaded:
     """The image of a picture: grey values, or what PyAV gives."""
     of_stack = isinstance(picture, np.ndarray)
-    grey = picture if of_stack else to_grey(picture_values(picture, reconstructor.sensor.camera.bits))
-    return torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels)
+    grey = picture if of_stack else to_grey(picture_values(picture, bits))
+    return Loaded(torch.from_numpy(grey)[None, None].to(reconstructor.rest_pixels))
 
 
 def _refuse(reason: str, reconstructor: "Reconstructor") -> NoReturn:

@@ -19,6 +19,7 @@ from ..results.npz import Stored
 from ..results.reconstruction import Frame, Reconstruction
 from ..results.status import Status
 from ..results.summary import UNREADABLE
+from ..results.view_status import status_in_words
 from .decode import DecodedFrame, Source, decoded, source_of
 from .inputs import frame_name
 
@@ -119,9 +120,16 @@ class FrameReconstructor:
         return [
             Outcome(frame.name, frame.file, None, frame.reason)
             if frame.image is None
-            else _outcome(frame, frame.image, Stored(next(frames), self._measured(frame), seconds))
+            else self._outcome(frame, frame.image, Stored(next(frames), self._measured(frame), seconds))
             for frame in group
         ]
+
+    def _outcome(self, frame: DecodedFrame, image: Tensor, stored: Stored) -> Outcome:
+        """A frame's outcome, with what is to be said of its status: which view was left out, or that values are too few."""
+        status = Status(int(stored.frame["status"]))
+        words = status_in_words(stored.frame, [view.name for view in self.reconstructor.sensor.views], frame.lacking)
+        remark = words.removeprefix(status.text) if status.has_surface else too_few_bits(image.cpu().numpy())
+        return Outcome(frame.name, frame.file, stored, remark)
 
     def _frame(self, path: object, image: Any, content: Any) -> DecodedFrame:
         file = Path(str(path))
@@ -193,11 +201,6 @@ class FrameReconstructor:
         image = torch.zeros(1, channels, height, width).to(self.reconstructor.rest_pixels)
         (frame,) = self._reconstructed([DecodedFrame("", Path(), image)])
         return frame | {"status": np.array(UNREADABLE, np.int32)}
-
-
-def _outcome(frame: DecodedFrame, image: Tensor, stored: Stored) -> Outcome:
-    shows_nothing = not Status(int(stored.frame["status"])).has_surface
-    return Outcome(frame.name, frame.file, stored, too_few_bits(image.cpu().numpy()) if shows_nothing else "")
 
 
 def _rows(columns: Any) -> Iterator[tuple[Any, Any, Any]]:

@@ -15,6 +15,7 @@ from ..files.provenance import printable
 from ..files.system_files import is_hidden, is_of_system
 from ..integrations.rosbag import BAGS, METADATA, is_bag, metadata_of
 from ..results.store import MESH
+from ..sensor.view_images import view_files
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".gif")
@@ -28,13 +29,15 @@ class Inputs(NamedTuple):
         videos: files of several frames: videos, image files of several pictures, and bags, which are their `metadata.yaml`
             or a storage file.
         topic: of the bags' images; None: the only one.
-        views: names of the views that have images of their own; `images` are then the first one's.
+        views: names of the views that have images of their own; `images` and the videos that are no bags are the first one's.
+        topics: of the bags' images of each of these views.
     """
 
     images: list[Path]
     videos: list[Path]
     topic: str | None = None
     views: Sequence[str] = ()
+    topics: Sequence[str] = ()
 
     @property
     def bags(self) -> list[Path]:
@@ -120,15 +123,18 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
     return inputs
 
 
-def of_first_view(inputs: Inputs, views: Sequence[str]) -> Inputs:
-    """Inputs with one image for each frame: of views with images of their own, NAME_VIEW.png, the first view's.
+def of_first_view(inputs: Inputs, views: Sequence[str], topics: Sequence[str] = ()) -> Inputs:
+    """Inputs with one image or video for each frame or recording: of views with images of their own, NAME_VIEW.png or
+    NAME_VIEW.mp4, the first view's.
 
     Args:
         inputs: as `find_inputs` gives them.
         views: names of the sensor's views with images of their own; none of one view, or of regions of one image.
+        topics: of these views' images in bags.
 
     Raises:
-        MembraneError: an image is of none of the views, or a frame has no image of the first one.
+        MembraneError: a file is of none of the views, a frame has no image of the first one, a recording no video of one of
+            them, or a bag no topics.
 
     Example:
         >>> both = Inputs([Path("press_left.png"), Path("press_right.png")], [])
@@ -137,13 +143,27 @@ def of_first_view(inputs: Inputs, views: Sequence[str]) -> Inputs:
     """
     if not views:
         return inputs
-    firsts = [path for path in inputs.images if path.stem.endswith(f"_{views[0]}")]
+    if inputs.bags and not topics:
+        wanted = " ".join(f"--topic {view}=TOPIC" for view in views)
+        raise MembraneError(f"{inputs.bags[0]}: a bag with several views; expected the topic of each, {wanted}")
+    bags = inputs.bags
+    images, videos = _firsts(inputs.images, views), _firsts([path for path in inputs.videos if path not in bags], views)
+    for path in videos:
+        if missing := [file for file in view_files(path, views) if not file.exists()]:
+            raise MembraneError(f"{path}: no {missing[0].name} beside it; expected a video of each view, of the same recording")
+    kept = [path for path in inputs.videos if path in bags or path in videos]
+    return inputs._replace(images=images, videos=kept, views=views, topics=topics)
+
+
+def _firsts(paths: list[Path], views: Sequence[str]) -> list[Path]:
+    """The first view's files among those of all."""
+    firsts = [path for path in paths if path.stem.endswith(f"_{views[0]}")]
     names = {path.stem.removesuffix(views[0]) for path in firsts}
-    for path in inputs.images:
+    for path in paths:
         stem = next((path.stem.removesuffix(view) for view in views if path.stem.endswith(f"_{view}")), None)
         if stem not in names:
             raise MembraneError(f"{path}: of no view, or of none of the frames; expected NAME_{', NAME_'.join(views)} of each")
-    return inputs._replace(images=firsts, views=views)
+    return firsts
 
 
 def single_images(inputs: Inputs) -> list[Path]:

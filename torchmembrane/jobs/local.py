@@ -42,6 +42,7 @@ class FrameCounts(NamedTuple):
     unexplained: int
     hidden: int
     out_of_range: int
+    view_left_out: int
     failed: int
     skipped: int
 
@@ -96,8 +97,9 @@ def reconstruct_files(
         >>> sensor = Sensor.from_file("examples/sensor.toml")
         >>> sensor = replace(sensor, markers=replace(sensor.markers, rest_image=None))  # quicker, less accurate
         >>> reconstructor, images = Reconstructor(sensor), find_inputs(["examples/rest.png"])
-        >>> reconstruct_files(reconstructor, images, tempfile.mkdtemp(), Settings.of(reconstructor, "npz"))
-        FrameCounts(reconstructed=1, not_converged=0, unexplained=0, hidden=0, out_of_range=0, failed=0, skipped=0)
+        >>> counts = reconstruct_files(reconstructor, images, tempfile.mkdtemp(), Settings.of(reconstructor, "npz"))
+        >>> counts.reconstructed, counts.failed, counts.skipped
+        (1, 0, 0)
     """
     out, report = Path(out), report or _write_line
     mesh = Mesh.of(reconstructor, settings)
@@ -118,8 +120,8 @@ def reconstruct_files(
                 folder.save()
                 progress.update(len(group), done)
     good = sum(done[status] for status in FINISHED)
-    doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN], done[Status.OUT_OF_RANGE]
-    return FrameCounts(good, *doubts, done.total() - good, progress.initial)
+    doubts = (Status.NOT_CONVERGED, Status.UNEXPLAINED, Status.HIDDEN, Status.OUT_OF_RANGE, Status.VIEW_LEFT_OUT)
+    return FrameCounts(good, *(done[doubt] for doubt in doubts), done.total() - good, progress.initial)
 
 
 def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:
@@ -143,9 +145,10 @@ def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:
 
 
 def _kept(folder: ResultFolder, outcome: Outcome, report: Callable[[str], None]) -> int:
-    """Store an outcome, print the reason if it is not a result, and return its status."""
+    """Store an outcome, print the reason if it is not a result, or one of views of which one was left out, and return its
+    status."""
     status = folder.keep(outcome)
-    if status not in FINISHED:
+    if status not in FINISHED or outcome.reason:
         of_video = "" if outcome.name == frame_name(outcome.file) else f", {outcome.name}"
         report(f"{outcome.file}{of_video}: {outcome.status_text}")
     return status
@@ -174,7 +177,7 @@ class _Progress:
         mine = [name for name in map(frame_name, inputs.images) if shard.holds(name)]
         self.initial = sum(name in finished for name in mine)
         self.initial += sum(inputs.video_of(name) is not None for name in finished) if inputs.videos else 0
-        lengths = [(length or 0) // shard.total for length in (length_of(path, inputs.topic) for path in inputs.videos)]
+        lengths = [(length or 0) // shard.total for length in (length_of(path, inputs) for path in inputs.videos)]
         total = len(mine) + sum(lengths)
         self.left = total - self.initial
         self.all_left = self.left if all(lengths) else None

@@ -12,7 +12,7 @@ from ..files.order import warn_of_file_times
 from ..track import Tracker
 from ..user_warnings import warn_user
 from .decode import Source, sources
-from .inputs import Inputs, find_inputs, frame_name
+from .inputs import Inputs, find_inputs, frame_name, of_first_view
 
 if TYPE_CHECKING:
     from ..reconstruct import Reconstructor
@@ -39,7 +39,7 @@ def recording_rest(reconstructor: "Reconstructor", arguments: list[str], inputs:
         warn_of_file_times(inputs.images)
         chosen = islice(sources(inputs, reconstructor), int(count))
     else:
-        chosen = sources(find_inputs(arguments), reconstructor)
+        chosen = sources(of_first_view(find_inputs(arguments), inputs.views, inputs.topics), reconstructor)
     said = f"--rest {' '.join(arguments)}"
     images = [_loaded(source, reconstructor, said) for source in chosen]
     try:
@@ -52,7 +52,7 @@ def recording_rest(reconstructor: "Reconstructor", arguments: list[str], inputs:
 
 def _loaded(source: Source, reconstructor: "Reconstructor", said: str) -> Tensor:
     try:
-        return source.load(reconstructor)
+        return source.load(reconstructor).image
     except MembraneError as error:
         picture = "" if source.name == frame_name(source.file) else f", {source.name}"
         cause = str(error).removeprefix(f"{source.file}: ")

@@ -13,7 +13,7 @@ from ..files.provenance import SourceFile, printable
 from ..results.frames import open_folder
 from ..results.store import FINISHED, MESH, Mesh, check_folder
 from ..results.summary import SUMMARY, UNREADABLE, Summary
-from ..sensor.view_images import view_files
+from .decode import files_of
 from .frame_reconstructor import Outcome
 from .inputs import Inputs, frame_name
 
@@ -117,11 +117,10 @@ class ResultFolder:
 
     def _judge(self, origins: dict[str, SourceFile]) -> None:
         """Remove frames whose images have changed from the finished ones, and report what was found."""
-        firsts = set(self._inputs.images)
 
         @cache
         def is_of(origin: SourceFile, file: Path) -> bool:
-            return origin.is_of(*(view_files(file, self._inputs.views) if file in firsts else [file]))
+            return origin.is_of(*files_of(file, self._inputs))
 
         files = {name: file for name in sorted(origins, key=in_order) if (file := self._file_of(name))}
         changed = [name for name, file in files.items() if not is_of(origins[name]._replace(time=0.0), file)]

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from torch import Tensor
 
 from ..errors import MembraneError
 from ..files.atomic import remove_partials
@@ -22,7 +21,7 @@ from ..machine_code import using
 from ..processes import begin_worker, handed_over
 from ..results.store import Mesh
 from ..sensor.view_images import first_view_image
-from .decode import DecodedFrame, Source, decoded, read_ahead
+from .decode import DecodedFrame, Loaded, Source, decoded, read_ahead
 from .frame_reconstructor import FrameReconstructor, Outcome
 
 if TYPE_CHECKING:
@@ -146,13 +145,14 @@ def _portable(source: Source, reconstructor: "Reconstructor") -> Source:
     if source.origin is None:
         return source
     frame = decoded(source, reconstructor)
-    return source._replace(load=partial(_given, frame.reason, None if frame.image is None else frame.image.numpy()))
+    image = None if frame.image is None else frame.image.numpy()
+    return source._replace(load=partial(_given, frame.reason, image, dict(frame.lacking)))
 
 
-def _given(reason: str, image: object, reconstructor: "Reconstructor") -> Tensor:
+def _given(reason: str, image: object, lacking: dict[str, str], reconstructor: "Reconstructor") -> Loaded:
     if image is None:
         raise MembraneError(reason)
-    return torch.as_tensor(image)
+    return Loaded(torch.as_tensor(image), lacking)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from ..files.digits import together
 from ..files.levels import too_few_bits
 from ..results.status import Status
 from ..results.store import Mesh
+from ..results.view_status import status_in_words
 from .loop import RECENT, LiveFrame, StreamStats
 
 TERMINAL_SECONDS, PLAIN_SECONDS = 0.1, 1.0
@@ -55,11 +56,13 @@ def described(seen: LiveFrame, stats: StreamStats, mesh: Mesh) -> str:
     pace = rate + "{:.0f} ms (95 %: {:.0f}), {} dropped".format(*milliseconds, stats.dropped)
     status = Status(int(seen.frame["status"]))
     if not status.has_surface:
-        return f"{pace} | {status.text}{too_few_bits(seen.image)}"
+        hints = [too_few_bits(image) for image in seen.images if image is not None]
+        return f"{pace} | {status.text}{''.join(hints[:1])}"
     unit = "relative" if mesh.force_unit == "relative" else mesh.force_unit
     force, moment = (together(half, DIGITS) for half in seen.frame["wrench"].reshape(2, 3))
     pressure = f"{seen.frame['pressure_change']:+.2g} {unit}/{mesh.length_unit}²"
-    words = status.text.partition(":")[0]
+    left_out = status_in_words(seen.frame, mesh.view_names.split()).removeprefix(status.text)
+    words = status.text.partition(":")[0] + left_out
     return f"{pace} | {words} | force {force} {unit} | moment {moment} {unit} {mesh.length_unit} | pressure {pressure}"
 
 

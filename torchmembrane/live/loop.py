@@ -12,7 +12,7 @@ from ..errors import MembraneError
 from ..interruption import frame_in_work
 from ..results.reconstruction import Frame
 from ..results.status import Status
-from .mailbox import Mailbox, now
+from .mailbox import Captured, Mailbox, now
 from .streams import Stream
 
 WAIT = 0.1
@@ -36,9 +36,14 @@ class LiveFrame(NamedTuple):
 
     number: int
     time: float
-    image: np.ndarray
+    image: Captured
     frame: Frame
     latency: float
+
+    @property
+    def images(self) -> list[np.ndarray | None]:
+        """The image, or those of all views."""
+        return [self.image] if isinstance(self.image, np.ndarray) else self.image
 
     @property
     def name(self) -> str:

@@ -4,13 +4,17 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Condition, Thread
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 EPOCH = time.time() - time.perf_counter()
 ENDING = 1.0
 """Seconds for a camera to give its last picture before its thread is left behind."""
+
+
+Captured: TypeAlias = "np.ndarray | list[np.ndarray | None]"
+"""An image `[height, width]` or `[height, width, 3]`; of views that have images of their own one each, or None."""
 
 
 def now() -> float:
@@ -23,12 +27,12 @@ class CapturedFrame(NamedTuple):
 
     Attributes:
         number: of the capture, from 0; those of dropped pictures are missing among the pictures taken.
-        image: `[height, width]` or `[height, width, 3]`.
+        image: as captured.
         time: of the capture, as `now` gives it.
     """
 
     number: int
-    image: np.ndarray
+    image: Captured
     time: float
 
 
@@ -53,7 +57,7 @@ class Mailbox:
         self._error: BaseException | None = None
         self._changed = Condition()
 
-    def put(self, image: np.ndarray) -> None:
+    def put(self, image: Captured) -> None:
         """A picture captured now."""
         with self._changed:
             self._picture = CapturedFrame(self.captured, image, now())
@@ -81,7 +85,7 @@ class Mailbox:
 
 
 @contextmanager
-def capture(images: Iterator[np.ndarray]) -> Iterator[Mailbox]:
+def capture(images: Iterator[Captured]) -> Iterator[Mailbox]:
     """A mailbox into which a thread puts these images as they come, until the block ends."""
     mailbox = Mailbox()
     thread = Thread(target=_capture, args=(images, mailbox), name="capture", daemon=True)
@@ -93,7 +97,7 @@ def capture(images: Iterator[np.ndarray]) -> Iterator[Mailbox]:
         thread.join(ENDING)
 
 
-def _capture(images: Iterator[np.ndarray], mailbox: Mailbox) -> None:
+def _capture(images: Iterator[Captured], mailbox: Mailbox) -> None:
     try:
         for image in images:
             if mailbox.ended:

@@ -1,8 +1,11 @@
 """What a stream showed, kept: images as they were captured, results as `torchmembrane reconstruct` writes them, times."""
 
 import csv
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
+
+import numpy as np
 
 from ..errors import MembraneError
 from ..files.atomic import make_subfolder, writing
@@ -27,9 +30,9 @@ MOST_TIMES_BYTES = 2**28
 class Recording:
     """A new folder of results of a stream: `with Recording(folder, mesh) as recording`, `recording.keep(seen)`.
 
-    The folder holds `images/NAME.png` (`.tiff` where 16 bits do not hold the values), NAME.npz, mesh.npz and summary.csv as of
-    `torchmembrane reconstruct`, and times.csv: `name`, `time` of the capture (seconds since 1970) and `latency` (seconds). NAME
-    is the number of the capture.
+    The folder holds `images/NAME.png` (`.tiff` where 16 bits do not hold the values), of views with images of their own
+    `images/NAME_VIEW.png`, NAME.npz, mesh.npz and summary.csv as of `torchmembrane reconstruct`, and times.csv: `name`, `time`
+    of the capture (seconds since 1970) and `latency` (seconds). NAME is the number of the capture.
 
     Args:
         folder: new or empty.
@@ -44,7 +47,7 @@ class Recording:
     def __init__(self, folder: Path, mesh: Mesh, bits: int | None = None):
         if folder.exists() and (not folder.is_dir() or not all(map(is_of_system, folder.iterdir()))):
             raise MembraneError(f"--record {folder}: holds something already; expected a new folder, one per recording")
-        self.folder, self.bits = folder, bits
+        self.folder, self.bits, self.views = folder, bits, mesh.view_names.split()
         self._results = ResultFolder(folder, mesh, Inputs([], []), WHOLE, False, print)
 
     def __enter__(self) -> "Recording":
@@ -68,11 +71,21 @@ class Recording:
 
     def keep(self, seen: LiveFrame) -> None:
         """Write a frame."""
-        path = write_as_taken(self.folder / IMAGES / seen.name, seen.image, self.bits)
-        stored = Stored(seen.frame, SourceFile.of(path)._replace(time=seen.time), seen.latency)
-        self._results.keep(Outcome(seen.name, path, stored))
+        paths = list(self._images(seen))
+        stored = Stored(seen.frame, SourceFile.of(*paths)._replace(time=seen.time), seen.latency)
+        self._results.keep(Outcome(seen.name, paths[0], stored))
         with writing(self.folder / TIMES):
             csv.writer(self._times).writerow((seen.name, f"{seen.time:.6f}", f"{seen.latency:.6f}"))
+
+    def _images(self, seen: LiveFrame) -> Iterator[Path]:
+        """The frame's image files, written."""
+        path = self.folder / IMAGES
+        if isinstance(seen.image, np.ndarray):
+            yield write_as_taken(path / seen.name, seen.image, self.bits)
+            return
+        for view, image in zip(self.views, seen.image, strict=True):
+            if image is not None:
+                yield write_as_taken(path / f"{seen.name}_{view}", image, self.bits)
 
 
 def times_of(folder: Path) -> dict[str, float]:

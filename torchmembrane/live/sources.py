@@ -14,6 +14,7 @@ from ..files.order import in_order, warn_of_file_times
 from ..files.video import picture_rate, picture_values, video_pictures
 from ..jobs.inputs import find_inputs
 from ..user_warnings import warn_user
+from .mailbox import Captured
 
 MOST_MISSED = 100
 """Reads of a camera that fail in a row before it is given up."""
@@ -27,7 +28,7 @@ class Timed(NamedTuple):
     """An image of a recording, and when it is due: seconds since the recording's beginning."""
 
     due: float
-    image: np.ndarray
+    image: Captured
 
 
 def camera_images(camera: int | str, size: tuple[int, int]) -> Iterator[np.ndarray]:
@@ -153,7 +154,7 @@ def _leave_out(said: object) -> None:
     warn_user(f"{said}; left out")
 
 
-def paced(images: Iterable[Timed]) -> Iterator[np.ndarray]:
+def paced(images: Iterable[Timed]) -> Iterator[Captured]:
     """Images when they are due; those that come too late are given at once.
 
     Example:

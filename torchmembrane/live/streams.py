@@ -1,7 +1,7 @@
 """What turns a stream's images into results, one after another: torch, or an exported model."""
 
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -12,10 +12,11 @@ from ..results.npz import completed
 from ..results.reconstruction import Frame
 from ..results.store import Mesh, Settings
 from ..track import Tracker
+from .mailbox import Captured
 
 
 class Stream(Protocol):
-    """Called with an image `[height, width]` or `[height, width, 3]` RGB and its time, seconds; gives the frame's arrays.
+    """Called with an image, RGB or grey, or with one of each view, and its time, seconds; gives the frame's arrays.
 
     Attributes:
         mesh: what the frames share.
@@ -23,7 +24,7 @@ class Stream(Protocol):
 
     mesh: Mesh
 
-    def __call__(self, image: np.ndarray, time: float) -> Frame: ...
+    def __call__(self, image: Captured, time: float) -> Frame: ...
 
     def rezero(self) -> None:
         """Take the latest frame for rest."""
@@ -48,11 +49,10 @@ class TrackedStream:
     """
 
     def __init__(self, reconstructor: Reconstructor):
-        reconstructor.sensor.refuse_views("live")
         self.tracker = Tracker(reconstructor)
         self.mesh = Mesh.of(reconstructor, Settings.of(reconstructor, "npz"))
 
-    def __call__(self, image: np.ndarray, time: float) -> Frame:
+    def __call__(self, image: Captured, time: float) -> Frame:
         return self.tracker(image, time=time).frame(0)
 
     def rezero(self) -> None:
@@ -106,12 +106,20 @@ class ModelStream:
         self.mesh = Mesh(**{key: value for key, value in known.items() if key in Mesh._fields})
         self._before: dict[str, np.ndarray] | None = None
 
-    def __call__(self, image: np.ndarray, time: float) -> Frame:
+    def __call__(self, image: Captured, time: float) -> Frame:
         try:
-            self._before = self._session.run(image[None], self._before)
+            self._before = self._session.run(self._batch(image), self._before)
         except self._edge.EdgeError as error:
             raise MembraneError(f"--model: {error}") from error
         return completed({key: values[0] for key, values in self._before.items()})
+
+    def _batch(self, image: Captured) -> Any:
+        """A batch of one as the model takes it; a view that lacks its image has NaN, so that it is left out."""
+        if isinstance(image, np.ndarray):
+            return image[None]
+        sizes = self._session.image_sizes
+        blanks = [np.full((1, height, width), np.nan, np.float32) for width, height in sizes]
+        return [blank if each is None else each[None] for each, blank in zip(image, blanks, strict=True)]
 
     def rezero(self) -> None:
         """Refused.

@@ -96,6 +96,7 @@ class Mesh(NamedTuple):
     camera_in_tool  [3, 4]  rotation and translation from the camera's frame to the tool's, `p_tool = R p + t`; [0, 4] where the
                             sensor file has no `[tool]`; `tool` gives it as a `Pose`
     record          `[record]` of the sensor file as JSON: serial, calibrated, images, by, uncertainty; empty without
+    view_names      of several views, separated by spaces; empty of one
     """
 
     rest_vertices: np.ndarray
@@ -124,6 +125,7 @@ class Mesh(NamedTuple):
     fields: str = ""
     camera_in_tool: np.ndarray = np.zeros((0, 4), np.float32)
     record: str = ""
+    view_names: str = ""
 
     @classmethod
     def of(cls, reconstructor: ResultMaker, settings: Settings) -> "Mesh":
@@ -145,6 +147,7 @@ class Mesh(NamedTuple):
             **settings._asdict(),
             camera_in_tool=_rows(sensor.tool),
             record=sensor.record.text,
+            view_names=" ".join(view.name for view in sensor.views),
         )
 
     @classmethod

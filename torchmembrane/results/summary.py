@@ -15,9 +15,9 @@ from ..files.order import in_order
 from ..files.provenance import printable
 from ..files.safe_read import regular_size
 from .npz import Stored
-from .status import Status
 from .store import Mesh
 from .summary_row import NAMES, TEXT, Column, cell, completed, escaped, in_units, numbers, unescaped
+from .view_status import status_in_words
 
 SUMMARY, DICTIONARY = "summary.csv", "summary_columns.csv"
 EXPECTED = "a table of results: delete it, it is made from the frames"
@@ -48,7 +48,8 @@ class Summary:
         mesh, status = self.mesh, int(frame["status"])
         found = numbers(frame | {"gauge": np.asarray(origin.gauge)}, mesh.rest_normals, mesh.length_unit, mesh.force_unit)
         found |= {"time": origin.time, "seconds": seconds}
-        texts = {"file": origin.path, "status_text": Status(status).text, "content_hash": origin.content_hash}
+        words = status_in_words(frame, mesh.view_names.split())
+        texts = {"file": origin.path, "status_text": words, "content_hash": origin.content_hash}
         self._set(name, status, texts | {key: cell(key, value) for key, value in found.items()})
 
     def add_unreadable(self, name: str, file: Path, reason: str) -> None:

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -14,18 +15,26 @@ from ..files.images import read_image
 from .views import View
 
 
+class MomentImages(NamedTuple):
+    """A frame's images of all views, `grey [1, W, height, width]`, and of the views that lack theirs why, by name."""
+
+    grey: Tensor
+    lacking: dict[str, str]
+
+
 def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Tensor) -> Tensor:
-    """Grey images `[B, W, height, width]` in 0..1; a smaller view's are dark beyond its own size.
+    """Grey images `[B, W, height, width]` in 0..1; a smaller view's are dark beyond its own size, and one that lacks its
+    images has NaN, so that it is left out.
 
     Args:
-        images: of W views, the first view's first: a list of W batches, each as `to_grayscale_batch` takes them; or stacked,
-            `[W, height, width]` or `[B, W, height, width]`, colour with its three channels last.
+        images: of W views, the first view's first: a list of W batches, each as `to_grayscale_batch` takes them, None of a view
+            without; or stacked, `[W, height, width]` or `[B, W, height, width]`, colour with its three channels last.
         views: of the sensor.
         channels: order of the channels of colour images.
         like: a tensor of the precision and device.
 
     Raises:
-        MembraneError: another number of views, or of frames in one of them.
+        MembraneError: another number of views, or of frames in one of them, or no view with images.
     """
     count = len(views)
     if not isinstance(images, list | tuple):
@@ -43,19 +52,22 @@ def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Ten
             images = [batch[..., :height, :width] for batch, (width, height) in zip(images, sizes, strict=True)]
     if len(images) != count:
         raise MembraneError(f"images of {len(images)} views; expected {count}: {', '.join(view.name for view in views)}")
-    each = [
-        to_grayscale_batch(_as_batch(batch), view.camera.image_size, channels, like, view.camera.bits)
-        for batch, view in zip(images, views, strict=True)
-    ]
-    frames = [len(batch) for batch in each]
-    if len(set(frames)) > 1:
-        raise MembraneError(f"images: {frames} frames of the views; expected the same number of each")
+    given = {
+        w: to_grayscale_batch(_as_batch(batch), view.camera.image_size, channels, like, view.camera.bits)
+        for w, (batch, view) in enumerate(zip(images, views, strict=True))
+        if batch is not None
+    }
+    frames = [len(batch) for batch in given.values()]
+    if len(set(frames)) != 1:
+        raise MembraneError(f"images: {frames} frames of the views; expected the same number of each, of one view at least")
+    sizes = [view.camera.image_size for view in views]
+    each = [given.get(w, like.new_full((frames[0], 1, *sizes[w][::-1]), torch.nan)) for w in range(count)]
     height, width = (max(batch.shape[axis] for batch in each) for axis in (-2, -1))
     return torch.cat([F.pad(batch, (0, width - batch.shape[-1], 0, height - batch.shape[-2])) for batch in each], 1)
 
 
-def read_views(path: Path, views: Sequence[View], like: Tensor) -> Tensor:
-    """A frame's images of all views, `[1, W, height, width]`, as of `grey_views`.
+def read_views(path: Path, views: Sequence[View], like: Tensor) -> MomentImages:
+    """A frame's images of all views, as of `grey_views`.
 
     Args:
         path: of the first view's image, as of `view_files`.
@@ -63,11 +75,19 @@ def read_views(path: Path, views: Sequence[View], like: Tensor) -> Tensor:
         like: a tensor of the precision and device.
 
     Raises:
-        MembraneError: the file is not named after the first view, or a view's cannot be read.
+        MembraneError: the file is not named after the first view, or no view's can be read.
     """
-    files = view_files(path, [view.name for view in views])
-    images = [read_image(file, view.camera.image_size, view.camera.bits) for file, view in zip(files, views, strict=True)]
-    return grey_views(images, views, "rgb", like)
+    images: list[np.ndarray | None] = []
+    lacking: dict[str, str] = {}
+    for file, view in zip(view_files(path, [view.name for view in views]), views, strict=True):
+        try:
+            images.append(read_image(file, view.camera.image_size, view.camera.bits))
+        except MembraneError as error:
+            images.append(None)
+            lacking[view.name] = str(error)
+    if len(lacking) == len(views):
+        raise MembraneError("; ".join(lacking.values()))
+    return MomentImages(grey_views(images, views, "rgb", like), lacking)
 
 
 def view_files(path: Path, names: Sequence[str]) -> list[Path]:
@@ -98,6 +118,14 @@ def first_view_image(grey: Tensor, views: Sequence[View]) -> Tensor:
     left, top = (views[0].region or (0, 0))[:2] if views else (0, 0)
     width, height = views[0].camera.image_size if views else (grey.shape[-1], grey.shape[-2])
     return grey[0, 0, top : top + height, left : left + width]
+
+
+def first_view_picture(picture: np.ndarray | list[np.ndarray | None], views: Sequence[View]) -> np.ndarray | None:
+    """The first view's part of a picture, or its own of a list of all views'; that of a sensor with one view as it is."""
+    if not isinstance(picture, np.ndarray):
+        return picture[0]
+    left, top, width, height = (views[0].region if views else None) or (0, 0, *picture.shape[1::-1])
+    return picture[top : top + height, left : left + width]
 
 
 def _as_batch(images: Any) -> Any:

@@ -1,0 +1,75 @@
+"""Pictures of several views matched by their times: one frame for each moment."""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from math import inf
+from statistics import median
+from typing import Generic, NamedTuple, TypeVar
+
+Image = TypeVar("Image")
+RECENT = 15
+"""Intervals between pictures of which the median is the usual one."""
+
+
+class TimedPicture(NamedTuple, Generic[Image]):
+    """A picture, and its time in seconds."""
+
+    time: float
+    picture: Image
+
+
+def moments(streams: Sequence[Iterator[TimedPicture[Image]]]) -> Iterator[list[TimedPicture[Image] | None]]:
+    """What each view shows at each moment, in the order of time.
+
+    A moment begins with the earliest picture that is left. Another view's next picture belongs to it where it is at most half
+    as late as the picture that follows the earliest in its own view, or would follow if none was lost: by the median of the
+    latest `RECENT` intervals. Else that view lacks a picture at this moment.
+
+    Args:
+        streams: of each view its pictures, in the order of time.
+
+    Yields:
+        Of each view its picture, or None.
+
+    Example:
+        >>> left, right = ([TimedPicture(time, None) for time in times] for times in ((0.0, 0.1, 0.2), (0.02, 0.21)))
+        >>> [[picture and picture.time for picture in moment] for moment in moments([iter(left), iter(right)])]
+        [[0.0, 0.02], [0.1, None], [0.2, 0.21]]
+    """
+    queues = [_Queue(stream) for stream in streams]
+    while waiting := [queue for queue in queues if queue.next is not None]:
+        first = min(waiting, key=lambda queue: queue.time)
+        latest = first.time + first.interval / 2
+        yield [queue.taken() if queue.time <= latest else None for queue in queues]
+
+
+class _Queue(Generic[Image]):
+    """A view's pictures, of which the next two are known."""
+
+    def __init__(self, stream: Iterator[TimedPicture[Image]]):
+        self._stream, self._intervals = stream, deque[float](maxlen=RECENT)
+        self.next: TimedPicture[Image] | None = next(stream, None)
+        self._after: TimedPicture[Image] | None = None
+        self._look_ahead()
+
+    @property
+    def time(self) -> float:
+        """Of the next picture; infinite where none is left."""
+        return inf if self.next is None else self.next.time
+
+    @property
+    def interval(self) -> float:
+        """From the next picture to the one after it, seconds, or the median of the latest, if that is less."""
+        usual = median(self._intervals) if self._intervals else inf
+        return usual if self._after is None else min(usual, self._after.time - self.time)
+
+    def taken(self) -> TimedPicture[Image] | None:
+        """The next picture, which is so no more."""
+        taken, self.next = self.next, self._after
+        self._look_ahead()
+        return taken
+
+    def _look_ahead(self) -> None:
+        self._after = None if self.next is None else next(self._stream, None)
+        if self._after is not None:
+            self._intervals.append(self._after.time - self.time)
