@@ -90,6 +90,11 @@ def write_draft(arguments: Namespace) -> list[str]:
     filling = arguments.filling or ("gas" if arguments.shape in ("bubble", *SHEETS) else "liquid")
     cavity = Cavity(filling, round(AIR + (inside or 0.0), 2) if filling == "gas" else None)
     sensor = Sensor(arguments.name or arguments.sensor.stem, unit, camera, membrane, material, cavity, markers, surface)
+    if arguments.views:
+        from .draft_views import with_views
+
+        sensor, places = with_views(sensor, arguments)
+        seen += places
     found = _dots_in_words(sensor)
     path = sensor.to_file(arguments.sensor)
     annotate(path, said, sensor.force_unit == "relative", unit)

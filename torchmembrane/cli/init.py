@@ -21,6 +21,8 @@ examples:
   torchmembrane init window.toml --shape rectangle --size 50,36 --corner 4 --height 6 --overpressure 12hPa --prestretch 1.1 \
       --thickness 0.2 --distance 40 --rest rest.png --focal 620
   torchmembrane init window.toml --outline rim.csv --height 6 --distance 40 --rest rest.png --focal 620
+  torchmembrane init pair.toml --shape cap --radius 12 --height 6 --distance 40 --rest rest_left.png --focal 800 \\
+      --dots dots.csv --views left right=25,0,5
   torchmembrane init sensor.toml            # on a terminal: asks
 
 What is needed: the shape and its lengths, the image's size (--image-size, or --rest), a focal length (--focal or --view),
@@ -39,6 +41,9 @@ rectangle, ellipse and --outline are sheets that are stretched in a rim and blow
 the rim, the prestretch and --height or --overpressure or both. rim.csv holds points once around: x,y from its middle, or x,y,z.
 Of such a sheet height, overpressure, prestretch and shear modulus x thickness any three give the fourth; of the other shapes
 overpressure, prestretch and shear modulus x thickness any two the third. Where all are given and disagree, it is said.
+
+Of several views (--views) --rest is the first one's image, NAME_VIEW.png, beside which the others' lie: each camera is then
+where its image shows the dots.
 
 SENSOR.toml's files are written beside it. Next: torchmembrane check SENSOR.toml --out sensor.png
 
@@ -132,6 +137,8 @@ def _add_camera(add: Add) -> None:
     add("--centre", metavar="U,V", type=centre, help="principal point, px (default: the rim's centre, else the image's)")
     few = "of the camera, where 16-bit images hold fewer, as 10 or 12 (default: 16)"
     add("--bits", metavar="N", type=count, help=few)
+    further = "name of the first view, and NAME=X,Y,Z of each further camera: about where it stands in the first one's frame"
+    add("--views", metavar="NAME", nargs="+", help=f"{further}; of the same lens, upright, it looks at the membrane's middle")
     rim = "the rim's circle in the rest image, px, as an image viewer tells it; auto: found in the image"
     add("--rim", metavar="U,V,RADIUS|auto", type=_rim, help=rim)
 

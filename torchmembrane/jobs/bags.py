@@ -29,7 +29,7 @@ def bag_remarks(inputs: Inputs, cameras: Sequence[Camera]) -> Iterator[str]:
         MembraneError: a bag cannot be read, it is not clear which of its topics is meant, or it is of images of another size.
     """
     for path in inputs.bags:
-        for topic, camera in zip(inputs.topics or [inputs.topic], cameras, strict=True):
+        for topic, camera in zip(inputs.image_topics, cameras, strict=True):
             if remark := camera_remark(path, image_topic(path, topic)[0], camera):
                 yield f"{path}: {remark}"
 
@@ -56,7 +56,7 @@ def write_bag(writer: BagWriter, inputs: Inputs, results: Path) -> int:
     names = set(found.names)
     with writer:
         for path in inputs.bags:
-            topics = [image_topic(path, topic)[0] for topic in inputs.topics or [inputs.topic]]
+            topics = [image_topic(path, topic)[0] for topic in inputs.image_topics]
             for number, moment in enumerate(moments([_timed(messages(path, topic)) for topic in topics])):
                 name = picture_name(path, number)
                 if name in names:

@@ -147,7 +147,7 @@ def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch:
 def length_of(path: Path, inputs: Inputs) -> int | None:
     """The number of frames that a video, bag or stack declares, of views the largest; None if it declares none or is none."""
     if is_bag(path):
-        return max(image_topic(path, topic)[1] for topic in inputs.topics or [inputs.topic])
+        return max(image_topic(path, topic)[1] for topic in inputs.image_topics)
     return max((picture_count(file) or picture_total(file) or 0 for file in files_of(path, inputs)), default=0) or None
 
 
@@ -204,7 +204,7 @@ def _pictures(path: Path, topic: str | None, size: tuple[int, int], bits: int | 
 def _pictures_of_views(path: Path, inputs: Inputs, views: Sequence[View]) -> Iterator[Picture]:
     """What a bag or the views' videos show, moment by moment; `path`: the bag's, or the first view's video."""
     files = [path] * len(views) if is_bag(path) else view_files(path, inputs.views)
-    topics = inputs.topics or [None] * len(views)
+    topics = inputs.topics if is_bag(path) else [None] * len(views)
     each = zip(files, topics, views, strict=True)
     streams = [_timed(_pictures(file, topic, view.camera.image_size, view.camera.bits)) for file, topic, view in each]
     for moment in moments(streams):

@@ -40,6 +40,11 @@ class Inputs(NamedTuple):
     topics: Sequence[str] = ()
 
     @property
+    def image_topics(self) -> Sequence[str | None]:
+        """Of the bags' images, of each view."""
+        return self.topics or (self.topic,)
+
+    @property
     def bags(self) -> list[Path]:
         """The videos that are bags."""
         return [path for path in self.videos if is_bag(path)]

@@ -120,8 +120,8 @@ def reconstruct_files(
                 folder.save()
                 progress.update(len(group), done)
     good = sum(done[status] for status in FINISHED)
-    doubts = (Status.NOT_CONVERGED, Status.UNEXPLAINED, Status.HIDDEN, Status.OUT_OF_RANGE, Status.VIEW_LEFT_OUT)
-    return FrameCounts(good, *(done[doubt] for doubt in doubts), done.total() - good, progress.initial)
+    doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN], done[Status.OUT_OF_RANGE]
+    return FrameCounts(good, *doubts, done[Status.VIEW_LEFT_OUT], done.total() - good, progress.initial)
 
 
 def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:

@@ -39,9 +39,9 @@ def moments_of_cameras(cameras: Mapping[str, Iterator[Captured]]) -> Iterator[Ca
     with ExitStack() as stack:
         boxes: dict[str, Mailbox] = {name: stack.enter_context(capture(images)) for name, images in cameras.items()}
         while boxes:
-            taken = {name: _taken(name, boxes, PATIENCE) for name in list(boxes)}
-            newer = {name: _taken(name, boxes, 0.0) for name in list(boxes)}
-            moment = [taken.get(name) if newer.get(name) is None else newer[name] for name in cameras]
+            waited = {name: _taken(name, boxes, PATIENCE) for name in list(boxes)}
+            newest = {name: _taken(name, boxes, 0.0) for name in list(boxes)}
+            moment = [waited.get(name) if newest.get(name) is None else newest[name] for name in cameras]
             if any(image is not None for image in moment):
                 yield moment
 
@@ -80,8 +80,9 @@ def moments_of_videos(path: Path, views: Sequence[View], rate: float | None) -> 
         yield Timed(due, [None if picture is None else picture.picture for picture in moment])
 
 
-def _timed(file: Path, view: View, rate: float | None) -> Iterator[TimedPicture[Captured]]:
-    return (TimedPicture(*each) for each in video_images(file, view.camera.image_size, rate, view.camera.bits))
+def _timed(file: Path, view: View, rate: float | None) -> Iterator[TimedPicture[np.ndarray]]:
+    for due, image in video_images(file, view.camera.image_size, rate, view.camera.bits):
+        yield TimedPicture(due, np.asarray(image))
 
 
 def moments_of_folder(folder: Path, views: Sequence[View], rate: float) -> Iterator[Timed]:

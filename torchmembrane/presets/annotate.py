@@ -14,6 +14,8 @@ WORDS = {
         "length_unit": f"{' | '.join(METRE)}: of all lengths here and in results",
     },
     "camera": {
+        "name": "of the view, and of its images, NAME_VIEW.png",
+        "pose": "of this camera's frame in the first one's; `calibrate rest` finds it from a rest image of each",
         "model": "pinhole (OpenCV's k1 k2 p1 p2 k3, or with k4 k5 k6) | fisheye (k1 to k4; ROS: equidistant)",
         "image_size": "width, height, px",
         "focal": "along u and v, px; fisheye: px / rad",

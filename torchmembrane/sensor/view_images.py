@@ -38,15 +38,15 @@ def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Ten
     """
     count = len(views)
     if not isinstance(images, list | tuple):
-        given = torch.as_tensor(images) if not isinstance(images, Tensor) else images
-        has_colours = given.ndim >= 4 and given.shape[-1] == 3
-        axis = given.ndim - 3 - has_colours
-        if axis not in (0, 1) or given.shape[axis] != count:
+        stacked = torch.as_tensor(images) if not isinstance(images, Tensor) else images
+        has_colours = stacked.ndim >= 4 and stacked.shape[-1] == 3
+        axis = stacked.ndim - 3 - has_colours
+        if axis not in (0, 1) or stacked.shape[axis] != count:
             expected = (
                 f"a list of {count} batches, or [B, {count}, H, W], for the views {', '.join(view.name for view in views)}"
             )
-            raise MembraneError(f"images {list(given.shape)}; expected {expected}")
-        images = given.unbind(axis)
+            raise MembraneError(f"images {list(stacked.shape)}; expected {expected}")
+        images = stacked.unbind(axis)
         if not has_colours:  # a stack may be as large as the largest view
             sizes = [view.camera.image_size for view in views]
             images = [batch[..., :height, :width] for batch, (width, height) in zip(images, sizes, strict=True)]

@@ -24,7 +24,8 @@ ORDER = """\
 A sensor is calibrated in this order, each step starting from the sensor file of the one before:
   camera     lens, from a checkerboard in air, ports not mounted
   ports      distance, thickness and index of flat layers, from a board of dots, in air and in the medium
-  rest       where the rest surface stands, and its dots, from the rest image, when the dots are listed
+  rest       where the rest surface stands, and its dots, from the rest image, when the dots are listed; and
+             where further views stand
   views      the same from several views, when they are not
   depth      the same from a depth image
   material   prestretch from images of presses; stiffness, where forces, or pressures in the cavity, of some are known
@@ -79,7 +80,8 @@ def _ports_options(add: Add) -> None:
 
 
 def _rest_options(add: Add) -> None:
-    add("image", metavar="REST.png", help="the membrane at rest")
+    at_rest = "the membrane at rest; of several views the first one's, NAME_VIEW, or the image whose regions they are"
+    add("image", metavar="REST.png", help=at_rest)
     gauge = "of an inflated surface: what a gauge reads at rest, inside over outside, with its unit, as 12hPa"
     add("--overpressure", metavar="P", type=pressure, help=gauge)
 
@@ -147,7 +149,7 @@ STEPS = {
     ),
     "rest": Step(
         "surface",
-        "find the rest surface's pose and its dots from one rest image of listed dots",
+        "find the rest surface's pose and its dots from a rest image of listed dots; of several views their poses, too",
         _rest_options,
         "ports/sensor.toml rest.png --out rest",
     ),

@@ -29,6 +29,7 @@ from ...sensor.record import Record
 from ...sensor.sensor import Sensor
 from ...sensor.toml import COORDINATE
 from ...sensor.units import millimetre
+from ...sensor.view_images import view_files
 from ...surface.checks import FARTHEST
 
 if TYPE_CHECKING:
@@ -45,14 +46,14 @@ FILES = ("image", "depth", "motions", "forces", "pressure", "pixels")
 """Arguments of the steps that name files to read: images, and single files."""
 
 
-def read_sensor(arguments: Namespace) -> Sensor:
-    """The sensor that the arguments name.
+def read_sensor(arguments: Namespace, with_views: bool = False) -> Sensor:
+    """The sensor that the arguments name; `with_views`: it may have several.
 
     Raises:
         MembraneError: it cannot be read, or has several views: what is found of one would not be that of the others.
     """
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
-    if sensor.views:
+    if sensor.views and not with_views:
         raise MembraneError(
             f"calibrate: {arguments.sensor} has {len(sensor.views)} views; expected one: calibrate each in a file of its own "
             "with [camera], and put the values that are found into its [[camera]]"
@@ -106,6 +107,20 @@ def write_calibrated(
 def read_sensor_image(path: str | Path, sensor: Sensor) -> np.ndarray:
     """An image `[H, W]` that must be as large as the sensor's."""
     return read_image(path, sensor.camera.image_size, sensor.camera.bits)
+
+
+def read_view_images(path: str | Path, sensor: Sensor) -> list[np.ndarray]:
+    """The images of all views, `[H, W]` each: those beside the first view's, NAME_VIEW, or their regions of one.
+
+    Raises:
+        MembraneError: one is missing, or of another size.
+    """
+    views, names = sensor.views, sensor.views_apart
+    if names:
+        files = zip(view_files(Path(path), names), views, strict=True)
+        return [read_image(file, view.camera.image_size, view.camera.bits) for file, view in files]
+    shared = read_image(path, sensor.image_size, sensor.camera.bits)
+    return [view.camera.mode.image(shared) for view in views if view.camera.mode is not None]
 
 
 def read_targets(images: Sequence[str], sensor: Sensor, board: Checkerboard | DotBoard) -> np.ndarray:

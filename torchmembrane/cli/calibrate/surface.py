@@ -5,11 +5,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from scipy.linalg import block_diag
 
 from ...calibrate.depth import rest_from_depth
+from ...calibrate.fit import Fit
 from ...calibrate.report import Report
-from ...calibrate.rest import rest_from_image
+from ...calibrate.rest import RestFit, rest_from_image
 from ...calibrate.surface import Correction, fine_surface
+from ...calibrate.view_poses import rest_from_view_images
 from ...calibrate.views import rest_from_views
 from ...errors import MembraneError
 from ...jobs.inputs import find_inputs, single_images
@@ -18,7 +21,7 @@ from ...sensor.inflated import InflatedSurface
 from ...sensor.sensor import Sensor
 from ...sensor.units import hectopascal
 from ..progress import ProgressDisplay
-from .files import read_depth, read_motions, read_sensor, read_sensor_image, write_calibrated
+from .files import read_depth, read_motions, read_sensor, read_sensor_image, read_view_images, write_calibrated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,10 +29,20 @@ if TYPE_CHECKING:
 
 def rest(arguments: Namespace) -> int:
     """`torchmembrane calibrate rest`"""
-    sensor = read_sensor(arguments)
+    sensor = read_sensor(arguments, with_views=True)
+    if sensor.views:
+        return _rest_of_views(arguments, sensor)
     image = read_sensor_image(arguments.image, sensor)
     with ProgressDisplay("calibrate rest") as progress:
         found = rest_from_image(sensor, image, arguments.overpressure, progress=progress)
+    units, design, notes = _before(sensor, found, arguments.overpressure)
+    title = "rest surface from one image"
+    report = Report.of(title, found.names, units, design, found.fit, found.pixels, found.residuals, notes)
+    return write_calibrated(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size), 1)
+
+
+def _before(sensor: Sensor, found: RestFit, overpressure: float | None) -> tuple[list[str], np.ndarray, list[str]]:
+    """Units of what a rest image tells, its values in the file, and notes on the dots."""
     sheet, unit = sensor.surface, sensor.length_unit
     units, design = ["degrees"] * 3 + [unit] * 3, np.zeros(6)
     shifts = np.linalg.norm(found.shifts, axis=1)
@@ -39,10 +52,35 @@ def rest(arguments: Namespace) -> int:
     ]
     if isinstance(sheet, InflatedSurface):
         units, design = [*units, unit, ""], np.append(design, [sheet.formed.height, sensor.material.prestretch])
-        notes += _held(found.sensor, arguments.overpressure)
-    title = "rest surface from one image"
-    report = Report.of(title, found.names, units, design, found.fit, found.pixels, found.residuals, notes)
-    return write_calibrated(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size), 1)
+        notes += _held(found.sensor, overpressure)
+    return units, design, notes
+
+
+def _rest_of_views(arguments: Namespace, sensor: Sensor) -> int:
+    """The same of several views: the surface by the first one, the others' poses by the dots on it."""
+    images = read_view_images(arguments.image, sensor)
+    with ProgressDisplay("calibrate rest") as progress:
+        found = rest_from_view_images(sensor, images, arguments.overpressure, progress=progress)
+    first, unit = found.first, sensor.length_unit
+    units, design, notes = _before(sensor, first, arguments.overpressure)
+    names, fits = list(first.names), [first.fit]
+    for view, of_view in zip(found.sensor.views[1:], found.further, strict=True):
+        names += [f"{view.name}.{name}" for name in of_view.names]
+        units, design, fits = units + ["degrees"] * 3 + [unit] * 3, np.append(design, np.zeros(6)), [*fits, of_view.fit]
+        seen = of_view.residuals[np.isfinite(of_view.residuals).all(1)]
+        place = ", ".join(f"{value:z.5g}" for value in view.pose.translation)
+        notes.append(
+            f"view {view.name!r} stands at {place} {unit}: it sees {len(seen)} dots, {np.sqrt((seen**2).mean()):.3f} px rms off"
+        )
+    joined = Fit(
+        np.concatenate([each.values for each in fits]),
+        block_diag(*(each.covariance for each in fits)),
+        np.concatenate([each.residuals for each in fits]),
+        first.fit.noise,
+    )
+    title = f"rest surface and poses from images of {len(images)} views"
+    report = Report.of(title, names, units, design, joined, first.pixels, first.residuals, notes)
+    return write_calibrated(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size), len(images))
 
 
 def _held(sensor: Sensor, gauge: float | None) -> list[str]:

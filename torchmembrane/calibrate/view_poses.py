@@ -1,0 +1,216 @@
+"""Poses of a sensor's further views from rest images of the same dots, the scale from the listed surface."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.func import jacfwd
+
+from ..errors import MembraneError
+from ..files.grayscale import check_image
+from ..markers.dots.pattern import DotPattern, find_dots
+from ..markers.placement import FEWEST_MARKERS, markers_in_view
+from ..pose import ViewPose
+from ..progress import Progress, silent, within
+from ..sensor.sensor import Sensor
+from .fit import fit, rotations
+from .rest import RestFit, rest_from_image
+from .surface import fine_surface
+
+NEAR = 0.35
+"""Of the dots' pitch: a found dot so near to where a listed one is expected may be that one."""
+FEWEST_MATCHED = 0.6
+"""Of the dots that a view sees: fewer that are found where they are expected are a coincidence."""
+ROUNDS = 8
+STEPS = (-1, 0, 1)
+"""Pitches along u and v by which a first guess may be off in a regular pattern."""
+
+
+class RigFit(NamedTuple):
+    """A sensor with several views, its surface, dots and poses where their rest images show them.
+
+    Attributes:
+        sensor: with pose and dots found, and the views' poses and rest images.
+        first: the fit of the first view alone: the surface's pose before it, and the dots on it.
+        further: of each further view its fit: what turned and shifted the surface in its frame, from the pose of the file.
+    """
+
+    sensor: Sensor
+    first: RestFit
+    further: list[RestFit]
+
+
+def rest_from_view_images(
+    sensor: Sensor, images: Sequence[np.ndarray], overpressure: float | None = None, *, progress: Progress = silent
+) -> RigFit:
+    """Pose of the rest surface and its dots from the first view's rest image, then the poses of the other views.
+
+    Each of these is the pose from which its camera sees the dots, as they were found, where its own image shows them; that of
+    the file is a first guess, within tens of degrees.
+
+    Args:
+        sensor: the design, with several views and a list of dots.
+        images: of each view, `[H, W]` the membrane at rest, grey in 0..1.
+        overpressure: as of `rest_from_image`.
+        progress: is told how far it is.
+
+    Raises:
+        MembraneError: as of `rest_from_image`, which then names the view; dots that are not recognised in an image.
+
+    Limitations:
+        The scale is that of the listed surface, which no image shows: an outline that is 1 % too large makes all distances so.
+    """
+    count = len(sensor.views)
+    if count < 2 or len(images) != count:
+        raise MembraneError(f"calibrate rest: {len(images)} images of {count} views; expected one of each of two views or more")
+    first = rest_from_image(sensor.in_view(0), images[0], overpressure, progress=within(progress, 0.0, 1 / count))
+    views, further = list(sensor.views), []
+    whole = replace(first.sensor, views=(replace(views[0], rest_image=images[0]), *views[1:]))
+    for number in range(1, count):
+        told = within(progress, number / count, (number + 1) / count)
+        whole, found = placed_view(whole, number, images[number], progress=told)
+        further.append(found)
+    return RigFit(whole, first, further)
+
+
+def placed_view(sensor: Sensor, number: int, image: np.ndarray, *, progress: Progress = silent) -> tuple[Sensor, RestFit]:
+    """The sensor with one of its further views where a rest image shows the listed dots.
+
+    Args:
+        sensor: with several views, its dots where they are.
+        number: of the view, from 1.
+        image: `[H, W]` of this view, grey in 0..1.
+        progress: is told how far it is.
+
+    Returns:
+        The sensor, its view with pose and rest image, and the fit.
+
+    Raises:
+        MembraneError: the dots are not recognised, with the view's name.
+    """
+    view = sensor.views[number]
+    try:
+        grey = check_image("calibrate rest: the image", image, view.camera.image_size)
+        pattern = find_dots(grey, sensor.markers.polarity)
+        roughly = _moved(sensor, number, *recognised(sensor.in_view(number), pattern))
+        seen = roughly.in_view(number)
+        shown = markers_in_view(seen)
+        sizes = None if seen.markers.sizes is None else [seen.markers.sizes[d] for d in np.nonzero(shown)[0]]
+        part = replace(seen.markers, positions=np.asarray(seen.markers.positions)[shown], sizes=sizes)
+        found = rest_from_image(replace(seen, markers=part), grey, progress=progress)
+    except MembraneError as error:
+        raise MembraneError(f"view {view.name!r}: {error}") from error
+    surface = fine_surface(seen)
+    motion = np.concatenate([np.deg2rad(found.fit.values[:3]), found.fit.values[3:6]])
+    placed = _moved(roughly, number, motion, surface.rest[surface.fixed].mean(0).numpy())
+    views = list(placed.views)
+    views[number] = replace(views[number], rest_image=grey.astype(np.float32))
+    return replace(placed, views=tuple(views)), found
+
+
+def recognised(sensor: Sensor, pattern: DotPattern) -> tuple[np.ndarray, np.ndarray]:
+    """A first motion of the surface after which a view has its dots where they were found.
+
+    The dots as expected are brought over those found, centre on centre and of the same extent, or a pitch beside that; the
+    nearest ones are taken for each other, which gives a pose and so better expectations. The start after which most are
+    found counts.
+
+    Args:
+        sensor: of the view alone, as `Sensor.in_view` gives it.
+        pattern: dots found in its image.
+
+    Returns:
+        Rotation vector (rad) and shift `[6]`, and the pivot `[3]` of the rotation.
+
+    Raises:
+        MembraneError: fewer than `FEWEST_MATCHED` of the dots that the view would see then are found.
+    """
+    shown = markers_in_view(sensor)
+    if shown.sum() < FEWEST_MARKERS:
+        raise MembraneError(f"{shown.sum()} dots would be seen from the pose in the file; expected at least {FEWEST_MARKERS}")
+    X, pivot = np.asarray(sensor.markers.positions)[shown], np.asarray(sensor.markers.positions)[shown].mean(0)
+    sizes = np.array([int(size == "large") for size in sensor.markers.sizes or ()], dtype=int)[shown]
+    expected, found = _seen(sensor, X), pattern.pixels
+    pitch = _pitch(found)
+    grown = _extent(found) / _extent(expected)
+    over = np.median(found, 0) + grown * (expected - np.median(expected, 0))
+    tries = [_settled(sensor, X, sizes, pivot, pattern, over + pitch * np.array(step)) for step in product(STEPS, STEPS)]
+    matched, motion = max(tries, key=lambda each: each[0])
+    if matched < FEWEST_MATCHED * len(X):
+        raise MembraneError(
+            f"{matched:.0f} of {len(X)} dots are recognised among {len(found)} found in its rest image; expected most: check "
+            "the pose in the file, its lens, and that the image shows the membrane at rest"
+        )
+    return motion, pivot
+
+
+def _settled(
+    sensor: Sensor, X: np.ndarray, sizes: np.ndarray, pivot: np.ndarray, pattern: DotPattern, expected: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """How many dots are found where a pose has them, those of the wrong size against it, and the pose; from a first guess of
+    where they are in the image."""
+    tree, motion = cKDTree(pattern.pixels), np.zeros(6)
+    both = len(np.unique(sizes)) == 2 == len(np.unique(pattern.sizes))
+    score = 0.0
+    for _ in range(ROUNDS):
+        away, nearest = tree.query(expected)
+        near = away < NEAR * _pitch(expected)
+        near &= cKDTree(expected).query(pattern.pixels[nearest])[1] == np.arange(len(X))
+        if near.sum() < FEWEST_MARKERS:
+            return 0.0, motion
+        motion = _pose(sensor, X[near], pivot, pattern.pixels[nearest[near]], motion)
+        expected = _seen(sensor, _turned(motion, X, pivot))
+        alike = sizes[near] == pattern.sizes[nearest[near]] if both else np.ones(near.sum(), bool)
+        score = float(alike.sum() - (~alike).sum())
+    return score, motion
+
+
+def _pose(sensor: Sensor, X: np.ndarray, pivot: np.ndarray, pixels: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """The motion `[6]` that brings points to where they are seen."""
+    points, centre, seen = torch.from_numpy(X), torch.from_numpy(pivot), torch.from_numpy(pixels)
+
+    def residuals(theta: Tensor) -> Tensor:
+        moved = (points - centre) @ rotations(theta[:3]).mT + centre + theta[3:]
+        return (sensor.camera.point_to_pixel(moved) - seen).flatten()
+
+    found = fit(
+        lambda theta: residuals(torch.from_numpy(theta)).numpy(),
+        lambda theta: jacfwd(residuals)(torch.from_numpy(theta)).numpy(),
+        start,
+        "calibrate rest",
+    )
+    return found.values
+
+
+def _turned(motion: np.ndarray, points: np.ndarray, pivot: np.ndarray) -> np.ndarray:
+    turned: np.ndarray = (points - pivot) @ rotations(torch.from_numpy(motion[:3])).numpy().T + pivot + motion[3:]
+    return turned
+
+
+def _moved(sensor: Sensor, number: int, motion: np.ndarray, pivot: np.ndarray) -> Sensor:
+    """The sensor with a view whose camera sees the surface as after this motion of it, in the view's frame."""
+    views, R = list(sensor.views), rotations(torch.from_numpy(motion[:3])).numpy()
+    motion_of_surface = ViewPose(R, pivot + motion[3:] - R @ pivot)
+    pose = ViewPose.of_matrix(views[number].pose.matrix @ motion_of_surface.inverse.matrix)
+    views[number] = replace(views[number], pose=pose)
+    return replace(sensor, views=tuple(views))
+
+
+def _seen(sensor: Sensor, points: np.ndarray) -> np.ndarray:
+    pixels: np.ndarray = sensor.camera.point_to_pixel(torch.from_numpy(points)).numpy()
+    return pixels
+
+
+def _pitch(pixels: np.ndarray) -> float:
+    """The median distance to the nearest neighbour."""
+    return float(np.median(cKDTree(pixels).query(pixels, k=2)[0][:, 1]))
+
+
+def _extent(pixels: np.ndarray) -> float:
+    """The median distance from the median."""
+    return float(np.median(np.linalg.norm(pixels - np.median(pixels, 0), axis=1)))
