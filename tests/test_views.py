@@ -301,12 +301,13 @@ def test_simulate_writes_an_image_for_each_view(press, tmp_path, capsys):
     assert len(tm.Sensor.from_file(tmp_path / "out" / "sensor.toml").views) == 2
 
 
-@pytest.mark.parametrize("step", ["rest", "material"])
+@pytest.mark.parametrize("step", ["camera --corners 5,4 --square 2", "depth --image rest.png"])
 def test_calibrations_of_one_camera_refuse_several_views(press, tmp_path, capsys, step):
     """What is found of one camera would leave the others as they were."""
     path = press[0].at_rest().to_file(tmp_path)
-    arguments = ["calibrate", step, str(path), str(tmp_path / "sensor_rest_left.png"), "--out", str(tmp_path / "out")]
-    assert main(arguments) == 2
+    name, *options = step.split()
+    image = str(tmp_path / "sensor_rest_left.png")
+    assert main(["calibrate", name, str(path), image, *options, "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert "has 2 views; expected one" in said and "Traceback" not in said and not (tmp_path / "out").exists()
     with pytest.raises(MembraneError, match="calibrate material: views is 2; expected 1"):

@@ -27,8 +27,12 @@ NEAR = 0.35
 FEWEST_MATCHED = 0.6
 """Of the dots that a view sees: fewer that are found where they are expected are a coincidence."""
 ROUNDS = 8
-STEPS = (-1, 0, 1)
-"""Pitches along u and v by which a first guess may be off in a regular pattern."""
+STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+"""Pitches along u and v by which a first guess may be off."""
+TURNS = (-16.0, -8.0, 0.0, 8.0, 16.0)
+"""Degrees, likewise."""
+KEPT = 6
+"""First guesses of which a pose is found."""
 
 
 class RigFit(NamedTuple):
@@ -113,12 +117,31 @@ def placed_view(sensor: Sensor, number: int, image: np.ndarray, *, progress: Pro
     return replace(placed, views=tuple(views)), found
 
 
+def with_found(sensor: Sensor, found: Sensor) -> Sensor:
+    """A sensor of several views with what was found of the first one alone.
+
+    Where the rest surface is another one now, the further views are placed again by their rest images.
+
+    Args:
+        sensor: with several views, or one.
+        found: its first view's, with another material, surface or dots.
+    """
+    if not sensor.views:
+        return found
+    whole = replace(found, tool=sensor.tool, views=sensor.views)
+    same = torch.equal(found.membrane.rest, sensor.membrane.rest)
+    for number, view in enumerate(() if same else sensor.views):
+        if number and view.rest_image is not None:
+            whole, _ = placed_view(whole, number, view.rest_image)
+    return whole
+
+
 def recognised(sensor: Sensor, pattern: DotPattern) -> tuple[np.ndarray, np.ndarray]:
     """A first motion of the surface after which a view has its dots where they were found.
 
-    The dots as expected are brought over those found, centre on centre and of the same extent, or a pitch beside that; the
-    nearest ones are taken for each other, which gives a pose and so better expectations. The start after which most are
-    found counts.
+    The dots as expected are brought over those found, centre on centre and of the same extent, or some pitches and turns beside
+    that; the nearest ones are taken for each other, which gives an affine map, then a pose, and so better expectations. The
+    start after which most are found counts.
 
     Args:
         sensor: of the view alone, as `Sensor.in_view` gives it.
@@ -129,24 +152,49 @@ def recognised(sensor: Sensor, pattern: DotPattern) -> tuple[np.ndarray, np.ndar
 
     Raises:
         MembraneError: fewer than `FEWEST_MATCHED` of the dots that the view would see then are found.
+
+    Limitations:
+        A regular pattern of one size of dot, of which the image does not show a whole row, may be taken a pitch off.
     """
     shown = markers_in_view(sensor)
     if shown.sum() < FEWEST_MARKERS:
         raise MembraneError(f"{shown.sum()} dots would be seen from the pose in the file; expected at least {FEWEST_MARKERS}")
     X, pivot = np.asarray(sensor.markers.positions)[shown], np.asarray(sensor.markers.positions)[shown].mean(0)
     sizes = np.array([int(size == "large") for size in sensor.markers.sizes or ()], dtype=int)[shown]
-    expected, found = _seen(sensor, X), pattern.pixels
-    pitch = _pitch(found)
-    grown = _extent(found) / _extent(expected)
-    over = np.median(found, 0) + grown * (expected - np.median(expected, 0))
-    tries = [_settled(sensor, X, sizes, pivot, pattern, over + pitch * np.array(step)) for step in product(STEPS, STEPS)]
+    starts = _overlays(_seen(sensor, X), pattern.pixels)
+    tries = [_settled(sensor, X, sizes, pivot, pattern, start) for start in starts]
     matched, motion = max(tries, key=lambda each: each[0])
     if matched < FEWEST_MATCHED * len(X):
         raise MembraneError(
-            f"{matched:.0f} of {len(X)} dots are recognised among {len(found)} found in its rest image; expected most: check "
-            "the pose in the file, its lens, and that the image shows the membrane at rest"
+            f"{matched:.0f} of {len(X)} dots are recognised among {len(pattern.pixels)} found in the rest image; expected most: "
+            "check the pose in the file, its lens, and that the image shows the membrane at rest"
         )
     return motion, pivot
+
+
+def _overlays(expected: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
+    """Where dots `[D, 2]` may be among those found `[K, 2]`: affine maps of the expected pixels, those that meet most first."""
+    middle, pitch, tree = np.median(expected, 0), _pitch(found), cKDTree(found)
+    grown = _extent(found) / _extent(expected)
+    tries = []
+    for *step, turn in product(STEPS, STEPS, TURNS):
+        c, s = np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))
+        over = np.median(found, 0) + pitch * np.array(step) + grown * (expected - middle) @ np.array([[c, s], [-s, c]])
+        for _ in range(ROUNDS):
+            near, nearest = _each_other(over, found, tree)
+            if near.sum() < FEWEST_MARKERS:
+                break
+            rows = np.column_stack([expected, np.ones(len(expected))])
+            over = rows @ np.linalg.lstsq(rows[near], found[nearest[near]], rcond=None)[0]
+        tries.append((int(near.sum()), over))
+    return [over for _, over in sorted(tries, key=lambda each: -each[0])[:KEPT]]
+
+
+def _each_other(expected: np.ndarray, found: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray]:
+    """Which of the expected pixels `[D]` have a found one near, of which they are the nearest, and which one."""
+    away, nearest = tree.query(expected)
+    near = away < NEAR * _pitch(expected)
+    return near & (cKDTree(expected).query(found[nearest])[1] == np.arange(len(expected))), nearest
 
 
 def _settled(
@@ -154,13 +202,10 @@ def _settled(
 ) -> tuple[float, np.ndarray]:
     """How many dots are found where a pose has them, those of the wrong size against it, and the pose; from a first guess of
     where they are in the image."""
-    tree, motion = cKDTree(pattern.pixels), np.zeros(6)
+    tree, motion, score = cKDTree(pattern.pixels), np.zeros(6), 0.0
     both = len(np.unique(sizes)) == 2 == len(np.unique(pattern.sizes))
-    score = 0.0
     for _ in range(ROUNDS):
-        away, nearest = tree.query(expected)
-        near = away < NEAR * _pitch(expected)
-        near &= cKDTree(expected).query(pattern.pixels[nearest])[1] == np.arange(len(X))
+        near, nearest = _each_other(expected, pattern.pixels, tree)
         if near.sum() < FEWEST_MARKERS:
             return 0.0, motion
         motion = _pose(sensor, X[near], pivot, pattern.pixels[nearest[near]], motion)

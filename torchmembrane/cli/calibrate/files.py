@@ -109,6 +109,13 @@ def read_sensor_image(path: str | Path, sensor: Sensor) -> np.ndarray:
     return read_image(path, sensor.camera.image_size, sensor.camera.bits)
 
 
+def read_first_image(path: str | Path, sensor: Sensor) -> np.ndarray:
+    """The image `[H, W]` of the camera, or the first view's, its own or its region of the one that views share."""
+    if not sensor.views or sensor.views_apart:
+        return read_sensor_image(path, sensor)
+    return read_view_images(path, sensor)[0]
+
+
 def read_view_images(path: str | Path, sensor: Sensor) -> list[np.ndarray]:
     """The images of all views, `[H, W]` each: those beside the first view's, NAME_VIEW, or their regions of one.
 

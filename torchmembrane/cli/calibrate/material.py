@@ -11,9 +11,10 @@ from ...calibrate.known_modulus import KnownForces, KnownPressures
 from ...calibrate.material import MaterialFit, material_from_images
 from ...calibrate.presses import STRETCHES
 from ...calibrate.report import Report
+from ...calibrate.view_poses import with_found
 from ...calibrate.weight import WeightFit, material_from_weight
 from ...files.timestamps import time_in
-from ...jobs.inputs import Inputs, find_inputs, frame_name, single_images
+from ...jobs.inputs import Inputs, find_inputs, frame_name, of_first_view, single_images
 from ...jobs.pressure import read_pressures
 from ...plot.calibration import material_figure
 from ...reconstruct import Reconstructor
@@ -21,17 +22,18 @@ from ...results.status import Status
 from ...sensor.inflated import InflatedSurface
 from ...sensor.sensor import Sensor
 from ..progress import ProgressDisplay
-from .files import read_forces, read_sensor, read_sensor_image, write_calibrated
+from .files import read_first_image, read_forces, read_sensor, write_calibrated
 
 
 def material(arguments: Namespace) -> int:
     """`torchmembrane calibrate material`"""
-    sensor, inputs = read_sensor(arguments), find_inputs(arguments.images)
+    whole = read_sensor(arguments, with_views=True)
+    sensor, inputs = whole.in_view(0), of_first_view(find_inputs(arguments.images), whole.views_apart)
     paths = single_images(inputs)
     alone = arguments.weight is not None and not (arguments.forces or arguments.pressure or arguments.overpressure)
     forces = known_forces(arguments, inputs)
     pressures = _pressures(arguments, inputs, sensor) if arguments.pressure else None
-    images = torch.from_numpy(np.stack([read_sensor_image(path, sensor) for path in paths]))[:, None]
+    images = torch.from_numpy(np.stack([read_first_image(path, whole) for path in paths]))[:, None]
     with ProgressDisplay("calibrate material") as progress:
         weighed = material_from_weight(sensor, images, arguments.weight, progress=progress) if alone else None
         known = dict(overpressure=arguments.overpressure, rest_error=arguments.rest_error, progress=progress)
@@ -49,6 +51,8 @@ def material(arguments: Namespace) -> int:
             f"the rest surface is {height:.4g} ± {deviation:.2g} {unit} high, by the presses and by what was stated of it; the "
             f"file said {sensor.surface.formed.height:.4g}; the calibrated sensor has the height found"
         )
+    if whole.views:
+        notes.append(f"found by the first view, {whole.views[0].name!r}, alone")
     notes += [_by_name(sentence, paths) for sentence in found.contradictions]
     notes += _of_forces(arguments, found, weighed)
     if weighed is None:
@@ -64,7 +68,7 @@ def material(arguments: Namespace) -> int:
     made = found.sensor if weighed is None else weighed.sensor
     uncertainty = found.force_deviation if weighed is None else weighed.deviation
     drawing = material_figure(report, found, [path.name for path in paths])
-    return write_calibrated(arguments, made, report, drawing, len(paths), uncertainty)
+    return write_calibrated(arguments, with_found(whole, made), report, drawing, len(paths), uncertainty)
 
 
 def _of_forces(arguments: Namespace, found: MaterialFit, weighed: WeightFit | None) -> list[str]:
