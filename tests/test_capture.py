@@ -104,6 +104,16 @@ def test_photographs_are_taken_with_settings_held_and_named_by_their_time(monkey
     assert all(np.isfinite(times)) and times[2] - times[0] > 0.018
 
 
+def test_photographs_of_two_cameras_bear_the_names_of_their_views(monkeypatch, tmp_path):
+    drivers = {number: Driver(Driver([]).values) for number in (0, 2)}
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: drivers[number])
+    call = ["capture", "--camera", "left=0", "--camera", "right=2", "--out", str(tmp_path), "--count", "2"]
+    assert main(call) == 0
+    names = sorted(path.stem for path in tmp_path.iterdir())
+    assert [name.partition("_")[2] for name in names] == ["left", "right"] * 2 and names[0][:-5] == names[1][:-6]
+    assert all(np.isfinite(time_in(name)) for name in names) and all(driver.released for driver in drivers.values())
+
+
 def test_a_photograph_of_another_size_than_the_sensor_s_is_refused(monkeypatch, small_sensor, tmp_path, capsys):
     monkeypatch.setattr(cv2, "VideoCapture", lambda number: Driver([]))
     call = ["capture", str(small_sensor / "sensor.toml"), "--camera", "0", "--out", str(tmp_path / "rest")]

@@ -16,6 +16,7 @@ from torchmembrane.errors import MembraneError
 from torchmembrane.jobs.inputs import Inputs, of_first_view
 from torchmembrane.plot.sensor import sensor_figure
 from torchmembrane.pose import ViewPose
+from torchmembrane.results.view_status import status_in_words
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
 from torchmembrane.sensor.sensor import Sensor
 from torchmembrane.sensor.views import View
@@ -229,6 +230,8 @@ def test_a_knocked_view_is_found_by_its_own_motion(reconstructor, found, press):
     assert abs(float(motion[1, 0]) - 2) < 0.1 and float(motion[0, :2].norm()) < 0.1
     assert knocked.status.tolist() == [0]
     assert float((knocked.vertices - found.vertices).norm(dim=-1).max()) < 0.06
+    assert status_in_words(knocked.frame(0), ["left", "right"]) == "ok; view right has moved since the rest image"
+    assert status_in_words(found.frame(0), ["left", "right"]) == "ok"
 
 
 def test_noise_spreads_from_all_views(reconstructor, found):
@@ -285,10 +288,12 @@ def test_a_changed_image_of_any_view_is_done_again(press, tmp_path, capsys):
     assert main(call) == 0
     said = capsys.readouterr()
     assert "done again" not in said.out + said.err
-    Image.fromarray(np.roll(press[1][1], 1, axis=1)).save(files[1])
+    Image.fromarray(np.roll(press[1][1], 3, axis=1)).save(files[1])
     assert main(call) == 0
     said = capsys.readouterr()
     assert "press_left.png: changed, done again" in said.out + said.err
+    assert "view right: its camera has moved since the rest image, in 1 frames" in said.out + said.err
+    assert "ok; view right has moved" in (found / "summary.csv").read_text()
     assert not np.array_equal(tm.read_results(found)["press_left"]["residual"], first)
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from .layout import FabricationLayout, layout_for_pixels, pixel_lattice
     from .material import MaterialFit, material_from_images, material_from_pixels
     from .rest import RestFit, rest_from_image
-    from .view_poses import RigFit, placed_view, rest_from_view_images
+    from .view_poses import RigFit, rest_from_view_images
     from .views import ViewsFit, rest_from_views
     from .weight import WeightFit, material_from_weight
 
@@ -38,7 +38,7 @@ _MODULES = {
     ".layout": ("FabricationLayout", "layout_for_pixels", "pixel_lattice"),
     ".material": ("MaterialFit", "material_from_images", "material_from_pixels"),
     ".rest": ("RestFit", "rest_from_image"),
-    ".view_poses": ("RigFit", "placed_view", "rest_from_view_images"),
+    ".view_poses": ("RigFit", "rest_from_view_images"),
     ".views": ("ViewsFit", "rest_from_views"),
     ".weight": ("WeightFit", "material_from_weight"),
 }
@@ -66,7 +66,6 @@ __all__ = [
     "material_from_pixels",
     "material_from_weight",
     "pixel_lattice",
-    "placed_view",
     "ports_from_views",
     "rest_from_depth",
     "rest_from_image",

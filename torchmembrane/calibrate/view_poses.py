@@ -68,6 +68,19 @@ def rest_from_view_images(
 
     Limitations:
         The scale is that of the listed surface, which no image shows: an outline that is 1 % too large makes all distances so.
+
+    Example:
+        >>> from torchmembrane import Camera
+        >>> from torchmembrane.sensor.views import View
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> image = sensor.markers.rest_image[::2, ::2]  # every other pixel, and a camera that sees them
+        >>> camera = Camera("fisheye", (320, 240), (80.0, 80.0), (161.05, 121.45))
+        >>> guess = ViewPose(np.array([0.0, 3.0, 0.0]), np.array([1.0, 0.0, 0.0]))
+        >>> views = View("one", camera), View("two", camera, guess)  # which stand at one place in truth
+        >>> pair = replace(sensor, camera=camera, markers=replace(sensor.markers, rest_image=image), views=views)
+        >>> found = rest_from_view_images(pair, [image, image])
+        >>> bool(np.abs(found.sensor.views[1].pose.matrix - np.eye(4)).max() < 0.05)
+        True
     """
     count = len(sensor.views)
     if count < 2 or len(images) != count:
@@ -166,8 +179,8 @@ def recognised(sensor: Sensor, pattern: DotPattern) -> tuple[np.ndarray, np.ndar
     matched, motion = max(tries, key=lambda each: each[0])
     if matched < FEWEST_MATCHED * len(X):
         raise MembraneError(
-            f"{matched:.0f} of {len(X)} dots are recognised among {len(pattern.pixels)} found in the rest image; expected most: "
-            "check the pose in the file, its lens, and that the image shows the membrane at rest"
+            f"{matched:.0f} of {len(X)} dots are recognised among {len(pattern.pixels)} found in its rest image; expected "
+            "most: check the pose in the file, its lens, and that the image shows the membrane at rest"
         )
     return motion, pivot
 
@@ -194,7 +207,8 @@ def _each_other(expected: np.ndarray, found: np.ndarray, tree: cKDTree) -> tuple
     """Which of the expected pixels `[D]` have a found one near, of which they are the nearest, and which one."""
     away, nearest = tree.query(expected)
     near = away < NEAR * _pitch(expected)
-    return near & (cKDTree(expected).query(found[nearest])[1] == np.arange(len(expected))), nearest
+    back = np.asarray(cKDTree(expected).query(found[nearest])[1])
+    return near & (back == np.arange(len(expected))), np.asarray(nearest)
 
 
 def _settled(
@@ -253,7 +267,7 @@ def _seen(sensor: Sensor, points: np.ndarray) -> np.ndarray:
 
 def _pitch(pixels: np.ndarray) -> float:
     """The median distance to the nearest neighbour."""
-    return float(np.median(cKDTree(pixels).query(pixels, k=2)[0][:, 1]))
+    return float(np.median(np.asarray(cKDTree(pixels).query(pixels, k=2)[0])[:, 1]))
 
 
 def _extent(pixels: np.ndarray) -> float:

@@ -4,17 +4,19 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from .arguments import add_command, camera, count, number_from
+from .arguments import add_command, camera, count, number_from, of_each_view
 
 PURPOSE = "photograph with a camera whose exposure, gain and white balance are held"
 EXAMPLES = """\
 examples:
   torchmembrane capture --camera 0 --out rest/ --count 20
   torchmembrane capture sensor.toml --camera 0 --out weights/ --count 5 --every 10     # put another weight on meanwhile
+  torchmembrane capture --camera left=0 --camera right=2 --out rest/                   # of several views
 
 The camera is opened as `live` opens it, left alone until what it sets by itself has settled, and then held so,
 as far as its driver lets; what cannot be held is said. Most drivers keep the settings until the camera is
-unplugged: `live` then sees what was photographed. The files are named after the time, UTC.
+unplugged: `live` then sees what was photographed. The files are named after the time, UTC, of several views
+TIME_VIEW.png.
 
 exit code: 0 all taken, 2 wrong usage, or a camera that gives no images (any more)"""
 LONGEST = 3600.0
@@ -26,8 +28,8 @@ def add_parser(commands: Any) -> None:
     add = add_command(commands, "capture", run, PURPOSE, EXAMPLES)
     size = "the sensor file, whose image size is asked for, or preset:NAME (default: the camera's own size)"
     add("sensor", metavar="SENSOR.toml", nargs="?", help=size)
-    opened = "a camera, by OpenCV: its number, 0 the first, or its path or address"
-    add("--camera", metavar="NUMBER|PATH", type=camera, required=True, help=opened)
+    opened = "a camera, by OpenCV: its number, 0 the first, or its path or address; of several views one each, named"
+    add("--camera", metavar="[VIEW=]NUMBER|PATH", action="append", required=True, help=opened)
     add("--out", metavar="DIR", type=Path, required=True, help="folder of the photographs; those that it holds are kept")
     add("--count", metavar="N", type=count, default=20, help="photographs (default: %(default)s)")
     add("--every", metavar="SECONDS", type=number_from(0, LONGEST), default=0.0, help="between them, at least (default: none)")
@@ -38,19 +40,35 @@ def run(arguments: Namespace) -> int:
     from ..files.atomic import make_folder
     from ..files.images import write_as_taken
     from ..live.capture import Photographs
-    from ..presets import sensor_file
-    from ..sensor.sensor import Sensor
 
-    size, bits = None, None
-    if arguments.sensor is not None:
-        camera = Sensor.from_file(sensor_file(arguments.sensor)).camera
-        size, bits = camera.image_size, camera.bits
-    photographs = Photographs(arguments.camera, size)
-    print(f"camera {arguments.camera}: {photographs.settings.said}", flush=True)
+    cameras = _cameras(arguments)
+    photographs = {ending: Photographs(opened, size) for ending, (opened, size, _) in cameras.items()}
+    for (opened, *_), each in zip(cameras.values(), photographs.values(), strict=True):
+        print(f"camera {opened}: {each.settings.said}", flush=True)
     make_folder(arguments.out)
-    for taken, (name, image) in enumerate(photographs.take(arguments.count, arguments.every), 1):
-        path = write_as_taken(arguments.out / name, image, bits)
-        print(f"{taken} of {arguments.count}: {path}", flush=True)
+    taken = zip(*(each.take(arguments.count, arguments.every) for each in photographs.values()), strict=True)
+    for number, images in enumerate(taken, 1):
+        for (ending, (_, _, bits)), (_, image) in zip(cameras.items(), images, strict=True):
+            path = write_as_taken(arguments.out / f"{images[0][0]}{ending}", image, bits)
+            print(f"{number} of {arguments.count}: {path}", flush=True)
     height, width = image.shape[:2]
     print(f"{arguments.count} photographs of {width} x {height} px in {arguments.out}")
     return 0
+
+
+def _cameras(arguments: Namespace) -> "dict[str, tuple[int | str, tuple[int, int] | None, int | None]]":
+    """What opens each camera, the size that is asked for, and its bits; by what is added to its images' names."""
+    from ..presets import sensor_file
+    from ..sensor.sensor import Sensor
+
+    sensor = None if arguments.sensor is None else Sensor.from_file(sensor_file(arguments.sensor))
+    named = [given.partition("=")[0] for given in arguments.camera if len(arguments.camera) > 1]
+    views = named if sensor is None else sensor.views_apart
+    opened = [camera(given) for given in of_each_view("--camera", "NUMBER", arguments.camera, views)]
+    if not views:
+        size, bits = (None, None) if sensor is None else (sensor.image_size, sensor.camera.bits)
+        return {"": (opened[0], size, bits)}
+    if sensor is None:
+        return {f"_{view}": (each, None, None) for view, each in zip(views, opened, strict=True)}
+    each_view = zip(sensor.views, opened, strict=True)
+    return {f"_{view.name}": (each, view.camera.image_size, view.camera.bits) for view, each in each_view}

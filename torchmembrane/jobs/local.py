@@ -17,6 +17,7 @@ from ..files.targets import refuse_overwriting
 from ..machine_code import SECONDS
 from ..results.status import Status
 from ..results.store import FINISHED, Mesh, Settings
+from ..results.view_status import moved_views
 from .decode import Source, length_of, sources
 from .frame_reconstructor import FrameReconstructor, Gauge, Outcome
 from .inputs import Inputs, frame_name
@@ -106,7 +107,7 @@ def reconstruct_files(
     refuse_overwriting(f"--out {out}", files_at_risk(out, inputs, figures), [*inputs.images, *inputs.videos], force=True)
     if inputs.need_pyav:
         load_pyav()
-    done: Counter[int] = Counter()
+    done, moved = Counter[int](), Counter[str]()
     computed = FrameReconstructor(reconstructor, rest_pixels, pressure, settings.fields.split())
     work = Work(computed, (out, mesh) if figures else None)
     with ResultFolder(out, mesh, inputs, shard, figures, report) as folder:
@@ -117,8 +118,11 @@ def reconstruct_files(
             for group in (engine or _local(reconstructor, workers, progress.left))(work, waiting, batch):
                 for outcome in group:
                     done[_kept(folder, outcome, report)] += 1
+                    moved.update(moved_views(outcome.stored.frame, mesh.view_names.split()) if outcome.stored else ())
                 folder.save()
                 progress.update(len(group), done)
+    for view, frames in moved.items():
+        report(f"view {view}: its camera has moved since the rest image, in {frames} frames: `calibrate rest` with new ones")
     good = sum(done[status] for status in FINISHED)
     doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN], done[Status.OUT_OF_RANGE]
     return FrameCounts(good, *doubts, done[Status.VIEW_LEFT_OUT], done.total() - good, progress.initial)
@@ -148,7 +152,7 @@ def _kept(folder: ResultFolder, outcome: Outcome, report: Callable[[str], None])
     """Store an outcome, print the reason if it is not a result, or one of views of which one was left out, and return its
     status."""
     status = folder.keep(outcome)
-    if status not in FINISHED or outcome.reason:
+    if status not in FINISHED or status == Status.VIEW_LEFT_OUT:
         of_video = "" if outcome.name == frame_name(outcome.file) else f", {outcome.name}"
         report(f"{outcome.file}{of_video}: {outcome.status_text}")
     return status

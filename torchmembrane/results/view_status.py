@@ -1,4 +1,4 @@
-"""The status of a frame of several views in words, with the names of the views that were left out."""
+"""The status of a frame of several views in words, with the names of the views that were left out or have moved."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,9 +6,27 @@ import numpy as np
 
 from .status import Status
 
+MOVED = (1.0, 0.3, 0.005)
+"""By how much an image moves where its camera has: px, degrees, scale; a camera at rest is found to move by less."""
+
+
+def moved_views(frame: Mapping[str, np.ndarray], views: Sequence[str]) -> list[str]:
+    """Names of the views whose `camera_motion` says that their camera has moved against the rim since the rest image.
+
+    Example:
+        >>> moved_views({"camera_motion": np.array([[0.1, 0, 0, 1], [8.7, 0.2, 0, 1]])}, ["left", "right"])
+        ['right']
+    """
+    if not views:
+        return []
+    du, dv, degrees, scale = np.moveaxis(np.asarray(frame["camera_motion"]), -1, 0)
+    sizes = np.hypot(du, dv), abs(degrees), abs(scale - 1)
+    moved = np.any([size > least for size, least in zip(sizes, MOVED, strict=True)], 0)
+    return [name for name, has_moved in zip(views, moved, strict=True) if has_moved]
+
 
 def status_in_words(frame: Mapping[str, np.ndarray], views: Sequence[str], lacking: Mapping[str, str] | None = None) -> str:
-    """A frame's status in words; where a view was left out, which.
+    """A frame's status in words; where a view was left out or has moved, which.
 
     Args:
         frame: its arrays.
@@ -17,11 +35,16 @@ def status_in_words(frame: Mapping[str, np.ndarray], views: Sequence[str], lacki
 
     Example:
         >>> frame = {"status": np.array(10), "confidence": np.array([[1.0, 0.9], [0.0, 0.0]])}
+        >>> frame["camera_motion"] = np.array([[0.0, 0.0, 0.0, 1.0]] * 2)
         >>> status_in_words(frame, ["left", "right"], {"right": "no picture"}).partition("left out: ")[2]
         "the answer is the others': right (no picture)"
     """
     status, lacking = Status(int(frame["status"])), lacking or {}
-    if status != Status.VIEW_LEFT_OUT or not views:
+    if not views or not status.has_surface:
         return status.text
+    moved = moved_views(frame, views)
+    said = f"; view {', '.join(moved)} has moved since the rest image" if moved else ""
+    if status != Status.VIEW_LEFT_OUT:
+        return status.text + said
     out = [name for name, sure in zip(views, frame["confidence"], strict=True) if not sure.any()]
-    return f"{status.text}: {', '.join(f'{name} ({lacking[name]})' if name in lacking else name for name in out)}"
+    return f"{status.text}: {', '.join(f'{name} ({lacking[name]})' if name in lacking else name for name in out)}{said}"
