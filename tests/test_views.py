@@ -288,7 +288,7 @@ def test_a_changed_image_of_any_view_is_done_again(press, tmp_path, capsys):
     assert main(call) == 0
     said = capsys.readouterr()
     assert "done again" not in said.out + said.err
-    Image.fromarray(np.roll(press[1][1], 3, axis=1)).save(files[1])
+    Image.fromarray(np.roll(press[1][1], 2, axis=1)).save(files[1])
     assert main(call) == 0
     said = capsys.readouterr()
     assert "press_left.png: changed, done again" in said.out + said.err

@@ -6,8 +6,8 @@ import numpy as np
 
 from .status import Status
 
-MOVED = (1.0, 0.3, 0.005)
-"""By how much an image moves where its camera has: px, degrees, scale; a camera at rest is found to move by less."""
+STILL = (1.0, 0.3, 0.005)
+"""px, degrees, scale: by how much the image of a camera that stands still is found to move at most."""
 
 
 def moved_views(frame: Mapping[str, np.ndarray], views: Sequence[str]) -> list[str]:
@@ -21,7 +21,7 @@ def moved_views(frame: Mapping[str, np.ndarray], views: Sequence[str]) -> list[s
         return []
     du, dv, degrees, scale = np.moveaxis(np.asarray(frame["camera_motion"]), -1, 0)
     sizes = np.hypot(du, dv), abs(degrees), abs(scale - 1)
-    moved = np.any([size > least for size, least in zip(sizes, MOVED, strict=True)], 0)
+    moved = np.any([size > least for size, least in zip(sizes, STILL, strict=True)], 0)
     return [name for name, has_moved in zip(views, moved, strict=True) if has_moved]
 
 
