@@ -50,7 +50,7 @@ class Denting:
         known = dict(
             name="cap", length_unit="mm", force_unit="N", fingerprint=fingerprint, camera=camera, tool=None, record=Record()
         )
-        self.sensor = SimpleNamespace(**known, views=(), views_apart=[])
+        self.sensor = SimpleNamespace(**known, image_size=(WIDTH, HEIGHT), views=(), views_apart=[])
         self.estimator = SimpleNamespace(membrane=membrane, must_compile=False)
         self.vertex_pixels = membrane.rest[:, :2] + 8
         self.rest_pixels = torch.linspace(2, 10, 14).reshape(7, 2)

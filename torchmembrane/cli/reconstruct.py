@@ -197,7 +197,7 @@ def _spare_files(arguments: Namespace, inputs: "Inputs") -> None:
 
 def _said(counts: "FrameCounts") -> str:
     doubts = {"not converged": counts.not_converged, "unexplained": counts.unexplained, "partly hidden": counts.hidden}
-    doubts |= {"out of range": counts.out_of_range, "without one of the views": counts.view_left_out}
+    doubts["out of range"] = counts.out_of_range
     said = ", ".join(f"{count} {doubt}" for doubt, count in doubts.items() if count)
     unsure = f" ({said})" if said else ""
     return f"{counts.reconstructed} reconstructed{unsure}, {counts.failed} failed, {counts.skipped} finished before"

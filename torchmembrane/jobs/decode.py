@@ -86,7 +86,7 @@ def sources(inputs: Inputs, reconstructor: "Reconstructor") -> Iterator[Source]:
         if sensor.views_apart:
             yield from _frames(path, _pictures_of_views(path, inputs, sensor.views), files_of(path, inputs))
         else:
-            yield from _frames(path, _pictures(path, inputs.topic, reconstructor.image_size, sensor.camera.bits), [path])
+            yield from _frames(path, _pictures(path, inputs.topic, sensor.image_size, sensor.camera.bits), [path])
 
 
 def source_of(path: Path) -> Source:

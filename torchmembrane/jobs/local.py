@@ -43,7 +43,6 @@ class FrameCounts(NamedTuple):
     unexplained: int
     hidden: int
     out_of_range: int
-    view_left_out: int
     failed: int
     skipped: int
 
@@ -121,11 +120,13 @@ def reconstruct_files(
                     moved.update(moved_views(outcome.stored.frame, mesh.view_names.split()) if outcome.stored else ())
                 folder.save()
                 progress.update(len(group), done)
+    if alone := done[Status.VIEW_LEFT_OUT]:
+        report(f"a view was left out in {alone} frames, which are those of the others")
     for view, frames in moved.items():
         report(f"view {view}: its camera has moved since the rest image, in {frames} frames: `calibrate rest` with new ones")
     good = sum(done[status] for status in FINISHED)
     doubts = done[Status.NOT_CONVERGED], done[Status.UNEXPLAINED], done[Status.HIDDEN], done[Status.OUT_OF_RANGE]
-    return FrameCounts(good, *doubts, done[Status.VIEW_LEFT_OUT], done.total() - good, progress.initial)
+    return FrameCounts(good, *doubts, done.total() - good, progress.initial)
 
 
 def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:
