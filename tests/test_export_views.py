@@ -1,5 +1,7 @@
 """The exported model of two views, and the package that runs it without torch, against torch."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from torchmembrane_edge.cli import main
 
 import torchmembrane as tm
 from torchmembrane.files.provenance import SourceFile
+from torchmembrane.live.streams import ModelStream
 from torchmembrane.onnx.export import export
 from torchmembrane.sensor.views import View
 from torchmembrane.simulate import Simulator, Sphere
@@ -63,6 +66,36 @@ def test_a_model_of_two_views_gives_what_torch_gives(frames, made):
         previous, before = (got, expected) if alone else (None, None)
     assert got["status"].tolist() == [4] and expected.status.tolist() == [4]
     assert session.run([left[1:2], dark])["status"].tolist() == [10]
+
+
+def test_a_view_without_a_picture_is_left_out_by_the_model_too(frames, made):
+    """As `live --model` does it: NaN in place of what a camera did not give."""
+    left = frames[1][1][0]
+    frame = ModelStream(made[1], made[0].sensor.fingerprint)([left, None], 0.0)
+    with torch.no_grad():
+        expected = made[0]([left, None])
+    assert int(frame["status"]) == int(expected.status[0]) == 10 and not frame["confidence"][1].any()
+    np.testing.assert_allclose(frame["vertices"], expected.vertices[0].numpy(), atol=2e-3)
+
+
+def test_a_model_of_regions_takes_the_image_that_they_share(few_steps, frames, tmp_path):
+    """One input, of the whole image; its outputs are those of torch, and one dark region is left out."""
+    cameras = [CAMERA, tm.Camera("pinhole", (160, 120), (100, 100), (79.5 + 160, 59.5))]
+    wholes = [tm.Camera("pinhole", (320, 120), camera.focal.tolist(), camera.centre.tolist()) for camera in cameras]
+    first, other = (whole.in_mode((160 * w, 0, 160, 120)) for w, whole in enumerate(wholes))
+    views = View("left", first, is_region=True), View("right", other, BESIDE, is_region=True)
+    simulator = Simulator(replace(cap(camera=first), views=views))
+    reconstructor, path = tm.Reconstructor(simulator.at_rest(), settings=few_steps), tmp_path / "model.onnx"
+    export(reconstructor, path)
+    session = edge.Session(path)
+    assert session.views == () and session.image_sizes == [(320, 120)] and session.mesh["rest_pixels"].shape == (2, 49, 2)
+    images = np.stack([np.concatenate(frame, 1) for frame in frames[1]])
+    images[2, :, 160:] = 30
+    with torch.no_grad():
+        expected = reconstructor(images)
+    got = session.run(images)
+    agrees(got, expected)
+    assert got["status"].tolist()[2] == 10 and 10 not in got["status"].tolist()[:2]
 
 
 def test_images_of_other_views_are_refused_in_words(frames, made):

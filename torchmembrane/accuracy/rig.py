@@ -42,7 +42,7 @@ def image_noise(sensor: Sensor) -> float:
 
 
 class Rig:
-    """What trials of one sensor need.
+    """What trials of one sensor need, of one camera or of several views.
 
     The simulator stands on a grid of its own, finer than the reconstructor's, with no line in common but the rim. The rest
     image is simulated as the presses are, in the same light.
@@ -54,24 +54,26 @@ class Rig:
     Attributes:
         simulator: that presses it and takes the images.
         reconstructor: that does not know what was pressed.
-        seen: `[V]` bool, which of the reconstructor's vertices the camera sees at rest.
+        seen: `[V]` bool, which of the reconstructor's vertices a camera sees at rest.
 
     Raises:
         MembraneError: the sensor cannot be simulated, or reconstructed.
     """
 
     def __init__(self, sensor: Sensor, noise: float):
-        sensor.refuse_views("check --accuracy")
         self.simulator = Simulator(sensor, appearance=Appearance(noise=noise))
-        simulated = replace(sensor.markers, rest_image=self.simulator.rest_image())
+        at_rest = self.simulator.at_rest()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what is to be said of the sensor, its own reconstructor says
-            self.reconstructor = Reconstructor(replace(sensor, markers=simulated, range=UNLIMITED))
+            self.reconstructor = Reconstructor(replace(at_rest, range=UNLIMITED))
         self.seen = self._in_image()
 
     def rest_trials(self, frames: int, seed: int) -> list[RestTrial]:
         """So many frames at rest, each with noise of its own."""
         rng = np.random.default_rng([seed, 0])
+        if self.simulator.sensor.views:
+            at_rest = self.simulator.membrane.rest
+            return rest_trials(self._found_in([self.simulator.images(at_rest, rng) for _ in range(frames)]), self.seen)
         with torch.no_grad():
             clean = self.simulator.renderer(self.simulator.membrane.rest)
             images = noisy(clean.expand(frames, *clean.shape), self.simulator.appearance.noise, rng)
@@ -89,9 +91,13 @@ class Rig:
         return pair_trials(direction, pairs, result)
 
     def _reconstructed(self, states: Sequence[Press], rng: np.random.Generator) -> Reconstruction:
-        images = np.stack([self.simulator.image(state.vertices, rng) for state in states])
+        return self._found_in([self.simulator.images(state.vertices, rng) for state in states])
+
+    def _found_in(self, frames: Sequence[Sequence[np.ndarray]]) -> Reconstruction:
+        """What is found in frames, of an image each or one of each view that has its own."""
+        images = [np.stack(of_view) for of_view in zip(*frames, strict=True)]
         with torch.no_grad():
-            found: Reconstruction = self.reconstructor(images)
+            found: Reconstruction = self.reconstructor(images if self.simulator.sensor.views_apart else images[0])
         return found
 
     def _displacement(self, states: Sequence[Press]) -> Tensor:
@@ -103,13 +109,21 @@ class Rig:
         return self.reconstructor.sensor.membrane.rest_normals.double()
 
     def _found(self) -> Tensor:
-        """`[D]` bool, which markers are found at rest."""
-        return self.reconstructor.observer.seen_at_rest
+        """`[D]` bool, which markers are found at rest, by any view."""
+        seen = self.reconstructor.observer.seen_at_rest
+        return seen.view(-1, len(self.reconstructor.rest_markers)).any(0)
 
     def _in_image(self) -> Tensor:
-        pixels = self.reconstructor.vertex_pixels
-        inside = (pixels > -0.5) & (pixels < pixels.new_tensor(self.reconstructor.image_size) - 0.5)
-        return inside.all(-1)
+        sensor, pixels = self.reconstructor.sensor, self.reconstructor.vertex_pixels
+        inside = _within(pixels, sensor.camera.image_size)
+        for view in sensor.views[1:]:
+            at_rest = view.camera.point_to_pixel(view.pose.inverse.points(sensor.membrane.rest))
+            inside |= _within(at_rest.to(pixels), view.camera.image_size)
+        return inside
+
+
+def _within(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
+    return ((pixels > -0.5) & (pixels < pixels.new_tensor(image_size) - 0.5)).all(-1)
 
 
 def rest_trials(result: Reconstruction, seen: Tensor) -> list[RestTrial]:
@@ -151,7 +165,8 @@ def press_trials(
     depth, deep = (-(values * normals[seen]).sum(-1).amin(-1) for values in (u, estimate))
     miss = torch.linalg.vector_norm((estimate - u).flatten(1), dim=-1) / torch.linalg.vector_norm(u.flatten(1), dim=-1)
     place = torch.linalg.vector_norm(result.contact_points[:, 0].double() - centre, dim=-1)
-    lost = (result.confidence[:, found] <= 0).double().mean(-1)
+    confidence = result.confidence.reshape(len(size), -1, len(found)).amax(1)  # of the view that is surest
+    lost = (confidence[:, found] <= 0).double().mean(-1)
     columns = (
         size,
         depth,
