@@ -16,6 +16,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 import torchmembrane as tm
 from torchmembrane import state_dict as kept_state
+from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergySettings
 from torchmembrane.markers.dots import locator
 from torchmembrane.markers.noise import pixel_noise
 
@@ -118,9 +119,11 @@ class FromPixels(nn.Module):
         return self.reconstructor.from_pixels(pixels)
 
 
-def test_torch_export_takes_the_reconstruction_from_markers_and_agrees(sensor, images, few_steps):
+@pytest.mark.parametrize("estimator", [pytest.param("force-balance", marks=pytest.mark.full), "minimum-energy"])
+def test_torch_export_takes_the_reconstruction_from_markers_and_agrees(sensor, images, few_steps, estimator):
     """In double precision, in which the exported elimination and LAPACK's hardly differ by rounding."""
-    reconstructor = tm.Reconstructor(sensor, settings=few_steps).double()
+    settings = few_steps if estimator == "force-balance" else MinimumEnergySettings(steps=3)
+    reconstructor = tm.Reconstructor(sensor, estimator, settings=settings).double()
     with torch.no_grad():
         expected = reconstructor(images.double())
         program = torch.export.export(FromPixels(reconstructor), (expected.pixels,), strict=False)
