@@ -292,6 +292,7 @@ def test_shards_are_disjoint_and_together_everything(images, tmp_path, settings,
         assert rows_in(tmp_path / "out") == good
 
 
+@pytest.mark.usefixtures("quick_processes")
 @pytest.mark.parametrize("settings", [pytest.param(NPZ, id="npz", marks=pytest.mark.full), pytest.param(PARQUET, id="parquet")])
 def test_worker_processes_give_what_one_process_gives(small_sensor, small_images, tmp_path, monkeypatch, settings):
     from torchmembrane import Reconstructor

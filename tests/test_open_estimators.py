@@ -134,6 +134,7 @@ def test_the_page_s_exported_model_gives_what_torch_gives(folder, monkeypatch):
         np.testing.assert_allclose(found[key], getattr(expected, key).numpy(), rtol=0, atol=2e-5, err_msg=key)
 
 
+@pytest.mark.usefixtures("quick_processes")
 def test_the_command_finds_it_in_the_current_directory_also_in_worker_processes(
     folder, small_sensor, small_images, tmp_path, monkeypatch, capsys
 ):

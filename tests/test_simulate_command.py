@@ -178,6 +178,7 @@ def test_a_data_set_goes_on_where_it_was_interrupted(sensor_path, tmp_path, caps
     assert content(tmp_path) == before
 
 
+@pytest.mark.usefixtures("quick_processes")
 def test_processes_and_formats_do_not_change_a_data_set(sensor_path, tmp_path, capsys):
     call = ("simulate", sensor_path, "--random", "2", "--indenter", "sphere,plane", "--noise", "35")
     assert run(capsys, *call, "--jobs", "1", "--out", tmp_path / "png")[0] == 0
