@@ -27,11 +27,12 @@ MADE = {
     "range": (f"{RANDOM_SENSORS} --sensors 240 --presses 4 --seed 8126",),
     "out-of-range": tuple(f"{RANDOM_SENSORS}/{name} --sensors {number} {of}" for name, number, of in OTHERS),
     "degraded-images": (f"{RANDOM_SENSORS} --sensors 15",),
-    "precision": ("torchmembrane export examples/sensor.toml --grid 17 17 --force -o DATA/model.onnx",),
+    "precision": (),
     "live-exported": (),
 }
 """Folders of data, and what makes them. Nothing makes the independent ones: `make measure INDEPENDENT=FOLDER` names them;
-`live-exported` makes its own."""
+`precision` and
+`live-exported` make their own."""
 
 
 class Part(NamedTuple):
