@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from bench.measure.accuracy_tables import Rows, percent
+from bench.measure.accuracy_tables import Rows
 
 STEPS = {
     "lens, pinhole": "`camera`: pinhole, 640 x 480, 12 images",
@@ -223,7 +223,8 @@ def contact_law(found: dict) -> Rows:
     rows = []
     for row in found["rows"]:
         elsewhere = "{:.2f} to {:.2f}".format(*np.nanquantile(row["elsewhere"], (0, 1)))
-        rows.append([f"`{row['sensor']}`", percent(row["fitted"]), percent(row["held_out"]), elsewhere, f"{row['plate']:.2g}"])
+        errors = [f"{100 * row[key]:.1f} %" for key in ("fitted", "held_out")]
+        rows.append([f"`{row['sensor']}`", *errors, elsewhere, f"{row['plate']:.2g}"])
     head = ["", "law off by at most: fitted", "held out", "balls elsewhere, 0.25 of the size off the rim", "a plate on the top"]
     return [head, *rows]
 

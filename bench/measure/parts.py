@@ -96,7 +96,7 @@ PARTS = {
     ),
     "spec-sheets": Part("bench.accuracy.spec_sheets", (*PRESSED, "torchmembrane/accuracy")),
     "calibration": Part(
-        "bench.accuracy.calibration lens ports rest effect views depth --seeds 1", (*PRESSED, "torchmembrane/calibrate")
+        "bench.accuracy.calibration lens ports rest effect views depth layout --seeds 1", (*PRESSED, "torchmembrane/calibrate")
     ),
     "material": Part("bench.accuracy.calibration material --seeds 1", (*PRESSED, "torchmembrane/calibrate")),
     "gauge-modulus": Part("bench.accuracy.calibration gauge --seeds 1", (*PRESSED, "torchmembrane/calibrate")),

@@ -112,8 +112,8 @@ def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights:
         ],
         [
             "degraded images",
-            f"{degraded['ok']} of {degraded['images']} pass with status ok; {degraded['wrong']} of these surfaces are off "
-            f"by more than a quarter, {degraded['mirrored']} of them mirrored or upside down",
+            f"{degraded['ok']} of {degraded['images']} pass with status ok; {degraded['wrong']} of these surfaces, "
+            f"{degraded['mirrored']} of them mirrored or upside down, are off by more than a quarter",
             "[range](force_balance.md#range)",
         ],
         ["drift of the rest state", "noticed while nothing touches the membrane", "[drift](drift.md#measured)"],

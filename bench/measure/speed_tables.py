@@ -196,8 +196,9 @@ def precision(found: dict) -> Rows:
         if "not_loaded" in row:
             cells += [f"onnxruntime refuses the file: {row['not_loaded']}", "", ""]
         else:
-            statuses = "ok" if not any(row["status"]) else ", ".join(map(str, row["status"]))
-            errors = [", ".join(f"{value:.{d}f}" for value in row[key]) for key, d in (("vertices", 3), ("force", 2))]
-            cells += [statuses, *(["", ""] if row["precision"] == "float32" else errors)]
+            cells.append("ok" if not any(row["status"]) else ", ".join(map(str, row["status"])))
+            for key, digits in (("vertices", 3), ("force", 2)):
+                errors = row[key] if row["precision"] != "float32" else []
+                cells.append(", ".join(f"{value:.{digits}f}" for value in errors))
         rows.append(cells)
     return [["", "MB", "status", "vertices against float32, mm", "force, relative"], *rows]
