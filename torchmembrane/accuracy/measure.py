@@ -42,7 +42,7 @@ def spec_sheet(
 ) -> SpecSheet:
     """Measure what to expect of a sensor, by trials on a simulated one, through images.
 
-    Noise at rest, the lightest touch found, errors by force, how near two touches are told apart, the deepest press.
+    Noise at rest, the lightest touch found, errors by force, the distance at which two contacts are resolved, the deepest press.
 
     Args:
         sensor: the sensor.

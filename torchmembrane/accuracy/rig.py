@@ -168,7 +168,7 @@ def press_trials(
 
 
 def pair_trials(direction: int, pairs: Sequence[PairPress], result: Reconstruction) -> list[PairTrial]:
-    """Which pairs are told apart.
+    """Which pairs are resolved.
 
     Args:
         direction: its number.

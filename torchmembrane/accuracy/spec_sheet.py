@@ -199,8 +199,8 @@ class ClosestPair(NamedTuple):
 
     Attributes:
         directions: in how many directions pairs were moved together.
-        told: in how many of them the widest pair is told apart.
-        distance: the smallest at which this and every wider pair is told apart, over those.
+        told: in how many of them the widest pair is resolved.
+        distance: the smallest at which this and every wider pair is resolved, over those.
         nearest: the smallest distance tried.
         widest: the largest distance tried.
     """

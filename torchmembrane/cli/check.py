@@ -31,8 +31,8 @@ The rest surface is tested where it can fail: what tension and pressure leave un
 blown up in the same rim, what that holds, what a gauge reads (--overpressure), and what either does to forces.
 
 --accuracy presses the sensor in the simulator, some 150 images, and reconstructs them: noise at rest, the lightest touch found,
-errors of force, depth and place, how near two touches are told apart, how deep a press may be. Some minutes of processor time,
-more for larger images. Interrupted, it keeps the series of presses that are finished, in accuracy-*.unfinished.json beside
+errors of force, depth and place, the distance at which two contacts are resolved, how deep a press may be. It takes some minutes
+of processor time, more for larger images. Interrupted, it keeps the series of presses that are finished, in accuracy-*.unfinished.json beside
 --out, else in the current folder; the same command goes on from there and removes the file at the end. SENSOR.toml may be
 preset:NAME.
 
