@@ -42,7 +42,7 @@ def spec_sheet(
 ) -> SpecSheet:
     """Measure what to expect of a sensor, by trials on a simulated one, through images.
 
-    Noise at rest, the lightest touch found, errors by force, the distance at which two contacts are resolved, the deepest press.
+    Noise at rest, the lightest touch found, errors by force, the distance that resolves two contacts, the deepest press.
 
     Args:
         sensor: the sensor.
