@@ -46,7 +46,9 @@ def test_what_a_part_measures_exists(name):
 def test_a_record_says_where_it_comes_from(path):
     found = json.loads(path.read_text())
     assert re.fullmatch("[0-9a-f]{7}", found["revision"]) and re.fullmatch(r"2\d{3}-\d\d-\d\d", found["date"])
-    assert re.match(r"(\.venv-ros/bin/)?python -m bench\.", found["command"]) and (found["seconds"] is None or found["processor"])
+    assert re.match(r"(\.venv-ros/bin/)?python -m bench\.", found["command"]) and (
+        found["seconds"] is None or found["processor"]
+    )
 
 
 def test_numbers_of_another_record_change_the_table(monkeypatch):

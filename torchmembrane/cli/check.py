@@ -32,9 +32,9 @@ blown up in the same rim, what that holds, what a gauge reads (--overpressure), 
 
 --accuracy presses the sensor in the simulator, some 150 images, and reconstructs them: noise at rest, the lightest touch found,
 errors of force, depth and place, the distance that resolves two contacts, how deep a press may be. It takes some minutes of
-processor time, more for larger images. An interrupted command keeps the finished series of presses in accuracy-*.unfinished.json
-beside --out, or else in the current folder. The same command continues from there and removes the file at the end. SENSOR.toml
-may be preset:NAME.
+processor time, more for larger images. An interrupted command keeps the finished series of presses in a file
+accuracy-*.unfinished.json beside --out, or else in the current folder. The same command continues from there and removes the
+file at the end. SENSOR.toml may be preset:NAME.
 
 exit code: 0 the sensor can be used, 2 it cannot: the message says why"""
 
