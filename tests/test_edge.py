@@ -674,7 +674,7 @@ def test_the_table_of_a_folder_is_torchmembrane_s(model, call, images, tmp_path)
     assert row["status_text"] == "ok" and rows["broken"]["status_text"].startswith("unreadable: ")
     assert [float(row[f"force_{axis}"]) for axis in "xyz"] == pytest.approx([0, 0, -mean], rel=1e-4)
     assert [float(row[key]) for key in ("deepest", "time")] == pytest.approx([mean, 1790509109], rel=1e-4)
-    assert row["content_hash"] == SourceFile.of(one).content_hash and row["contact_1_x"] == ""
+    assert row["content_hash"] == SourceFile.from_files(one).content_hash and row["contact_1_x"] == ""
     with np.load(tmp_path / "r" / f"{one.stem}.npz") as stored:
         assert str(stored["path"]) == row["file"] == str(one) and stored["time"] == 1790509109
     again = images("again.png", GREY)

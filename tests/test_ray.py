@@ -169,7 +169,7 @@ def test_a_killed_worker_is_replaced_and_each_frame_is_there_once(reconstructor,
     for k, path in enumerate(paths):
         Image.open(small_images[k % 3]).save(path)
     (tmp_path / "broken.png").write_bytes(b"broken")
-    settings = Settings.of(reconstructor, "parquet")
+    settings = Settings.from_reconstructor(reconstructor, "parquet")
     inputs = find_inputs([*paths[:30], tmp_path / "broken.png"])
     ray.init(num_cpus=2, log_to_driver=False, logging_level="error", include_dashboard=False)
     try:
@@ -190,7 +190,7 @@ def test_what_ray_does_not_do_is_refused(reconstructor, small_images, tmp_path):
     pytest.importorskip("ray")
     from torchmembrane.jobs.ray_engine import RayEngine
 
-    settings = Settings.of(reconstructor, "parquet")
+    settings = Settings.from_reconstructor(reconstructor, "parquet")
     with pytest.raises(MembraneError, match="figures"):
         reconstruct_files(
             reconstructor, find_inputs(small_images), tmp_path / "out", settings, engine=RayEngine(), figures=True

@@ -441,7 +441,7 @@ def test_a_grid_keeps_its_source_when_the_solver_takes_another(tmp_path):
     assert sensor.membrane.grid == (25, 25) and sensor.surface.values["vertices"].shape == (9, 7, 3)
     written = np.load(sensor.to_file(tmp_path / "b").with_name("sensor_grid.npz"))
     assert np.array_equal(written["vertices"], sensor.surface.values["vertices"])
-    assert torch.equal(Surface.of(sensor.membrane).membrane((25, 25)).rest, sensor.membrane.rest)
+    assert torch.equal(Surface.from_membrane(sensor.membrane).membrane((25, 25)).rest, sensor.membrane.rest)
 
 
 def test_a_files_own_lines_are_made_even_unless_they_are_asked_for(tmp_path):

@@ -91,7 +91,7 @@ class Reconstructor(nn.Module):
             raise MembraneError(f"Reconstructor: dtype = {dtype}; expected torch.float32 or torch.float64")
         self.sensor, self.estimator_name, self.locator_name, self.channels = sensor, name, locator, channels
         self.image_size, self.model = sensor.image_size, model or sensor.material.model
-        self.range = sensor.range.of(sensor.fingerprint)
+        self.range = sensor.range.for_fingerprint(sensor.fingerprint)
         refuse_unfit(sensor, name, kind)
         membrane = copy.deepcopy(sensor.membrane)
         seen = sightings(sensor, locator, dtype, kind.needs_every_vertex, check_rest)

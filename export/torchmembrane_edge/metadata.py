@@ -44,7 +44,7 @@ class Metadata(NamedTuple):
     bits: int | None
 
     @classmethod
-    def of(cls, known: dict[str, str], model: str) -> "Metadata":
+    def from_properties(cls, known: dict[str, str], model: str) -> "Metadata":
         """From a model's metadata; `model` is its path, for messages.
 
         Raises:

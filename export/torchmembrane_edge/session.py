@@ -52,7 +52,7 @@ class Session:
         except Exception as error:  # onnxruntime's errors have no common base
             cause = f"onnxruntime {onnxruntime.__version__}: {in_one_line(error)}"
             raise EdgeError(f"{model}: not readable as a model ({cause}); expected {EXPECTED}") from error
-        said = Metadata.of(known, model)
+        said = Metadata.from_properties(known, model)
         self.name, self.length_unit, self.force_unit, self.status_texts, self.mesh, self.bits = said
         self._outputs = {given.name: (TYPES.get(given.type), given.shape[1:]) for given in self._session.get_outputs()}
         inputs = {given.name: given.shape for given in self._session.get_inputs()}

@@ -37,7 +37,7 @@ class Mode(NamedTuple):
     binning: tuple[int, int]
 
     @classmethod
-    def of(
+    def from_camera(
         cls,
         image_size: tuple[int, int],
         focal: Sequence[float],
@@ -51,7 +51,7 @@ class Mode(NamedTuple):
             MembraneError: a crop beyond the image, or blocks that do not fill it; names the value and what was expected.
 
         Example:
-            >>> Mode.of((640, 480), (400.0, 400.0), (320.0, 240.0), (0, 0, 640, 480), (3, 3))
+            >>> Mode.from_camera((640, 480), (400.0, 400.0), (320.0, 240.0), (0, 0, 640, 480), (3, 3))
             Traceback (most recent call last):
             ...
             torchmembrane.errors.MembraneError: Camera: binning is [3, 3]; expected whole numbers of 1 or more that divide the \

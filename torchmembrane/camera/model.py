@@ -164,7 +164,7 @@ class Camera(ImageMotion, nn.Module):
         """
         part = (0, 0, *self.image_size) if crop is None else crop
         blocks: Any = (binning, binning) if is_number(binning) else binning
-        mode = Mode.of(self.image_size, self.focal.tolist(), self.centre.tolist(), part, blocks)
+        mode = Mode.from_camera(self.image_size, self.focal.tolist(), self.centre.tolist(), part, blocks)
         lens = mode.size, mode.binned_focal, mode.binned_centre, self.distortion.tolist()
         made = Camera(self.model, *lens, ports=self.ports, medium_index=self.medium_index.item(), bits=self.bits)
         made.mode = mode

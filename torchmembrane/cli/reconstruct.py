@@ -113,11 +113,12 @@ def run(arguments: Namespace) -> int:
     pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
     format = arguments.format or ("parquet" if by_ray else "npz")
     fields = sorted(set(arguments.fields), key=FIELDS.index)
-    settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""), fields)
+    given = " ".join(arguments.rest), str(arguments.pressure or "")
+    settings = Settings.from_reconstructor(reconstructor, format, *given, fields)
     check_folder(arguments.out, sensor.fingerprint, settings)
     for remark in bag_remarks(inputs, sensor.camera):
         print(f"torchmembrane: {remark}", file=sys.stderr)
-    mesh, shard = Mesh.of(reconstructor, settings), Shard(*arguments.shard)
+    mesh, shard = Mesh.from_reconstructor(reconstructor, settings), Shard(*arguments.shard)
     bag = result_bag(arguments.bag, inputs, mesh, reconstructor, shard) if arguments.bag else None
     rest = recording_rest(reconstructor, arguments.rest, inputs) if arguments.rest else None
     counts = reconstruct_files(

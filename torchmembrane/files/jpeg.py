@@ -63,7 +63,7 @@ def _is_decoded(content: bytes) -> bool:
 def _without_padding(content: bytes) -> Iterator[Iterator[bytes]]:
     """For each restart interval, files of it alone that end where its data may end; the whole picture is one interval where
     there are no restart markers, or several scans."""
-    header = _Header.of(content)
+    header = _Header.from_bytes(content)
     end = content.find(END, header.length) if header else -1
     if header is None or end < 0:
         yield iter(())
@@ -110,7 +110,7 @@ class _Header:
         self.unit = 8 * max(byte & 15 for byte in samplings), 8 * max(byte >> 4 for byte in samplings)
 
     @classmethod
-    def of(cls, content: bytes) -> "_Header | None":
+    def from_bytes(cls, content: bytes) -> "_Header | None":
         """The header of a file whose segments are in order; None for another file."""
         at, frame, restart = 2, 0, 0
         while at + 4 <= len(content) and content[at] == 0xFF:

@@ -71,7 +71,7 @@ class FormedSurface(NamedTuple):
     outline: Outline
     cells: OutlineGrid
 
-    def on(self, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    def resampled_to(self, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and sheet `[*grid, 3]` on another grid, bicubic in the grid's lines."""
         return _on(self.vertices, grid), _on(self.sheet, grid)
 

@@ -53,7 +53,7 @@ class SheetEnergy(ElasticEnergy):
         for name, value in (("sheet", sheet), ("rest", membrane.rest), ("is_free", (~membrane.fixed)[split].any(1))):
             self.register_buffer(name, value)
 
-    def on(self, membrane: Membrane) -> "SheetEnergy":
+    def for_membrane(self, membrane: Membrane) -> "SheetEnergy":
         """The same sheet on every second line of the grid."""
         sheet = self.sheet.unflatten(0, self.grid)[::2, ::2].flatten(0, 1)
         return SheetEnergy(membrane, sheet, self.model, float(self.prestretch), self.modulus, self.c2_ratio)

@@ -103,7 +103,7 @@ def source_file_of(*paths: Path) -> SourceFile:
         for path in paths:
             if not path.is_file():
                 raise MembraneError(f"{path}: not a regular file; expected an image or a video")
-        return SourceFile.of(*paths)
+        return SourceFile.from_files(*paths)
     except OSError as error:
         raise MembraneError(f"{error.filename or paths[0]}: not readable ({error})") from error
 

@@ -83,7 +83,7 @@ class FrameReconstructor:
             raise MembraneError(f"FrameReconstructor: reconstructor is a {_kind(reconstructor)}; expected a tm.Reconstructor")
         self.reconstructor, self.rest_pixels, self.pressure, self.fields = reconstructor, rest_pixels, pressure, fields
 
-    def on(self, device: str) -> "FrameReconstructor":
+    def on_device(self, device: str) -> "FrameReconstructor":
         """The same on a device, "cpu" or "cuda"."""
         rest_pixels = None if self.rest_pixels is None else self.rest_pixels.to(device)
         return FrameReconstructor(self.reconstructor.to(device), rest_pixels, self.pressure, self.fields)
@@ -251,5 +251,5 @@ def outcomes_of(rows: dict[str, np.ndarray]) -> list[Outcome]:
             outcomes.append(Outcome(name, file, None, text))
         else:
             remark = text.removeprefix(Status(int(frame["status"])).text)
-            outcomes.append(Outcome(name, file, Stored.of(frame), remark))
+            outcomes.append(Outcome(name, file, Stored.from_arrays(frame), remark))
     return outcomes

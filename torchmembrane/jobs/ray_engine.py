@@ -70,7 +70,7 @@ class RayWorker:
         import ray
 
         torch.set_num_threads(1)
-        self.state: FrameReconstructor = ray.get(reference).on(device)
+        self.state: FrameReconstructor = ray.get(reference).on_device(device)
 
     def __call__(self, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return self.state(rows)

@@ -69,7 +69,7 @@ class Recording:
     def keep(self, seen: LiveFrame) -> None:
         """Write a frame."""
         path = write_as_taken(self.folder / IMAGES / seen.name, seen.image, self.bits)
-        stored = Stored(seen.frame, SourceFile.of(path)._replace(time=seen.time), seen.latency)
+        stored = Stored(seen.frame, SourceFile.from_files(path)._replace(time=seen.time), seen.latency)
         self._results.keep(Outcome(seen.name, path, stored))
         with writing(self.folder / TIMES):
             csv.writer(self._times).writerow((seen.name, f"{seen.time:.6f}", f"{seen.latency:.6f}"))

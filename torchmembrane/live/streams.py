@@ -50,7 +50,7 @@ class TrackedStream:
     def __init__(self, reconstructor: Reconstructor):
         reconstructor.sensor.refuse_views("live")
         self.tracker = Tracker(reconstructor)
-        self.mesh = Mesh.of(reconstructor, Settings.of(reconstructor, "npz"))
+        self.mesh = Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, "npz"))
 
     def __call__(self, image: np.ndarray, time: float) -> Frame:
         return self.tracker(image, time=time).frame(0)

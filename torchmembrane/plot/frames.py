@@ -60,7 +60,7 @@ def figure(
         >>> sensor = Sensor.from_file("examples/sensor.toml")
         >>> reconstructor = Reconstructor(replace(sensor, markers=replace(sensor.markers, rest_image=None)))
         >>> frame = reconstructor.from_pixels(reconstructor.rest_pixels).frame(0)
-        >>> drawing = figure(frame, Mesh.of(reconstructor, Settings.of(reconstructor, "npz")))
+        >>> drawing = figure(frame, Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, "npz")))
         >>> [axes.get_title() for axes in drawing.axes[:2]]
         ['Marker flow', 'Surface, seen along x']
     """

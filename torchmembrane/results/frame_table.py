@@ -247,4 +247,5 @@ def _stored_rows(table: Any, part: Path) -> dict[str, Stored]:
         columns[key] = values.to_numpy(zero_copy_only=False).reshape(len(table), *shape)
     known = {key: table[key].to_pylist() for key in (*SourceFile._fields, "seconds") if key in table.column_names}
     names = _names(table, part)
-    return {name: Stored.of({key: values[i] for key, values in (columns | known).items()}) for i, name in enumerate(names)}
+    values = columns | known
+    return {name: Stored.from_arrays({key: column[i] for key, column in values.items()}) for i, name in enumerate(names)}

@@ -37,7 +37,7 @@ class Stored(NamedTuple):
     seconds: float = float("nan")
 
     @classmethod
-    def of(cls, arrays: dict[str, Any]) -> "Stored":
+    def from_arrays(cls, arrays: dict[str, Any]) -> "Stored":
         """A frame from all arrays of a file; what the file lacks is taken as unknown.
 
         Raises:
@@ -104,7 +104,7 @@ def load_stored(path: Path) -> Stored:
     """
     arrays = read_arrays(path, None, EXPECTED, NUMBERS + TEXT)
     try:
-        return Stored.of({key: np.array(array, array.dtype.newbyteorder("=")) for key, array in arrays.items()})
+        return Stored.from_arrays({key: np.array(array, array.dtype.newbyteorder("=")) for key, array in arrays.items()})
     except DAMAGE as error:
         raise MembraneError(f"{path}: not a result of torchmembrane ({in_one_line(error)}); expected {EXPECTED}") from error
 

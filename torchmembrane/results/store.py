@@ -56,7 +56,7 @@ class Settings(NamedTuple):
     fields: str = ""
 
     @classmethod
-    def of(
+    def from_reconstructor(
         cls, reconstructor: ResultMaker, format: str, rest: str = "", pressure: str = "", fields: Sequence[str] = ()
     ) -> "Settings":
         """Those of results that a reconstructor makes; `rest`: what was taken for rest in place of the sensor's rest image,
@@ -126,7 +126,7 @@ class Mesh(NamedTuple):
     record: str = ""
 
     @classmethod
-    def of(cls, reconstructor: ResultMaker, settings: Settings) -> "Mesh":
+    def from_reconstructor(cls, reconstructor: ResultMaker, settings: Settings) -> "Mesh":
         """What the frames of a `Reconstructor` share."""
         sensor, membrane = reconstructor.sensor, reconstructor.estimator.membrane
         return cls(

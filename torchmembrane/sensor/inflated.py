@@ -98,11 +98,11 @@ class InflatedSurface(Surface):
 
     def membrane(self, grid: tuple[int, int]) -> Membrane:
         """The rest surface on a solver grid; see `Surface.membrane`."""
-        return Membrane(self.formed.on(grid)[0])
+        return Membrane(self.formed.resampled_to(grid)[0])
 
     def sheet(self, grid: tuple[int, int]) -> Tensor:
         """Where the vertices of a solver grid were without pressure, `[V, 3]`."""
-        return torch.from_numpy(self.formed.on(grid)[1].reshape(-1, 3).copy())
+        return torch.from_numpy(self.formed.resampled_to(grid)[1].reshape(-1, 3).copy())
 
     def of_height(self, height: float) -> "InflatedSurface":
         """The same sheet and rim, blown up to another height."""

@@ -235,7 +235,7 @@ class Surface:
 
     @classmethod
     @check_arguments
-    def of(cls, membrane: Membrane) -> "Surface":
+    def from_membrane(cls, membrane: Membrane) -> "Surface":
         """The surface that a membrane's own grid describes.
 
         Args:
@@ -247,6 +247,8 @@ class Surface:
         m, n = membrane.grid
         vertices = membrane.rest.cpu().double().numpy().reshape(m, n, 3)
         return cls("grid", {"vertices": vertices, "fixed": membrane.fixed.cpu().numpy().reshape(m, n)})
+
+    of = from_membrane  # its name before 0.2.0
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Those of the values that are arrays, which lie in a file of their own."""

@@ -80,7 +80,7 @@ class Sensor:
         if isinstance(self.surface, InflatedSurface):
             self._solve_again(self.surface)
         if self.surface is None or not _same_surface(self.surface.membrane(self.membrane.grid), self.membrane):
-            object.__setattr__(self, "surface", Surface.of(self.membrane))
+            object.__setattr__(self, "surface", Surface.from_membrane(self.membrane))
         if self.markers.rest_image is not None:
             object.__setattr__(self, "markers", _in_mode(self.markers, self.markers.rest_image, self.camera))
         if self.markers.positions is not None:

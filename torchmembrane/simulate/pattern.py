@@ -82,7 +82,7 @@ class Dots:
 
     @classmethod
     @check_arguments
-    def of(cls, sensor: Sensor, radii: Sequence[float] | None = None, missing: Sequence[int] = ()) -> "Dots":
+    def from_sensor(cls, sensor: Sensor, radii: Sequence[float] | None = None, missing: Sequence[int] = ()) -> "Dots":
         """The dots that a sensor lists; `radii` of small and large ones, default 0.16 and 0.27 of their spacing."""
         positions, sizes = sensor.markers.positions, sensor.markers.sizes
         if positions is None or sizes is None:
@@ -98,6 +98,8 @@ class Dots:
         if radii is not None:
             _refuse_overlap(made)
         return made
+
+    of = from_sensor  # its name before 0.2.0
 
     def described(self) -> dict[str, Any]:
         """What a data set's settings keep of the pattern."""
@@ -210,7 +212,7 @@ def pattern_of(sensor: Sensor, radii: Sequence[float] | None = None, missing: Se
         'Dots'
     """
     if sensor.markers.positions is not None:
-        return Dots.of(sensor, radii, missing)
+        return Dots.from_sensor(sensor, radii, missing)
     if radii or len(missing):
         raise MembraneError(f"sensor {sensor.name!r} lists no dots; expected neither radii nor missing dots, or list them")
     if sensor.markers.rest_image is None:

@@ -93,7 +93,7 @@ class LinearOnTriangles(NamedTuple):
     corner: Tensor
 
     @classmethod
-    def of(cls, corners: Tensor, values: Tensor) -> "LinearOnTriangles":
+    def from_corners(cls, corners: Tensor, values: Tensor) -> "LinearOnTriangles":
         """From corners `[T, 3, 2]` and the values there `[T, 3, C]`."""
         (a, b), (c, d) = ((corners[:, k] - corners[:, 0]).unbind(-1) for k in (1, 2))
         det = a * d - b * c

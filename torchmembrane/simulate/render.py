@@ -203,7 +203,7 @@ class Renderer(nn.Module):
         corners, visible = self._visible(x, samples=1)
         sample = torch.nonzero(visible.view(-1) >= 0).squeeze(-1)
         place = torch.stack([sample % visible.shape[1], sample // visible.shape[1]], -1).float()
-        linear = LinearOnTriangles.of(corners, x[self.surface.triangles][..., 2:])
+        linear = LinearOnTriangles.from_corners(corners, x[self.surface.triangles][..., 2:])
         depth = linear.at(visible.view(-1)[sample], place).squeeze(-1)
         image = torch.full(visible.shape, torch.nan, dtype=depth.dtype, device=visible.device)
         image.view(-1)[sample] = depth
@@ -244,10 +244,10 @@ class Renderer(nn.Module):
         triangle = visible.view(-1).index_select(0, sample)
         place = torch.stack([sample % visible.shape[1], sample // visible.shape[1]], -1).float()
         brightness = torch.stack([self.albedo * light[:, 0], light[:, 1]], -1)[self.surface.triangles]
-        grey, shine = LinearOnTriangles.of(corners, brightness).at(triangle, place).unbind(-1)
+        grey, shine = LinearOnTriangles.from_corners(corners, brightness).at(triangle, place).unbind(-1)
         near = torch.nonzero(self.inked.index_select(0, triangle)).squeeze(-1)
         if len(near):
-            linear = LinearOnTriangles.of(corners[self.inked], self.dot_place)
+            linear = LinearOnTriangles.from_corners(corners[self.inked], self.dot_place)
             row = self.dot_row.index_select(0, triangle.index_select(0, near))
             covered = inside_unit_disc(linear.at(row, place.index_select(0, near)), linear.slope.index_select(0, row))
             grey[near] *= 1 + (self.ink - 1) * covered

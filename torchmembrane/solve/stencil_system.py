@@ -111,7 +111,7 @@ class StencilSystem(nn.Module):
 def _ends(inner_grid: tuple[int, int]) -> np.ndarray:
     """The numbers of every vertex' neighbours at `OFFSETS`, of some vertex where there is none, in fields `[3, N]`: `[3, 10,
     N]`."""
-    inner = Inner.of(inner_grid)
+    inner = Inner.from_size(inner_grid)
     beside = np.stack([inner.at(inner.row + i, inner.column + j) for i, j in OFFSETS]).clip(min=0)
     return beside + len(inner.row) * np.arange(3)[:, None, None]
 
