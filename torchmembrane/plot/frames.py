@@ -199,9 +199,10 @@ def draw_traction(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
     if len(points):
         arrow = FORCE_ARROW * mesh.image_size[0] * force[:2] / size
         axes.annotate("", place[nearest[0]] + arrow, place[nearest[0]], arrowprops=dict(arrowstyle="-|>", color=BLUE, lw=2.5))
-    components = ", ".join(f"{c:.3g}" for c in force)
+    decimals = max(0, int(2 - np.floor(np.log10(size)))) if size > 0 else 0
+    components = ", ".join(f"{c:.{decimals}f}" for c in force)
     unit = "relative units\n" if mesh.force_unit == "relative" else f"{mesh.force_unit} "
-    axes.set_title(f"Force {size:.3g} {unit}({components})")
+    axes.set_title(f"Force {size:.{decimals}f} {unit}({components})")
 
 
 def _pressure_unit(mesh: Mesh) -> str:

@@ -144,4 +144,4 @@ def _legend(drawing: Figure, shades: Mapping[int, str]) -> None:
         handles.append(Patch(color=shade, alpha=0.45))
         text = "unreadable" if status == UNREADABLE else Status(status).text
         labels.append(f"status {status}: {text.partition(':')[0].partition(' (')[0]}")
-    drawing.legend(handles, labels, loc="lower center", ncols=min(4, len(labels)), frameon=False, fontsize=11.5)
+    drawing.legend(handles, labels, loc="lower center", ncols=min(5, len(labels)), frameon=False, fontsize=11.5)
