@@ -37,7 +37,7 @@ class Interrupted(KeyboardInterrupt):
     """A signal has come.
 
     Attributes:
-        number: of the signal.
+        number: number of the signal.
     """
 
     def __init__(self, number: int):
@@ -49,7 +49,7 @@ class _State:
     """The state of the signals of one command.
 
     Attributes:
-        number: of the first signal; 0: none yet.
+        number: number of the first signal; 0: none yet.
         answered: whether the main thread has it, and ends.
         raised: whether it has it as an exception.
         lost: whether its exception went nowhere.
@@ -170,7 +170,7 @@ def end_process(number: int) -> NoReturn:
     """Print a message and end this process and those that it has started, without Python's usual clean-up, which takes long.
 
     Args:
-        number: of the signal that has come.
+        number: number of the signal that has come.
     """
     os.write(2, f"{SAID}\n".encode())
     if "multiprocessing" in sys.modules:

@@ -42,7 +42,7 @@ class Tracker:
         reconstructor: the sensor's.
 
     Attributes:
-        time: of the latest frame, as it was given; None where it was not.
+        time: time of the latest frame, as it was given; None where it was not.
         stiffness: what known loads, given by `weigh` and `gauge`, tell of the membrane's modulus.
 
     Limitations:
@@ -273,8 +273,8 @@ def press_in_words(force: float, unit: str) -> str:
     """A contact in what is taken for rest, and the remedy.
 
     Args:
-        force: of the contact; NaN where it is not known.
-        unit: of the force.
+        force: force of the contact; NaN where it is not known.
+        unit: unit of the force.
     """
     known = f"of {force:.3g} {unit} " if np.isfinite(force) else ""
     return (

@@ -68,7 +68,7 @@ class Uses:
 
     Args:
         work: a folder for what stays whole.
-        lines: of the example's grid, that of its file if none are given.
+        lines: number of lines of the example's grid, that of its file if none are given.
     """
 
     def __init__(self, work: Path, lines: int | None):

@@ -36,7 +36,7 @@ class BallPress(NamedTuple):
     """A ball pressed into the top, without friction.
 
     Attributes:
-        radius: of the ball, length unit.
+        radius: radius of the ball, length unit.
         depth: how far it has moved along the inward normal since it touched, length unit.
         force: magnitude, force unit.
         held_out: whether the law was not fitted to it.

@@ -46,8 +46,8 @@ def spec_sheet(
 
     Args:
         sensor: the sensor.
-        seed: of presses and noise; the same gives the same.
-        noise: of the images, white over its standard deviation, dB; default: as in the rest image (`image_noise`).
+        seed: seed of presses and noise; the same gives the same.
+        noise: noise of the images, white over its standard deviation, dB; default: as in the rest image (`image_noise`).
         effort: how much is tried.
         jobs: processes.
         finished: series that an interrupted call of the same arguments has finished, which keeps those of this call as well.

@@ -128,8 +128,8 @@ def working_range(trials: Sequence[PressTrial], size: float, fingerprint: str) -
 
     Args:
         trials: the presses, without limits.
-        size: of the surface, length unit.
-        fingerprint: of the sensor.
+        size: size of the surface, length unit.
+        fingerprint: fingerprint of the sensor.
     """
     deep = [trial for trial in trials if trial.depth > LEAST_DEPTH * size and trial.status == Status.OK]
     wrong = [trial.depth for trial in deep if trial.is_wrong]

@@ -56,7 +56,7 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
 
     Args:
         sensor: camera and rest surface.
-        pitch: of the lattice, px, 4 or more.
+        pitch: pitch of the lattice, px, 4 or more.
 
     Returns:
         Pixels `[D, 2]`, and the sizes, small or large, of each.

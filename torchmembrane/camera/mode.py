@@ -15,9 +15,9 @@ class Mode(NamedTuple):
     seen at `(u - left - (b - 1) / 2) / b`. Distortion, ports and what stands for angles do not change.
 
     Attributes:
-        image_size: of the calibration, width and height, px.
-        focal: of the calibration, along u and v, px (fisheye: px / rad).
-        centre: of the calibration, px.
+        image_size: size of the calibration, width and height, px.
+        focal: focal lengths of the calibration, along u and v, px (fisheye: px / rad).
+        centre: centre of the calibration, px.
         crop: left, top, width, height of the part that is kept, px of the calibration.
         binning: pixels of a block along u and v.
 

@@ -64,7 +64,7 @@ class Camera(ImageMotion, nn.Module):
         distortion: coefficients; what is left off is zero, an empty list leaves the distortion out of the computation.
         ports: layers (distance, thickness, index) in order from the camera; what lies before and between them is air.
         medium_index: refractive index of all that follows the last port; without ports it plays no part.
-        bits: of its values, 8 to 16, where images of 16 bits hold fewer; None: all bits of what they are stored in.
+        bits: bits of its values, 8 to 16, where images of 16 bits hold fewer; None: all bits of what they are stored in.
 
     Attributes:
         focal: `[2]`, as all others a float64 tensor.

@@ -21,7 +21,7 @@ class FrameImages:
     Args:
         files: of those that there are.
         size: width and height that they must have, px.
-        bits: of the camera, where it is known that 16-bit files hold fewer.
+        bits: bits of the camera, where it is known that 16-bit files hold fewer.
     """
 
     def __init__(self, files: Mapping[str, Path], size: tuple[int, int], bits: int | None = None):

@@ -97,7 +97,7 @@ def refuse_unfit(sensor: Sensor, name: str, kind: type[Estimator]) -> None:
 
     Args:
         sensor: the sensor.
-        name: of the estimator, for messages.
+        name: name of the estimator, for messages.
         kind: its class.
 
     Raises:
@@ -116,9 +116,9 @@ def built_estimator(problem: Problem, name: str, kind: type[Estimator], settings
 
     Args:
         problem: the sensor's.
-        name: of the estimator, for messages.
+        name: name of the estimator, for messages.
         kind: its class.
-        settings: of that class; None: its defaults.
+        settings: settings of that class; None: its defaults.
 
     Raises:
         MembraneError: settings of another estimator.

@@ -165,7 +165,7 @@ def refuse_damaged(image: Image.Image, content: bytes) -> None:
 
     Args:
         image: that was loaded.
-        content: of its file; of a JPEG among several in a file, from its beginning on.
+        content: content of its file; of a JPEG among several in a file, from its beginning on.
 
     Raises:
         ValueError: it is damaged; of a PNG others of `DAMAGE` as well.

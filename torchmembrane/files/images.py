@@ -34,7 +34,7 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None, bits: int 
     Args:
         path: a PNG, JPEG, BMP, TIFF or WebP file with one picture.
         size: width and height that it must have, px; it is looked at before pixels are decoded.
-        bits: of the camera, where 16-bit files hold fewer; None: as the file says, or 16.
+        bits: bits of the camera, where 16-bit files hold fewer; None: as the file says, or 16.
 
     Returns:
         Grey values.
@@ -58,7 +58,7 @@ def decode_image(content: bytes, name: str | Path, size: tuple[int, int] | None 
     """The grey values of an image file's content, as `read_image` gives them.
 
     Args:
-        content: of a PNG, JPEG, BMP, TIFF or WebP file.
+        content: content of a PNG, JPEG, BMP, TIFF or WebP file.
         name: what an error calls it.
         size: width and height that it must have, px.
         bits: as `read_image`.
@@ -242,7 +242,7 @@ def to_grey(array: np.ndarray, bits: int | None = None) -> np.ndarray:
 
     Args:
         array: `[height, width]` grey or `[height, width, 3]` RGB; uint8 (0..255), uint16 (0..65535) or float (0..1).
-        bits: of the camera, where a uint16 holds fewer: white is `2^bits - 1`.
+        bits: bits of the camera, where a uint16 holds fewer: white is `2^bits - 1`.
 
     Raises:
         MembraneError: another shape or type, a value not finite, outside 0..1 or beyond `bits`.
@@ -285,7 +285,7 @@ def write_image(stem: str | Path, grey: np.ndarray, bits: int | None = None) -> 
     Args:
         stem: the file without its ending, `.png` or `.tiff`.
         grey: `[height, width]` in 0..1.
-        bits: of the camera, with which it will be read.
+        bits: bits of the camera, with which it will be read.
 
     Returns:
         The path.
@@ -312,7 +312,7 @@ def write_as_taken(stem: str | Path, image: np.ndarray, bits: int | None = None)
         stem: the file without its ending, `.png` or `.tiff`.
         image: `[height, width]` uint8 or uint16, `[height, width, 3]` uint8, or grey values as for `write_image`; of
             `[height, width, 3]` uint16 the grey values are written.
-        bits: of the camera, with which it will be read.
+        bits: bits of the camera, with which it will be read.
 
     Returns:
         The path.

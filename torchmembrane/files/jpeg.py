@@ -29,7 +29,7 @@ def is_whole(content: bytes) -> bool:
     that are alike, or up to `MOST_ODD`. Such padding is no damage. What ends early, or is not decodable, is damaged.
 
     Args:
-        content: of the file, grey or of three colours.
+        content: content of the file, grey or of three colours.
 
     Limitations:
         A decoder that loses its place in damaged data and ends up to `MOST_ODD` bytes early is not noticed, nor is damage for

@@ -42,7 +42,7 @@ def white_of(stored: int, bits: int | None) -> int:
 
     Args:
         stored: bits that a value is stored in, 8 or 16.
-        bits: of the camera, where 16 hold fewer; None: those it is stored in.
+        bits: bits of the camera, where 16 hold fewer; None: those it is stored in.
 
     Example:
         >>> white_of(16, 12), white_of(16, None), white_of(8, 12)

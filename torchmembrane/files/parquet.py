@@ -20,7 +20,7 @@ def read_table(path: Path, what: str, expected: str, columns: Sequence[str] | No
     """A Parquet file as a `pyarrow.Table`; checksums, where it has them, are compared.
 
     Args:
-        path: of the file.
+        path: path of the file.
         what: is read, for messages.
         expected: the remedy, for messages.
         columns: the ones that are read; None: all.

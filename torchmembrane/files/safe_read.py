@@ -122,10 +122,10 @@ def read_arrays(
     """Arrays from an `.npz`, by name. Sizes are checked before anything is unpacked; nothing is unpickled.
 
     Args:
-        path: of the file.
-        names: of the arrays, others that the file may hold are not read; None: all.
+        path: path of the file.
+        names: names of the arrays, others that the file may hold are not read; None: all.
         expected: what is read, for messages.
-        kinds: of their types, `NUMBERS` or `NUMBERS + TEXT`.
+        kinds: kinds of types that they may have, `NUMBERS` or `NUMBERS + TEXT`.
 
     Raises:
         MembraneError: no such file, a damaged or too large one, or one that lacks an array.
@@ -158,7 +158,7 @@ def read_array(path: Path) -> np.ndarray:
     """The array of numbers of an `.npy`, checked as `read_arrays` does.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
         MembraneError: no such file, or a damaged or too large one.

@@ -33,7 +33,7 @@ def refuse_damaged_page(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
     """Refuse a page whose compressed data have a wrong checksum or go on after its last pixel, where decoders stop.
 
     Args:
-        tags: of the page.
+        tags: tags of the page.
         file: that holds it.
 
     Raises:
@@ -62,7 +62,7 @@ def refuse_displaced(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
     Equal bytes are taken for padding.
 
     Args:
-        tags: of the page.
+        tags: tags of the page.
         file: that holds it.
 
     Raises:

@@ -19,7 +19,7 @@ def missing_end(path: Path) -> str:
     """In words, what is missing at the end of a video file; "" if nothing is, or if that cannot be told.
 
     Args:
-        path: of a regular file.
+        path: path of a regular file.
 
     Example:
         >>> from tempfile import TemporaryDirectory

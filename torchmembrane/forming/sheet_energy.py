@@ -19,7 +19,7 @@ class SheetEnergy(ElasticEnergy):
         membrane: the rest surface.
         sheet: `[V, 3]`, where its vertices were before: stretched in its rim by the prestretch, without pressure.
         model: "harmonic" | "neo_hookean" | "mooney_rivlin".
-        prestretch: of the sheet, equal in both directions.
+        prestretch: prestretch of the sheet, equal in both directions.
         modulus: shear modulus x thickness of the sheet as it is stretched in its rim, force / length.
         c2_ratio: C2 / C1, Mooney-Rivlin only.
 

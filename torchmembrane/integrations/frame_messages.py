@@ -63,7 +63,7 @@ class SiUnits:
     """A sensor's results in N, N m, m and Pa.
 
     Args:
-        mesh: of the results.
+        mesh: mesh of the results.
         gas_pressure: `Sensor.gas_pressure`.
 
     Raises:

@@ -44,7 +44,7 @@ def grey_of(message: Any, size: tuple[int, int], bits: int | None = None) -> np.
     Args:
         message: the message.
         size: width and height that it must have, px.
-        bits: of the camera, where 16 hold fewer.
+        bits: bits of the camera, where 16 hold fewer.
 
     Raises:
         MembraneError: another size, values beyond `bits`, an encoding without a grey or colour value for every pixel, or a

@@ -70,7 +70,7 @@ class RerunLog:
         """Log a frame.
 
         Args:
-            number: of the frame.
+            number: number of the frame.
             frame: its arrays, as `Reconstruction.frame` gives them.
             image: its image, `[height, width]` or `[height, width, 3]`, uint8 or in 0..1.
             time: when it was taken, seconds since 1970.

@@ -131,7 +131,7 @@ class BagWriter:
 
     Args:
         path: a folder: new, or of such a bag, which is replaced when the new one is whole.
-        units: of the results.
+        units: units of the results.
         mcap: store as MCAP; else as sqlite3.
 
     Raises:

@@ -113,7 +113,7 @@ def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch:
 
     Args:
         sources: frames to decode, in order.
-        reconstructor: of the sensor.
+        reconstructor: reconstructor of the sensor.
         batch: the number of frames in a batch.
 
     Yields:

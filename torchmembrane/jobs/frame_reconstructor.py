@@ -56,11 +56,11 @@ class FrameReconstructor:
     It can be pickled.
 
     Args:
-        reconstructor: of the sensor.
+        reconstructor: reconstructor of the sensor.
         rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
         pressure: readings of a gauge by the names of the frames, or a function of name and time (s); units as for
             `Reconstructor`.
-        fields: of the surface that frames hold as well, as of `Reconstructor.fields`: "stretch", "tension".
+        fields: fields of the surface that frames hold as well, as of `Reconstructor.fields`: "stretch", "tension".
 
     Example:
         >>> from dataclasses import replace

@@ -129,7 +129,7 @@ def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:
     A few frames take less time by tensor operations than compiling does.
 
     Args:
-        reconstructor: of the job.
+        reconstructor: reconstructor of the job.
         left: its frames; None where that is not known.
     """
     if not reconstructor.estimator.must_compile or left == 0:

@@ -20,7 +20,7 @@ class RayEngine:
     A worker that dies is replaced, and its frames are computed again.
 
     Args:
-        device: of each worker, "cpu" with one thread, or "cuda" with a GPU of its own.
+        device: device of each worker, "cpu" with one thread, or "cuda" with a GPU of its own.
         workers: how many; default: as many as the cluster has room for.
 
     Raises:

@@ -19,7 +19,7 @@ class StatusLine:
     """Shows the latest frame, with rate and latency over the last `RECENT` frames.
 
     Args:
-        mesh: of the stream.
+        mesh: mesh of the stream.
         file: where to write.
     """
 

@@ -27,8 +27,8 @@ class LiveFrame(NamedTuple):
     """A frame as it was followed.
 
     Attributes:
-        number: of the capture, from 0.
-        time: of the capture, seconds since 1970.
+        number: number of the capture, from 0.
+        time: time of the capture, seconds since 1970.
         image: as it was captured.
         frame: its result's arrays.
         latency: from the capture to the result, seconds.
@@ -57,8 +57,8 @@ class StreamStats:
     Attributes:
         captured: pictures, to the latest one that was followed.
         failed: frames without a surface.
-        times: of the captures of the frames followed, seconds since 1970.
-        latencies: of the same, seconds.
+        times: times of the captures of the frames followed, seconds since 1970.
+        latencies: latencies of the same, seconds.
 
     Example:
         >>> stats = StreamStats()

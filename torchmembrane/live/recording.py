@@ -34,7 +34,7 @@ class Recording:
     Args:
         folder: new or empty.
         mesh: what the frames share.
-        bits: of the camera, where 16 hold fewer.
+        bits: bits of the camera, where 16 hold fewer.
 
     Raises:
         MembraneError: the folder holds something; of `keep`, and when the block ends: it cannot be written to. Where the block

@@ -47,7 +47,7 @@ def figure(
         frame: one frame's arrays, as `Reconstruction.frame` gives them.
         mesh: the `Mesh` stored beside it.
         image: its image `[height, width]` in 0..1; without one, none is drawn.
-        name: of the frame, for the title.
+        name: name of the frame, for the title.
         places: for panels, 4 or 3; default: as many as there are. Films need figures of one size.
 
     Returns:

@@ -51,7 +51,7 @@ def blown_up(rim: Mapping[str, Any], unit: str, stated: Stated) -> BlownUp:
 
     Args:
         rim: `outline`, `size`, `corner` and `base_z` as of `InflatedSurface`.
-        unit: of length.
+        unit: unit of length.
         stated: what is known.
 
     Returns:
@@ -168,7 +168,7 @@ def sheet_dots(surface: InflatedSurface, pitch: float) -> tuple[np.ndarray, list
 
     Args:
         surface: the rest surface.
-        pitch: of the pattern on the stretched sheet, length unit.
+        pitch: pitch of the pattern on the stretched sheet, length unit.
 
     Returns:
         Positions `[D, 3]` on the rest surface, camera's frame, and sizes.

@@ -32,7 +32,7 @@ def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.
     column `size`: small or large (default: small).
 
     Args:
-        path: of the CSV file.
+        path: path of the CSV file.
         surface: the rest surface.
         camera: for `u,v`.
 

@@ -42,7 +42,7 @@ class FrameTable:
     back for `SAVE_SECONDS`, or until `PART_ROWS` of them make a file.
 
     Args:
-        folder: of the parts.
+        folder: folder of the parts.
         mesh: what the frames share.
         write_lock: held while parts are changed.
 

@@ -11,7 +11,7 @@ def files_of(path: Path) -> list[Path]:
     """A sensor's file, and those beside it that it names.
 
     Args:
-        path: of the `.toml` file.
+        path: path of the `.toml` file.
 
     Raises:
         MembraneError: it cannot be read as TOML.

@@ -89,8 +89,8 @@ class Cavity:
 
     Args:
         filling: "liquid" (volume kept) | "gas" (absolute pressure x volume kept) | "open" (pressure stays at rest).
-        pressure: of a gas, absolute, at rest, hPa.
-        volume: of a gas, length unit cubed; None: between the rim and the rest surface.
+        pressure: pressure of a gas, absolute, at rest, hPa.
+        volume: volume of a gas, length unit cubed; None: between the rim and the rest surface.
 
     Raises:
         MembraneError: names the value, what came and what was expected.
@@ -124,8 +124,8 @@ class Markers:
         positions: `[D, 3]` of the dots at rest, length unit, camera frame; None: found in the rest image.
         sizes: D times "small" | "large"; None: all small.
         rest_image: an array as `to_grey` takes it, kept as grey float32 `[height, width]`; or a path, which is read.
-        height: of dots that stand off the inner side, as pins' tips do, along the inward normal, length unit: one number for
-            all, or `[D]`, one for each listed dot, whose position is then that of its foot on the surface.
+        height: height of dots that stand off the inner side along the inward normal, as the tips of pins do, length unit: one
+            number for all, or `[D]`, one for each listed dot, whose position is then that of its foot on the surface.
 
     Raises:
         MembraneError: names the value, what came and what was expected.
@@ -295,7 +295,7 @@ def refuse_other_size(size: tuple[int, int], camera: Camera) -> None:
     """Refuse a rest image that is neither of the camera's size nor, where it is in a mode, of the calibrated one.
 
     Args:
-        size: of the image, width and height, px.
+        size: size of the image, width and height, px.
         camera: the sensor's.
 
     Raises:

@@ -97,7 +97,7 @@ class Sensor:
         """The sensor of one of the views alone, in that view's frame: its camera, and the membrane as it is seen from there.
 
         Args:
-            number: of the view, from 0; 0 of a sensor with one camera is the sensor itself.
+            number: number of the view, from 0; 0 of a sensor with one camera is the sensor itself.
 
         Raises:
             MembraneError: there is no such view.
@@ -209,7 +209,7 @@ class Sensor:
         """The sensor that a `sensor.toml` describes, with the files named in it (paths relative to it).
 
         Args:
-            path: of the `.toml` file.
+            path: path of the `.toml` file.
 
         Returns:
             The `Sensor`.

@@ -37,7 +37,7 @@ class Table:
 
     Args:
         path: the file.
-        name: of the table, dotted; empty for the file itself.
+        name: name of the table, dotted; empty for the file itself.
         values: by key.
 
     Example:
@@ -219,7 +219,7 @@ def toml_lines(name: str, values: Mapping[str, object], repeated: bool = False) 
     """A table as lines of TOML.
 
     Args:
-        name: of the table, dotted; empty for the file itself.
+        name: name of the table, dotted; empty for the file itself.
         values: text, numbers and lists of numbers by key; keys that are None are left out.
         repeated: one of a list of tables.
 

@@ -53,7 +53,7 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
     """The parts of the sensor that a `sensor.toml` describes; `Sensor.from_file` puts them together.
 
     Args:
-        path: of the `.toml` file; the files named in it are relative to its folder.
+        path: path of the `.toml` file; the files named in it are relative to its folder.
         undotted: whether it is a design that may have no dots yet; one in the middle then stands for those to come.
 
     Returns:
@@ -102,7 +102,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
 
     Args:
         parts: what is written.
-        path: of the `.toml` file; the other files are named after it.
+        path: path of the `.toml` file; the other files are named after it.
 
     Returns:
         The path.

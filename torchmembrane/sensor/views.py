@@ -29,9 +29,9 @@ class View:
     Args:
         name: one word, also of the files of its images.
         camera: the calibrated `Camera`; of a region of a shared image that of the region, `camera.in_mode(region)`.
-        pose: of the view's frame in the first view's; reflected of a mirror.
+        pose: pose of the view's frame in the first view's; it reflects for a mirror.
         rest_image: as of `Markers`, without contact; None: displacements are then from where the model sees the markers.
-        side: of the membrane at which it looks, "inside" | "outside".
+        side: side of the membrane at which it looks, "inside" | "outside".
         is_region: whether it is a region of an image that all views share.
 
     Raises:

@@ -132,7 +132,7 @@ class Speckle:
 
     Args:
         size: mean size of a grain, length unit.
-        seed: of the waves.
+        seed: seed of the waves.
         dark: reflectance of the darkest grains.
 
     Raises:
@@ -200,7 +200,7 @@ def pattern_of(sensor: Sensor, radii: Sequence[float] | None = None, missing: Se
 
     Args:
         sensor: the sensor.
-        radii: of small and large dots, length unit; default: 0.16 and 0.27 of their spacing.
+        radii: radii of small and large dots, length unit; default: 0.16 and 0.27 of their spacing.
         missing: dots that are not painted.
 
     Raises:
@@ -224,7 +224,7 @@ def inside_unit_disc(place: Tensor, slope: Tensor) -> Tensor:
     """The share of each sample that lies within the unit disc, whose outline is taken as straight.
 
     Args:
-        place: of the samples, in units of the disc's radius, `[S, 2]`.
+        place: place of the samples, in units of the disc's radius, `[S, 2]`.
         slope: its derivative in the image, `[S, 2, 2]`.
 
     Returns:
@@ -246,8 +246,8 @@ def dot_coordinates(
     """Triangles that a dot may touch, and their corners in its tangent plane.
 
     Args:
-        corners: of the triangles, `[T, 3, 3]`.
-        positions: of the dots, `[D, 3]`.
+        corners: corners of the triangles, `[T, 3, 3]`.
+        positions: positions of the dots, `[D, 3]`.
         normals: there, `[D, 3]`.
         radii: `[D]`.
 

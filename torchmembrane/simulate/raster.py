@@ -18,8 +18,8 @@ def visible_triangles(corners: Tensor, depth: Tensor, width: int, height: int) -
         corners: `[T, 3, 2]`. Only triangles that turn from +u to +v are visible, which those of an outward surface do from
             inside, and none with a corner that is NaN.
         depth: `[T]`, one for each triangle.
-        width: of the image.
-        height: of the image.
+        width: width of the image.
+        height: height of the image.
 
     Returns:
         Indices of triangles, int64 `[height, width]`, -1 where there is none.

@@ -29,8 +29,8 @@ class RenderedDots(NamedTuple):
     """Dots of a deformed membrane.
 
     Attributes:
-        positions: of their centres, `[..., D, 3]`; of dots at a height of their tips.
-        pixels: of their centres, `[..., D, 2]`.
+        positions: positions of their centres, `[..., D, 3]`; of dots at a height of their tips.
+        pixels: pixels of their centres, `[..., D, 2]`.
         visible: `[..., D]` bool, in the image and not hidden.
     """
 
@@ -173,7 +173,7 @@ class Renderer(nn.Module):
         """Images without noise.
 
         Args:
-            vertices: of the membrane on the grid, `[..., V, 3]`.
+            vertices: vertices of the membrane on the grid, `[..., V, 3]`.
 
         Returns:
             Images, `[..., H, W]`, float32 in 0..1.
@@ -191,7 +191,7 @@ class Renderer(nn.Module):
         """Depth images of the membrane: z along the axis of what is visible at each pixel's centre.
 
         Args:
-            vertices: of the membrane on the grid, `[..., V, 3]`.
+            vertices: vertices of the membrane on the grid, `[..., V, 3]`.
 
         Returns:
             Depths, length unit, `[..., H, W]`; NaN beside the membrane.
@@ -283,8 +283,8 @@ def render(
 
     Args:
         sensor: as of `Renderer`, as are the other arguments.
-        vertices: of the membrane on the grid, `[..., V, 3]`.
-        grid: of the vertices.
+        vertices: vertices of the membrane on the grid, `[..., V, 3]`.
+        grid: grid of the vertices.
         pattern: on the membrane.
         appearance: light, lens and chip.
         samples: along a pixel's side.

@@ -50,9 +50,9 @@ class GaussNewton(nn.Module):
     """Reweighted Gauss-Newton steps by a schedule of the losses' scales.
 
     Args:
-        equations: of the force balance, linearised and weighted.
+        equations: equations of the force balance, linearised and weighted.
         cavity: its law.
-        settings: of the estimator.
+        settings: settings of the estimator.
     """
 
     def __init__(self, equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings):
@@ -211,9 +211,9 @@ class GaussNewton(nn.Module):
 
         Args:
             state: before the step.
-            weights: of the normal tractions in the step before, `[B, N]`.
+            weights: weights of the normal tractions in the step before, `[B, N]`.
             measured: the markers' rays.
-            scales: of the losses, and the step's other numbers.
+            scales: scales of the losses, and the step's other numbers.
 
         Returns:
             The state and the weights after it.

@@ -39,7 +39,7 @@ class InitialGuess(nn.Module):
     """Surfaces that are dented where something pushes.
 
     Args:
-        gauss_newton: of the grid, which knows the pushes.
+        gauss_newton: Gauss-Newton steps of the grid, which knows the pushes.
     """
 
     around: Tensor

@@ -144,7 +144,7 @@ class TractionLoss(nn.Module):
             tau: scale of the compressive traction's loss.
             cone: how much less shear weighs where something pushes; default, that of this loss.
             curvature: the curvature of a push's loss instead of its weight, zero where it bends down.
-            memory: of the step before; `w_n` is then a geometric mean with it.
+            memory: weights of the step before; `w_n` is then a geometric mean with it.
         """
         q_n, shear2, compression2 = self.parts(force / self.area, normal)
         rho2 = self.scale2(compression2, noise_level, tau)

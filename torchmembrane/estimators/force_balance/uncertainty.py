@@ -85,12 +85,12 @@ def linearise(
     """The equations about a state, and what solves them for small loads.
 
     Args:
-        equations: of the force balance.
+        equations: equations of the force balance.
         cavity: its law.
         state: the solution.
         measured: the markers' rays.
-        scales: of the losses of tractions and of markers.
-        play: of the camera, px, as for `CameraMotion.held`.
+        scales: scales of the losses of tractions and of markers.
+        play: scale of the prior of the camera's motion, px, as for `CameraMotion.with_prior`.
         curvature: as for `TractionLoss.weights`.
     """
     at, normal, loads, corner, motion, _ = equations.linearised(*state, measured, *scales, curvature=curvature)
@@ -120,10 +120,10 @@ def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observat
     how much the objective falls in the mean as the surface follows it, over the markers `[]`.
 
     Args:
-        equations: of the force balance.
+        equations: equations of the force balance.
         cavity: its law.
         rest: the markers' rays at rest.
-        play: of the camera, px, as for `CameraMotion.held`.
+        play: scale of the prior of the camera's motion, px, as for `CameraMotion.with_prior`.
     """
     membrane, loss = equations.forces.membrane, equations.loss
     measured = equations.bearings.measured(rest)
@@ -191,7 +191,7 @@ def standard_deviations(
     """At a solution, of the rays it was found from.
 
     Args:
-        equations: of the estimator.
+        equations: equations of the estimator.
         cavity: its law.
         settings: its settings.
         state: the solution.
@@ -232,7 +232,7 @@ def of_presses(
     """With the model's error.
 
     Args:
-        noise: of force and depth, as `spreads` gives it.
+        noise: noise of force and depth, as `spreads` gives it.
         force: `[B, 3]`, as found.
         depth: `[B]`, as found.
         gap: `[B]`, to the markers around the deepest point, as of `gap_around`.
