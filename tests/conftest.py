@@ -1,3 +1,5 @@
+"""Fixtures that several test files share."""
+
 import gc
 from dataclasses import replace
 from functools import partialmethod

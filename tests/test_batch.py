@@ -1,4 +1,4 @@
-"""Images on disk to results on disk, with a quick reconstructor that dents the surface by an image's mean grey."""
+"""Jobs write every image's result once, whatever interrupts them."""
 
 import csv
 import io

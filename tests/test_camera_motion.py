@@ -1,4 +1,4 @@
-"""A camera that was bumped: its motion against the rim is found with the surface, and taken out."""
+"""A moved camera is found with the surface and compensated."""
 
 from dataclasses import replace
 

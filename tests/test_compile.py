@@ -1,4 +1,4 @@
-"""The whole reconstruction, from rest, from a start and with a gauge, compiles to one graph and gives what it gives eagerly."""
+"""The reconstruction compiles to one graph with the same results."""
 
 from dataclasses import replace
 from pathlib import Path

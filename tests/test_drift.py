@@ -1,4 +1,4 @@
-"""Drift of the rest image is detected in frames without contact, and only there; noise, touches and presses are no drift."""
+"""Drift of the rest image is detected, and nothing else is."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""The package for machines without torch, with files that are damaged, of other programs, or not what was meant.
+"""The edge package needs no torch and refuses damaged files.
 
 Its model is made by hand, of a few nodes; `tests/test_export.py` runs exported ones.
 """

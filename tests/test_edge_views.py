@@ -1,4 +1,4 @@
-"""The package for machines without torch, with a model of two views made by hand.
+"""The edge package runs a model of two views.
 
 `tests/test_export_views.py` runs an exported one.
 """

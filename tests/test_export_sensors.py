@@ -1,4 +1,4 @@
-"""Exported models of random sensors of the whole span against torch, those of `bench/accuracy/exports.py` on small grids."""
+"""Exported models of random sensors agree with torch."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The exported model of two views, and the package that runs it without torch, against torch."""
+"""The exported model of two views agrees with torch."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Laws of blown up sheets: grids without folds, closed forms of the circle, other meshes and solvers, and sensors of them."""
+"""Inflated sheets agree with closed forms, meshes and solvers."""
 
 import csv
 import math

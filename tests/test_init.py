@@ -1,4 +1,4 @@
-"""Laws of drafted sensors: what `init` writes is read, checked and reconstructs; pressures as of a neo-Hookean sphere."""
+"""Every sensor file that `init` writes is read and reconstructs."""
 
 import csv
 import math

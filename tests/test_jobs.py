@@ -1,4 +1,4 @@
-"""Jobs that are killed, doubled, divided, given bad names, new images and damaged results."""
+"""Killed, doubled or divided jobs lose no frame and repeat none."""
 
 import csv
 import os

@@ -1,4 +1,4 @@
-"""What learning stacks do with a module works with a `Reconstructor`: states, functional calls, export, DDP, autocast."""
+"""A `Reconstructor` works with what learning stacks do to modules."""
 
 import io
 import subprocess

@@ -1,4 +1,4 @@
-"""Markers that stand off the surface: their tips, what is seen of them, and presses that are found from them."""
+"""Markers that stand off the surface are modelled as levers."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What a sensor's life tells: its peaks, and whether its membrane is still as stiff as it was calibrated."""
+"""A sensor's life keeps its peaks and tells when it softens."""
 
 import json
 from dataclasses import replace

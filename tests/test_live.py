@@ -1,4 +1,4 @@
-"""A camera that is followed: the newest frame, no lag, what is dropped counted, what is kept readable again.
+"""A live camera yields the newest frame and counts dropped ones.
 
 Cameras are played by a class with the interface of `cv2.VideoCapture`.
 """

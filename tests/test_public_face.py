@@ -1,4 +1,4 @@
-"""What `import torchmembrane as tm` gives: images as cameras give them, streams, results that move; wrong calls in words."""
+"""The public face takes images and streams, and names mistakes."""
 
 import warnings
 from dataclasses import fields, replace

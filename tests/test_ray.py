@@ -1,4 +1,4 @@
-"""A job on a local Ray cluster of two workers, one of which is killed midway."""
+"""A job on Ray survives a killed worker."""
 
 import os
 import re

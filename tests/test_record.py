@@ -1,4 +1,4 @@
-"""The record of a sensor: serial and calibration, from its file to results and models, without a part in the fingerprint."""
+"""A sensor's record reaches results and models unchanged."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Laws of rendered images: geometry and brightness against closed forms, painting that moves with the material."""
+"""Rendered geometry and brightness agree with closed forms."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Laws of the test of a rest surface: a blown up sheet passes it, another surface in the same rim does not."""
+"""An inflated sheet passes the test of rest shapes; others fail."""
 
 from dataclasses import replace
 

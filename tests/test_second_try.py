@@ -1,4 +1,4 @@
-"""When force balance solves a frame a second time, what it takes of both tries, and how far a step goes."""
+"""A frame that has not settled is solved again and improves."""
 
 from dataclasses import replace
 

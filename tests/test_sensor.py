@@ -1,4 +1,4 @@
-"""Sensor files: what is written is read back, a fingerprint is of the content, and every mistake is named."""
+"""A sensor file that is written is read back; mistakes are named."""
 
 import dataclasses
 import math

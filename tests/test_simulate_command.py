@@ -1,4 +1,4 @@
-"""The command `torchmembrane simulate` as a person uses it, its data sets, and the sensors that come with the package."""
+"""`torchmembrane simulate` writes presses, data sets and truth."""
 
 import json
 import sys

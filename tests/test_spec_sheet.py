@@ -1,4 +1,4 @@
-"""A spec sheet says what its trials gave; the trials, by what the presses and the results of their images differ."""
+"""A spec sheet reports what its trials gave."""
 
 import math
 import pickle

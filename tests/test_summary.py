@@ -1,4 +1,4 @@
-"""summary.csv: its columns, compared one by one with the frames' arrays; times; the same table of torchmembrane-edge."""
+"""Every column of summary.csv agrees with the frames' arrays."""
 
 import csv
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Files that systems and programs leave in folders are no frames, wherever folders and patterns are read."""
+"""Files that systems leave in folders are not frames."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""No command writes over the user's files unless told to, nor over what it reads; files are written whole or not at all."""
+"""No command overwrites a user's file unless told to."""
 
 import ast
 import errno

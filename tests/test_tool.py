@@ -1,4 +1,4 @@
-"""The camera's pose in a tool's frame: laws of wrenches, and where the pose is kept."""
+"""Wrenches transform with the camera's pose in a tool's frame."""
 
 import dataclasses
 import json

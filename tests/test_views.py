@@ -1,4 +1,4 @@
-"""Several views of one membrane: the sensor's file, what each view sees, and what is reconstructed from all of them."""
+"""Several views of one membrane are reconstructed together."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The range in which a sensor's answers were shown right, and the status beyond it."""
+"""A result beyond the validated range gets status 9."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Spec sheets, as `torchmembrane check SENSOR.toml --accuracy` prints them, and what they cost.
+"""Spec sheets, as `torchmembrane check SENSOR.toml --accuracy` prints them, and their processor time.
 
 python -m bench.accuracy.spec_sheets [SENSOR.toml|preset:NAME ...] [--seed 0] [--jobs 1] [--json FILE]
 
@@ -32,9 +32,9 @@ def main() -> None:
     torch.set_num_threads(1)
     sheets = []
     for name in args.sensors:
-        start = time.perf_counter()
+        start = time.process_time()
         lines = sheet_lines(spec_sheet(tm.Sensor.from_file(sensor_file(name)), args.seed, jobs=args.jobs))
-        sheets.append(dict(sensor=name, lines=lines, seconds=time.perf_counter() - start))
+        sheets.append(dict(sensor=name, lines=lines, seconds=time.process_time() - start))
         print(*lines, f"{name}: {sheets[-1]['seconds']:.0f} s", sep="\n", flush=True)
     write(args.json, dict(sheets=sheets))
 

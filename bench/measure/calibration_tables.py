@@ -242,5 +242,5 @@ def bubble_sheet(found: dict) -> str:
 def sheet(of: dict) -> str:
     """A sheet as the command prints it, and the command."""
     lines = "\n".join(f"    {line}".rstrip() for line in of["lines"])
-    took = f", {of['seconds']:.0f} s of one processor" if of["seconds"] else ""
+    took = f", {of['seconds']:.0f} s of processor time" if of["seconds"] else ""
     return f"`torchmembrane check {of['sensor']} --accuracy`{took}:\n\n{lines}"
