@@ -359,7 +359,7 @@ def test_all_that_a_class_lacks_is_named(cap):
         (":Sheet", "the module '' cannot be imported"),
         ("linear_map:Sheet", "no 'Sheet' in "),
         ("linear_map:", "no '' in "),
-        ("linear_map:torch", "is no class; expected a subclass"),
+        ("linear_map:torch", "is not a class; expected a subclass"),
         ("linear_map:LinearMapSettings", "lacks the base class torchmembrane.Estimator, Settings, from_problem"),
     ],
 )

@@ -118,7 +118,7 @@ def test_an_image_that_is_none_is_a_row_with_its_reason(reconstructor, small_ima
 @pytest.mark.parametrize("content", ["text", 1.5, np.array([1, 2])])
 def test_content_that_is_no_bytes_is_a_row_with_its_reason(reconstructor, small_images, content):
     rows = FrameReconstructor(reconstructor)(columns(["a.png", "b.png"], bytes=[content, small_images[2].read_bytes()]))
-    assert rows["status"].tolist() == [-1, 0] and "expected bytes, what is in the file" in rows["status_text"][0]
+    assert rows["status"].tolist() == [-1, 0] and "expected bytes, the content of the file" in rows["status_text"][0]
 
 
 def test_pandas_gives_what_a_dict_does(reconstructor, small_images):

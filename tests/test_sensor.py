@@ -558,7 +558,7 @@ def test_a_byte_order_mark_is_passed_over(tmp_path):
     path.write_text(GOOD, encoding="utf-8-sig")
     assert Sensor.from_file(path).name == "fingertip"
     path.write_bytes(GOOD.encode() + b"#\0")
-    assert "holds NUL" in refusal(path)
+    assert "contains NUL" in refusal(path)
 
 
 def test_a_listed_file_that_is_none_is_not_quoted(tmp_path):

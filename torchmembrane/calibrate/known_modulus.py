@@ -53,11 +53,11 @@ class ModulusEvidence(NamedTuple):
     """What one kind of measurement says of the modulus.
 
     Attributes:
-        source: in words.
+        source: name of the measurement, in words.
         modulus: shear modulus x thickness, force / length.
         deviation: standard deviation, at the prestretch found.
-        change: with one standard deviation of the prestretch.
-        by_height: change with one standard deviation of the rest surface's height.
+        change: change of the modulus with one standard deviation of the prestretch.
+        by_height: change of the modulus with one standard deviation of the rest surface's height.
         sides: the modulus with a prestretch one standard deviation lower and higher; its logarithm is then a parabola, else a
             straight line.
     """

@@ -45,9 +45,9 @@ class _Scaled(Surface):
 
 
 def at_other_height(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
-    """The sensor whose rest surface is lower over its rim by a share, its markers where their rays meet it.
+    """The sensor with a rest surface that is lower above its rim by a share, and markers where their rays meet it.
 
-    Where a surface folds when it is lowered, it is raised: what a small change does has then the other sign throughout.
+    A surface that folds when it is lowered is raised instead; all effects of the small change then have the opposite sign.
 
     Args:
         sensor: any.
@@ -55,7 +55,7 @@ def at_other_height(sensor: Sensor, positions: np.ndarray, share: float) -> tupl
         share: share of the height.
 
     Returns:
-        The sensor, without a rest image, and which markers it has, `[D]` bool: the rays of others miss the surface.
+        The sensor, without a rest image, and which markers it has, `[D]` bool: the rays of the others miss the surface.
 
     Raises:
         MembraneError: the surface folds either way.

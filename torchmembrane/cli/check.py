@@ -54,7 +54,7 @@ def add_parser(commands: Any) -> None:
     gauge = "what a gauge reads at rest, inside over outside, with its unit, as 12hPa: compared with the model's"
     add("--overpressure", metavar="P", type=pressure, help=gauge)
     add("--accuracy", action="store_true", help="also what to expect of it, from simulated presses")
-    add("--seed", type=seed, help="of presses and noise of --accuracy (default: 0)")
+    add("--seed", type=seed, help="seed of presses and noise of --accuracy (default: 0)")
     noise = "of images of --accuracy, white over the noise's standard deviation (default: as in the rest image, else 40)"
     add("--noise", metavar="DB", type=number_from(0, MOST_DECIBEL), help=noise)
     add("--jobs", metavar="J", type=count, help="processes of --accuracy (default: all cores)")

@@ -70,7 +70,7 @@ def add_parser(commands: Any) -> None:
         action="store_true",
         help="treat every input as a video (mp4, mov, avi, mkv, webm, gif always are); extra video",
     )
-    add("--topic", metavar="TOPIC", help="of the images in bags of ROS 2 (default: the only one; needs the extra ros)")
+    add("--topic", metavar="TOPIC", help="topic of the images in bags of ROS 2 (default: the only one; needs the extra ros)")
     messages = "also a bag of their results, a folder: wrenches, tractions, of a gas pressures, in N, N m, m and Pa"
     add("--bag", metavar="BAG", type=Path, help=messages)
     own = "images of this recording without contact, or first:N, its first N frames: their mean is rest (default: the sensor's)"
@@ -162,7 +162,7 @@ def _check(arguments: Namespace) -> None:
     if arguments.engine == "local":
         check_device(arguments.device)
     if arguments.fields and (arguments.engine == "ray" or arguments.format == "parquet"):
-        raise MembraneError("--fields with a Parquet dataset, whose columns are fixed; expected --format npz")
+        raise MembraneError("--fields does not work with a Parquet dataset, whose columns are fixed; pass --format npz")
     if arguments.engine == "ray" and arguments.format == "npz":
         raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
     if arguments.video_out is not None:

@@ -334,7 +334,7 @@ class Estimator(nn.Module, ABC):
 
     @property
     def volume(self) -> str:
-        """The volume's constraint, as `mesh.npz` names it; default: that of the settings, else "exact"."""
+        """Name of the volume constraint in `mesh.npz`; default: that of the settings, or "exact"."""
         return str(getattr(self.settings, "volume", "exact"))
 
     @property

@@ -82,7 +82,7 @@ def check_protocol(kind: Any, given: str) -> None:
         MembraneError: it is no class, or lacks parts of the protocol, which are named.
     """
     if not isinstance(kind, type):
-        raise MembraneError(f"{given} is no class; expected a subclass of torchmembrane.Estimator")
+        raise MembraneError(f"{given} is not a class; expected a subclass of torchmembrane.Estimator")
     lacking = [] if issubclass(kind, Estimator) else ["the base class torchmembrane.Estimator"]
     lacking += [part for part in PROTOCOL if not _defines(kind, part)]
     settings = getattr(kind, "Settings", None)

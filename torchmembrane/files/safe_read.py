@@ -101,18 +101,18 @@ def read_text(path: Path, most: int, expected: str) -> str:
 
     Args:
         path: as `read_bytes`.
-        most: bytes that it may hold.
-        expected: what is read, for messages.
+        most: largest number of bytes that it may hold.
+        expected: what the file should be, for messages.
 
     Raises:
-        MembraneError: as `read_bytes`; or it is not UTF-8, or holds NUL.
+        MembraneError: as for `read_bytes`; or the file is not UTF-8, or contains NUL.
     """
     try:
         text = read_bytes(path, most, expected).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise MembraneError(f"{path}: not UTF-8 text ({error}); expected {expected}, saved as UTF-8") from error
     if "\0" in text:
-        raise MembraneError(f"{path}: holds NUL, so it is no text; expected {expected}, saved as UTF-8")
+        raise MembraneError(f"{path}: contains NUL, so it is not text; expected {expected}, saved as UTF-8")
     return text
 
 

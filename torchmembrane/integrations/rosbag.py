@@ -142,7 +142,7 @@ class BagWriter:
         self.path, self.units, self.mcap = Path(path), units, mcap
         self.written = 0
         if os.path.lexists(self.path) and not _is_ours(self.path):
-            raise MembraneError(f"{path}: exists already, and is no bag of results alone; expected a new folder")
+            raise MembraneError(f"{path}: exists already, and is not a bag of results alone; expected a new folder")
         load_rosbags()
 
     def __enter__(self) -> "BagWriter":

@@ -109,7 +109,7 @@ def source_file_of(*paths: Path) -> SourceFile:
 
 
 def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch: int) -> Iterator[list[DecodedFrame]]:
-    """Batches of decoded frames; while one is used, the next is decoded.
+    """Yield batches of decoded frames, and decode the next one while one is used.
 
     Args:
         sources: frames to decode, in order.

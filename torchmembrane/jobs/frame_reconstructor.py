@@ -134,7 +134,7 @@ class FrameReconstructor:
                 data, grey = np.ascontiguousarray(image).tobytes(), self._grey(image)
             else:
                 if not isinstance(content, bytes | bytearray | memoryview):
-                    raise MembraneError(f"bytes are a {_kind(content)}; expected bytes, what is in the file")
+                    raise MembraneError(f"bytes are a {_kind(content)}; expected bytes, the content of the file")
                 data = bytes(content)
                 grey = self._read(data)
             return frame._replace(image=grey, origin=SourceFile.of_bytes(file, data))

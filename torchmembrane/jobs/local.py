@@ -34,8 +34,7 @@ FEW_FRAMES = 50
 
 
 class FrameCounts(NamedTuple):
-    """Numbers of frames of a call that were reconstructed (some with a status that is not ok), failed, or were skipped as
-    finished."""
+    """How many frames of a call were reconstructed (some with a status other than ok), failed, or were already finished."""
 
     reconstructed: int
     not_converged: int

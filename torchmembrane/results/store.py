@@ -232,7 +232,7 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
     """Refuse a folder whose results are of another sensor (fingerprint) or of other settings, or no results at all."""
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
-        raise MembraneError(f"--out {folder}: is a file; expected a folder, new or of earlier results of this sensor")
+        raise MembraneError(f"--out {folder}: is a file; expected a new folder, or one with earlier results of this sensor")
     if not (folder / MESH).exists():
         if not all(map(is_of_system, folder.glob("*.npz"))) or (folder / "frames").exists():
             raise MembraneError(f"--out {folder}: holds .npz files or frames/ but no {MESH}; choose another folder")

@@ -1,6 +1,6 @@
-"""Which triangle of a projected mesh is visible at every sample of an image, and values that are linear on triangles.
+"""Rasterisation: the visible triangle of a projected mesh at every sample, and values that are linear on triangles.
 
-Triangles are cut into spans of rows, all of them at once.
+All triangles are cut into spans of rows at once.
 """
 
 from typing import NamedTuple

@@ -230,7 +230,7 @@ class Simulator:
 
         Args:
             state: the equilibrium.
-            stroke: that led to it.
+            stroke: motion of the indenters that led to it.
             rng: random generator of the image's noise.
 
         Returns:

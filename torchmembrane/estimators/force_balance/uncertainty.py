@@ -116,8 +116,10 @@ def linearise(
 
 @torch.no_grad()
 def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observation, play: float) -> tuple[Tensor, Tensor]:
-    """What the markers' noise makes at rest, one standard deviation, while all losses are quadratic: the push `S [N]`, and by
-    how much the objective falls in the mean as the surface follows it, over the markers `[]`.
+    """Effects of the markers' noise at rest while all losses are quadratic.
+
+    They are the standard deviation of the push `S [N]`, and the mean decrease `[]` of the objective, per marker, when the
+    surface follows the noise.
 
     Args:
         equations: equations of the force balance.
