@@ -84,7 +84,7 @@ def test_an_empty_folder_may_hold_them(tmp_path, small_sensor):
     with Recording(tmp_path, Mesh.from_reconstructor(made, settings)):
         pass
     (tmp_path / "old.npz").touch()
-    with pytest.raises(MembraneError, match="holds something already"):
+    with pytest.raises(MembraneError, match="is not empty"):
         Recording(tmp_path, Mesh.from_reconstructor(made, settings))
 
 

@@ -116,7 +116,7 @@ def pair_states(simulator: Simulator, number: int, count: int, seed: int) -> lis
     places, ways = max(lines, key=lambda line: len(line[0]))
     found = [pair for place, way in zip(places, ways, strict=True) for pair in _pair(simulator, place, way)]
     if not found:
-        raise MembraneError(f"pairs, direction {number + 1}: no pair has room, or can be followed; {FAR_FROM_A_RIM}")
+        raise MembraneError(f"pairs, direction {number + 1}: no pair of balls fits, or none can be simulated; {FAR_FROM_A_RIM}")
     return found
 
 

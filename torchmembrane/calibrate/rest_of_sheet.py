@@ -88,7 +88,7 @@ def rest_of_sheet(sensor: Sensor, image: np.ndarray, overpressure: float | None,
         The sensor found, its rim as points in the camera's frame, and the fit: pose, height, prestretch.
 
     Raises:
-        MembraneError: as `rest_from_image`; a height or prestretch without an equilibrium.
+        MembraneError: as for `rest_from_image`; a height or prestretch without an equilibrium.
     """
     sheet, X, sizes = sensor.surface, sensor.markers.positions, sensor.markers.sizes
     assert isinstance(sheet, InflatedSurface) and X is not None  # as `rest_from_image` has seen

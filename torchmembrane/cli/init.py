@@ -155,7 +155,7 @@ def _add_material(add: Add) -> None:
     prestretch = "of the membrane at rest (default: from the overpressure, else 1.2); of the sheet in its rim (else 1.1)"
     add("--overpressure", metavar="P", type=pressure, help="inside over outside, at rest, with its unit: 20hPa, 2kPa, 0.3psi")
     add("--prestretch", metavar="L", type=positive, help=prestretch)
-    add("--shear-modulus", metavar="G", type=positive, help="N / length unit^2: a third of Young's modulus")
+    add("--shear-modulus", metavar="G", type=positive, help="shear modulus, N / length unit^2: a third of Young's modulus")
     add(
         "--thickness",
         metavar="T",

@@ -123,7 +123,7 @@ def stored(image: Image.Image, size: tuple[int, int] | None = None) -> Stored:
     """The current picture of an opened image.
 
     Args:
-        image: as `opened` gives it.
+        image: as for `opened` gives it.
         size: width and height that it must have, px; it is looked at before pixels are decoded.
 
     Raises:

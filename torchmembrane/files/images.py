@@ -61,10 +61,10 @@ def decode_image(content: bytes, name: str | Path, size: tuple[int, int] | None 
         content: content of a PNG, JPEG, BMP, TIFF or WebP file.
         name: what an error calls it.
         size: width and height that it must have, px.
-        bits: as `read_image`.
+        bits: as for `read_image`.
 
     Raises:
-        MembraneError: as `read_image`.
+        MembraneError: as for `read_image`.
     """
     with _opened_single(name, content) as image:
         grey = _grey_of(image, size, bits)
@@ -80,7 +80,7 @@ def read_pixels(name: str | Path, content: bytes | None = None) -> np.ndarray:
         content: what the file holds; default: it is read.
 
     Raises:
-        MembraneError: as `read_image`.
+        MembraneError: as for `read_image`.
 
     Example:
         >>> read_pixels("examples/rest.png").dtype
@@ -97,10 +97,10 @@ def image_size(path: str | Path) -> tuple[int, int]:
     """Width and height of an image file, px, without decoding its pixels.
 
     Args:
-        path: as `read_image`.
+        path: as for `read_image`.
 
     Raises:
-        MembraneError: the file is missing, no image, too large, or has several pictures.
+        MembraneError: the file is missing, is not an image, is too large, or has several pictures.
 
     Example:
         >>> image_size("examples/rest.png")
@@ -134,7 +134,7 @@ def stack_images(path: Path, size: tuple[int, int], bits: int | None = None) -> 
     Args:
         path: a PNG, JPEG, BMP, TIFF or WebP file of one picture or more.
         size: width and height that they must have, px.
-        bits: as `read_image`.
+        bits: as for `read_image`.
 
     Yields:
         Grey values, or an error that does not name the file.
@@ -221,16 +221,16 @@ def mean_image(paths: Sequence[Path], bits: int | None = None) -> np.ndarray:
 
     Args:
         paths: one file or more.
-        bits: as `read_image`.
+        bits: as for `read_image`.
 
     Raises:
-        MembraneError: as `read_image`; or the images differ in size.
+        MembraneError: as for `read_image`; or the images differ in size.
     """
     first = image_size(paths[0])
     for path in paths[1:]:
         if (size := image_size(path)) != first:
             sizes = ["{} x {}".format(*each) for each in (size, first)]
-            raise MembraneError(f"{path} is {sizes[0]} px; expected {sizes[1]} as {paths[0]}: give images of one camera mode")
+            raise MembraneError(f"{path} is {sizes[0]} px; expected {sizes[1]} as in {paths[0]}: give images of one mode")
     total = np.zeros(first[::-1])
     for path in paths:
         total += read_image(path, first, bits)

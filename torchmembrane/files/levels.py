@@ -56,7 +56,7 @@ def refuse_beyond(highest: Any, white: int) -> None:
 
     Args:
         highest: of the values.
-        white: as `white_of` gives it.
+        white: as for `white_of` gives it.
 
     Raises:
         MembraneError: the highest is beyond white.

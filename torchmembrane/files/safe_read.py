@@ -75,7 +75,7 @@ def regular_size(path: Path, most: int, expected: str) -> int:
     """The size of a regular file in bytes; it is not opened.
 
     Args:
-        path: as `read_bytes`.
+        path: as for `read_bytes`.
         most: bytes that it may hold.
         expected: what is to be read, for messages.
 
@@ -100,7 +100,7 @@ def read_text(path: Path, most: int, expected: str) -> str:
     """A file's text: UTF-8, with or without a byte order mark.
 
     Args:
-        path: as `read_bytes`.
+        path: as for `read_bytes`.
         most: largest number of bytes that it may hold.
         expected: what the file should be, for messages.
 

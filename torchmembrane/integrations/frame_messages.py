@@ -118,7 +118,7 @@ class SiUnits:
         return each[np.isfinite(frame["contact_points"]).all(-1)].astype(np.float32)
 
     def pressure(self, frame: Frame) -> float | None:
-        """Of the gas, absolute, Pa; from the frame's `pressure_change []`; None of a sensor without one."""
+        """Absolute pressure of the gas, Pa, from the frame's `pressure_change []`; None for a sensor without gas."""
         if self.gas_pressure is None:
             return None
         return (self.gas_pressure + float(frame["pressure_change"])) * self.metre**2

@@ -124,7 +124,7 @@ def of_first_view(inputs: Inputs, views: Sequence[str]) -> Inputs:
     """Inputs with one image for each frame: of views with images of their own, NAME_VIEW.png, the first view's.
 
     Args:
-        inputs: as `find_inputs` gives them.
+        inputs: as for `find_inputs` gives them.
         views: names of the sensor's views with images of their own; none of one view, or of regions of one image.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What a stream showed, kept: images as they were captured, results as `torchmembrane reconstruct` writes them, times."""
+"""Recording of a stream: captured images, results as `torchmembrane reconstruct` writes them, and times."""
 
 import csv
 from pathlib import Path
@@ -43,7 +43,7 @@ class Recording:
 
     def __init__(self, folder: Path, mesh: Mesh, bits: int | None = None):
         if folder.exists() and (not folder.is_dir() or not all(map(is_of_system, folder.iterdir()))):
-            raise MembraneError(f"--record {folder}: holds something already; expected a new folder, one per recording")
+            raise MembraneError(f"--record {folder}: is not empty; expected a new folder for each recording")
         self.folder, self.bits = folder, bits
         self._results = ResultFolder(folder, mesh, Inputs([], []), WHOLE, False, print)
 

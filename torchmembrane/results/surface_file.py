@@ -20,7 +20,7 @@ def save_surface(path: str | Path, frame: Frame, mesh: Mesh) -> list[str]:
 
     Args:
         path: the file, `.ply` or `.vtk` (both ASCII), written atomically.
-        frame: as `Reconstruction.frame` gives it, with `stretch` and `tension` where they were asked for.
+        frame: as for `Reconstruction.frame` gives it, with `stretch` and `tension` where they were asked for.
         mesh: mesh of the folder, whose triangles these are.
 
     Returns:

@@ -147,8 +147,7 @@ class Sensor:
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Width and height, px, of its images: the camera's; of several views those of the image that they share, or of the
-        largest."""
+        """Width and height of its images, px. For several views it is the size of their common or largest image."""
         modes = [view.camera.mode for view in self.views if view.region is not None]
         if modes and modes[0] is not None:
             return modes[0].image_size

@@ -245,7 +245,7 @@ def _shown(value: object) -> str:
 
 
 def _plain(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """What a file holds, refused where it is nested too deeply or a whole number is no number of this world."""
+    """The content of a file; refused if it is nested too deeply or contains a whole number of more than 300 digits."""
     level: list[Any] = [values]
     for _ in range(DEEPEST + 1):
         if any(isinstance(value, int) and abs(value) > LARGEST for value in level):

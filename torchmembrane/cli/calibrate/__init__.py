@@ -88,7 +88,7 @@ def _ports_options(add: Add) -> None:
 
 
 def _rest_options(add: Add) -> None:
-    add("image", metavar="REST.png", help="the membrane at rest")
+    add("image", metavar="REST.png", help="image of the membrane at rest")
     gauge = "of an inflated surface: what a gauge reads at rest, inside over outside, with its unit, as 12hPa"
     add("--overpressure", metavar="P", type=pressure, help=gauge)
 

@@ -1,4 +1,4 @@
-"""What can be chosen about force balance: frozen, checked at construction."""
+"""Settings of force balance: immutable, and checked at construction."""
 
 from dataclasses import dataclass
 from functools import wraps
