@@ -26,7 +26,7 @@ PATIENCE = 1.5
 LONGER = 10.0
 """The same where a frame is computed, and for what is closed after the exception."""
 AGAIN = 0.5
-"""Of these times, after which the exception is asked for once more."""
+"""Share of these times after which the exception is requested once more."""
 APART = 0.3
 """Seconds within which several signals are one: groups of processes may be sent it twice."""
 LOOK = 0.05

@@ -16,11 +16,11 @@ from .stiffness import StiffnessWatch
 from .user_warnings import warn_user
 
 LOOKED_AT = (Status.OK, Status.UNEXPLAINED, Status.OUT_OF_RANGE, Status.VIEW_LEFT_OUT)
-"""Of frames that tell of a drift: a camera that moved may leave them unexplained."""
+"""Statuses of frames that reveal a drift: a camera that moved may leave them unexplained."""
 STEADY = 100
 """Frames in which a contact holds still from the beginning before it is said that it may be a drift."""
 FOUND_PRESSURE_ERROR = 0.06
-"""Of a pressure change that is found, relative (docs/calibration.md)."""
+"""Relative error of a pressure change that is found (docs/calibration.md)."""
 LARGEST_STEADY = 0.3
 """px, rms: how far such a contact moves the markers at most."""
 

@@ -64,15 +64,28 @@ def out_of_range_summary(results: dict) -> dict:
     return dict(bands=bands)
 
 
-def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights: dict) -> Rows:
-    """What holds to which limit, from the records of the tables that say more."""
-    groups = range_["groups"]
+def by_depth(found: dict) -> tuple[dict[str, int], dict]:
+    """Shares right and wrong with status ok, %, of presses up to a fifth of the size deep; and the group of the deeper ones."""
+    groups = found["groups"]
     first = next(k for k, row in enumerate(groups) if row["name"] == "depth up to 0.05")
     shallow, deep = groups[first : first + 3], groups[first + 3]
-    of = {
-        key: round(100 * sum(row["presses"] * row[key] for row in shallow) / sum(row["presses"] for row in shallow))
-        for key in ("right", "wrong")
-    }
+    presses = sum(row["presses"] for row in shallow)
+    return {key: round(100 * sum(row["presses"] * row[key] for row in shallow) / presses) for key in ("right", "wrong")}, deep
+
+
+def readme_range(found: dict) -> str:
+    """A paragraph on how deep a press may be."""
+    (of, deep), every = by_depth(found), round(1 / found["groups"][0]["wrong"])
+    return (
+        f"The results are not reliable for presses deeper than a fifth of the membrane's size: up to that depth "
+        f"{of['right']} % are right, from there to 0.3 of the size {percent(deep['right'])}, "
+        f"and of all presses one in {every} is wrong although its status is `ok`."
+    )
+
+
+def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights: dict) -> Rows:
+    """What holds to which limit, from the records of the tables that say more."""
+    of, deep = by_depth(range_)
     firm = [row["force"][0] for row in light["bands"] if 0.05 <= row["low"] < 0.15]
     held = next(row for row in intervals_["bands"] if row["low"] is None)
     middle, most, largest = (f"{100 * value:.1f} %" for value in weights["errors"])

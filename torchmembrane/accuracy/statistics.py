@@ -11,7 +11,7 @@ from ..sensor.working_range import GENERAL, WorkingRange
 from .spec_sheet import Band, ClosestPair, DeepestPress, LightestTouch, PairTrial, PressTrial, RestFloor, RestTrial, Spread
 
 EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
-"""Of the bands, over the hardest press."""
+"""Edges of the bands of force, over the force of the hardest press."""
 LEAST_DEPTH = 0.05
 """Over the size: of the presses that a range is judged by."""
 UNBROKEN = "the deepest press tried"

@@ -23,11 +23,11 @@ COEFFICIENTS = {"pinhole": 5, "fisheye": 4}  # k1 k2 p1 p2 k3 | k1 k2 k3 k4
 RATIONAL = 8  # of a pinhole: k1 k2 p1 p2 k3 k4 k5 k6
 FURTHER = (12, 14)  # OpenCV's, with thin prisms s1 to s4 and a tilted chip, which are not modelled
 LONGEST_SIDE = 16384
-"""Of an image, px."""
+"""Longest side of an image, px."""
 FOCAL = (1.0, 1e6)
 """Least and greatest, px."""
 MOST_ASPECT = 20.0
-"""Of the two focal lengths to one another."""
+"""Largest ratio of the two focal lengths."""
 FARTHEST_CENTRE, MOST_DISTORTION = 1e6, 1e6
 
 

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 LARGEST_SHIFT = 0.03
-"""Of half the image's diagonal: no camera that is fixed to a sensor moves so far; an image that has lost bytes does."""
+"""Largest shift over half the image's diagonal: a fixed camera never moves so far, but an image that lost bytes does."""
 
 
 def motion_of_pixels(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:

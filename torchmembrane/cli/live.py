@@ -61,7 +61,7 @@ MODULUS = (
 SOURCES = ("camera", "video", "images")
 OF_TORCH = ("grid", "energy", "flow", "smoothing", "locator")
 DEFAULTS = {"estimator": "force-balance", "device": "cpu"}
-"""Of torch as well."""
+"""Defaults of options that torch uses as well."""
 
 
 def add_parser(commands: Any) -> None:

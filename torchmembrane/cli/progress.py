@@ -8,9 +8,9 @@ from typing import Any
 LINE_SECONDS = 5.0
 """Between two lines where stderr is no terminal."""
 FEWEST_STEPS = 2
-"""Of which the rate is taken at least: processes side by side end several at once, and then none for a while."""
+"""Fewest steps for a rate: parallel processes end several steps at once, and then none for a while."""
 LEAST_DONE = 0.1
-"""Of the work that is done before the rate of its beginning counts, when processes may have had to start."""
+"""Share of the work after which the rate since its beginning counts, because processes may have had to start."""
 
 
 def announce(title: str) -> None:

@@ -18,7 +18,7 @@ from .safe_read import DAMAGE, in_one_line, read_bytes, regular_size
 from .tiff import refuse_damaged_page
 
 MOST_IMAGE_BYTES, MOST_STACK_BYTES = 2**28, 2**32
-"""Of a file; of a TIFF of several pages, which are read one by one."""
+"""Largest file; largest TIFF of several pages, which are read one by one."""
 MOST_PICTURES = 2**17
 """In a file."""
 GREY = (0.299, 0.587, 0.114)

@@ -9,7 +9,7 @@ FRAMES = (0xC0, 0xC1, 0xC2)
 """Markers that begin the header of a frame coded by Huffman's method."""
 SCAN, RESTART_INTERVAL = 0xDA, 0xDD
 FILL, BARE = 0xFF, (0x01, *range(0xD0, 0xD9))
-"""What may stand before a marker, and markers without a segment."""
+"""The byte that may fill the space before a marker, and the markers without a segment."""
 RESTART = re.compile(rb"\xff[\xd0-\xd7]")
 SEGMENT = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 """Markers within the data of a scan, and behind them."""

@@ -10,7 +10,7 @@ from ..errors import MembraneError, expect
 
 FEWEST_BITS, MOST_BITS = 8, 16
 USUAL_BITS = (8, 10, 12, 14)
-"""Of cameras whose values are stored in 16."""
+"""Numbers of bits of cameras whose values are stored in 16."""
 MOST_AVERAGED = 16
 """Pixels or images whose mean is still recognised as one of whole levels."""
 HIGHEST = 2**16 - 1

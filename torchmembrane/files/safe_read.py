@@ -22,7 +22,7 @@ from ..errors import MembraneError
 from .atomic import kind_of
 
 MOST_ARRAY_BYTES = 2**26
-"""Of a file of arrays, and of the arrays that are read from it together."""
+"""Largest size of a file of arrays, and of all arrays that are read from it."""
 MOST_ARRAYS = 64
 """In a file."""
 NUMBERS, TEXT = "biuf", "U"
@@ -34,7 +34,7 @@ DAMAGE = (
     *(OSError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError, EOFError, RuntimeError, SyntaxError),
     *(MemoryError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
-"""What zipfile, zlib, numpy and Pillow raise of damaged files."""
+"""Exceptions that zipfile, zlib, numpy and Pillow raise for damaged files."""
 
 
 class LackingArray(MembraneError):

@@ -24,9 +24,9 @@ TOPICS = {
 }
 """Types of the messages by the last name of their topic; each of them has a header."""
 POINT_FIELDS = ("x", "y", "z", "normal_traction", "shear_x", "shear_y", "shear_z")
-"""Of a vertex, each float32: place, m; compressive normal traction and shear traction on the membrane, Pa."""
+"""Fields of a vertex, each float32: place, m; compressive normal traction and shear traction on the membrane, Pa."""
 CONTACT_FIELDS = ("x", "y", "z", "force_x", "force_y", "force_z", "normal_x", "normal_y", "normal_z", "area")
-"""Of a contact, strongest first, each float32: place, m; force on the membrane, N; outward normal; area, m^2."""
+"""Fields of a contact, strongest first, each float32: place, m; force on the membrane, N; outward normal; area, m^2."""
 FLOAT32 = 7
 """A PointField's datatype."""
 GOOD, DOUBTFUL, FAILED = range(3)

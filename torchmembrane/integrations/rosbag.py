@@ -24,13 +24,13 @@ from .messages import camera_mismatch, info_topic, size_of
 BAGS, ROS_1, METADATA = (".mcap", ".db3"), ".bag", "metadata.yaml"
 MOST_METADATA_BYTES = 2**20
 MOST_BYTES = 2**50
-"""Of a storage file, which is never read whole."""
+"""Largest storage file; it is never read as a whole."""
 MCAP_MARK, SQLITE_MARK, ROS_1_MARK = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#ROSBAG"
 """The first bytes of a storage file; those of MCAP are its last ones, too."""
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 NAMESPACE = "/torchmembrane"
-"""Of the topics written, as of a node of this name."""
+"""Namespace of the topics that are written, as of a node of this name."""
 OURS = "torchmembrane reconstruct --bag"
 """Stands in the metadata of a bag that is written here."""
 

@@ -27,7 +27,7 @@ PRESSURES = Columns(
 UNKNOWN = ("", "nan")
 """Cells of frames that have no reading."""
 KINDS = {"name": "frames", "image": "images"}
-"""What a table's first column names."""
+"""What the first column of a table may name."""
 REACH, INTERVALS = 1.0, 1.5
 """A frame has a reading by time where one is within so many seconds, or intervals between readings if that is more."""
 

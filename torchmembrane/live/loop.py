@@ -20,7 +20,7 @@ WAIT = 0.1
 RECENT = 100
 """Frames over which the rate and latency that are shown as they go are taken."""
 Request = Callable[[Stream], str]
-"""What is asked of a stream between two frames, such as to take the latest for rest; gives what became of it."""
+"""A request to a stream between two frames, such as taking the latest one for rest; it returns the answer."""
 
 
 class LiveFrame(NamedTuple):

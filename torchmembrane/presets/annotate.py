@@ -76,7 +76,7 @@ OF_SHEETS = {
     "prestretch": "of the sheet in its rim before it is blown up, over the unstretched sheet, 1 or more",
     "thickness": "of the sheet in its rim before it is blown up: unstretched, over prestretch^2",
 }
-"""Of `[material]` where the shape is "inflated"."""
+"""Comments of `[material]` if the shape is "inflated"."""
 
 
 def annotate(path: Path, said: Sequence[str], relative: bool, unit: str) -> None:

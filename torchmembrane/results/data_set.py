@@ -28,7 +28,7 @@ UNITS = {
     **{"wrench": "{force}, {force} {length}", "contact_area": "{length}^2", "contact_curvature": "1/{length}"},
     **{"pixels": "px", "residual": "px", "camera_motion": "px, px, degrees, 1"},
 }
-"""Of the arrays of a frame that have one."""
+"""Units of the arrays of a frame that have one."""
 
 CARD = """\
 ---

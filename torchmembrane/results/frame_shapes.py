@@ -15,9 +15,9 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
 }
 
 FIELDS: dict[str, tuple[str | int, ...]] = {"stretch": ("V", 2), "tension": ("V", 2)}
-"""Of arrays that a frame holds where they are asked for: principal values, the larger stretch's direction first."""
+"""Shapes of arrays that a frame contains on request: principal values, those of the larger stretch first."""
 OF_EACH_VIEW = ("pixels", "confidence", "residual", "camera_motion")
-"""Of several views these begin with an axis `W`."""
+"""Arrays that begin with an axis `W` if there are several views."""
 
 
 def shape_of(key: str, sizes: Mapping[str, int]) -> tuple[int, ...]:

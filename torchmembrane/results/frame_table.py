@@ -25,7 +25,7 @@ from .store import Mesh
 PART_ROWS = 256
 """Frames of one Parquet file, at least, once there are as many."""
 PART_BYTES = 2**27
-"""Of the arrays of such a file, about: of large surfaces a file holds fewer frames."""
+"""Approximate size of the arrays of such a file; with large surfaces a file holds fewer frames."""
 SAVE_SECONDS = 5.0
 """Frames are held back for this long at most."""
 PART = re.compile(r"part-\d+")

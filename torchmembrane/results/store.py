@@ -22,7 +22,7 @@ MESH = "mesh.npz"
 FIXED = ("element", "volume")
 """Settings that no option of the command chooses: each estimator has its own."""
 ELSE = {"pressure": "not measured", "fields": "none"}
-"""Of settings that are empty; of all others what the sensor has."""
+"""Text for settings that are empty; for all others it is what the sensor has."""
 
 
 class ResultMaker(Protocol):

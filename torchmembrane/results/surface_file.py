@@ -12,7 +12,7 @@ from .store import Mesh
 
 SUFFIXES = (".ply", ".vtk")
 NAMES = {3: ("x", "y", "z"), 2: ("1", "2")}
-"""Of the components of a vector, and of principal values."""
+"""Names of the components of a vector, and of principal values."""
 
 
 def save_surface(path: str | Path, frame: Frame, mesh: Mesh) -> list[str]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 MOST_PRESTRETCH, MOST_C2_RATIO = 10.0, 1e3
 POSITIVE = {"shear_modulus": (1e-12, 1e12), "thickness": (1e-6, 1e5), "pressure": (1e-3, 1e6), "volume": (1e-12, 1e18)}
-"""What such a quantity of a membrane can be, in the file's units with any of the length units."""
+"""Ranges of these quantities of a membrane in the file's units, for every length unit."""
 FILLINGS = ("liquid", "gas", "open")
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 SHAPES_BY_NUMBERS = {

@@ -22,9 +22,9 @@ from ..files.system_files import is_of_system
 from .suggestions import did_you_mean
 
 MOST_BYTES, LONGEST_LINE = 2**15, 2000
-"""Of a sensor file: the time that TOML takes grows as the square of a line's length."""
+"""Largest sensor file, and longest line in it: the time to read TOML grows as the square of a line's length."""
 MOST_FILES = 1000
-"""That a key may name."""
+"""Largest number of files that a key may name."""
 LARGEST = 1e300
 """Whole number."""
 DEEPEST = 8

@@ -40,7 +40,7 @@ FORMAT = 1
 COARSEST, FINEST = 25, 33  # solver grids chosen where the file names none
 FEWEST_LINES, MOST_LINES = 5, 65  # of a solver grid: beyond, a frame takes more than 2 GB
 MOST_VERTICES = 2**18
-"""Of a rest surface in a file of arrays."""
+"""Largest number of vertices of a rest surface in a file of arrays."""
 MOST_DOTS, MOST_DOTS_BYTES = 2000, 2**20
 SIZES = ("small", "large")
 DOTS_HEADER = ("x", "y", "z", "size")

@@ -16,7 +16,7 @@ from .parts import Surface
 SIDES = ("inside", "outside")
 MOST_VIEWS = 8
 FEWEST_LINES = 25
-"""Of the solver's grid: two views see the shape so well that on fewer lines the grid's own error is what forces are off by."""
+"""Fewest lines of the solver's grid: two views see the shape so well that a coarser grid dominates the error of forces."""
 SAME_PLACE = 1e-9
 """Largest entry by which the first view's pose may differ from none."""
 

@@ -80,7 +80,7 @@ def turn_cosine(normals: Tensor, rest: Tensor) -> Tensor:
 
 
 GENERAL = WorkingRange(depth=0.175, turn=60.0)
-"""Of sensors without a range of their own: `docs/accuracy.md` says what it was found on."""
+"""Range of sensors that have none of their own; `docs/accuracy.md` says on which sensors it was found."""
 UNLIMITED = WorkingRange(depth=inf)
 
 

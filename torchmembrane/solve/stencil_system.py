@@ -12,10 +12,10 @@ from .stencil import STENCIL
 from .stencil_layouts import OFFSETS, Band, Inner, RowBlocks
 
 SLOTS = sorted(range(len(STENCIL)), key=STENCIL.__getitem__)
-"""Of a stencil, in the order of the vertices: from one to a later one leads an offset, never its opposite."""
+"""Places of a stencil in the order of the vertices: an offset leads from one to a later one, never its opposite."""
 
 PAIRS = [(a, b) for k, a in enumerate(SLOTS) for b in SLOTS[k:]]
-"""Of a stencil's vertices, each with itself and with the later ones."""
+"""Pairs of a stencil's vertices, each with itself and with the later ones."""
 
 
 class Matrix(NamedTuple):

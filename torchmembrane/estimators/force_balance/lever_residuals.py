@@ -27,7 +27,7 @@ from ..base import Observation
 from .marker_residuals import MarkerResiduals, MeasuredRays
 
 FIELDS = 3
-"""That a tip follows: displacement, and its two derivatives."""
+"""Number of fields that a tip follows: displacement, and its two derivatives."""
 QUADRATIC = 0.5 * np.array(
     [
         [[0, 1, 0, 0, -1, 0, 0], [-4, 2, 0, 0, 2, 0, 0], [2, -1, 1, -1, -1, 1, -1]],

@@ -19,7 +19,7 @@ from ...surface.tangent import tangent_frame
 from ..base import Observation, Problem
 
 NEIGHBOURS = 4
-"""Of a marker, that are asked whether they are off their rays alike."""
+"""Number of neighbours of a marker that are tested for being off their rays in the same way."""
 
 
 class MeasuredRays(NamedTuple):
