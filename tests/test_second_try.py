@@ -61,11 +61,11 @@ def test_a_step_changes_no_edge_by_more_than_its_share(dented, tau):
 
 
 def test_frames_that_settle_keep_their_first_solution_others_are_solved_again_from_rest(dented):
-    anything = dict(settled_step_tolerance=1e9, largest_misfit=1e9, largest_relative_step=1e9, largest_volume_error=1e9)
+    anything = dict(settled_step_tol=1e9, largest_misfit=1e9, largest_relative_step=1e9, largest_volume_error=1e9)
     anything |= dict(
         largest_outlier_share=1.0, largest_unexplained=1e9, likely_objective=(1e9, 1e9, 1e9), largest_shared_misfit=1e9
     )
-    kept, again = estimator(**anything), estimator(settled_step_tolerance=0.0, largest_relative_step=0.0)
+    kept, again = estimator(**anything), estimator(settled_step_tol=0.0, largest_relative_step=0.0)
     measured = kept.equations.bearings.measured(dented)
     torch.testing.assert_close(kept(dented).vertices, kept._solved(measured).vertices)
     torch.testing.assert_close(again(dented).vertices, again._solved(measured, is_retry=True).vertices)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ..jobs.inputs import Inputs
     from ..jobs.local import FrameCounts
     from ..reconstruct import Reconstructor
+    from ..results.store import Settings
 
 PURPOSE = "reconstruct surfaces from images or a video of one sensor"
 EXAMPLES = """\
@@ -100,7 +101,7 @@ def run(arguments: Namespace) -> int:
     from ..jobs.rest import recording_rest
     from ..presets import sensor_file
     from ..results.read import read_results
-    from ..results.store import Mesh, Settings, check_folder
+    from ..results.store import Mesh, check_folder
     from ..sensor.sensor import Sensor
     from .build import build_reconstructor
 
@@ -112,9 +113,7 @@ def run(arguments: Namespace) -> int:
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
     format = arguments.format or ("parquet" if by_ray else "npz")
-    fields = sorted(set(arguments.fields), key=FIELDS.index)
-    given = " ".join(arguments.rest), str(arguments.pressure or "")
-    settings = Settings.from_reconstructor(reconstructor, format, *given, fields)
+    settings = _settings(reconstructor, arguments, format)
     check_folder(arguments.out, sensor.fingerprint, settings)
     for remark in bag_remarks(inputs, sensor.camera):
         print(f"torchmembrane: {remark}", file=sys.stderr)
@@ -142,6 +141,15 @@ def run(arguments: Namespace) -> int:
         draw_film(read_results(arguments.out), images, arguments.video_out)
     print(f"frames: {_said(counts)}; results in {arguments.out}")
     return 1 if counts.failed else 0
+
+
+def _settings(reconstructor: "Reconstructor", arguments: Namespace, format: str) -> "Settings":
+    """The settings of the results."""
+    from ..results.store import Settings
+
+    fields = sorted(set(arguments.fields), key=FIELDS.index)
+    given = " ".join(arguments.rest), str(arguments.pressure or "")
+    return Settings.from_reconstructor(reconstructor, format, *given, fields)
 
 
 def _pressures(log: Path, reconstructor: "Reconstructor", inputs: "Inputs") -> "Gauge":

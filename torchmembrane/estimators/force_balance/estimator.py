@@ -16,8 +16,7 @@ neighbourhood of radius `reach` (contacts are patches), and the weights of the s
 
 Iteratively reweighted least squares (IRLS) by Gauss-Newton steps, while `tau` declines from where everything is quadratic
 (graduated non-convexity, GNC): no start but the rest surface is needed. A fine grid starts from the solution on every second of
-its lines, with an `InitialGuess` where something pushes. Frames that have not settled are solved again, by more steps from
-several starts.
+its lines, with an `InitialGuess` where something pushes. Frames that have not settled are solved again from several starts.
 """
 
 from dataclasses import replace
@@ -294,8 +293,7 @@ class ForceBalance(Estimator):
     @traced
     def is_settled(self, found: Equilibrium) -> Tensor:
         """`[B]` bool: converged and explained, so that more steps would change little."""
-        is_short = found.relative_step < self.settings.settled_step_tolerance
-        return is_short & self.is_converged(found) & self.is_explained(found)
+        return (found.relative_step < self.settings.settled_step_tol) & self.is_converged(found) & self.is_explained(found)
 
     @traced
     def is_done(self, found: Equilibrium, measured: MeasuredRays) -> Tensor:
@@ -309,15 +307,12 @@ class ForceBalance(Estimator):
         return done if self.dents is None else done & ~self.dents.is_ring_shaped(found, self.membrane)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: noise and the model's error alone explain how far the markers are off their rays.
-
-        That is, neighbours are not off alike, there is hardly any tension or shear without a push, little of both together, and
-        not all of the surface is pushed. The size of the force is no reason for doubt.
-        """
+        """`[B]` bool: noise and the model's error explain the markers' angles off their rays, neighbours are not off alike,
+        there is hardly any tension or shear without a push, little of both together, and not all of the surface is pushed."""
         settings, press = self.settings, self._press(found)
         misfit = found.misfit / (settings.largest_misfit + settings.misfit_per_displacement * press) / self.coarseness
-        most_unexplained = settings.largest_unexplained + settings.unexplained_per_displacement * press
-        pulls = found.unexplained / most_unexplained / self.coarseness**2
+        largest = settings.largest_unexplained + settings.unexplained_per_displacement * press
+        pulls = found.unexplained / largest / self.coarseness**2
         alike, (most, aged) = found.shared_misfit / settings.largest_shared_misfit / self.coarseness, settings.largest_doubt
         doubtful = (misfit.maximum(pulls).maximum(alike) > 1) | (pulls + alike > most + aged / press)
         return torch.logical_not(doubtful | (found.pushed > settings.largest_pushed))
@@ -337,8 +332,7 @@ class ForceBalance(Estimator):
         force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, u)
         with torch.no_grad():
             spread = spreads(net.gauss_newton, self.settings, state, observation)
-            positions = self.equations.bearings.positions
-            gap = gap_around(shares_of_deepest(depth), positions, observation.confidence, self.membrane)
+            gap = gap_around(shares_of_deepest(depth), self.equations.bearings.positions, observation.confidence, self.membrane)
         unseen = self.equations.loss.push_noise.mean() * self.reference * self.size**2
         return of_presses(spread, force, depth.amax(-1), gap, contacts, self.membrane, unseen)
 

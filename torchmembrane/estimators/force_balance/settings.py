@@ -18,7 +18,7 @@ OLD_NAMES = {
     "patient_damping": "retry_damping",
     "patient_fine_tau": "retry_fine_tau",
     "patient_tau": "retry_tau",
-    "settled_step": "settled_step_tolerance",
+    "settled_step": "settled_step_tol",
     "unexplained_of_press": "unexplained_per_displacement",
     "worse_objective": "retry_acceptance_ratio",
 }
@@ -55,7 +55,7 @@ class ForceBalanceSettings:
         retry_tau: `tau` of a second try.
         retry_fine_tau: `fine_tau` of a second try.
         settling_steps: number of further steps of a second try, at its last scale, on grids finer than that of the dents.
-        settled_step_tolerance: rms of the last step below which a solution has settled and is not solved again.
+        settled_step_tol: rms of the last step below which a solution has settled and is not solved again.
         camera_motion: scale of the prior of the camera's motion against the rim, px, as tau ends: smaller motions are ignored,
             larger ones are barely penalised further.
         gnc_fraction: share of the steps over which tau declines.
@@ -125,7 +125,7 @@ class ForceBalanceSettings:
     retry_tau: tuple[float, float] = (16.0, 0.4)
     retry_fine_tau: tuple[float, float] = (2.0, 0.4)
     settling_steps: int = 16
-    settled_step_tolerance: float = 4e-4
+    settled_step_tol: float = 4e-4
     camera_motion: float = 0.005
     gnc_fraction: float = 0.6
     sparsity: float = 9000.0
