@@ -15,7 +15,7 @@ PRESSED = (*FRAME, "torchmembrane/simulate")
 JOBS = (*FRAME, "torchmembrane/jobs", "torchmembrane/files", "torchmembrane/results")
 FILES = ("torchmembrane/files", "torchmembrane/sensor", "bench/robustness/fuzz_kinds.py", "bench/robustness/malformed_files.py")
 SEEDS = (9001, 9002, 9003)
-OTHERS = (("a", 25, "--seed 481127"), ("b", 24, "--seed 271126"), ("c", 15, "--first 2000"), ("d", 88, "--seed 8126"))
+OTHERS = (("a", 25, "--seed 481127"), ("b", 24, "--seed 271126"), ("c", 15, "--first 2000"), ("d", 189, "--seed 8126"))
 """Random sensors on which no limit was chosen: folder, number, and which."""
 RANDOM_SENSORS = "bench.data.random_sensors DATA"
 MADE = {
