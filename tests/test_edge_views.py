@@ -69,8 +69,8 @@ def test_each_view_is_its_own_input(model):
         heights = session.run(images(204, 51, count))["vertices"]
         np.testing.assert_allclose(heights, np.full((count, 9, 3), 0.6), atol=1e-6)
     for wrong, said in (
-        (images(0, 0)[0], "no list of 2; expected one with those of the views left, right"),
-        (images(0, 0)[:1], "no list of 2"),
+        (images(0, 0)[0], "not a list of 2; expected one with those of the views left, right"),
+        (images(0, 0)[:1], "not a list of 2"),
         ([images(0, 0)[0], images(0, 0, 2)[1]], r"\[1, 2\] images of the views left, right"),
         (images(0, 0)[::-1], "expected 8 x 6"),
     ):

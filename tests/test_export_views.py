@@ -68,8 +68,8 @@ def test_a_model_of_two_views_gives_what_torch_gives(frames, made):
 def test_images_of_other_views_are_refused_in_words(frames, made):
     left, right = frames[1][0]
     for wrong, said in (
-        (left, "no list of 2; expected one with those of the views left, right"),
-        ([left], "no list of 2"),
+        (left, "not a list of 2; expected one with those of the views left, right"),
+        ([left], "not a list of 2"),
         ([left, np.stack([right] * 2)], r"\[1, 2\] images of the views left, right"),
         ([left, right[:100]], "expected 160 x 120"),
     ):
