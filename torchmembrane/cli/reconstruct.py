@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ..jobs.inputs import Inputs
     from ..jobs.local import FrameCounts
     from ..reconstruct import Reconstructor
+    from ..results.store import Settings
 
 PURPOSE = "reconstruct surfaces from images or a video of one sensor"
 EXAMPLES = """\
@@ -102,7 +103,7 @@ def run(arguments: Namespace) -> int:
     from ..jobs.rest import recording_rest
     from ..presets import sensor_file
     from ..results.read import read_results
-    from ..results.store import Mesh, Settings, check_folder
+    from ..results.store import Mesh, check_folder
     from ..sensor.sensor import Sensor
     from .build import build_reconstructor
 
@@ -114,12 +115,11 @@ def run(arguments: Namespace) -> int:
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
     format = arguments.format or ("parquet" if by_ray else "npz")
-    fields = sorted(set(arguments.fields), key=FIELDS.index)
-    settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""), fields)
+    settings = _settings(reconstructor, arguments, format)
     check_folder(arguments.out, sensor.fingerprint, settings)
     for remark in bag_remarks(inputs, [view.camera for view in sensor.views] if sensor.views_apart else [sensor.camera]):
         print(f"torchmembrane: {remark}", file=sys.stderr)
-    mesh, shard = Mesh.of(reconstructor, settings), Shard(*arguments.shard)
+    mesh, shard = Mesh.from_reconstructor(reconstructor, settings), Shard(*arguments.shard)
     bag = result_bag(arguments.bag, inputs, mesh, reconstructor, shard) if arguments.bag else None
     rest = recording_rest(reconstructor, arguments.rest, inputs) if arguments.rest else None
     counts = reconstruct_files(
@@ -153,6 +153,15 @@ def _inputs(arguments: Namespace, views: "list[str]") -> "Inputs":
     return of_first_view(find_inputs(arguments.images, arguments.video, next(iter(topics), None)), views, topics)
 
 
+def _settings(reconstructor: "Reconstructor", arguments: Namespace, format: str) -> "Settings":
+    """The settings of the results."""
+    from ..results.store import Settings
+
+    fields = sorted(set(arguments.fields), key=FIELDS.index)
+    given = " ".join(arguments.rest), str(arguments.pressure or "")
+    return Settings.from_reconstructor(reconstructor, format, *given, fields)
+
+
 def _pressures(log: Path, reconstructor: "Reconstructor", inputs: "Inputs") -> "Gauge":
     """What a gauge's log says of the frames; unused readings are counted."""
     from ..jobs.pressure import recording_pressures
@@ -171,7 +180,7 @@ def _check(arguments: Namespace) -> None:
     if arguments.engine == "local":
         check_device(arguments.device)
     if arguments.fields and (arguments.engine == "ray" or arguments.format == "parquet"):
-        raise MembraneError("--fields with a Parquet dataset, whose columns are fixed; expected --format npz")
+        raise MembraneError("--fields does not work with a Parquet dataset, whose columns are fixed; pass --format npz")
     if arguments.engine == "ray" and arguments.format == "npz":
         raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
     if arguments.video_out is not None:

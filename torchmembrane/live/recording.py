@@ -1,4 +1,4 @@
-"""What a stream showed, kept: images as they were captured, results as `torchmembrane reconstruct` writes them, times."""
+"""Recording of a stream: captured images, results as `torchmembrane reconstruct` writes them, and times."""
 
 import csv
 from collections.abc import Iterator
@@ -37,7 +37,7 @@ class Recording:
     Args:
         folder: new or empty.
         mesh: what the frames share.
-        bits: of the camera, where 16 hold fewer.
+        bits: bits of the camera, where 16 hold fewer.
 
     Raises:
         MembraneError: the folder holds something; of `keep`, and when the block ends: it cannot be written to. Where the block
@@ -46,7 +46,7 @@ class Recording:
 
     def __init__(self, folder: Path, mesh: Mesh, bits: int | None = None):
         if folder.exists() and (not folder.is_dir() or not all(map(is_of_system, folder.iterdir()))):
-            raise MembraneError(f"--record {folder}: holds something already; expected a new folder, one per recording")
+            raise MembraneError(f"--record {folder}: is not empty; expected a new folder for each recording")
         self.folder, self.bits, self.views = folder, bits, mesh.view_names.split()
         self._results = ResultFolder(folder, mesh, Inputs([], []), WHOLE, False, print)
 
@@ -72,7 +72,7 @@ class Recording:
     def keep(self, seen: LiveFrame) -> None:
         """Write a frame."""
         paths = list(self._images(seen))
-        stored = Stored(seen.frame, SourceFile.of(*paths)._replace(time=seen.time), seen.latency)
+        stored = Stored(seen.frame, SourceFile.from_files(*paths)._replace(time=seen.time), seen.latency)
         self._results.keep(Outcome(seen.name, paths[0], stored))
         with writing(self.folder / TIMES):
             csv.writer(self._times).writerow((seen.name, f"{seen.time:.6f}", f"{seen.latency:.6f}"))

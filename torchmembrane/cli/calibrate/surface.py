@@ -37,7 +37,7 @@ def rest(arguments: Namespace) -> int:
         found = rest_from_image(sensor, image, arguments.overpressure, progress=progress)
     units, design, notes = _before(sensor, found, arguments.overpressure)
     title = "rest surface from one image"
-    report = Report.of(title, found.names, units, design, found.fit, found.pixels, found.residuals, notes)
+    report = Report.from_fit(title, found.names, units, design, found.fit, found.pixels, found.residuals, notes)
     return write_calibrated(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size), 1)
 
 
@@ -79,7 +79,7 @@ def _rest_of_views(arguments: Namespace, sensor: Sensor) -> int:
         first.fit.noise,
     )
     title = f"rest surface and poses from images of {len(images)} views"
-    report = Report.of(title, names, units, design, joined, first.pixels, first.residuals, notes)
+    report = Report.from_fit(title, names, units, design, joined, first.pixels, first.residuals, notes)
     return write_calibrated(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size), len(images))
 
 
@@ -113,7 +113,8 @@ def views(arguments: Namespace) -> int:
     units = (["degrees"] * 3 + [unit] * 3) * (P - 1)
     modelled = found.sensor.camera.point_to_pixel(torch.from_numpy(found.dots)).numpy()
     pixels = np.broadcast_to(modelled, found.residuals.shape)
-    report = Report.of(f"rest surface from {P} views", found.names, units, design, found.fit, pixels, found.residuals, notes)
+    title = f"rest surface from {P} views"
+    report = Report.from_fit(title, found.names, units, design, found.fit, pixels, found.residuals, notes)
     return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface), P)
 
 
