@@ -1,4 +1,4 @@
-"""Compiles the solve's machine code for both precisions, while the style is checked: else every process of the tests would."""
+"""Compiles the solver's machine code once, before the tests start."""
 
 from dataclasses import replace
 from pathlib import Path

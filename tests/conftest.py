@@ -1,3 +1,5 @@
+"""Fixtures that several test files share."""
+
 import gc
 from dataclasses import replace
 from functools import partialmethod
@@ -48,7 +50,7 @@ def quick_images():
 @pytest.fixture
 def few_steps():
     """Settings for torch.compile and torch.export, which unroll all steps: every branch of the solve, each of few steps."""
-    return ForceBalanceSettings(steps=2, coarse_steps=2, fine_steps=2, finer_steps=2, patience=1, settling_steps=2)
+    return ForceBalanceSettings(steps=2, coarse_steps=2, fine_steps=2, finer_steps=2, retry_steps_factor=1, settling_steps=2)
 
 
 @pytest.fixture

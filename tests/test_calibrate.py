@@ -1,4 +1,4 @@
-"""Laws of calibration: what was simulated is found within three reported standard deviations; what cannot be known is said."""
+"""Calibration finds the truth within three reported deviations."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""The whole reconstruction, from rest, from a start and with a gauge, compiles to one graph and gives what it gives eagerly."""
+"""The reconstruction compiles to one graph with the same results."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.sensor import Sensor
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-FEW = ForceBalanceSettings(steps=2, patience=2, worse_objective=1e9)
+FEW = ForceBalanceSettings(steps=2, retry_steps_factor=2, retry_acceptance_ratio=1e9)
 """Steps take long to compile; after so few the first try has not settled, and the second is taken, whatever its objective."""
 
 
@@ -20,8 +20,8 @@ def test_the_second_try_is_taken_in_what_is_compiled_here(monkeypatch):
     sensor, asked = Sensor.from_file(EXAMPLES / "sensor.toml"), []
     small = replace(sensor, membrane=sensor.membrane.resampled((9, 9)))
     reconstructor = Reconstructor(small, dtype=torch.float64, settings=FEW)
-    again = reconstructor.estimator._patiently
-    monkeypatch.setattr(reconstructor.estimator, "_patiently", lambda *given: asked.append(1) or again(*given))
+    again = reconstructor.estimator._retry
+    monkeypatch.setattr(reconstructor.estimator, "_retry", lambda *given: asked.append(1) or again(*given))
     with torch.no_grad():
         second = reconstructor(reconstructor.read(EXAMPLES / "two_contacts.png"))
         monkeypatch.setattr(reconstructor.estimator, "chosen", lambda done, values, others: values)

@@ -1,4 +1,4 @@
-"""The exported model against torch, and the package that runs it where torch is not installed."""
+"""The exported model agrees with torch."""
 
 import importlib.metadata
 import json

@@ -1,6 +1,6 @@
-"""Exported models of random sensors of the whole span against torch, those of `bench/accuracy/exports.py` on small grids.
+"""Exported models of random sensors agree with torch.
 
-Beside them `tests/test_export.py` has a small sensor.
+Those of `bench/accuracy/exports.py` on small grids; beside them `tests/test_export.py` has a small sensor.
 """
 
 import pytest

@@ -1,4 +1,4 @@
-"""Principal stretches and tensions in the files of results: npz, PLY, VTK, Rerun."""
+"""Files of results hold principal stretches and tensions."""
 
 from types import SimpleNamespace
 
@@ -54,7 +54,7 @@ def test_a_folder_is_of_one_choice_of_fields(results, tmp_path, capsys):
         assert main([*call, *fields]) == 2
         assert said in capsys.readouterr().err
     assert main([*call[:4], "--out", str(tmp_path / "out"), "--format", "parquet", "--fields", "stretch"]) == 2
-    assert "expected --format npz" in capsys.readouterr().err
+    assert "pass --format npz" in capsys.readouterr().err
 
 
 def test_a_surface_is_read_back_from_its_file(results, tmp_path, capsys):

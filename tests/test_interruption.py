@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM end every command soon, wherever it is: no traceback, no half files, no processes that stay."""
+"""SIGINT and SIGTERM end every command soon and cleanly."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""What learning stacks do with a module works with a `Reconstructor`: states, functional calls, export, DDP, autocast."""
+"""A `Reconstructor` works with what learning stacks do to modules."""
 
 import io
 import subprocess
@@ -280,7 +280,7 @@ def test_a_frame_that_has_not_converged_passes_finite_gradients(sensor, pixels, 
     """Markers far from any surface, so that the limits of what is plausible are lifted: they would be said first."""
     monkeypatch.setattr("torchmembrane.reconstruct.LARGEST_RESIDUAL", float("inf"))
     few = tm.ForceBalanceSettings(
-        patience=1, settling_steps=2, renewal=0.5, largest_shared_misfit=100.0, largest_unexplained=100.0
+        retry_steps_factor=1, settling_steps=2, renewal=0.5, largest_shared_misfit=100.0, largest_unexplained=100.0
     )
     reconstructor = tm.Reconstructor(sensor, settings=few, dtype=torch.float64)
     rest = reconstructor.rest_pixels

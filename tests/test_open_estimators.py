@@ -1,4 +1,4 @@
-"""An estimator of one's own, as docs/own_estimator.md has it: in Reconstructor, jobs, the command line and exported models."""
+"""An estimator of one's own works everywhere without a change."""
 
 import re
 import shlex
@@ -360,7 +360,7 @@ def test_all_that_a_class_lacks_is_named(cap):
         (":Sheet", "the module '' cannot be imported"),
         ("linear_map:Sheet", "no 'Sheet' in "),
         ("linear_map:", "no '' in "),
-        ("linear_map:torch", "is no class; expected a subclass"),
+        ("linear_map:torch", "is not a class; expected a subclass"),
         ("linear_map:LinearMapSettings", "lacks the base class torchmembrane.Estimator, Settings, from_problem"),
     ],
 )

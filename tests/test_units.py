@@ -1,4 +1,4 @@
-"""Laws of units: the whole tour, from a draft to the live line, says the same of one membrane in every length unit."""
+"""Every length unit gives the same answer for one membrane."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""Figures say what a frame holds: where, how deep, in which unit, and in words if there is no surface."""
+"""Figures show where, how deep and in which unit."""
 
 import subprocess
 import sys

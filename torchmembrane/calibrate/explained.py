@@ -121,8 +121,8 @@ def explained(sensor: Sensor, reconstructor: Reconstructor, known: MeasuredPress
 
     Args:
         sensor: as it is known.
-        reconstructor: of it, on the grid for calibration.
-        known: of the presses.
+        reconstructor: reconstructor of the sensor, on the grid for calibration.
+        known: what is known of the presses.
         progress: is told how far it is.
     """
     presses = Presses(reconstructor, known.displacement, known.confidence, known.covariance)

@@ -47,7 +47,7 @@ def figure(
         frame: one frame's arrays, as `Reconstruction.frame` gives them.
         mesh: the `Mesh` stored beside it.
         image: its image `[height, width]` in 0..1; without one, none is drawn.
-        name: of the frame, for the title.
+        name: name of the frame, for the title.
         places: for panels, 4 or 3; default: as many as there are. Films need figures of one size.
 
     Returns:
@@ -60,7 +60,7 @@ def figure(
         >>> sensor = Sensor.from_file("examples/sensor.toml")
         >>> reconstructor = Reconstructor(replace(sensor, markers=replace(sensor.markers, rest_image=None)))
         >>> frame = reconstructor.from_pixels(reconstructor.rest_pixels).frame(0)
-        >>> drawing = figure(frame, Mesh.of(reconstructor, Settings.of(reconstructor, "npz")))
+        >>> drawing = figure(frame, Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, "npz")))
         >>> [axes.get_title() for axes in drawing.axes[:2]]
         ['Marker flow', 'Surface, seen along x']
     """

@@ -16,7 +16,7 @@ from .drawing import BLUE, GREY, VERMILION, readable
 GREEN = "#009E73"  # distinct from the others with any colour vision
 COLOURS = dict(zip("xyz", (VERMILION, GREEN, BLUE), strict=True))
 SHADES = ("#F0E442", "#CC79A7", "#56B4E9", "#E69F00", "#999999", "#8C564B")
-"""Of the bands of statuses other than ok, in the order in which they appear."""
+"""Colours of the bands of statuses other than ok, in the order in which they appear."""
 WIDTH, HEIGHT = 9.0, 3.1
 """Inches, of a recording's column and of a row."""
 LONGEST = 1e8
