@@ -96,7 +96,7 @@ class Workspace(NamedTuple):
     normal: Any
     """`[N, 3]`"""
     fields: Any
-    """`[4, N]`"""
+    """`[5, N]`"""
     blocks: Any
     """`[D, 3, 3]`, of the markers; their bearing Jacobians, weighted, `jacobians [D, 2, 3]`, and `marker_weights [D]`."""
     jacobians: Any
@@ -122,7 +122,7 @@ def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
     N, V, width = (m - 2) * (n - 2), m * n, 3 * (2 * (n - 2) + 2) + 2  # to two lines, vertices and components further
     unknowns, rows, ld = storage(3 * N, width)
     shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, m, n), weighted=(3, 21, V), W=(3, 3, V), of_loads=(3, 2, V))
-    shapes |= dict(sums=(90, V), normal=(N, 3), fields=(4, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
+    shapes |= dict(sums=(90, V), normal=(N, 3), fields=(5, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
     shapes |= dict(marker_weights=(markers,), inverse=(unknowns,), panel=(RANK * ld,), scale=(unknowns,))
     arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
     y = aligned(-(-LOADS // ROWS) * ROWS * unknowns, dtype)
@@ -135,7 +135,7 @@ def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
     """`TractionLoss.weights`: `W`, and `before` becomes the weights of the normal tractions; `curvature`: of a push's loss, in
     place of its weight."""
     k, N, n = c.numbers, len(c.area), c.surface.free.shape[1]
-    q_n, shear2, push2, around = work.fields
+    q_n, shear2, push2, around, shares = work.fields
     for i in range(N):
         p, q = i // (n - 2) + 1, i % (n - 2) + 1
         square, along, across2 = 0.0, 0.0, 0.0
@@ -148,18 +148,15 @@ def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
             across2 += (work.force[p, q, a] - along * work.normal[i, a]) ** 2
         unit = c.area[i] * k.reference
         q_n[i], shear2[i] = along / unit, across2 / unit**2
-    push2[:] = 0
-    for i in range(N):
-        if not q_n[i] >= 0:
-            _add(push2, c.surroundings[i], q_n[i] ** 2, c.surroundings_within[i])
+        shares[i] = 0.0 if q_n[i] >= 0 else q_n[i] ** 2
+    _sum_rows(push2, c.surroundings, c.surroundings_within, shares)
     top = TINY
     for i in range(N):
         top = max(top, push2[i])
-    around[:] = 0
     for i in range(N):
         share = (push2[i] / top) ** POWER
-        if not share < NOTHING:
-            _add(around, c.wider[i], share, c.wider_within[i])
+        shares[i] = 0.0 if share < NOTHING else share
+    _sum_rows(around, c.wider, c.wider_within, shares)
     least = min(k.decrease * (tau / k.last_tau - 1) + k.least_scale, 1.0) ** 2
     for i in range(N):
         expected = top * max(around[i], TINY) ** (1 / POWER) * k.scale_share**2
@@ -181,11 +178,25 @@ def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
 
 
 @compiled
-def _add(total, row, share, within):
-    """`total += share row`, of which only the places `within` are not zero."""
-    part, of_row = total[within[0] : within[1]], row[within[0] : within[1]]
-    for i in range(len(part)):
-        part[i] += share * of_row[i]
+def _sum_rows(total, rows, within, shares):
+    """`total = shares @ rows`, four rows at a time of those that have a share; each is zero but `within`."""
+    chosen, own, count = np.zeros(4, np.intp), np.zeros(4, total.dtype), 0
+    total[:] = 0
+    for i in range(len(rows)):
+        if shares[i] != 0:
+            chosen[count], own[count] = i, shares[i]
+            count += 1
+        if count == 4 or (count > 0 and i == len(rows) - 1):
+            chosen[count:], own[count:] = chosen[0], 0
+            first, end = len(total), 0
+            for k in chosen:
+                first, end = min(first, within[k, 0]), max(end, within[k, 1])
+            part, a, b, c, d = total[first:end], chosen[0], chosen[1], chosen[2], chosen[3]
+            row_a, row_b, row_c, row_d = rows[a, first:end], rows[b, first:end], rows[c, first:end], rows[d, first:end]
+            of_a, of_b, of_c, of_d = own[0], own[1], own[2], own[3]
+            for k in range(len(part)):
+                part[k] += of_a * row_a[k] + of_b * row_b[k] + of_c * row_c[k] + of_d * row_d[k]
+            count = 0
 
 
 @compiled
