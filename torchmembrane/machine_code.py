@@ -16,7 +16,9 @@ from typing import Any
 
 import numba
 import numpy as np
+import torch
 from llvmlite.binding import get_host_cpu_name
+from torch import Tensor
 
 from .interruption import unstoppable
 
@@ -45,6 +47,18 @@ def using(wanted: bool) -> Iterator[None]:
 def is_used() -> bool:
     """Whether machine code may be used here."""
     return _used.get()
+
+
+def takes(*values: Any) -> bool:
+    """Whether machine code computes with these tensors: on a processor, alone, without gradients."""
+    tensors = [value for value in values if value is not None]
+    return (
+        not torch.compiler.is_compiling()
+        and is_used()
+        and all(type(value) is Tensor and value.device.type == "cpu" for value in tensors)
+        and not (torch.is_grad_enabled() and any(value.requires_grad for value in tensors))
+        and all(torch.func.debug_unwrap(value, recurse=False) is value for value in tensors)
+    )
 
 
 OPTIONS: dict[str, Any] = dict(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
@@ -80,9 +94,11 @@ class Kept:
     Args:
         function: as `kept` gives it.
         sources: `fingerprint` of its sources.
+        seconds: about how long it takes to compile.
     """
 
-    def __init__(self, function: Any, sources: str):
+    def __init__(self, function: Any, sources: str, seconds: int = SECONDS):
+        self.seconds = seconds
         folder, version = getattr(function.stats, "cache_path", None), f"{platform.python_version()} {numba.__version__}"
         self.folder = Path(folder) if folder else None
         self.key = hashlib.sha256(f"{sources} {version} {get_host_cpu_name()}".encode()).hexdigest()[:16]
@@ -104,7 +120,7 @@ class Kept:
             self.announced.add(dtype.name)
         if is_new:
             logging.getLogger("torchmembrane").warning(
-                "torchmembrane: compiling machine code for %s, about %d s, once", dtype.name, SECONDS
+                "torchmembrane: compiling machine code for %s, about %d s, once", dtype.name, self.seconds
             )
         with unstoppable() if is_new else nullcontext():
             yield

@@ -22,14 +22,13 @@ its lines, and a `Dent` where something pushes. What has not settled is solved a
 from dataclasses import replace
 from typing import Any, ClassVar, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ...control_flow import retry_rows, traced, where_rows
 from ...mechanics.cavity import CavityLaw, rest_balance
 from ...mechanics.hyperelastic import ElasticEnergy
-from ...solve.stencil import inner, pad_border
+from ...solve.stencil import pad_border
 from ...surface.bicubic import Refinement
 from ...surface.membrane import Membrane
 from ...surface.projection import SurfacePoints
@@ -143,9 +142,8 @@ class ForceBalance(Estimator):
     @property
     def must_compile(self) -> bool:
         """Whether the first frame waits for machine code to be compiled."""
-        rest = self.membrane.rest
-        taken = rest.device.type == "cpu" and self.equations.bearings.in_machine_code
-        return taken and not compiled.is_compiled(np.dtype(str(rest.dtype).removeprefix("torch.")))
+        taken = self.membrane.rest.is_cpu and self.equations.bearings.in_machine_code
+        return taken and not compiled.is_compiled(self.membrane.rest.numpy().dtype)
 
     @property
     def solves_in_double(self) -> bool:
@@ -172,8 +170,7 @@ class ForceBalance(Estimator):
     def prepare(self, camera: Any, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
         """The rays of the markers seen at `pixels [B, D, 2]`, each with its own noise where its `covariance` is given."""
         if covariance is None:
-            origins, directions = camera.pixel_to_ray(pixels)
-            return Observation(origins, directions, confidence)
+            return Observation(*camera.pixel_to_ray(pixels), confidence)
         return marker_rays(camera, pixels, self.equations.bearings.seen_at_rest, confidence, covariance)
 
     def check_gauge(self) -> None:
@@ -270,19 +267,22 @@ class ForceBalance(Estimator):
     @traced
     def equilibrium(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: MeasuredRays) -> Equilibrium:
         """What this state amounts to; `before`: the displacement a step earlier."""
-        membrane, loss, x = self.membrane, self.equations.loss, self.membrane.rest + u
-        step = (u - before).square().sum(-1).mean(-1).sqrt() / self.size
-        traction = self.equations.forces(u, pressure) / membrane.rest_area[:, None]
-        within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
-        terms, seen = loss(*within, measured.noise_level), measured.weight.sum(-1).clamp_min(1)
+        membrane, steps, x = self.membrane, self.gauss_newton, self.membrane.rest + u
+        if steps.is_native(u, pressure, moved, before, *measured):
+            given = self.equations, self.cavity, (u, pressure, moved), before, measured, self._far
+            (step, volume, misfit, *reasons), traction, reference = steps.native.solution(*given)
+            return Equilibrium(x, pressure, volume, traction, step, reference, misfit, moved, *reasons)
+        loss, step = self.equations.loss, (u - before).square().sum(-1).mean(-1).sqrt() / self.size
+        traction, normal = steps.tractions(u, pressure)
+        terms, seen = loss(traction, normal, measured.noise_level), measured.weight.sum(-1).clamp_min(1)
         angles = self.equations.bearings.angles(u, measured, moved)[0]
-        unexplained = (self.gauss_newton.misfit(angles, pressure, measured) + terms.others) / seen
+        unexplained = (steps.misfit(angles, pressure, measured) + terms.others) / seen
         objective = unexplained + terms.pushes / seen
-        gain = self.gauss_newton.objective_at_rest(measured) / seen - objective
+        gain = steps.objective_at_rest(measured) / seen - objective
         scale = 1 + pad_border(loss.contact_scale(terms, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
         misfit, shared = self.equations.bearings.misfits(angles, measured, self.settings.outlier, self._far)
-        reasons = misfit, moved, objective, unexplained, loss.pushed(terms.push2), shared
-        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *reasons)
+        reasons, traction = [objective, unexplained, loss.pushed(terms.push2), shared], pad_border(traction.mT, membrane.grid)
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, misfit, moved, *reasons)
 
     @traced
     def is_converged(self, found: Equilibrium) -> Tensor:
@@ -331,8 +331,7 @@ class ForceBalance(Estimator):
         force, depth = (found.traction * self.membrane.rest_area[:, None]).sum(1), depths(self.membrane, u)
         with torch.no_grad():
             spread = spreads(net.gauss_newton, self.settings, state, observation)
-            positions = self.equations.bearings.positions
-            gap = gap_around(shares_of_deepest(depth), positions, observation.confidence, self.membrane)
+            gap = gap_around(shares_of_deepest(depth), self.equations.bearings.positions, observation.confidence, self.membrane)
         unseen = self.equations.loss.push_noise.mean() * self.reference * self.size**2
         return of_presses(spread, force, depth.amax(-1), gap, contacts, self.membrane, unseen)
 
