@@ -1,4 +1,4 @@
-"""Compiles the solve's machine code for both precisions, while the style is checked: else every process of the tests would."""
+"""Compiles machine code for both precisions, while the style is checked: else every process of the tests would."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ def main() -> None:
     for dtype in (torch.float32, torch.float64):
         reconstructor = tm.Reconstructor(small, dtype=dtype)
         with torch.no_grad():
-            reconstructor.from_pixels(reconstructor.rest_pixels)
+            reconstructor(reconstructor.read(SENSOR.parent / "rest.png"))
 
 
 if __name__ == "__main__":

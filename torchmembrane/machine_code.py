@@ -8,7 +8,7 @@ import hashlib
 import logging
 import platform
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from pathlib import Path
 from threading import Lock
@@ -55,7 +55,7 @@ def takes(*values: Any) -> bool:
     return (
         not torch.compiler.is_compiling()
         and is_used()
-        and all(type(value) is Tensor and value.device.type == "cpu" for value in tensors)
+        and all(type(value) is Tensor and value.is_cpu for value in tensors)
         and not (torch.is_grad_enabled() and any(value.requires_grad for value in tensors))
         and all(torch.func.debug_unwrap(value, recurse=False) is value for value in tensors)
     )
@@ -104,6 +104,7 @@ class Kept:
         self.key = hashlib.sha256(f"{sources} {version} {get_host_cpu_name()}".encode()).hexdigest()[:16]
         self.known: set[str] = set()
         self.announced: set[str] = set()
+        self.called: set[np.dtype[Any]] = set()
         self.lock = Lock()
 
     def is_compiled(self, dtype: np.dtype[Any]) -> bool:
@@ -112,9 +113,12 @@ class Kept:
             self.known.add(dtype.name)
         return dtype.name in self.known
 
-    @contextmanager
-    def compiling(self, dtype: np.dtype[Any]) -> Iterator[None]:
+    def compiling(self, dtype: np.dtype[Any]) -> AbstractContextManager[None]:
         """For a call: if it compiles, this is logged, and noted when it is done."""
+        return nullcontext() if dtype in self.called else self._compiling(dtype)
+
+    @contextmanager
+    def _compiling(self, dtype: np.dtype[Any]) -> Iterator[None]:
         with self.lock:  # threads begin their first calls at the same time
             is_new = not self.is_compiled(dtype) and dtype.name not in self.announced
             self.announced.add(dtype.name)
@@ -128,6 +132,7 @@ class Kept:
             self.known.add(dtype.name)
             if self.folder and self.folder.exists():
                 self._mark(dtype).touch()
+        self.called.add(dtype)
 
     def _mark(self, dtype: np.dtype[Any]) -> Path:
         assert self.folder is not None

@@ -126,7 +126,7 @@ def choices(c, predicted, support, blobs, base, found):  # type: ignore[no-untyp
 
 
 SOURCES = fingerprint(__file__)
-KEPT = {function: Kept(function, SOURCES, 3) for function in (gradients, flows, choices)}
+KEPT_STEPS = {function: Kept(function, SOURCES, 3) for function in (gradients, flows, choices)}
 
 
 def is_native(*values: Tensor) -> bool:
@@ -138,7 +138,7 @@ def found_by(function: Any, constants: tuple[Tensor, ...], given: tuple[Tensor, 
     """What one of the functions finds, `[B, *shape]`, from the constants of a pattern and what is `given` of the frames."""
     frames = max(len(value) for value in given)
     found = given[0].new_empty(frames, *shape)
-    with KEPT[function].compiling(np.dtype(np.float32)):
+    with KEPT_STEPS[function].compiling(np.dtype(np.float32)):
         each = (value.expand(frames, *value.shape[1:]).contiguous().numpy() for value in given)
         function(tuple(value.numpy() for value in constants), *each, found.numpy())
     return found
