@@ -15,7 +15,7 @@ MIDDLES = [[(0.0, 0.0)], [(4.0, 1.0), (-4.0, -2.0)], [(0.0, 11.3), (5.0, -3.0), 
 
 def pushed(dtype):
     """A dome dented where it is pushed, with shear, a pull elsewhere, and noise too weak to be a contact."""
-    dome = spherical_cap(12, 9, 3, (15, 13))
+    dome = spherical_cap(12, 9, 3, (27, 25))
     generator = torch.Generator().manual_seed(0)
     x, traction = dome.rest.repeat(len(MIDDLES), 1, 1), torch.zeros(len(MIDDLES), *dome.rest.shape).double()
     for frame, middles in enumerate(MIDDLES):

@@ -205,8 +205,9 @@ def _curvature(c, x, mine, strong, share, axes, curvature):
             by = sums[b, a] / sums[a, a] if b != a else 0.0
             for e in range(a, 7):
                 sums[b, e] -= by * sums[a, e]
-    by_u, by_v, uu, uv, vv = (sums[1, 6] / sums[1, 1], sums[2, 6] / sums[2, 2], sums[3, 6] / sums[3, 3],
-                              sums[4, 6] / sums[4, 4], sums[5, 6] / sums[5, 5])  # fmt: skip
+    for a in range(6):
+        t[a] = sums[a, 6] / sums[a, a]
+    by_u, by_v, uu, uv, vv = t[1], t[2], t[3], t[4], t[5]
     steep = 1 + by_u * by_u + by_v * by_v
     middle = ((1 + by_v * by_v) * uu - 2 * by_u * by_v * uv + (1 + by_u * by_u) * vv) / (2 * steep * np.sqrt(steep))
     gauss = (uu * vv - uv * uv) / (steep * steep)
@@ -253,7 +254,7 @@ def _told(c, x, normals, traction, indicator, area, mine, told):
 
 def _entry(sources: str) -> Any:
     @kept
-    def patches(c, x, normals, traction, reference, indicator, told):  # type: ignore[no-untyped-def]
+    def patches(c, x, normals, traction, reference, indicator, told):
         """Of frames `[B, V, 3]` and `[B, V]`, `indicator [B, V]` and `told [B, P, 14]` are filled."""
         V = x.shape[1]
         push, weight, height, area = np.empty((4, V), x.dtype)
@@ -323,6 +324,5 @@ def _constants(owner: Any, surroundings: Tensor, limits: tuple[float, ...]) -> C
     dtype = membrane.rest.numpy().dtype
     rows = np.ascontiguousarray(surroundings.numpy(), dtype)
     rest = np.ascontiguousarray(membrane.rest.numpy().reshape(*membrane.grid, 3))
-    fields = (membrane.rest_area, owner.near_rim, owner.beside_rim)
-    arrays = (np.ascontiguousarray(each.numpy(), dtype) for each in fields)
-    return Constants(rest, *arrays, rows, within(rows), *limits, owner.least_span, membrane.size)
+    area, near, beside = (each.numpy().astype(dtype) for each in (membrane.rest_area, owner.near_rim, owner.beside_rim))
+    return Constants(rest, area, near, beside, rows, within(rows), *limits, owner.least_span, membrane.size)

@@ -6,7 +6,7 @@ from ..machine_code import Kept, fingerprint, kept
 
 
 @kept
-def noises(images, stride, exposed, cut, rounds, divisor, found):  # type: ignore[no-untyped-def]
+def noises(images, stride, exposed, cut, rounds, divisor, found):
     """`found [B]` of images `[B, H, W]`; the numbers as of `noise`."""
     height, width = images.shape[1:]
     sizes = np.empty(-(-(height - 2) // stride) * -(-(width - 2) // stride), images.dtype)

@@ -153,7 +153,8 @@ class GaussNewton(nn.Module):
         """The contact tractions `[B, V, 3]`."""
         if self.is_native(*state, *measured):
             return self.native.solution(*self._given, state, state.u, measured, 1.0)[1]
-        return self.equations.forces(state.u, state.pressure) / self.membrane.rest_area[:, None]
+        traction: Tensor = self.equations.forces(state.u, state.pressure) / self.membrane.rest_area[:, None]
+        return traction
 
     @traced
     def _next(

@@ -85,7 +85,7 @@ def _steps(c, d, pixels, sure, gradient):
 
 
 @kept
-def trusts(c, numbers, pixels, confidence, gradient, predicted, blobs, log_radius, valid, found):  # type: ignore[no-untyped-def]
+def trusts(c, numbers, pixels, confidence, gradient, predicted, blobs, log_radius, valid, found):
     """`found [B, D]` of every frame; `numbers`: narrowness of sizes, `TEAR`, `STRAY`; the rest as of `Coherence.forward`."""
     count = pixels.shape[1]
     sure, left, alone = np.empty(count), np.empty(blobs.shape[1]), np.empty(count)

@@ -101,7 +101,7 @@ def _choice(c, predicted, support, blobs, base, least, found):
 
 
 @kept
-def gradients(c, weight, flow, prior, found):  # type: ignore[no-untyped-def]
+def gradients(c, weight, flow, prior, found):
     """`found [B, 2, 2, D]` of every frame."""
     rows, sums = np.empty(len(c[5]), np.float32), np.empty((3, c[0].shape[1]), np.float32)
     for b in range(len(found)):
@@ -109,7 +109,7 @@ def gradients(c, weight, flow, prior, found):  # type: ignore[no-untyped-def]
 
 
 @kept
-def flows(c, weight, flow, gradient, found):  # type: ignore[no-untyped-def]
+def flows(c, weight, flow, gradient, found):
     """`found [B, 3, D]` of every frame."""
     count = len(c[5])
     rows, fields, sums = np.empty(count, np.float32), np.empty((6, count), np.float32), np.empty((7, 3 * count), np.float32)
@@ -118,7 +118,7 @@ def flows(c, weight, flow, gradient, found):  # type: ignore[no-untyped-def]
 
 
 @kept
-def choices(c, predicted, support, blobs, base, found):  # type: ignore[no-untyped-def]
+def choices(c, predicted, support, blobs, base, found):
     """`found [B, 7, D]` of every frame."""
     least = np.empty(len(c[0]), np.float32)
     for b in range(len(found)):

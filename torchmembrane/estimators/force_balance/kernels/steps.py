@@ -89,13 +89,13 @@ class NativeSteps:
         """What a state amounts to: the numbers `[B]` of what is `TOLD`, the tractions `[B, V, 3]` and what they are measured
         against `[B, V]`; arguments as of `ForceBalance.equilibrium`, `far`: as of `MarkerResiduals.misfits`."""
         constants, fixed = self._prepared(equations, cavity, measured)
-        u, pressure, moved, before = (value.contiguous().numpy() for value in (*state, before))
+        u, pressure, moved, earlier = (value.contiguous().numpy() for value in (*state, before))
         weights, given = np.empty((len(u), 0), u.dtype), np.array([[equations.loss.cone, far, 0, 0, 0]], float)
         found = state[0].new_empty(len(u), TOLD), torch.empty_like(state[0]), torch.empty_like(state[0][..., 0])
         told, traction, reference = (value.numpy() for value in found)
         grid = equations.forces.membrane.grid
-        u, before, traction = (value.reshape(-1, *grid, 3) for value in (u, before, traction))
-        each = [u, pressure, moved, weights, before, *fixed, traction, reference.reshape(-1, *grid), told]
+        u, earlier, traction = (value.reshape(-1, *grid, 3) for value in (u, earlier, traction))
+        each = [u, pressure, moved, weights, earlier, *fixed, traction, reference.reshape(-1, *grid), told]
         self._shared_out(equations, constants, each, given)
         return found[0].unbind(1), *found[1:]
 
@@ -200,15 +200,30 @@ def _sparse(rows: np.ndarray, count: int | None = None) -> tuple[np.ndarray, np.
 def _entry(sources: str) -> Any:
     @kept
     def frames(  # type: ignore[no-untyped-def]
-        c, work, u, pressure, moved, weights, before, origins, across, weight, noise_level, motion, gauge, traction, reference,
-        rows, found,
-    ):  # fmt: skip
+        c,
+        work,
+        u,
+        pressure,
+        moved,
+        weights,
+        before,
+        origins,
+        across,
+        weight,
+        noise_level,
+        motion,
+        gauge,
+        traction,
+        scale,
+        rows,
+        found,
+    ):
         """Steps of every frame, and then its deviations, or what its state amounts to.
 
         `u [B, m, n, 3]`, `pressure [B]`, `moved [B, 4]` and `weights [B, N]`, of the normal tractions, become those after the
         steps; `before [B, m, n, 3]` the displacement before the last. With the last of the rows no step is taken where `found`
         is asked for: `[B, 4]`, the standard deviations of force and depth; `[B, 7]` what is `TOLD`, with `traction
-        [B, m, n, 3]` and `reference [B, m, n]`.
+        [B, m, n, 3]` and `scale [B, m, n]`, what they are measured against.
 
         c: `Constants`, work: a `Workspace`, origins to gauge: `MeasuredRays`, rows: of every step tau, outlier, cone, renewal
         and damping, `[S, 5]`.
@@ -223,7 +238,7 @@ def _entry(sources: str) -> Any:
                     earlier[i] = now[i]
                 step(c, work, *state, seen, *measured, rows[k])
             if wanted == TOLD:
-                told = found[b], traction[b], reference[b]
+                told = found[b], traction[b], scale[b]
                 solution_of(c, work, *state[:3], before[b], seen, *measured, rows[count], *told)
             elif wanted > 0:
                 spread_of(c, work, *state, seen, *measured, rows[count], found[b])
