@@ -3,6 +3,7 @@
 The formulas are those of `contacts` and `regions`, which say what they mean; a test holds both to the same numbers.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -304,7 +305,7 @@ class NativePatches:
         return type(self), ()
 
     def __call__(
-        self, owner: Any, count: int, limits: tuple[float, ...], surroundings: Tensor, *frames: Tensor
+        self, owner: Any, count: int, limits: Sequence[float], surroundings: Tensor, *frames: Tensor
     ) -> tuple[Tensor, ...]:
         """What `Contacts` holds, of `frames`: surface, normals, traction and reference; `limits`: of `contacts`, as the
         `Constants` have them."""
@@ -319,7 +320,7 @@ class NativePatches:
         return indicator, points, force, normal, area[..., 0], slip[..., 0], curvature, at_rim[..., 0]
 
 
-def _constants(owner: Any, surroundings: Tensor, limits: tuple[float, ...]) -> Constants:
+def _constants(owner: Any, surroundings: Tensor, limits: Sequence[float]) -> Constants:
     membrane = owner.membrane
     dtype = membrane.rest.numpy().dtype
     rows = np.ascontiguousarray(surroundings.numpy(), dtype)

@@ -22,8 +22,8 @@ LANES, FIELDS, UNKNOWNS = 16, 8, 7
 HALF, ONE, TINY, DARKEST = np.float32(0.5), np.float32(1), np.float32(1e-12), np.float32(10)
 LARGEST = np.float32(7.90531110763549805)
 """Beyond it tanh is 1."""
-ODD = (-2.76076847742355e-16, 2.00018790482477e-13, -8.60467152213735e-11, 5.12229709037114e-08, 1.48572235717979e-05)
-ODD = tuple(np.float32(c) for c in (*ODD, 6.37261928875436e-04, 4.89352455891786e-03))
+TOP = (-2.76076847742355e-16, 2.00018790482477e-13, -8.60467152213735e-11, 5.12229709037114e-08, 1.48572235717979e-05)
+ODD = tuple(np.float32(c) for c in (*TOP, 6.37261928875436e-04, 4.89352455891786e-03))
 EVEN = tuple(np.float32(c) for c in (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4.89352518554385e-03))
 """tanh as a quotient of polynomials in x^2, the highest power first (Eigen's `ptanh`): to some 1e-7."""
 
