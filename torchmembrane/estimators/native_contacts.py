@@ -3,7 +3,6 @@
 The formulas are those of `contacts` and `regions`, which say what they mean; a test holds both to the same numbers.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +19,9 @@ TOLD = 14
 """Numbers that are told of a patch."""
 TINY = 1e-37
 """Keeps quotients of what vanishes finite."""
+
+
+Limits = tuple[float, float, float, float, float]
 
 
 class Constants(NamedTuple):
@@ -304,9 +306,7 @@ class NativePatches:
     def __reduce__(self) -> tuple[Any, tuple[()]]:
         return type(self), ()
 
-    def __call__(
-        self, owner: Any, count: int, limits: Sequence[float], surroundings: Tensor, *frames: Tensor
-    ) -> tuple[Tensor, ...]:
+    def __call__(self, owner: Any, count: int, limits: Limits, surroundings: Tensor, *frames: Tensor) -> tuple[Tensor, ...]:
         """What `Contacts` holds, of `frames`: surface, normals, traction and reference; `limits`: of `contacts`, as the
         `Constants` have them."""
         if self._constants is None or self._constants[0] is not surroundings:
@@ -320,7 +320,7 @@ class NativePatches:
         return indicator, points, force, normal, area[..., 0], slip[..., 0], curvature, at_rim[..., 0]
 
 
-def _constants(owner: Any, surroundings: Tensor, limits: Sequence[float]) -> Constants:
+def _constants(owner: Any, surroundings: Tensor, limits: Limits) -> Constants:
     membrane = owner.membrane
     dtype = membrane.rest.numpy().dtype
     rows = np.ascontiguousarray(surroundings.numpy(), dtype)
