@@ -11,7 +11,8 @@ from torchmembrane.cli.main import command_parser
 HEAD = """\
 # The command
 
-Made by `python docs/reference.py` from the command's own parsers; `torchmembrane COMMAND --help` says the same, with examples.
+This page lists every option of every command. `torchmembrane COMMAND --help` prints the same. The page is made
+by `python docs/reference.py`.
 `SENSOR.toml` may be `preset:NAME` ([which](presets.md)). Exit codes: 0 all well, 1 some frames failed, 2 wrong usage, 130
 ended by Ctrl-C, 143 by SIGTERM.
 

@@ -1,4 +1,4 @@
-"""An independent twin of the estimator for round membranes: one unknown function of the material radius.
+"""An independent twin of the estimator for round membranes.
 
 A flat disc of radius 1 at z = 1 is seen from the origin; the material circle s is observed at image radius `phi(s)`
 (z = 1 plane), so that its points are `t(s) (phi cos a, phi sin a, 1)`. The energy of the principal stretches

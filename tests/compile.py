@@ -1,4 +1,4 @@
-"""Compiles machine code for both precisions, while the style is checked: else every process of the tests would."""
+"""Compiles the machine code of a frame once, before the tests start."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,6 +1,9 @@
+"""Fixtures that several test files share."""
+
 import gc
 from dataclasses import replace
 from functools import partialmethod
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +11,11 @@ import pytest
 import torch
 from PIL import Image
 
+from torchmembrane import processes
 from torchmembrane.calibrate import explained, presses
 from torchmembrane.camera.model import Camera
 from torchmembrane.estimators.force_balance.settings import ForceBalanceSettings
+from torchmembrane.jobs import workers
 from torchmembrane.markers.dots import pattern
 from torchmembrane.reconstruct import Reconstructor
 from torchmembrane.sensor.parts import Cavity, Markers, Material, Surface
@@ -45,7 +50,16 @@ def quick_images():
 @pytest.fixture
 def few_steps():
     """Settings for torch.compile and torch.export, which unroll all steps: every branch of the solve, each of few steps."""
-    return ForceBalanceSettings(steps=2, coarse_steps=2, fine_steps=2, finer_steps=2, patience=1, settling_steps=2)
+    return ForceBalanceSettings(steps=2, coarse_steps=2, fine_steps=2, finer_steps=2, retry_steps_factor=1, settling_steps=2)
+
+
+@pytest.fixture
+def quick_processes(monkeypatch):
+    """Worker processes are forked from one that has imported torch; new ones, as users get them, take five seconds each."""
+    context = get_context("forkserver")
+    context.set_forkserver_preload(["torchmembrane.reconstruct"])
+    for module in (processes, workers):
+        monkeypatch.setattr(module, "get_context", lambda _: context)
 
 
 @pytest.fixture(scope="session", autouse=True)

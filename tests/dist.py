@@ -1,4 +1,4 @@
-"""Source distributions and wheels built, and used from environments that have nothing else: `make test-dist`.
+"""Built distributions work in environments that have nothing else.
 
 python tests/dist.py OUT MODEL.onnx
 

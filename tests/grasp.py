@@ -1,4 +1,4 @@
-"""A model around a reconstruction, and one of several processes that train it: python grasp.py RANK PROCESSES FOLDER."""
+"""A model around a reconstruction, trained by several processes."""
 
 import sys
 from dataclasses import replace

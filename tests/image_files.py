@@ -1,4 +1,4 @@
-"""Image files as cameras and their programs write them, made by hand where Pillow writes none."""
+"""Image files as cameras write them, where Pillow writes none."""
 
 import io
 import struct

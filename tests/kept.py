@@ -1,4 +1,4 @@
-"""What tests simulate, kept in `out/tests/kept` from one run to the next."""
+"""What tests simulate is kept in `out/tests/kept` between runs."""
 
 import functools
 import inspect

@@ -1,4 +1,4 @@
-"""The quick start with the lowest versions that `pyproject.toml` allows, as `make test-lowest` installs them.
+"""The quick start works with the lowest versions of dependencies.
 
 Images of the examples are reconstructed by minimum energy and by force balance, and a gradient is taken through the latter.
 """

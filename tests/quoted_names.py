@@ -1,4 +1,4 @@
-"""Names of the code that documents quote in backticks, and what they stand for."""
+"""Names of the code that documents quote, and what they stand for."""
 
 import importlib
 import re

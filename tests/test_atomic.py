@@ -1,4 +1,4 @@
-"""A file is written whole or not at all; what may be missing is asked for by its extra's name."""
+"""A file is written whole or not at all."""
 
 import sys
 

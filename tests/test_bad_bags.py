@@ -1,4 +1,4 @@
-"""Bags that are damaged, cut off, of another kind or made to harm: one line with the remedy, at once, in little memory."""
+"""Damaged or hostile bags are refused in one line, in little memory."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Laws of the band matrices that LAPACK factors: the dense matrix, what rounding leaves, batches, vmap, compiled graphs."""
+"""Band factorisation equals the dense one, in batches and graphs."""
 
 import pytest
 import torch

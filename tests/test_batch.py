@@ -1,4 +1,4 @@
-"""Images on disk to results on disk, with a quick reconstructor that dents the surface by an image's mean grey."""
+"""Jobs write every image's result once, whatever interrupts them."""
 
 import csv
 import io
@@ -483,6 +483,6 @@ def test_figures_never_overwrite_images(images):
 
 def test_a_stored_mesh_reads_back(images, tmp_path):
     made = reconstruct(images[:1], tmp_path / "out")[2]
-    mesh, expected = Mesh.load(tmp_path / "out" / "mesh.npz"), Mesh.of(made, NPZ)
+    mesh, expected = Mesh.load(tmp_path / "out" / "mesh.npz"), Mesh.from_reconstructor(made, NPZ)
     assert mesh.settings == NPZ and mesh.image_size.tolist() == [WIDTH, HEIGHT]
     assert all(np.array_equal(a, b) for a, b in zip(mesh, expected, strict=True))

@@ -1,4 +1,4 @@
-"""Each benchmark states its own command, what it imports from another exists, and bench/README.md lists them all."""
+"""Each benchmark states its command and stands in bench/README.md."""
 
 import ast
 import re

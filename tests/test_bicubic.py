@@ -1,4 +1,4 @@
-"""Fields at points between a grid's lines: exact for cubics, of fourth order, linear where something holds the surface."""
+"""Bicubic interpolation is exact for cubics and of fourth order."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Cameras of 10, 12 and 14 bits whose values are stored in 16: one key of the sensor file holds for all of their images."""
+"""One key tells how many bits of 16 a camera uses, for all images."""
 
 import json
 import re

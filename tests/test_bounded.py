@@ -1,4 +1,4 @@
-"""Files that others wrote: whatever they hold, one line that names them, at once, and no memory taken before."""
+"""Untrusted files are refused in one line before memory is taken."""
 
 import ast
 import io

@@ -1,4 +1,4 @@
-"""Laws of the camera: what goes out comes back, Snell's law by Fermat's principle, OpenCV's formulas by hand."""
+"""Projection inverts rays; refraction obeys Snell and Fermat."""
 
 import math
 

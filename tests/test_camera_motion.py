@@ -1,4 +1,4 @@
-"""A camera that was bumped: its motion against the rim is found with the surface, and taken out."""
+"""A moved camera is found with the surface and compensated."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from scipy import ndimage
 from test_light import CAMERAS
 
 from torchmembrane import Reconstructor, Status, Tracker
-from torchmembrane.camera.motion import in_pixels, in_words, shift_of
+from torchmembrane.camera.motion import shift_of, to_degrees_and_scale, to_pixels
 from torchmembrane.estimators.force_balance.camera_motion import PRIOR_WEIGHT, CameraMotion
 from torchmembrane.estimators.force_balance.marker_residuals import marker_rays
 from torchmembrane.presets import preset
@@ -51,12 +51,12 @@ def test_what_holds_the_camera_is_the_slope_of_its_loss():
 def test_the_motion_is_a_similarity_of_the_image_and_its_words_say_which():
     moved = torch.tensor([[0.4, -0.3, 0.5, -0.7]], dtype=torch.float64)
     pixels = torch.tensor([[[0.0, 0.0], [639.0, 479.0], [100.0, 300.0]]], dtype=torch.float64)
-    du, dv, degrees, scale = in_words(moved, SIZE)[0].tolist()
+    du, dv, degrees, scale = to_degrees_and_scale(moved, SIZE)[0].tolist()
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     centre = np.array([319.5, 239.5])
     expected = scale * (pixels[0].numpy() - centre) @ np.array([[c, s], [-s, c]]) + centre + [du, dv]
     np.testing.assert_allclose((pixels + shift_of(moved, pixels, SIZE))[0].numpy(), expected, atol=2e-3)
-    torch.testing.assert_close(in_pixels(in_words(moved, SIZE), SIZE), moved)
+    torch.testing.assert_close(to_pixels(to_degrees_and_scale(moved, SIZE), SIZE), moved)
 
 
 @pytest.mark.parametrize("name", CAMERAS)

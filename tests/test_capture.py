@@ -1,4 +1,4 @@
-"""Photographs of a camera: its settings are held as far as the driver lets, and what is not is said."""
+"""Camera settings are held; what the driver refuses is named."""
 
 import re
 import subprocess

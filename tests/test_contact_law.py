@@ -1,4 +1,4 @@
-"""The law of contact force and pressure over depth: what it is fitted to, what its pressure adds up to, and its files."""
+"""The contact law fits its presses, and its pressure adds up."""
 
 import csv
 import tomllib

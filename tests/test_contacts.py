@@ -1,4 +1,4 @@
-"""What contacts tell: wrench, force, normal, area, slip and curvatures of patches, the rim; what of a membrane is seen."""
+"""Wrench, force, normal, area, slip and curvature of contacts."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Every function of `control_flow` gives the same values eagerly, compiled, exported to ONNX, and on a GPU."""
+"""Control flow is the same eager, compiled, exported and on a GPU."""
 
 from inspect import isfunction
 from typing import NamedTuple

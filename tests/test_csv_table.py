@@ -1,4 +1,4 @@
-"""Laws of tables that people make: however it is written, a table is read rightly or refused with file, line and remedy."""
+"""A table is read correctly, or refused with its line and remedy."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A recording as a data set folder: every frame with its image, and a card. `make test-lerobot` loads one with `datasets`."""
+"""A recording as a data set holds every frame with its image."""
 
 import numpy as np
 import pyarrow.parquet as pq

@@ -1,4 +1,4 @@
-"""torch's default type decides nothing: results are the same whatever it is, and whenever it was set."""
+"""torch's default dtype does not change any result."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Contacts are dented in their middle for the steps to find pits that look like mounds."""
+"""From a dent the steps find dents that look like mounds."""
 
 from dataclasses import replace
 

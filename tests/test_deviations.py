@@ -1,4 +1,4 @@
-"""Standard deviations against the scatter of estimates from noisy markers; gradients against finite differences."""
+"""Standard deviations match the scatter of estimates."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,7 @@
-"""The pipeline on a device that refuses what lies on another, and cannot be waited for: the meta device.
+"""The pipeline neither mixes devices nor waits for one.
 
-A tensor left on the CPU, a value read by Python, a branch on one: each is an error there. (Fake CUDA tensors cannot be indexed
-where torch was built without CUDA.)
+A tensor left on the CPU, a value read by Python, a branch on one: each is an error on the meta device. (Fake CUDA tensors
+cannot be indexed where torch was built without CUDA.)
 """
 
 import dataclasses

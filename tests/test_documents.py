@@ -1,4 +1,4 @@
-"""Changelog, guide for contributors, glossary and citation say what is there."""
+"""Changelog, contributing guide, glossary and citation are true."""
 
 import re
 import tomllib

@@ -1,4 +1,4 @@
-"""The flow that the dots around a dot have it move by, and the small systems of the fits."""
+"""The flow around a dot predicts its motion; fits solve exactly."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Dots: found and measured in the rest image, located and matched in frames, all through rendered pixels."""
+"""Dots are found, located and matched in rendered images."""
 
 import warnings
 from functools import partial

@@ -1,4 +1,4 @@
-"""Drift of the rest image is detected in frames without contact, and only there; noise, touches and presses are no drift."""
+"""Drift of the rest image is detected, and nothing else is."""
 
 import re
 import warnings
@@ -169,7 +169,7 @@ class Stream:
         """Where all vertices go, and how far the dots do, rms, px."""
         membrane, elasticity = self.simulator.membrane, self.simulator.elasticity
         p0, load = rest_balance(membrane, elasticity)
-        softer = elasticity.on(membrane)
+        softer = elasticity.for_membrane(membrane)
         softer.prestretch = 0.999 * elasticity.prestretch
         cause = (elasticity, Liquid(1.001 * float(membrane.rest_volume))) if swells else (softer, Open())
         moved = EquilibriumProblem(membrane, *cause, load).solve(self.rest, float(p0)).vertices - self.rest

@@ -1,4 +1,4 @@
-"""The package for machines without torch, with files that are damaged, of other programs, or not what was meant.
+"""The edge package needs no torch and refuses damaged files.
 
 Its model is made by hand, of a few nodes; `tests/test_export.py` runs exported ones.
 """
@@ -479,7 +479,7 @@ FILES = {
     "mesh without size": (model_of(metadata() | {"mesh": without("image_size")}), "mesh lacks image_size"),
     "mesh without sensor": (model_of(metadata() | {"mesh": without("sensor")}), "mesh lacks sensor"),
     "mesh without vertices": (model_of(metadata() | {"mesh": without("rest_vertices")}), "mesh lacks rest_vertices"),
-    "sensor a number": (model_of(metadata({"sensor": 1})), "mesh: sensor is no text"),
+    "sensor a number": (model_of(metadata({"sensor": 1})), "mesh: sensor is not text"),
     "size of one": (model_of(metadata({"image_size": [8]})), "image_size is int64 [1], not [2]"),
     "size a number": (model_of(metadata({"image_size": 8})), "image_size is int64 [], not [2]"),
     "size a text": (model_of(metadata({"image_size": "8 x 6"})), "image_size is <U5 [], not [2]"),
@@ -674,7 +674,7 @@ def test_the_table_of_a_folder_is_torchmembrane_s(model, call, images, tmp_path)
     assert row["status_text"] == "ok" and rows["broken"]["status_text"].startswith("unreadable: ")
     assert [float(row[f"force_{axis}"]) for axis in "xyz"] == pytest.approx([0, 0, -mean], rel=1e-4)
     assert [float(row[key]) for key in ("deepest", "time")] == pytest.approx([mean, 1790509109], rel=1e-4)
-    assert row["content_hash"] == SourceFile.of(one).content_hash and row["contact_1_x"] == ""
+    assert row["content_hash"] == SourceFile.from_files(one).content_hash and row["contact_1_x"] == ""
     with np.load(tmp_path / "r" / f"{one.stem}.npz") as stored:
         assert str(stored["path"]) == row["file"] == str(one) and stored["time"] == 1790509109
     again = images("again.png", GREY)
@@ -782,7 +782,7 @@ NO_IMAGES = {
     "a number": (3, r"images \[\]; expected"),
     "an empty list": ([], r"images \[0\]; expected"),
     "a text": ("press.png", r"images \[\]; expected"),
-    "rows of different lengths": ([[1, 2], [3]], "images are no array"),
+    "rows of different lengths": ([[1, 2], [3]], "images are not an array"),
     "whole numbers": (GREY.astype(int), "images of type int64; expected uint8, uint16 or float in 0..1"),
     "truths": (GREY > 3, "images of type bool"),
     "objects": (GREY.astype(object), "images of type object"),

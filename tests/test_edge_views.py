@@ -1,4 +1,4 @@
-"""The package for machines without torch, with a model of two views made by hand.
+"""The edge package runs a model of two views.
 
 `tests/test_export_views.py` runs an exported one.
 """
@@ -90,6 +90,6 @@ def test_the_command_takes_the_files_of_each_view(model, tmp_path, capsys):
     assert sorted(path.name for path in out.glob("press*")) == ["press0_left.npz"]
     np.testing.assert_allclose(np.load(out / "press0_left.npz")["vertices"], np.full((9, 3), 90 / 255), atol=1e-6)
     files = [tmp_path / f"press0_{name}.png" for name in SIZES]
-    assert SourceFile.of(*files).content_hash in (out / "summary.csv").read_text().splitlines()[1]
+    assert SourceFile.from_files(*files).content_hash in (out / "summary.csv").read_text().splitlines()[1]
     assert main([str(model), str(files[1]), "--out", str(out)]) == 2
     assert "expected images NAME_left, NAME_right of each frame" in capsys.readouterr().err

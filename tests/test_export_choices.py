@@ -1,4 +1,4 @@
-"""What the command's choices are put together of, exported and run; models that cannot be written, or are not the same."""
+"""Every choice of the command is exported; bad models are refused."""
 
 from contextlib import nullcontext
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Dots located softly as ONNX, against torch: standard operators, any batch."""
+"""The soft locator as ONNX agrees with torch, for any batch."""
 
 import numpy as np
 import onnx

@@ -1,4 +1,4 @@
-"""The exported model of two views, and the package that runs it without torch, against torch."""
+"""The exported model of two views agrees with torch."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def frames():
 @pytest.fixture(scope="module")
 def made(frames, tmp_path_factory):
     """The reconstructor, of few steps, and its model that follows the dots."""
-    settings = tm.ForceBalanceSettings(steps=5, patience=1)
+    settings = tm.ForceBalanceSettings(steps=5, retry_steps_factor=1)
     reconstructor, path = tm.Reconstructor(frames[0], settings=settings), tmp_path_factory.mktemp("views") / "model.onnx"
     export(reconstructor, path, tracking=True)
     return reconstructor, path, edge.Session(path)
@@ -91,7 +91,7 @@ def test_the_command_takes_an_image_of_each_view(frames, made, tmp_path, capsys)
         np.testing.assert_array_equal(results[name]["vertices"], expected["vertices"][0])
     files = [tmp_path / f"press1_{name}.png" for name in ("left", "right")]
     row = next(row for row in (out / "summary.csv").read_text().splitlines() if row.startswith("press1_left"))
-    assert SourceFile.of(*files).content_hash in row
+    assert SourceFile.from_files(*files).content_hash in row
     files[1].unlink()
     assert main([str(made[1]), f"{tmp_path}/press*.png", "--out", str(out)]) == 1
     assert "press1_right.png" in capsys.readouterr().err

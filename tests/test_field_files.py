@@ -1,4 +1,4 @@
-"""Principal stretches and tensions in the files of results: npz, PLY, VTK, Rerun."""
+"""Files of results hold principal stretches and tensions."""
 
 from types import SimpleNamespace
 

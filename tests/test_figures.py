@@ -1,4 +1,4 @@
-"""What the paper's figures of pressed sensors show, on the preset sensors: presses simulated on a finer grid, noisy markers."""
+"""Presses show what the paper's figures of them show."""
 
 from typing import NamedTuple
 

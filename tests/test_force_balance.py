@@ -1,4 +1,4 @@
-"""Laws of the force-balance estimator and its solver; accuracy on presses simulated on another grid, and on the examples."""
+"""Laws and accuracy of force balance and of its solver."""
 
 from dataclasses import replace
 from itertools import chain

@@ -1,4 +1,4 @@
-"""Laws of blown up sheets: grids without folds, closed forms of the circle, other meshes and solvers, and sensors of them."""
+"""Inflated sheets agree with closed forms, meshes and solvers."""
 
 import csv
 import math
@@ -209,7 +209,7 @@ def test_the_forces_of_a_sheet_are_the_derivative_of_its_energy():
     inner = membrane.free_vertices
     torch.testing.assert_close(energy.gradient_of_displaced(u)[inner], forces[inner])
     fine = SheetEnergy(Membrane(found.vertices), torch.from_numpy(found.sheet.reshape(-1, 3).copy()), "neo_hookean", 1.1, 0.3)
-    coarse = fine.on(Membrane(found.vertices[::2, ::2])).on(membrane)
+    coarse = fine.for_membrane(Membrane(found.vertices[::2, ::2])).for_membrane(membrane)
     torch.testing.assert_close(coarse.gradient(x.detach())[inner], forces[inner])
 
 

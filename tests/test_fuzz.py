@@ -1,4 +1,4 @@
-"""Damaged and malformed files, a few of each kind, always the same: `make soak` tries as many as there is time for."""
+"""Damaged and malformed files break no rule: a few of each kind."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""A gauge in the cavity: what its reading does to the solve, and where it tells nothing."""
+"""A gauge's reading pulls the solution to its pressure."""
 
 from dataclasses import replace
 

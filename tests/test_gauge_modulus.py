@@ -1,4 +1,4 @@
-"""Laws of the modulus from a gauge: of readings alone, and of presses simulated on another grid."""
+"""The modulus follows from readings of a gauge."""
 
 import json
 from pathlib import Path

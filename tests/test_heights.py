@@ -1,4 +1,4 @@
-"""Heights of markers in the sensor file: kept, checked, and refused where markers must lie on the surface."""
+"""Heights of markers are kept, checked, and refused where none fit."""
 
 import numpy as np
 import pytest

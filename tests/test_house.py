@@ -1,4 +1,4 @@
-"""House rules: lengths of files and functions, what an import loads, documents that quote the code's own numbers.
+"""House rules: lengths of files, imports, constants in documents.
 
 Layers and types are checked by `make lint`.
 """
@@ -239,3 +239,9 @@ def test_no_stray_file_is_tracked_at_the_top():
     known = {".gitignore", ".pre-commit-config.yaml", "CITATION.cff", "LICENSE", "Makefile", "mkdocs.yml", "pyproject.toml"}
     stray = [name for name in tracked.stdout.split() if name not in known and Path(name).suffix not in {".md", ".txt"}]
     assert stray == []
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "tests").glob("*.py")), ids=lambda path: path.name)
+def test_a_test_file_says_its_law_in_its_title(path):
+    title = (ast.get_docstring(ast.parse(path.read_text())) or "").partition("\n")[0]
+    assert title and len(title) <= 70, f"{path.name}: {len(title)} characters, expected 1 to 70"

@@ -1,4 +1,4 @@
-"""One grey everywhere: 0.299 R + 0.587 G + 0.114 B in floating point, whatever the file or array."""
+"""Grey is 0.299 R + 0.587 G + 0.114 B for every file and array."""
 
 import re
 import tracemalloc

@@ -1,4 +1,4 @@
-"""Laws of signed distance functions: unit gradients, projection onto the surface, rigid motion; closed forms at points."""
+"""Signed distances have unit gradients and project to the surface."""
 
 import numpy as np
 import pytest

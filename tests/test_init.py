@@ -1,4 +1,4 @@
-"""Laws of drafted sensors: what `init` writes is read, checked and reconstructs; pressures as of a neo-Hookean sphere."""
+"""Every sensor file that `init` writes is read and reconstructs."""
 
 import csv
 import math
@@ -218,7 +218,7 @@ def test_a_rim_that_is_not_in_the_image_is_not_found():
         ("--shape dome --radius 12 --image-size 640,480 --distance 12", "--view is missing"),
         (
             "--shape dome --radius 12 --height 3 --image-size 640,480 --distance 12 --view 100",
-            "--height is no length of a dome",
+            "--height is not a length of a dome",
         ),
         ("--shape dome --radius 12 --image-size 640,480 --distance 12 --view 200", "less than 180"),
         ("--shape dome --radius 12 --image-size 640,480 --distance 12 --view 100 --focal 300", "one of them"),

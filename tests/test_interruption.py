@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM end every command soon, wherever it is: no traceback, no half files, no processes that stay."""
+"""SIGINT and SIGTERM end every command soon and cleanly."""
 
 import os
 import signal
@@ -222,7 +222,8 @@ if __name__ == "__main__":
 
 
 ENDS = {"Ctrl-C": (signal.SIGINT, True), "SIGTERM": (signal.SIGTERM, False)}
-QUICK = {("reconstruct", "Ctrl-C"), ("simulate", "SIGTERM"), ("check", "Ctrl-C")}
+QUICK = {("reconstruct", "Ctrl-C"), ("simulate", "Ctrl-C")}
+"""The workers of `check` start as those of `simulate` do; Ctrl-C reaches the workers too."""
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Jobs that are killed, doubled, divided, given bad names, new images and damaged results."""
+"""Killed, doubled or divided jobs lose no frame and repeat none."""
 
 import csv
 import os
@@ -99,7 +99,7 @@ def test_a_new_image_under_an_old_name_is_done_again(images, tmp_path, settings)
     outcome, lines, _ = reconstruct(images, tmp_path / "out", settings)
     assert outcome == (1, 0, 0, 0, 0, 0, 4) and lines == [f"{images[1]}: changed, done again"]
     assert float(read_results(tmp_path / "out")["i1"]["pressure"]) == pytest.approx(200 / 255, abs=1e-5)
-    assert summary_of(tmp_path / "out")["i1"]["content_hash"] == SourceFile.of(images[1]).content_hash
+    assert summary_of(tmp_path / "out")["i1"]["content_hash"] == SourceFile.from_files(images[1]).content_hash
     assert reconstruct(images, tmp_path / "out", settings)[0] == (0, 0, 0, 0, 0, 0, 5)
 
 
@@ -292,6 +292,7 @@ def test_shards_are_disjoint_and_together_everything(images, tmp_path, settings,
         assert rows_in(tmp_path / "out") == good
 
 
+@pytest.mark.usefixtures("quick_processes")
 @pytest.mark.parametrize("settings", [pytest.param(NPZ, id="npz", marks=pytest.mark.full), pytest.param(PARQUET, id="parquet")])
 def test_worker_processes_give_what_one_process_gives(small_sensor, small_images, tmp_path, monkeypatch, settings):
     from torchmembrane import Reconstructor
@@ -304,7 +305,7 @@ def test_worker_processes_give_what_one_process_gives(small_sensor, small_images
     reconstructor = Reconstructor.from_file(small_sensor / "sensor.toml")
     found, lines = [], []
     for count in (1, 2):
-        out, made = tmp_path / f"out{count}", Settings.of(reconstructor, settings.format)
+        out, made = tmp_path / f"out{count}", Settings.from_reconstructor(reconstructor, settings.format)
         options = {"batch": 1, "workers": count, "report": lines.append, "figures": count == 2}
         counts = reconstruct_files(reconstructor, find_inputs([*small_images, broken]), out, made, **options)
         assert (counts.reconstructed, counts.failed) == (3, 1)

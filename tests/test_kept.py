@@ -1,4 +1,4 @@
-"""Laws of what tests keep: it is made once, and again where its parameters or its sources have changed."""
+"""What tests keep is made anew when its source has changed."""
 
 import kept
 import numpy as np

@@ -1,4 +1,4 @@
-"""Laws of a modulus that several measurements tell: the mean by their deviations; contradictions are named one by one."""
+"""Measurements of a modulus combine by their deviations."""
 
 from dataclasses import replace
 

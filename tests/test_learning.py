@@ -1,4 +1,4 @@
-"""The Python of the page on learning runs, the head learns, the prestretch and the rest shape are found."""
+"""The page on learning runs: a head, prestretch, rest shape."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What learning stacks do with a module works with a `Reconstructor`: states, functional calls, export, DDP, autocast."""
+"""A `Reconstructor` works with what learning stacks do to modules."""
 
 import io
 import subprocess
@@ -16,6 +16,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 import torchmembrane as tm
 from torchmembrane import state_dict as kept_state
+from torchmembrane.estimators.minimum_energy.estimator import MinimumEnergySettings
 from torchmembrane.markers.dots import locator
 from torchmembrane.markers.noise import pixel_noise
 
@@ -118,9 +119,11 @@ class FromPixels(nn.Module):
         return self.reconstructor.from_pixels(pixels)
 
 
-def test_torch_export_takes_the_reconstruction_from_markers_and_agrees(sensor, images, few_steps):
+@pytest.mark.parametrize("estimator", [pytest.param("force-balance", marks=pytest.mark.full), "minimum-energy"])
+def test_torch_export_takes_the_reconstruction_from_markers_and_agrees(sensor, images, few_steps, estimator):
     """In double precision, in which the exported elimination and LAPACK's hardly differ by rounding."""
-    reconstructor = tm.Reconstructor(sensor, settings=few_steps).double()
+    settings = few_steps if estimator == "force-balance" else MinimumEnergySettings(steps=3)
+    reconstructor = tm.Reconstructor(sensor, estimator, settings=settings).double()
     with torch.no_grad():
         expected = reconstructor(images.double())
         program = torch.export.export(FromPixels(reconstructor), (expected.pixels,), strict=False)
@@ -277,7 +280,7 @@ def test_a_frame_that_has_not_converged_passes_finite_gradients(sensor, pixels, 
     """Markers far from any surface, so that the limits of what is plausible are lifted: they would be said first."""
     monkeypatch.setattr("torchmembrane.reconstruct.LARGEST_RESIDUAL", float("inf"))
     few = tm.ForceBalanceSettings(
-        patience=1, settling_steps=2, renewal=0.5, largest_shared_misfit=100.0, largest_unexplained=100.0
+        retry_steps_factor=1, settling_steps=2, renewal=0.5, largest_shared_misfit=100.0, largest_unexplained=100.0
     )
     reconstructor = tm.Reconstructor(sensor, settings=few, dtype=torch.float64)
     rest = reconstructor.rest_pixels

@@ -1,4 +1,4 @@
-"""A fisheye of more than 180 degrees stands within the dome, its rim behind it: what sees it, presses it and drafts it."""
+"""A fisheye of more than 180 degrees can stand inside the dome."""
 
 import math
 from dataclasses import replace

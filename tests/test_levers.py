@@ -1,4 +1,4 @@
-"""Markers that stand off the surface: their tips, what is seen of them, and presses that are found from them."""
+"""Markers that stand off the surface are modelled as levers."""
 
 from dataclasses import replace
 
@@ -205,7 +205,7 @@ def test_no_height_is_the_same_to_the_bit(press):
     pixels = torch.from_numpy(press[0].truth["uv_nominal"]) + 0.5
     for a, b in zip(one.from_pixels(pixels), two.from_pixels(pixels), strict=True):
         assert torch.equal(a.nan_to_num(), b.nan_to_num())
-    flat = Dots.of(none)
+    flat = Dots.from_sensor(none)
     images = [
         Renderer(none, pattern=replace(flat, heights=heights), samples=1)(none.membrane.rest)
         for heights in (None, np.zeros(49))

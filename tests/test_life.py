@@ -1,4 +1,4 @@
-"""What a sensor's life tells: its peaks, and whether its membrane is still as stiff as it was calibrated."""
+"""A sensor's life keeps its peaks and tells when it softens."""
 
 import json
 from dataclasses import replace
@@ -104,7 +104,7 @@ def test_a_load_that_tells_nothing_is_refused(pressed):
 @pytest.fixture
 def frames():
     made = Denting()
-    mesh = Mesh.of(made, NPZ)
+    mesh = Mesh.from_reconstructor(made, NPZ)
     batch = made(torch.tensor([0.3, 0.9, 0.05, 0.0])[:, None, None, None].expand(4, 1, 12, 16))
     return mesh, [batch.frame(k) for k in range(4)]  # the third has not converged, the last has no surface
 

@@ -1,4 +1,4 @@
-"""Light touches: found as soon as the markers can tell them from their noise, and none where there is none."""
+"""Light touches are found as soon as they exceed the noise."""
 
 from dataclasses import replace
 

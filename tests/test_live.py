@@ -1,4 +1,4 @@
-"""A camera that is followed: the newest frame, no lag, what is dropped counted, what is kept readable again.
+"""A live camera yields the newest frame and counts dropped ones.
 
 Cameras are played by a class with the interface of `cv2.VideoCapture`.
 """
@@ -562,7 +562,7 @@ def test_a_recording_reads_back_as_results_and_reconstructs_to_the_same(reconstr
     assert times_of(tmp_path / "day") == {each.name: each.time for each in kept}
     with open(tmp_path / "day" / "summary.csv", newline="") as file:
         assert [row["name"] for row in csv.DictReader(file)] == results.names
-    with pytest.raises(tm.MembraneError, match="holds something already"):
+    with pytest.raises(tm.MembraneError, match="is not empty"):
         Recording(tmp_path / "day", stream.mesh)
 
 

@@ -1,4 +1,4 @@
-"""The Python of docs/live.md: frames lost, times, drift and rezero of a stream."""
+"""The Python of docs/live.md runs and does what it says."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Lost markers and lost frames: gradients stay finite, deviations are NaN, and the next frame starts from rest."""
+"""Lost markers and frames leave gradients finite and others alone."""
 
 from pathlib import Path
 

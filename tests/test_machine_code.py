@@ -1,4 +1,4 @@
-"""Laws of when machine code is used: it is known for which precisions it exists, and a job is solved in one way."""
+"""Machine code is used where it exists, one way for a whole job."""
 
 import logging
 import threading

@@ -1,4 +1,4 @@
-"""Laws of prestretch and stiffness from presses: found within three deviations, and said where the images do not know."""
+"""Prestretch and stiffness are found within three deviations."""
 
 import json
 from dataclasses import replace

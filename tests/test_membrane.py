@@ -1,4 +1,4 @@
-"""Laws of the rest surface: areas, normals, volume, orientation, material points."""
+"""Areas, normals, volume and orientation of the rest surface."""
 
 import math
 

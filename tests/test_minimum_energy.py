@@ -1,4 +1,4 @@
-"""Laws of minimum energy; accuracy against an independent twin (`axisymmetric.py`)."""
+"""Laws of minimum energy, and its accuracy against a twin."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Cropped and binned cameras: a mode's pixel sees what its block of the calibrated image's pixels sees."""
+"""A pixel of a cropped or binned camera sees its block's mean."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Appendix D: the coefficients, the expanded form, the energy they stand for, its misprints, and the estimator in that form."""
+"""Appendix D: coefficients, expanded form, energy and misprints."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Laws of the steps by machine code: the numbers of the tensor operations, to whom all is left that it cannot do."""
+"""Steps in machine code give the numbers of tensor operations."""
 
 import ast
 import copy

@@ -1,4 +1,4 @@
-"""Frames come in the order of the numbers in their names, wherever order counts."""
+"""Frames are ordered by the numbers in their names."""
 
 import csv
 import os

@@ -1,4 +1,4 @@
-"""The paper's own estimator: one frame through the chain, every intermediate against its equation, solves against dense."""
+"""The paper's estimator obeys its equations stage by stage."""
 
 from dataclasses import fields, replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Laws and closed forms of the forward problem: inflation, balance of forces, friction, work."""
+"""Simulated presses obey closed forms, force balance and friction."""
 
 import numpy as np
 import pytest

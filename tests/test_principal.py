@@ -1,4 +1,4 @@
-"""Principal stretches and tensions: they ignore rotation, are the energy's derivatives, and hold a sphere's pressure."""
+"""Principal tensions are the energy's derivatives."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Long commands say at once that they work, how far they are and how long they still take; an interrupted one goes on."""
+"""Long commands say at once how far they are, and resume."""
 
 import io
 import json

@@ -1,6 +1,7 @@
-"""What `import torchmembrane as tm` gives: images as cameras give them, streams, results that move; wrong calls in words."""
+"""The public face takes images and streams, and names mistakes."""
 
 import warnings
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from PIL import Image
 
 import torchmembrane as tm
+from torchmembrane.estimators.force_balance.settings import OLD_NAMES
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NAMES = ("press_on_axis", "two_contacts", "flat_plate")
@@ -248,3 +250,14 @@ def test_rezero_nulls_what_has_drifted_since_the_rest_image(sensor):
     assert after.displacement.abs().max() < 1e-3 and after.residual.max() < 0.02
     with pytest.raises(tm.MembraneError, match="expected a frame without contact"):
         tracker.rezero(np.zeros((480, 640), np.uint8))
+
+
+def test_names_before_this_version_are_accepted():
+    old, new = dict(patience=2, decline=0.5), dict(retry_steps_factor=2, gnc_fraction=0.5)
+    assert tm.ForceBalanceSettings(**old) == tm.ForceBalanceSettings(**new) != tm.ForceBalanceSettings()
+    assert replace(tm.ForceBalanceSettings(**new), patience=3).retry_steps_factor == 3
+    assert set(OLD_NAMES.values()) < {field.name for field in fields(tm.ForceBalanceSettings)}
+    membrane = tm.preset("fingertip").membrane
+    assert torch.equal(tm.Surface.of(membrane).membrane(membrane.grid).rest, membrane.rest)
+    assert tm.ElasticEnergy(membrane, prestretch=1.5).on(membrane).prestretch == 1.5
+    assert len(tm.simulate.Dots.of(tm.preset("fingertip")).positions) == 119

@@ -1,4 +1,4 @@
-"""A job on a local Ray cluster of two workers, one of which is killed midway."""
+"""A job on Ray survives a killed worker."""
 
 import os
 import re
@@ -118,7 +118,7 @@ def test_an_image_that_is_none_is_a_row_with_its_reason(reconstructor, small_ima
 @pytest.mark.parametrize("content", ["text", 1.5, np.array([1, 2])])
 def test_content_that_is_no_bytes_is_a_row_with_its_reason(reconstructor, small_images, content):
     rows = FrameReconstructor(reconstructor)(columns(["a.png", "b.png"], bytes=[content, small_images[2].read_bytes()]))
-    assert rows["status"].tolist() == [-1, 0] and "expected bytes, what is in the file" in rows["status_text"][0]
+    assert rows["status"].tolist() == [-1, 0] and "expected bytes, the content of the file" in rows["status_text"][0]
 
 
 def test_pandas_gives_what_a_dict_does(reconstructor, small_images):
@@ -169,7 +169,7 @@ def test_a_killed_worker_is_replaced_and_each_frame_is_there_once(reconstructor,
     for k, path in enumerate(paths):
         Image.open(small_images[k % 3]).save(path)
     (tmp_path / "broken.png").write_bytes(b"broken")
-    settings = Settings.of(reconstructor, "parquet")
+    settings = Settings.from_reconstructor(reconstructor, "parquet")
     inputs = find_inputs([*paths[:30], tmp_path / "broken.png"])
     ray.init(num_cpus=2, log_to_driver=False, logging_level="error", include_dashboard=False)
     try:
@@ -190,7 +190,7 @@ def test_what_ray_does_not_do_is_refused(reconstructor, small_images, tmp_path):
     pytest.importorskip("ray")
     from torchmembrane.jobs.ray_engine import RayEngine
 
-    settings = Settings.of(reconstructor, "parquet")
+    settings = Settings.from_reconstructor(reconstructor, "parquet")
     with pytest.raises(MembraneError, match="figures"):
         reconstruct_files(
             reconstructor, find_inputs(small_images), tmp_path / "out", settings, engine=RayEngine(), figures=True

@@ -1,4 +1,4 @@
-"""Images to surfaces: rendered example images (by an independent program) against their truth; bad images."""
+"""Rendered images give their true surfaces; bad images a status."""
 
 import dataclasses
 import warnings

@@ -1,4 +1,4 @@
-"""The record of a sensor: serial and calibration, from its file to results and models, without a part in the fingerprint."""
+"""A sensor's record reaches results and models unchanged."""
 
 import json
 from dataclasses import replace
@@ -60,7 +60,7 @@ def test_what_is_no_record_is_refused_with_file_and_key(line, said, sensor, tmp_
 
 def test_results_and_models_carry_the_record(sensor, tmp_path):
     reconstructor = tm.Reconstructor(replace(sensor, record=KNOWN))
-    mesh = Mesh.of(reconstructor, Settings.of(reconstructor, "npz"))
+    mesh = Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, "npz"))
     mesh.save(tmp_path / "mesh.npz")
     carried = {"serial": "A 17", "calibrated": "2026-09-27", "images": 12, "by": "calibrate material", "uncertainty": 0.04}
     assert json.loads(Mesh.load(tmp_path / "mesh.npz").record) == carried

@@ -1,4 +1,4 @@
-"""The reference has every key, column, option, status and public name; every page has its place."""
+"""The reference names every key, column, option and status."""
 
 import ast
 import importlib

@@ -1,4 +1,4 @@
-"""Laws of rendered images: geometry and brightness against closed forms, painting that moves with the material."""
+"""Rendered geometry and brightness agree with closed forms."""
 
 import math
 from dataclasses import replace
@@ -78,7 +78,7 @@ def outline(camera, position, radius):
 @pytest.mark.parametrize("name", CAMERAS)
 def test_a_dot_s_centroid_is_that_of_its_projected_outline(name):
     camera, sensor = CAMERAS[name], cap_sensor(CAMERAS[name])
-    dots = Dots.of(sensor, (0.6, 0.9))
+    dots = Dots.from_sensor(sensor, (0.6, 0.9))
     renderer = Renderer(sensor, (25, 25), dots, PLAIN)
     image = renderer(dented(renderer.coarse_rest)).numpy()
     seen = renderer.dots(dented(renderer.coarse_rest))
@@ -131,7 +131,9 @@ def test_lambert_s_law_and_vignetting_on_a_flat_plate():
     camera = Camera("pinhole", SIZE, (100, 100), (79.5, 59.5))
     sensor, light = plate_sensor(camera), np.array([5.0, -3.0, 2.0])
     appearance = Appearance(lights=[light], ambient=0.0, vignetting=0.3, blur=0.0, exposure=0.5)
-    image = render(sensor, sensor.membrane.rest, pattern=Dots.of(sensor, missing=[0]), appearance=appearance, samples=2).numpy()
+    image = render(
+        sensor, sensor.membrane.rest, pattern=Dots.from_sensor(sensor, missing=[0]), appearance=appearance, samples=2
+    ).numpy()
     v, u = np.mgrid[10:110, 10:150]
     points = 20 * np.stack([(u - 79.5) / 100, (v - 59.5) / 100, np.ones(u.shape)], -1)
     ray = light - points
@@ -174,7 +176,7 @@ def test_painting_moves_with_the_material():
     camera = Camera("pinhole", SIZE, (100, 100), (79.5, 59.5))
     sensor = plate_sensor(camera, [(0.0, 0, 20), (5.0, 3, 20)])
     shifted = sensor.membrane.rest + torch.tensor([1.2, -0.8, 0.0])
-    for pattern in (Dots.of(sensor, (1.0, 1.0)), Speckle(1.0, seed=3)):
+    for pattern in (Dots.from_sensor(sensor, (1.0, 1.0)), Speckle(1.0, seed=3)):
         rest, moved = Renderer(sensor, pattern=pattern, appearance=PLAIN)(torch.stack([sensor.membrane.rest, shifted]))
         assert rest[20:100, 20:140].std() > 0.05
         torch.testing.assert_close(moved[16:96, 26:146], rest[20:100, 20:140], atol=0.02, rtol=0)
@@ -209,7 +211,7 @@ def test_a_dot_behind_a_ridge_is_hidden():
     def height(xy):
         return 20 - 9 * np.exp(-((xy - 5) ** 2) / 3)
 
-    renderer = Renderer(sensor, (41, 41), Dots.of(sensor, (0.3, 0.3)))
+    renderer = Renderer(sensor, (41, 41), Dots.from_sensor(sensor, (0.3, 0.3)))
     X = renderer.coarse_rest.clone()
     X[:, 2] = torch.from_numpy(height(X[:, 0].numpy()))
     share = np.linspace(0.3, 0.98, 200)[:, None]
@@ -241,7 +243,7 @@ def test_a_painted_rest_image_is_seen_again_at_rest():
     image = render(plain, plain.membrane.rest, pattern=Speckle(0.8), appearance=appearance)
     sensor = cap_sensor(camera, "texture", image.numpy())
     assert isinstance(pattern_of(sensor), Painted)
-    inside = render(plain, plain.membrane.rest, pattern=Dots.of(plain, missing=range(5)), appearance=appearance) > 0.4
+    inside = render(plain, plain.membrane.rest, pattern=Dots.from_sensor(plain, missing=range(5)), appearance=appearance) > 0.4
     assert inside.float().mean() > 0.15
     again = render(sensor, sensor.membrane.rest, appearance=appearance)
     assert (again - image)[inside].square().mean().sqrt() < 0.25 * image[inside].std()
@@ -288,8 +290,8 @@ def test_wrong_arguments_are_refused():
     for call, expected in (
         (lambda: Renderer(sensor)(torch.zeros(7, 3)), "vertices [7, 3]"),
         (lambda: Renderer(away), "in the image"),
-        (lambda: Dots.of(sensor, missing=[4]), "missing"),
-        (lambda: Dots.of(sensor, (0.0, 0.0)), "radii"),
+        (lambda: Dots.from_sensor(sensor, missing=[4]), "missing"),
+        (lambda: Dots.from_sensor(sensor, (0.0, 0.0)), "radii"),
         (lambda: Dots([[0, 0, 1]], [1], ground=0.0), "ground"),
         (lambda: Speckle(0.0), "size"),
         (lambda: Appearance(vignetting=2.0), "vignetting"),

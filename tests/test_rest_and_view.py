@@ -1,4 +1,4 @@
-"""Where rest is: a rest image that disagrees, a recording's own; and cameras that see a part of the membrane."""
+"""A wrong rest image and a partial view are recognised."""
 
 import re
 from dataclasses import replace

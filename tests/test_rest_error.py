@@ -1,4 +1,4 @@
-"""Laws of a rest surface that is not surely known: it is lowered over its rim, dots stay on their rays, deviations add up."""
+"""An uncertain rest height adds to all deviations."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Laws of `calibrate rest` of a blown up sheet: height, prestretch and pose are found together, and intervals hold them."""
+"""Height, prestretch and pose of a sheet are found together."""
 
 from dataclasses import replace
 

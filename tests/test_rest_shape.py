@@ -1,4 +1,4 @@
-"""Laws of the test of a rest surface: a blown up sheet passes it, another surface in the same rim does not."""
+"""An inflated sheet passes the test of rest shapes; others fail."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def with_heights(window, heights):
 
 
 def test_a_sheet_that_is_given_as_a_grid_is_found_again(window):
-    sheet = replace(window, surface=Surface.of(window.membrane), material=RUBBER)
+    sheet = replace(window, surface=Surface.from_membrane(window.membrane), material=RUBBER)
     found = rest_shape(sheet)
     assert found.left_over < 0.1 and found.nearest.distance < 0.002 * window.membrane.size
     assert found.nearest.height == pytest.approx(6.0, rel=0.01) and found.nearest.least == pytest.approx(1.035, abs=0.003)

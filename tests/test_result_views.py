@@ -1,4 +1,4 @@
-"""Views of a result: depth map, Isaac Lab's fields, the contact as a point cloud."""
+"""Depth maps, fields and point clouds show the result's surface."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""URDF and MJCF of a sensor: closed meshes that are the rest surface, and frames that are the camera's and the tool's."""
+"""URDF and MJCF hold the rest surface and the sensor's frames."""
 
 from dataclasses import replace
 from xml.etree import ElementTree

@@ -1,4 +1,4 @@
-"""Laws of the robust losses: weight and curvature are derivatives of the loss; all are quadratic near zero."""
+"""Weight and curvature are derivatives of each robust loss."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Laws of ROS images, whatever their encoding, and of the CameraInfo beside them, whatever the camera's mode."""
+"""ROS images of every encoding are read as the same grey."""
 
 from io import BytesIO
 from types import SimpleNamespace

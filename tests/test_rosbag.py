@@ -1,4 +1,4 @@
-"""Laws of ROS 2 bags: images through the command, results back into a bag, in SI units and with the images' times."""
+"""Bags are read, and results written to bags in SI units."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Wrong matches are flagged, right ones are not, and the surface hardly suffers."""
+"""Wrong matches are flagged, right ones are not."""
 
 import numpy as np
 import pytest

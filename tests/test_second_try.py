@@ -1,4 +1,4 @@
-"""When force balance solves a frame a second time, what it takes of both tries, and how far a step goes."""
+"""A frame that has not settled is solved again and improves."""
 
 from dataclasses import replace
 
@@ -60,13 +60,15 @@ def test_a_step_changes_no_edge_by_more_than_its_share(dented, tau):
     assert (share < SETTINGS.largest_stretch * (1 + 1e-6)).all() and (share > 0.01).all()
 
 
-def test_frames_that_settle_keep_their_first_solution_others_are_solved_patiently_from_rest(dented):
-    anything = dict(settled_step=1e9, largest_misfit=1e9, largest_relative_step=1e9, largest_volume_error=1e9)
-    anything |= dict(largest_outlying=1.0, largest_unexplained=1e9, likely_objective=(1e9, 1e9, 1e9), largest_shared_misfit=1e9)
-    kept, again = estimator(**anything), estimator(settled_step=0.0, largest_relative_step=0.0)
+def test_frames_that_settle_keep_their_first_solution_others_are_solved_again_from_rest(dented):
+    anything = dict(settled_step_tol=1e9, largest_misfit=1e9, largest_relative_step=1e9, largest_volume_error=1e9)
+    anything |= dict(
+        largest_outlier_share=1.0, largest_unexplained=1e9, likely_objective=(1e9, 1e9, 1e9), largest_shared_misfit=1e9
+    )
+    kept, again = estimator(**anything), estimator(settled_step_tol=0.0, largest_relative_step=0.0)
     measured = kept.equations.bearings.measured(dented)
     torch.testing.assert_close(kept(dented).vertices, kept._solved(measured).vertices)
-    torch.testing.assert_close(again(dented).vertices, again._solved(measured, patient=True).vertices)
+    torch.testing.assert_close(again(dented).vertices, again._solved(measured, is_retry=True).vertices)
     assert (kept(dented).vertices - again(dented).vertices)[1].abs().max() > 1e-4
 
 
@@ -98,14 +100,14 @@ def test_a_second_try_settles_on_the_grids_that_are_finer_than_its_dents_damped_
     """Of three grids, with 9, 17 and 33 lines."""
     fine, damped = estimator(spherical_cap(12, 9, 3, (33, 33))), []
     for one, settling in ((fine, SETTINGS.settling_steps), (fine.coarse, 0), (fine.coarse.coarse, 0)):
-        first, second = one.schedule(), one.schedule(patient=True)
-        assert len(second) == SETTINGS.patience * len(first) + settling
+        first, second = one.schedule(), one.schedule(is_retry=True)
+        assert len(second) == SETTINGS.retry_steps_factor * len(first) + settling
         assert second[len(second) - settling :] == [second[-1]] * settling
     steps = fine.gauss_newton.forward
     monkeypatch.setattr(fine.gauss_newton, "forward", lambda *given, damping, **_: damped.append(damping) or steps(*given))
-    for patient in (False, True):
-        fine._stepped(fine.equations.bearings.measured(dented), patient)
-    assert damped == [SETTINGS.settling_damping, SETTINGS.patient_damping] and damped[1] > damped[0]
+    for is_retry in (False, True):
+        fine._solve_on_grid(fine.equations.bearings.measured(dented), is_retry)
+    assert damped == [SETTINGS.settling_damping, SETTINGS.retry_damping] and damped[1] > damped[0]
 
 
 def test_coarser_grids_lose_fewer_markers():
@@ -117,7 +119,7 @@ def test_coarser_grids_lose_fewer_markers():
         (fine.coarse.coarse, SETTINGS.coarse_outlier),
     ):
         assert one.gauss_newton.settings.outlier == last < 2.1 * SETTINGS.outlier
-        assert [one.schedule(patient)[-1] for patient in (False, True)] == 2 * [(0.4, last)]
+        assert [one.schedule(is_retry)[-1] for is_retry in (False, True)] == 2 * [(0.4, last)]
     assert fine.coarse.coarse.schedule()[0] == (4.0, pytest.approx(20 * SETTINGS.coarse_outlier, rel=0.01))
 
 
@@ -268,13 +270,13 @@ def test_a_converged_solution_gives_way_to_a_likelier_one_only(dented):
 def test_unlikely_solutions_are_tried_again_and_what_no_push_is_the_reason_of_explains_nothing(dented):
     """On a grid that resolves the contacts, and on one of half the lines, whose model errs four times as much: likely; not; so
     that nothing explains it; and unlikely by its pushes alone, however much."""
-    coarse = estimator(spherical_cap(12, 9, 3, (9, 9)), largest_outlying=1.0)
-    for one, error in ((estimator(largest_outlying=1.0), 1.0), (coarse, 16.0)):
+    coarse = estimator(spherical_cap(12, 9, 3, (9, 9)), largest_outlier_share=1.0)
+    for one, error in ((estimator(largest_outlier_share=1.0), 1.0), (coarse, 16.0)):
         found = one(dented)
         moved = (found.vertices[1] - one.membrane.rest).square().sum(-1).mean().sqrt() / one.size
-        largest = (SETTINGS.largest_unexplained + SETTINGS.unexplained_of_press * moved) * error
+        largest = (SETTINGS.largest_unexplained + SETTINGS.unexplained_per_displacement * moved) * error
         least, most, _ = SETTINGS.likely_objective
-        likely = min(least + SETTINGS.likely_of_press * moved, most) * error
+        likely = min(least + SETTINGS.likely_per_displacement * moved, most) * error
         first = type(found)(*(value[1:].repeat(4, *[1] * (value.ndim - 1)) for value in found))
         objective = torch.tensor([0.9 * likely, 1.1 * likely, 0.9 * likely, 100 * largest]).double()
         unexplained = torch.tensor([0.0, 0.9 * largest, 1.1 * largest, 0.0]).double()
@@ -296,7 +298,7 @@ def test_pulls_and_neighbours_that_deviate_alike_add_up_but_for_a_rest_image_tha
     found = one(dented)
     found = type(found)(*(value[:1].repeat(6, *[1] * (value.ndim - 1)) for value in found))
     found = found._replace(vertices=one.membrane.rest + one.size * moved[:, None, None] * up)
-    pulls = share[:, 0] * (SETTINGS.largest_unexplained + SETTINGS.unexplained_of_press * moved)
+    pulls = share[:, 0] * (SETTINGS.largest_unexplained + SETTINGS.unexplained_per_displacement * moved)
     alike = share[:, 1] * SETTINGS.largest_shared_misfit
     found = found._replace(unexplained=pulls, shared_misfit=alike, misfit=0 * pulls, pushed=0 * pulls)
     assert one.is_explained(found).tolist() == [True, True, False, True, False, False]
@@ -308,7 +310,7 @@ def test_a_press_may_be_further_off_its_markers_than_a_sensor_at_rest(dented):
     for one, error in ((estimator(), 1.0), (estimator(spherical_cap(12, 9, 3, (9, 9))), 4.0)):
         found = one(dented)
         moved = (found.vertices[1] - one.membrane.rest).square().sum(-1).mean().sqrt() / one.size
-        largest = (SETTINGS.largest_misfit + SETTINGS.misfit_of_press * moved) * error
+        largest = (SETTINGS.largest_misfit + SETTINGS.misfit_per_displacement * moved) * error
         first = type(found)(*(value[1:].repeat(3, *[1] * (value.ndim - 1)) for value in found))
         vertices = torch.cat([first.vertices[:2], one.membrane.rest[None].to(first.vertices)])
         first = first._replace(vertices=vertices, misfit=largest * torch.tensor([0.999, 1.001, 0.999]).double())
@@ -318,7 +320,7 @@ def test_a_press_may_be_further_off_its_markers_than_a_sensor_at_rest(dented):
 
 
 def test_what_is_likely_grows_with_the_press_up_to_a_limit(dented):
-    one, zero = estimator(largest_outlying=1.0), torch.zeros(2, dtype=torch.float64)
+    one, zero = estimator(largest_outlier_share=1.0), torch.zeros(2, dtype=torch.float64)
     found = one(dented)._replace(misfit=zero, relative_step=zero, unexplained=zero, shared_misfit=zero, objective=zero + 0.8)
     measured = one.equations.bearings.measured(dented)
     moved = (found.vertices - one.membrane.rest).square().sum(-1).mean(-1).sqrt() / one.size
@@ -329,10 +331,10 @@ def test_what_is_likely_grows_with_the_press_up_to_a_limit(dented):
     found = found._replace(reference=one.reference * torch.ones_like(found.reference))
     assert one.is_done(found, measured).tolist() == [False, True]
     least, most, _ = SETTINGS.likely_objective
-    steep = estimator(likely_of_press=(most - least) / moved[1].item() / 2, largest_outlying=1.0)
+    steep = estimator(likely_per_displacement=(most - least) / moved[1].item() / 2, largest_outlier_share=1.0)
     for objective, expected in ((0.49 * (least + most), True), (0.51 * (least + most), False)):
         assert steep.is_done(found._replace(objective=0 * moved + objective), measured)[1] == expected
-    assert not estimator(likely_of_press=1e9, largest_outlying=1.0).is_done(
+    assert not estimator(likely_per_displacement=1e9, largest_outlier_share=1.0).is_done(
         found._replace(objective=0 * moved + 1.01 * most), measured
     )[1]
 

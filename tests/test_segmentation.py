@@ -1,4 +1,4 @@
-"""Laws of eq. 29 and of the reconstruct / segment loop; contacts of presses simulated on another grid."""
+"""Laws of eq. 29 and of the reconstruct / segment loop."""
 
 import heapq
 

@@ -1,4 +1,4 @@
-"""Sensor files: what is written is read back, a fingerprint is of the content, and every mistake is named."""
+"""A sensor file that is written is read back; mistakes are named."""
 
 import dataclasses
 import math
@@ -441,7 +441,7 @@ def test_a_grid_keeps_its_source_when_the_solver_takes_another(tmp_path):
     assert sensor.membrane.grid == (25, 25) and sensor.surface.values["vertices"].shape == (9, 7, 3)
     written = np.load(sensor.to_file(tmp_path / "b").with_name("sensor_grid.npz"))
     assert np.array_equal(written["vertices"], sensor.surface.values["vertices"])
-    assert torch.equal(Surface.of(sensor.membrane).membrane((25, 25)).rest, sensor.membrane.rest)
+    assert torch.equal(Surface.from_membrane(sensor.membrane).membrane((25, 25)).rest, sensor.membrane.rest)
 
 
 def test_a_files_own_lines_are_made_even_unless_they_are_asked_for(tmp_path):
@@ -558,7 +558,7 @@ def test_a_byte_order_mark_is_passed_over(tmp_path):
     path.write_text(GOOD, encoding="utf-8-sig")
     assert Sensor.from_file(path).name == "fingertip"
     path.write_bytes(GOOD.encode() + b"#\0")
-    assert "holds NUL" in refusal(path)
+    assert "contains NUL" in refusal(path)
 
 
 def test_a_listed_file_that_is_none_is_not_quoted(tmp_path):
@@ -610,7 +610,7 @@ def test_a_rest_image_of_another_size_is_refused_before_its_pixels_are_decoded(t
 
 
 @pytest.mark.parametrize(
-    "shape, words", [((3, 9, 3), "3 x 9 lines; expected 4 or more"), ((600, 600, 3), "expected at most 262144")]
+    "shape, words", [((3, 9, 3), "3 x 9 lines; expected at least 4"), ((600, 600, 3), "expected at most 262144")]
 )
 def test_grids_too_small_or_too_large_to_interpolate_are_refused(tmp_path, shape, words):
     path = write(tmp_path, with_membrane("grid"))

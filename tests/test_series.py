@@ -1,4 +1,4 @@
-"""Pictures of a whole folder: force, moment and pressure over time, and all frames on one sheet."""
+"""Plots of a folder show force, moment and pressure over time."""
 
 import csv
 import shutil

@@ -1,4 +1,4 @@
-"""The command `torchmembrane simulate` as a person uses it, its data sets, and the sensors that come with the package."""
+"""`torchmembrane simulate` writes presses, data sets and truth."""
 
 import json
 import sys
@@ -178,6 +178,7 @@ def test_a_data_set_goes_on_where_it_was_interrupted(sensor_path, tmp_path, caps
     assert content(tmp_path) == before
 
 
+@pytest.mark.usefixtures("quick_processes")
 def test_processes_and_formats_do_not_change_a_data_set(sensor_path, tmp_path, capsys):
     call = ("simulate", sensor_path, "--random", "2", "--indenter", "sphere,plane", "--noise", "35")
     assert run(capsys, *call, "--jobs", "1", "--out", tmp_path / "png")[0] == 0
@@ -400,6 +401,6 @@ def test_a_mesh_is_read_or_refused_whatever_guesses_encodings(name, tmp_path, mo
 def test_dots_may_be_as_large_as_do_not_overlap():
     sensor = preset("fingertip")
     nearest = np.sort(np.linalg.norm(sensor.markers.positions[:, None] - sensor.markers.positions, axis=-1), 1)[:, 1].min()
-    assert Dots.of(sensor, [0.49 * nearest, 0.49 * nearest]).radii.max() < nearest / 2
+    assert Dots.from_sensor(sensor, [0.49 * nearest, 0.49 * nearest]).radii.max() < nearest / 2
     with pytest.raises(MembraneError, match="overlap"):
-        Dots.of(sensor, [0.51 * nearest, 0.51 * nearest])
+        Dots.from_sensor(sensor, [0.51 * nearest, 0.51 * nearest])

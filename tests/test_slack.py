@@ -1,4 +1,4 @@
-"""Slack sheets: solved in double precision, from the markers' fit to the result, and alike in other runtimes."""
+"""Slack sheets are solved in double precision everywhere."""
 
 from dataclasses import replace
 

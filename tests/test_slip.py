@@ -1,4 +1,4 @@
-"""The page on slip runs, and what it finds is what the simulator's friction says."""
+"""The page on slip finds the simulator's friction."""
 
 import re
 from pathlib import Path

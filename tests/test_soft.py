@@ -197,7 +197,7 @@ def test_a_reconstructor_is_built_with_either_locator():
     sensor = replace(sensor, membrane=sensor.surface.membrane((9, 9)))
     fit, soft = (Reconstructor(sensor, "minimum-energy", locator=name) for name in ("fit", "soft"))
     assert type(soft.observer.locator) is SoftLocator
-    assert [Settings.of(made, "npz").locator for made in (fit, soft)] == ["fit", "soft"]
+    assert [Settings.from_reconstructor(made, "npz").locator for made in (fit, soft)] == ["fit", "soft"]
     image = fit.read("examples/two_contacts.png")
     with torch.no_grad():
         one, other = fit(image), soft(image)

@@ -1,4 +1,4 @@
-"""Formulas of the soft locators against closed forms, twins and laws, each alone."""
+"""Formulas of the soft locators agree with closed forms and twins."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A spec sheet says what its trials gave; the trials, by what the presses and the results of their images differ."""
+"""A spec sheet reports what its trials gave."""
 
 import math
 import pickle
@@ -235,7 +235,7 @@ def test_the_deepest_press_is_the_last_before_the_first_failure(changed, end):
 
 
 def test_the_closest_pair_is_that_from_which_on_all_are_told_apart():
-    """Monotone: what is told apart below a distance that is not, does not count."""
+    """Monotone: what is resolved below a distance that is not, does not count."""
     told = {0: (8, 6, 5, 2), 1: (8, 4), 2: ()}
     trials = [PairTrial(k, d, d in known) for k, known in told.items() for d in (2, 5, 8, 6, 4, 3)]
     pair = statistics.closest_pair(trials)

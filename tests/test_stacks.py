@@ -1,4 +1,4 @@
-"""Files of several pictures: each is a frame where frames are meant, and none is taken alone where an image is."""
+"""Files of several pictures give a frame each, or are refused."""
 
 import struct
 from pathlib import Path

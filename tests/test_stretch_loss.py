@@ -1,4 +1,4 @@
-"""Laws of what a prestretch costs: pushes cost nothing, and a solve that ended elsewhere is led to what its neighbour found."""
+"""Pushes cost nothing in the loss that finds the prestretch."""
 
 import numpy as np
 import pytest

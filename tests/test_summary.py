@@ -1,4 +1,4 @@
-"""summary.csv: its columns, compared one by one with the frames' arrays; times; the same table of torchmembrane-edge."""
+"""Every column of summary.csv agrees with the frames' arrays."""
 
 import csv
 from pathlib import Path
@@ -101,7 +101,7 @@ def test_each_column_holds_what_the_frame_s_arrays_say(table):
     for key, value in expected.items():
         assert row[key] == "" if np.isnan(value) else float(row[key]) == pytest.approx(float(value), rel=2e-5), key
     texts = {"name": image.stem, "file": str(image), "status_text": "ok", "length_unit": "mm", "force_unit": "N"}
-    texts["content_hash"] = SourceFile.of(image).content_hash
+    texts["content_hash"] = SourceFile.from_files(image).content_hash
     assert {key: row[key] for key in texts} == texts and float(row["seconds"]) > 0
     assert set(expected) | set(texts) | {"seconds"} == set(NAMES)
 

@@ -1,4 +1,4 @@
-"""Files that systems and programs leave in folders are no frames, wherever folders and patterns are read."""
+"""Files that systems leave in folders are not frames."""
 
 from pathlib import Path
 
@@ -78,14 +78,14 @@ def test_results_pass_them_over(tmp_path, small_sensor, small_images):
 
 def test_an_empty_folder_may_hold_them(tmp_path, small_sensor):
     made = tm.Reconstructor.from_file(small_sensor / "sensor.toml")
-    settings = Settings.of(made, "npz")
+    settings = Settings.from_reconstructor(made, "npz")
     (tmp_path / "._old.npz").touch()
     check_folder(tmp_path, made.sensor.fingerprint, settings)
-    with Recording(tmp_path, Mesh.of(made, settings)):
+    with Recording(tmp_path, Mesh.from_reconstructor(made, settings)):
         pass
     (tmp_path / "old.npz").touch()
-    with pytest.raises(MembraneError, match="holds something already"):
-        Recording(tmp_path, Mesh.of(made, settings))
+    with pytest.raises(MembraneError, match="is not empty"):
+        Recording(tmp_path, Mesh.from_reconstructor(made, settings))
 
 
 def test_simulated_frames_pass_them_over(tmp_path):

@@ -1,4 +1,4 @@
-"""No command writes over the user's files unless told to, nor over what it reads; files are written whole or not at all."""
+"""No command overwrites a user's file unless told to."""
 
 import ast
 import errno
@@ -264,7 +264,7 @@ def stored_results(folder: Path) -> Path:
     sensor = Sensor.from_file(EXAMPLES / "sensor.toml")
     reconstructor = Reconstructor(sensor, check_rest=False)
     folder.mkdir()
-    Mesh.of(reconstructor, Settings.of(reconstructor, "npz")).save(folder / "mesh.npz")
+    Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, "npz")).save(folder / "mesh.npz")
     V, D = len(sensor.membrane.rest), len(reconstructor.rest_pixels)
     frame = {key: np.zeros(shape_of(key, {"V": V, "D": D, "P": 4})) for key in SHAPES}
     save_frame(folder / "press.npz", frame | {"status": np.int32(0)})

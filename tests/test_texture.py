@@ -1,4 +1,4 @@
-"""Texture markers: patches of a rendered speckle follow a known smooth warp, and say so where they cannot."""
+"""Texture patches follow a known warp, or say that they cannot."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Laws of the height of an inflated rest surface that presses tell: least loss, in rounds, with what was stated of it."""
+"""Presses tell the height of an inflated rest surface."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The camera's pose in a tool's frame: laws of wrenches, and where the pose is kept."""
+"""Wrenches transform with the camera's pose in a tool's frame."""
 
 import dataclasses
 import json
@@ -183,7 +183,7 @@ def test_check_says_the_tool_in_words(sensor):
 
 @pytest.fixture
 def mesh(reconstructor):
-    return Mesh.of(reconstructor, Settings.of(reconstructor, "npz"))
+    return Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, "npz"))
 
 
 def test_stored_results_know_the_tool(results, mesh, tmp_path):
@@ -200,7 +200,7 @@ def test_folders_of_before_and_sensors_without_a_tool_have_none(sensor, mesh, tm
     old = Mesh.load(tmp_path / "mesh.npz")
     assert old.tool is None and old.settings == mesh.settings and old.sensor == mesh.sensor
     bare = tm.Reconstructor(dataclasses.replace(sensor, tool=None))
-    Mesh.of(bare, Settings.of(bare, "npz")).save(tmp_path / "mesh.npz")
+    Mesh.from_reconstructor(bare, Settings.from_reconstructor(bare, "npz")).save(tmp_path / "mesh.npz")
     assert Mesh.load(tmp_path / "mesh.npz").tool is None
 
 

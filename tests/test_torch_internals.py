@@ -1,4 +1,4 @@
-"""The private parts of torch that the export uses are there, work as expected, and stand in one file."""
+"""The private parts of torch in use work and stand in one file."""
 
 import ast
 import importlib

@@ -1,4 +1,4 @@
-"""A stream of several views: followed frames, and a drift in one of the views."""
+"""A stream of several views is followed; drift is noticed."""
 
 import numpy as np
 import pytest

@@ -35,9 +35,9 @@ def test_a_frame_followed_is_what_it_is_alone_to_the_last_digit(stream, monkeypa
     """Through frames that are searched for alone, and through second tries, which make much of a rounding."""
     reconstructor, images = stream
     estimator, matcher, tracker = reconstructor.estimator, reconstructor.observer.locator.match, tm.Tracker(reconstructor)
-    work, search, patiently = [], matcher.search, estimator._patiently
+    work, search, retry = [], matcher.search, estimator._retry
     monkeypatch.setattr(matcher, "search", lambda *given: work.append("search") or search(*given))
-    monkeypatch.setattr(estimator, "_patiently", lambda *given: work.append("second try") or patiently(*given))
+    monkeypatch.setattr(estimator, "_retry", lambda *given: work.append("second try") or retry(*given))
     seen = set()
     for image in images:
         work.clear()

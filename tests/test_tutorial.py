@@ -1,4 +1,4 @@
-"""The tutorial's commands and its Python run from top to bottom, and what it says comes out; so does the recipes' Python.
+"""The tutorial and the recipes run, and their numbers come out.
 
 Marked `full`: the pages as they are. Beside them: their commands on coarser grids, of a material that is told.
 """

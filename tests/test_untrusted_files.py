@@ -1,4 +1,4 @@
-"""Untrusted results, summaries and readings are refused in one line or made anew."""
+"""Untrusted results are refused in one line or made anew."""
 
 import os
 import subprocess

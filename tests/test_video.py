@@ -1,4 +1,4 @@
-"""Videos: of whatever name, cut off, damaged, or none at all; nothing of them is lost without a word."""
+"""Videos that are cut off or damaged lose no frame silently."""
 
 import struct
 from pathlib import Path

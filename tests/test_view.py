@@ -1,4 +1,4 @@
-"""Figures say what a frame holds: where, how deep, in which unit, and in words if there is no surface."""
+"""Figures show where, how deep and in which unit."""
 
 import subprocess
 import sys
@@ -164,7 +164,7 @@ def test_a_fourth_panel_shows_where_and_how_hard_something_pushes(mesh):
     drawing = view.figure(frame, mesh)
     (panel,) = drawing.axes[3:4]
     assert len(view.figure(pressed(mesh), mesh).axes) < len(drawing.axes)
-    assert panel.get_title() == "Force 5 N (3, 0, -4)"
+    assert panel.get_title() == "Force 5.00 N (3.00, 0.00, -4.00)"
     assert panel.child_axes[0].get_xlabel() == "compressive normal traction [N/mm²]"
     (mark,) = (line for line in panel.get_lines() if line.get_marker() == "x")
     np.testing.assert_allclose(np.ravel(mark.get_data()), mesh.vertex_pixels[DENT])

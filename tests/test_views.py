@@ -1,4 +1,4 @@
-"""Several views of one membrane: the sensor's file, what each view sees, and what is reconstructed from all of them."""
+"""Several views of one membrane are reconstructed together."""
 
 from dataclasses import replace
 
@@ -191,7 +191,7 @@ def test_the_order_of_the_views_does_not_matter(press, found):
     simulator, images, truth, state = press
     sensor, inverse = simulator.at_rest(), BESIDE.inverse
     other = sensor.in_view(1)
-    other = replace(other, membrane=Surface.of(other.membrane).membrane((9, 9)), surface=None)
+    other = replace(other, membrane=Surface.from_membrane(other.membrane).membrane((9, 9)), surface=None)
     swapped = replace(other, views=(View("right", CAMERA), View("left", CAMERA, inverse, sensor.markers.rest_image)))
     got = tm.Reconstructor(swapped)(images[::-1])
     back = BESIDE.points(got.vertices[0])

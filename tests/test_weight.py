@@ -1,4 +1,4 @@
-"""Laws of newtons from one known weight: other presses' forces are right then, and what tells nothing is refused."""
+"""One known weight makes the forces of other presses right."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""The range in which a sensor's answers were shown right, and the status beyond it."""
+"""A result beyond the validated range gets status 9."""
 
 from dataclasses import replace
 
@@ -113,7 +113,7 @@ def test_a_sensor_file_s_range_is_taken_while_it_is_of_that_sensor(sensor, tmp_p
     own.to_file(range_file(path))
     read = tm.Sensor.from_file(path)
     assert read.range == own and read.fingerprint == sensor.fingerprint
-    assert read.range.of(read.fingerprint) == own and read.range.of("of another sensor") == GENERAL
+    assert read.range.for_fingerprint(read.fingerprint) == own and read.range.for_fingerprint("of another sensor") == GENERAL
     assert any("12.5 N, as `check --accuracy` has shown" in line for line in described(read))
     assert any("of another state of this file" in line for line in described(replace(read, name="other")))
     range_file(path).write_text(range_file(path).read_text() + "width = 3\n")

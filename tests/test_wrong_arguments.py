@@ -1,4 +1,4 @@
-"""Wrong arguments of what users call: a `MembraneError` that names the argument, whatever it is."""
+"""A wrong argument raises a `MembraneError` that names it."""
 
 import warnings
 from functools import partial

@@ -57,7 +57,7 @@ def traced(method: Callable[Inputs, Output]) -> Callable[Inputs, Output]:
     Called with tensors, eagerly or compiled, it is the method itself.
 
     Args:
-        method: of a module; it takes and gives tensors, or tuples of them.
+        method: method of a module; it takes and gives tensors, or tuples of them.
 
     Returns:
         The method, which also accepts `Value`s and then returns them.

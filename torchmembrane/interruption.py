@@ -26,7 +26,7 @@ PATIENCE = 1.5
 LONGER = 10.0
 """The same where a frame is computed, and for what is closed after the exception."""
 AGAIN = 0.5
-"""Of these times, after which the exception is asked for once more."""
+"""Share of these times after which the exception is requested once more."""
 APART = 0.3
 """Seconds within which several signals are one: groups of processes may be sent it twice."""
 LOOK = 0.05
@@ -37,7 +37,7 @@ class Interrupted(KeyboardInterrupt):
     """A signal has come.
 
     Attributes:
-        number: of the signal.
+        number: number of the signal.
     """
 
     def __init__(self, number: int):
@@ -49,7 +49,7 @@ class _State:
     """The state of the signals of one command.
 
     Attributes:
-        number: of the first signal; 0: none yet.
+        number: number of the first signal; 0: none yet.
         answered: whether the main thread has it, and ends.
         raised: whether it has it as an exception.
         lost: whether its exception went nowhere.
@@ -170,7 +170,7 @@ def end_process(number: int) -> NoReturn:
     """Print a message and end this process and those that it has started, without Python's usual clean-up, which takes long.
 
     Args:
-        number: of the signal that has come.
+        number: number of the signal that has come.
     """
     os.write(2, f"{SAID}\n".encode())
     if "multiprocessing" in sys.modules:

@@ -92,7 +92,7 @@ class Kept:
     """The state of a `kept` function: the precisions for which it has been compiled, in this process or on disk.
 
     Args:
-        function: as `kept` gives it.
+        function: as for `kept` gives it.
         sources: `fingerprint` of its sources.
         seconds: about how long it takes to compile.
     """

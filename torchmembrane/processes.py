@@ -22,9 +22,9 @@ def spawned_pool(jobs: int, begin: Callable[[Path], None], shared: Any) -> Itera
     """A `multiprocessing.Pool` of new processes; they are ended with the block.
 
     Args:
-        jobs: how many.
-        begin: called in each at its start, with the path of a file; it calls `begin_worker`.
-        shared: what this file holds, pickled.
+        jobs: number of processes.
+        begin: function that each process calls at its start with the path of a file; it calls `begin_worker`.
+        shared: object that this file holds, pickled.
     """
     with handed_over(shared) as path:
         with starting_processes():
@@ -52,7 +52,7 @@ def begin_worker(path: Path) -> Any:
     """Set up a worker process: it uses one thread, and only its parent interrupts and ends it.
 
     Args:
-        path: as `handed_over` gave it.
+        path: as for `handed_over` gave it.
 
     Returns:
         What was handed over.

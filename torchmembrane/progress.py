@@ -18,7 +18,7 @@ def within(progress: Progress, first: float, last: float) -> Progress:
     """The progress of a part of the work.
 
     Args:
-        progress: of the whole work.
+        progress: progress of the whole work.
         first: share of the whole at which the part begins.
         last: share of the whole at which it ends.
 

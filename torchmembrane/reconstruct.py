@@ -46,10 +46,10 @@ class Reconstructor(nn.Module):
         estimator: "force-balance"; "minimum-energy", which finds no tractions and flattens what is narrow and far; or "paper",
             the paper's own: linear, harmonic, with its contact segmentation; or one of your own: the name it is registered
             under, "module:Class", or the class.
-        settings: of that estimator, an instance of its `Settings`, as `ForceBalanceSettings`; default: `Settings()`.
+        settings: settings of that estimator, an instance of its `Settings`, as `ForceBalanceSettings`; default: `Settings()`.
         model: the elastic energy, default the sensor's: "harmonic" | "neo_hookean" | "mooney_rivlin".
         channels: order of the channels of colour images, "rgb" or "bgr".
-        dtype: of images and results, torch.float32 or torch.float64; slack sheets are solved in the latter whatever it is.
+        dtype: of images and results, torch.float32 or torch.float64; slack sheets are always solved in the latter.
         locator: how markers are found in images: "fit", by least squares, or "soft", by soft-argmax of responses; default:
             the estimator's: "soft" for "paper", else "fit".
         check_rest: whether a rest image that disagrees with the model by more than calibration could explain is refused.
@@ -91,7 +91,7 @@ class Reconstructor(nn.Module):
             raise MembraneError(f"Reconstructor: dtype = {dtype}; expected torch.float32 or torch.float64")
         self.sensor, self.estimator_name, self.locator_name, self.channels = sensor, name, locator, channels
         self.image_size, self.model = sensor.image_size, model or sensor.material.model
-        self.range = sensor.range.of(sensor.fingerprint)
+        self.range = sensor.range.for_fingerprint(sensor.fingerprint)
         refuse_unfit(sensor, name, kind)
         membrane = copy.deepcopy(sensor.membrane)
         seen = sightings(sensor, locator, dtype, kind.needs_every_vertex, check_rest)

@@ -11,7 +11,7 @@ from .user_warnings import warn_user
 
 OF_MATERIAL = ("prestretch", "c1", "c2", "rest_pressure", "rest_load")
 STIFFNESS, FOLLOWING = ("c1", "c2"), ("rest_pressure", "rest_load")
-"""Of these: what another sensor's has otherwise, which is refused; what follows from the others."""
+"""Entries whose difference shows another sensor, which is refused; entries that follow from the others."""
 IDENTITY = "rest_markers"
 """The markers' rest positions `[D, 3]`: those of another sensor are refused."""
 SAME_MARKERS = 1e-4  # largest distance of rest markers of one sensor, over their extent

@@ -6,7 +6,7 @@ from math import sqrt
 LEAST_OFF = 0.05
 """By how much forces must be off, over the true ones, before a calibration is due."""
 LEAST_DEVIATION = 0.03
-"""Of one comparison, relative, whatever the frame says: that of forces after one weight, in nine of ten (docs/recipes.md)."""
+"""Smallest relative deviation of a comparison: the error of nine in ten forces after one weight (docs/recipes.md)."""
 MEMORY = 4
 """Comparisons that count, the latest."""
 SURE = 3.0

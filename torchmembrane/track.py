@@ -16,11 +16,11 @@ from .stiffness import StiffnessWatch
 from .user_warnings import warn_user
 
 LOOKED_AT = (Status.OK, Status.UNEXPLAINED, Status.OUT_OF_RANGE, Status.VIEW_LEFT_OUT)
-"""Of frames that tell of a drift: a camera that moved may leave them unexplained."""
+"""Statuses of frames that reveal a drift: a camera that moved may leave them unexplained."""
 STEADY = 100
 """Frames in which a contact holds still from the beginning before it is said that it may be a drift."""
 FOUND_PRESSURE_ERROR = 0.06
-"""Of a pressure change that is found, relative (docs/calibration.md)."""
+"""Relative error of a pressure change that is found (docs/calibration.md)."""
 LARGEST_STEADY = 0.3
 """px, rms: how far such a contact moves the markers at most."""
 
@@ -42,7 +42,7 @@ class Tracker:
         reconstructor: the sensor's.
 
     Attributes:
-        time: of the latest frame, as it was given; None where it was not.
+        time: time of the latest frame, as it was given; None where it was not.
         stiffness: what known loads, given by `weigh` and `gauge`, tell of the membrane's modulus.
 
     Limitations:
@@ -273,8 +273,8 @@ def press_in_words(force: float, unit: str) -> str:
     """A contact in what is taken for rest, and the remedy.
 
     Args:
-        force: of the contact; NaN where it is not known.
-        unit: of the force.
+        force: force of the contact; NaN where it is not known.
+        unit: unit of the force.
     """
     known = f"of {force:.3g} {unit} " if np.isfinite(force) else ""
     return (

@@ -71,7 +71,11 @@ def lens(seeds, figures):
             f"{model}, {len(pixels)} images of a checkerboard",
             [*guess.focal, *guess.centre, *np.zeros(len(truth[2]))],
         )
-        draw(figures, f"lens_{model}", Report.of(title, found.names, found.names, start, found.fit, pixels, found.residuals))
+        draw(
+            figures,
+            f"lens_{model}",
+            Report.from_fit(title, found.names, found.names, start, found.fit, pixels, found.residuals),
+        )
 
 
 def ports(seeds, figures):
@@ -90,7 +94,7 @@ def ports(seeds, figures):
                 if seed == seeds - 1:
                     start = [GUESS[name] for name in found.names]
                     title = f"{model} through a port, images in {label.replace('both', 'air and medium')}"
-                    report = Report.of(title, found.names, found.names, start, found.fit, pixels[chosen], found.residuals)
+                    report = Report.from_fit(title, found.names, found.names, start, found.fit, pixels[chosen], found.residuals)
                     draw(figures, f"ports_{model}_{label}", report)
 
 
@@ -111,7 +115,7 @@ def rest(seeds, figures):
             before, after = (rms(s.markers.positions - truth.markers.positions) for s in (design, found.sensor))
             yield record | dict(dots_before=before, dots_after=after)
         title, start = f"{name}: rest surface from one image", np.zeros(6)
-        report = Report.of(title, found.names, found.names, start, found.fit, found.pixels, found.residuals)
+        report = Report.from_fit(title, found.names, found.names, start, found.fit, found.pixels, found.residuals)
         draw(figures, f"rest_{name}", report)
 
 
@@ -234,7 +238,7 @@ def views(seeds, figures):
             yield record
         pixels = np.broadcast_to(truth.camera.point_to_pixel(torch.from_numpy(found.dots)).numpy(), found.residuals.shape)
         title = f"{name}: dots and rest surface from five views"
-        report = Report.of(title, found.names, found.names, true, found.fit, pixels, found.residuals)
+        report = Report.from_fit(title, found.names, found.names, true, found.fit, pixels, found.residuals)
         if figures:
             places = fine_surface(design).rest.numpy()
             save(surface_figure(report, design.camera.image_size, places, found.surface, "mm"), figures / f"views_{name}.png")

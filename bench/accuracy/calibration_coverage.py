@@ -49,9 +49,9 @@ class Drawn(NamedTuple):
     Attributes:
         rim: `[K, 3]`, mm.
         sheet: what it is made of.
-        size: of its membrane, mm.
+        size: size of its membrane, mm.
         off: standard deviation of the height that is told, over the size.
-        error: of that height, in these.
+        error: error of that height, in these.
     """
 
     rim: np.ndarray

@@ -1,6 +1,6 @@
 """How far the estimator's answers hold: random sensors, pressed at random, through images.
 
-python -m bench.accuracy.range DATA [--first 0] [--sensors 10000] [--only press,light,rest] [--json FILE]
+python -m bench.accuracy.range DATA... [--first 0] [--sensors 10000] [--only press,light,rest] [--json FILE]
 
 DATA from data/random_sensors.py. A press is right where the markers' surface is within a quarter of their displacement and the
 force within a quarter of the true one, or said to be a lower bound, by `contact_at_rim`. Printed: shares right and wrong with
@@ -83,7 +83,7 @@ def contact_width(truth: dict, spacing: float) -> float:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
+    parser.add_argument("data", type=Path, nargs="+")
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--sensors", type=int, default=10000)
     parser.add_argument("--json", type=Path)
@@ -91,7 +91,7 @@ def main():
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     rows, refused = [], []
-    for folder in sorted(args.data.glob("s[0-9]*")):
+    for folder in (folder for data in args.data for folder in sorted(data.glob("s[0-9]*"))):
         if not args.first <= int(folder.name[1:]) < args.first + args.sensors:
             continue
         files = sorted(path for kind in args.only.split(",") for path in folder.glob(f"{kind}_*.npz"))

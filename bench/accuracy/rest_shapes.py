@@ -1,6 +1,6 @@
 """What `check` says of rest surfaces that are wrong by a known share of their size.
 
-python -m bench.accuracy.rest_shapes [--sensors 120]
+python -m bench.accuracy.rest_shapes [--sensors 120] [--json FILE]
 
 Sheets on rectangles, ellipses and rounded triangles, prestretch 1.02 to 1.3, blown up to 0.1 to 0.25 of their size (seed 0).
 Each is given as a grid: as it is, and with one of eight smooth waves added whose rms is 1, 2 or 5 % of the size. Of each group:
@@ -9,11 +9,13 @@ and how many `check` doubts, for what is left over, or because the nearest sheet
 """
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 import torch
 
 import torchmembrane as tm
+from bench.data.record import write
 from torchmembrane.accuracy.rest_shape import rest_shape
 from torchmembrane.cli.rest_words import rest_in_words
 from torchmembrane.forming.formed import FormedSurface, SheetMaterial, formed_surface
@@ -26,10 +28,11 @@ WRONG = (0.0, 0.01, 0.02, 0.05)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sensors", type=int, default=120)
-    count = parser.parse_args().sensors
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
     torch.set_num_threads(1)
     rng, rows = np.random.default_rng(0), {wrong: [] for wrong in WRONG}
-    for k in range(count):
+    for k in range(args.sensors):
         formed, stretch = sheet(k % 3, rng)
         for wrong in WRONG if k % 4 == 0 else WRONG[1 + k % 3 :][:1]:
             sensor = with_wave(formed, stretch, wrong, rng)
@@ -40,13 +43,17 @@ def main() -> None:
             near = found.nearest
             values = (np.nan,) * 2 if near is None else (near.distance / sensor.membrane.size, near.pressure / found.pressure)
             rows[wrong].append([found.left_over, *values, doubted])
+    groups = []
     for wrong, values in rows.items():
         table = np.array(values, float)
-        words = [
-            f"{name} {np.nanmedian(column):.3f} ({np.nanquantile(column, 0.05):.3f}, {np.nanquantile(column, 0.95):.3f})"
+        spans = {
+            name: np.nanquantile(column, (0.5, 0.05, 0.95)).tolist()
             for name, column in zip(("left over", "distance / size", "pressure ratio"), table.T, strict=False)
-        ]
+        }
+        groups.append(dict(wrong=wrong, sensors=len(table), spans=spans, doubted=float(table[:, 3].mean())))
+        words = ["{} {:.3f} ({:.3f}, {:.3f})".format(name, *span) for name, span in spans.items()]
         print(f"off by {wrong:.0%}: {len(table)} sensors; {'; '.join(words)}; doubted {table[:, 3].mean():.0%}", flush=True)
+    write(args.json, dict(groups=groups))
 
 
 def sheet(kind: int, rng: np.random.Generator) -> tuple[FormedSurface, float]:

@@ -1,6 +1,6 @@
 """Forces after one known weight: of sensors whose modulus and prestretch nobody knows, one press is known, others compared.
 
-python -m bench.accuracy.weight [--sensors dome_24 bubble_60 ... | --others]
+python -m bench.accuracy.weight [--sensors dome_24 bubble_60 ... | --others] [--json FILE]
 
 Twenty sensors: domes, caps, bubbles of gas, fingertips and half cylinders of 12 to 80 mm across, liquid, gas and open,
 prestretched 1.05 to 1.7. Each is pressed by balls in five ways by the simulator, 0.03 to 0.12 of its size deep, and rendered
@@ -13,12 +13,14 @@ chosen.
 
 import argparse
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
 import torchmembrane as tm
+from bench.data.record import write
 from torchmembrane.calibrate.weight import SURE, material_from_weight
 from torchmembrane.camera.model import Camera
 from torchmembrane.presets.draft import drafted_dots, drafted_surface, focal_of_view
@@ -132,9 +134,9 @@ def presses(sensor: tm.Sensor) -> tuple[torch.Tensor, np.ndarray]:
     return (stacked / 255 if images[0].dtype == np.uint8 else stacked)[:, None], np.array(forces)
 
 
-def report(name: str) -> list[float]:
-    """Print what each weight gives; returns how far the other presses' forces are off, relative."""
-    truth, errors = sensor_of(name), []
+def report(name: str) -> list[dict]:
+    """Print what each weight gives; returns a row for each weight, with the other presses' forces found over true."""
+    truth, rows = sensor_of(name), []
     images, forces = presses(truth)
     told = replace(truth, material=replace(truth.material, prestretch=1.2, shear_modulus=None, thickness=None))
     for known in WEIGHTS:
@@ -143,13 +145,16 @@ def report(name: str) -> list[float]:
             found = material_from_weight(told, images[known : known + 1], forces[known])
         except tm.MembraneError as error:
             print(begun, f"refused: {error}", flush=True)
+            rows.append(dict(sensor=name, weight=known, refused=str(error)))
             continue
         with torch.no_grad():
             result = tm.Reconstructor(found.sensor)(images)
         magnitude = result.force.norm(dim=1)
         ratio = magnitude.numpy() / forces
         sure = ((result.force_deviation * result.force).norm(dim=1) / magnitude**2 < SURE).numpy()
-        errors += abs(ratio - 1)[sure & (np.arange(len(PRESSES)) != known)].tolist()
+        others = np.arange(len(PRESSES)) != known
+        row = dict(sensor=name, weight=known, ratios=ratio[sure & others].tolist(), unsure=ratio[~sure & others].tolist())
+        rows.append(row | dict(deviation=found.deviation))
         stretch, sigma = found.sensor.material.prestretch, found.material.deviations[0]
         words = " ".join(f"{r:.3f}" if s else f"({r:.3f})" for r, s in zip(ratio, sure, strict=True))
         print(
@@ -158,18 +163,21 @@ def report(name: str) -> list[float]:
             words,
             flush=True,
         )
-    return errors
+    return rows
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sensors", nargs="+", default=list(SENSORS), choices=list(ALL), metavar="NAME")
     parser.add_argument("--others", dest="sensors", action="store_const", const=list(OTHERS))
+    parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    errors = [error for name in args.sensors for error in report(name)]
+    rows = [row for name in args.sensors for row in report(name)]
+    errors = [abs(ratio - 1) for row in rows for ratio in row.get("ratios", ())]
     words = " ".join(f"{np.quantile(errors, q):.3f}" for q in (0.5, 0.9, 1.0))
     print(f"{len(errors)} forces of other presses, off by, median, 90 %, largest: {words}")
+    write(args.json, dict(rows=rows))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Tables in the documents: between markers, from the records in docs/measured, with revision, date and processor.
+"""Tables and paragraphs in the documents, between markers, from the records in docs/measured, with revision and processor.
 
-A page holds `<!-- measured: NAME -->`, a table, a line that says where it comes from, and `<!-- end of NAME -->`.
+A page holds `<!-- measured: NAME -->`, a table or a paragraph, a line that says where it comes from, `<!-- end of NAME -->`.
 """
 
 import json
@@ -44,11 +44,13 @@ def source(found: dict) -> str:
     return f"*{how} revision {found['revision']}, {found['date']}, {where}: `{found['command']}`*"
 
 
-def block(parts: tuple[str, ...], make: Callable[..., list[list[str]]]) -> str:
+def block(parts: tuple[str, ...], make: Callable[..., list[list[str]] | str]) -> str:
     """What stands between the markers of a table."""
     found = [record(part) for part in parts]
-    rows = make(*(each["results"] for each in found))
-    return "\n" + markdown(rows) + "\n\n" + "\n".join(source(each) for each in found) + "\n"
+    made = make(*(each["results"] for each in found))
+    return (
+        "\n" + (made if isinstance(made, str) else markdown(made)) + "\n\n" + "\n".join(source(each) for each in found) + "\n"
+    )
 
 
 def blocks(page: str) -> dict[str, str]:

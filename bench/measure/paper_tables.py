@@ -3,6 +3,7 @@
 import numpy as np
 
 from bench.measure.accuracy_tables import SENSORS, Rows
+from bench.measure.simulator_tables import scientific
 
 METHODS = {
     "fit": "`fit`",
@@ -125,3 +126,14 @@ def one_dimension(found: dict) -> Rows:
         for name, text in EXPERIMENTS.items()
     ]
     return [["", "minimum energy", "force balance"], *rows]
+
+
+def energy_steps(found: dict) -> Rows:
+    """Worst and median error of minimum energy after so many steps."""
+    columns = (("the sensor's", "float64"), ("harmonic", "float64"), ("the sensor's", "float32"))
+    of = {(row["material"], row["precision"], row["steps"]): row for row in found["rows"]}
+    rows = []
+    for steps in dict.fromkeys(row["steps"] for row in found["rows"]):
+        chosen = [of[material, precision, steps] for material, precision in columns]
+        rows.append([str(steps), *(f"{scientific(row['worst'])} ({scientific(row['median'])})" for row in chosen)])
+    return [["steps", "the sensor's material", "harmonic", "the sensor's material, float32"], *rows]

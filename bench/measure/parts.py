@@ -11,7 +11,12 @@ CASES = (*FRAME, "bench/data/cases.py")
 RANDOM = (*FRAME, "bench/data/random_sensors.py")
 SIMULATOR = ("torchmembrane/simulate", "torchmembrane/mechanics", "torchmembrane/surface")
 CLI = (*FRAME, "torchmembrane/cli", "torchmembrane/calibrate", "torchmembrane/presets")
+PRESSED = (*FRAME, "torchmembrane/simulate")
+JOBS = (*FRAME, "torchmembrane/jobs", "torchmembrane/files", "torchmembrane/results")
+FILES = ("torchmembrane/files", "torchmembrane/sensor", "bench/robustness/fuzz_kinds.py", "bench/robustness/malformed_files.py")
 SEEDS = (9001, 9002, 9003)
+OTHERS = (("a", 25, "--seed 481127"), ("b", 24, "--seed 271126"), ("c", 15, "--first 2000"), ("d", 189, "--seed 8126"))
+"""Random sensors on which no limit was chosen: folder, number, and which."""
 RANDOM_SENSORS = "bench.data.random_sensors DATA"
 MADE = {
     "cases": ("bench.data.cases CASES",),
@@ -20,8 +25,14 @@ MADE = {
     "gauge": (f"{RANDOM_SENSORS} --sensors 14 --presses 2 --light 8",),
     "intervals": tuple(f"{RANDOM_SENSORS}/{seed} --sensors 40 --presses 2 --light 6 --seed {seed}" for seed in SEEDS),
     "range": (f"{RANDOM_SENSORS} --sensors 240 --presses 4 --seed 8126",),
+    "out-of-range": tuple(f"{RANDOM_SENSORS}/{name} --sensors {number} {of}" for name, number, of in OTHERS),
+    "degraded-images": (f"{RANDOM_SENSORS} --sensors 15",),
+    "precision": (),
+    "live-exported": (),
 }
-"""Folders of data, and what makes them. Nothing makes the independent ones: `make measure INDEPENDENT=FOLDER` names them."""
+"""Folders of data, and what makes them. Nothing makes the independent ones: `make measure INDEPENDENT=FOLDER` names them;
+`precision` and
+`live-exported` make their own."""
 
 
 class Part(NamedTuple):
@@ -32,12 +43,14 @@ class Part(NamedTuple):
         measures: paths that the figures depend on, besides the module itself.
         data: which folder of `MADE` the command needs.
         needs_gpu: whether it is left out on a machine without a GPU.
+        python: another interpreter, where `make` has set one up; without it the part is left out.
     """
 
     command: str
     measures: tuple[str, ...] = FRAME
     data: str | None = None
     needs_gpu: bool = False
+    python: str | None = None
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -48,7 +61,7 @@ class Part(NamedTuple):
     def shown(self) -> str:
         """The command, after the one that makes its data, as documents print it."""
         made = MADE[self.data] if self.data else ()
-        return " && ".join(f"python -m {command}" for command in (*made, self.command))
+        return " && ".join(f"{self.python or 'python'} -m {command}" for command in (*made, self.command))
 
 
 def words(command: str, folder: str) -> list[str]:
@@ -74,6 +87,33 @@ PARTS = {
     "windows": Part("bench.accuracy.window_commands", (*CLI, "torchmembrane/forming", "bench/accuracy/windows.py")),
     "cli-errors": Part("bench.robustness.cli_errors", CLI),
     "memory": Part("bench.speed.memory", (*FRAME, "torchmembrane/jobs/workers.py")),
+    "life": Part("bench.robustness.life", (*PRESSED, "torchmembrane/stiffness.py", "bench/robustness/mistakes.py")),
+    "mistakes": Part("bench.robustness.mistakes", PRESSED),
+    "pins": Part("bench.accuracy.pins", PRESSED),
+    "contact-law": Part("bench.accuracy.contact_law", (*SIMULATOR, "torchmembrane/accuracy/contact_law.py")),
+    "rest-shapes": Part(
+        "bench.accuracy.rest_shapes --sensors 100", ("torchmembrane/forming", "torchmembrane/accuracy/rest_shape.py")
+    ),
+    "spec-sheets": Part("bench.accuracy.spec_sheets", (*PRESSED, "torchmembrane/accuracy")),
+    "calibration": Part(
+        "bench.accuracy.calibration lens ports rest effect views depth layout --seeds 1", (*PRESSED, "torchmembrane/calibrate")
+    ),
+    "material": Part("bench.accuracy.calibration material --seeds 1", (*PRESSED, "torchmembrane/calibrate")),
+    "gauge-modulus": Part("bench.accuracy.calibration gauge --seeds 1", (*PRESSED, "torchmembrane/calibrate")),
+    "weight": Part("bench.accuracy.weight", (*PRESSED, "torchmembrane/calibrate")),
+    "drift": Part("bench.robustness.drift", (*PRESSED, "torchmembrane/track.py", "bench/data/random_sensors.py")),
+    **{
+        f"crash-{name}": Part(f"bench.robustness.crash_recovery --latest 2.5 --workers 1 {options}", JOBS)
+        for name, options in (("npz", "--format npz"), ("parquet", "--format parquet"), ("ray", "--engine ray"))
+    },
+    "fuzz": Part("bench.robustness.fuzz", FILES),
+    "live": Part("bench.speed.live", (*FRAME, "torchmembrane/live")),
+    "live-exported": Part(
+        "bench.speed.live --model DATA/video.onnx --only '17 x 17; exported,17 x 17; exported; recorded'",
+        (*EXPORT, "torchmembrane/live"),
+        data="live-exported",
+    ),
+    "ros": Part("bench.speed.ros", (*FRAME, "ros/torchmembrane_ros"), python=".venv-ros/bin/python"),
     "gpu": Part("bench.speed.gpu --batches 1 4 16 64 256 1024 2048", needs_gpu=True),
     "independent": Part("bench.accuracy.accuracy CASES", data="independent"),
     "simulator-independent": Part("bench.accuracy.simulator CASES", SIMULATOR, data="independent"),
@@ -81,11 +121,26 @@ PARTS = {
     "locators": Part("bench.accuracy.locators CASES", ("torchmembrane/markers", "bench/data/cases.py"), data="cases"),
     "segmentation": Part("bench.accuracy.segmentation CASES", CASES, data="cases"),
     "monge": Part("bench.accuracy.monge CASES", CASES, data="cases"),
+    "energy-steps": Part(
+        "bench.accuracy.energy_steps CASES",
+        ("torchmembrane/estimators/minimum_energy", "torchmembrane/mechanics"),
+        data="cases",
+    ),
+    "mismatched": Part("bench.robustness.mismatched CASES --draws 4", CASES, data="cases"),
+    "precision": Part(
+        "bench.accuracy.precision DATA/model.onnx examples/press_on_axis.png examples/flat_plate.png examples/two_contacts.png",
+        EXPORT,
+        data="precision",
+    ),
     "ablation": Part("bench.accuracy.ablation CASES", CASES, data="cases"),
     "gauge": Part("bench.accuracy.gauge DATA", RANDOM, data="gauge"),
     "views": Part("bench.accuracy.views --first 1 --sensors 20 --presses 3", (*RANDOM, "torchmembrane/simulate")),
     "light": Part("bench.accuracy.range DATA --only light", RANDOM, data="light"),
     "intervals": Part(f"bench.accuracy.intervals {' '.join(f'DATA/{seed}' for seed in SEEDS)}", RANDOM, data="intervals"),
     "range": Part("bench.accuracy.range DATA", RANDOM, data="range"),
+    "degraded-images": Part("bench.robustness.degraded_images DATA --sensors 4,8,14", RANDOM, data="degraded-images"),
+    "out-of-range": Part(
+        f"bench.accuracy.range {' '.join(f'DATA/{name}' for name, *_ in OTHERS)} --only press", RANDOM, data="out-of-range"
+    ),
 }
 """In the order in which they are measured, the quick ones first."""

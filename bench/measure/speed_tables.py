@@ -146,3 +146,59 @@ def paper_stages(found: dict) -> Rows:
         "image to result": "image to result",
     }
     return [["stage", "ms"], *([text, f"{each[name]:.2g}"] for name, text in names.items())]
+
+
+LIVE = {
+    "17 x 17": "17 x 17",
+    "17 x 17; recorded": "17 x 17, `--record`",
+    "default grid": "default grid, 33 x 33",
+    "17 x 17; exported": "17 x 17, `--model`",
+    "17 x 17; exported; recorded": "17 x 17, `--model`, `--record`",
+}
+
+
+def live(*found: dict) -> Rows:
+    """Rate, dropped frames and latency of a live camera, by grid and what computes."""
+    rows = []
+    for name, row in (each for part in found for each in part["cases"].items()):
+        dropped, latency = f"{row['dropped']} of {row['captured']}", "{median:.0f} ({percent_95:.0f})".format(**row)
+        quarters = "{first_quarter:.0f}, {last_quarter:.0f}".format(**row)
+        rows.append(
+            [LIVE[name], f"{row['load']:.1f}", f"{row['rate']:.1f}", dropped, latency, quarters, f"{row['processor']:.0f}"]
+        )
+    head = ["", "load", "followed, Hz", "dropped", "latency, ms: median (95 %)", "median in the first, the last quarter"]
+    return [head + ["processor time per frame followed, ms"], *rows]
+
+
+def ros(found: dict) -> Rows:
+    """Wrenches and latency of the node of ROS 2."""
+    rows = [
+        ["images sent at 30 Hz", str(found["sent"])],
+        ["wrenches received", str(found["received"])],
+        ["from the image's stamp to its wrench, median / 99 %", "{median_ms:.0f} / {most_ms:.0f} ms".format(**found)],
+        ["the node's processor time for each wrench", f"{found['processor_ms']:.0f} ms"],
+    ]
+    return [["", ""], *rows]
+
+
+PRECISIONS = {
+    "float32": "float32",
+    "float16": "float16, all (`onnxruntime.transformers.float16`)",
+    "int8": "int8, weights (`quantize_dynamic`)",
+}
+
+
+def precision(found: dict) -> Rows:
+    """Size and errors of a model in half precision and in integers."""
+    rows = []
+    for row in found["rows"]:
+        cells = [PRECISIONS[row["precision"]], f"{row['megabytes']:.1f}"]
+        if "not_loaded" in row:
+            cells += [f"onnxruntime refuses the file: {row['not_loaded']}", "", ""]
+        else:
+            cells.append("ok" if not any(row["status"]) else ", ".join(map(str, row["status"])))
+            for key, digits in (("vertices", 3), ("force", 2)):
+                errors = row[key] if row["precision"] != "float32" else []
+                cells.append(", ".join(f"{value:.{digits}f}" for value in errors))
+        rows.append(cells)
+    return [["", "MB", "status", "vertices against float32, mm", "force, relative"], *rows]

@@ -4,13 +4,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import bench.measure.accuracy_tables as accuracy
+import bench.measure.calibration_tables as calibration
 import bench.measure.paper_tables as paper
+import bench.measure.range_tables as working_range
+import bench.measure.robustness_tables as robustness
 import bench.measure.scaling_tables as scaling
 import bench.measure.simulator_tables as simulator
 import bench.measure.speed_tables as speed
 from bench.measure.parts import PARTS
 
-TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows]]] = {
+TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows | str]]] = {
     "readme": (("independent", "frame"), speed.readme),
     "accuracy-independent": (("independent",), accuracy.default_accuracy),
     "accuracy-cases": (("cases",), accuracy.default_accuracy),
@@ -48,10 +51,37 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows]]] = {
     "intervals": (("intervals",), accuracy.intervals),
     "views": (("views",), accuracy.views),
     "range": (("range",), accuracy.working_range),
+    "readme-range": (("range",), working_range.readme_range),
+    "limits": (("range", "light", "intervals", "degraded-images", "weight"), working_range.limits),
+    "out-of-range": (("out-of-range",), working_range.out_of_range),
+    "pins": (("pins",), working_range.pins),
+    "drift": (("drift",), robustness.drift),
+    "life": (("life",), robustness.life),
+    "mistakes": (("mistakes",), robustness.mistakes),
+    "mismatched": (("mismatched",), robustness.mismatched),
+    "degraded-images": (("degraded-images",), robustness.degraded_images),
+    "crash-recovery": (("crash-npz", "crash-parquet", "crash-ray"), robustness.crash_recovery),
+    "fuzz": (("fuzz",), robustness.fuzz),
+    "calibration-steps": (("calibration",), calibration.calibration_steps),
+    "calibrated-surfaces": (("calibration",), calibration.calibrated_surfaces),
+    "layout": (("calibration",), calibration.layout),
+    "pose-effect": (("calibration",), calibration.pose_effect),
+    "pose-effect-alone": (("calibration",), calibration.pose_effect_alone),
+    "material": (("material",), calibration.material),
+    "gauge-modulus": (("gauge-modulus",), calibration.gauge_modulus),
+    "rest-shapes": (("rest-shapes",), calibration.rest_shapes),
+    "weight": (("weight",), calibration.weight),
+    "contact-law": (("contact-law",), calibration.contact_law),
+    "example-sheet": (("spec-sheets",), calibration.example_sheet),
+    "bubble-sheet": (("spec-sheets",), calibration.bubble_sheet),
+    "live": (("live", "live-exported"), speed.live),
+    "ros": (("ros",), speed.ros),
+    "precision": (("precision",), speed.precision),
+    "energy-steps": (("energy-steps",), paper.energy_steps),
     "scaling-exponents": (("scaling",), scaling.exponents),
     "scaling-costs": (("scaling",), scaling.costs),
 }
-"""Of every table its parts, and the function of their results that makes its rows."""
+"""Of every table its parts, and the function of their results that makes its rows, or its paragraph."""
 FIGURES: dict[str, tuple[str, Callable[[dict, Path], None]]] = {"docs/figures/scaling.png": ("scaling", scaling.draw)}
 """Of every figure its part, and the function that draws it."""
 
@@ -73,5 +103,18 @@ SUMMARIES: dict[str, Callable[[dict], dict]] = {
     "segmentation": paper.segmentation_summary,
     "monge": paper.monge_summary,
     "simulator-independent": simulator.agreement_summary,
+    "out-of-range": working_range.out_of_range_summary,
+    "pins": working_range.pins_summary,
+    "drift": robustness.drift_summary,
+    "life": robustness.life_summary,
+    "mistakes": robustness.mistakes_summary,
+    "mismatched": robustness.mismatched_summary,
+    "degraded-images": robustness.degraded_summary,
+    "crash-npz": robustness.crash_summary,
+    "crash-parquet": robustness.crash_summary,
+    "crash-ray": robustness.crash_summary,
+    "fuzz": robustness.fuzz_summary,
+    "calibration": calibration.calibration_summary,
+    "weight": calibration.weight_summary,
 }
 """Of a part whose results have a row for every case: what its record keeps of them."""

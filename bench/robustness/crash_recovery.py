@@ -1,7 +1,7 @@
 """Jobs killed at random moments: what is lost, and whether the end is as if nothing had happened.
 
     python -m bench.robustness.crash_recovery [--sensor SENSOR.toml --images FOLDER] [--kills 10]
-        [--format npz|parquet] [--engine ray]
+        [--format npz|parquet] [--engine ray] [--json FILE]
 
 By default 500 images, the example's three presses again and again, on 17 x 17 vertices.
 
@@ -25,6 +25,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 import torchmembrane as tm
+from bench.data.record import write
 from torchmembrane.errors import MembraneError
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -66,8 +67,8 @@ def example(folder: Path) -> tuple[str, str]:
     return str(folder / "sensor.toml"), str(folder / "images")
 
 
-def killed(command: list[str], out: Path, after: float, end: signal.Signals) -> float:
-    """One job, ended so many seconds after its computation has begun; prints what was kept, returns the seconds lost."""
+def killed(command: list[str], out: Path, after: float, end: signal.Signals) -> dict:
+    """One job, ended so many seconds after its computation has begun: frames kept before and after, the seconds lost."""
     before, log = kept(out), out.with_suffix(".log")
     with open(log, "w") as said, subprocess.Popen(command, stdout=said, stderr=said) as process:
         while not has_begun(log.read_text()) and process.poll() is None:
@@ -81,21 +82,22 @@ def killed(command: list[str], out: Path, after: float, end: signal.Signals) -> 
     written = max(last_written(out) or begun, begun)
     lost = max(ended - written, 0.0) if alive else 0.0
     said = "" if alive else "  (had ended)"
-    done = f"{before:4d} -> {kept(out):4d} frames"
-    print(f"{end.name:8} after {after:5.1f} s: {done}, at most {lost:4.1f} s of work lost{said}", flush=True)
-    return lost
+    row = dict(signal=end.name, after=after, before=before, kept=kept(out), lost=lost)
+    done = "{before:4d} -> {kept:4d} frames, at most {lost:4.1f} s of work lost".format(**row)
+    print(f"{end.name:8} after {after:5.1f} s: {done}{said}", flush=True)
+    return row
 
 
-def difference(one: Path, other: Path) -> str:
-    """How far the results of two folders are apart: names, then the largest difference of some arrays."""
+def difference(one: Path, other: Path) -> dict:
+    """How far the results of two folders are apart: frames equal bit for bit, and the largest difference of some arrays."""
     a, b = tm.read_results(one), tm.read_results(other)
     if a.names != b.names:
-        return f"names differ: {len(a)} and {len(b)}"
+        return dict(frames=(len(a), len(b)))
     pairs = list(zip(a, b, strict=True))
     keys = "vertices", "force", "pressure", "residual"
     worst = {key: max(float(np.nanmax(np.abs(x[key] - y[key]), initial=0)) for x, y in pairs) for key in keys}
     same = sum(all(np.array_equal(x[key], y[key], equal_nan=True) for key in x) for x, y in pairs)
-    return f"{same} of {len(a)} bit for bit; largest differences: " + ", ".join(f"{k} {v:.1e}" for k, v in worst.items())
+    return dict(frames=(len(a), len(b)), same=same, largest=worst)
 
 
 def main() -> int:
@@ -104,23 +106,26 @@ def main() -> int:
     parser.add_argument("--images")
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--latest", type=float, default=12.0, help="seconds of computation after which a job is killed at most")
+    parser.add_argument("--json", type=Path)
     arguments, options = parser.parse_known_args()
     dice = random.Random(0)
     with TemporaryDirectory() as folder:
         whole, broken = Path(folder) / "whole", Path(folder) / "broken"
         given = (arguments.sensor, arguments.images) if arguments.images else example(Path(folder))
         base = [sys.executable, "-m", "torchmembrane", "reconstruct", *given, *options, "--out"]
-        lost = []
+        kills = []
         for number in range(arguments.kills):
             end = (signal.SIGTERM, signal.SIGKILL)[number % 2]
-            lost.append(killed([*base, str(broken)], broken, dice.uniform(0, arguments.latest), end))
+            kills.append(killed([*base, str(broken)], broken, dice.uniform(0, arguments.latest), end))
         for out in (broken, whole):
             done = subprocess.run([*base, str(out)], capture_output=True, text=True)
             print(done.stdout.strip().rpartition(";")[0], flush=True)
         summary = (broken / "summary.csv").read_text().count("\n") - 1
-        print(f"rows of summary.csv: {summary}; {difference(broken, whole)}")
-        same = tm.read_results(broken).names == tm.read_results(whole).names
-        return int(not same or summary != kept(whole) or max(lost) > MOST_LOST)
+        end = difference(broken, whole)
+        print(f"rows of summary.csv: {summary}; {end}")
+        write(arguments.json, dict(kills=kills, rows=summary, end=end))
+        lost = max(kill["lost"] for kill in kills)
+        return int("same" not in end or summary != kept(whole) or lost > MOST_LOST)
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ class Aged:
             if kind == "swells":
                 fluid = Liquid((1 + change) * float(membrane.rest_volume))
             elif kind == "softens":
-                soft = elasticity.on(membrane)
+                soft = elasticity.for_membrane(membrane)
                 soft.prestretch = (1 - change) * elasticity.prestretch
             else:  # the fluid's weight, across
                 fluid = Liquid(float(membrane.rest_volume))

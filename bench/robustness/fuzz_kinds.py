@@ -68,7 +68,7 @@ class Uses:
 
     Args:
         work: a folder for what stays whole.
-        lines: of the example's grid, that of its file if none are given.
+        lines: number of lines of the example's grid, that of its file if none are given.
     """
 
     def __init__(self, work: Path, lines: int | None):
@@ -121,7 +121,7 @@ class Uses:
         return kinds[name]()
 
     def settings(self, form: str) -> Settings:
-        return Settings.of(self.reconstructor, form)
+        return Settings.from_reconstructor(self.reconstructor, form)
 
     def sensor(self, folder: Path) -> str:
         """Read a sensor, and where it is accepted reconstruct a frame with it."""
@@ -167,7 +167,7 @@ class Uses:
             results.batch(), results.to_pandas(), results[results.names[0]]
 
         def go_on() -> None:
-            mesh = Mesh.of(self.reconstructor, self.settings(form))
+            mesh = Mesh.from_reconstructor(self.reconstructor, self.settings(form))
             with ResultFolder(folder, mesh, self.presses, WHOLE, False, lambda line: None):
                 pass
 

@@ -80,7 +80,8 @@ def main():
         for what, errors in {"mismatched": spoiled, "screened": screened, "other noise": noise}.items():
             print(f"    {what}: {grown(errors, clean)}")
     print("{2} mismatched markers, {0} missed; {1} right ones distrusted".format(*counts))
-    write(args.json, dict(mismatched=rows))
+    screened = dict(zip(("missed", "distrusted", "mismatched"), counts.tolist(), strict=True))
+    write(args.json, dict(mismatched=rows, screened=screened))
 
 
 if __name__ == "__main__":

@@ -104,6 +104,7 @@ def main():
     }
     if args.model:
         if not args.model.exists():
+            args.model.parent.mkdir(parents=True, exist_ok=True)
             tm.export(tm.Reconstructor(coarse), args.model, tracking=True)
         cases["17 x 17; exported"] = lambda: ModelStream(args.model, coarse.fingerprint), False
         cases["17 x 17; exported; recorded"] = lambda: ModelStream(args.model, coarse.fingerprint), True

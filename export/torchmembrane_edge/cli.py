@@ -295,7 +295,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--batch", metavar="N", type=_whole(1, MOST_BATCH), default=1, help=batch)
     threads = "of onnxruntime (default: %(default)s)"
     add("--threads", metavar="N", type=_whole(1, MOST_THREADS), default=1, help=threads)
-    add("--providers", metavar="NAME", nargs="+", default=["CPUExecutionProvider"], help="of onnxruntime, in order")
+    add("--providers", metavar="NAME", nargs="+", default=["CPUExecutionProvider"], help="providers of onnxruntime, in order")
     camera = "instead of images: a camera's, a line printed for each (OpenCV)"
     add("--camera", metavar="NUMBER", type=_whole(0, MOST_NUMBER), help=camera)
     add("--frames", metavar="N", type=_whole(1, MOST_NUMBER), help="stop the camera after so many")

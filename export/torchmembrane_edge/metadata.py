@@ -44,7 +44,7 @@ class Metadata(NamedTuple):
     bits: int | None
 
     @classmethod
-    def of(cls, known: dict[str, str], model: str) -> "Metadata":
+    def from_properties(cls, known: dict[str, str], model: str) -> "Metadata":
         """From a model's metadata; `model` is its path, for messages.
 
         Raises:
@@ -96,7 +96,7 @@ def _mesh(found: dict[str, Any]) -> dict[str, Any]:
     if missing := [key for key in (*MESH_TEXTS, *MESH_ARRAYS) if key not in found]:
         raise ValueError(f"mesh lacks {missing[0]}")
     if wrong := [key for key in MESH_TEXTS if not isinstance(found[key], str)]:
-        raise ValueError(f"mesh: {wrong[0]} is no text")
+        raise ValueError(f"mesh: {wrong[0]} is not text")
     sizes: dict[str, int] = {}
     mesh = found | {key: _array(key, found[key], sizes) for key in MESH_ARRAYS}
     if min(mesh["image_size"]) < 1 or mesh["grid"].prod() != sizes["V"] or sizes["R"] not in (0, 3):

@@ -20,7 +20,7 @@ SETTINGS = ("estimator", "energy", "element", "format", "volume", "flow", "smoot
 def refuse_file(out: Path) -> None:
     """Refuse a folder for results that is a file."""
     if out.exists() and not out.is_dir():
-        raise EdgeError(f"--out {printable(out)}: is a file; expected a folder, new or of earlier results of this sensor")
+        raise EdgeError(f"--out {printable(out)}: is a file; expected a new folder, or one with earlier results of this sensor")
 
 
 def begin(out: Path, mesh: Mapping[str, Any]) -> None:

@@ -52,7 +52,7 @@ class Session:
         except Exception as error:  # onnxruntime's errors have no common base
             cause = f"onnxruntime {onnxruntime.__version__}: {in_one_line(error)}"
             raise EdgeError(f"{model}: not readable as a model ({cause}); expected {EXPECTED}") from error
-        said = Metadata.of(known, model)
+        said = Metadata.from_properties(known, model)
         self.name, self.length_unit, self.force_unit, self.status_texts, self.mesh, self.bits = said
         self._outputs = {given.name: (TYPES.get(given.type), given.shape[1:]) for given in self._session.get_outputs()}
         inputs = {given.name: given.shape for given in self._session.get_inputs()}
@@ -95,7 +95,7 @@ class Session:
         """The inputs of images, by their names."""
         views = ", ".join(self.views)
         if self.views and not (isinstance(images, list | tuple) and len(images) == len(self.views)):
-            raise EdgeError(f"images are no list of {len(self.views)}; expected one with those of the views {views}")
+            raise EdgeError(f"images are not a list of {len(self.views)}; expected one with those of the views {views}")
         each = images if self.views else [images]
         parts = [
             grey(_arranged(_array(part), size), self.bits)[:, None] for part, size in zip(each, self.image_sizes, strict=True)
@@ -211,7 +211,7 @@ def _array(images: Any) -> np.ndarray:
     try:
         return np.asarray(images)
     except ValueError as error:  # rows of different lengths
-        raise EdgeError(f"images are no array ({in_one_line(error)}); expected {SHAPES}") from error
+        raise EdgeError(f"images are not an array ({in_one_line(error)}); expected {SHAPES}") from error
 
 
 def _arranged(images: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -108,8 +108,8 @@ def numbers(frame: Mapping[str, Any], rest_normals: np.ndarray, length_unit: str
     Args:
         frame: arrays by the names of `Reconstruction`, and `gauge`, a reading; those that it lacks are unknown.
         rest_normals: `[V, 3]`, of the rest surface.
-        length_unit: of its lengths.
-        force_unit: of its forces.
+        length_unit: unit of its lengths.
+        force_unit: unit of its forces.
     """
     found: dict[str, Any] = {}
 

@@ -17,9 +17,9 @@ from ..surface.membrane import Membrane
 from .presses import followed
 
 RADII, HELD_RADII = (0.1, 0.16, 0.26), (0.13, 0.21)
-"""Of the balls over the surface's size: those that the law is fitted to, and those that it is tried on."""
+"""Radii of the balls over the surface's size: those that the law is fitted to, and those that it is tried on."""
 DEPTHS, HELD_DEPTHS = (0.02, 0.035, 0.05, 0.07, 0.1), (0.028, 0.042, 0.06, 0.085)
-"""How deep they press, over the size."""
+"""Depths of the presses over the size, likewise."""
 RADIUS, DEPTH = 0.16, 0.05
 """Over the size, of the press that the law's numbers are for."""
 FINER = 1.5
@@ -36,7 +36,7 @@ class BallPress(NamedTuple):
     """A ball pressed into the top, without friction.
 
     Attributes:
-        radius: of the ball, length unit.
+        radius: radius of the ball, length unit.
         depth: how far it has moved along the inward normal since it touched, length unit.
         force: magnitude, force unit.
         held_out: whether the law was not fitted to it.

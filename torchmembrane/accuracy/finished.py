@@ -21,7 +21,7 @@ class FinishedSeries(NamedTuple):
 
     Attributes:
         path: the file; it need not exist.
-        outcomes: of the finished series, by their number.
+        outcomes: outcomes of the finished series, by their number.
     """
 
     path: Path
@@ -35,10 +35,10 @@ class FinishedSeries(NamedTuple):
 
         Args:
             folder: where the file is.
-            version: of the package.
+            version: version of the package.
             sensor: the sensor.
-            seed: of the trials.
-            noise: of the images, dB; None: that of the rest image.
+            seed: seed of the trials.
+            noise: noise of the images, dB; None: that of the rest image.
             effort: how much is tried.
 
         Raises:
@@ -52,7 +52,7 @@ class FinishedSeries(NamedTuple):
         """Write the file anew with one more series, atomically.
 
         Args:
-            number: of the series.
+            number: number of the series.
             outcome: what its trials gave.
         """
         self.outcomes[number] = outcome

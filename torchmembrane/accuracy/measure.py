@@ -42,12 +42,12 @@ def spec_sheet(
 ) -> SpecSheet:
     """Measure what to expect of a sensor, by trials on a simulated one, through images.
 
-    Noise at rest, the lightest touch found, errors by force, how near two touches are told apart, the deepest press.
+    Noise at rest, the lightest touch found, errors by force, the distance that resolves two contacts, the deepest press.
 
     Args:
         sensor: the sensor.
-        seed: of presses and noise; the same gives the same.
-        noise: of the images, white over its standard deviation, dB; default: as in the rest image (`image_noise`).
+        seed: seed of presses and noise; the same gives the same.
+        noise: noise of the images, white over its standard deviation, dB; default: as in the rest image (`image_noise`).
         effort: how much is tried.
         jobs: processes.
         finished: series that an interrupted call of the same arguments has finished, which keeps those of this call as well.

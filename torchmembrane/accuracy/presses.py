@@ -59,10 +59,10 @@ def stroke_states(simulator: Simulator, number: int, frames: int, offset: float,
 
     Args:
         simulator: the sensor's.
-        number: of the stroke, which says what presses, where and with what friction.
+        number: number of the stroke, which says what presses, where and with what friction.
         frames: how many, at the `shares` of `DEEPEST`.
-        offset: of the shares, 0..1.
-        seed: of all strokes.
+        offset: offset of the shares, 0..1.
+        seed: seed of all strokes.
 
     Returns:
         As many as the membrane can follow, without those before the first vertex is touched.
@@ -87,9 +87,9 @@ def pair_states(simulator: Simulator, number: int, count: int, seed: int) -> lis
 
     Args:
         simulator: the sensor's.
-        number: of the direction, in which they lie from each other.
+        number: number of the direction, in which they lie from each other.
         count: how many distances are tried, from `WIDEST` x size on, each `NEARER` of the one before.
-        seed: of all directions.
+        seed: seed of all directions.
 
     Returns:
         Those that have room off the rim and in view, and that the membrane can follow.
@@ -116,7 +116,7 @@ def pair_states(simulator: Simulator, number: int, count: int, seed: int) -> lis
     places, ways = max(lines, key=lambda line: len(line[0]))
     found = [pair for place, way in zip(places, ways, strict=True) for pair in _pair(simulator, place, way)]
     if not found:
-        raise MembraneError(f"pairs, direction {number + 1}: no pair has room, or can be followed; {FAR_FROM_A_RIM}")
+        raise MembraneError(f"pairs, direction {number + 1}: no pair of balls fits, or none can be simulated; {FAR_FROM_A_RIM}")
     return found
 
 

@@ -21,11 +21,11 @@ class NearestSheet(NamedTuple):
     """The nearest rest surface that is a sheet of the same rubber, inflated in the same rim.
 
     Attributes:
-        height: of its highest point above the rim's plane.
+        height: height of its highest point above the rim's plane.
         distance: rms of the given surface's distance from it, length unit.
         most: the largest.
         pressure: that holds it, force / length^2.
-        stretch: of the sheet in its rim, before it is blown up.
+        stretch: stretch of the sheet in its rim, before it is blown up.
         least: mean stretch that blowing up alone gives.
     """
 

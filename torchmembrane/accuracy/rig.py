@@ -49,7 +49,7 @@ class Rig:
 
     Args:
         sensor: the sensor.
-        noise: of all images, dB below white.
+        noise: noise of all images, dB below white.
 
     Attributes:
         simulator: that presses it and takes the images.
@@ -116,7 +116,7 @@ def rest_trials(result: Reconstruction, seen: Tensor) -> list[RestTrial]:
     """What frames at rest give.
 
     Args:
-        result: of B frames.
+        result: result of B frames.
         seen: `[V]` bool, the vertices in view.
     """
     rms = result.displacement[:, seen].double().square().sum(-1).mean(-1).sqrt()
@@ -140,7 +140,7 @@ def press_trials(
         stroke: its number.
         states: the B true equilibria, of one indenter.
         displacement: true, at the result's vertices, `[B, V, 3]`.
-        result: of the B images.
+        result: result of the B images.
         normals: outward at rest, `[V, 3]`.
         seen: `[V]` bool, the vertices in view.
         found: `[D]` bool, the markers found at rest.
@@ -168,12 +168,12 @@ def press_trials(
 
 
 def pair_trials(direction: int, pairs: Sequence[PairPress], result: Reconstruction) -> list[PairTrial]:
-    """Which pairs are told apart.
+    """Which pairs are resolved.
 
     Args:
         direction: its number.
         pairs: B of them.
-        result: of the B images.
+        result: result of the B images.
     """
     trials = []
     for pair, points, status in zip(pairs, result.contact_points.double(), result.status, strict=True):

@@ -29,7 +29,7 @@ class PressTrial(NamedTuple):
         stroke: number of the stroke that it belongs to.
         force: magnitude of the true force.
         depth: true depth, the deepest displacement along the inward normal.
-        force_error: of the force as a vector, over the true one's magnitude.
+        force_error: error of the force as a vector, over the true one's magnitude.
         depth_error: absolute, of the depth.
         place_error: distance from the centre of the true contact to the strongest one reported; infinite where none is.
         surface_error: rms over the part in view, over the rms of the true displacement there.
@@ -112,7 +112,7 @@ class Effort(NamedTuple):
 
     Attributes:
         strokes: from the first touch on, towards random places.
-        frames: of each stroke.
+        frames: number of frames of each stroke.
         directions: in which two touches are moved together.
         distances: between them that are tried.
         rest: frames at rest.
@@ -139,8 +139,8 @@ class RestFloor(NamedTuple):
 
     Attributes:
         frames: how many.
-        not_ok: of them with another status than ok; not in the spreads.
-        touched: of them with a contact reported.
+        not_ok: number of them with another status than ok; not in the spreads.
+        touched: number of them with a contact reported.
         surface: rms displacement.
         force: magnitude.
         pressure: magnitude of the change.
@@ -160,8 +160,8 @@ class LightestTouch(NamedTuple):
     Attributes:
         strokes: in how many strokes.
         found: in how many of them the contact is found at all.
-        force: of the first frame found, over those strokes.
-        depth: of the same frame.
+        force: force of the first frame found, over those strokes.
+        depth: depth of the same frame.
     """
 
     strokes: int
@@ -199,8 +199,8 @@ class ClosestPair(NamedTuple):
 
     Attributes:
         directions: in how many directions pairs were moved together.
-        told: in how many of them the widest pair is told apart.
-        distance: the smallest at which this and every wider pair is told apart, over those.
+        told: in how many of them the widest pair is resolved.
+        distance: the smallest at which this and every wider pair is resolved, over those.
         nearest: the smallest distance tried.
         widest: the largest distance tried.
     """
@@ -216,8 +216,8 @@ class DeepestPress(NamedTuple):
     """The depth up to which strokes are reconstructed.
 
     Attributes:
-        depths: of each stroke, the deepest press that is reconstructed, as all between it and the first one found.
-        forces: of these presses.
+        depths: depth of the deepest press of each stroke that is reconstructed, as are all between it and the first one found.
+        forces: forces of those presses.
         ends: how many strokes end by what: a status, markers lost, the surface off, nothing up to the deepest press tried.
     """
 
@@ -230,21 +230,21 @@ class SpecSheet(NamedTuple):
     """What to expect of a sensor.
 
     Attributes:
-        name: of the sensor.
+        name: name of the sensor.
         length_unit: the sensor's.
         force_unit: "N" | "relative".
-        noise: of the images, white over its standard deviation, dB.
-        seed: of presses and noise.
+        noise: noise of the images, white over its standard deviation, dB.
+        seed: seed of presses and noise.
         simulated_on: the simulator's grid.
         reconstructed_on: the sensor's own.
-        spacing: of the markers, length unit.
+        spacing: spacing of the markers, length unit.
         near: distance from where it is within which a contact counts as found, length unit.
         left_out: for each stroke or direction of pairs that could not be simulated, why.
         rest: at rest.
-        lightest: of light touches.
+        lightest: figures of light touches.
         bands: errors by force, the lightest first.
-        closest: of two touches.
-        deepest: of deep presses.
+        closest: figures of two touches.
+        deepest: figures of deep presses.
         presses: every press of the strokes.
         pairs: every pair.
         range: in which presses are right; None where none is.

@@ -11,7 +11,7 @@ from ..sensor.working_range import GENERAL, WorkingRange
 from .spec_sheet import Band, ClosestPair, DeepestPress, LightestTouch, PairTrial, PressTrial, RestFloor, RestTrial, Spread
 
 EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)
-"""Of the bands, over the hardest press."""
+"""Edges of the bands of force, over the force of the hardest press."""
 LEAST_DEPTH = 0.05
 """Over the size: of the presses that a range is judged by."""
 UNBROKEN = "the deepest press tried"
@@ -128,8 +128,8 @@ def working_range(trials: Sequence[PressTrial], size: float, fingerprint: str) -
 
     Args:
         trials: the presses, without limits.
-        size: of the surface, length unit.
-        fingerprint: of the sensor.
+        size: size of the surface, length unit.
+        fingerprint: fingerprint of the sensor.
     """
     deep = [trial for trial in trials if trial.depth > LEAST_DEPTH * size and trial.status == Status.OK]
     wrong = [trial.depth for trial in deep if trial.is_wrong]

@@ -40,8 +40,8 @@ class CameraFit(NamedTuple):
 
     Attributes:
         camera: the camera.
-        names: of the n numbers that were fitted.
-        fit: of these numbers, which come first, and then of 6 of each pose.
+        names: names of the n numbers that were fitted.
+        fit: fit of these numbers, which come first, and then of 6 of each pose.
         poses: `[P, 6]` rotation vectors (rad) and translations (length unit) of the board.
         residuals: `[P, D, 2]` px, measured less modelled, NaN where not used.
     """

@@ -24,6 +24,7 @@ from .rest_error import HeightEffect, PressesTold, StatedHeight, changed_height,
 
 GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
 PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the loss's, alike in all images
+PRESTRETCH_ERROR_INFLATED = 0.02  # the same where the rest surface's height is found with it
 WRONG = 0.02  # probability that an image is explained wrongly altogether and carries no information
 HEIGHT_ROUNDS = 4
 RANGE, NEAR = 3.0, 7  # standard deviations to either side in which the prestretch is looked for again; how many are tried
@@ -72,13 +73,18 @@ class ByShapes(NamedTuple):
         return np.unique(found)
 
 
-def by_shapes(profile: LossProfile) -> ByShapes:
-    """The presses' losses as probabilities: of all, and of each image."""
+def by_shapes(profile: LossProfile, shared_error: float = PRESTRETCH_ERROR) -> ByShapes:
+    """The presses' losses as probabilities: of all, and of each image.
+
+    Args:
+        profile: the losses.
+        shared_error: relative standard deviation of the prestretch that all images have in common.
+    """
     each, own = np.array([_log_stretch(profile.stretches, losses[:, None]) for losses in profile.losses.T]).T
     mean, by_losses = _log_stretch(profile.stretches, profile.losses)
-    variances = own**2 + PRESTRETCH_ERROR**2
+    variances = own**2 + shared_error**2
     contradiction = ((each - mean) ** 2 / variances).sum() / max(len(each) - 1, 1)
-    deviation = float(np.hypot(by_losses * np.sqrt(max(1.0, contradiction)), PRESTRETCH_ERROR))
+    deviation = float(np.hypot(by_losses * np.sqrt(max(1.0, contradiction)), shared_error))
     return ByShapes(mean, deviation, by_losses, each, variances)
 
 
@@ -115,8 +121,8 @@ def explained(sensor: Sensor, reconstructor: Reconstructor, known: MeasuredPress
 
     Args:
         sensor: as it is known.
-        reconstructor: of it, on the grid for calibration.
-        known: of the presses.
+        reconstructor: reconstructor of the sensor, on the grid for calibration.
+        known: what is known of the presses.
         progress: is told how far it is.
     """
     presses = Presses(reconstructor, known.displacement, known.confidence, known.covariance)
@@ -134,7 +140,8 @@ def _at_told_height(sensor: Sensor, presses: Presses, known: MeasuredPresses, pr
     stretches, height, is_close = STRETCHES, known.height, False
     for k in range(HEIGHT_ROUNDS):
         of_round = within(progress, k / HEIGHT_ROUNDS, (k + 1) / HEIGHT_ROUNDS)
-        shapes = by_shapes(profile := presses.profile_at(stretches, within(of_round, 0.0, 1 - HEIGHT_SHARE)))
+        profile = presses.profile_at(stretches, within(of_round, 0.0, 1 - HEIGHT_SHARE))
+        shapes = by_shapes(profile, PRESTRETCH_ERROR_INFLATED)
         of_round(1 - HEIGHT_SHARE, "prestretch at other heights of the rest surface")
         lower, higher = (presses.at_height(side * height.reach * height.error) for side in (-1, 1))
         own, below, above = (each.told(shapes.around[::2]) for each in (presses, lower, higher))

@@ -53,11 +53,11 @@ class ModulusEvidence(NamedTuple):
     """What one kind of measurement says of the modulus.
 
     Attributes:
-        source: in words.
+        source: name of the measurement, in words.
         modulus: shear modulus x thickness, force / length.
         deviation: standard deviation, at the prestretch found.
-        change: with one standard deviation of the prestretch.
-        by_height: change with one standard deviation of the rest surface's height.
+        change: change of the modulus with one standard deviation of the prestretch.
+        by_height: change of the modulus with one standard deviation of the rest surface's height.
         sides: the modulus with a prestretch one standard deviation lower and higher; its logarithm is then a parabola, else a
             straight line.
     """
@@ -74,9 +74,9 @@ class JoinedEvidence(NamedTuple):
     """Prestretch and modulus by all that is known.
 
     Attributes:
-        shift: of the logarithm of the prestretch, in its standard deviations.
+        shift: shift of the logarithm of the prestretch, in its standard deviations.
         modulus: force / length.
-        height: of the rest surface, above what it is, in its standard deviations.
+        height: height of the rest surface, above what it is, in its standard deviations.
         covariance: `[3, 3]` of the shift, of the logarithm of the modulus, and of the height.
         contradictions: a sentence for each two kinds of measurement that contradict one another.
     """
@@ -106,7 +106,7 @@ def joined(
     `exp(-least squares / 2)` is summed over `t`.
 
     Args:
-        evidence: of each measurement.
+        evidence: evidence of each measurement.
         by_height: `b`, the shift that the presses' shapes tell, with one standard deviation of the height.
         height: `h0` and `s0`, its mean and standard deviation without the evidence.
         least: shift that is possible.

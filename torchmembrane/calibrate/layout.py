@@ -56,7 +56,7 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
 
     Args:
         sensor: camera and rest surface.
-        pitch: of the lattice, px, 4 or more.
+        pitch: pitch of the lattice, px, 4 or more.
 
     Returns:
         Pixels `[D, 2]`, and the sizes, small or large, of each.
@@ -84,7 +84,7 @@ def pixel_lattice(sensor: Sensor, pitch: float) -> tuple[np.ndarray, list[str]]:
     u, v = np.where(inside[..., None], around, 0).transpose(2, 0, 1)
     kept = (inside & mask[v, u]).all(1)
     if not kept.any():
-        raise MembraneError(f"calibrate layout: pitch = {pitch}; expected less, so that dots lie within the rim's outline")
+        raise MembraneError(f"calibrate layout: pitch = {pitch}; expected a smaller one, so that dots lie within the rim")
     return pixels[kept], np.where((i + j) % 2 == 0, "large", "small")[kept].tolist()
 
 

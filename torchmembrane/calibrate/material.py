@@ -131,7 +131,7 @@ def material_from_pixels(
             `KnownForces`, with their deviations.
         pressures: what a gauge read.
         overpressure: what it read at rest, hPa.
-        noise: of the pixels, as for `Reconstructor.from_pixels`.
+        noise: noise of the pixels, as for `Reconstructor.from_pixels`.
         rest_error: standard deviation of the rest surface's height over its rim, relative.
         progress: is told how far it is.
 

@@ -65,7 +65,7 @@ class Presses:
 
     @property
     def rest_markers(self) -> np.ndarray:
-        """`[D, 3]`."""
+        """Positions of the markers on the rest surface, `[D, 3]`."""
         positions: np.ndarray = self.reconstructor.rest_markers.double().numpy()
         return positions
 

@@ -77,7 +77,7 @@ class Report(NamedTuple):
     notes: list[str]
 
     @classmethod
-    def of(
+    def from_fit(
         cls,
         title: str,
         names: Sequence[str],

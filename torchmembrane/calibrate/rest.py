@@ -32,8 +32,8 @@ class RestFit(NamedTuple):
 
     Attributes:
         sensor: the sensor with the pose and dots found.
-        names: of the six numbers of the pose.
-        fit: of the pose, from the design: rotation vector about the rim's centre (degrees), and offset (length unit).
+        names: names of the six numbers of the pose.
+        fit: fit of the pose, from the design: rotation vector about the rim's centre (degrees), and offset (length unit).
         pixels: `[D, 2]` px, measured centres of the dots' outlines, NaN where not visible.
         residuals: `[D, 2]` px, measured less modelled by the pose alone.
         shifts: `[D, 3]` by which the dots were then moved along the surface to null the residuals.

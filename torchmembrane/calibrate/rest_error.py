@@ -45,17 +45,17 @@ class _Scaled(Surface):
 
 
 def at_other_height(sensor: Sensor, positions: np.ndarray, share: float) -> tuple[Sensor, np.ndarray]:
-    """The sensor whose rest surface is lower over its rim by a share, its markers where their rays meet it.
+    """The sensor with a rest surface that is lower above its rim by a share, and markers where their rays meet it.
 
-    Where a surface folds when it is lowered, it is raised: what a small change does has then the other sign throughout.
+    A surface that folds when it is lowered is raised instead; all effects of the small change then have the opposite sign.
 
     Args:
         sensor: any.
         positions: `[D, 3]` of its markers.
-        share: of the height.
+        share: share of the height.
 
     Returns:
-        The sensor, without a rest image, and which markers it has, `[D]` bool: the rays of others miss the surface.
+        The sensor, without a rest image, and which markers it has, `[D]` bool: the rays of the others miss the surface.
 
     Raises:
         MembraneError: the surface folds either way.
@@ -94,11 +94,11 @@ class HeightEffect(NamedTuple):
     """What presses tell otherwise where the rest surface has another height, by one standard deviation of it.
 
     Attributes:
-        shift: of the logarithm of the prestretch that they tell.
+        shift: shift of the logarithm of the prestretch that they tell.
         by_stretch: change of the forces' logarithm with one standard deviation of the prestretch, in the mean.
         by_height: with the height.
-        mean: of the height, by what was stated of it and what the presses tell, in stated standard deviations.
-        deviation: of the height, in stated ones.
+        mean: mean of the height, by what was stated of it and what the presses tell, in stated standard deviations.
+        deviation: deviation of the height, in stated ones.
     """
 
     shift: float
@@ -125,8 +125,8 @@ def height_effect(own: PressesTold, other: PressesTold, step: float, variance: f
     Args:
         own: on the sensor's surface.
         other: on that of another height.
-        step: of the prestretch's logarithm.
-        variance: of the prestretch's logarithm by the presses' losses.
+        step: step of the prestretch's logarithm.
+        variance: variance of the prestretch's logarithm by the presses' losses.
     """
     added = other.losses - own.losses
     bound = MOST_SHIFT * variance**0.5
@@ -177,9 +177,9 @@ def height_told(
         own: on the sensor's surface.
         lower: on one that is lower by `stated.reach` standard deviations.
         higher: on one that is as much higher.
-        step: of the prestretch's logarithm.
-        variance: of the prestretch's logarithm by the presses' losses.
-        stated: of the height.
+        step: step of the prestretch's logarithm.
+        variance: variance of the prestretch's logarithm by the presses' losses.
+        stated: stated deviation of the height.
     """
     d = stated.reach
     slope = (higher.losses - lower.losses) / (2 * d)

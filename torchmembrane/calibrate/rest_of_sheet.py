@@ -54,18 +54,18 @@ class _Material:
         points: np.ndarray = (vertices[self.vertices] * self.weights[..., None]).sum(1)
         return points
 
-    def of(self, height: float, prestretch: float) -> InflatedSurface:
+    def sheet_with(self, height: float, prestretch: float) -> InflatedSurface:
         """The sheet at a height, with a prestretch."""
         material = replace(self.surface.material, prestretch=max(1.0, prestretch))
         return replace(self.surface.of_height(height), material=material)
 
     def positions(self, sheet: InflatedSurface) -> np.ndarray:
         """Of the dots, `[D, 3]`."""
-        return self._on(sheet.formed.on(self.grid)[0].reshape(-1, 3)) + self.off
+        return self._on(sheet.formed.resampled_to(self.grid)[0].reshape(-1, 3)) + self.off
 
     def linear(self, at: np.ndarray) -> _Linear:
         """Near a height and prestretch."""
-        here, *others = (self.of(*(at * factor)) for factor in ((1.0, 1.0), (1 + STEP, 1.0), (1.0, 1 + STEP)))
+        here, *others = (self.sheet_with(*(at * factor)) for factor in ((1.0, 1.0), (1 + STEP, 1.0), (1.0, 1 + STEP)))
         points, p = self.positions(here), float(np.log(here.formed.pressure))
         slopes = [(self.positions(other) - points) / (STEP * value) for other, value in zip(others, at, strict=True)]
         rises = [(np.log(other.formed.pressure) - p) / (STEP * value) for other, value in zip(others, at, strict=True)]
@@ -88,7 +88,7 @@ def rest_of_sheet(sensor: Sensor, image: np.ndarray, overpressure: float | None,
         The sensor found, its rim as points in the camera's frame, and the fit: pose, height, prestretch.
 
     Raises:
-        MembraneError: as `rest_from_image`; a height or prestretch without an equilibrium.
+        MembraneError: as for `rest_from_image`; a height or prestretch without an equilibrium.
     """
     sheet, X, sizes = sensor.surface, sensor.markers.positions, sensor.markers.sizes
     assert isinstance(sheet, InflatedSurface) and X is not None  # as `rest_from_image` has seen
@@ -176,7 +176,7 @@ def _moved(
     """The sensor where and as it was found, its dots moved along the surface to where they are seen."""
     theta = torch.from_numpy(result.values)
     rotation, pivot, offset = rotations(theta[:3]).numpy(), seen.pivot.numpy(), result.values[3:6]
-    flat = dots.of(*result.values[6:])
+    flat = dots.sheet_with(*result.values[6:])
     rim = (flat.rim - pivot) @ rotation.T + pivot + offset
     values = {"outline": rim, "height": float(result.values[6])}
     material = flat.material

@@ -33,7 +33,7 @@ class RimOutline(NamedTuple):
         centre: `(u, v)` px.
         half_axes: the longer and the shorter one, px.
         deviation: standard deviation of centre and half axes, px.
-        share: of the outline within the image along which an edge is seen.
+        share: share of the outline within the image along which an edge is seen.
     """
 
     centre: tuple[float, float]

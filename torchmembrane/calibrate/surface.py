@@ -108,7 +108,7 @@ def correction(surface: Membrane, projection: SurfaceProjection, variances: np.n
         What moves the surface within itself is not observed. Where the rim is far outside the points, it is extrapolated.
     """
     if len(projection.points) < 12:
-        raise MembraneError(f"calibrate: {len(projection.points)} points of the rest surface; expected at least 12")
+        raise MembraneError(f"calibrate: {len(projection.points)} points of the rest surface were given; expected at least 12")
     unit = np.eye(len(projection.points))
     weights = RBFInterpolator(projection.points, unit, kernel="thin_plate_spline", degree=1)(surface.rest.numpy())
     shift = weights @ (projection.signed_distance[:, None] * projection.normals)

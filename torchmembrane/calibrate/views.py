@@ -30,8 +30,8 @@ class ViewsFit(NamedTuple):
 
     Attributes:
         sensor: the sensor with the surface and dots found.
-        names: of the 6 numbers of each camera pose but the first.
-        fit: of these numbers (degrees, length unit), and then of the dots (length unit, first camera's frame).
+        names: names of the 6 numbers of each camera pose but the first.
+        fit: fit of these numbers (degrees, length unit), and then of the dots (length unit, first camera's frame).
         dots: `[D, 3]`.
         deviations: `[D, 3]` standard deviations of the dots.
         surface: `Correction` of the designed surface.

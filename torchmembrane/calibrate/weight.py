@@ -31,7 +31,7 @@ class WeightFit(NamedTuple):
         sensor: with prestretch and modulus found.
         material: what `material_from_images` found, before the last scaling.
         forces: `[B]` magnitudes that the reconstruction then says, N.
-        deviation: of the scale of all forces, relative.
+        deviation: deviation of the scale of all forces, relative.
     """
 
     sensor: Sensor

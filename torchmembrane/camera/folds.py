@@ -47,7 +47,7 @@ def refuse_folds(camera: Camera, points: Tensor) -> None:
 
     Args:
         camera: the camera.
-        points: of the membrane at rest, `[V, 3]`, camera frame.
+        points: points of the membrane at rest, `[V, 3]`, camera frame.
 
     Raises:
         MembraneError: with the radius at which it folds.

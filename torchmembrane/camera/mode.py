@@ -15,9 +15,9 @@ class Mode(NamedTuple):
     seen at `(u - left - (b - 1) / 2) / b`. Distortion, ports and what stands for angles do not change.
 
     Attributes:
-        image_size: of the calibration, width and height, px.
-        focal: of the calibration, along u and v, px (fisheye: px / rad).
-        centre: of the calibration, px.
+        image_size: size of the calibration, width and height, px.
+        focal: focal lengths of the calibration, along u and v, px (fisheye: px / rad).
+        centre: centre of the calibration, px.
         crop: left, top, width, height of the part that is kept, px of the calibration.
         binning: pixels of a block along u and v.
 
@@ -37,7 +37,7 @@ class Mode(NamedTuple):
     binning: tuple[int, int]
 
     @classmethod
-    def of(
+    def from_camera(
         cls,
         image_size: tuple[int, int],
         focal: Sequence[float],
@@ -51,7 +51,7 @@ class Mode(NamedTuple):
             MembraneError: a crop beyond the image, or blocks that do not fill it; names the value and what was expected.
 
         Example:
-            >>> Mode.of((640, 480), (400.0, 400.0), (320.0, 240.0), (0, 0, 640, 480), (3, 3))
+            >>> Mode.from_camera((640, 480), (400.0, 400.0), (320.0, 240.0), (0, 0, 640, 480), (3, 3))
             Traceback (most recent call last):
             ...
             torchmembrane.errors.MembraneError: Camera: binning is [3, 3]; expected whole numbers of 1 or more that divide the \

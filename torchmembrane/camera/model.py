@@ -23,11 +23,11 @@ COEFFICIENTS = {"pinhole": 5, "fisheye": 4}  # k1 k2 p1 p2 k3 | k1 k2 k3 k4
 RATIONAL = 8  # of a pinhole: k1 k2 p1 p2 k3 k4 k5 k6
 FURTHER = (12, 14)  # OpenCV's, with thin prisms s1 to s4 and a tilted chip, which are not modelled
 LONGEST_SIDE = 16384
-"""Of an image, px."""
+"""Longest side of an image, px."""
 FOCAL = (1.0, 1e6)
 """Least and greatest, px."""
 MOST_ASPECT = 20.0
-"""Of the two focal lengths to one another."""
+"""Largest ratio of the two focal lengths."""
 FARTHEST_CENTRE, MOST_DISTORTION = 1e6, 1e6
 
 
@@ -64,7 +64,7 @@ class Camera(ImageMotion, nn.Module):
         distortion: coefficients; what is left off is zero, an empty list leaves the distortion out of the computation.
         ports: layers (distance, thickness, index) in order from the camera; what lies before and between them is air.
         medium_index: refractive index of all that follows the last port; without ports it plays no part.
-        bits: of its values, 8 to 16, where images of 16 bits hold fewer; None: all bits of what they are stored in.
+        bits: bits of its values, 8 to 16, where images of 16 bits hold fewer; None: all bits of what they are stored in.
 
     Attributes:
         focal: `[2]`, as all others a float64 tensor.
@@ -164,7 +164,7 @@ class Camera(ImageMotion, nn.Module):
         """
         part = (0, 0, *self.image_size) if crop is None else crop
         blocks: Any = (binning, binning) if is_number(binning) else binning
-        mode = Mode.of(self.image_size, self.focal.tolist(), self.centre.tolist(), part, blocks)
+        mode = Mode.from_camera(self.image_size, self.focal.tolist(), self.centre.tolist(), part, blocks)
         lens = mode.size, mode.binned_focal, mode.binned_centre, self.distortion.tolist()
         made = Camera(self.model, *lens, ports=self.ports, medium_index=self.medium_index.item(), bits=self.bits)
         made.mode = mode

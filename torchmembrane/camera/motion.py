@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 LARGEST_SHIFT = 0.03
-"""Of half the image's diagonal: no camera that is fixed to a sensor moves so far; an image that has lost bytes does."""
+"""Largest shift over half the image's diagonal: a fixed camera never moves so far, but an image that lost bytes does."""
 
 
 def motion_of_pixels(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
@@ -25,15 +25,15 @@ def shift_of(moved: Tensor, pixels: Tensor, image_size: tuple[int, int]) -> Tens
     return shift
 
 
-def in_words(moved: Tensor, image_size: tuple[int, int]) -> Tensor:
+def to_degrees_and_scale(moved: Tensor, image_size: tuple[int, int]) -> Tensor:
     """The motion `[B, 4]` as du, dv (px), rotation (degrees) and scale."""
     du, dv, rotation, growth = moved.unbind(-1)
     half = _half_diagonal(image_size)
     return torch.stack([du, dv, torch.rad2deg(rotation / half), 1 + growth / half], -1)
 
 
-def in_pixels(motion: Tensor, image_size: tuple[int, int]) -> Tensor:
-    """What `in_words` gave as a motion in px again."""
+def to_pixels(motion: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """What `to_degrees_and_scale` gave as a motion in px again."""
     du, dv, rotation, scale = motion.unbind(-1)
     half = _half_diagonal(image_size)
     return torch.stack([du, dv, torch.deg2rad(rotation) * half, (scale - 1) * half], -1)
@@ -77,15 +77,15 @@ class ImageMotion:
         """The motion as du, dv (px), rotation (degrees) and scale, `[B, 4]`; of several images `[B, W, 4]`."""
         sizes = self.image_sizes
         if len(sizes) == 1:
-            return in_words(moved, sizes[0])
-        return torch.stack([in_words(each, size) for each, size in zip(moved.split(4, -1), sizes, strict=True)], -2)
+            return to_degrees_and_scale(moved, sizes[0])
+        return torch.stack([to_degrees_and_scale(each, size) for each, size in zip(moved.split(4, -1), sizes, strict=True)], -2)
 
     def motion_in_pixels(self, motion: Tensor) -> Tensor:
         """What `motion_in_words` gave as `moved` again."""
         sizes = self.image_sizes
         if len(sizes) == 1:
-            return in_pixels(motion, sizes[0])
-        return torch.cat([in_pixels(each, size) for each, size in zip(motion.unbind(-2), sizes, strict=True)], -1)
+            return to_pixels(motion, sizes[0])
+        return torch.cat([to_pixels(each, size) for each, size in zip(motion.unbind(-2), sizes, strict=True)], -1)
 
     def is_displaced(self, moved: Tensor) -> Tensor:
         """Whether an image is shifted farther than a camera moves, `[B]` bool."""

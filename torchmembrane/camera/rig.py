@@ -16,7 +16,7 @@ class Rig(ImageMotion, nn.Module):
 
     Args:
         cameras: W of them.
-        poses: of their frames in the first one's; reflected of mirrors.
+        poses: poses of their frames in the first one's; they reflect for mirrors.
         outside: which of them look at the membrane's outer side; default: none.
 
     Attributes:
@@ -91,7 +91,7 @@ def turns_by_noise(camera: Camera | Rig, pixels: Tensor, points: Tensor, covaria
         camera: what sees them.
         pixels: `[B, N, 2]`.
         points: `[B, N, 3]`: behind a port a ray's origin moves too, which turns it about a point.
-        covariance: of the pixels, `[N, 2, 2]` px^2.
+        covariance: covariance of the pixels, `[N, 2, 2]` px^2.
 
     Returns:
         `[B, N, 2, 3]`, the turns by one standard deviation of two independent noises.

@@ -18,8 +18,8 @@ class Checkerboard:
     """A checkerboard; the corner before the first inner one belongs to a dark square.
 
     Args:
-        columns: of inner corners.
-        rows: of inner corners.
+        columns: number of columns of inner corners.
+        rows: number of rows of inner corners.
         square: side of a square, length unit.
 
     Raises:
@@ -67,10 +67,10 @@ class DotBoard:
     """A board of dots; three larger ones mark place and turn.
 
     Args:
-        columns: of dots.
-        rows: of dots.
+        columns: number of columns of dots.
+        rows: number of rows of dots.
         pitch: between their centres, length unit.
-        radius: of the small ones; default: 0.22 pitches.
+        radius: radius of the small ones; default: 0.22 pitches.
 
     Raises:
         MembraneError: fewer than 8 x 6 dots, no positive pitch, or dots that touch.

@@ -31,10 +31,10 @@ The rest surface is tested where it can fail: what tension and pressure leave un
 blown up in the same rim, what that holds, what a gauge reads (--overpressure), and what either does to forces.
 
 --accuracy presses the sensor in the simulator, some 150 images, and reconstructs them: noise at rest, the lightest touch found,
-errors of force, depth and place, how near two touches are told apart, how deep a press may be. Some minutes of processor time,
-more for larger images. Interrupted, it keeps the series of presses that are finished, in accuracy-*.unfinished.json beside
---out, else in the current folder; the same command goes on from there and removes the file at the end. SENSOR.toml may be
-preset:NAME.
+errors of force, depth and place, the distance that resolves two contacts, how deep a press may be. It takes some minutes of
+processor time, more for larger images. An interrupted command keeps the finished series of presses in a file
+accuracy-*.unfinished.json beside --out, or else in the current folder. The same command continues from there and removes the
+file at the end. SENSOR.toml may be preset:NAME.
 
 exit code: 0 the sensor can be used, 2 it cannot: the message says why"""
 
@@ -54,7 +54,7 @@ def add_parser(commands: Any) -> None:
     gauge = "what a gauge reads at rest, inside over outside, with its unit, as 12hPa: compared with the model's"
     add("--overpressure", metavar="P", type=pressure, help=gauge)
     add("--accuracy", action="store_true", help="also what to expect of it, from simulated presses")
-    add("--seed", type=seed, help="of presses and noise of --accuracy (default: 0)")
+    add("--seed", type=seed, help="seed of presses and noise of --accuracy (default: 0)")
     noise = "of images of --accuracy, white over the noise's standard deviation (default: as in the rest image, else 40)"
     add("--noise", metavar="DB", type=number_from(0, MOST_DECIBEL), help=noise)
     add("--jobs", metavar="J", type=count, help="processes of --accuracy (default: all cores)")

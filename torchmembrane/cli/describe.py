@@ -77,7 +77,7 @@ def described(sensor: Sensor, reconstructor: Reconstructor | None = None, frame:
 
 def _range(sensor: Sensor) -> str:
     """The limits of the sensor's answers, and where they come from."""
-    own = sensor.range.of(sensor.fingerprint)
+    own = sensor.range.for_fingerprint(sensor.fingerprint)
     size, unit = sensor.membrane.size, sensor.length_unit
     limits = f"up to {own.depth * size:.3g} {unit} deep, the surface turned by {own.turn:.3g} degrees"
     if own.sensor:

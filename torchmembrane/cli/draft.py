@@ -116,7 +116,7 @@ def refuse_foreign(arguments: Namespace) -> None:
     for name in LENGTHS:
         if getattr(arguments, name) is not None and name not in allowed:
             expected = ", ".join(f"--{other.replace('_', '-')}" for other in SHAPES[arguments.shape])
-            raise MembraneError(f"init: --{name.replace('_', '-')} is no length of a {arguments.shape}; expected {expected}")
+            raise MembraneError(f"init: --{name.replace('_', '-')} is not a length of a {arguments.shape}; expected {expected}")
     for one, other in (("focal", "view"), ("dots", "pitch"), ("rest", "pitch")):
         if getattr(arguments, one) is not None and getattr(arguments, other) is not None:
             raise MembraneError(f"init: --{one} and --{other}; expected one of them, either says the same")

@@ -21,13 +21,13 @@ class FrameImages:
     Args:
         files: of those that there are.
         size: width and height that they must have, px.
-        bits: of the camera, where it is known that 16-bit files hold fewer.
+        bits: bits of the camera, where it is known that 16-bit files hold fewer.
     """
 
     def __init__(self, files: Mapping[str, Path], size: tuple[int, int], bits: int | None = None):
         self.files, self.size, self.bits = files, size, bits
 
-    def of(self, name: str) -> "np.ndarray | None":
+    def named(self, name: str) -> "np.ndarray | None":
         """Grey values `[height, width]` in 0..1, or None."""
         from ..files.images import read_image
 
@@ -53,7 +53,7 @@ def draw_film(results: "Results", images: FrameImages, path: Path, rate: float =
     check_film(path, rate)
     named = zip(results.names, tqdm(results, unit="frame", desc="draw"), strict=True)
     count = 4 if any(bool(frame["traction"].any()) for frame in results) else 3
-    drawn = (figure(frame, results.mesh, images.of(name), name, count) for name, frame in named)
+    drawn = (figure(frame, results.mesh, images.named(name), name, count) for name, frame in named)
     write_film(path, map(picture_of, drawn), rate)
     print(f"{len(results)} frames drawn in {path}")
 
@@ -65,6 +65,6 @@ def draw_sheet(results: "Results", images: FrameImages, path: Path) -> None:
     from ..plot.sheet import sheet_figure
 
     names = evenly(results.names, MOST_FRAMES)
-    chosen = {name: (results[name], images.of(name)) for name in names}
+    chosen = {name: (results[name], images.named(name)) for name in names}
     save(sheet_figure(chosen, results.mesh), path, "view")
     print(f"{len(names)} of {len(results)} frames drawn in {path}")

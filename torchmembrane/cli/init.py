@@ -88,8 +88,8 @@ def add_parser(commands: Any) -> None:
     """Add the command's parser."""
     add = add_command(commands, "init", run, PURPOSE, EXAMPLES)
     add("sensor", metavar="SENSOR.toml", type=Path, help="the file to write")
-    add("--name", help="of the sensor (default: the file's)")
-    add("--unit", choices=LENGTH_UNITS, default=LENGTH_UNITS[0], help="of all lengths (default: %(default)s)")
+    add("--name", help="name of the sensor (default: the name of the file)")
+    add("--unit", choices=LENGTH_UNITS, default=LENGTH_UNITS[0], help="unit of all lengths (default: %(default)s)")
     add_force(add)
     _add_membrane(add)
     _add_camera(add)
@@ -108,16 +108,26 @@ def _add_membrane(add: Add) -> None:
         "--outline",
         metavar="RIM.csv",
         type=Path,
-        help="in place of --shape: a sheet blown up in the closed rim of these points",
+        help="instead of --shape: a sheet inflated in the closed rim of these points",
     )
-    add("--size", metavar="A,B", type=positive_pair("two lengths, A,B"), help="of the rectangle or ellipse, along x and y")
+    add("--size", metavar="A,B", type=positive_pair("two lengths, A,B"), help="size of the rectangle or ellipse, along x and y")
     add("--corner", metavar="R", type=positive, help="radius of the rectangle's corners (default: 0)")
-    add("--radius", metavar="R", type=positive, help="of the dome, of the cap's or bubble's rim, or of the half cylinder")
+    add(
+        "--radius",
+        metavar="R",
+        type=positive,
+        help="radius of the dome, of the rim of the cap or bubble, or of the half cylinder",
+    )
     height = "of the cap, bubble or blown up sheet, from its rim's plane to its highest point; its unit may follow: 6mm"
     add("--height", metavar="H", type=_length, help=height)
-    add("--semi-axes", metavar="A,B,C", type=vector, help="of the fingertip along x, y, z")
-    add("--length", metavar="L", type=positive, help="of the half cylinder, along x")
-    add("--half-angle", metavar="DEGREES", type=positive, help="of the half cylinder to either side of its top (default: 90)")
+    add("--semi-axes", metavar="A,B,C", type=vector, help="semi-axes of the fingertip along x, y, z")
+    add("--length", metavar="L", type=positive, help="length of the half cylinder, along x")
+    add(
+        "--half-angle",
+        metavar="DEGREES",
+        type=positive,
+        help="angle from the top of the half cylinder to either side (default: 90)",
+    )
 
 
 def _add_camera(add: Add) -> None:
@@ -127,7 +137,7 @@ def _add_camera(add: Add) -> None:
     size = count_pair("two counts, WIDTH,HEIGHT", LONGEST_SIDE)
     add("--image-size", metavar="WIDTH,HEIGHT", type=size, help="px (default: the rest image's)")
     add("--focal", metavar="PX", type=positive, help="focal length, px; fisheye: px / rad")
-    add("--view", metavar="DEGREES", type=positive, help="in place of --focal: field of view across the image's width")
+    add("--view", metavar="DEGREES", type=positive, help="instead of --focal: field of view across the image's width")
     centre = positive_pair("two numbers, U,V")
     add("--centre", metavar="U,V", type=centre, help="principal point, px (default: the rim's centre, else the image's)")
     few = "of the camera, where 16-bit images hold fewer, as 10 or 12 (default: 16)"
@@ -137,16 +147,20 @@ def _add_camera(add: Add) -> None:
 
 
 def _add_material(add: Add) -> None:
-    add("--filling", choices=FILLINGS, help="of the cavity (default: of a bubble or a blown up sheet gas, else liquid)")
+    add(
+        "--filling",
+        choices=FILLINGS,
+        help="filling of the cavity (default: gas for a bubble or an inflated sheet, else liquid)",
+    )
     prestretch = "of the membrane at rest (default: from the overpressure, else 1.2); of the sheet in its rim (else 1.1)"
     add("--overpressure", metavar="P", type=pressure, help="inside over outside, at rest, with its unit: 20hPa, 2kPa, 0.3psi")
     add("--prestretch", metavar="L", type=positive, help=prestretch)
-    add("--shear-modulus", metavar="G", type=positive, help="N / length unit^2: a third of Young's modulus")
+    add("--shear-modulus", metavar="G", type=positive, help="shear modulus, N / length unit^2: a third of Young's modulus")
     add(
         "--thickness",
         metavar="T",
         type=positive,
-        help="of the membrane at rest, of the sheet in its rim: unstretched, over prestretch^2",
+        help="thickness of the membrane at rest, or of the sheet in its rim: unstretched thickness / prestretch^2",
     )
 
 
@@ -154,7 +168,12 @@ def _add_markers(add: Add) -> None:
     add("--rest", metavar="REST.png", help="image of the membrane at rest; without --dots, the dots are found in it")
     add("--dots", metavar="FILE.csv", type=Path, help="list of dots, in one of the frames below")
     add("--pitch", metavar="LENGTH", type=positive, help="without either: of a pattern of dots along the membrane")
-    add("--polarity", choices=POLARITIES, default=POLARITIES[0], help="of dots against their ground (default: %(default)s)")
+    add(
+        "--polarity",
+        choices=POLARITIES,
+        default=POLARITIES[0],
+        help="whether dots are darker or lighter than their ground (default: %(default)s)",
+    )
 
 
 def _rim(text: str) -> list[float] | str:

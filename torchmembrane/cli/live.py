@@ -61,7 +61,7 @@ MODULUS = (
 SOURCES = ("camera", "video", "images")
 OF_TORCH = ("grid", "energy", "flow", "smoothing", "locator")
 DEFAULTS = {"estimator": "force-balance", "device": "cpu"}
-"""Of torch as well."""
+"""Defaults of options that torch uses as well."""
 
 
 def add_parser(commands: Any) -> None:
@@ -249,7 +249,7 @@ def _requests_by_keys(length_unit: str) -> "deque[Request]":
 
 
 def request_of(text: str, length_unit: str) -> "Request":
-    """What a line asks for: `z`, a weight or a gauge's reading; anything else is answered by what is understood.
+    """The request of a typed line: `z`, a weight or a reading of a gauge; the answer to any other line is what is expected.
 
     Example:
         >>> request_of("q", "mm")(None)

@@ -147,7 +147,7 @@ def _stroke(arguments: Namespace, simulator: Simulator) -> Stroke:
     direction = np.array(arguments.direction)
     if not 1e-6 < np.abs(direction).max() < 1e6:
         raise MembraneError(
-            f"--direction {_listed(direction)}: expected X,Y,Z with a length, the side that the indenter comes from"
+            f"--direction {_listed(direction)}: expected X,Y,Z other than zero, the side from which the indenter comes"
         )
     slide = np.zeros(3) if arguments.slide is None else np.array(arguments.slide)
     turn, friction = np.deg2rad(arguments.turn), arguments.friction

@@ -8,16 +8,16 @@ from typing import Any
 LINE_SECONDS = 5.0
 """Between two lines where stderr is no terminal."""
 FEWEST_STEPS = 2
-"""Of which the rate is taken at least: processes side by side end several at once, and then none for a while."""
+"""Fewest steps for a rate: parallel processes end several steps at once, and then none for a while."""
 LEAST_DONE = 0.1
-"""Of the work that is done before the rate of its beginning counts, when processes may have had to start."""
+"""Share of the work after which the rate since its beginning counts, because processes may have had to start."""
 
 
 def announce(title: str) -> None:
     """Say that a command has begun, before packages are loaded that take seconds.
 
     Args:
-        title: of the command, as `calibrate material`.
+        title: title of the command, as `calibrate material`.
     """
     print(f"{title}: loading packages", file=sys.stderr, flush=True)
 
@@ -42,7 +42,7 @@ class ProgressDisplay:
     the beginning takes, other processes to start or code to compile, is soon forgotten.
 
     Args:
-        title: of the command.
+        title: title of the command.
 
     Example:
         >>> import contextlib
@@ -89,7 +89,7 @@ class ProgressDisplay:
         """Seconds until all is done; None until there is a rate to tell it by.
 
         Args:
-            share: of the work that is done.
+            share: share of the work that is done.
             now: seconds, of any clock; the first call begins.
         """
         self.told.append((share, now))

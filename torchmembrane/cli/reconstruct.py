@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ..jobs.inputs import Inputs
     from ..jobs.local import FrameCounts
     from ..reconstruct import Reconstructor
+    from ..results.store import Settings
 
 PURPOSE = "reconstruct surfaces from images or a video of one sensor"
 EXAMPLES = """\
@@ -70,7 +71,7 @@ def add_parser(commands: Any) -> None:
         action="store_true",
         help="treat every input as a video (mp4, mov, avi, mkv, webm, gif always are); extra video",
     )
-    add("--topic", metavar="TOPIC", help="of the images in bags of ROS 2 (default: the only one; needs the extra ros)")
+    add("--topic", metavar="TOPIC", help="topic of the images in bags of ROS 2 (default: the only one; needs the extra ros)")
     messages = "also a bag of their results, a folder: wrenches, tractions, of a gas pressures, in N, N m, m and Pa"
     add("--bag", metavar="BAG", type=Path, help=messages)
     own = "images of this recording without contact, or first:N, its first N frames: their mean is rest (default: the sensor's)"
@@ -100,7 +101,7 @@ def run(arguments: Namespace) -> int:
     from ..jobs.rest import recording_rest
     from ..presets import sensor_file
     from ..results.read import read_results
-    from ..results.store import Mesh, Settings, check_folder
+    from ..results.store import Mesh, check_folder
     from ..sensor.sensor import Sensor
     from .build import build_reconstructor
 
@@ -112,12 +113,11 @@ def run(arguments: Namespace) -> int:
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
     format = arguments.format or ("parquet" if by_ray else "npz")
-    fields = sorted(set(arguments.fields), key=FIELDS.index)
-    settings = Settings.of(reconstructor, format, " ".join(arguments.rest), str(arguments.pressure or ""), fields)
+    settings = _settings(reconstructor, arguments, format)
     check_folder(arguments.out, sensor.fingerprint, settings)
     for remark in bag_remarks(inputs, sensor.camera):
         print(f"torchmembrane: {remark}", file=sys.stderr)
-    mesh, shard = Mesh.of(reconstructor, settings), Shard(*arguments.shard)
+    mesh, shard = Mesh.from_reconstructor(reconstructor, settings), Shard(*arguments.shard)
     bag = result_bag(arguments.bag, inputs, mesh, reconstructor, shard) if arguments.bag else None
     rest = recording_rest(reconstructor, arguments.rest, inputs) if arguments.rest else None
     counts = reconstruct_files(
@@ -143,6 +143,15 @@ def run(arguments: Namespace) -> int:
     return 1 if counts.failed else 0
 
 
+def _settings(reconstructor: "Reconstructor", arguments: Namespace, format: str) -> "Settings":
+    """The settings of the results."""
+    from ..results.store import Settings
+
+    fields = sorted(set(arguments.fields), key=FIELDS.index)
+    given = " ".join(arguments.rest), str(arguments.pressure or "")
+    return Settings.from_reconstructor(reconstructor, format, *given, fields)
+
+
 def _pressures(log: Path, reconstructor: "Reconstructor", inputs: "Inputs") -> "Gauge":
     """What a gauge's log says of the frames; unused readings are counted."""
     from ..jobs.pressure import recording_pressures
@@ -161,7 +170,7 @@ def _check(arguments: Namespace) -> None:
     if arguments.engine == "local":
         check_device(arguments.device)
     if arguments.fields and (arguments.engine == "ray" or arguments.format == "parquet"):
-        raise MembraneError("--fields with a Parquet dataset, whose columns are fixed; expected --format npz")
+        raise MembraneError("--fields does not work with a Parquet dataset, whose columns are fixed; pass --format npz")
     if arguments.engine == "ray" and arguments.format == "npz":
         raise MembraneError("--engine ray --format npz: Ray's results are one dataset; leave --format out, or pass parquet")
     if arguments.video_out is not None:

@@ -78,12 +78,12 @@ def _errors(sheet: SpecSheet) -> Iterator[str]:
 def _closest(sheet: SpecSheet) -> Iterator[str]:
     pair, unit = sheet.closest, sheet.length_unit
     if not sheet.pairs:
-        yield "touches: not tried"
+        yield "contacts: not tried"
         return
     if pair.told:
-        yield f"touches told apart from a distance of {_spread(pair.distance, unit)} on"
+        yield f"contacts resolved from a distance of {_spread(pair.distance, unit)} on"
     tried = f"tried from {_number(pair.widest)} down to {_number(pair.nearest)} {unit}"
-    yield f"told apart in {pair.told} of {pair.directions} directions; {tried}"
+    yield f"resolved in {pair.told} of {pair.directions} directions; {tried}"
 
 
 def _deepest(sheet: SpecSheet) -> Iterator[str]:

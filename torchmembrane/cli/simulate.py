@@ -65,7 +65,7 @@ def add_parser(commands: Any) -> None:
     add_sensor(add)
     add("--out", metavar="DIR", type=Path, required=True, help="folder of frames: new, or of the same sensor and appearance")
     add_force(add)
-    add("--name", type=file_name, default="press", help="of a single press' files (default: %(default)s)")
+    add("--name", type=file_name, default="press", help="name of the files of a single press (default: %(default)s)")
     _add_press(add)
     _add_sequence(add)
     _add_appearance(add)
@@ -75,9 +75,11 @@ def _add_press(add: Add) -> None:
     kinds = ", ".join(INDENTERS)
     mesh = "or a closed mesh that presses along its +z (STL, OBJ, PLY)"
     add("--indenter", metavar="KIND", help=f"{kinds}, {mesh}; with --random several, a,b,c")
-    add("--radius", metavar="R", type=positive, help="of a sphere or cylinder; of the edges' rounding of a wedge or box")
-    add("--sides", metavar="X,Y,Z", type=vector, help="of a box; it presses along Z")
-    add("--opening", metavar="DEGREES", type=positive, help="of a wedge")
+    add(
+        "--radius", metavar="R", type=positive, help="radius of a sphere or cylinder, or of the rounded edges of a wedge or box"
+    )
+    add("--sides", metavar="X,Y,Z", type=vector, help="sides of a box; it presses along Z")
+    add("--opening", metavar="DEGREES", type=positive, help="opening angle of a wedge")
     add("--depth", metavar="D", type=positive, help="how far it moves from its first touch")
     direction = "the side that it comes from, seen from the point it aims at (default: %(default)s, straight at the camera)"
     add("--direction", metavar="X,Y,Z", type=vector, default="0,0,1", help=direction)
@@ -96,7 +98,7 @@ def _add_sequence(add: Add) -> None:
     add("--frames", metavar="N", type=count, default=10, help="frames on each leg of --path (default: %(default)s)")
     add("--video", action="store_true", help="--path as NAME.mp4 instead of images (extra video)")
     add("--random", metavar="N", type=count, help="a data set of N random presses")
-    add("--seed", type=seed, default=0, help="of presses and noise (default: %(default)s)")
+    add("--seed", type=seed, default=0, help="seed of presses and noise (default: %(default)s)")
     add("--jobs", metavar="J", type=count, default=os.cpu_count(), help="processes of --random (default: all cores)")
     stored = "of --random: png and npz files, or a Parquet data set (extra parquet)"
     add("--format", choices=SIMULATION_FORMATS, default=SIMULATION_FORMATS[0], help=stored)
@@ -115,10 +117,15 @@ def _add_appearance(add: Add) -> None:
     blur = "defocus, standard deviation (default: %(default)s)"
     add("--blur", metavar="PX", type=number_from(0, MOST_BLUR), default=BLUR, help=blur)
     radii, grid = positive_pair("two radii, SMALL,LARGE"), count_pair("two counts of vertices, M,N", MOST_LINES)
-    add("--dots", metavar="SMALL,LARGE", type=radii, help="their radii (default: 0.16 and 0.27 of their spacing)")
+    add(
+        "--dots",
+        metavar="SMALL,LARGE",
+        type=radii,
+        help="their radii (default: 0.16 and 0.27 of the spacing)",
+    )
     missing = numbers("numbers of dots, as 0,17,18")
     add("--missing", metavar="I,J", type=missing, default=(), help="dots that are not painted, from 0")
-    add("--grid", metavar="M,N", type=grid, help="of the equilibrium (default: 38 per side, or finer than the sensor's)")
+    add("--grid", metavar="M,N", type=grid, help="grid of the equilibrium (default: 38 per side, or finer than the sensor's)")
 
 
 def run(arguments: Namespace) -> int:

@@ -131,7 +131,7 @@ def _show(results: "Results", images: FrameImages, times: dict[str, float], save
 
     with RerunLog(results.mesh, save) as log:
         for number, (name, frame) in enumerate(zip(results.names, results, strict=True)):
-            log.add(number, frame, images.of(name), times.get(name))
+            log.add(number, frame, images.named(name), times.get(name))
     print(f"{len(results)} frames {f'written to {save}' if save else 'shown in Rerun'}")
 
 

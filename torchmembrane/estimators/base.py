@@ -176,7 +176,7 @@ class Estimator(nn.Module, ABC):
         membrane: the rest surface on the solver's grid.
         cavity: what the fluid asks of the volume; of a problem, `problem.cavity_law()`.
         settings: default: those of `Settings()`.
-        spacing: of the markers, length unit, where it limits what is known of contacts.
+        spacing: spacing of the markers, length unit, where it limits what is known of contacts.
 
     Attributes:
         Settings: a frozen dataclass, of which every field has a default.
@@ -245,9 +245,9 @@ class Estimator(nn.Module, ABC):
 
         Args:
             camera: the sensor's `Camera`; of several views a `Rig`.
-            pixels: of the markers, `[B, D, 2]`; those of a lost one mean nothing.
-            confidence: of the markers, `[B, D]`, 0 for a lost one.
-            covariance: of the pixels, `[B, D, 2, 2]` px^2, with the model's own error.
+            pixels: pixels of the markers, `[B, D, 2]`; those of a lost one mean nothing.
+            confidence: confidence of the markers, `[B, D]`, 0 for a lost one.
+            covariance: covariance of the pixels, `[B, D, 2, 2]` px^2, with the model's own error.
         """
 
     @abstractmethod
@@ -283,7 +283,7 @@ class Estimator(nn.Module, ABC):
 
         Args:
             found: by `forward`.
-            normals: of the surface, outward unit vectors `[B, V, 3]`.
+            normals: normals of the surface, outward unit vectors `[B, V, 3]`.
         """
         return self.patches.bulges(found.vertices, normals, found.traction if self.finds_tractions else None)
 
@@ -334,7 +334,7 @@ class Estimator(nn.Module, ABC):
 
     @property
     def volume(self) -> str:
-        """The volume's constraint, as `mesh.npz` names it; default: that of the settings, else "exact"."""
+        """Name of the volume constraint in `mesh.npz`; default: that of the settings, or "exact"."""
         return str(getattr(self.settings, "volume", "exact"))
 
     @property

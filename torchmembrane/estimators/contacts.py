@@ -144,7 +144,7 @@ class ContactPatches(nn.Module):
 
     Args:
         membrane: the rest surface on the solver's grid.
-        spacing: of the markers on it, length unit; 0 where it does not limit what is resolved.
+        spacing: spacing of the markers on it, length unit; 0 where it does not limit what is resolved.
     """
 
     near_rim: Tensor
@@ -209,7 +209,7 @@ class ContactPatches(nn.Module):
             x: the surface `[B, V, 3]`.
             normals: its outward normals `[B, V, 3]`.
             traction: contact force per rest area, `[B, V, 3]`.
-            indicator: of contact, `[B, V]`.
+            indicator: indicator of contact, `[B, V]`.
             points: the patches' centroids `[B, P, 3]`, NaN where there is none.
             mine: `[B, P, V]`, 1 where a vertex is the patch's, else 0.
         """

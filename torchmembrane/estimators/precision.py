@@ -24,11 +24,11 @@ def check_precision(dtype: torch.dtype) -> None:
         )
 
 
-def shortened(matrix: Tensor) -> Tensor:
+def rounded_to_float32(matrix: Tensor) -> Tensor:
     """A matrix of means as single precision holds it: its last digits mean nothing, and a model's file keeps half.
 
     Example:
-        >>> shortened(torch.tensor(0.1, dtype=torch.float64)).item()
+        >>> rounded_to_float32(torch.tensor(0.1, dtype=torch.float64)).item()
         0.10000000149011612
     """
     return matrix.float().to(matrix)

@@ -82,7 +82,7 @@ def check_protocol(kind: Any, given: str) -> None:
         MembraneError: it is no class, or lacks parts of the protocol, which are named.
     """
     if not isinstance(kind, type):
-        raise MembraneError(f"{given} is no class; expected a subclass of torchmembrane.Estimator")
+        raise MembraneError(f"{given} is not a class; expected a subclass of torchmembrane.Estimator")
     lacking = [] if issubclass(kind, Estimator) else ["the base class torchmembrane.Estimator"]
     lacking += [part for part in PROTOCOL if not _defines(kind, part)]
     settings = getattr(kind, "Settings", None)
@@ -97,7 +97,7 @@ def refuse_unfit(sensor: Sensor, name: str, kind: type[Estimator]) -> None:
 
     Args:
         sensor: the sensor.
-        name: of the estimator, for messages.
+        name: name of the estimator, for messages.
         kind: its class.
 
     Raises:
@@ -116,9 +116,9 @@ def built_estimator(problem: Problem, name: str, kind: type[Estimator], settings
 
     Args:
         problem: the sensor's.
-        name: of the estimator, for messages.
+        name: name of the estimator, for messages.
         kind: its class.
-        settings: of that class; None: its defaults.
+        settings: settings of that class; None: its defaults.
 
     Raises:
         MembraneError: settings of another estimator.

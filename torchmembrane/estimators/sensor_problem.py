@@ -17,7 +17,7 @@ def problem_of(seen: Sightings, membrane: Membrane, elasticity: ElasticEnergy, c
     Args:
         seen: how its markers are seen.
         membrane: the rest surface on the solver's grid.
-        elasticity: of it.
+        elasticity: elasticity of the membrane.
         cavity: what fills it.
     """
     views = len(seen.positions) // len(seen.markers.positions)

@@ -71,8 +71,8 @@ def remove_partials(folder: Path, processes: Iterable[int | None]) -> None:
     """Remove the unfinished files of processes that were killed while they wrote to a folder.
 
     Args:
-        folder: any.
-        processes: their numbers.
+        folder: where the files are.
+        processes: numbers of these processes.
     """
     for left in [path for process in processes for path in folder.glob(f".*-{process}.partial")]:
         left.unlink(missing_ok=True)
@@ -86,7 +86,7 @@ def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
         content: its bytes.
 
     Raises:
-        MembraneError: as `whole_file`.
+        MembraneError: as for `whole_file`.
     """
     with whole_file(path) as partial:
         partial.write_bytes(content)
@@ -154,7 +154,7 @@ def make_subfolder(path: Path) -> Path:
     """Make a folder within a folder of results; a symbolic link in its place is refused.
 
     Raises:
-        MembraneError: as `make_folder`; or the folder is a symbolic link.
+        MembraneError: as for `make_folder`; or the folder is a symbolic link.
     """
     if path.is_symlink():
         raise MembraneError(f"{path}: is a symbolic link to {os.readlink(path)}; expected a folder of its own: remove the link")

@@ -7,7 +7,7 @@ PATTERNS = ("rggb", "bggr", "gbrg", "grbg")
 CROSS = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 4
 """Weights of the green pixels around one: of its own value, or of four neighbours."""
 SQUARE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4
-"""Of the red ones, or the blue ones: of its own value, of two neighbours, or of four."""
+"""Weights of the red or blue values: of a pixel's own, of two neighbours, or of four."""
 
 
 def demosaiced(mosaic: np.ndarray, pattern: str) -> np.ndarray:

@@ -72,7 +72,7 @@ class Row(NamedTuple):
     Attributes:
         path: the file.
         line: its number, from 1.
-        places: of the columns among the cells, by name.
+        places: places of the columns among the cells, by name.
         cells: the line's.
     """
 
@@ -137,7 +137,7 @@ def read_table(path: Path, columns: Columns, most_bytes: int) -> Table:
     """Read the lines of a table; a cell is checked when it is asked for.
 
     Args:
-        path: of the file, CSV.
+        path: path of the file, CSV.
         columns: that it may have.
         most_bytes: that it may hold.
 

@@ -123,7 +123,7 @@ def stored(image: Image.Image, size: tuple[int, int] | None = None) -> Stored:
     """The current picture of an opened image.
 
     Args:
-        image: as `opened` gives it.
+        image: as for `opened` gives it.
         size: width and height that it must have, px; it is looked at before pixels are decoded.
 
     Raises:
@@ -165,7 +165,7 @@ def refuse_damaged(image: Image.Image, content: bytes) -> None:
 
     Args:
         image: that was loaded.
-        content: of its file; of a JPEG among several in a file, from its beginning on.
+        content: content of its file; of a JPEG among several in a file, from its beginning on.
 
     Raises:
         ValueError: it is damaged; of a PNG others of `DAMAGE` as well.

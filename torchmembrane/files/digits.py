@@ -1,4 +1,4 @@
-"""How many digits of a number are written; it depends on the number's size, because lengths may be in any unit."""
+"""The number of digits to write, which depends on the size of a number because lengths may be in any unit."""
 
 import math
 

@@ -21,7 +21,7 @@ class Shard(NamedTuple):
 
     Attributes:
         number: 1 to `total`.
-        total: of all shards.
+        total: number of all shards.
 
     Example:
         >>> shards = [Shard(1, 2), Shard(2, 2)]

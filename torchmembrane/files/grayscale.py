@@ -34,7 +34,7 @@ def to_grayscale_batch(
         size: width and height, px.
         channels: order of the three channels, "rgb" or "bgr".
         like: a tensor.
-        bits: of the camera, if fewer than the 16 of uint16 images: white is `2^bits - 1`.
+        bits: bits of the camera, if fewer than the 16 of uint16 images: white is `2^bits - 1`.
 
     Raises:
         MembraneError: another shape, size or type, or values beyond `bits`; says what came, what was expected, and how to

@@ -18,7 +18,7 @@ from .safe_read import DAMAGE, in_one_line, read_bytes, regular_size
 from .tiff import refuse_damaged_page
 
 MOST_IMAGE_BYTES, MOST_STACK_BYTES = 2**28, 2**32
-"""Of a file; of a TIFF of several pages, which are read one by one."""
+"""Largest file; largest TIFF of several pages, which are read one by one."""
 MOST_PICTURES = 2**17
 """In a file."""
 GREY = (0.299, 0.587, 0.114)
@@ -34,7 +34,7 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None, bits: int 
     Args:
         path: a PNG, JPEG, BMP, TIFF or WebP file with one picture.
         size: width and height that it must have, px; it is looked at before pixels are decoded.
-        bits: of the camera, where 16-bit files hold fewer; None: as the file says, or 16.
+        bits: bits of the camera, where 16-bit files hold fewer; None: as the file says, or 16.
 
     Returns:
         Grey values.
@@ -58,13 +58,13 @@ def decode_image(content: bytes, name: str | Path, size: tuple[int, int] | None 
     """The grey values of an image file's content, as `read_image` gives them.
 
     Args:
-        content: of a PNG, JPEG, BMP, TIFF or WebP file.
+        content: content of a PNG, JPEG, BMP, TIFF or WebP file.
         name: what an error calls it.
         size: width and height that it must have, px.
-        bits: as `read_image`.
+        bits: as for `read_image`.
 
     Raises:
-        MembraneError: as `read_image`.
+        MembraneError: as for `read_image`.
     """
     with _opened_single(name, content) as image:
         grey = _grey_of(image, size, bits)
@@ -80,7 +80,7 @@ def read_pixels(name: str | Path, content: bytes | None = None) -> np.ndarray:
         content: what the file holds; default: it is read.
 
     Raises:
-        MembraneError: as `read_image`.
+        MembraneError: as for `read_image`.
 
     Example:
         >>> read_pixels("examples/rest.png").dtype
@@ -97,10 +97,10 @@ def image_size(path: str | Path) -> tuple[int, int]:
     """Width and height of an image file, px, without decoding its pixels.
 
     Args:
-        path: as `read_image`.
+        path: as for `read_image`.
 
     Raises:
-        MembraneError: the file is missing, no image, too large, or has several pictures.
+        MembraneError: the file is missing, is not an image, is too large, or has several pictures.
 
     Example:
         >>> image_size("examples/rest.png")
@@ -134,7 +134,7 @@ def stack_images(path: Path, size: tuple[int, int], bits: int | None = None) -> 
     Args:
         path: a PNG, JPEG, BMP, TIFF or WebP file of one picture or more.
         size: width and height that they must have, px.
-        bits: as `read_image`.
+        bits: as for `read_image`.
 
     Yields:
         Grey values, or an error that does not name the file.
@@ -221,16 +221,16 @@ def mean_image(paths: Sequence[Path], bits: int | None = None) -> np.ndarray:
 
     Args:
         paths: one file or more.
-        bits: as `read_image`.
+        bits: as for `read_image`.
 
     Raises:
-        MembraneError: as `read_image`; or the images differ in size.
+        MembraneError: as for `read_image`; or the images differ in size.
     """
     first = image_size(paths[0])
     for path in paths[1:]:
         if (size := image_size(path)) != first:
             sizes = ["{} x {}".format(*each) for each in (size, first)]
-            raise MembraneError(f"{path} is {sizes[0]} px; expected {sizes[1]} as {paths[0]}: give images of one camera mode")
+            raise MembraneError(f"{path} is {sizes[0]} px; expected {sizes[1]} as in {paths[0]}: give images of one mode")
     total = np.zeros(first[::-1])
     for path in paths:
         total += read_image(path, first, bits)
@@ -242,7 +242,7 @@ def to_grey(array: np.ndarray, bits: int | None = None) -> np.ndarray:
 
     Args:
         array: `[height, width]` grey or `[height, width, 3]` RGB; uint8 (0..255), uint16 (0..65535) or float (0..1).
-        bits: of the camera, where a uint16 holds fewer: white is `2^bits - 1`.
+        bits: bits of the camera, where a uint16 holds fewer: white is `2^bits - 1`.
 
     Raises:
         MembraneError: another shape or type, a value not finite, outside 0..1 or beyond `bits`.
@@ -285,7 +285,7 @@ def write_image(stem: str | Path, grey: np.ndarray, bits: int | None = None) -> 
     Args:
         stem: the file without its ending, `.png` or `.tiff`.
         grey: `[height, width]` in 0..1.
-        bits: of the camera, with which it will be read.
+        bits: bits of the camera, with which it will be read.
 
     Returns:
         The path.
@@ -312,7 +312,7 @@ def write_as_taken(stem: str | Path, image: np.ndarray, bits: int | None = None)
         stem: the file without its ending, `.png` or `.tiff`.
         image: `[height, width]` uint8 or uint16, `[height, width, 3]` uint8, or grey values as for `write_image`; of
             `[height, width, 3]` uint16 the grey values are written.
-        bits: of the camera, with which it will be read.
+        bits: bits of the camera, with which it will be read.
 
     Returns:
         The path.

@@ -9,7 +9,7 @@ FRAMES = (0xC0, 0xC1, 0xC2)
 """Markers that begin the header of a frame coded by Huffman's method."""
 SCAN, RESTART_INTERVAL = 0xDA, 0xDD
 FILL, BARE = 0xFF, (0x01, *range(0xD0, 0xD9))
-"""What may stand before a marker, and markers without a segment."""
+"""The byte that may fill the space before a marker, and the markers without a segment."""
 RESTART = re.compile(rb"\xff[\xd0-\xd7]")
 SEGMENT = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 """Markers within the data of a scan, and behind them."""
@@ -29,7 +29,7 @@ def is_whole(content: bytes) -> bool:
     that are alike, or up to `MOST_ODD`. Such padding is no damage. What ends early, or is not decodable, is damaged.
 
     Args:
-        content: of the file, grey or of three colours.
+        content: content of the file, grey or of three colours.
 
     Limitations:
         A decoder that loses its place in damaged data and ends up to `MOST_ODD` bytes early is not noticed, nor is damage for
@@ -63,7 +63,7 @@ def _is_decoded(content: bytes) -> bool:
 def _without_padding(content: bytes) -> Iterator[Iterator[bytes]]:
     """For each restart interval, files of it alone that end where its data may end; the whole picture is one interval where
     there are no restart markers, or several scans."""
-    header = _Header.of(content)
+    header = _Header.from_bytes(content)
     end = content.find(END, header.length) if header else -1
     if header is None or end < 0:
         yield iter(())
@@ -110,7 +110,7 @@ class _Header:
         self.unit = 8 * max(byte & 15 for byte in samplings), 8 * max(byte >> 4 for byte in samplings)
 
     @classmethod
-    def of(cls, content: bytes) -> "_Header | None":
+    def from_bytes(cls, content: bytes) -> "_Header | None":
         """The header of a file whose segments are in order; None for another file."""
         at, frame, restart = 2, 0, 0
         while at + 4 <= len(content) and content[at] == 0xFF:

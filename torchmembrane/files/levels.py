@@ -10,7 +10,7 @@ from ..errors import MembraneError, expect
 
 FEWEST_BITS, MOST_BITS = 8, 16
 USUAL_BITS = (8, 10, 12, 14)
-"""Of cameras whose values are stored in 16."""
+"""Numbers of bits of cameras whose values are stored in 16."""
 MOST_AVERAGED = 16
 """Pixels or images whose mean is still recognised as one of whole levels."""
 HIGHEST = 2**16 - 1
@@ -42,7 +42,7 @@ def white_of(stored: int, bits: int | None) -> int:
 
     Args:
         stored: bits that a value is stored in, 8 or 16.
-        bits: of the camera, where 16 hold fewer; None: those it is stored in.
+        bits: bits of the camera, where 16 hold fewer; None: those it is stored in.
 
     Example:
         >>> white_of(16, 12), white_of(16, None), white_of(8, 12)
@@ -56,7 +56,7 @@ def refuse_beyond(highest: Any, white: int) -> None:
 
     Args:
         highest: of the values.
-        white: as `white_of` gives it.
+        white: as for `white_of` gives it.
 
     Raises:
         MembraneError: the highest is beyond white.

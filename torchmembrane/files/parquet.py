@@ -11,16 +11,16 @@ from .optional import load_pyarrow
 from .safe_read import DAMAGE, in_one_line, regular_size
 
 MOST_BYTES = 2**30
-"""Of a file, and of what its columns that are read take in memory."""
+"""Largest file, and largest size in memory of the columns that are read."""
 VALUE_BYTES = 8
-"""Of one value, at most."""
+"""Largest size of one value."""
 
 
 def read_table(path: Path, what: str, expected: str, columns: Sequence[str] | None = None) -> Any:
     """A Parquet file as a `pyarrow.Table`; checksums, where it has them, are compared.
 
     Args:
-        path: of the file.
+        path: path of the file.
         what: is read, for messages.
         expected: the remedy, for messages.
         columns: the ones that are read; None: all.

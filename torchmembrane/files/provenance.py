@@ -32,14 +32,14 @@ class SourceFile(NamedTuple):
     gauge: float = float("nan")
 
     @classmethod
-    def of(cls, file: Path, *further: Path) -> "SourceFile":
+    def from_files(cls, file: Path, *further: Path) -> "SourceFile":
         """The origin of a file as it is now; `further`: of the other views, in their order.
 
         Raises:
             OSError: one cannot be read.
 
         Example:
-            >>> rest, press = (SourceFile.of(Path("examples") / name) for name in ("rest.png", "flat_plate.png"))
+            >>> rest, press = (SourceFile.from_files(Path("examples") / name) for name in ("rest.png", "flat_plate.png"))
             >>> rest.content_hash == press.content_hash
             False
         """
@@ -64,7 +64,7 @@ class SourceFile(NamedTuple):
             size, modified = sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
             if not self.content_hash or (size, modified) == (self.file_size, self.file_modified):
                 return True
-            return size == self.file_size and SourceFile.of(*files).content_hash == self.content_hash
+            return size == self.file_size and SourceFile.from_files(*files).content_hash == self.content_hash
         except OSError:
             return True
 

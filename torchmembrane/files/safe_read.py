@@ -22,7 +22,7 @@ from ..errors import MembraneError
 from .atomic import kind_of
 
 MOST_ARRAY_BYTES = 2**26
-"""Of a file of arrays, and of the arrays that are read from it together."""
+"""Largest size of a file of arrays, and of all arrays that are read from it."""
 MOST_ARRAYS = 64
 """In a file."""
 NUMBERS, TEXT = "biuf", "U"
@@ -34,7 +34,7 @@ DAMAGE = (
     *(OSError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError, EOFError, RuntimeError, SyntaxError),
     *(MemoryError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
-"""What zipfile, zlib, numpy and Pillow raise of damaged files."""
+"""Exceptions that zipfile, zlib, numpy and Pillow raise for damaged files."""
 
 
 class LackingArray(MembraneError):
@@ -75,7 +75,7 @@ def regular_size(path: Path, most: int, expected: str) -> int:
     """The size of a regular file in bytes; it is not opened.
 
     Args:
-        path: as `read_bytes`.
+        path: as for `read_bytes`.
         most: bytes that it may hold.
         expected: what is to be read, for messages.
 
@@ -100,19 +100,19 @@ def read_text(path: Path, most: int, expected: str) -> str:
     """A file's text: UTF-8, with or without a byte order mark.
 
     Args:
-        path: as `read_bytes`.
-        most: bytes that it may hold.
-        expected: what is read, for messages.
+        path: as for `read_bytes`.
+        most: largest number of bytes that it may hold.
+        expected: what the file should be, for messages.
 
     Raises:
-        MembraneError: as `read_bytes`; or it is not UTF-8, or holds NUL.
+        MembraneError: as for `read_bytes`; or the file is not UTF-8, or contains NUL.
     """
     try:
         text = read_bytes(path, most, expected).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise MembraneError(f"{path}: not UTF-8 text ({error}); expected {expected}, saved as UTF-8") from error
     if "\0" in text:
-        raise MembraneError(f"{path}: holds NUL, so it is no text; expected {expected}, saved as UTF-8")
+        raise MembraneError(f"{path}: contains NUL, so it is not text; expected {expected}, saved as UTF-8")
     return text
 
 
@@ -122,10 +122,10 @@ def read_arrays(
     """Arrays from an `.npz`, by name. Sizes are checked before anything is unpacked; nothing is unpickled.
 
     Args:
-        path: of the file.
-        names: of the arrays, others that the file may hold are not read; None: all.
+        path: path of the file.
+        names: names of the arrays, others that the file may hold are not read; None: all.
         expected: what is read, for messages.
-        kinds: of their types, `NUMBERS` or `NUMBERS + TEXT`.
+        kinds: kinds of types that they may have, `NUMBERS` or `NUMBERS + TEXT`.
 
     Raises:
         MembraneError: no such file, a damaged or too large one, or one that lacks an array.
@@ -158,7 +158,7 @@ def read_array(path: Path) -> np.ndarray:
     """The array of numbers of an `.npy`, checked as `read_arrays` does.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
         MembraneError: no such file, or a damaged or too large one.

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 OF_SYSTEM = re.compile(r"\._.*|\.DS_Store|(eh)?thumbs\.db|desktop\.ini|icon\r", re.IGNORECASE)
-"""Of macOS on other systems' disks, with a file's attributes: `._NAME`; views of folders: the others."""
+"""Files that macOS leaves on other systems' disks with a file's attributes (`._NAME`), and views of folders (the others)."""
 
 
 def is_of_system(path: Path) -> bool:

@@ -16,7 +16,7 @@ UNCOMPRESSED, DEFLATED, LZW, PACKBITS, REVERSED, SUBSAMPLED, APART = 1, (8, 3294
 CLEAR, END, MOST_CODES = 256, 257, 4096
 """Codes of LZW that begin a new table and end the data, and how many a table has."""
 OLD_LZW = re.compile(b"\0[\x01\x03\x05\x07\x09\x0b\x0d\x0f]")
-"""How data of another order of bits begin, which are not looked at."""
+"""Beginning of data with another order of bits, which are not checked."""
 SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 """Bytes of a value, by its type."""
 FURTHER = {330, 34665, 34853, 40965}
@@ -33,7 +33,7 @@ def refuse_damaged_page(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
     """Refuse a page whose compressed data have a wrong checksum or go on after its last pixel, where decoders stop.
 
     Args:
-        tags: of the page.
+        tags: tags of the page.
         file: that holds it.
 
     Raises:
@@ -62,7 +62,7 @@ def refuse_displaced(tags: ImageFileDirectory_v2, file: IO[bytes]) -> None:
     Equal bytes are taken for padding.
 
     Args:
-        tags: of the page.
+        tags: tags of the page.
         file: that holds it.
 
     Raises:

@@ -40,7 +40,7 @@ def video_pictures(path: Path, size: tuple[int, int]) -> Iterator[Any]:
     The pictures after a damaged one count as damaged too, up to the next key frame.
 
     Args:
-        path: of the video.
+        path: path of the video.
         size: width and height that they must have, px.
 
     Yields:
@@ -79,8 +79,8 @@ def picture_values(picture: Any, bits: int | None = None) -> np.ndarray:
     """A picture's values: RGB `[height, width, 3]` uint8; of a video of 16-bit grey `[height, width]` in 0..1.
 
     Args:
-        picture: of a video, as PyAV gives it.
-        bits: of the camera, where 16 hold fewer.
+        picture: picture of a video, as PyAV gives it.
+        bits: bits of the camera, where 16 hold fewer.
 
     Raises:
         MembraneError: values beyond `bits`.

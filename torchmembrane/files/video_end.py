@@ -6,11 +6,11 @@ from typing import BinaryIO
 EBML, SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
 """Identifiers of a Matroska file's header, and of the part behind it that is all the rest."""
 BOXES = (b"ftyp", b"moov", b"moof", b"mdat", b"wide", b"free", b"skip")
-"""That an MP4 or MOV file may begin with."""
+"""Boxes with which an MP4 or MOV file may begin."""
 FRAGMENT = b"moof"
 INDEX = (b"moov", FRAGMENT)
 MOST_BOXES = 2**16
-"""That are looked at."""
+"""Largest number of boxes that are read."""
 LONGEST_TAIL = 1024
 """Bytes, zeros as a rule, that some programs leave behind the end of a GIF."""
 
@@ -19,7 +19,7 @@ def missing_end(path: Path) -> str:
     """In words, what is missing at the end of a video file; "" if nothing is, or if that cannot be told.
 
     Args:
-        path: of a regular file.
+        path: path of a regular file.
 
     Example:
         >>> from tempfile import TemporaryDirectory

@@ -23,7 +23,7 @@ class SheetMaterial(NamedTuple):
 
     Attributes:
         model: "harmonic" | "neo_hookean" | "mooney_rivlin".
-        prestretch: of the sheet in its rim, before it is blown up.
+        prestretch: prestretch of the sheet in its rim, before it is blown up.
         c2_ratio: C2 / C1, Mooney-Rivlin only.
     """
 
@@ -59,7 +59,7 @@ class FormedSurface(NamedTuple):
         vertices: `[m, n, 3]`.
         sheet: `[m, n, 3]`, where they were without pressure.
         pressure: that holds it, over shear modulus x thickness of the sheet, 1 / length.
-        height: of the highest vertex above the rim's plane.
+        height: height of the highest vertex above the rim's plane.
         outline: the rim.
         cells: the grid within it, with its worst cell.
     """
@@ -71,7 +71,7 @@ class FormedSurface(NamedTuple):
     outline: Outline
     cells: OutlineGrid
 
-    def on(self, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    def resampled_to(self, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and sheet `[*grid, 3]` on another grid, bicubic in the grid's lines."""
         return _on(self.vertices, grid), _on(self.sheet, grid)
 
@@ -89,10 +89,10 @@ def formed_surface(
 
     Args:
         rim: `[K, 3]` once around, camera's frame.
-        material: of the sheet.
-        height: of the highest point above the rim's plane, along its normal, which points away from the camera.
+        material: material of the sheet.
+        height: height of the highest point above the rim's plane, along its normal, which points away from the camera.
         pressure: in place of the height, over shear modulus x thickness of the sheet, 1 / length.
-        lines: of the grid on which it is solved, both ways: 8, 16 or 32 and one.
+        lines: number of lines of the grid on which it is solved, both ways: 8, 16 or 32 and one.
 
     Returns:
         The `FormedSurface`.
@@ -116,7 +116,7 @@ def film(rim: np.ndarray, lines: int = LINES) -> Film:
 
     Args:
         rim: `[K, 3]` once around, camera's frame.
-        lines: of its grid, both ways.
+        lines: number of lines of its grid, both ways.
 
     Raises:
         MembraneError: a rim within which there is no grid, or no film.

@@ -49,7 +49,7 @@ class Inflated(NamedTuple):
     Attributes:
         vertices: `[m, n, 3]`, in the frame of the rim's plane.
         pressure: that holds it, over shear modulus x thickness of the sheet in its rim; 1 / length.
-        height: of the highest vertex above the rim's plane.
+        height: height of the highest vertex above the rim's plane.
     """
 
     vertices: np.ndarray
@@ -62,7 +62,7 @@ def inflated_to(sheet: Sheet, height: float) -> Inflated:
 
     Args:
         sheet: with an odd number of lines.
-        height: of the highest point above the rim's plane, length unit.
+        height: height of the highest point above the rim's plane, length unit.
 
     Returns:
         `Inflated`.

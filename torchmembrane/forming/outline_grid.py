@@ -29,7 +29,7 @@ SHIFTS, WINDOW = 4, 1.5  # of the candidates; how far around them the rim is loo
 POWER = 2  # of the distortion: the worst count more than in a mean
 SIZE = 0.3
 STEPS = (60, 60, 400)
-"""Of the descent, while folds are taken out and then."""
+"""Steps of the descent: two rounds while folds are removed, and the last one."""
 BLUNT = (0.5, 0.05)  # det J up to which it is smoothed, over the mean, where there are folds
 
 

@@ -19,7 +19,7 @@ class SheetEnergy(ElasticEnergy):
         membrane: the rest surface.
         sheet: `[V, 3]`, where its vertices were before: stretched in its rim by the prestretch, without pressure.
         model: "harmonic" | "neo_hookean" | "mooney_rivlin".
-        prestretch: of the sheet, equal in both directions.
+        prestretch: prestretch of the sheet, equal in both directions.
         modulus: shear modulus x thickness of the sheet as it is stretched in its rim, force / length.
         c2_ratio: C2 / C1, Mooney-Rivlin only.
 
@@ -53,7 +53,7 @@ class SheetEnergy(ElasticEnergy):
         for name, value in (("sheet", sheet), ("rest", membrane.rest), ("is_free", (~membrane.fixed)[split].any(1))):
             self.register_buffer(name, value)
 
-    def on(self, membrane: Membrane) -> "SheetEnergy":
+    def for_membrane(self, membrane: Membrane) -> "SheetEnergy":
         """The same sheet on every second line of the grid."""
         sheet = self.sheet.unflatten(0, self.grid)[::2, ::2].flatten(0, 1)
         return SheetEnergy(membrane, sheet, self.model, float(self.prestretch), self.modulus, self.c2_ratio)

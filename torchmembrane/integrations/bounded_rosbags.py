@@ -14,7 +14,7 @@ from typing import Any
 from ..files.optional import load_rosbags
 
 MOST_CHUNK_BYTES = 2**28
-"""Of a chunk of MCAP, or of a message, unpacked."""
+"""Largest size of an unpacked chunk of MCAP, or of a message."""
 MOST_RATIO = 256
 """Bytes that all chunks or a compressed file may unpack to, over those of the file, where they are more than a chunk's."""
 WINDOW = 28

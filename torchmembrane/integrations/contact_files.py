@@ -29,7 +29,7 @@ def write_contact_law(law: ContactLaw, sensor: Sensor, folder: str | Path) -> Pa
     """Write `contact.toml`, `contact.csv` and `contact.png`, in m, N and Pa; forces stay relative where the sensor's are.
 
     Args:
-        law: of the sensor.
+        law: law of the sensor.
         sensor: its tool is the frame of places, else its camera, as in `write_robot_model`.
         folder: made if it does not exist; files of these names are replaced.
 

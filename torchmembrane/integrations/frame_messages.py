@@ -24,9 +24,9 @@ TOPICS = {
 }
 """Types of the messages by the last name of their topic; each of them has a header."""
 POINT_FIELDS = ("x", "y", "z", "normal_traction", "shear_x", "shear_y", "shear_z")
-"""Of a vertex, each float32: place, m; compressive normal traction and shear traction on the membrane, Pa."""
+"""Fields of a vertex, each float32: place, m; compressive normal traction and shear traction on the membrane, Pa."""
 CONTACT_FIELDS = ("x", "y", "z", "force_x", "force_y", "force_z", "normal_x", "normal_y", "normal_z", "area")
-"""Of a contact, strongest first, each float32: place, m; force on the membrane, N; outward normal; area, m^2."""
+"""Fields of a contact, strongest first, each float32: place, m; force on the membrane, N; outward normal; area, m^2."""
 FLOAT32 = 7
 """A PointField's datatype."""
 GOOD, DOUBTFUL, FAILED = range(3)
@@ -63,7 +63,7 @@ class SiUnits:
     """A sensor's results in N, N m, m and Pa.
 
     Args:
-        mesh: of the results.
+        mesh: mesh of the results.
         gas_pressure: `Sensor.gas_pressure`.
 
     Raises:
@@ -118,7 +118,7 @@ class SiUnits:
         return each[np.isfinite(frame["contact_points"]).all(-1)].astype(np.float32)
 
     def pressure(self, frame: Frame) -> float | None:
-        """Of the gas, absolute, Pa; from the frame's `pressure_change []`; None of a sensor without one."""
+        """Absolute pressure of the gas, Pa, from the frame's `pressure_change []`; None for a sensor without gas."""
         if self.gas_pressure is None:
             return None
         return (self.gas_pressure + float(frame["pressure_change"])) * self.metre**2

@@ -24,7 +24,7 @@ CHANNELS: dict[str, tuple[type[np.unsignedinteger[Any]], int, list[int]]] = {
     **{"yuv422_yuy2": (np.uint8, 2, [0]), "yuyv": (np.uint8, 2, [0])},
     **{"yuv422": (np.uint8, 2, [1]), "uyvy": (np.uint8, 2, [1])},
 }
-"""Of an image's encoding: the type of a value, values of a pixel, and which of them are grey, or red, green and blue."""
+"""For each encoding: the type of a value, values of a pixel, and which of them are grey, or red, green and blue."""
 PLANES = {"nv12": 1.5, "nv21": 1.5, "nv24": 3.0}
 """Encodings that hold the grey values of all pixels first, then the colours: bytes for each pixel."""
 MOSAICS = {f"bayer_{pattern}{bits}": pattern for pattern in PATTERNS for bits in (8, 16)}
@@ -44,7 +44,7 @@ def grey_of(message: Any, size: tuple[int, int], bits: int | None = None) -> np.
     Args:
         message: the message.
         size: width and height that it must have, px.
-        bits: of the camera, where 16 hold fewer.
+        bits: bits of the camera, where 16 hold fewer.
 
     Raises:
         MembraneError: another size, values beyond `bits`, an encoding without a grey or colour value for every pixel, or a

@@ -18,14 +18,14 @@ from ..surface.topology import rim_loop
 BLUE, VERMILION, GREY, DARK = (0, 114, 178), (213, 94, 0), (184, 184, 184), (60, 60, 60)
 TRACTION_MAP, FIELD_MAP = "Oranges", "viridis"
 LONGEST_TRACTION, LONGEST_FORCE = 0.15, 0.35
-"""Of the surface's extent: the arrows of the largest traction and of the largest force so far."""
+"""Lengths of the arrows of the largest traction and the largest force so far, over the surface's extent."""
 LEAST_TRACTION = 0.1
-"""Of the largest traction so far: smaller ones get no arrow."""
+"""Smallest traction that gets an arrow, over the largest one so far."""
 LONGER = 5.0
-"""As long as the markers' motion: its arrows."""
+"""Length of the arrows of the markers' motion, over this motion."""
 TINY = 1e-12
 QUALITY = 90
-"""Of the images' JPEG."""
+"""JPEG quality of the images."""
 
 
 class RerunLog:
@@ -70,7 +70,7 @@ class RerunLog:
         """Log a frame.
 
         Args:
-            number: of the frame.
+            number: number of the frame.
             frame: its arrays, as `Reconstruction.frame` gives them.
             image: its image, `[height, width]` or `[height, width, 3]`, uint8 or in 0..1.
             time: when it was taken, seconds since 1970.

@@ -12,9 +12,9 @@ from ..sensor.units import METRE
 from ..surface.topology import rim_loop
 
 RIM_WIDTH = 0.02
-"""Of the membrane's extent: the radius of the tube that is drawn along the rim."""
+"""Radius of the tube that is drawn along the rim, over the membrane's extent."""
 SIDES = 8
-"""Of that tube."""
+"""Number of sides of that tube."""
 OPTICAL_TO_GRAPHICS = np.diag([1.0, -1.0, -1.0])
 """A camera of MuJoCo looks along its -z, its y is up; the sensor's looks along z, its y is down."""
 

@@ -24,13 +24,13 @@ from .messages import camera_mismatch, info_topic, size_of
 BAGS, ROS_1, METADATA = (".mcap", ".db3"), ".bag", "metadata.yaml"
 MOST_METADATA_BYTES = 2**20
 MOST_BYTES = 2**50
-"""Of a storage file, which is never read whole."""
+"""Largest storage file; it is never read as a whole."""
 MCAP_MARK, SQLITE_MARK, ROS_1_MARK = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#ROSBAG"
 """The first bytes of a storage file; those of MCAP are its last ones, too."""
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 NAMESPACE = "/torchmembrane"
-"""Of the topics written, as of a node of this name."""
+"""Namespace of the topics that are written, as of a node of this name."""
 OURS = "torchmembrane reconstruct --bag"
 """Stands in the metadata of a bag that is written here."""
 
@@ -131,7 +131,7 @@ class BagWriter:
 
     Args:
         path: a folder: new, or of such a bag, which is replaced when the new one is whole.
-        units: of the results.
+        units: units of the results.
         mcap: store as MCAP; else as sqlite3.
 
     Raises:
@@ -142,7 +142,7 @@ class BagWriter:
         self.path, self.units, self.mcap = Path(path), units, mcap
         self.written = 0
         if os.path.lexists(self.path) and not _is_ours(self.path):
-            raise MembraneError(f"{path}: exists already, and is no bag of results alone; expected a new folder")
+            raise MembraneError(f"{path}: exists already, and is not a bag of results alone; expected a new folder")
         load_rosbags()
 
     def __enter__(self) -> "BagWriter":

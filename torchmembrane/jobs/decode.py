@@ -103,17 +103,17 @@ def source_file_of(*paths: Path) -> SourceFile:
         for path in paths:
             if not path.is_file():
                 raise MembraneError(f"{path}: not a regular file; expected an image or a video")
-        return SourceFile.of(*paths)
+        return SourceFile.from_files(*paths)
     except OSError as error:
         raise MembraneError(f"{error.filename or paths[0]}: not readable ({error})") from error
 
 
 def read_ahead(sources: Iterator[Source], reconstructor: "Reconstructor", batch: int) -> Iterator[list[DecodedFrame]]:
-    """Batches of decoded frames; while one is used, the next is decoded.
+    """Yield batches of decoded frames, and decode the next one while one is used.
 
     Args:
         sources: frames to decode, in order.
-        reconstructor: of the sensor.
+        reconstructor: reconstructor of the sensor.
         batch: the number of frames in a batch.
 
     Yields:

@@ -56,11 +56,11 @@ class FrameReconstructor:
     It can be pickled.
 
     Args:
-        reconstructor: of the sensor.
+        reconstructor: reconstructor of the sensor.
         rest_pixels: `[D, 2]`, the markers of this recording at rest; default: of the sensor's rest image.
         pressure: readings of a gauge by the names of the frames, or a function of name and time (s); units as for
             `Reconstructor`.
-        fields: of the surface that frames hold as well, as of `Reconstructor.fields`: "stretch", "tension".
+        fields: fields of the surface that frames hold as well, as of `Reconstructor.fields`: "stretch", "tension".
 
     Example:
         >>> from dataclasses import replace
@@ -83,7 +83,7 @@ class FrameReconstructor:
             raise MembraneError(f"FrameReconstructor: reconstructor is a {_kind(reconstructor)}; expected a tm.Reconstructor")
         self.reconstructor, self.rest_pixels, self.pressure, self.fields = reconstructor, rest_pixels, pressure, fields
 
-    def on(self, device: str) -> "FrameReconstructor":
+    def on_device(self, device: str) -> "FrameReconstructor":
         """The same on a device, "cpu" or "cuda"."""
         rest_pixels = None if self.rest_pixels is None else self.rest_pixels.to(device)
         return FrameReconstructor(self.reconstructor.to(device), rest_pixels, self.pressure, self.fields)
@@ -134,7 +134,7 @@ class FrameReconstructor:
                 data, grey = np.ascontiguousarray(image).tobytes(), self._grey(image)
             else:
                 if not isinstance(content, bytes | bytearray | memoryview):
-                    raise MembraneError(f"bytes are a {_kind(content)}; expected bytes, what is in the file")
+                    raise MembraneError(f"bytes are a {_kind(content)}; expected bytes, the content of the file")
                 data = bytes(content)
                 grey = self._read(data)
             return frame._replace(image=grey, origin=SourceFile.of_bytes(file, data))
@@ -251,5 +251,5 @@ def outcomes_of(rows: dict[str, np.ndarray]) -> list[Outcome]:
             outcomes.append(Outcome(name, file, None, text))
         else:
             remark = text.removeprefix(Status(int(frame["status"])).text)
-            outcomes.append(Outcome(name, file, Stored.of(frame), remark))
+            outcomes.append(Outcome(name, file, Stored.from_arrays(frame), remark))
     return outcomes

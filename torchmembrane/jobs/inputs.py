@@ -27,7 +27,7 @@ class Inputs(NamedTuple):
         images: image files.
         videos: files of several frames: videos, image files of several pictures, and bags, which are their `metadata.yaml`
             or a storage file.
-        topic: of the bags' images; None: the only one.
+        topic: topic of the bags' images; None: the only one.
         views: names of the views that have images of their own; `images` are then the first one's.
     """
 
@@ -85,7 +85,7 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
         arguments: paths of files, folders (their images in name order, or the bag that it is) and glob patterns. Numbers in
             names count as numbers: 2 before 10. Hidden files and those that operating systems leave in folders are ignored.
         video: take every file for a video.
-        topic: of the bags' images.
+        topic: topic of the bags' images.
 
     Returns:
         The files, images and videos each in the order of the call; where that is the plain order of their names, which shells
@@ -124,7 +124,7 @@ def of_first_view(inputs: Inputs, views: Sequence[str]) -> Inputs:
     """Inputs with one image for each frame: of views with images of their own, NAME_VIEW.png, the first view's.
 
     Args:
-        inputs: as `find_inputs` gives them.
+        inputs: as for `find_inputs` gives them.
         views: names of the sensor's views with images of their own; none of one view, or of regions of one image.
 
     Raises:

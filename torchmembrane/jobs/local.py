@@ -34,8 +34,7 @@ FEW_FRAMES = 50
 
 
 class FrameCounts(NamedTuple):
-    """Numbers of frames of a call that were reconstructed (some with a status that is not ok), failed, or were skipped as
-    finished."""
+    """How many frames of a call were reconstructed (some with a status other than ok), failed, or were already finished."""
 
     reconstructed: int
     not_converged: int
@@ -96,11 +95,11 @@ def reconstruct_files(
         >>> sensor = Sensor.from_file("examples/sensor.toml")
         >>> sensor = replace(sensor, markers=replace(sensor.markers, rest_image=None))  # quicker, less accurate
         >>> reconstructor, images = Reconstructor(sensor), find_inputs(["examples/rest.png"])
-        >>> reconstruct_files(reconstructor, images, tempfile.mkdtemp(), Settings.of(reconstructor, "npz"))
+        >>> reconstruct_files(reconstructor, images, tempfile.mkdtemp(), Settings.from_reconstructor(reconstructor, "npz"))
         FrameCounts(reconstructed=1, not_converged=0, unexplained=0, hidden=0, out_of_range=0, failed=0, skipped=0)
     """
     out, report = Path(out), report or _write_line
-    mesh = Mesh.of(reconstructor, settings)
+    mesh = Mesh.from_reconstructor(reconstructor, settings)
     refuse_overwriting(f"--out {out}", files_at_risk(out, inputs, figures), [*inputs.images, *inputs.videos], force=True)
     if inputs.need_pyav:
         load_pyav()
@@ -129,7 +128,7 @@ def _by_machine_code(reconstructor: "Reconstructor", left: int | None) -> bool:
     A few frames take less time by tensor operations than compiling does.
 
     Args:
-        reconstructor: of the job.
+        reconstructor: reconstructor of the job.
         left: its frames; None where that is not known.
     """
     if not reconstructor.estimator.must_compile or left == 0:

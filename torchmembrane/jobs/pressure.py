@@ -27,7 +27,7 @@ PRESSURES = Columns(
 UNKNOWN = ("", "nan")
 """Cells of frames that have no reading."""
 KINDS = {"name": "frames", "image": "images"}
-"""What a table's first column names."""
+"""What the first column of a table may name."""
 REACH, INTERVALS = 1.0, 1.5
 """A frame has a reading by time where one is within so many seconds, or intervals between readings if that is more."""
 
@@ -72,8 +72,8 @@ def recording_pressures(reconstructor: "Reconstructor", path: Path, inputs: Inpu
 
     Args:
         reconstructor: the sensor's.
-        path: of the table, as for `read_pressures`.
-        inputs: of the call.
+        path: path of the table, as for `read_pressures`.
+        inputs: inputs of the call.
 
     Raises:
         MembraneError: a pressure tells nothing to this estimator or of this cavity; the sensor has no modulus; the table is not
@@ -95,8 +95,8 @@ def read_pressures(path: Path, inputs: Inputs, sensor: Sensor) -> PressureReadin
     """Read a gauge's log: `pressure` or `pressure_change` by `name` or by `time`, hPa; 1 hPa = 100 N/m^2.
 
     Args:
-        path: of the table. A name is that of a frame or of its image file; a value may be left empty, or be nan. Readings of
-            other frames, or at other times, are counted.
+        path: path of the table. A name is that of a frame or of its image file; a value may be left empty, or be nan. The
+            readings of other frames, or at other times, are counted.
         inputs: the frames.
         sensor: gives the length unit.
 

@@ -20,7 +20,7 @@ class RayEngine:
     A worker that dies is replaced, and its frames are computed again.
 
     Args:
-        device: of each worker, "cpu" with one thread, or "cuda" with a GPU of its own.
+        device: device of each worker, "cpu" with one thread, or "cuda" with a GPU of its own.
         workers: how many; default: as many as the cluster has room for.
 
     Raises:
@@ -70,7 +70,7 @@ class RayWorker:
         import ray
 
         torch.set_num_threads(1)
-        self.state: FrameReconstructor = ray.get(reference).on(device)
+        self.state: FrameReconstructor = ray.get(reference).on_device(device)
 
     def __call__(self, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return self.state(rows)

@@ -26,7 +26,7 @@ def recording_rest(reconstructor: "Reconstructor", arguments: list[str], inputs:
     Args:
         reconstructor: the sensor's.
         arguments: image files, globs or folders; or `first:N`, the first N frames of the inputs.
-        inputs: of the call.
+        inputs: inputs of the call.
 
     Raises:
         MembraneError: no such image, one that cannot be read, or one that does not show the markers.

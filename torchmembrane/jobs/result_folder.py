@@ -22,8 +22,8 @@ def files_at_risk(folder: Path, inputs: Inputs, figures: bool) -> list[Path]:
     """Files in a folder that a job would overwrite and that are not its own earlier results.
 
     Args:
-        folder: of the results.
-        inputs: of the job.
+        folder: folder of the results.
+        inputs: inputs of the job.
         figures: whether every frame has a figure.
     """
     found = [folder / SUMMARY] if (folder / SUMMARY).exists() and not (folder / MESH).exists() else []

@@ -40,7 +40,7 @@ PIXEL_BYTES = 600
 VERTEX_BYTES = 25000
 """Memory of a frame in computation, over the pixels of its image and the vertices of its surface."""
 MEMORY_SHARE = 0.25
-"""Of the machine's memory, for all frames in computation."""
+"""Share of the machine's memory for all frames that are computed at a time."""
 
 
 DRAWS = "reconstruct"
@@ -174,7 +174,7 @@ def _pool(workers: int, work: Work) -> Iterator[ProcessPoolExecutor]:
 
 
 _work: Work
-"""Of this worker process."""
+"""The work of this worker process."""
 
 
 def _start(path: Path) -> None:

@@ -19,7 +19,7 @@ class StatusLine:
     """Shows the latest frame, with rate and latency over the last `RECENT` frames.
 
     Args:
-        mesh: of the stream.
+        mesh: mesh of the stream.
         file: where to write.
     """
 
@@ -49,7 +49,7 @@ class StatusLine:
 
 
 def described(seen: LiveFrame, stats: StreamStats, mesh: Mesh) -> str:
-    """Rate, latency, dropped pictures, status, wrench and change of pressure in one line."""
+    """One line with rate, latency, dropped pictures, status, wrench and change of pressure."""
     milliseconds = [1000 * stats.latency(percent, RECENT) for percent in (50, 95)]
     rate = f"{stats.rate(RECENT):.1f} Hz, " if stats.followed > 1 else ""
     pace = rate + "{:.0f} ms (95 %: {:.0f}), {} dropped".format(*milliseconds, stats.dropped)

@@ -20,15 +20,15 @@ WAIT = 0.1
 RECENT = 100
 """Frames over which the rate and latency that are shown as they go are taken."""
 Request = Callable[[Stream], str]
-"""What is asked of a stream between two frames, such as to take the latest for rest; gives what became of it."""
+"""A request to a stream between two frames, such as taking the latest one for rest; it returns the answer."""
 
 
 class LiveFrame(NamedTuple):
     """A frame as it was followed.
 
     Attributes:
-        number: of the capture, from 0.
-        time: of the capture, seconds since 1970.
+        number: number of the capture, from 0.
+        time: time of the capture, seconds since 1970.
         image: as it was captured.
         frame: its result's arrays.
         latency: from the capture to the result, seconds.
@@ -57,8 +57,8 @@ class StreamStats:
     Attributes:
         captured: pictures, to the latest one that was followed.
         failed: frames without a surface.
-        times: of the captures of the frames followed, seconds since 1970.
-        latencies: of the same, seconds.
+        times: times of the captures of the frames followed, seconds since 1970.
+        latencies: latencies of the same, seconds.
 
     Example:
         >>> stats = StreamStats()

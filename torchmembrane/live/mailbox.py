@@ -22,9 +22,9 @@ class CapturedFrame(NamedTuple):
     """An image as it was captured.
 
     Attributes:
-        number: of the capture, from 0; those of dropped pictures are missing among the pictures taken.
+        number: number of the capture, from 0; those of dropped pictures are missing among the pictures taken.
         image: `[height, width]` or `[height, width, 3]`.
-        time: of the capture, as `now` gives it.
+        time: time of the capture, as `now` gives it.
     """
 
     number: int

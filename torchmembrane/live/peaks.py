@@ -25,7 +25,7 @@ class Peaks:
     """The largest force and depth of the frames that were given.
 
     Args:
-        mesh: of the stream.
+        mesh: mesh of the stream.
 
     Attributes:
         force: magnitude of the largest contact force; zero before there is one.
@@ -54,7 +54,7 @@ class Peaks:
         """Add them to a sensor's life, and say what that has seen.
 
         Args:
-            path: of the file, made where there is none.
+            path: path of the file, made where there is none.
 
         Raises:
             MembraneError: the file is another, or of a sensor of another name or other units.

@@ -1,4 +1,4 @@
-"""What a stream showed, kept: images as they were captured, results as `torchmembrane reconstruct` writes them, times."""
+"""Recording of a stream: captured images, results as `torchmembrane reconstruct` writes them, and times."""
 
 import csv
 from pathlib import Path
@@ -34,7 +34,7 @@ class Recording:
     Args:
         folder: new or empty.
         mesh: what the frames share.
-        bits: of the camera, where 16 hold fewer.
+        bits: bits of the camera, where 16 hold fewer.
 
     Raises:
         MembraneError: the folder holds something; of `keep`, and when the block ends: it cannot be written to. Where the block
@@ -43,7 +43,7 @@ class Recording:
 
     def __init__(self, folder: Path, mesh: Mesh, bits: int | None = None):
         if folder.exists() and (not folder.is_dir() or not all(map(is_of_system, folder.iterdir()))):
-            raise MembraneError(f"--record {folder}: holds something already; expected a new folder, one per recording")
+            raise MembraneError(f"--record {folder}: is not empty; expected a new folder for each recording")
         self.folder, self.bits = folder, bits
         self._results = ResultFolder(folder, mesh, Inputs([], []), WHOLE, False, print)
 
@@ -69,7 +69,7 @@ class Recording:
     def keep(self, seen: LiveFrame) -> None:
         """Write a frame."""
         path = write_as_taken(self.folder / IMAGES / seen.name, seen.image, self.bits)
-        stored = Stored(seen.frame, SourceFile.of(path)._replace(time=seen.time), seen.latency)
+        stored = Stored(seen.frame, SourceFile.from_files(path)._replace(time=seen.time), seen.latency)
         self._results.keep(Outcome(seen.name, path, stored))
         with writing(self.folder / TIMES):
             csv.writer(self._times).writerow((seen.name, f"{seen.time:.6f}", f"{seen.latency:.6f}"))

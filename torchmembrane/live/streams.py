@@ -50,7 +50,7 @@ class TrackedStream:
     def __init__(self, reconstructor: Reconstructor):
         reconstructor.sensor.refuse_views("live")
         self.tracker = Tracker(reconstructor)
-        self.mesh = Mesh.of(reconstructor, Settings.of(reconstructor, "npz"))
+        self.mesh = Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, "npz"))
 
     def __call__(self, image: np.ndarray, time: float) -> Frame:
         return self.tracker(image, time=time).frame(0)
@@ -82,9 +82,9 @@ class ModelStream:
     """By a model of `torchmembrane export`, run by onnxruntime; one that tracks follows dots from frame to frame.
 
     Args:
-        path: of the model.
+        path: path of the model.
         sensor: the fingerprint that it must have been exported from.
-        threads: of onnxruntime.
+        threads: number of threads of onnxruntime.
 
     Raises:
         MembraneError: torchmembrane-edge is missing; no model, or that of another sensor; of a call: an image that the

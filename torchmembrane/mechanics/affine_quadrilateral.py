@@ -15,7 +15,7 @@ class AffineQuadrilaterals(nn.Module):
 
     Args:
         membrane: the rest surface.
-        tension: of the rest state, force / length.
+        tension: tension of the rest state, force / length.
 
     Limitations:
         It is blind to the hourglass mode: use it with the smoother (eq. 28).

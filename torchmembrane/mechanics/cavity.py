@@ -23,7 +23,7 @@ def gas_law_step(
     `volume step + C (pressure step) = c`.
 
     Args:
-        rise: of the cavity's volume above that at rest, `[...]`.
+        rise: rise of the cavity's volume above that at rest, `[...]`.
         pressure: pressure difference across the membrane, `[...]`.
         rest_pressure: p0, pressure difference at rest.
         absolute: P, the gas's absolute pressure at rest, force / length^2.

@@ -167,10 +167,12 @@ class ElasticEnergy(nn.Module):
         self.register_buffer("cell_first", det.sqrt() * inverse)
         self.register_buffer("cell_second", 1 / det.sqrt())
 
-    def on(self, membrane: Membrane) -> "ElasticEnergy":
+    def for_membrane(self, membrane: Membrane) -> "ElasticEnergy":
         """The same material on another membrane or grid."""
         modulus = 2 * float(self.c1 + self.c2)
         return ElasticEnergy(membrane, self.model, float(self.prestretch), modulus, float(self.c2 / self.c1))
+
+    on = for_membrane  # its name before 0.2.0
 
     def strain(self, x: Tensor) -> Strain:
         """The strain of `x [..., V, 3]`: of all triangles, `T = 2 (m-1) (n-1)`."""

@@ -22,7 +22,7 @@ def principal_fields(elasticity: ElasticEnergy, membrane: Membrane, x: Tensor, n
     the triangles around it, weighted by their areas at rest.
 
     Args:
-        elasticity: of the membrane.
+        elasticity: elasticity of the membrane.
         membrane: the rest surface on the same grid.
         x: vertices `[..., V, 3]`.
         name: "stretch" | "tension".

@@ -23,7 +23,7 @@ class Agreement(NamedTuple):
 
     Attributes:
         distance: the largest between their vertices, length unit.
-        status: of the model's frames, the first one twice.
+        status: status of the model's frames, the first one twice.
         expected: torch's.
     """
 

@@ -261,7 +261,7 @@ def _finished(tracer: Tracer, inputs: list[Known], result: Any, reconstructor: R
 
 def metadata_of(reconstructor: Reconstructor) -> dict[str, str]:
     """The metadata of a model on its sensor: texts by key."""
-    mesh = Mesh.of(reconstructor, Settings.of(reconstructor, FORMATS[0]))._asdict()
+    mesh = Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, FORMATS[0]))._asdict()
     plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in mesh.items()}
     texts = {str(status.value): status.text for status in Status}
     metadata = {"format": str(FORMAT), "version": __version__, "name": mesh["name"], "length_unit": mesh["length_unit"]}

@@ -22,7 +22,7 @@ OPSET = 18
 MANY = 1_000_003
 """A prime: the length of the batch that is traced. Nothing of that size is made."""
 HUGE = (1 << 31) - 1
-"""What lies beyond, the end of an axis, is no length."""
+"""Values beyond it stand for the end of an axis and are not lengths."""
 LENGTHS = 8
 """Numbers that are lengths, at most, in a tensor."""
 NUMBERS = (ir.AttributeType.INT, ir.AttributeType.INTS, ir.AttributeType.FLOAT, ir.AttributeType.FLOATS)
@@ -35,7 +35,7 @@ TIDY = passes.Sequential(
     common.OutputFixPass(),
     common.NameFixPass(),
 )
-"""What torch's exporter does too, but for its patterns, which take most of its time and change next to nothing here."""
+"""The passes of torch's exporter without its patterns, which take most of its time and change hardly anything here."""
 
 
 def _number(s: float, dtype: int = TensorProto.FLOAT, layout: str = "", device: str = "", pin_memory: bool = False) -> Any:

@@ -85,7 +85,7 @@ def _draw_range(axes: Axes, sheet: SpecSheet) -> None:
 
 
 def _draw_pairs(axes: Axes, sheet: SpecSheet) -> None:
-    for told, face, label in ((True, BLUE, "told apart"), (False, "none", "not told apart")):
+    for told, face, label in ((True, BLUE, "resolved"), (False, "none", "not resolved")):
         points = _columns([(pair.distance, pair.direction + 1) for pair in sheet.pairs if pair.told is told])
         axes.plot(*points, "o", ls="none", ms=8, mfc=face, mec=BLUE, label=label)
     if np.isfinite(sheet.closest.distance.median):

@@ -76,7 +76,7 @@ def surface_figure(report: Report, image_size: tuple[int, int], places: np.ndarr
         image_size: width and height of the image, px.
         places: `[V, 3]`, the surface's vertices.
         correction: its `offsets [V]` along the normals and their `deviations [V]`.
-        unit: of lengths.
+        unit: unit of lengths.
 
     Example:
         >>> from torchmembrane.calibrate.surface import Correction
@@ -113,7 +113,7 @@ def material_figure(report: Report, found: Any, names: list[str]) -> Figure:
         report: the calibration's numbers, the prestretch first.
         found: a material's fit: its `profile` (prestretches `[S]`, losses `[S, B]` of B images), `forces [B, 2]`
             and `pressures [B, 2]`.
-        names: of the B images.
+        names: names of the B images.
 
     Example:
         >>> from types import SimpleNamespace
@@ -158,7 +158,7 @@ def layout_figure(title: str, sensor: Sensor, dots: Any) -> Figure:
     """The wanted pattern in the image, and its dots on the rest surface, from above and from the side.
 
     Args:
-        title: of the figure.
+        title: title of the figure.
         sensor: the sensor that is to bear the dots.
         dots: their `pixels [D, 2]` as wanted, `positions [D, 3]` on the rest surface and `radii [D]`.
 

@@ -15,7 +15,7 @@ def contact_figure(law: ContactLaw, name: str) -> Figure:
 
     Args:
         law: what is drawn.
-        name: of the sensor.
+        name: name of the sensor.
 
     Returns:
         A figure of two panels.

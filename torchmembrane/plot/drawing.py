@@ -1,4 +1,4 @@
-"""What the figures share: colours, rows of panels, axes in pixels and in lengths, grids as lines; writing and showing.
+"""Common parts of figures: colours, rows of panels, axes in pixels and in lengths, grids as lines; writing and showing.
 
 A figure here is a matplotlib `Figure` that belongs to no window, so that drawing needs no display.
 """
@@ -54,7 +54,7 @@ def drawn_by(command: str, path: Path) -> bool:
     """Whether a file is a figure that a command of torchmembrane drew, which may draw it anew.
 
     Args:
-        command: as `save` was told.
+        command: as for `save` was told.
         path: any file.
 
     Example:

@@ -17,7 +17,7 @@ from ..files.video import ffmpeg_name
 
 VIDEOS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
 COLOURS = 256
-"""Of a GIF."""
+"""Number of colours of a GIF."""
 RATES, GIF_RATES = (0.001, 1000.0), (0.002, 50.0)
 """Hz, least and greatest, that the formats hold and viewers keep; a GIF counts hundredths of a second, up to 655.35 s."""
 

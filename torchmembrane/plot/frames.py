@@ -47,7 +47,7 @@ def figure(
         frame: one frame's arrays, as `Reconstruction.frame` gives them.
         mesh: the `Mesh` stored beside it.
         image: its image `[height, width]` in 0..1; without one, none is drawn.
-        name: of the frame, for the title.
+        name: name of the frame, for the title.
         places: for panels, 4 or 3; default: as many as there are. Films need figures of one size.
 
     Returns:
@@ -60,7 +60,7 @@ def figure(
         >>> sensor = Sensor.from_file("examples/sensor.toml")
         >>> reconstructor = Reconstructor(replace(sensor, markers=replace(sensor.markers, rest_image=None)))
         >>> frame = reconstructor.from_pixels(reconstructor.rest_pixels).frame(0)
-        >>> drawing = figure(frame, Mesh.of(reconstructor, Settings.of(reconstructor, "npz")))
+        >>> drawing = figure(frame, Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, "npz")))
         >>> [axes.get_title() for axes in drawing.axes[:2]]
         ['Marker flow', 'Surface, seen along x']
     """
@@ -199,9 +199,10 @@ def draw_traction(axes: Axes, frame: dict[str, np.ndarray], mesh: Mesh) -> None:
     if len(points):
         arrow = FORCE_ARROW * mesh.image_size[0] * force[:2] / size
         axes.annotate("", place[nearest[0]] + arrow, place[nearest[0]], arrowprops=dict(arrowstyle="-|>", color=BLUE, lw=2.5))
-    components = ", ".join(f"{c:.3g}" for c in force)
+    decimals = max(0, int(2 - np.floor(np.log10(size)))) if size > 0 else 0
+    components = ", ".join(f"{c:.{decimals}f}" for c in force)
     unit = "relative units\n" if mesh.force_unit == "relative" else f"{mesh.force_unit} "
-    axes.set_title(f"Force {size:.3g} {unit}({components})")
+    axes.set_title(f"Force {size:.{decimals}f} {unit}({components})")
 
 
 def _pressure_unit(mesh: Mesh) -> str:

@@ -16,7 +16,7 @@ from .drawing import BLUE, GREY, VERMILION, readable
 GREEN = "#009E73"  # distinct from the others with any colour vision
 COLOURS = dict(zip("xyz", (VERMILION, GREEN, BLUE), strict=True))
 SHADES = ("#F0E442", "#CC79A7", "#56B4E9", "#E69F00", "#999999", "#8C564B")
-"""Of the bands of statuses other than ok, in the order in which they appear."""
+"""Colours of the bands of statuses other than ok, in the order in which they appear."""
 WIDTH, HEIGHT = 9.0, 3.1
 """Inches, of a recording's column and of a row."""
 LONGEST = 1e8
@@ -144,4 +144,4 @@ def _legend(drawing: Figure, shades: Mapping[int, str]) -> None:
         handles.append(Patch(color=shade, alpha=0.45))
         text = "unreadable" if status == UNREADABLE else Status(status).text
         labels.append(f"status {status}: {text.partition(':')[0].partition(' (')[0]}")
-    drawing.legend(handles, labels, loc="lower center", ncols=min(4, len(labels)), frameon=False, fontsize=11.5)
+    drawing.legend(handles, labels, loc="lower center", ncols=min(5, len(labels)), frameon=False, fontsize=11.5)

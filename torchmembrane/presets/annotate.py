@@ -76,7 +76,7 @@ OF_SHEETS = {
     "prestretch": "of the sheet in its rim before it is blown up, over the unstretched sheet, 1 or more",
     "thickness": "of the sheet in its rim before it is blown up: unstretched, over prestretch^2",
 }
-"""Of `[material]` where the shape is "inflated"."""
+"""Comments of `[material]` if the shape is "inflated"."""
 
 
 def annotate(path: Path, said: Sequence[str], relative: bool, unit: str) -> None:
@@ -86,7 +86,7 @@ def annotate(path: Path, said: Sequence[str], relative: bool, unit: str) -> None
         path: what `Sensor.to_file` wrote.
         said: sentences for its top: what was assumed or derived.
         relative: whether its forces are, so that it shows the keys that give newtons.
-        unit: of its lengths, in which the examples of further keys are.
+        unit: unit of its lengths, in which the examples of further keys are.
     """
     one = millimetre(unit)
     examples = {name: length * one for name, length in OF_EXAMPLES.items()} | {"modulus": MODULUS / one**2}

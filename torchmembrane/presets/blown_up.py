@@ -51,7 +51,7 @@ def blown_up(rim: Mapping[str, Any], unit: str, stated: Stated) -> BlownUp:
 
     Args:
         rim: `outline`, `size`, `corner` and `base_z` as of `InflatedSurface`.
-        unit: of length.
+        unit: unit of length.
         stated: what is known.
 
     Returns:
@@ -168,7 +168,7 @@ def sheet_dots(surface: InflatedSurface, pitch: float) -> tuple[np.ndarray, list
 
     Args:
         surface: the rest surface.
-        pitch: of the pattern on the stretched sheet, length unit.
+        pitch: pitch of the pattern on the stretched sheet, length unit.
 
     Returns:
         Positions `[D, 3]` on the rest surface, camera's frame, and sizes.
@@ -178,7 +178,7 @@ def sheet_dots(surface: InflatedSurface, pitch: float) -> tuple[np.ndarray, list
     i, j = (a.ravel() for a in np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij"))
     flat = np.stack([i, j], -1) * pitch
     lines = 2 * len(formed.vertices) - 1
-    vertices, sheet = formed.on((lines, lines))
+    vertices, sheet = formed.resampled_to((lines, lines))
     plane = ((sheet - outline.origin) @ outline.axes.T)[..., :2]
     inside = encloses(outline.points, flat) & (_distance(outline.points, flat) > MARGIN * pitch)
     found = LinearNDInterpolator(plane.reshape(-1, 2), vertices.reshape(-1, 3))(flat)

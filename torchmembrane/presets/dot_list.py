@@ -19,7 +19,7 @@ FINE = (97, 97)  # vertices of the surface on which dots are put
 RAYS = (("x", "y"), ("angle", "azimuth"), ("u", "v"))  # columns of dots that a ray puts on the surface
 POINTS = (("x", "y", "z"), ("x", "y", "h"))
 LIMITS = {"x": COORDINATE, "angle": ANGLE, "u": ANY}
-"""Of the numbers of a form, by its first column."""
+"""Limits of the numbers of a form, by its first column."""
 SIZE = "size"
 DOTS = Columns((*POINTS, *RAYS), "dot", SIZE, least=FEWEST_MARKERS, most=MOST_DOTS)
 
@@ -32,7 +32,7 @@ def read_drafted_dots(path: Path, surface: Surface, camera: Camera) -> tuple[np.
     column `size`: small or large (default: small).
 
     Args:
-        path: of the CSV file.
+        path: path of the CSV file.
         surface: the rest surface.
         camera: for `u,v`.
 

@@ -69,7 +69,7 @@ class RimCircle:
     """The rim as an image shows it, by a camera on the axis of a round membrane: its radius and distance, and a focal length.
 
     Args:
-        radius: of the rim, length unit.
+        radius: radius of the rim, length unit.
         pixels: its radius in the image, px.
         model: "pinhole" | "fisheye".
 
@@ -126,7 +126,7 @@ def overpressure(membrane: Membrane, material: Material, unit: str) -> float:
     Args:
         membrane: the rest surface.
         material: its prestretch, shear modulus and thickness at rest.
-        unit: of length.
+        unit: unit of length.
 
     Example:
         >>> from torchmembrane.surface.shapes import spherical_cap
@@ -150,9 +150,9 @@ def balanced(
 
     Args:
         membrane: the rest surface.
-        unit: of length.
+        unit: unit of length.
         stated: the overpressure measured, hPa.
-        prestretch: of the membrane at rest.
+        prestretch: prestretch of the membrane at rest.
         shear_modulus: N per length unit squared.
         thickness: at rest, already stretched, length unit.
 

@@ -28,7 +28,7 @@ UNITS = {
     **{"wrench": "{force}, {force} {length}", "contact_area": "{length}^2", "contact_curvature": "1/{length}"},
     **{"pixels": "px", "residual": "px", "camera_motion": "px, px, degrees, 1"},
 }
-"""Of the arrays of a frame that have one."""
+"""Units of the arrays of a frame that have one."""
 
 CARD = """\
 ---
@@ -76,7 +76,7 @@ def write_data_set(results: Results, folder: Path, images: Mapping[str, Path], t
         results: the frames.
         folder: the folder to be made; it must not exist.
         images: files by name, of all frames or of none.
-        times: of capture, seconds since 1970, by name; may be empty.
+        times: times of capture, seconds since 1970, by name; may be empty.
 
     Raises:
         MembraneError: PyArrow is not installed, there is something at `folder`, or some frames have an image and others none.
@@ -131,8 +131,8 @@ def card(mesh: Mesh, name: str, counts: Mapping[Status, int], has_images: bool) 
 
     Args:
         mesh: what its frames share.
-        name: of the data set.
-        counts: of frames by status.
+        name: name of the data set.
+        counts: numbers of frames by status.
         has_images: whether there are images.
     """
     facts = {"sensor": mesh.name, "record of its calibration": mesh.record or "none", "sensor file's fingerprint": mesh.sensor}

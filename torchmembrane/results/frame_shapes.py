@@ -15,9 +15,9 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
 }
 
 FIELDS: dict[str, tuple[str | int, ...]] = {"stretch": ("V", 2), "tension": ("V", 2)}
-"""Of arrays that a frame holds where they are asked for: principal values, the larger stretch's direction first."""
+"""Shapes of arrays that a frame contains on request: principal values, those of the larger stretch first."""
 OF_EACH_VIEW = ("pixels", "confidence", "residual", "camera_motion")
-"""Of several views these begin with an axis `W`."""
+"""Arrays that begin with an axis `W` if there are several views."""
 
 
 def shape_of(key: str, sizes: Mapping[str, int]) -> tuple[int, ...]:
@@ -44,7 +44,8 @@ def of_first_view(frame: Mapping[str, np.ndarray], key: str) -> np.ndarray:
 
 
 def shape_mismatch(frame: Mapping[str, np.ndarray], vertices: int, markers: int, views: int = 0) -> str:
-    """What of a frame is not as of a surface with so many vertices and markers; "" where all is. `views`: 0 of a single one.
+    """The first array of a frame whose shape does not fit these numbers of vertices and markers; "" if all fit. `views`: 0 of a
+    sensor with one view.
 
     Example:
         >>> shape_mismatch({key: np.zeros(shape_of(key, {"V": 9, "D": 2, "P": 4})) for key in SHAPES}, 9, 3)

@@ -25,7 +25,7 @@ from .store import Mesh
 PART_ROWS = 256
 """Frames of one Parquet file, at least, once there are as many."""
 PART_BYTES = 2**27
-"""Of the arrays of such a file, about: of large surfaces a file holds fewer frames."""
+"""Approximate size of the arrays of such a file; with large surfaces a file holds fewer frames."""
 SAVE_SECONDS = 5.0
 """Frames are held back for this long at most."""
 PART = re.compile(r"part-\d+")
@@ -42,7 +42,7 @@ class FrameTable:
     back for `SAVE_SECONDS`, or until `PART_ROWS` of them make a file.
 
     Args:
-        folder: of the parts.
+        folder: folder of the parts.
         mesh: what the frames share.
         write_lock: held while parts are changed.
 
@@ -247,4 +247,5 @@ def _stored_rows(table: Any, part: Path) -> dict[str, Stored]:
         columns[key] = values.to_numpy(zero_copy_only=False).reshape(len(table), *shape)
     known = {key: table[key].to_pylist() for key in (*SourceFile._fields, "seconds") if key in table.column_names}
     names = _names(table, part)
-    return {name: Stored.of({key: values[i] for key, values in (columns | known).items()}) for i, name in enumerate(names)}
+    values = columns | known
+    return {name: Stored.from_arrays({key: column[i] for key, column in values.items()}) for i, name in enumerate(names)}

@@ -22,7 +22,7 @@ def open_folder(folder: str | Path, mesh: Mesh, write_lock: AbstractContextManag
     """Open the frames of a folder for writing; the folder is made if it does not exist.
 
     Args:
-        folder: of the results.
+        folder: folder of the results.
         mesh: what they share.
         write_lock: a lock that is held while files are changed that other processes change as well.
 
@@ -48,7 +48,7 @@ class FrameFiles:
     """Frames as one NAME.npz each: the keys of `Reconstruction`, and of `Stored`.
 
     Args:
-        folder: of the files.
+        folder: folder of the files.
         mesh: what the frames share.
 
     Attributes:

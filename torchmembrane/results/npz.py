@@ -27,7 +27,7 @@ class Stored(NamedTuple):
     """A frame as it is stored: its arrays, its source image, and the time that it took.
 
     Attributes:
-        frame: as `Reconstruction.frame` gives it.
+        frame: as for `Reconstruction.frame` gives it.
         origin: the image file, or the video.
         seconds: NaN where it is not known.
     """
@@ -37,7 +37,7 @@ class Stored(NamedTuple):
     seconds: float = float("nan")
 
     @classmethod
-    def of(cls, arrays: dict[str, Any]) -> "Stored":
+    def from_arrays(cls, arrays: dict[str, Any]) -> "Stored":
         """A frame from all arrays of a file; what the file lacks is taken as unknown.
 
         Raises:
@@ -60,7 +60,7 @@ def save_frame(path: str | Path, frame: dict[str, np.ndarray]) -> None:
 
     Args:
         path: the file, `.npz`.
-        frame: as `Reconstruction.frame` gives it.
+        frame: as for `Reconstruction.frame` gives it.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -100,11 +100,11 @@ def load_stored(path: Path) -> Stored:
     """Read a frame with its source and time.
 
     Raises:
-        MembraneError: as `load_frame`.
+        MembraneError: as for `load_frame`.
     """
     arrays = read_arrays(path, None, EXPECTED, NUMBERS + TEXT)
     try:
-        return Stored.of({key: np.array(array, array.dtype.newbyteorder("=")) for key, array in arrays.items()})
+        return Stored.from_arrays({key: np.array(array, array.dtype.newbyteorder("=")) for key, array in arrays.items()})
     except DAMAGE as error:
         raise MembraneError(f"{path}: not a result of torchmembrane ({in_one_line(error)}); expected {EXPECTED}") from error
 
@@ -129,7 +129,7 @@ def stack_frames(frames: list[dict[str, np.ndarray]]) -> Reconstruction:
     """Frames of one sensor as a batch.
 
     Args:
-        frames: as `Reconstruction.frame` gives them.
+        frames: as for `Reconstruction.frame` gives them.
 
     Returns:
         The batch, in their order, on the CPU.

@@ -16,7 +16,7 @@ def save_contact_cloud(path: str | Path, frame: Frame) -> int:
 
     Args:
         path: the file, `.ply` (ASCII), written atomically.
-        frame: as `Reconstruction.frame` gives it.
+        frame: as for `Reconstruction.frame` gives it.
 
     Returns:
         The number of points, those with `contact` above 0.5; 0 without a contact.

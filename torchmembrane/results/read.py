@@ -71,7 +71,7 @@ def read_frame(path: str | Path, name: str | None = None) -> FoundFrame:
 
     Args:
         path: NAME.npz, a part of a Parquet dataset, or a folder of results.
-        name: of the frame in a part or a folder; default: the first.
+        name: name of the frame in a part or a folder; default: the first.
 
     Raises:
         MembraneError: it holds no results, or none of this name.
@@ -106,7 +106,7 @@ class Results:
     Attributes:
         folder: the same.
         mesh: what all frames share: rest surface, triangles, units, settings.
-        names: of all frames, in order: numbers within them count as numbers.
+        names: names of all frames, in order: numbers within them count as numbers.
 
     Raises:
         MembraneError: the folder holds no results, or not one frame.

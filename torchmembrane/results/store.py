@@ -22,7 +22,7 @@ MESH = "mesh.npz"
 FIXED = ("element", "volume")
 """Settings that no option of the command chooses: each estimator has its own."""
 ELSE = {"pressure": "not measured", "fields": "none"}
-"""Of settings that are empty; of all others what the sensor has."""
+"""Text for settings that are empty; for all others it is what the sensor has."""
 
 
 class ResultMaker(Protocol):
@@ -56,7 +56,7 @@ class Settings(NamedTuple):
     fields: str = ""
 
     @classmethod
-    def of(
+    def from_reconstructor(
         cls, reconstructor: ResultMaker, format: str, rest: str = "", pressure: str = "", fields: Sequence[str] = ()
     ) -> "Settings":
         """Those of results that a reconstructor makes; `rest`: what was taken for rest in place of the sensor's rest image,
@@ -126,7 +126,7 @@ class Mesh(NamedTuple):
     record: str = ""
 
     @classmethod
-    def of(cls, reconstructor: ResultMaker, settings: Settings) -> "Mesh":
+    def from_reconstructor(cls, reconstructor: ResultMaker, settings: Settings) -> "Mesh":
         """What the frames of a `Reconstructor` share."""
         sensor, membrane = reconstructor.sensor, reconstructor.estimator.membrane
         return cls(
@@ -232,7 +232,7 @@ def check_folder(folder: str | Path, sensor: str, settings: Settings) -> None:
     """Refuse a folder whose results are of another sensor (fingerprint) or of other settings, or no results at all."""
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
-        raise MembraneError(f"--out {folder}: is a file; expected a folder, new or of earlier results of this sensor")
+        raise MembraneError(f"--out {folder}: is a file; expected a new folder, or one with earlier results of this sensor")
     if not (folder / MESH).exists():
         if not all(map(is_of_system, folder.glob("*.npz"))) or (folder / "frames").exists():
             raise MembraneError(f"--out {folder}: holds .npz files or frames/ but no {MESH}; choose another folder")

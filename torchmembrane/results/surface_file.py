@@ -12,7 +12,7 @@ from .store import Mesh
 
 SUFFIXES = (".ply", ".vtk")
 NAMES = {3: ("x", "y", "z"), 2: ("1", "2")}
-"""Of the components of a vector, and of principal values."""
+"""Names of the components of a vector, and of principal values."""
 
 
 def save_surface(path: str | Path, frame: Frame, mesh: Mesh) -> list[str]:
@@ -20,8 +20,8 @@ def save_surface(path: str | Path, frame: Frame, mesh: Mesh) -> list[str]:
 
     Args:
         path: the file, `.ply` or `.vtk` (both ASCII), written atomically.
-        frame: as `Reconstruction.frame` gives it, with `stretch` and `tension` where they were asked for.
-        mesh: of the folder, whose triangles these are.
+        frame: as for `Reconstruction.frame` gives it, with `stretch` and `tension` where they were asked for.
+        mesh: mesh of the folder, whose triangles these are.
 
     Returns:
         Names of the fields at the vertices.

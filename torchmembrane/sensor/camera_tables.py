@@ -91,7 +91,7 @@ def write_cameras(path: Path, camera: Camera, views: Sequence[View]) -> tuple[li
     """The lines of the cameras' tables; the views' rest images are written beside the file.
 
     Args:
-        path: of the sensor's file.
+        path: path of the sensor's file.
         camera: the first one.
         views: all, where there are several.
 

@@ -11,7 +11,7 @@ def files_of(path: Path) -> list[Path]:
     """A sensor's file, and those beside it that it names.
 
     Args:
-        path: of the `.toml` file.
+        path: path of the `.toml` file.
 
     Raises:
         MembraneError: it cannot be read as TOML.
@@ -24,7 +24,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 def companions_of(path: Path) -> list[Path]:
-    """The sensor's file, and all that `write_sensor` may write beside it.
+    """The sensor's file, and all files that `write_sensor` may write beside it.
 
     Example:
         >>> [file.name for file in companions_of(Path("a.toml"))]

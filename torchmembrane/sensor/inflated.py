@@ -40,8 +40,8 @@ class InflatedSurface(Surface):
         values: `outline`, "rectangle", "ellipse" or points `[K, 2]` or `[K, 3]` once around; of the first two `size [a, b]` and
             `corner`; `base_z` of the rim (of points with z added to theirs, default 0); and either `height` of the highest
             point above the rim's plane or `overpressure`, hPa.
-        material: of the sheet.
-        length_unit: of all lengths.
+        material: material of the sheet.
+        length_unit: unit of all lengths.
 
     Raises:
         MembraneError: a key too many or missing; an overpressure without a modulus.
@@ -98,11 +98,11 @@ class InflatedSurface(Surface):
 
     def membrane(self, grid: tuple[int, int]) -> Membrane:
         """The rest surface on a solver grid; see `Surface.membrane`."""
-        return Membrane(self.formed.on(grid)[0])
+        return Membrane(self.formed.resampled_to(grid)[0])
 
     def sheet(self, grid: tuple[int, int]) -> Tensor:
         """Where the vertices of a solver grid were without pressure, `[V, 3]`."""
-        return torch.from_numpy(self.formed.on(grid)[1].reshape(-1, 3).copy())
+        return torch.from_numpy(self.formed.resampled_to(grid)[1].reshape(-1, 3).copy())
 
     def of_height(self, height: float) -> "InflatedSurface":
         """The same sheet and rim, blown up to another height."""
@@ -121,8 +121,8 @@ def read_inflated(table: Table, material: Material, length_unit: str) -> Inflate
 
     Args:
         table: `[membrane]`.
-        material: of `[material]`.
-        length_unit: of the file.
+        material: material of `[material]`.
+        length_unit: unit of the file.
 
     Raises:
         MembraneError: names file, key, value, what was expected and the remedy.

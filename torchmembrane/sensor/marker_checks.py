@@ -20,7 +20,7 @@ def refuse_off_surface(membrane: Membrane, positions: np.ndarray, names: Sequenc
     Args:
         membrane: the rest surface.
         positions: `[D, 3]`.
-        names: of the D dots, as the message begins.
+        names: names of the D dots, as the message begins.
 
     Raises:
         MembraneError: with its name, position, distance and what was expected.
@@ -56,7 +56,7 @@ def refuse_coincident(membrane: Membrane, positions: np.ndarray, names: Sequence
     Args:
         membrane: the rest surface.
         positions: `[D, 3]`.
-        names: of the D dots, as the message begins.
+        names: names of the D dots, as the message begins.
 
     Raises:
         MembraneError: with the names and positions of both, and what was expected.

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 MOST_PRESTRETCH, MOST_C2_RATIO = 10.0, 1e3
 POSITIVE = {"shear_modulus": (1e-12, 1e12), "thickness": (1e-6, 1e5), "pressure": (1e-3, 1e6), "volume": (1e-12, 1e18)}
-"""What such a quantity of a membrane can be, in the file's units with any of the length units."""
+"""Ranges of these quantities of a membrane in the file's units, for every length unit."""
 FILLINGS = ("liquid", "gas", "open")
 MODELS = ("harmonic", "neo_hookean", "mooney_rivlin")
 SHAPES_BY_NUMBERS = {
@@ -89,8 +89,8 @@ class Cavity:
 
     Args:
         filling: "liquid" (volume kept) | "gas" (absolute pressure x volume kept) | "open" (pressure stays at rest).
-        pressure: of a gas, absolute, at rest, hPa.
-        volume: of a gas, length unit cubed; None: between the rim and the rest surface.
+        pressure: pressure of a gas, absolute, at rest, hPa.
+        volume: volume of a gas, length unit cubed; None: between the rim and the rest surface.
 
     Raises:
         MembraneError: names the value, what came and what was expected.
@@ -124,8 +124,8 @@ class Markers:
         positions: `[D, 3]` of the dots at rest, length unit, camera frame; None: found in the rest image.
         sizes: D times "small" | "large"; None: all small.
         rest_image: an array as `to_grey` takes it, kept as grey float32 `[height, width]`; or a path, which is read.
-        height: of dots that stand off the inner side, as pins' tips do, along the inward normal, length unit: one number for
-            all, or `[D]`, one for each listed dot, whose position is then that of its foot on the surface.
+        height: height of dots that stand off the inner side along the inward normal, as the tips of pins do, length unit: one
+            number for all, or `[D]`, one for each listed dot, whose position is then that of its foot on the surface.
 
     Raises:
         MembraneError: names the value, what came and what was expected.
@@ -235,7 +235,7 @@ class Surface:
 
     @classmethod
     @check_arguments
-    def of(cls, membrane: Membrane) -> "Surface":
+    def from_membrane(cls, membrane: Membrane) -> "Surface":
         """The surface that a membrane's own grid describes.
 
         Args:
@@ -247,6 +247,8 @@ class Surface:
         m, n = membrane.grid
         vertices = membrane.rest.cpu().double().numpy().reshape(m, n, 3)
         return cls("grid", {"vertices": vertices, "fixed": membrane.fixed.cpu().numpy().reshape(m, n)})
+
+    of = from_membrane  # its name before 0.2.0
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Those of the values that are arrays, which lie in a file of their own."""
@@ -293,7 +295,7 @@ def refuse_other_size(size: tuple[int, int], camera: Camera) -> None:
     """Refuse a rest image that is neither of the camera's size nor, where it is in a mode, of the calibrated one.
 
     Args:
-        size: of the image, width and height, px.
+        size: size of the image, width and height, px.
         camera: the sensor's.
 
     Raises:

@@ -12,7 +12,7 @@ class Record(NamedTuple):
     """`[record]` of a sensor file. It says nothing of how images become surfaces, so it is no part of the fingerprint.
 
     Attributes:
-        serial: of the piece, any text.
+        serial: serial of the piece, any text.
         calibrated: the day of the latest calibration.
         images: that it was made from.
         by: what made it.

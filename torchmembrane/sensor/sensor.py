@@ -80,7 +80,7 @@ class Sensor:
         if isinstance(self.surface, InflatedSurface):
             self._solve_again(self.surface)
         if self.surface is None or not _same_surface(self.surface.membrane(self.membrane.grid), self.membrane):
-            object.__setattr__(self, "surface", Surface.of(self.membrane))
+            object.__setattr__(self, "surface", Surface.from_membrane(self.membrane))
         if self.markers.rest_image is not None:
             object.__setattr__(self, "markers", _in_mode(self.markers, self.markers.rest_image, self.camera))
         if self.markers.positions is not None:
@@ -97,7 +97,7 @@ class Sensor:
         """The sensor of one of the views alone, in that view's frame: its camera, and the membrane as it is seen from there.
 
         Args:
-            number: of the view, from 0; 0 of a sensor with one camera is the sensor itself.
+            number: number of the view, from 0; 0 of a sensor with one camera is the sensor itself.
 
         Raises:
             MembraneError: there is no such view.
@@ -147,8 +147,7 @@ class Sensor:
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Width and height, px, of its images: the camera's; of several views those of the image that they share, or of the
-        largest."""
+        """Width and height of its images, px. For several views it is the size of their common or largest image."""
         modes = [view.camera.mode for view in self.views if view.region is not None]
         if modes and modes[0] is not None:
             return modes[0].image_size
@@ -209,7 +208,7 @@ class Sensor:
         """The sensor that a `sensor.toml` describes, with the files named in it (paths relative to it).
 
         Args:
-            path: of the `.toml` file.
+            path: path of the `.toml` file.
 
         Returns:
             The `Sensor`.

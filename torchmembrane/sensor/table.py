@@ -22,9 +22,9 @@ from ..files.system_files import is_of_system
 from .suggestions import did_you_mean
 
 MOST_BYTES, LONGEST_LINE = 2**15, 2000
-"""Of a sensor file: the time that TOML takes grows as the square of a line's length."""
+"""Largest sensor file, and longest line in it: the time to read TOML grows as the square of a line's length."""
 MOST_FILES = 1000
-"""That a key may name."""
+"""Largest number of files that a key may name."""
 LARGEST = 1e300
 """Whole number."""
 DEEPEST = 8
@@ -37,7 +37,7 @@ class Table:
 
     Args:
         path: the file.
-        name: of the table, dotted; empty for the file itself.
+        name: name of the table, dotted; empty for the file itself.
         values: by key.
 
     Example:
@@ -219,7 +219,7 @@ def toml_lines(name: str, values: Mapping[str, object], repeated: bool = False) 
     """A table as lines of TOML.
 
     Args:
-        name: of the table, dotted; empty for the file itself.
+        name: name of the table, dotted; empty for the file itself.
         values: text, numbers and lists of numbers by key; keys that are None are left out.
         repeated: one of a list of tables.
 
@@ -245,7 +245,7 @@ def _shown(value: object) -> str:
 
 
 def _plain(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """What a file holds, refused where it is nested too deeply or a whole number is no number of this world."""
+    """The content of a file; refused if it is nested too deeply or contains a whole number of more than 300 digits."""
     level: list[Any] = [values]
     for _ in range(DEEPEST + 1):
         if any(isinstance(value, int) and abs(value) > LARGEST for value in level):

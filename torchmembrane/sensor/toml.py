@@ -40,7 +40,7 @@ FORMAT = 1
 COARSEST, FINEST = 25, 33  # solver grids chosen where the file names none
 FEWEST_LINES, MOST_LINES = 5, 65  # of a solver grid: beyond, a frame takes more than 2 GB
 MOST_VERTICES = 2**18
-"""Of a rest surface in a file of arrays."""
+"""Largest number of vertices of a rest surface in a file of arrays."""
 MOST_DOTS, MOST_DOTS_BYTES = 2000, 2**20
 SIZES = ("small", "large")
 DOTS_HEADER = ("x", "y", "z", "size")
@@ -53,7 +53,7 @@ def read_sensor(path: Path, undotted: bool = False) -> SensorParts:
     """The parts of the sensor that a `sensor.toml` describes; `Sensor.from_file` puts them together.
 
     Args:
-        path: of the `.toml` file; the files named in it are relative to its folder.
+        path: path of the `.toml` file; the files named in it are relative to its folder.
         undotted: whether it is a design that may have no dots yet; one in the middle then stands for those to come.
 
     Returns:
@@ -102,7 +102,7 @@ def write_sensor(parts: SensorParts, path: Path) -> Path:
 
     Args:
         parts: what is written.
-        path: of the `.toml` file; the other files are named after it.
+        path: path of the `.toml` file; the other files are named after it.
 
     Returns:
         The path.

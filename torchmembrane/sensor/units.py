@@ -21,7 +21,7 @@ def hectopascal(unit: str) -> float:
     """One hPa, which is 100 N/m^2, in N per length unit squared.
 
     Args:
-        unit: of length, one of `METRE`.
+        unit: unit of length, one of `METRE`.
 
     Example:
         >>> hectopascal("mm"), hectopascal("m")

@@ -15,12 +15,12 @@ from .views import View
 
 
 def grey_views(images: Any, views: Sequence[View], channels: Channels, like: Tensor) -> Tensor:
-    """Grey images `[B, W, height, width]` in 0..1; a smaller view's are dark beyond its own size.
+    """Grey images `[B, W, height, width]` in 0..1; the image of a smaller view is dark beyond its own size.
 
     Args:
-        images: of W views, the first view's first: a list of W batches, each as `to_grayscale_batch` takes them; or stacked,
-            `[W, height, width]` or `[B, W, height, width]`, colour with its three channels last.
-        views: of the sensor.
+        images: images of W views, those of the first view first: a list of W batches, each as `to_grayscale_batch` takes them;
+            or stacked, `[W, height, width]` or `[B, W, height, width]`, colour with its three channels last.
+        views: views of the sensor.
         channels: order of the channels of colour images.
         like: a tensor of the precision and device.
 
@@ -58,8 +58,8 @@ def read_views(path: Path, views: Sequence[View], like: Tensor) -> Tensor:
     """A frame's images of all views, `[1, W, height, width]`, as of `grey_views`.
 
     Args:
-        path: of the first view's image, as of `view_files`.
-        views: of the sensor.
+        path: path of the first view's image, as of `view_files`.
+        views: views of the sensor.
         like: a tensor of the precision and device.
 
     Raises:
@@ -74,8 +74,9 @@ def view_files(path: Path, names: Sequence[str]) -> list[Path]:
     """The image files of a frame, of all views.
 
     Args:
-        path: of the first view's image, NAME_VIEW and an ending; the others have the same name and ending, with their view's.
-        names: of the views that have images of their own; none of one view, or of regions of one image.
+        path: path of the first view's image, NAME_VIEW and an ending; the others have the same name and ending with the name of
+            their view.
+        names: names of the views that have images of their own; none of one view, or of regions of one image.
 
     Raises:
         MembraneError: the file is not named after the first view.

@@ -16,7 +16,7 @@ from .parts import Surface
 SIDES = ("inside", "outside")
 MOST_VIEWS = 8
 FEWEST_LINES = 25
-"""Of the solver's grid: two views see the shape so well that on fewer lines the grid's own error is what forces are off by."""
+"""Fewest lines of the solver's grid: two views see the shape so well that a coarser grid dominates the error of forces."""
 SAME_PLACE = 1e-9
 """Largest entry by which the first view's pose may differ from none."""
 
@@ -29,9 +29,9 @@ class View:
     Args:
         name: one word, also of the files of its images.
         camera: the calibrated `Camera`; of a region of a shared image that of the region, `camera.in_mode(region)`.
-        pose: of the view's frame in the first view's; reflected of a mirror.
+        pose: pose of the view's frame in the first view's; it reflects for a mirror.
         rest_image: as of `Markers`, without contact; None: displacements are then from where the model sees the markers.
-        side: of the membrane at which it looks, "inside" | "outside".
+        side: side of the membrane at which it looks, "inside" | "outside".
         is_region: whether it is a region of an image that all views share.
 
     Raises:

@@ -48,7 +48,7 @@ class WorkingRange(NamedTuple):
         """Write it as TOML, whole or not at all."""
         write_text(path, "\n".join([HEAD, *toml_lines("", self._asdict())]) + "\n")
 
-    def of(self, fingerprint: str) -> "WorkingRange":
+    def for_fingerprint(self, fingerprint: str) -> "WorkingRange":
         """This one where it was found for the sensor of this fingerprint, or for any; else `GENERAL`."""
         return self if self.sensor in ("", fingerprint) else GENERAL
 
@@ -80,7 +80,7 @@ def turn_cosine(normals: Tensor, rest: Tensor) -> Tensor:
 
 
 GENERAL = WorkingRange(depth=0.175, turn=60.0)
-"""Of sensors without a range of their own: `docs/accuracy.md` says what it was found on."""
+"""Range of sensors that have none of their own; `docs/accuracy.md` says on which sensors it was found."""
 UNLIMITED = WorkingRange(depth=inf)
 
 

@@ -31,9 +31,9 @@ class Plan(NamedTuple):
     """The settings that the presses of a data set share.
 
     Attributes:
-        kinds: of indenters, some of `KINDS`.
+        kinds: kinds of indenters, some of `KINDS`.
         friction: Coulomb's coefficient.
-        seed: of presses and noise.
+        seed: seed of presses and noise.
         increment: longest travel in a step, length unit; None: as of `presses`.
 
     Example:
@@ -177,7 +177,7 @@ def make_frames(
     Args:
         simulator: that makes them.
         plan: what the presses share.
-        count: of the data set's frames.
+        count: number of the data set's frames.
         frames: where they are kept.
         jobs: processes.
         report: takes a line for each press that fails; default: it is written to stderr.

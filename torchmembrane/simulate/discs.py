@@ -10,10 +10,10 @@ def draw_discs(image: Tensor, centres: Tensor, radii: Tensor, grey: Tensor) -> N
     """Draw discs, one after the other.
 
     Args:
-        image: of samples, `[H, W]`; it is changed.
+        image: image of samples, `[H, W]`; it is changed.
         centres: `[T, 2]`, samples.
         radii: two across each other as they are imaged, `[T, 2, 2]`: radius, then u and v; what lies between is linear.
-        grey: of the discs, `[T]`.
+        grey: grey value of the discs, `[T]`.
 
     Example:
         >>> image = torch.ones(3, 5)

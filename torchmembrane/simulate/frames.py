@@ -80,7 +80,7 @@ class SimulatedFrameTable(SimulatedFrames):
 
     Args:
         folder: that exists.
-        record: of the sensor, as `Record.text`.
+        record: record of the sensor, as `Record.text`.
     """
 
     def __init__(self, folder: Path, record: str = "") -> None:
@@ -145,7 +145,7 @@ def video_file(path: Path, rate: int = 25) -> Iterator[Callable[[np.ndarray], No
     """An H.264 video that is written image by image, whole or not at all.
 
     Args:
-        path: of the file, `.mp4`.
+        path: path of the file, `.mp4`.
         rate: images a second.
 
     Yields:

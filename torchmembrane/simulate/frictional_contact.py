@@ -105,7 +105,7 @@ class FrictionalContact(NamedTuple):
         return torch.zeros_like(x).index_copy(0, index, self.normal[index, None] * n + self.tangential[index])
 
     def distance_from(self, other: "FrictionalContact") -> float:
-        """Largest difference of a nodal force component."""
+        """Largest difference between the nodal force components of two contacts."""
         normal, tangential = self.normal - other.normal, self.tangential - other.tangential
         return float(torch.cat([normal, tangential.ravel()]).abs().max())
 

@@ -232,7 +232,7 @@ class Wedge(Indenter):
 
     Args:
         opening: between its flanks, degrees.
-        radius: of its rounded edge, length unit.
+        radius: radius of its rounded edge, length unit.
 
     Example:
         >>> round(Wedge(90.0, 0.5).distance(torch.tensor([0.0, 0, 2])).item(), 6)
@@ -262,7 +262,7 @@ class Box(Indenter):
 
     Args:
         sides: `[3]`, length unit.
-        radius: of edges and corners.
+        radius: radius of edges and corners.
 
     Example:
         >>> Box((4.0, 4.0, 2.0), 0.5).distance(torch.tensor([[0.0, 0, 3], [0.0, 0, 0]])).tolist()

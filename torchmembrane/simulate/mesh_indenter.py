@@ -16,7 +16,7 @@ from .indenters import Indenter, box_distance
 
 KINDS = ("stl", "obj", "ply")
 MOST_TRIANGLES, MOST_BYTES = 200_000, 2**25
-"""Of a file."""
+"""Largest number of triangles and of bytes of a file."""
 
 
 @check_arguments

@@ -82,7 +82,7 @@ class Dots:
 
     @classmethod
     @check_arguments
-    def of(cls, sensor: Sensor, radii: Sequence[float] | None = None, missing: Sequence[int] = ()) -> "Dots":
+    def from_sensor(cls, sensor: Sensor, radii: Sequence[float] | None = None, missing: Sequence[int] = ()) -> "Dots":
         """The dots that a sensor lists; `radii` of small and large ones, default 0.16 and 0.27 of their spacing."""
         positions, sizes = sensor.markers.positions, sensor.markers.sizes
         if positions is None or sizes is None:
@@ -98,6 +98,8 @@ class Dots:
         if radii is not None:
             _refuse_overlap(made)
         return made
+
+    of = from_sensor  # its name before 0.2.0
 
     def described(self) -> dict[str, Any]:
         """What a data set's settings keep of the pattern."""
@@ -130,7 +132,7 @@ class Speckle:
 
     Args:
         size: mean size of a grain, length unit.
-        seed: of the waves.
+        seed: seed of the waves.
         dark: reflectance of the darkest grains.
 
     Raises:
@@ -198,7 +200,7 @@ def pattern_of(sensor: Sensor, radii: Sequence[float] | None = None, missing: Se
 
     Args:
         sensor: the sensor.
-        radii: of small and large dots, length unit; default: 0.16 and 0.27 of their spacing.
+        radii: radii of small and large dots, length unit; default: 0.16 and 0.27 of their spacing.
         missing: dots that are not painted.
 
     Raises:
@@ -210,7 +212,7 @@ def pattern_of(sensor: Sensor, radii: Sequence[float] | None = None, missing: Se
         'Dots'
     """
     if sensor.markers.positions is not None:
-        return Dots.of(sensor, radii, missing)
+        return Dots.from_sensor(sensor, radii, missing)
     if radii or len(missing):
         raise MembraneError(f"sensor {sensor.name!r} lists no dots; expected neither radii nor missing dots, or list them")
     if sensor.markers.rest_image is None:
@@ -222,7 +224,7 @@ def inside_unit_disc(place: Tensor, slope: Tensor) -> Tensor:
     """The share of each sample that lies within the unit disc, whose outline is taken as straight.
 
     Args:
-        place: of the samples, in units of the disc's radius, `[S, 2]`.
+        place: place of the samples, in units of the disc's radius, `[S, 2]`.
         slope: its derivative in the image, `[S, 2, 2]`.
 
     Returns:
@@ -244,8 +246,8 @@ def dot_coordinates(
     """Triangles that a dot may touch, and their corners in its tangent plane.
 
     Args:
-        corners: of the triangles, `[T, 3, 3]`.
-        positions: of the dots, `[D, 3]`.
+        corners: corners of the triangles, `[T, 3, 3]`.
+        positions: positions of the dots, `[D, 3]`.
         normals: there, `[D, 3]`.
         radii: `[D]`.
 

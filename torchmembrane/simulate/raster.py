@@ -1,6 +1,6 @@
-"""Which triangle of a projected mesh is visible at every sample of an image, and values that are linear on triangles.
+"""Rasterisation: the visible triangle of a projected mesh at every sample, and values that are linear on triangles.
 
-Triangles are cut into spans of rows, all of them at once.
+All triangles are cut into spans of rows at once.
 """
 
 from typing import NamedTuple
@@ -18,8 +18,8 @@ def visible_triangles(corners: Tensor, depth: Tensor, width: int, height: int) -
         corners: `[T, 3, 2]`. Only triangles that turn from +u to +v are visible, which those of an outward surface do from
             inside, and none with a corner that is NaN.
         depth: `[T]`, one for each triangle.
-        width: of the image.
-        height: of the image.
+        width: width of the image.
+        height: height of the image.
 
     Returns:
         Indices of triangles, int64 `[height, width]`, -1 where there is none.
@@ -93,7 +93,7 @@ class LinearOnTriangles(NamedTuple):
     corner: Tensor
 
     @classmethod
-    def of(cls, corners: Tensor, values: Tensor) -> "LinearOnTriangles":
+    def from_corners(cls, corners: Tensor, values: Tensor) -> "LinearOnTriangles":
         """From corners `[T, 3, 2]` and the values there `[T, 3, C]`."""
         (a, b), (c, d) = ((corners[:, k] - corners[:, 0]).unbind(-1) for k in (1, 2))
         det = a * d - b * c

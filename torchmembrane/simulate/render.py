@@ -29,8 +29,8 @@ class RenderedDots(NamedTuple):
     """Dots of a deformed membrane.
 
     Attributes:
-        positions: of their centres, `[..., D, 3]`; of dots at a height of their tips.
-        pixels: of their centres, `[..., D, 2]`.
+        positions: positions of their centres, `[..., D, 3]`; of dots at a height of their tips.
+        pixels: pixels of their centres, `[..., D, 2]`.
         visible: `[..., D]` bool, in the image and not hidden.
     """
 
@@ -173,7 +173,7 @@ class Renderer(nn.Module):
         """Images without noise.
 
         Args:
-            vertices: of the membrane on the grid, `[..., V, 3]`.
+            vertices: vertices of the membrane on the grid, `[..., V, 3]`.
 
         Returns:
             Images, `[..., H, W]`, float32 in 0..1.
@@ -191,7 +191,7 @@ class Renderer(nn.Module):
         """Depth images of the membrane: z along the axis of what is visible at each pixel's centre.
 
         Args:
-            vertices: of the membrane on the grid, `[..., V, 3]`.
+            vertices: vertices of the membrane on the grid, `[..., V, 3]`.
 
         Returns:
             Depths, length unit, `[..., H, W]`; NaN beside the membrane.
@@ -203,7 +203,7 @@ class Renderer(nn.Module):
         corners, visible = self._visible(x, samples=1)
         sample = torch.nonzero(visible.view(-1) >= 0).squeeze(-1)
         place = torch.stack([sample % visible.shape[1], sample // visible.shape[1]], -1).float()
-        linear = LinearOnTriangles.of(corners, x[self.surface.triangles][..., 2:])
+        linear = LinearOnTriangles.from_corners(corners, x[self.surface.triangles][..., 2:])
         depth = linear.at(visible.view(-1)[sample], place).squeeze(-1)
         image = torch.full(visible.shape, torch.nan, dtype=depth.dtype, device=visible.device)
         image.view(-1)[sample] = depth
@@ -244,10 +244,10 @@ class Renderer(nn.Module):
         triangle = visible.view(-1).index_select(0, sample)
         place = torch.stack([sample % visible.shape[1], sample // visible.shape[1]], -1).float()
         brightness = torch.stack([self.albedo * light[:, 0], light[:, 1]], -1)[self.surface.triangles]
-        grey, shine = LinearOnTriangles.of(corners, brightness).at(triangle, place).unbind(-1)
+        grey, shine = LinearOnTriangles.from_corners(corners, brightness).at(triangle, place).unbind(-1)
         near = torch.nonzero(self.inked.index_select(0, triangle)).squeeze(-1)
         if len(near):
-            linear = LinearOnTriangles.of(corners[self.inked], self.dot_place)
+            linear = LinearOnTriangles.from_corners(corners[self.inked], self.dot_place)
             row = self.dot_row.index_select(0, triangle.index_select(0, near))
             covered = inside_unit_disc(linear.at(row, place.index_select(0, near)), linear.slope.index_select(0, row))
             grey[near] *= 1 + (self.ink - 1) * covered
@@ -283,8 +283,8 @@ def render(
 
     Args:
         sensor: as of `Renderer`, as are the other arguments.
-        vertices: of the membrane on the grid, `[..., V, 3]`.
-        grid: of the vertices.
+        vertices: vertices of the membrane on the grid, `[..., V, 3]`.
+        grid: grid of the vertices.
         pattern: on the membrane.
         appearance: light, lens and chip.
         samples: along a pixel's side.

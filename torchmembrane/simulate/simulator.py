@@ -102,9 +102,9 @@ class Simulator:
 
     Args:
         sensor: the sensor.
-        grid: of the equilibrium; default: about 38 per side, finer than the solver's, no line in common but the rim.
+        grid: grid of the equilibrium; default: about 38 per side, finer than the solver's, no line in common but the rim.
         appearance: light, lens and chip.
-        radii: of small and large dots, length unit; default: as in `Dots.of`.
+        radii: radii of small and large dots, length unit; default: as in `Dots.from_sensor`.
         missing: dots that are not painted.
 
     Raises:
@@ -192,7 +192,7 @@ class Simulator:
 
         Args:
             stroke: the motion.
-            legs: of the stroke, some of "push", "slide", "release".
+            legs: legs of the stroke, some of "push", "slide", "release".
             frames: on each leg.
             increment: longest travel in one step; default: as of `presses`.
 
@@ -230,8 +230,8 @@ class Simulator:
 
         Args:
             state: the equilibrium.
-            stroke: that led to it.
-            rng: of the image's noise.
+            stroke: motion of the indenters that led to it.
+            rng: random generator of the image's noise.
 
         Returns:
             The image with its truth: dots_nominal, dots_deformed `[D, 3]`, uv_nominal, uv_deformed `[D, 2]` px (of the dots'

@@ -18,7 +18,7 @@ class TargetRenderer(NamedTuple):
     """One camera's images of flat targets.
 
     Attributes:
-        origin: of the rays through all samples of the image, `[H s, W s, 3]`.
+        origin: origin of the rays through all samples of the image, `[H s, W s, 3]`.
         direction: theirs, `[H s, W s, 3]`.
 
     Example:
@@ -56,7 +56,7 @@ class TargetRenderer(NamedTuple):
             translation: `[3]`, length unit.
             noise: white over its standard deviation, dB; None: no noise.
             blur: standard deviation of the defocus, px.
-            rng: of the noise.
+            rng: random generator of the noise.
 
         Returns:
             The image in grey, uint8 `[H, W]`.

@@ -44,7 +44,7 @@ def factor(parts: Sequence[Tensor], dense: Callable[[Tensor], Tensor]) -> Factor
     """What `substitute` needs to solve `M x = b`.
 
     Args:
-        parts: of `M`, as `places` lists them, best with a diagonal about 1.
+        parts: parts of `M`, as `places` lists them, best with a diagonal about 1.
         dense: makes blocks `[K B, s, s]` of what a part `[B, ...]` has of `K` of them, which are a matrix's worth of memory if
             all are there at once.
     """

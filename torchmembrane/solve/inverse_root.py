@@ -62,8 +62,10 @@ def by_cholesky(matrix: Tensor) -> Tensor:
 
 @onnx_function
 def by_products(matrix: Tensor) -> Tensor:
-    """`inverse_root` by matrix products; too small in the directions of eigenvalues below a leaf's largest over
-    `LARGEST_CONDITION`."""
+    """`inverse_root` by matrix products.
+
+    It is too small in the directions of eigenvalues below the largest one of a leaf divided by `LARGEST_CONDITION`.
+    """
     if matrix.shape[-1] > ITERATED_LEAF:
         return _by_parts(matrix, by_products, ITERATED_LEAF)
     condition = LARGEST_CONDITION[matrix.dtype]

@@ -128,7 +128,7 @@ class Inner(NamedTuple):
     size: tuple[int, int]
 
     @classmethod
-    def of(cls, size: tuple[int, int]) -> "Inner":
+    def from_size(cls, size: tuple[int, int]) -> "Inner":
         row, column = np.indices(size)
         return cls(row.ravel(), column.ravel(), size)
 
@@ -141,7 +141,7 @@ def _sources(inner_grid: tuple[int, int], free: np.ndarray, places: np.ndarray, 
     """Where the entries between the two grid rows of each of the `places [places, 2]` are, between the numbers of a vertex and
     those of the ones at most `REACH` columns from it, `[places, columns, 3, WIDTH]`: among the vertices' blocks
     `[3, 3, 10, N]`, a zero and a one. Places of which a row is not there are zero."""
-    inner, N, K = Inner.of(inner_grid), len(free), len(OFFSETS)
+    inner, N, K = Inner.from_size(inner_grid), len(free), len(OFFSETS)
     number = np.full((2 * REACH + 1,) * 2, -1)
     for k, offset in enumerate(OFFSETS):
         number[offset] = k  # negative indices wrap: the opposite offset has its own place

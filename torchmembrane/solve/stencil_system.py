@@ -12,10 +12,10 @@ from .stencil import STENCIL
 from .stencil_layouts import OFFSETS, Band, Inner, RowBlocks
 
 SLOTS = sorted(range(len(STENCIL)), key=STENCIL.__getitem__)
-"""Of a stencil, in the order of the vertices: from one to a later one leads an offset, never its opposite."""
+"""Places of a stencil in the order of the vertices: an offset leads from one to a later one, never its opposite."""
 
 PAIRS = [(a, b) for k, a in enumerate(SLOTS) for b in SLOTS[k:]]
-"""Of a stencil's vertices, each with itself and with the later ones."""
+"""Pairs of a stencil's vertices, each with itself and with the later ones."""
 
 
 class Matrix(NamedTuple):
@@ -111,7 +111,7 @@ class StencilSystem(nn.Module):
 def _ends(inner_grid: tuple[int, int]) -> np.ndarray:
     """The numbers of every vertex' neighbours at `OFFSETS`, of some vertex where there is none, in fields `[3, N]`: `[3, 10,
     N]`."""
-    inner = Inner.of(inner_grid)
+    inner = Inner.from_size(inner_grid)
     beside = np.stack([inner.at(inner.row + i, inner.column + j) for i, j in OFFSETS]).clip(min=0)
     return beside + len(inner.row) * np.arange(3)[:, None, None]
 

@@ -18,7 +18,7 @@ def bicubic_shares(points: SurfacePoints, grid: tuple[int, int], fixed: Tensor) 
     """The shares of the vertices in a field at points of the surface, in the grid's own coordinates.
 
     Args:
-        points: of the grid's triangles.
+        points: points of the grid's triangles.
         grid: `m, n`, at least 3 each.
         fixed: `[V]` bool. Where it is more than the border, a field may have a kink: points near such vertices are linear in
             their triangle.

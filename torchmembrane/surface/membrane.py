@@ -258,7 +258,7 @@ class Membrane(nn.Module):
         """The same rest surface, its vertices in the same order, in another frame: of a view that may see a part of it only.
 
         Args:
-            pose: of this frame in the other one; it may reflect.
+            pose: pose of this frame in the other one; it may reflect.
             outside: whether the other view looks at the outer side, which is then away from its triangles' normals.
 
         Example:

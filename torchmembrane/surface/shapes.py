@@ -41,7 +41,7 @@ def spherical_cap(rim_radius: float, height: float, base_z: float, grid: tuple[i
 
     Args:
         rim_radius: length unit.
-        height: of the pole above the rim.
+        height: height of the pole above the rim.
         base_z: the rim's z.
         grid: vertices along x and y.
 

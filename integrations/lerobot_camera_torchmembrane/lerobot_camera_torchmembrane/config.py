@@ -17,7 +17,8 @@ class TorchMembraneCameraConfig(OpenCVCameraConfig):
 
     Args:
         sensor: path of the sensor file, `sensor.toml`; width and height are its camera's.
-        index_or_path: of the video device, as OpenCV takes it, or a video file, whose own rate is the default of `fps`.
+        index_or_path: index or path of the video device, as OpenCV takes it, or of a video file, whose own rate is the default
+            of `fps`.
 
     Raises:
         MembraneError: the sensor file is wrong, or says another width or height; or a file is no video, or of another size.

@@ -17,7 +17,7 @@ def convert(folders: list[Path], root: Path, repo_id: str, name: str, fps: int, 
         folders: what `torchmembrane reconstruct` wrote, each a run, its frames in the order of their names.
         root: the data set's folder, which must not exist.
         repo_id: its name, `owner/name`.
-        name: of the sensor in the keys `observation.tactile.NAME.points`, `.wrench`, `.contacts` and `.status`.
+        name: name of the sensor in the keys `observation.tactile.NAME.points`, `.wrench`, `.contacts` and `.status`.
         fps: frames per second of the runs.
         task: what was done, in words.
 

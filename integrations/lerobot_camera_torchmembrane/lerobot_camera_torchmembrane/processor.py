@@ -23,7 +23,7 @@ class TactileProcessorStep(ObservationProcessorStep):
 
     Args:
         sensor: path of the sensor file.
-        name: of the camera.
+        name: name of the camera.
 
     Raises:
         MembraneError: the sensor file is wrong, or an image is of another size, or missing.

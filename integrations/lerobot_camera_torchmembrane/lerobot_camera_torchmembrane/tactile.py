@@ -57,8 +57,8 @@ def features(name: str, vertices: int | None = None) -> dict[str, dict]:
     """A sensor's arrays as a LeRobot data set declares them.
 
     Args:
-        name: of the sensor.
-        vertices: of its points; None: without points.
+        name: name of the sensor.
+        vertices: vertices of its points; None: without points.
     """
     names = {"wrench": list(WRENCH), "status": ["status"]}
     names["contacts"] = [f"contact{k}.{each}" for k in range(1, CONTACTS + 1) for each in OF_CONTACT]

@@ -222,7 +222,9 @@ def test_a_data_set_folder_is_loaded_by_datasets_offline(sensor, tmp_path):
 
 def test_the_viewer_takes_the_version_that_lerobot_allows(sensor, expected, tmp_path):
     reconstructor = tm.Reconstructor.from_file(sensor)
-    with RerunLog(Mesh.of(reconstructor, Settings.of(reconstructor, "npz")), tmp_path / "press.rrd") as log:
+    with RerunLog(
+        Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, "npz")), tmp_path / "press.rrd"
+    ) as log:
         log.add(0, expected)
     subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(tmp_path / "press.rrd")], check=True)
 

@@ -30,7 +30,7 @@ class Health:
 
     Args:
         sensor: that is followed.
-        path: of its file, whose age is told where the file has no record of its calibration.
+        path: path of its file, whose age is told where the file has no record of its calibration.
     """
 
     def __init__(self, sensor: tm.Sensor, path: Path):

@@ -160,7 +160,9 @@ class TrackerNode(LifecycleNode):
         path = Path(self.get_parameter("sensor").value)
         reconstructor = tm.Reconstructor.from_file(path)
         sensor, self.camera = reconstructor.sensor, reconstructor.sensor.camera
-        self.units = SiUnits(Mesh.of(reconstructor, Settings.of(reconstructor, "npz")), sensor.gas_pressure)
+        self.units = SiUnits(
+            Mesh.from_reconstructor(reconstructor, Settings.from_reconstructor(reconstructor, "npz")), sensor.gas_pressure
+        )
         tool_frame, frame_id = (self.get_parameter(name).value for name in ("tool_frame", "frame_id"))
         if tool_frame:
             self._send_transform(transform_of(sensor, tool_frame, frame_id))

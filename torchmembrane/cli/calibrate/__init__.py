@@ -47,7 +47,13 @@ def add_parser(commands: Any) -> None:
         add = add_command(steps, name, partial(_run, step.module, name), step.purpose, example, *step.aliases)
         add("sensor", metavar="SENSOR.toml", help="the design, or the sensor file of the step before")
         step.add_options(add)
-        add("--out", metavar="DIR", type=Path, required=True, help="folder of the calibrated sensor; not that of SENSOR.toml")
+        add(
+            "--out",
+            metavar="DIR",
+            type=Path,
+            required=True,
+            help="folder for the calibrated sensor; not that of SENSOR.toml",
+        )
         add_force(add)
 
 
@@ -62,30 +68,38 @@ def _run(module: str, step: str, arguments: Namespace) -> int:
 
 def _camera_options(add: Add) -> None:
     corners = count_pair("two counts, COLUMNS,ROWS")
-    add("images", metavar="IMAGES", nargs="+", help="of the checkerboard in different poses, filling the image")
+    add("images", metavar="IMAGES", nargs="+", help="images of the checkerboard in different poses, filling the image")
     add("--corners", metavar="COLUMNS,ROWS", type=corners, required=True, help="inner corners of the checkerboard")
     add("--square", metavar="LENGTH", type=positive, required=True, help="side of its squares, in the sensor's unit")
 
 
 def _ports_options(add: Add) -> None:
-    add("--air", metavar="IMAGES", nargs="+", default=[], help="of the board of dots through the ports, before filling")
-    add("--medium", metavar="IMAGES", nargs="+", default=[], help="of the same in the medium")
-    add("--dots", metavar="COLUMNS,ROWS", type=count_pair("two counts, COLUMNS,ROWS"), required=True, help="of the board")
-    add("--pitch", metavar="LENGTH", type=positive, required=True, help="of its dots, in the sensor's unit")
+    add("--air", metavar="IMAGES", nargs="+", default=[], help="images of the board of dots through the ports, before filling")
+    add("--medium", metavar="IMAGES", nargs="+", default=[], help="images of the same board in the medium")
+    add("--dots", metavar="COLUMNS,ROWS", type=count_pair("two counts, COLUMNS,ROWS"), required=True, help="dots of the board")
+    add("--pitch", metavar="LENGTH", type=positive, required=True, help="pitch of its dots, in the sensor's unit")
     add(
-        "--radius", metavar="LENGTH", type=positive, help="of its dots (default: 0.22 pitches; the three marks: 1.7 times that)"
+        "--radius",
+        metavar="LENGTH",
+        type=positive,
+        help="radius of dots (default: 0.22 pitches; the three marks: 1.7 times that)",
     )
     add("--held", metavar="NAME", nargs="+", choices=PORTS, default=[], help=f"taken as known: {', '.join(PORTS)}")
 
 
 def _rest_options(add: Add) -> None:
-    add("image", metavar="REST.png", help="the membrane at rest")
+    add("image", metavar="REST.png", help="image of the membrane at rest")
     gauge = "of an inflated surface: what a gauge reads at rest, inside over outside, with its unit, as 12hPa"
     add("--overpressure", metavar="P", type=pressure, help=gauge)
 
 
 def _views_options(add: Add) -> None:
-    add("images", metavar="IMAGES", nargs="+", help="of the membrane at rest; the first by the camera as it is in the sensor")
+    add(
+        "images",
+        metavar="IMAGES",
+        nargs="+",
+        help="images of the membrane at rest; the first by the camera as it is in the sensor",
+    )
     where = "CSV x,y,z,turn_x,turn_y,turn_z: where the camera was for each image, roughly, in its first frame; degrees"
     add("--motions", metavar="FILE.csv", type=Path, required=True, help=where)
     scale = "standard deviation of the second image's travel, which sets the scale, in the sensor's unit (default: 0.01 mm)"
@@ -101,7 +115,7 @@ def _depth_options(add: Add) -> None:
 
 
 def _material_options(add: Add) -> None:
-    add("images", metavar="IMAGES", nargs="+", help="of presses, deep ones: files, globs, folders")
+    add("images", metavar="IMAGES", nargs="+", help="images of deep presses: files, globs, folders")
     vectors, lengths = "CSV image,fx,fy,fz (on the membrane, in the camera's frame)", "image,force (magnitude)"
     table = f"{vectors} or {lengths}, N: total force in some images; each with a further column deviation or without"
     add("--forces", metavar="FILE.csv", type=Path, help=table)

@@ -47,7 +47,7 @@ def ports(arguments: Namespace) -> int:
 
 def _write(arguments: Namespace, sensor: Sensor, found: CameraFit, pixels: np.ndarray, units: list[str], title: str) -> int:
     design = [_value(sensor.camera, name) for name in found.names]
-    report = Report.of(title, found.names, units, design, found.fit, pixels, found.residuals)
+    report = Report.from_fit(title, found.names, units, design, found.fit, pixels, found.residuals)
     drawing = fit_figure(report, sensor.camera.image_size)
     return write_calibrated(arguments, replace(sensor, camera=found.camera), report, drawing, len(pixels))
 

@@ -64,8 +64,8 @@ def spare_files(step: str, arguments: Namespace) -> None:
     """Refuse a folder in which files would be written over, or that of the sensor that is calibrated.
 
     Args:
-        step: of the calibration.
-        arguments: of the command.
+        step: step of the calibration.
+        arguments: arguments of the command.
     """
     given = vars(arguments)
     read = [*files_of(sensor_file(arguments.sensor)), *(given[name] for name in FILES if given.get(name) is not None)]
@@ -86,9 +86,9 @@ def write_calibrated(
     """Write the calibrated sensor with its record, and its report, print what was found; returns the exit code.
 
     Args:
-        arguments: of the command.
+        arguments: arguments of the command.
         sensor: as found.
-        report: of it.
+        report: report of the calibration.
         drawing: its figure.
         images: that it was found from.
         uncertainty: relative standard deviation of forces, where the step tells it; default: the file's, of an earlier step.
@@ -127,7 +127,7 @@ def read_motions(path: Path) -> np.ndarray:
     """Where the camera was, `[P, 6]`: position (length unit) and rotation vector (degrees) of each view, the first one zeros.
 
     Args:
-        path: of a table with a line for each image, in their order.
+        path: path of a table with a line for each image, in their order.
 
     Raises:
         MembraneError: another table, or a first line that is not zeros.
@@ -144,7 +144,7 @@ def read_forces(path: Path, inputs: Inputs) -> KnownForces:
     """Forces of the images `[B, 3]`, or magnitudes `[B, 1]`, N, NaN where the file has none, and their standard deviations.
 
     Args:
-        path: of a table of forces by the names of images.
+        path: path of a table of forces by the names of images.
         inputs: the B images.
 
     Raises:
@@ -174,9 +174,9 @@ def read_depth(path: Path, unit: float | None, length_unit: str) -> np.ndarray:
     As ROS has them: 16 bits, 0 where there is none, or float, NaN and infinities there.
 
     Args:
-        path: of an array, or of an image with 16 bits or float.
-        unit: of one step of the file's values; default: of an image with 16 bits 1 mm, else the length unit.
-        length_unit: of the sensor.
+        path: path of an array, or of an image with 16 bits or float.
+        unit: unit of one step of the file's values; default: of an image with 16 bits 1 mm, else the length unit.
+        length_unit: unit of the sensor.
 
     Raises:
         MembraneError: the file cannot be read, or its depths are none of this world.

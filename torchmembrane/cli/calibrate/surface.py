@@ -41,7 +41,7 @@ def rest(arguments: Namespace) -> int:
         units, design = [*units, unit, ""], np.append(design, [sheet.formed.height, sensor.material.prestretch])
         notes += _held(found.sensor, arguments.overpressure)
     title = "rest surface from one image"
-    report = Report.of(title, found.names, units, design, found.fit, found.pixels, found.residuals, notes)
+    report = Report.from_fit(title, found.names, units, design, found.fit, found.pixels, found.residuals, notes)
     return write_calibrated(arguments, found.sensor, report, fit_figure(report, sensor.camera.image_size), 1)
 
 
@@ -75,7 +75,8 @@ def views(arguments: Namespace) -> int:
     units = (["degrees"] * 3 + [unit] * 3) * (P - 1)
     modelled = found.sensor.camera.point_to_pixel(torch.from_numpy(found.dots)).numpy()
     pixels = np.broadcast_to(modelled, found.residuals.shape)
-    report = Report.of(f"rest surface from {P} views", found.names, units, design, found.fit, pixels, found.residuals, notes)
+    title = f"rest surface from {P} views"
+    report = Report.from_fit(title, found.names, units, design, found.fit, pixels, found.residuals, notes)
     return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface), P)
 
 

@@ -16,7 +16,7 @@ neighbourhood of radius `reach` (contacts are patches), and the weights of the s
 
 Iteratively reweighted least squares (IRLS) by Gauss-Newton steps, while `tau` declines from where everything is quadratic
 (graduated non-convexity, GNC): no start but the rest surface is needed. A fine grid starts from the solution on every second of
-its lines, and a `Dent` where something pushes. What has not settled is solved again, by more steps from several starts.
+its lines, with an `InitialGuess` where something pushes. Frames that have not settled are solved again from several starts.
 """
 
 from dataclasses import replace
@@ -42,7 +42,7 @@ from .marker_residuals import MarkerResiduals, MeasuredRays, marker_rays, rest_r
 from .normal_equations import BalanceEquations
 from .pressure_gauge import gauge_reading, refuse_open
 from .settings import ForceBalanceSettings
-from .starts import Dent
+from .starts import InitialGuess
 from .traction_loss import TractionLoss, is_significant
 from .uncertainty import depths, gap_around, noise_effects, of_presses, shares_of_deepest, spreads, standard_deviations
 
@@ -114,7 +114,7 @@ class ForceBalance(Estimator):
         loss = TractionLoss(membrane, self.reference, cone, settings)
         self.equations = BalanceEquations(ContactForce(membrane, elasticity), bearings, loss)
         self.gauss_newton = GaussNewton(self.equations, self.cavity, settings)
-        self.dent = Dent(self.gauss_newton) if self.coarse is not None and self.coarse.coarse is None else None
+        self.dent = InitialGuess(self.gauss_newton) if self.coarse is not None and self.coarse.coarse is None else None
         self.settling = 1 if is_coarse or self.coarse is not None else SINGLE_GRID_SETTLING_STEPS
         first = settings.coarse_steps if is_coarse else settings.steps
         self.steps = first if self.coarse is None else settings.finer_steps if self.dent is None else settings.fine_steps
@@ -134,7 +134,7 @@ class ForceBalance(Estimator):
         if any(count % 2 == 0 or count < 2 * self.settings.coarsest - 1 for count in grid):
             return None
         every_second = Membrane(*(a.unflatten(0, grid)[::2, ::2].numpy() for a in (membrane.rest, membrane.fixed)))
-        markers, material = every_second.closest_points(positions.numpy()), elasticity.on(every_second)
+        markers, material = every_second.closest_points(positions.numpy()), elasticity.for_membrane(every_second)
         given = every_second, material, markers, positions, bearings.noise
         settings = replace(self.settings, outlier=self.settings.coarse_outlier)
         return type(self)(*given, settings=settings, is_coarse=True, **others)
@@ -151,7 +151,7 @@ class ForceBalance(Estimator):
         return self.equations.is_slack
 
     @property
-    def dents(self) -> Dent | None:
+    def dents(self) -> InitialGuess | None:
         """Those of this grid or of a coarser one."""
         return self.coarse.dents if self.dent is None and self.coarse is not None else self.dent
 
@@ -188,58 +188,58 @@ class ForceBalance(Estimator):
         """The surface that the markers' rays show."""
         measured = self.equations.bearings.measured(observation)
         found = self._solved(measured)
-        return Equilibrium(*retry_rows(self.is_done(found, measured), found, self._patiently, measured, self.chosen))
+        return Equilibrium(*retry_rows(self.is_done(found, measured), found, self._retry, measured, self.chosen))
 
-    def _patiently(self, *measured: Any) -> Equilibrium:
+    def _retry(self, *measured: Any) -> Equilibrium:
         """In many small steps: deep presses need them."""
-        return self._solved(MeasuredRays(*measured), patient=True)
+        return self._solved(MeasuredRays(*measured), is_retry=True)
 
     @traced
     def chosen(self, done: Tensor, values: Equilibrium, others: Equilibrium) -> Equilibrium:
         """`values` where `done [B]` holds, where the others broke down or are worse than what has converged; else `others`."""
         first, second = Equilibrium(*values), Equilibrium(*others)
-        is_worse = second.objective > self.settings.worse_objective * first.objective
+        is_worse = second.objective > self.settings.retry_acceptance_ratio * first.objective
         stands = self.is_converged(first) & self.is_explained(first) & is_worse
         return Equilibrium(*where_rows(done | stands | second.objective.isnan(), first, second))
 
-    def _solved(self, measured: MeasuredRays, patient: bool = False) -> Equilibrium:
-        state, before = self._stepped(measured, patient)
+    def _solved(self, measured: MeasuredRays, is_retry: bool = False) -> Equilibrium:
+        state, before = self._solve_on_grid(measured, is_retry)
         return self.equilibrium(*state, before, measured)
 
-    def _stepped(self, measured: MeasuredRays, patient: bool) -> tuple[State, Tensor]:
+    def _solve_on_grid(self, measured: MeasuredRays, is_retry: bool) -> tuple[State, Tensor]:
         """The state after all steps, on coarser grids too, and the surface before the last."""
-        schedule = self.schedule(patient)
+        schedule = self.schedule(is_retry)
         last = schedule[-1:] * len(schedule)
         found: tuple[State, Tensor]
         if self.dent is None:
             settling, damping = self.settling, self.settings.settling_damping
-            if patient and self.coarse is not None:
-                settling, damping = self.settings.settling_steps, self.settings.patient_damping
-            found = self.gauss_newton(self._begun(measured, patient), measured, schedule, settling=settling, damping=damping)
-        elif patient:
-            quick, slow = (self._undented(measured, patient) for patient in (False, True))
+            if is_retry and self.coarse is not None:
+                settling, damping = self.settings.settling_steps, self.settings.retry_damping
+            found = self.gauss_newton(self._begun(measured, is_retry), measured, schedule, settling=settling, damping=damping)
+        elif is_retry:
+            quick, slow = (self._undented(measured, is_retry) for is_retry in (False, True))
             found = self.dent.best_of_starts(quick, slow, self.at_rest(measured.weight), measured, last)
         else:
             found = self.gauss_newton(self.dent(*self._undented(measured), measured), measured, last)
         return found
 
-    def _begun(self, measured: MeasuredRays, patient: bool) -> State:
+    def _begun(self, measured: MeasuredRays, is_retry: bool) -> State:
         """At what is found on the coarser grid, without one at rest."""
         if self.coarse is None:
             return self.at_rest(measured.weight)
-        return State(*self.refined(*self.coarse._stepped(measured, patient)[0]))
+        return State(*self.refined(*self.coarse._solve_on_grid(measured, is_retry)[0]))
 
-    def _undented(self, measured: MeasuredRays, patient: bool = False) -> State:
+    def _undented(self, measured: MeasuredRays, is_retry: bool = False) -> State:
         """The state after a first step, whose pushes say where to dent it."""
-        return State(*self.gauss_newton(self._begun(measured, patient), measured, self.schedule(patient)[:1])[0])
+        return State(*self.gauss_newton(self._begun(measured, is_retry), measured, self.schedule(is_retry)[:1])[0])
 
-    def schedule(self, patient: bool = False) -> list[tuple[float, float]]:
-        """`tau` and `R` of every step on this grid; `patient`: a second time."""
+    def schedule(self, is_retry: bool = False) -> list[tuple[float, float]]:
+        """`tau` and `R` of every step on this grid; `is_retry`: a second time."""
         settings = self.settings
-        steps = settings.patience * self.steps if patient else self.steps
+        steps = settings.retry_steps_factor * self.steps if is_retry else self.steps
         if self.coarse is not None and self.dent is None:
-            return [(settings.fine_tau[-1], settings.outlier)] * (steps + patient * settings.settling_steps)
-        coarsest, fine = (settings.patient_tau, settings.patient_fine_tau) if patient else (settings.tau, settings.fine_tau)
+            return [(settings.fine_tau[-1], settings.outlier)] * (steps + is_retry * settings.settling_steps)
+        coarsest, fine = (settings.retry_tau, settings.retry_fine_tau) if is_retry else (settings.tau, settings.fine_tau)
         return settings.gnc_schedule(steps, coarsest if self.coarse is None else fine)
 
     @traced
@@ -282,7 +282,10 @@ class ForceBalance(Estimator):
         gain = steps.objective_at_rest(measured) / seen - objective
         scale = 1 + pad_border(loss.contact_scale(terms, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
         misfit, shared = self.equations.bearings.misfits(angles, measured, self.settings.outlier, self._far)
-        reasons, traction = [objective, unexplained, loss.pushed(terms.push2), shared], pad_border(traction.mT, membrane.grid)
+        reasons, traction = (
+            [objective, unexplained, loss.pushed(terms.compression2), shared],
+            pad_border(traction.mT, membrane.grid),
+        )
         return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, misfit, moved, *reasons)
 
     @traced
@@ -293,26 +296,27 @@ class ForceBalance(Estimator):
 
     @traced
     def is_settled(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: neither unfinished nor unexplained, so that more steps would change little."""
-        return (found.relative_step < self.settings.settled_step) & self.is_converged(found) & self.is_explained(found)
+        """`[B]` bool: converged and explained, so that more steps would change little."""
+        return (found.relative_step < self.settings.settled_step_tol) & self.is_converged(found) & self.is_explained(found)
 
     @traced
     def is_done(self, found: Equilibrium, measured: MeasuredRays) -> Tensor:
-        """`[B]` bool: settled, likely, no mound for a pit, hardly a marker outside, as beside a contact steps went past."""
+        """`[B]` bool: settled, plausible, not a mound in place of a dent, and with few outliers among the markers."""
         settings, (least, most, untouched) = self.settings, self.settings.likely_objective
         outlying = self.equations.bearings.outlying(found.vertices - self.membrane.rest, measured, found.moved, self._far)
-        likely = (least + settings.likely_of_press * self._press(found)).clamp_max(most)
+        likely = (least + settings.likely_per_displacement * self._press(found)).clamp_max(most)
         pushed = (is_significant(found.reference / self.reference) & ~self.membrane.fixed).any(-1)
         likely = torch.where(pushed, likely, untouched) * self.coarseness**2
-        done: Tensor = self.is_settled(found) & (found.objective <= likely) & (outlying <= settings.largest_outlying)
+        done: Tensor = self.is_settled(found) & (found.objective <= likely) & (outlying <= settings.largest_outlier_share)
         return done if self.dents is None else done & ~self.dents.is_ring_shaped(found, self.membrane)
 
     def is_explained(self, found: Equilibrium) -> Tensor:
-        """`[B]` bool: markers off their rays by noise and the model's error alone, neighbours not alike, hardly a pull or shear
-        that no push comes with, little of both together, not pushed everywhere. How hard is no reason to doubt."""
+        """`[B]` bool: noise and the model's error explain the markers' angles off their rays, neighbours are not off alike,
+        there is hardly any tension or shear without a push, little of both together, and not all of the surface is pushed."""
         settings, press = self.settings, self._press(found)
-        misfit = found.misfit / (settings.largest_misfit + settings.misfit_of_press * press) / self.coarseness
-        pulls = found.unexplained / (settings.largest_unexplained + settings.unexplained_of_press * press) / self.coarseness**2
+        misfit = found.misfit / (settings.largest_misfit + settings.misfit_per_displacement * press) / self.coarseness
+        largest = settings.largest_unexplained + settings.unexplained_per_displacement * press
+        pulls = found.unexplained / largest / self.coarseness**2
         alike, (most, aged) = found.shared_misfit / settings.largest_shared_misfit / self.coarseness, settings.largest_doubt
         doubtful = (misfit.maximum(pulls).maximum(alike) > 1) | (pulls + alike > most + aged / press)
         return torch.logical_not(doubtful | (found.pushed > settings.largest_pushed))

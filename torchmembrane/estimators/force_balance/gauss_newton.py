@@ -51,9 +51,9 @@ class GaussNewton(nn.Module):
     """Reweighted Gauss-Newton steps by a schedule of the losses' scales.
 
     Args:
-        equations: of the force balance, linearised and weighted.
+        equations: equations of the force balance, linearised and weighted.
         cavity: its law.
-        settings: of the estimator.
+        settings: settings of the estimator.
     """
 
     def __init__(self, equations: BalanceEquations, cavity: CavityLaw, settings: ForceBalanceSettings):
@@ -72,8 +72,16 @@ class GaussNewton(nn.Module):
         settling: int = 1,
         damping: float | None = None,
     ) -> tuple[State, Tensor]:
-        """The state after the steps of a schedule, and the displacement before the last; `cone`: as for `TractionLoss.weights`;
-        `settling`: so many steps, the last ones, have at least a `damping` (default, `settling_damping`) to settle."""
+        """The state after the steps of a schedule, and the displacement before the last step.
+
+        Args:
+            state: to start from.
+            measured: the markers' rays.
+            schedule: scales of the losses in every step.
+            cone: as for `TractionLoss.weights`.
+            settling: number of last steps that have at least this damping, so that they settle.
+            damping: default `settling_damping`.
+        """
         frames = max(1, VERTICES // self.membrane.rest.shape[0])
         if self.is_native(*state, *measured):
             frames = max(frames, torch.get_num_threads())
@@ -82,12 +90,12 @@ class GaussNewton(nn.Module):
         taus, size = [tau for tau, _ in schedule], len(schedule)
         numbers = [self._numbers(taus[: k + 1], damping if size - k <= settling else 0.0) for k in range(size)]
         rows = [(*scales, cone, *others) for scales, others in zip(schedule, numbers, strict=True)]
-        u, pressure, moved, before = chunked(frames, self._stepped, (*state, *measured), rows, settling)
+        u, pressure, moved, before = chunked(frames, self._run_chunk, (*state, *measured), rows, settling)
         return State(u, pressure, moved), before
 
     def _numbers(self, taus: list[float], least: float) -> tuple[float, float]:
-        """The renewal and the damping of a step, from the scales `tau` up to its own: while these decline all weights are new,
-        or they would lag behind; `least`: damping, but for a first step."""
+        """The renewal and the damping of a step, from the scales `tau` up to its own; `least`: smallest damping, except in a
+        first step. While the scales decline, all weights are new, because they would lag behind otherwise."""
         settings, (first, last) = self.settings, self.settings.tau
         *before, tau = taus
         damping = settings.damping * (min(tau, first) / last) ** 2
@@ -95,7 +103,7 @@ class GaussNewton(nn.Module):
             damping = max(damping, least)
         return settings.renewal if before[-1:] == [tau] else 1.0, damping
 
-    def _stepped(self, u: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _run_chunk(self, u: Tensor, pressure: Tensor, moved: Tensor, *given: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The state after the steps, and the displacement before the last; `given`: what is measured, the steps' scales, how
         many of them settle."""
         *of_markers, rows, settling = given
@@ -107,7 +115,7 @@ class GaussNewton(nn.Module):
         else:
             state = fori_loop(self._next, first, state, measured)
         if last:
-            state = fori_loop(self._settle, last, (*state, *state[:4], self._none_found(pressure)), measured)[5:]
+            state = fori_loop(self._step_keeping_best, last, (*state, *state[:4], self._none_found(pressure)), measured)[5:]
         u, pressure, moved, before = state[:4]
         return u, pressure, moved, before
 
@@ -117,7 +125,7 @@ class GaussNewton(nn.Module):
 
     @traced
     def _unweighted(self, u: Tensor) -> Tensor:
-        """What the first step has for the weights of a step before, `[B, N]`, and does not ask."""
+        """What stands in for the weights of a step before the first, `[B, N]`; the first step does not use it."""
         return torch.ones_like(u[:, : self.equations.loss.area.shape[0], 0])
 
     @traced
@@ -168,39 +176,42 @@ class GaussNewton(nn.Module):
         *scales: float,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """The state, the displacement before, and the weights of normal tractions."""
-        state, weights = self._traced_once(State(u, pressure, moved), weights, measured, scales)
+        state, weights = self._compiled_step(State(u, pressure, moved), weights, measured, scales)
         return *state, u, weights
 
     @traced
-    def _settle(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, weights: Tensor, *given: Any) -> list[Tensor]:
-        """As `_next`, and of the states so far that of the lowest objective, the displacement before it, and the objective: a
-        vertex that is pushed in one step and pulled in the next is no answer in every step.
+    def _step_keeping_best(
+        self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, weights: Tensor, *given: Any
+    ) -> list[Tensor]:
+        """What `_next` returns, and of the states so far the one of the lowest objective, the displacement before it and its
+        objective: where a vertex is pushed in one step and pulled in the next, not every step is an answer.
 
         Args:
-            given: the latter, what is measured, the numbers of the step.
+            given: the best state so far, what is measured, and the numbers of the step.
         """
         *kept, lowest, measured = given[:6]
-        state, weights = self._traced_once(State(u, pressure, moved), weights, measured, given[6:])
+        state, weights = self._compiled_step(State(u, pressure, moved), weights, measured, given[6:])
         objective = self.objective(state, *self.tractions(*state[:2]), measured)
         is_lower = objective < lowest
         return [*state, u, weights, *where_rows(is_lower, (*state, u, objective), (*kept, lowest))]
 
-    def _traced_once(
+    def _compiled_step(
         self, state: State, weights: Tensor, measured: MeasuredRays, scales: Sequence[float]
     ) -> tuple[State, Tensor]:
-        """`step`, which `torch.compile` then traces and compiles once, not once per step; so does the exporter by itself.
+        """`step`, which `torch.compile` traces and compiles once instead of once per step, as the exporter does by itself.
 
-        With gradients every step is: those of a nested region come with strides that torch 2.13 does not follow."""
+        With gradients every step is traced: the gradients of a nested region have strides that torch 2.13 does not follow.
+        """
         if self.is_native(*state, weights, *measured):
             *after, _, weights = self.native.take(*self._given, state, weights, measured, [scales])
             return State(*after), weights
         numbers = Scales(*(scale if isinstance(scale, Tensor) else state.u.new_full((), scale) for scale in scales))
-        step = self.step if torch.compiler.is_exporting() or torch.is_grad_enabled() else self._compiled_once
+        step = self.step if torch.compiler.is_exporting() or torch.is_grad_enabled() else self._nested_step
         taken: tuple[State, Tensor] = step(state, weights, measured, numbers)
         return taken
 
     @torch.compiler.nested_compile_region
-    def _compiled_once(self, state: State, weights: Tensor, measured: MeasuredRays, scales: Scales) -> tuple[State, Tensor]:
+    def _nested_step(self, state: State, weights: Tensor, measured: MeasuredRays, scales: Scales) -> tuple[State, Tensor]:
         return self.step(state, weights, measured, scales)
 
     def step(self, state: State, weights: Tensor, measured: MeasuredRays, scales: Scales) -> tuple[State, Tensor]:
@@ -208,9 +219,9 @@ class GaussNewton(nn.Module):
 
         Args:
             state: before the step.
-            weights: of the normal tractions in the step before, `[B, N]`.
+            weights: weights of the normal tractions in the step before, `[B, N]`.
             measured: the markers' rays.
-            scales: of the losses, and the step's other numbers.
+            scales: scales of the losses, and the step's other numbers.
 
         Returns:
             The state and the weights after it.

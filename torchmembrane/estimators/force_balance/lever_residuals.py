@@ -27,7 +27,7 @@ from ..base import Observation
 from .marker_residuals import MarkerResiduals, MeasuredRays
 
 FIELDS = 3
-"""That a tip follows: displacement, and its two derivatives."""
+"""Number of fields that a tip follows: displacement, and its two derivatives."""
 QUADRATIC = 0.5 * np.array(
     [
         [[0, 1, 0, 0, -1, 0, 0], [-4, 2, 0, 0, 2, 0, 0], [2, -1, 1, -1, -1, 1, -1]],
@@ -168,7 +168,7 @@ def _ring_shares(membrane: Membrane, markers: SurfacePoints) -> tuple[np.ndarray
     nearest = np.where(is_inner, markers.weights, -1.0).argmax(1)
     centre = corners[np.arange(len(corners)), nearest].clip(1, [m - 2, n - 2])
     ring = centre[:, None] + STENCIL
-    vertices = Inner.of((m - 2, n - 2)).at(*(ring - 1).T).T
+    vertices = Inner.from_size((m - 2, n - 2)).at(*(ring - 1).T).T
     is_corner = (ring[:, :, None] == corners[:, None]).all(-1)
     values = (is_corner * markers.weights[:, None]).sum(-1)
     flat = (is_corner * triangle_slopes(markers, membrane.grid)[:, :, None]).sum(-1)

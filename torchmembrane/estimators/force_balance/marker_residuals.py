@@ -19,7 +19,7 @@ from ...surface.tangent import tangent_frame
 from ..base import Observation, Problem
 
 NEIGHBOURS = 4
-"""Of a marker, that are asked whether they are off their rays alike."""
+"""Number of neighbours of a marker that are tested for being off their rays in the same way."""
 
 
 class MeasuredRays(NamedTuple):
@@ -49,7 +49,7 @@ def marker_rays(camera: Camera | Rig, pixels: Tensor, positions: Tensor, confide
         pixels: `[B, D, 2]`.
         positions: `[D, 3]`, the markers' rest positions: behind a port a ray's origin moves too, which turns it about a marker.
         confidence: `[B, D]`.
-        covariance: of the pixels, `[B, D, 2, 2]` px^2.
+        covariance: covariance of the pixels, `[B, D, 2, 2]` px^2.
 
     Returns:
         The rays; along `across` a turn has the covariance 1: with the derivative `J [3, 2]` of a ray in its pixel, as a marker
@@ -221,7 +221,7 @@ class MarkerResiduals(nn.Module):
         """How far the markers are off their rays, in standard deviations, and as much of it as neighbours have in common.
 
         Args:
-            angles: of the markers, `[B, 2, D]`.
+            angles: angles of the markers, `[B, 2, D]`.
             measured: the markers' rays.
             outlier: as what each marker counts at most, in the first.
             far: the same in the second.

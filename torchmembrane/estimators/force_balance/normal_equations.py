@@ -1,4 +1,4 @@
-"""The normal equations of a force balance on one grid: forces and bearings, linearised, weighted, put together.
+"""The normal equations of force balance on one grid: linearised, weighted forces and bearing residuals.
 
 Fields have their components first and the inner vertices, or the markers, last.
 """

@@ -27,7 +27,7 @@ def gauge_reading(pressure: Tensor | float, rest_pressure: Tensor, deviation: fl
 
     Args:
         pressure: across the membrane, `[B]` or `[]`, NaN where there is no reading.
-        rest_pressure: of the membrane, `[]`, of the grid whose pressure is reported.
+        rest_pressure: pressure at rest of the membrane, `[]`, of the grid whose pressure is reported.
         deviation: sigma, force / length^2.
         confidence: `[B, D]` of the frames' markers.
 

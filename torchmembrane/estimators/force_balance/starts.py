@@ -1,8 +1,8 @@
-"""A dent in the middle of every contact, for the steps to start from.
+"""Initial guesses: a dent in the middle of every contact, from which the steps start.
 
-One camera sees hardly more of a narrow contact than how its markers moved across the rays. A pit, and a low mound ringed by
-pushes, show them alike. From a smooth surface, found on a grid too coarse for the pit, the steps find the mound: a minimum,
-whose tractions cost several times those of the pit. From a dent they find the pit; where there is none it fills.
+One camera sees of a narrow contact hardly more than how its markers moved across the rays. A dent and a low mound ringed by
+pushes look alike in this. From a smooth surface, found on a grid too coarse for the dent, the steps find the mound: a minimum
+whose tractions cost several times those of the dent. From a dent they find the dent; where there is none, it fills.
 """
 
 from collections.abc import Sequence
@@ -14,20 +14,20 @@ from ...control_flow import stacked, traced, where_rows
 from ...solve.stencil import inner, pad_border
 from ...surface.membrane import Membrane
 from ..base import Equilibrium
-from ..precision import shortened
+from ..precision import rounded_to_float32
 from .gauss_newton import GaussNewton, State
 from .marker_residuals import MeasuredRays
 from .traction_loss import is_significant
 
 DEPTH = 0.05  # over the surface's size
 WIDTH = 0.1  # standard deviation, over the size
-DEEP, WIDE = (0.16, 0.08), (0.25, 0.15)  # depth and width of those for a press that the first does not find
+DEEP_DENT, WIDE_DENT = (0.16, 0.08), (0.25, 0.15)  # depth and width of dents for presses that the first dent does not find
 REACH = 0.25  # of the surroundings whose pushes have one middle, over the size
-FAINT = 1.0  # of the push that the markers' noise makes: less hardly dents
-MIDDLE = 0.04  # radius of the middle of a contact, over the size
-HOLLOW = 0.1  # push there over the largest, of which less is hardly any
-LOWER = 0.9  # objective over another's of which it is taken
-TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle of none finite
+FAINT_PUSH = 1.0  # over the push that the markers' noise makes: a fainter push hardly dents the surface
+CENTRE_RADIUS = 0.04  # of the middle of a contact, over the size
+RING_SHARE = 0.1  # push in the middle over the largest push, below which a contact is ring-shaped
+ACCEPTANCE_RATIO = 0.9  # objective of another solution over the one that is kept, below which it is taken
+TINY = 1e-12  # of a push over the reference traction, squared: keeps the middle finite where nothing pushes
 
 Schedule = list[tuple[float, float]]
 Found = tuple[State, Tensor]
@@ -35,11 +35,11 @@ Stepped = Sequence[Tensor]
 """A `State`, and the displacement a step before."""
 
 
-class Dent(nn.Module):
-    """Dents contacts in.
+class InitialGuess(nn.Module):
+    """Surfaces that are dented where something pushes.
 
     Args:
-        gauss_newton: of the grid, which knows the pushes.
+        gauss_newton: Gauss-Newton steps of the grid, which knows the pushes.
     """
 
     around: Tensor
@@ -50,7 +50,9 @@ class Dent(nn.Module):
         super().__init__()
         self.gauss_newton, self.membrane = gauss_newton, gauss_newton.membrane
         rest, size = self.membrane.rest, self.membrane.size
-        self.register_buffer("around", shortened(torch.exp(-(torch.cdist(rest, rest) ** 2) / (2 * (REACH * size) ** 2))))
+        self.register_buffer(
+            "around", rounded_to_float32(torch.exp(-(torch.cdist(rest, rest) ** 2) / (2 * (REACH * size) ** 2)))
+        )
         self.register_buffer("area", self.membrane.rest_area / size**2)
         self.register_buffer("free", (~self.membrane.fixed).double())
 
@@ -62,29 +64,29 @@ class Dent(nn.Module):
     @traced
     def deep(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays) -> State:
         """The state, dented deeper."""
-        return self._dented(u, pressure, moved, measured, *DEEP)
+        return self._dented(u, pressure, moved, measured, *DEEP_DENT)
 
     @traced
     def wide(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays) -> State:
         """The state, dented deeper and wider."""
-        return self._dented(u, pressure, moved, measured, *WIDE)
+        return self._dented(u, pressure, moved, measured, *WIDE_DENT)
 
     def _dented(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays, depth: float, width: float) -> State:
         membrane, loss = self.membrane, self.gauss_newton.equations.loss
         normals = membrane.normals(membrane.rest + u)
         q_n = (self.gauss_newton.traction(State(u, pressure, moved), measured) * normals).sum(-1, keepdim=True)
-        push2 = loss.push2(inner(q_n, membrane.grid)[..., 0])
-        weight = (pad_border(push2[..., None], membrane.grid)[..., 0] + TINY) * self.area
+        compression2 = loss.compression2(inner(q_n, membrane.grid)[..., 0])
+        weight = (pad_border(compression2[..., None], membrane.grid)[..., 0] + TINY) * self.area
         middle = (weight[..., None] * membrane.rest).mT @ self.around / (weight @ self.around)[:, None]
         off2 = (middle.mT - membrane.rest).square().sum(-1) / membrane.size**2
-        faint2 = (FAINT * measured.noise_level[:, None] * loss.push_noise).square().mean(-1) + TINY
-        share = (push2.amax(-1) / (push2.amax(-1) + faint2))[:, None]
+        faint2 = (FAINT_PUSH * measured.noise_level[:, None] * loss.push_noise).square().mean(-1) + TINY
+        share = (compression2.amax(-1) / (compression2.amax(-1) + faint2))[:, None]
         inwards = depth * membrane.size * share * torch.exp(-off2 / (2 * width**2)) * self.free
         return State(u - inwards[..., None] * normals, pressure, moved)
 
     def is_ring_shaped(self, found: Equilibrium, membrane: Membrane) -> Tensor:
-        """`[B]` bool: hardly anything pushes in the middle of what pushes, as where a mound ringed by pushes stands for a pit,
-        or two contacts are close; `membrane`: of the finer grid it is found on."""
+        """`[B]` bool: hardly anything pushes in the middle of a contact, as where a mound ringed by pushes is found in place of
+        a dent, or where two contacts are close; `membrane`: of the finer grid on which the solution was found."""
         p0 = self.gauss_newton.equations.loss.reference
         pushes = (-(found.traction * membrane.normals(found.vertices)).sum(-1) / p0).clamp_min(0)
         pushes = torch.where(is_significant(found.reference / p0), pushes, 0.0)
@@ -94,14 +96,16 @@ class Dent(nn.Module):
         around = pushes * self.area * self.around[pushes.argmax(-1)]
         middle = around @ rest / around.sum(-1, keepdim=True)
         off2 = (rest - middle[:, None]).square().sum(-1) / size**2
-        near = torch.exp(-off2 / (2 * MIDDLE**2)) * self.area
-        return torch.lt((near * pushes).sum(-1) / near.sum(-1), HOLLOW * pushes.amax(-1))
+        near = torch.exp(-off2 / (2 * CENTRE_RADIUS**2)) * self.area
+        return torch.lt((near * pushes).sum(-1) / near.sum(-1), RING_SHARE * pushes.amax(-1))
 
     def best_of_starts(self, quick: State, slow: State, rest: State, measured: MeasuredRays, schedule: Schedule) -> Found:
-        """The best of what the steps of a schedule make of several dents in two states and of two states found from `rest` on
-        this grid, and the displacement a step before; the first of those that are about as good, for answers must not jump
-        between them. The two from rest: by a sharp loss from the start, and without a cone, where shear is dear even under a
-        push."""
+        """The best solution from several starts, and the displacement a step before it.
+
+        The starts are dents of two states and two states found from `rest` on this grid: one by a loss that is sharp from the
+        beginning, one without a cone, so that shear is expensive even under a push. Of solutions that are about as good, the
+        first is taken, so that answers do not jump between them.
+        """
         settings = self.gauss_newton.settings
         steps = 2 * settings.steps
         starts = [
@@ -129,6 +133,6 @@ class Dent(nn.Module):
             self.gauss_newton.objective(State(*each[:3]), *self.gauss_newton.tractions(*each[:2]), measured)
             for each in (kept, other)
         )
-        is_lower = of_other < torch.where(of_kept.isnan(), torch.inf, LOWER * of_kept)
+        is_lower = of_other < torch.where(of_kept.isnan(), torch.inf, ACCEPTANCE_RATIO * of_kept)
         u, pressure, moved, before = where_rows(is_lower, other, kept)
         return u, pressure, moved, before

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from ...solve.stencil import inner
 from ...surface.membrane import Membrane
-from ..precision import shortened
+from ..precision import rounded_to_float32
 from .robust import GemanMcClure, PseudoHuber
 from .settings import ForceBalanceSettings
 
@@ -38,10 +38,10 @@ Memory = tuple[Tensor, Tensor | float]
 
 
 class LossTerms(NamedTuple):
-    """Of tractions at the last scale: `push2` `S^2 [B, N]`, `scale2` `rho^2 [B, N]`, and the loss `[B]` in two parts, of the
-    `pushes`, and of the `others`, pulls and shear."""
+    """Of tractions at the last scale: `compression2` is `S^2 [B, N]`, `scale2` is `rho^2 [B, N]`, and the loss `[B]` has two
+    parts: `pushes`, and `others`, which are tension and shear."""
 
-    push2: Tensor
+    compression2: Tensor
     scale2: Tensor
     pushes: Tensor
     others: Tensor
@@ -73,9 +73,9 @@ class TractionLoss(nn.Module):
 
         self.register_buffer("area", within(membrane.rest_area[:, None]).squeeze(-1))
         surroundings = _gaussian_mean(membrane, settings.reach * self.size)
-        self.register_buffer("surroundings", shortened(within(within(surroundings).mT).mT))
+        self.register_buffer("surroundings", rounded_to_float32(within(within(surroundings).mT).mT))
         wider = within(within(_gaussian_mean(membrane, settings.scale_reach * self.size)).mT).mT
-        self.register_buffer("wider", shortened(wider / wider.sum(0)))
+        self.register_buffer("wider", rounded_to_float32(wider / wider.sum(0)))
         self.register_buffer("push_noise", torch.zeros_like(self.area))
         self.register_buffer("noise_gain", self.area.new_zeros(()))
 
@@ -85,33 +85,33 @@ class TractionLoss(nn.Module):
         p0 = self.reference
         q_n = (traction * normal).sum(1)
         q_t = traction - q_n[:, None] * normal
-        return q_n / p0, q_t.square().sum(1) / p0**2, self.push2(q_n)
+        return q_n / p0, q_t.square().sum(1) / p0**2, self.compression2(q_n)
 
-    def push2(self, q_n: Tensor) -> Tensor:
+    def compression2(self, q_n: Tensor) -> Tensor:
         """The mean squared push `S^2` around, `[B, N]`, of the tractions' normal parts `[B, N]`."""
-        push2: Tensor = (-q_n / self.reference).clamp_min(0) ** 2 @ self.surroundings
-        return push2
+        compression2: Tensor = (-q_n / self.reference).clamp_min(0) ** 2 @ self.surroundings
+        return compression2
 
-    def pushed(self, push2: Tensor) -> Tensor:
+    def pushed(self, compression2: Tensor) -> Tensor:
         """Share `[B]` of the surface that is pushed more than the last scale `tau`, from `S^2 [B, N]`."""
-        return (push2 > self.settings.tau[-1] ** 2).to(self.area.dtype) @ self.area / self.area.sum()
+        return (compression2 > self.settings.tau[-1] ** 2).to(self.area.dtype) @ self.area / self.area.sum()
 
-    def shear_weight(self, push2: Tensor, cone: float | Tensor | None = None) -> Tensor:
+    def shear_weight(self, compression2: Tensor, cone: float | Tensor | None = None) -> Tensor:
         """`kappa [B, N]`; `cone`: default, that of this loss."""
         settings, cone = self.settings, self.cone if cone is None else cone
-        return settings.friction / (1 + cone * (push2 + settings.slip**4).sqrt())
+        return settings.friction / (1 + cone * (compression2 + settings.slip**4).sqrt())
 
-    def scale2(self, push2: Tensor, noise_level: Tensor, tau: float | Tensor) -> Tensor:
+    def scale2(self, compression2: Tensor, noise_level: Tensor, tau: float | Tensor) -> Tensor:
         """`rho^2 [B, N]`, from `S^2 [B, N]` and the frames' noise over that at rest `[B]`.
 
         At least as much as the scale `tau` of the step allows: from rest, where nothing pushes yet, it begins at 1.
         """
         settings, last = self.settings, self.settings.tau[-1]
-        top = push2.amax(-1, keepdim=True).clamp_min(TINY)
-        around = top * (((push2 / top) ** POWER) @ self.wider).clamp_min(TINY) ** (1 / POWER)
+        top = compression2.amax(-1, keepdim=True).clamp_min(TINY)
+        around = top * (((compression2 / top) ** POWER) @ self.wider).clamp_min(TINY) ** (1 / POWER)
         noise2 = (settings.noise_share * noise_level[:, None] * self.push_noise).square()
         expected = torch.maximum((settings.scale_share**2 * around).maximum(settings.far_share**2 * top), noise2)
-        tau = tau if isinstance(tau, Tensor) else push2.new_full((), tau)
+        tau = tau if isinstance(tau, Tensor) else compression2.new_full((), tau)
         least = (settings.decrease * (tau / last - 1) + settings.least_scale).clamp_max(1.0)
         return (expected / last**2).maximum(least**2).clamp_max(1.0)
 
@@ -124,7 +124,7 @@ class TractionLoss(nn.Module):
             noise_level: `[B]`, of the frames over that at rest.
             gain: `[B]`, by how much the objective is below that of the surface at rest, over the markers seen.
         """
-        above = terms.push2 > (self.settings.contact_noise * noise_level[:, None] * self.push_noise).square()
+        above = terms.compression2 > (self.settings.contact_noise * noise_level[:, None] * self.push_noise).square()
         above = above & (gain > self.settings.evidence * self.noise_gain)[:, None]
         return torch.where(above, terms.scale2.sqrt(), NO_CONTACT_SCALE)
 
@@ -148,18 +148,18 @@ class TractionLoss(nn.Module):
             tau: scale of the compressive traction's loss.
             cone: how much less shear weighs where something pushes; default, that of this loss.
             curvature: the curvature of a push's loss instead of its weight, zero where it bends down.
-            memory: of the step before; `w_n` is then a geometric mean with it.
+            memory: weights of the step before; `w_n` is then a geometric mean with it.
         """
-        q_n, shear2, push2 = self.parts(force / self.area, normal)
-        rho2 = self.scale2(push2, noise_level, tau)
-        shear2, push2 = shear2 / rho2, push2 / rho2
+        q_n, shear2, compression2 = self.parts(force / self.area, normal)
+        rho2 = self.scale2(compression2, noise_level, tau)
+        shear2, compression2 = shear2 / rho2, compression2 / rho2
         compressive = GemanMcClure(tau)
-        pushed = compressive.curvature(push2) if curvature else compressive.weight(push2)
+        pushed = compressive.curvature(compression2) if curvature else compressive.weight(compression2)
         w_n = self.settings.floor + torch.where(q_n < 0, pushed, 1.0)
         if memory is not None:
             before, renewal = memory
             w_n = before * (w_n / before) ** renewal
-        w_t = self.shear_weight(push2, cone) * self.shear.weight(shear2)
+        w_t = self.shear_weight(compression2, cone) * self.shear.weight(shear2)
         scale = self.settings.sparsity / (self.reference * self.size) ** 2 / self.area / rho2
         one = torch.eye(3, dtype=force.dtype, device=force.device)[..., None]
         along = (scale * (w_n - w_t))[:, None] * normal
@@ -167,13 +167,13 @@ class TractionLoss(nn.Module):
 
     def forward(self, traction: Tensor, normal: Tensor, noise_level: Tensor) -> LossTerms:
         """The loss of tractions `[B, 3, N]` at the last scale `tau`, each push judged by itself."""
-        q_n, shear2, push2 = self.parts(traction, normal)
-        rho2 = self.scale2(push2, noise_level, self.settings.tau[-1])
+        q_n, shear2, compression2 = self.parts(traction, normal)
+        rho2 = self.scale2(compression2, noise_level, self.settings.tau[-1])
         q_n, shear2 = q_n / rho2.sqrt(), shear2 / rho2
         pushes = GemanMcClure(self.settings.tau[-1]).loss((-q_n).clamp_min(0) ** 2)
-        others = q_n.clamp_min(0) ** 2 / 2 + self.shear_weight(push2 / rho2) * self.shear.loss(shear2)
+        others = q_n.clamp_min(0) ** 2 / 2 + self.shear_weight(compression2 / rho2) * self.shear.loss(shear2)
         unit = self.settings.sparsity / self.size**2 * self.area
-        return LossTerms(push2, rho2, pushes @ unit, others @ unit)
+        return LossTerms(compression2, rho2, pushes @ unit, others @ unit)
 
 
 def is_significant(scale: Tensor) -> Tensor:

@@ -85,12 +85,12 @@ def linearise(
     """The equations about a state, and what solves them for small loads.
 
     Args:
-        equations: of the force balance.
+        equations: equations of the force balance.
         cavity: its law.
         state: the solution.
         measured: the markers' rays.
-        scales: of the losses of tractions and of markers.
-        play: of the camera, px, as for `CameraMotion.held`.
+        scales: scales of the losses of tractions and of markers.
+        play: scale of the prior of the camera's motion, px, as for `CameraMotion.with_prior`.
         curvature: as for `TractionLoss.weights`.
     """
     at, normal, loads, corner, motion, _ = equations.linearised(*state, measured, *scales, curvature=curvature)
@@ -116,14 +116,16 @@ def linearise(
 
 @torch.no_grad()
 def noise_effects(equations: BalanceEquations, cavity: CavityLaw, rest: Observation, play: float) -> tuple[Tensor, Tensor]:
-    """What the markers' noise makes at rest, one standard deviation, while all losses are quadratic: the push `S [N]`, and by
-    how much the objective falls in the mean as the surface follows it, over the markers `[]`.
+    """Effects of the markers' noise at rest while all losses are quadratic.
+
+    They are the standard deviation of the push `S [N]`, and the mean decrease `[]` of the objective, per marker, when the
+    surface follows the noise.
 
     Args:
-        equations: of the force balance.
+        equations: equations of the force balance.
         cavity: its law.
         rest: the markers' rays at rest.
-        play: of the camera, px, as for `CameraMotion.held`.
+        play: scale of the prior of the camera's motion, px, as for `CameraMotion.with_prior`.
     """
     membrane, loss = equations.forces.membrane, equations.loss
     measured = equations.bearings.measured(rest)
@@ -191,7 +193,7 @@ def standard_deviations(
     """At a solution, of the rays it was found from.
 
     Args:
-        equations: of the estimator.
+        equations: equations of the estimator.
         cavity: its law.
         settings: its settings.
         state: the solution.
@@ -232,7 +234,7 @@ def of_presses(
     """With the model's error.
 
     Args:
-        noise: of force and depth, as `spreads` gives it.
+        noise: noise of force and depth, as `spreads` gives it.
         force: `[B, 3]`, as found.
         depth: `[B]`, as found.
         gap: `[B]`, to the markers around the deepest point, as of `gap_around`.

@@ -33,7 +33,7 @@ class MinimumEnergySettings:
     """Settings of `MinimumEnergy`.
 
     Args:
-        steps: of the solve.
+        steps: number of steps of the solve.
 
     Raises:
         MembraneError: no steps.

@@ -50,7 +50,7 @@ class FlowInterpolation(nn.Module):
     Args:
         membrane: the rest surface on the solver's grid.
         markers: the markers as points of it.
-        steps: of the conjugate gradients.
+        steps: number of steps of the conjugate gradients.
 
     Raises:
         MembraneError: fewer than three markers.

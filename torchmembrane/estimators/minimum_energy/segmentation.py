@@ -43,7 +43,7 @@ class PolarAngle(nn.Module):
     Args:
         points: `[N, 3]` at rest.
         normals: outward unit normals there, `[N, 3]`.
-        origins: of their rest rays, `[N, 3]`.
+        origins: origins of their rest rays, `[N, 3]`.
         directions: unit directions of their rest rays, `[N, 3]`.
 
     Limitations:
@@ -88,7 +88,7 @@ class Segmentation(nn.Module):
         membrane: the rest surface on the solver's grid.
         rest_rays: the rest rays of its vertices, `origins` and `directions [V, 3]`.
         count: how many contacts are reported.
-        patches: of the membrane, where they are at hand.
+        patches: patches of the membrane, where they are at hand.
 
     Limitations:
         Contacts closer than about a fifth of the surface's size are one. A contact on the axis that turns all rays outwards is

@@ -23,11 +23,11 @@ class VertexRays(Estimator):
 
     Args:
         membrane: the rest surface on the solver's grid.
-        energy: what it stores.
+        energy: elastic energy of the membrane.
         rest_rays: origins and unit directions `[V, 3]` of the rest rays.
         filling: the cavity, as for `CavityLaw`.
         gas: a gas' absolute pressure at rest and its volume.
-        flow: what carries the markers' pixels to the grid's vertices; `prepare` alone needs it.
+        flow: interpolates the markers' pixels to the vertices of the grid; only `prepare` needs it.
     """
 
     in_parts: ClassVar[bool] = True

@@ -72,8 +72,8 @@ class PaperSettings:
 
     Args:
         smoothing: weight s of `s |S psi|^2` (eq. 28) over the rest tension.
-        flow: of the grid's vertices, "bilinear" between the dots (section 5), or "smooth".
-        rounds: of the reconstruct / segment loop (section 5.1).
+        flow: flow of the grid's vertices, "bilinear" between the dots (section 5), or "smooth".
+        rounds: number of rounds of the reconstruct / segment loop (section 5.1).
         free_part_only: take the energy over the free part of the membrane only (section 2, item 1): quadrilaterals that lie
             wholly in a contact weigh next to nothing.
 
@@ -106,7 +106,7 @@ class PaperEstimator(VertexRays):
 
     Args:
         membrane: the rest surface on the solver's grid.
-        elasticity: of which the rest tension is used.
+        elasticity: of which the rest tension alone is used.
         rest_rays: origins and unit directions `[V, 3]` of the rest rays.
         filling: the cavity, as for `CavityLaw`.
         gas: a gas' absolute pressure at rest and its volume.

@@ -102,7 +102,7 @@ class MongeMinimumEnergy(nn.Module):
     Args:
         membrane: at rest.
         elasticity: its elastic energy, "harmonic".
-        rest_rays: of the vertices at rest, `(origins, directions)`, `[V, 3]` each.
+        rest_rays: rays of the vertices at rest, `(origins, directions)`, `[V, 3]` each.
         steps: 1 is the paper's (eqs. 18, 22, about psi = 0); more repeat it about the surface found.
         smoothing: s over the rest tension.
 
@@ -160,8 +160,8 @@ class MongeMinimumEnergy(nn.Module):
         """The equilibrium of one frame.
 
         Args:
-            origins: of the vertices' rays, `[V, 3]`.
-            directions: of the vertices' rays, `[V, 3]`.
+            origins: origins of the vertices' rays, `[V, 3]`.
+            directions: directions of the vertices' rays, `[V, 3]`.
 
         Returns:
             The `Equilibrium`; its vertices are the material points, where their rays meet the surface found.

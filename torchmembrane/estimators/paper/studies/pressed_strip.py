@@ -43,7 +43,7 @@ class Arc(NamedTuple):
 
     Attributes:
         centre: `[2]`.
-        radius: of the circle.
+        radius: radius of the circle.
         start: angle where the arc begins, radians.
         end: angle where it ends; on a disc it is the smaller one.
     """
@@ -75,7 +75,7 @@ class PressedStrip:
     """The semicircle around the origin (ends on the x axis), pressed by discs, its area kept.
 
     Args:
-        radius: of the semicircle.
+        radius: radius of the semicircle.
         discs: that press it, none inside another's contact.
 
     Raises:

@@ -36,8 +36,8 @@ class Obstacle(NamedTuple):
     """A convex body above the line, its lowest point at height 0.
 
     Attributes:
-        height: of its lower boundary at x.
-        slope: of that boundary at x.
+        height: height of its lower boundary at x.
+        slope: slope of that boundary at x.
         left: least x of the body.
         right: largest x of the body.
     """
@@ -64,7 +64,7 @@ class FlatContact(NamedTuple):
     Attributes:
         contact: `(c1, c2)`, its ends.
         curvature: p / T of the free parts.
-        height: of the membrane at x.
+        height: height of the membrane at x.
     """
 
     contact: tuple[float, float]
@@ -140,10 +140,10 @@ class StripProfile(NamedTuple):
 
     Attributes:
         nodes: `[N, 2]`.
-        pressure: of the fluid, force / length^2.
+        pressure: pressure of the fluid, force / length^2.
         traction: `[N, 2]`, contact force on the strip over length; zero for minimum energy.
         angle: `[N]`, of the nodes at rest, radians.
-        radius: of the semicircle.
+        radius: radius of the semicircle.
     """
 
     nodes: Tensor
@@ -183,7 +183,7 @@ class MinimumEnergyProfile(_Semicircle):
     Called with markers' angles it gives a `StripProfile`; between markers `g` is a cubic spline.
 
     Args:
-        radius: of the semicircle.
+        radius: radius of the semicircle.
         strip: its material.
         nodes: how many.
 
@@ -240,7 +240,7 @@ class ForceBalanceProfile(_Semicircle):
     Solved from the rest shape.
 
     Args:
-        radius: of the semicircle.
+        radius: radius of the semicircle.
         strip: its material.
         nodes: how many.
         noise: standard deviation of a marker's angle, radians.

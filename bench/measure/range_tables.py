@@ -1,0 +1,140 @@
+"""Tables of what is in and out of range: pins, presses that are too deep, and the limits at a glance."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from bench.measure.accuracy_tables import Rows, percent
+
+PINS = {
+    "feet and height": "feet listed, `height`",
+    "height": "`height`, tips from the rest image",
+    "no height": "tips taken for dots",
+}
+
+
+def pins(found: dict) -> Rows:
+    """Errors with pins of several heights, with the height in the file and without."""
+    head = ["height of the pins", "file", "displacement", "force", "status ok", "of these off by over a quarter"]
+    rows = []
+    for row in found["groups"]:
+        errors = ["{:.2g} / {:.2g}".format(*row[key]) for key in ("surface", "force")]
+        height = f"{row['height']:g} mm" if row["height"] else "0 (painted)"
+        file = PINS[row["file"]] if row["height"] else "dots listed"
+        rows.append([height, file, *errors, f"{row['ok']} of {row['presses']}", str(row["wrong"])])
+    return [head, *rows]
+
+
+def pins_summary(results: dict) -> dict:
+    """Medians and worst errors; of painted dots one file, as the three are alike."""
+    groups = []
+    rows = results["presses"]
+    for height in dict.fromkeys(row["height"] for row in rows):
+        for file in PINS if height else ("feet and height",):
+            chosen = [row for row in rows if (row["height"], row["file"]) == (height, file)]
+            group = dict(height=height, file=file, presses=len(chosen), ok=sum(row["status"] == 0 for row in chosen))
+            for key in ("surface", "force"):
+                values = [row[key] for row in chosen]
+                group[key] = [float(np.nanmedian(values)), float(np.nanmax(values))]
+            groups.append(group | dict(wrong=sum(row["status"] == 0 and row["surface"] > 0.25 for row in chosen)))
+    return dict(groups=groups)
+
+
+def out_of_range(found: dict) -> Rows:
+    """How many right and wrong presses have status 9, by depth."""
+    rows = []
+    for row in found["bands"]:
+        counts = ["{} of {}".format(*row[key]) for key in ("right", "wrong")]
+        rows.append([f"{row['low']:g} to {row['high']:g}", *counts])
+    return [["depth of the press, over the size", "right presses with status 9", "wrong presses with status 9"], *rows]
+
+
+def out_of_range_summary(results: dict) -> dict:
+    """Counts of the presses that are no narrower than the dots' spacing and have status ok or 9."""
+    from bench.accuracy.range import is_right
+
+    presses = [row for row in results["rows"] if row["width"] >= 1 and row["status"] in (0, 9)]
+    bands = []
+    for low, high in pairwise((0, 0.05, 0.1, 0.18, 0.2, 0.3)):
+        counts = {}
+        for name, expected in (("right", True), ("wrong", False)):
+            statuses = [row["status"] for row in presses if low <= row["depth"] < high and is_right(row) == expected]
+            counts[name] = [statuses.count(9), len(statuses)]
+        bands.append(dict(low=low, high=high, **counts))
+    return dict(bands=bands)
+
+
+def by_depth(found: dict) -> tuple[dict[str, int], dict]:
+    """Shares right and wrong with status ok, %, of presses up to a fifth of the size deep; and the group of the deeper ones."""
+    groups = found["groups"]
+    first = next(k for k, row in enumerate(groups) if row["name"] == "depth up to 0.05")
+    shallow, deep = groups[first : first + 3], groups[first + 3]
+    presses = sum(row["presses"] for row in shallow)
+    return {key: round(100 * sum(row["presses"] * row[key] for row in shallow) / presses) for key in ("right", "wrong")}, deep
+
+
+def readme_range(found: dict) -> str:
+    """A paragraph on how deep a press may be."""
+    (of, deep), every = by_depth(found), round(1 / found["groups"][0]["wrong"])
+    return (
+        f"The results are not reliable for presses deeper than a fifth of the membrane's size: up to that depth "
+        f"{of['right']} % are right, from there to 0.3 of the size {percent(deep['right'])}, "
+        f"and of all presses one in {every} is wrong although its status is `ok`."
+    )
+
+
+def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights: dict) -> Rows:
+    """What holds to which limit, from the records of the tables that say more."""
+    of, deep = by_depth(range_)
+    firm = [row["force"][0] for row in light["bands"] if 0.05 <= row["low"] < 0.15]
+    held = next(row for row in intervals_["bands"] if row["low"] is None)
+    middle, most, largest = (f"{100 * value:.1f} %" for value in weights["errors"])
+    return [
+        ["", "", "measured"],
+        [
+            "depth",
+            f"presses up to a fifth of the membrane's size: {of['right']} % are right; from there to 0.3: "
+            f"{percent(deep['right'])}. {of['wrong']} % and {percent(deep['wrong'])} are wrong with status ok",
+            "[range](force_balance.md#range)",
+        ],
+        [
+            "near the rim",
+            "the rim bears a part of the force: the result is a lower bound and marked as one",
+            "[range](force_balance.md#range)",
+        ],
+        [
+            "light touches",
+            f"5 to 15 % of the force of a firm press: the median error of the force is {percent(max(firm))}",
+            "[light touches](force_balance.md#light-touches)",
+        ],
+        [
+            "small contacts",
+            "contacts narrower than the spacing of the dots are not resolved",
+            "[range](force_balance.md#range)",
+        ],
+        [
+            "two contacts",
+            "the spec sheet says from which distance on they are resolved",
+            "[spec sheet](spec_sheet.md#measured)",
+        ],
+        [
+            "intervals",
+            f"one `force_deviation` contains the truth in {100 * held['force']['held']:.0f} % of frames, one "
+            f"`depth_deviation` in {100 * held['depth']['held']:.0f} %",
+            "[intervals](force_balance.md#intervals)",
+        ],
+        [
+            "degraded images",
+            f"{degraded['ok']} of {degraded['images']} pass with status ok; {degraded['wrong']} of these surfaces, "
+            f"{degraded['mirrored']} of them mirrored or upside down, are off by more than a quarter",
+            "[range](force_balance.md#range)",
+        ],
+        ["drift of the rest state", "noticed while nothing touches the membrane", "[drift](drift.md#measured)"],
+        ["friction", "estimated from a drag", "[slip](slip.md)"],
+        [
+            "forces after one weight",
+            f"the error is {middle} in the median, below {most} in nine of ten cases, and at most {largest} in all "
+            f"{weights['forces']}",
+            "[recipes](recipes.md#newtons-from-one-known-weight)",
+        ],
+    ]
