@@ -274,18 +274,15 @@ class ForceBalance(Estimator):
             (step, volume, misfit, *reasons), traction, reference = steps.native.solution(*given)
             return Equilibrium(x, pressure, volume, traction, step, reference, misfit, moved, *reasons)
         loss, step = self.equations.loss, (u - before).square().sum(-1).mean(-1).sqrt() / self.size
-        traction, normal = steps.tractions(u, pressure)
+        (traction, normal), grid = steps.tractions(u, pressure), membrane.grid
         terms, seen = loss(traction, normal, measured.noise_level), measured.weight.sum(-1).clamp_min(1)
         angles = self.equations.bearings.angles(u, measured, moved)[0]
         unexplained = (steps.misfit(angles, pressure, measured) + terms.others) / seen
         objective = unexplained + terms.pushes / seen
         gain = steps.objective_at_rest(measured) / seen - objective
-        scale = 1 + pad_border(loss.contact_scale(terms, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
+        scale = 1 + pad_border(loss.contact_scale(terms, measured.noise_level, gain)[..., None] - 1, grid)[..., 0]
         misfit, shared = self.equations.bearings.misfits(angles, measured, self.settings.outlier, self._far)
-        reasons, traction = (
-            [objective, unexplained, loss.pushed(terms.compression2), shared],
-            pad_border(traction.mT, membrane.grid),
-        )
+        reasons, traction = [objective, unexplained, loss.pushed(terms.compression2), shared], pad_border(traction.mT, grid)
         return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, misfit, moved, *reasons)
 
     @traced
