@@ -170,8 +170,7 @@ class ForceBalance(Estimator):
     def prepare(self, camera: Any, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
         """The rays of the markers seen at `pixels [B, D, 2]`, each with its own noise where its `covariance` is given."""
         if covariance is None:
-            origins, directions = camera.pixel_to_ray(pixels)
-            return Observation(origins, directions, confidence)
+            return Observation(*camera.pixel_to_ray(pixels), confidence=confidence)
         return marker_rays(camera, pixels, self.equations.bearings.seen_at_rest, confidence, covariance)
 
     def check_gauge(self) -> None:
