@@ -107,8 +107,9 @@ class ForceBalance(Estimator):
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
         bearings = residuals_of(membrane, markers, positions, noise, rest, views, levers)
-        others: dict[str, Any] = dict(rest=rest, filling=filling, gas=gas, views=views, levers=levers)
-        self.coarse = self._coarser(membrane, elasticity, bearings, **others)
+        self.coarse = self._coarser(
+            membrane, elasticity, bearings, rest=rest, filling=filling, gas=gas, views=views, levers=levers
+        )
         self.refinement = None if self.coarse is None else Refinement(self.coarse.membrane.grid, membrane.grid)
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
@@ -170,7 +171,8 @@ class ForceBalance(Estimator):
     def prepare(self, camera: Any, pixels: Tensor, confidence: Tensor, covariance: Tensor | None = None) -> Observation:
         """The rays of the markers seen at `pixels [B, D, 2]`, each with its own noise where its `covariance` is given."""
         if covariance is None:
-            return Observation(*camera.pixel_to_ray(pixels), confidence=confidence)
+            origins, directions = camera.pixel_to_ray(pixels)
+            return Observation(origins, directions, confidence)
         return marker_rays(camera, pixels, self.equations.bearings.seen_at_rest, confidence, covariance)
 
     def check_gauge(self) -> None:
