@@ -107,9 +107,7 @@ class ForceBalance(Estimator):
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
         bearings = residuals_of(membrane, markers, positions, noise, rest, views, levers)
-        self.coarse = self._coarser(
-            membrane, elasticity, bearings, rest=rest, filling=filling, gas=gas, views=views, levers=levers
-        )
+        self.coarse = self._coarser(elasticity, bearings, rest=rest, filling=filling, gas=gas, views=views, levers=levers)
         self.refinement = None if self.coarse is None else Refinement(self.coarse.membrane.grid, membrane.grid)
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
@@ -130,8 +128,8 @@ class ForceBalance(Estimator):
         sensor = noise, problem.filling, problem.gas
         return cls(*surface, *sensor, settings, rest, problem.views, levers=problem.levers)
 
-    def _coarser(self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerResiduals, **others: Any) -> Self | None:
-        grid, positions = membrane.grid, bearings.positions
+    def _coarser(self, elasticity: ElasticEnergy, bearings: MarkerResiduals, **others: Any) -> Self | None:
+        membrane, grid, positions = self.membrane, self.membrane.grid, bearings.positions
         if any(count % 2 == 0 or count < 2 * self.settings.coarsest - 1 for count in grid):
             return None
         every_second = Membrane(*(a.unflatten(0, grid)[::2, ::2].numpy() for a in (membrane.rest, membrane.fixed)))
