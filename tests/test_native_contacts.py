@@ -1,4 +1,4 @@
-"""Laws of contact patches by machine code: what tensor operations find."""
+"""Compiled and tensor contact patches agree."""
 
 import pytest
 import torch

@@ -1,4 +1,7 @@
-"""Laws of the fit of ellipses by machine code: the numbers of the tensor operations, to whom all is left that it cannot do."""
+"""Compiled and tensor fits of ellipses agree.
+
+What the compiled fit cannot do is left to the tensor operations.
+"""
 
 import copy
 import pickle

@@ -1,4 +1,4 @@
-"""Laws of the matching's steps by machine code: the numbers of tensor operations."""
+"""Compiled and tensor steps of the matching agree."""
 
 import numpy as np
 import pytest
