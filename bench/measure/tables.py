@@ -14,7 +14,7 @@ import bench.measure.speed_tables as speed
 from bench.measure.parts import PARTS
 
 TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows | str]]] = {
-    "readme": (("independent", "frame"), speed.readme),
+    "readme": (("independent", "frame", "live"), speed.readme),
     "accuracy-independent": (("independent",), accuracy.default_accuracy),
     "accuracy-cases": (("cases",), accuracy.default_accuracy),
     "estimators-independent": (("independent",), accuracy.estimators),
