@@ -52,7 +52,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows | str]]] = 
     "views": (("views",), accuracy.views),
     "range": (("range",), accuracy.working_range),
     "readme-range": (("range",), working_range.readme_range),
-    "limits": (("range", "light", "intervals", "degraded-images", "weight"), working_range.limits),
+    "limits": (("range", "light", "intervals", "degraded-images", "weight", "out-of-range"), working_range.limits),
     "out-of-range": (("out-of-range",), working_range.out_of_range),
     "pins": (("pins",), working_range.pins),
     "drift": (("drift",), robustness.drift),
