@@ -1,4 +1,4 @@
-"""Laws of the fit of ellipses by machine code: the numbers of the tensor operations, to whom all is left that it cannot do."""
+"""Laws of the fit by machine code: the numbers of tensor operations."""
 
 import copy
 import pickle

@@ -1,4 +1,4 @@
-"""Laws of the matching's steps by machine code: the numbers of tensor operations."""
+"""Laws of matching by machine code: the numbers of tensor operations."""
 
 import numpy as np
 import pytest
