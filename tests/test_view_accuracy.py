@@ -1,4 +1,4 @@
-"""`check --accuracy` of several views: trials by the images of all of them."""
+"""`check --accuracy` of several views: trials by the images of all."""
 
 import numpy as np
 import pytest

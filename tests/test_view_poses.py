@@ -1,4 +1,4 @@
-"""Poses of several views from rest images of the same dots: rendered, with the file's poses wrong by much."""
+"""Poses of several views are found from rest images of the same dots."""
 
 from dataclasses import replace
 

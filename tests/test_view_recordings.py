@@ -1,4 +1,4 @@
-"""Recordings and streams of several views: one frame for each moment, and what a view lacks is said."""
+"""Recordings and streams of several views: one frame each moment."""
 
 import time
 

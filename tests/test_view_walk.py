@@ -1,4 +1,4 @@
-"""The page on several views, its commands from top to bottom: two webcams, a rest photograph of each, one weight, one press."""
+"""The commands of the page on several views run from top to bottom."""
 
 from pathlib import Path
 
