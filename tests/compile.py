@@ -1,4 +1,4 @@
-"""Compiles the solver's machine code once, before the tests start."""
+"""Compiles the machine code of a frame once, before the tests start."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ def main() -> None:
     for dtype in (torch.float32, torch.float64):
         reconstructor = tm.Reconstructor(small, dtype=dtype)
         with torch.no_grad():
-            reconstructor.from_pixels(reconstructor.rest_pixels)
+            reconstructor(reconstructor.read(SENSOR.parent / "rest.png"))
 
 
 if __name__ == "__main__":

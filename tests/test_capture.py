@@ -121,7 +121,9 @@ def test_a_photograph_of_another_size_than_the_sensor_s_is_refused(monkeypatch, 
     assert "images of 8 x 6 px; expected the sensor's 160 x 120" in capsys.readouterr().err and not (tmp_path / "rest").exists()
 
 
-@pytest.mark.parametrize("options", [["capture", "--out", "rest"], ["live", "preset:bubble"]])
+@pytest.mark.parametrize(
+    "options", [["capture", "--out", "rest"], pytest.param(["live", "preset:bubble"], marks=pytest.mark.full)]
+)
 def test_only_this_package_s_words_reach_the_terminal_where_there_is_no_camera(options, tmp_path):
     command = [sys.executable, "-m", "torchmembrane", *options, "--camera", "987"]
     done = subprocess.run(

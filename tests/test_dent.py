@@ -13,7 +13,6 @@ from torchmembrane.estimators.force_balance.starts import DEPTH, REACH, WIDTH
 from torchmembrane.mechanics.hyperelastic import ElasticEnergy
 from torchmembrane.simulate import Simulator, Sphere
 from torchmembrane.simulate.dataset import stroke_to
-from torchmembrane.solve.stencil import inner
 from torchmembrane.surface.shapes import spherical_cap
 
 DOME = spherical_cap(12, 9, 30, (17, 17))
@@ -32,16 +31,15 @@ def dented(estimator: ForceBalance, middles: list[int], push: float = 1.0) -> to
     """How far every vertex of the dome is moved, `[V, 3]`, when what is within a seventh of its size of some is pushed."""
     rest = estimator.membrane.rest
     near = (torch.cdist(rest, rest[middles]) < DOME.size / 7).any(1)
-    normal = inner(DOME.rest_normals, DOME.grid).mT[None]
-    tractions = -push * estimator.reference * inner(near.double()[:, None], DOME.grid).mT * normal, normal
+    traction = -push * estimator.reference * near.double()[:, None] * DOME.rest_normals
     rays = torch.nn.functional.normalize(estimator.equations.bearings.positions, dim=-1)[None]
     measured = estimator.equations.bearings.measured(Observation(torch.zeros_like(rays), rays, torch.ones_like(rays[..., 0])))
-    held = estimator.gauss_newton.tractions
-    estimator.gauss_newton.tractions = lambda u, pressure: tractions
+    held = estimator.gauss_newton.traction
+    estimator.gauss_newton.traction = lambda state, measured: traction[None]
     try:
         return estimator.dent(*estimator.at_rest(measured.weight), measured).u[0]
     finally:
-        estimator.gauss_newton.tractions = held
+        estimator.gauss_newton.traction = held
 
 
 def vertex_near(x: float, y: float) -> int:

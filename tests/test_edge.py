@@ -829,6 +829,9 @@ def test_results_that_a_frame_cannot_start_from_are_refused(edge, tmp_path):
     assert [len(found["status"]) for found in session.track([GREY, GREY.tolist() and GREY])] == [1, 1]
     with pytest.raises(edge.EdgeError, match="NoneType; expected a video's images"):
         next(session.track(None))
+    model.write_bytes(model_of(metadata()))
+    with pytest.raises(edge.EdgeError, match="does not track"):
+        next(edge.Session(model).track([GREY]))
 
 
 @pytest.mark.parametrize(

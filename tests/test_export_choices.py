@@ -318,8 +318,8 @@ def test_a_failure_is_said_in_one_line_and_nothing_is_written(part, small_sensor
     assert ("not the same" if part == "checked" else "cannot be written as ONNX: [ShapeInferenceError] ranks differ") in said[0]
 
 
-@pytest.mark.parametrize("follows", [True, False])
-def test_a_tracking_model_is_given_where_dots_were(follows, small_sensor, tmp_path, monkeypatch):
+@pytest.mark.parametrize("follows, tracking", [(True, True), (False, True), (True, False)])
+def test_a_tracking_model_is_given_where_dots_were(follows, tracking, small_sensor, tmp_path, monkeypatch):
     """Of any estimator; a texture, which is not followed, makes the same model as without tracking."""
     made = Reconstructor.from_file(small_sensor / "sensor.toml", estimator="minimum-energy")
     made.observer.locator.follows = follows
@@ -327,8 +327,8 @@ def test_a_tracking_model_is_given_where_dots_were(follows, small_sensor, tmp_pa
     monkeypatch.setattr(Reconstructor, "reconstruct_grey", lambda _, *given: names.extend(value.name for value in given))
     monkeypatch.setattr(export, "_finished", lambda *_: onnx.ModelProto())
     monkeypatch.setattr(export, "checked", lambda *_: None)
-    export.export(made, tmp_path / "model.onnx", tracking=True)
-    assert names == (["image", "previous_pixels"] if follows else ["image"])
+    export.export(made, tmp_path / "model.onnx", tracking=tracking)
+    assert names == (["image", "previous_pixels"] if follows and tracking else ["image"])
 
 
 def test_single_precision_only(sensor, tmp_path):

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 import torchmembrane as tm
+from torchmembrane import machine_code
 from torchmembrane.cli.main import main
-from torchmembrane.estimators.force_balance.kernels import steps
 from torchmembrane.jobs import local
-from torchmembrane.machine_code import Kept, is_used, kept, using
+from torchmembrane.machine_code import Kept, is_used, kept, takes, using
 
 SINGLE, DOUBLE = np.dtype("float32"), np.dtype("float64")
 
@@ -86,9 +86,9 @@ def test_tensor_operations_find_what_machine_code_finds(reconstructor):
     with torch.no_grad():
         by_code = reconstructor(images)
         with using(False):
-            assert not is_used() and not steps.takes(images)
+            assert not is_used() and not takes(images)
             by_tensors = reconstructor(images)
-    assert is_used() and steps.takes(images)
+    assert is_used() and takes(images)
     assert (by_code.status == by_tensors.status).all()
     torch.testing.assert_close(by_code.vertices, by_tensors.vertices, rtol=0, atol=2e-3)
 
@@ -101,7 +101,7 @@ def test_a_job_is_solved_in_one_way_from_its_first_frame_to_its_last(
     asked = []
     monkeypatch.setattr(local, "FEW_FRAMES", few)
     monkeypatch.setattr(tm.ForceBalance, "must_compile", property(lambda self: not asked))  # compiled after the first frame
-    monkeypatch.setattr(steps, "is_used", lambda: asked.append(is_used()) or asked[-1])
+    monkeypatch.setattr(machine_code, "is_used", lambda: asked.append(is_used()) or asked[-1])
     assert (
         main(
             ["reconstruct", str(small_sensor / "sensor.toml"), *map(str, small_images), "--out", str(tmp_path), "--batch", "1"]

@@ -1,4 +1,4 @@
-"""`check --accuracy` of several views: trials by the images of all."""
+"""`check --accuracy` tries several views by the images of all of them."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,7 @@
-"""Poses of several views are found from rest images of the same dots."""
+"""Poses of several views are found from rest images of the same dots.
+
+Images are rendered, with the poses of the file far from the truth.
+"""
 
 from dataclasses import replace
 

@@ -1,4 +1,7 @@
-"""Recordings and streams of several views: one frame each moment."""
+"""Recordings of several views give one frame for each moment.
+
+What a view lacks at a moment is reported.
+"""
 
 import time
 

@@ -1,4 +1,7 @@
-"""The commands of the page on several views run from top to bottom."""
+"""The commands of the page on several views run from top to bottom.
+
+Two webcams, a rest photograph of each, one weight, one press.
+"""
 
 from pathlib import Path
 

@@ -8,7 +8,7 @@ import hashlib
 import logging
 import platform
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from pathlib import Path
 from threading import Lock
@@ -16,7 +16,9 @@ from typing import Any
 
 import numba
 import numpy as np
+import torch
 from llvmlite.binding import get_host_cpu_name
+from torch import Tensor
 
 from .interruption import unstoppable
 
@@ -45,6 +47,18 @@ def using(wanted: bool) -> Iterator[None]:
 def is_used() -> bool:
     """Whether machine code may be used here."""
     return _used.get()
+
+
+def takes(*values: Any) -> bool:
+    """Whether machine code computes with these tensors: on a processor, alone, without gradients."""
+    tensors = [value for value in values if value is not None]
+    return (
+        not torch.compiler.is_compiling()
+        and is_used()
+        and all(type(value) is Tensor and value.is_cpu for value in tensors)
+        and not (torch.is_grad_enabled() and any(value.requires_grad for value in tensors))
+        and all(torch.func.debug_unwrap(value, recurse=False) is value for value in tensors)
+    )
 
 
 OPTIONS: dict[str, Any] = dict(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
@@ -80,14 +94,17 @@ class Kept:
     Args:
         function: as for `kept` gives it.
         sources: `fingerprint` of its sources.
+        seconds: about how long it takes to compile.
     """
 
-    def __init__(self, function: Any, sources: str):
+    def __init__(self, function: Any, sources: str, seconds: int = SECONDS):
+        self.seconds = seconds
         folder, version = getattr(function.stats, "cache_path", None), f"{platform.python_version()} {numba.__version__}"
         self.folder = Path(folder) if folder else None
         self.key = hashlib.sha256(f"{sources} {version} {get_host_cpu_name()}".encode()).hexdigest()[:16]
         self.known: set[str] = set()
         self.announced: set[str] = set()
+        self.called: set[np.dtype[Any]] = set()
         self.lock = Lock()
 
     def is_compiled(self, dtype: np.dtype[Any]) -> bool:
@@ -96,15 +113,18 @@ class Kept:
             self.known.add(dtype.name)
         return dtype.name in self.known
 
-    @contextmanager
-    def compiling(self, dtype: np.dtype[Any]) -> Iterator[None]:
+    def compiling(self, dtype: np.dtype[Any]) -> AbstractContextManager[None]:
         """For a call: if it compiles, this is logged, and noted when it is done."""
+        return nullcontext() if dtype in self.called else self._compiling(dtype)
+
+    @contextmanager
+    def _compiling(self, dtype: np.dtype[Any]) -> Iterator[None]:
         with self.lock:  # threads begin their first calls at the same time
             is_new = not self.is_compiled(dtype) and dtype.name not in self.announced
             self.announced.add(dtype.name)
         if is_new:
             logging.getLogger("torchmembrane").warning(
-                "torchmembrane: compiling machine code for %s, about %d s, once", dtype.name, SECONDS
+                "torchmembrane: compiling machine code for %s, about %d s, once", dtype.name, self.seconds
             )
         with unstoppable() if is_new else nullcontext():
             yield
@@ -112,6 +132,7 @@ class Kept:
             self.known.add(dtype.name)
             if self.folder and self.folder.exists():
                 self._mark(dtype).touch()
+        self.called.add(dtype)
 
     def _mark(self, dtype: np.dtype[Any]) -> Path:
         assert self.folder is not None

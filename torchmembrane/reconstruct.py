@@ -286,10 +286,9 @@ class Reconstructor(nn.Module):
             depth_deviation=deviations.depth,
             **{f"contact_{name}": getattr(contacts, name) for name in Contacts._fields[1:]},
         )
-        kept = {
-            name: torch.where(gone.reshape(-1, *(1,) * (value.ndim - 1)), torch.nan, value).to(markers)
-            for name, value in values.items()
-        }
+        kept = {name: value.to(markers) for name, value in values.items()}
+        if not (gone.is_cpu and torch.is_inference_mode_enabled()) or bool(gone.any()):
+            kept = {k: torch.where(gone.reshape(-1, *(1,) * (value.ndim - 1)), torch.nan, value) for k, value in kept.items()}
         measured = by_view(torch.where(lost[..., None], torch.nan, pixels).to(markers))
         return Reconstruction(pixels=measured, confidence=by_view(confidence), status=status.to(torch.int32), **kept)
 

@@ -83,9 +83,10 @@ def readme_range(found: dict) -> str:
     )
 
 
-def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights: dict) -> Rows:
+def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights: dict, checked: dict) -> Rows:
     """What holds to which limit, from the records of the tables that say more."""
-    of, deep = by_depth(range_)
+    (of, deep), deepest = by_depth(range_), checked["bands"][-1]
+    unnoticed = (deepest["wrong"][1] - deepest["wrong"][0]) / (deepest["right"][1] + deepest["wrong"][1])
     firm = [row["force"][0] for row in light["bands"] if 0.05 <= row["low"] < 0.15]
     held = next(row for row in intervals_["bands"] if row["low"] is None)
     middle, most, largest = (f"{100 * value:.1f} %" for value in weights["errors"])
@@ -94,8 +95,9 @@ def limits(range_: dict, light: dict, intervals_: dict, degraded: dict, weights:
         [
             "depth",
             f"presses up to a fifth of the membrane's size: {of['right']} % are right; from there to 0.3: "
-            f"{percent(deep['right'])}. {of['wrong']} % and {percent(deep['wrong'])} are wrong with status ok",
-            "[range](force_balance.md#range)",
+            f"{percent(deep['right'])}, nearly all with status 9. {of['wrong']} % and {percent(unnoticed)} are wrong with "
+            "status ok",
+            "[range](force_balance.md#range), [status 9](#range)",
         ],
         [
             "near the rim",

@@ -5,7 +5,7 @@ from bench.measure.accuracy_tables import Rows, default_accuracy
 TRACKED = "tracked, from the frame before"
 
 
-def readme(independent: dict, frame: dict) -> Rows:
+def readme(independent: dict, frame: dict, live: dict) -> Rows:
     head, surface, contact, force, _ = default_accuracy(independent)
     rows = frame["rows"]
     times = " / ".join(f"{rows[name]['median']:.0f}" for name in ("one image", "in batches of 16", TRACKED))
@@ -15,6 +15,7 @@ def readme(independent: dict, frame: dict) -> Rows:
         contact,
         force,
         ["processor time of one image / in batches / tracked", f"{times} ms", ""],
+        ["latency of a live camera of 30 Hz", f"{live['cases']['default grid']['median']:.0f} ms", ""],
     ]
 
 

@@ -14,7 +14,7 @@ import bench.measure.speed_tables as speed
 from bench.measure.parts import PARTS
 
 TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows | str]]] = {
-    "readme": (("independent", "frame"), speed.readme),
+    "readme": (("independent", "frame", "live"), speed.readme),
     "accuracy-independent": (("independent",), accuracy.default_accuracy),
     "accuracy-cases": (("cases",), accuracy.default_accuracy),
     "estimators-independent": (("independent",), accuracy.estimators),
@@ -52,7 +52,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows | str]]] = 
     "views": (("views",), accuracy.views),
     "range": (("range",), accuracy.working_range),
     "readme-range": (("range",), working_range.readme_range),
-    "limits": (("range", "light", "intervals", "degraded-images", "weight"), working_range.limits),
+    "limits": (("range", "light", "intervals", "degraded-images", "weight", "out-of-range"), working_range.limits),
     "out-of-range": (("out-of-range",), working_range.out_of_range),
     "pins": (("pins",), working_range.pins),
     "drift": (("drift",), robustness.drift),

@@ -12,10 +12,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ..machine_code import takes
 from ..solve.elimination import solve_dense
 from ..solve.stencil import inner, pad_border
 from ..surface.membrane import Membrane
 from ..surface.tangent import tangent_frame
+from .native_contacts import NativePatches
 from .regions import persistent_peaks, persistent_regions
 
 CONTACT_POINTS = 4
@@ -150,7 +152,7 @@ class ContactPatches(nn.Module):
 
     def __init__(self, membrane: Membrane, spacing: float = 0.0):
         super().__init__()
-        self.membrane = membrane
+        self.membrane, self.native = membrane, NativePatches()
         m, n = membrane.grid
         self.least_span = max(LEAST_STEPS * membrane.size / ((m - 1) * (n - 1)) ** 0.5, spacing)
         from_rim = torch.cdist(membrane.rest, membrane.rest[membrane.fixed]).amin(1)
@@ -166,6 +168,9 @@ class ContactPatches(nn.Module):
         vertex in each column, by which the push is smoothed, twice; the others as below.
         """
         membrane, grid = self.membrane, self.membrane.grid
+        if takes(x, normals, traction, reference) and x.dtype == surroundings.dtype == normals.dtype:
+            limits = PUSHED, LEAST, APART, RIM_SHARE, MOVED
+            return Contacts(*self.native(self, CONTACT_POINTS, limits, surroundings, x, normals, traction, reference))
         indicator = contact_indicator(traction, normals, reference)
         push = (indicator > PUSHED) * (-(traction * normals).sum(-1)).clamp_min(0)
         smooth = inner(push[..., None], grid)[..., 0] @ surroundings @ surroundings

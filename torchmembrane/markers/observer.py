@@ -10,6 +10,7 @@ from ..control_flow import can_sync, traced
 from ..errors import MembraneError, expect
 from ..files.levels import too_few_bits
 from ..files.tensors import tensor_of
+from ..machine_code import is_used, using
 from ..results.status import Status
 from .locator import Locator, isotropic
 from .placement import FEWEST_MARKERS, PlacedMarkers
@@ -125,7 +126,7 @@ class MarkerObserver(nn.Module):
     def _in_rest_image(self, image: Tensor, name: str) -> tuple[Tensor, Tensor, Tensor]:
         """The markers in the rest image, their covariance, which are found: subtracted from every frame's, rest offsets are
         nulled (5.2)."""
-        with torch.no_grad():
+        with torch.no_grad(), using(is_used() and getattr(self.locator, "is_compiled", True)):
             pixels, confidence, covariance = self.locator(image[None, None])
         found = (confidence > FOUND) & self.seen_at_rest  # what the model has outside cannot be one of the dots in view
         in_view = int(self.seen_at_rest.sum())

@@ -17,7 +17,7 @@ from numba.extending import intrinsic
 
 from ..machine_code import compiled
 
-LANES, RANK, ROWS = 16, 4, 4
+LANES, RANK, ROWS = 16, 8, 4
 
 
 def storage(unknowns: int, width: int) -> tuple[int, int, int]:
@@ -56,17 +56,18 @@ def _subtract(
             return builder.bitcast(at(pointer, *places), vector.as_pointer())
 
         one = ir.Constant(row.type, 1)
-        shares = [[spread(at(of_S.data, (own, 1), (one, k), (turn, p))) for p in range(RANK)] for k in range(ROWS)]
         with cgutils.for_range(builder, chunks) as loop:
-            behind = [builder.load(vector_at(of_W.data, (first, 1), (ld, p), (loop.index, LANES))) for p in range(RANK)]
             places = [vector_at(of_A.data, (row, 1), (step, k), (loop.index, LANES)) for k in range(ROWS)]
             totals = [builder.load(place) for place in places]
-            for value in (*behind, *totals):
-                value.align = kind.bitwidth // 8
-            for place, total, of_row in zip(places, totals, shares, strict=True):
-                for share, values in zip(of_row, behind, strict=True):
-                    product = builder.fmul(share, values, flags=("contract",))
-                    total = builder.fadd(product, total, flags=("contract",))
+            for total in totals:
+                total.align = kind.bitwidth // 8
+            for p in range(RANK):
+                behind = builder.load(vector_at(of_W.data, (first, 1), (ld, p), (loop.index, LANES)))
+                behind.align = kind.bitwidth // 8
+                for k in range(ROWS):
+                    product = builder.fmul(spread(at(of_S.data, (own, 1), (one, k), (turn, p))), behind, flags=("contract",))
+                    totals[k] = builder.fadd(product, totals[k], flags=("contract",))
+            for place, total in zip(places, totals, strict=True):
                 builder.store(total, place).align = kind.bitwidth // 8
         return context.get_dummy_value()
 

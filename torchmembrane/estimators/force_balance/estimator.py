@@ -22,14 +22,13 @@ its lines, with an `InitialGuess` where something pushes. Frames that have not s
 from dataclasses import replace
 from typing import Any, ClassVar, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ...control_flow import retry_rows, traced, where_rows
 from ...mechanics.cavity import CavityLaw, rest_balance
 from ...mechanics.hyperelastic import ElasticEnergy
-from ...solve.stencil import inner, pad_border
+from ...solve.stencil import pad_border
 from ...surface.bicubic import Refinement
 from ...surface.membrane import Membrane
 from ...surface.projection import SurfacePoints
@@ -108,8 +107,7 @@ class ForceBalance(Estimator):
         tension, stiffness = float(elasticity.tension), float(elasticity.c1 + elasticity.c2)
         self.reference = max(float(self.rest_pressure), tension / self.size, stiffness / self.size)
         bearings = residuals_of(membrane, markers, positions, noise, rest, views, levers)
-        others: dict[str, Any] = dict(rest=rest, filling=filling, gas=gas, views=views, levers=levers)
-        self.coarse = self._coarser(membrane, elasticity, bearings, **others)
+        self.coarse = self._coarser(elasticity, bearings, rest=rest, filling=filling, gas=gas, views=views, levers=levers)
         self.refinement = None if self.coarse is None else Refinement(self.coarse.membrane.grid, membrane.grid)
         cone = settings.coarse_cone if is_coarse and self.coarse is None else settings.cone
         loss = TractionLoss(membrane, self.reference, cone, settings)
@@ -130,8 +128,8 @@ class ForceBalance(Estimator):
         sensor = noise, problem.filling, problem.gas
         return cls(*surface, *sensor, settings, rest, problem.views, levers=problem.levers)
 
-    def _coarser(self, membrane: Membrane, elasticity: ElasticEnergy, bearings: MarkerResiduals, **others: Any) -> Self | None:
-        grid, positions = membrane.grid, bearings.positions
+    def _coarser(self, elasticity: ElasticEnergy, bearings: MarkerResiduals, **others: Any) -> Self | None:
+        membrane, grid, positions = self.membrane, self.membrane.grid, bearings.positions
         if any(count % 2 == 0 or count < 2 * self.settings.coarsest - 1 for count in grid):
             return None
         every_second = Membrane(*(a.unflatten(0, grid)[::2, ::2].numpy() for a in (membrane.rest, membrane.fixed)))
@@ -143,9 +141,8 @@ class ForceBalance(Estimator):
     @property
     def must_compile(self) -> bool:
         """Whether the first frame waits for machine code to be compiled."""
-        rest = self.membrane.rest
-        taken = rest.device.type == "cpu" and self.equations.bearings.in_machine_code
-        return taken and not compiled.is_compiled(np.dtype(str(rest.dtype).removeprefix("torch.")))
+        taken = self.membrane.rest.is_cpu and self.equations.bearings.in_machine_code
+        return taken and not compiled.is_compiled(self.membrane.rest.numpy().dtype)
 
     @property
     def solves_in_double(self) -> bool:
@@ -270,19 +267,22 @@ class ForceBalance(Estimator):
     @traced
     def equilibrium(self, u: Tensor, pressure: Tensor, moved: Tensor, before: Tensor, measured: MeasuredRays) -> Equilibrium:
         """What this state amounts to; `before`: the displacement a step earlier."""
-        membrane, loss, x = self.membrane, self.equations.loss, self.membrane.rest + u
-        step = (u - before).square().sum(-1).mean(-1).sqrt() / self.size
-        traction = self.equations.forces(u, pressure) / membrane.rest_area[:, None]
-        within = inner(traction, membrane.grid).mT, inner(membrane.normals(x), membrane.grid).mT
-        terms, seen = loss(*within, measured.noise_level), measured.weight.sum(-1).clamp_min(1)
+        membrane, steps, x = self.membrane, self.gauss_newton, self.membrane.rest + u
+        if steps.is_native(u, pressure, moved, before, *measured):
+            given = self.equations, self.cavity, (u, pressure, moved), before, measured, self._far
+            (step, volume, misfit, *reasons), traction, reference = steps.native.solution(*given)
+            return Equilibrium(x, pressure, volume, traction, step, reference, misfit, moved, *reasons)
+        loss, step = self.equations.loss, (u - before).square().sum(-1).mean(-1).sqrt() / self.size
+        (traction, normal), grid = steps.tractions(u, pressure), membrane.grid
+        terms, seen = loss(traction, normal, measured.noise_level), measured.weight.sum(-1).clamp_min(1)
         angles = self.equations.bearings.angles(u, measured, moved)[0]
-        unexplained = (self.gauss_newton.misfit(angles, pressure, measured) + terms.others) / seen
+        unexplained = (steps.misfit(angles, pressure, measured) + terms.others) / seen
         objective = unexplained + terms.pushes / seen
-        gain = self.gauss_newton.objective_at_rest(measured) / seen - objective
-        scale = 1 + pad_border(loss.contact_scale(terms, measured.noise_level, gain)[..., None] - 1, membrane.grid)[..., 0]
+        gain = steps.objective_at_rest(measured) / seen - objective
+        scale = 1 + pad_border(loss.contact_scale(terms, measured.noise_level, gain)[..., None] - 1, grid)[..., 0]
         misfit, shared = self.equations.bearings.misfits(angles, measured, self.settings.outlier, self._far)
-        reasons = misfit, moved, objective, unexplained, loss.pushed(terms.compression2), shared
-        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, *reasons)
+        reasons, traction = [objective, unexplained, loss.pushed(terms.compression2), shared], pad_border(traction.mT, grid)
+        return Equilibrium(x, pressure, membrane.volume(x), traction, step, self.reference * scale, misfit, moved, *reasons)
 
     @traced
     def is_converged(self, found: Equilibrium) -> Tensor:

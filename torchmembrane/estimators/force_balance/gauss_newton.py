@@ -9,11 +9,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...control_flow import chunked, fori_loop, traced, where_rows
+from ...machine_code import takes
 from ...mechanics.cavity import CavityLaw
 from ...solve.implicit import differentiable
 from ...solve.kkt import border_unknowns
 from ...solve.stencil import inner
-from .kernels.steps import NativeSteps, takes
+from .kernels.steps import NativeSteps
 from .marker_residuals import MeasuredRays
 from .normal_equations import BalanceEquations, NormalEquations
 from .pressure_gauge import gauge_loss, pulled
@@ -155,6 +156,13 @@ class GaussNewton(nn.Module):
         traction = self.equations.forces(u, pressure) / self.membrane.rest_area[:, None]
         normals = self.membrane.normals(self.membrane.rest + u)
         return inner(traction, self.membrane.grid).mT, inner(normals, self.membrane.grid).mT
+
+    def traction(self, state: State, measured: MeasuredRays) -> Tensor:
+        """The contact tractions `[B, V, 3]`."""
+        if self.is_native(*state, *measured):
+            return self.native.solution(*self._given, state, state.u, measured, 1.0)[1]
+        traction: Tensor = self.equations.forces(state.u, state.pressure) / self.membrane.rest_area[:, None]
+        return traction
 
     @traced
     def _next(

@@ -7,7 +7,7 @@ non-convexity (GNC): the problem begins quadratic.
 Reference: Barron 2019, A general and adaptive robust loss function; Blake and Zisserman 1987, Visual reconstruction.
 """
 
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from torch import Tensor
 
@@ -36,6 +36,17 @@ def geman_mcclure_curvature(ratio: Scalar) -> Scalar:
     return curvature
 
 
+def geman_mcclure_loss(r2: Scalar, scale: Any) -> Scalar:
+    """Geman and McClure's loss of `r^2 [...]` at a scale `s`, a number or a tensor `[]`.
+
+    Example:
+        >>> geman_mcclure_loss(4.0, 2.0)
+        1.0
+    """
+    loss: Scalar = r2 / (2 + 2 * r2 / scale**2)
+    return loss
+
+
 class GemanMcClure(NamedTuple):
     """`r^2 / (2 (1 + r^2 / s^2))`: saturates at `s^2 / 2`, what lies far out has no more weight.
 
@@ -52,7 +63,7 @@ class GemanMcClure(NamedTuple):
 
     def loss(self, r2: Tensor) -> Tensor:
         """The loss, of the shape of `r2`."""
-        return r2 / (2 + 2 * r2 / self.scale**2)
+        return geman_mcclure_loss(r2, self.scale)
 
     def weight(self, r2: Tensor) -> Tensor:
         """The weight, of the shape of `r2`, in 0..1."""

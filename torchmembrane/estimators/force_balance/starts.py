@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ...control_flow import stacked, traced, where_rows
-from ...solve.stencil import pad_border
+from ...solve.stencil import inner, pad_border
 from ...surface.membrane import Membrane
 from ..base import Equilibrium
 from ..precision import rounded_to_float32
@@ -73,14 +73,16 @@ class InitialGuess(nn.Module):
 
     def _dented(self, u: Tensor, pressure: Tensor, moved: Tensor, measured: MeasuredRays, depth: float, width: float) -> State:
         membrane, loss = self.membrane, self.gauss_newton.equations.loss
-        compression2 = loss.parts(*self.gauss_newton.tractions(u, pressure))[2]
+        normals = membrane.normals(membrane.rest + u)
+        q_n = (self.gauss_newton.traction(State(u, pressure, moved), measured) * normals).sum(-1, keepdim=True)
+        compression2 = loss.compression2(inner(q_n, membrane.grid)[..., 0])
         weight = (pad_border(compression2[..., None], membrane.grid)[..., 0] + TINY) * self.area
         middle = (weight[..., None] * membrane.rest).mT @ self.around / (weight @ self.around)[:, None]
         off2 = (middle.mT - membrane.rest).square().sum(-1) / membrane.size**2
         faint2 = (FAINT_PUSH * measured.noise_level[:, None] * loss.push_noise).square().mean(-1) + TINY
         share = (compression2.amax(-1) / (compression2.amax(-1) + faint2))[:, None]
         inwards = depth * membrane.size * share * torch.exp(-off2 / (2 * width**2)) * self.free
-        return State(u - inwards[..., None] * membrane.normals(membrane.rest + u), pressure, moved)
+        return State(u - inwards[..., None] * normals, pressure, moved)
 
     def is_ring_shaped(self, found: Equilibrium, membrane: Membrane) -> Tensor:
         """`[B]` bool: hardly anything pushes in the middle of a contact, as where a mound ringed by pushes is found in place of

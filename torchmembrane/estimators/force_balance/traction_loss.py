@@ -85,8 +85,12 @@ class TractionLoss(nn.Module):
         p0 = self.reference
         q_n = (traction * normal).sum(1)
         q_t = traction - q_n[:, None] * normal
-        compression2 = (-q_n / p0).clamp_min(0) ** 2 @ self.surroundings
-        return q_n / p0, q_t.square().sum(1) / p0**2, compression2
+        return q_n / p0, q_t.square().sum(1) / p0**2, self.compression2(q_n)
+
+    def compression2(self, q_n: Tensor) -> Tensor:
+        """The mean squared push `S^2` around, `[B, N]`, of the tractions' normal parts `[B, N]`."""
+        compression2: Tensor = (-q_n / self.reference).clamp_min(0) ** 2 @ self.surroundings
+        return compression2
 
     def pushed(self, compression2: Tensor) -> Tensor:
         """Share `[B]` of the surface that is pushed more than the last scale `tau`, from `S^2 [B, N]`."""

@@ -5,7 +5,9 @@ import torch
 from torch import Tensor, nn
 
 from ..spacing import FADED, faded, safe_length, spacing, square_distance
-from .steps import NeighbourSteps, trust
+from .native_coherence import trust_of
+from .native_flow import is_native
+from .steps import STRAY, NeighbourSteps, trust
 
 SEAM = 2.0  # width of the neighbourhood in which a seam is looked for, pitches
 TEAR = 0.045  # root of the share of dots lost and blobs left over, times the relative error of steps
@@ -72,6 +74,9 @@ class Coherence(nn.Module):
             predicted: where its neighbours predict each dot `[B, D, 2]`, px.
             blobs: `[B, K, 2]`, px; log_radius, valid: `[B, K]`, as for `DotMatcher`.
         """
+        given = pixels, confidence, gradient, predicted, blobs, log_radius, valid
+        if is_native(*given, self.share):
+            return trust_of(self, (-0.5 / self.size_tolerance**2, TEAR, STRAY), *given)
         sure = torch.sigmoid(20 * (confidence - 0.5))
         places = torch.cat([pixels, predicted], 1) - self.origin
         square, other = square_distance(blobs - self.origin, places).chunk(2, -1)  # [B, K, D]

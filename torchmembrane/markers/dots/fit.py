@@ -6,14 +6,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ...machine_code import takes
 from ...solve.elimination import solve_dense
 from ..spacing import spacing
 from .ellipse import SOFTNESS, half_axes, rms_half_axes
+from .native_fit import MISFIT, NativeFit
 from .pyramid import LEVELS
 
 RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level
 FINEST = 2.0  # a dot's short half axis on its level of the pyramid is at least this, where it can be
-MISFIT = 0.02  # of the residual's variance, what differs from image to image besides noise: most of it is the model's, in all
 RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, its slope over the dot, depth, shift, growth
 
 
@@ -80,6 +81,7 @@ class EllipseFit(nn.Module):
         gap = (0.85 * spacing(pixels)[0] - 2 * long) / stride
         ring = np.clip(0.7 * gap, 1.5, RING) * stride
         half = int(np.round(((long + ring) / stride).max()))
+        self.native = NativeFit()
         self.half_width = min(half, (min(sizes[level].min(0)) - 1) // 2)
         self.narrowness = -0.25 / size_tolerance**2
         self._register_levels(level, _disc(self.half_width), sizes)
@@ -143,6 +145,8 @@ class EllipseFit(nn.Module):
             size against that of `shape` or at rest.
         """
         centre, shape, noise = (value.to(self.size) for value in (centre, shape, noise))
+        if self.size.dtype == torch.float32 and takes(*levels, centre, shape, noise):
+            return FittedDots(*self.native(self, levels, centre, shape, noise, steps))
         values, middle = self.windows(levels, centre)
         mean = values.mean(-1, keepdim=True)
         window = values - mean

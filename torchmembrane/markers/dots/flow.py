@@ -5,6 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from ..spacing import faded, spacing
+from .native_flow import flows, found_by, gradients, is_native
 
 RIDGE = 0.5  # draws the flow's gradient to the one measured, where neighbours do not fix it
 SUPPORT = 0.8  # sure nodes, weighted by distance, that a prediction needs
@@ -59,6 +60,8 @@ class FlowAverages(nn.Module):
 
     def gradient(self, weight: Tensor, flow: Tensor, prior: Tensor) -> Tensor:
         """Gradient `[B, 2, 2, D]` of the least-squares affine flow, drawn to `prior` where neighbours do not fix it."""
+        if is_native(weight, flow, prior, self.h):
+            return found_by(gradients, self._constants(), (weight, flow, prior), 2, 2, len(self.h))
         weight = weight[:, None]
         rows = torch.cat([weight, weight * flow], 1)
         sums = (rows @ self.moments).unflatten(-1, (7, -1))  # [B, 3, 7, D]
@@ -80,6 +83,9 @@ class FlowAverages(nn.Module):
         Returns:
             Flow `[B, 2, D]` and support `[B, D]`: the sure nodes around, weighted by distance.
         """
+        if is_native(weight, flow, gradient, self.h):
+            found = found_by(flows, self._constants(), (weight, flow, gradient), 3, len(self.h))
+            return found[:, :2], found[:, 2]
         weight = weight[:, None]
         rows = torch.cat([weight, weight * torch.cat([flow, gradient.flatten(1, 2)], 1)], 1)
         sums = (rows @ self.first_moments).unflatten(-1, (3, -1))  # [B, 7, 3, D]
@@ -89,3 +95,6 @@ class FlowAverages(nn.Module):
         mine = (gradient * near[:, None, 1:]).sum(2)
         total = sums[:, 1:3, 0].addcmul(self.h, theirs + mine, value=-0.5)
         return total / (support + 1e-3)[:, None], support
+
+    def _constants(self) -> tuple[Tensor, ...]:
+        return self.moments, self.first_moments, self.still, self.raised, self.pull, self.h

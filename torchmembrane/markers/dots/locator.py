@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from ...control_flow import traced
 from ...errors import MembraneError
 from ..locator import LocatedMarkers
+from ..native_noise import kept_noises
 from ..noise import pixel_noise
 from ..spacing import partly_in_view, safe_length, spacing
 from .coherence import Coherence
@@ -16,6 +17,9 @@ from .detect import BlobDetector
 from .ellipse import draw_dots, size_tolerance
 from .fit import EllipseFit
 from .match import KEPT, DotMatcher
+from .native_coherence import kept_trusts
+from .native_fit import kept_fits
+from .native_flow import KEPT_STEPS
 from .pattern import OUTLIER, DotPattern
 from .pyramid import mean_pyramid
 
@@ -153,6 +157,13 @@ class DotLocator(nn.Module):
         self.is_exact = True
         self.fit.double()
         self.shapes = self.shapes.double()
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether there is machine code of the fit and the matching's steps already."""
+        return all(
+            each.is_compiled(np.dtype(np.float32)) for each in (kept_fits, kept_trusts, kept_noises, *KEPT_STEPS.values())
+        )
 
     def forward(self, image: Tensor, previous: Tensor | None = None) -> LocatedMarkers:
         """Locate the dots in a batch of frames.

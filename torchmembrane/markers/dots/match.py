@@ -13,6 +13,7 @@ from .agreement import NeighbourAgreement
 from .alignment import Alignment
 from .deformation import FAR, LocalDeformation
 from .flow import SUPPORT, FlowAverages
+from .native_flow import choices, found_by, is_native
 from .steps import NeighbourSteps, trust
 
 ROUNDS = 2  # in which neighbours agree
@@ -54,6 +55,7 @@ class DotMatcher(nn.Module):
     stiffness: Tensor
     slope: Tensor
     log_radius: Tensor
+    enough: Tensor
     seen: Tensor
 
     def __init__(self, pixels: np.ndarray, log_radius: np.ndarray, size_tolerance: float, seen: np.ndarray):
@@ -73,6 +75,7 @@ class DotMatcher(nn.Module):
         self.register_buffer("stiffness", torch.as_tensor((TOLERANCE * nearest) ** -2.0))
         self.register_buffer("slope", -2 * self.stiffness)
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
+        self.register_buffer("enough", torch.tensor([SUPPORT], dtype=torch.float64))
 
     def nearest_dots(self, blobs: Tensor) -> Tensor:
         """Which dot at rest is nearest to each of `blobs [B, K, 2]`, `[B, K]`."""
@@ -100,6 +103,10 @@ class DotMatcher(nn.Module):
         Returns:
             Certainty `[B, D]`, the flow to the blob `[B, 2, D]` (the prediction where lost), its strain `[B, 2, 2, D]`.
         """
+        if is_native(predicted, support, blobs, base, self.pixels):
+            given = predicted, support, blobs, base
+            taken = found_by(choices, (self.pixels, self.stiffness, self.enough), given, 7, len(self.pixels))
+            return taken[:, 0], taken[:, 1:3], taken[:, 3:].unflatten(1, (2, 2))
         expected = self.pixels.mT + predicted
         alone = (expected * expected).sum(1) * self.stiffness + FAR * (support < SUPPORT).to(support.dtype)
         cost = torch.cat([alone[:, None], self.slope * expected], 1).mT @ blobs[:, :3] + base

@@ -12,6 +12,7 @@ from ....machine_code import aligned, compiled
 from ....mechanics.native_membrane import STENCIL, Surface
 from ....solve.band import RIDGES
 from ....solve.native_band import LANES, RANK, ROWS, storage
+from ....solve.native_rows import sum_rows
 from ....solve.stencil_layouts import OFFSETS
 from ..robust import geman_mcclure_curvature, geman_mcclure_weight
 from ..traction_loss import POWER, TINY
@@ -48,6 +49,8 @@ class Constants(NamedTuple):
     """Numbers of inner vertices and their shares in the markers' displacement, `[D, K]` each."""
     corners: tuple[Any, Any]
     """The same in what markers pull, `[D, 3]`."""
+    nearest: Any
+    """`[D, K]`, the markers next to each."""
     numbers: "Numbers"
 
 
@@ -70,6 +73,10 @@ class Numbers(NamedTuple):
     camera_motion: float
     longest_step: float
     largest_stretch: float
+    contact_noise: float
+    evidence: float
+    outlier: float
+    noise_gain: float
     rest_pressure: float
     rest_volume: float
     is_open: bool
@@ -96,7 +103,7 @@ class Workspace(NamedTuple):
     normal: Any
     """`[N, 3]`"""
     fields: Any
-    """`[4, N]`"""
+    """`[5, N]`"""
     blocks: Any
     """`[D, 3, 3]`, of the markers; their bearing Jacobians, weighted, `jacobians [D, 2, 3]`, and `marker_weights [D]`."""
     jacobians: Any
@@ -122,7 +129,7 @@ def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
     N, V, width = (m - 2) * (n - 2), m * n, 3 * (2 * (n - 2) + 2) + 2  # to two lines, vertices and components further
     unknowns, rows, ld = storage(3 * N, width)
     shapes = dict(force=(m, n, 3), volume=(m, n, 3), A=(3, 21, m, n), weighted=(3, 21, V), W=(3, 3, V), of_loads=(3, 2, V))
-    shapes |= dict(sums=(90, V), normal=(N, 3), fields=(4, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
+    shapes |= dict(sums=(90, V), normal=(N, 3), fields=(5, N), blocks=(markers, 3, 3), jacobians=(markers, 2, 3))
     shapes |= dict(marker_weights=(markers,), inverse=(unknowns,), panel=(RANK * ld,), scale=(unknowns,))
     arrays = {name: np.zeros(shape, dtype) for name, shape in shapes.items()}
     y = aligned(-(-LOADS // ROWS) * ROWS * unknowns, dtype)
@@ -131,11 +138,11 @@ def workspace(grid: tuple[int, int], markers: int, dtype: Any) -> Workspace:
 
 
 @compiled
-def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
-    """`TractionLoss.weights`: `W`, and `before` becomes the weights of the normal tractions; `curvature`: of a push's loss, in
-    place of its weight."""
+def scaled(c, work, noise_level, tau):
+    """`TractionLoss.parts` and `scale2`: `work.fields` become the normal part and the squared shear of the tractions, over the
+    reference, `S^2` and `rho^2`; `work.normal` the normals."""
     k, N, n = c.numbers, len(c.area), c.surface.free.shape[1]
-    q_n, shear2, push2, around = work.fields
+    q_n, shear2, push2, around, shares = work.fields
     for i in range(N):
         p, q = i // (n - 2) + 1, i % (n - 2) + 1
         square, along, across2 = 0.0, 0.0, 0.0
@@ -148,30 +155,37 @@ def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
             across2 += (work.force[p, q, a] - along * work.normal[i, a]) ** 2
         unit = c.area[i] * k.reference
         q_n[i], shear2[i] = along / unit, across2 / unit**2
-    push2[:] = 0
-    for i in range(N):
-        if not q_n[i] >= 0:
-            _add(push2, c.surroundings[i], q_n[i] ** 2, c.surroundings_within[i])
+        shares[i] = 0.0 if q_n[i] >= 0 else q_n[i] ** 2
+    sum_rows(push2, c.surroundings, c.surroundings_within, shares)
     top = TINY
     for i in range(N):
         top = max(top, push2[i])
-    around[:] = 0
     for i in range(N):
         share = (push2[i] / top) ** POWER
-        if not share < NOTHING:
-            _add(around, c.wider[i], share, c.wider_within[i])
+        shares[i] = 0.0 if share < NOTHING else share
+    sum_rows(around, c.wider, c.wider_within, shares)
     least = min(k.decrease * (tau / k.last_tau - 1) + k.least_scale, 1.0) ** 2
     for i in range(N):
         expected = top * max(around[i], TINY) ** (1 / POWER) * k.scale_share**2
         expected = max(expected, top * k.far_share**2, (k.noise_share * noise_level * c.push_noise[i]) ** 2)
+        around[i] = min(max(expected / k.last_tau**2, least), 1.0)
+
+
+@compiled
+def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
+    """`TractionLoss.weights`: `W`, and `before` becomes the weights of the normal tractions; `curvature`: of a push's loss, in
+    place of its weight."""
+    k, n = c.numbers, c.surface.free.shape[1]
+    scaled(c, work, noise_level, tau)
+    for i in range(len(c.area)):
+        q_n, shear2, rho2 = work.fields[0, i], work.fields[1, i], work.fields[3, i]
         at = (i // (n - 2) + 1) * n + i % (n - 2) + 1
-        rho2 = min(max(expected / k.last_tau**2, least), 1.0)
-        pushed = push2[i] / rho2
+        pushed = work.fields[2, i] / rho2
         ratio = pushed / tau**2
         of_push = max(curvature_of_push(ratio), 0.0) if curvature else weight_of_push(ratio)
-        w_n = k.floor + (of_push if q_n[i] < 0 else 1.0)
+        w_n = k.floor + (of_push if q_n < 0 else 1.0)
         w_n = before[i] * (w_n / before[i]) ** renewal
-        w_t = k.friction / (1 + cone * np.sqrt(pushed + k.slip**4)) / np.sqrt(shear2[i] / rho2 + k.slip**2)
+        w_t = weight_of_shear(k, pushed, cone) / np.sqrt(shear2 / rho2 + k.slip**2)
         scale = k.sparsity / (k.reference * k.size) ** 2 / c.area[i] / rho2
         for a in range(3):
             for b in range(3):
@@ -181,11 +195,9 @@ def weigh(c, work, before, noise_level, tau, cone, renewal, curvature):
 
 
 @compiled
-def _add(total, row, share, within):
-    """`total += share row`, of which only the places `within` are not zero."""
-    part, of_row = total[within[0] : within[1]], row[within[0] : within[1]]
-    for i in range(len(part)):
-        part[i] += share * of_row[i]
+def weight_of_shear(k, push2, cone):
+    """`TractionLoss.shear_weight`."""
+    return k.friction / (1 + cone * np.sqrt(push2 + k.slip**4))
 
 
 @compiled
@@ -227,60 +239,6 @@ def _add_products(total, first, count, a, of_a, b, of_b, at):
     b0, b1, b2 = b[0, of_b, at : at + count], b[1, of_b, at : at + count], b[2, of_b, at : at + count]
     for k in range(count):
         out[k] += a0[k] * b0[k] + a1[k] * b1[k] + a2[k] * b2[k]
-
-
-@compiled
-def load_markers(c, work, u, moved, seen, outlier, own, slope):
-    """`MarkerResiduals.angles` and what they add to the loads and to the camera's equations, `own [4, 4]` and `slope [4]`; the
-    markers' blocks.
-
-    `seen`: origins `[3, D]`, across `[2, 3, D]`, weight `[D]`, motion `[2, 4, D]`."""
-    (origins, across, weight, motion), (corners, pulls) = seen, c.corners
-    to_marker, jacobian, angle = np.zeros(3), np.zeros((2, 3)), np.zeros(2)
-    for d in range(len(weight)):
-        _place(c, u, d, to_marker)
-        for a in range(3):
-            to_marker[a] -= origins[a, d]
-        distance, square = np.sqrt(to_marker[0] ** 2 + to_marker[1] ** 2 + to_marker[2] ** 2), 0.0
-        for r in range(2):
-            turned = 0.0
-            for a in range(3):
-                turned += across[r, a, d] * to_marker[a] / distance
-            for a in range(3):
-                jacobian[r, a] = (across[r, a, d] - turned * to_marker[a] / distance) / distance
-            for a in range(4):
-                turned += motion[r, a, d] * moved[a]
-            angle[r] = turned
-            square += turned * turned
-        w = weight[d] / (1 + weight[d] * square / outlier**2)
-        work.marker_weights[d] = w
-        for a in range(3):
-            work.jacobians[d, 0, a], work.jacobians[d, 1, a] = w * jacobian[0, a], w * jacobian[1, a]
-            pull = w * (jacobian[0, a] * angle[0] + jacobian[1, a] * angle[1])
-            for b in range(3):
-                work.blocks[d, a, b] = w * (jacobian[0, a] * jacobian[0, b] + jacobian[1, a] * jacobian[1, b])
-            for s in range(3):
-                at, share = 3 * corners[d, s] + a, pulls[d, s]
-                work.loads[FORCES, at] += share * pull
-                for e in range(4):
-                    by_motion = motion[0, e, d] * jacobian[0, a] + motion[1, e, d] * jacobian[1, a]
-                    work.loads[CAMERA + e, at] += share * w * by_motion
-        for a in range(4):
-            slope[a] += w * (motion[0, a, d] * angle[0] + motion[1, a, d] * angle[1])
-            for b in range(4):
-                own[a, b] += w * (motion[0, a, d] * motion[0, b, d] + motion[1, a, d] * motion[1, b, d])
-
-
-@compiled
-def _place(c, u, d, place):
-    """`MarkerResiduals.markers`: where marker d is on the surface."""
-    n, (numbers, shares) = c.surface.free.shape[1], c.smooth
-    for a in range(3):
-        place[a] = c.positions[d, a]
-    for s in range(numbers.shape[1]):
-        i = numbers[d, s]
-        for a in range(3):
-            place[a] += shares[d, s] * u[i // (n - 2) + 1, i % (n - 2) + 1, a]
 
 
 @compiled

@@ -12,7 +12,8 @@ from ....mechanics.native_membrane import linearise
 from ....solve.native_band import RANK, ROWS, backward, factor
 from ....solve.symmetric_2x2 import symmetric_solution
 from ..camera_motion import camera_stiffness
-from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, load_markers, sum_blocks, weigh
+from .equations import CAMERA, FLUID, FORCES, LOADS, VOLUME, WANTED, fill, load_forces, sum_blocks, weigh
+from .markers import load_markers
 
 gas_step, solution_2x2, stiffness_of_camera = compiled(gas_law_step), compiled(symmetric_solution), compiled(camera_stiffness)
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from ....machine_code import compiled
 from ....mechanics.native_membrane import linearise
-from .equations import CAMERA, FLUID, LOADS, VOLUME, WANTED, load_forces, load_markers, sum_blocks, weigh
+from .equations import CAMERA, FLUID, LOADS, VOLUME, WANTED, load_forces, sum_blocks, weigh
 from .gauss_newton import border_unknowns, cavity_condition, eliminated, factored, stiffness_at, substituted
+from .markers import load_markers
 
 
 @compiled

@@ -9,18 +9,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ....machine_code import Kept, fingerprint, is_used, kept
+from ....machine_code import Kept, fingerprint, kept
 from ....mechanics import cavity, native_membrane
 from ....mechanics.cavity import CavityLaw
 from ....mechanics.native_membrane import Surface, surface_of
-from ....solve import native_band, symmetric_2x2
+from ....solve import native_band, native_rows, symmetric_2x2
+from ....solve.native_rows import within
 from ....solve.stencil import inner
 from .. import camera_motion, robust
 from ..marker_residuals import MeasuredRays
 from ..normal_equations import DAMPING, BalanceEquations
-from . import equations, gauss_newton, spread
+from . import equations, gauss_newton, markers, solution, spread
 from .equations import Constants, Numbers, Workspace, workspace
 from .gauss_newton import step
+from .solution import TOLD, solution_of
 from .spread import spread_of
 
 
@@ -52,9 +54,8 @@ class NativeSteps:
         u, pressure, moved, weighing, before = (value.numpy() for value in changing)
         surface = -1, *equations.forces.membrane.grid, 3
         surfaces = u.reshape(surface), pressure, moved, weighing, before.reshape(surface)
-        self._shared_out(
-            equations, constants, [*surfaces, *fixed, np.empty((0, 4), u.dtype)], np.array(rows, float).reshape(-1, 5)
-        )
+        each = [*surfaces, *fixed, *_nothing(u), np.empty((len(u), 0), u.dtype)]
+        self._shared_out(equations, constants, each, np.array(rows, float).reshape(-1, 5))
         after, pressure_after, camera, weights, before_last = changing
         return [after, pressure_after, camera, before_last, weights]
 
@@ -72,8 +73,31 @@ class NativeSteps:
         weights, found = np.ones((len(u), len(constants.area)), u.dtype), np.empty((len(u), 4), u.dtype)
         scales = np.array([[equations.loss.settings.tau[1], outlier, equations.loss.cone, 1.0, DAMPING]])
         u = u.reshape(-1, *equations.forces.membrane.grid, 3)
-        self._shared_out(equations, constants, [u, pressure, moved, weights, u, *fixed, found], scales)
+        each = [u, pressure, moved, weights, u, *fixed, *_nothing(u), found]
+        self._shared_out(equations, constants, each, scales)
         return torch.from_numpy(found)
+
+    def solution(
+        self,
+        equations: BalanceEquations,
+        cavity: CavityLaw,
+        state: tuple[Tensor, Tensor, Tensor],
+        before: Tensor,
+        measured: MeasuredRays,
+        far: float,
+    ) -> tuple[Sequence[Tensor], Tensor, Tensor]:
+        """What a state amounts to: the numbers `[B]` of what is `TOLD`, the tractions `[B, V, 3]` and what they are measured
+        against `[B, V]`; arguments as of `ForceBalance.equilibrium`, `far`: as of `MarkerResiduals.misfits`."""
+        constants, fixed = self._prepared(equations, cavity, measured)
+        u, pressure, moved, earlier = (value.contiguous().numpy() for value in (*state, before))
+        weights, given = np.empty((len(u), 0), u.dtype), np.array([[equations.loss.cone, far, 0, 0, 0]], float)
+        found = state[0].new_empty(len(u), TOLD), torch.empty_like(state[0]), torch.empty_like(state[0][..., 0])
+        told, traction, reference = (value.numpy() for value in found)
+        grid = equations.forces.membrane.grid
+        u, earlier, traction = (value.reshape(-1, *grid, 3) for value in (u, earlier, traction))
+        each = [u, pressure, moved, weights, earlier, *fixed, traction, reference.reshape(-1, *grid), told]
+        self._shared_out(equations, constants, each, given)
+        return found[0].unbind(1), *found[1:]
 
     def _prepared(
         self, equations: BalanceEquations, cavity: CavityLaw, measured: MeasuredRays
@@ -113,18 +137,6 @@ class NativeSteps:
         return self._constants[1]
 
 
-def takes(*values: Any) -> bool:
-    """Whether steps of these tensors are taken by machine code: on a processor, alone, without gradients."""
-    tensors = [value for value in values if value is not None]
-    return (
-        not torch.compiler.is_compiling()
-        and is_used()
-        and all(type(value) is Tensor and value.device.type == "cpu" for value in tensors)
-        and not (torch.is_grad_enabled() and any(value.requires_grad for value in tensors))
-        and all(torch.func.debug_unwrap(value, recurse=False) is value for value in tensors)
-    )
-
-
 def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Constants:
     forces, loss, bearings, settings = equations.forces, equations.loss, equations.bearings, equations.loss.settings
     absolute, gas = cavity.gas.tolist()
@@ -134,6 +146,7 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Co
         size=loss.size,
         last_tau=settings.tau[1],
         first_tau=settings.tau[0],
+        noise_gain=float(loss.noise_gain),
         rest_pressure=float(cavity.rest_pressure),
         rest_volume=_volume(surface),
         is_open=cavity.filling == "open",
@@ -151,16 +164,22 @@ def _constants(equations: BalanceEquations, cavity: CavityLaw, dtype: Any) -> Co
         surface,
         array(loss.area),
         surroundings,
-        _within(surroundings),
+        within(surroundings),
         wider,
-        _within(wider),
+        within(wider),
         array(loss.push_noise),
         -array(inner(forces.membrane.rest_normals, forces.membrane.grid)),
         array(bearings.positions),
         _sparse(array(bearings.smooth_shares)),
         _sparse(array(bearings.vertex_shares), 3),
+        bearings.nearest.numpy(),
         numbers,
     )
+
+
+def _nothing(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tractions, and what they are measured against, that are not asked for."""
+    return np.empty((len(u), 0, 0, 3), u.dtype), np.empty((len(u), 0, 0), u.dtype)
 
 
 def _volume(surface: Surface) -> float:
@@ -169,12 +188,6 @@ def _volume(surface: Surface) -> float:
     spins = np.cross(edges[:, 0], edges[:, 1], axis=0).sum(1)
     inner: np.ndarray = surface.rest[:-1, :-1].astype(float)
     return float(surface.law[4] * (inner * np.moveaxis(spins, 0, -1)).sum())
-
-
-def _within(rows: np.ndarray) -> np.ndarray:
-    """Where the rows begin and end to be more than zero, `[N, 2]`."""
-    there = rows != 0
-    return np.stack([there.argmax(1), rows.shape[1] - there[:, ::-1].argmax(1)], 1)
 
 
 def _sparse(rows: np.ndarray, count: int | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -187,18 +200,36 @@ def _sparse(rows: np.ndarray, count: int | None = None) -> tuple[np.ndarray, np.
 def _entry(sources: str) -> Any:
     @kept
     def frames(  # type: ignore[no-untyped-def]
-        c, work, u, pressure, moved, weights, before, origins, across, weight, noise_level, motion, gauge, rows, found
+        c,
+        work,
+        u,
+        pressure,
+        moved,
+        weights,
+        before,
+        origins,
+        across,
+        weight,
+        noise_level,
+        motion,
+        gauge,
+        traction,
+        scale,
+        rows,
+        found,
     ):
-        """Steps of every frame, and then its deviations.
+        """Steps of every frame, and then its deviations, or what its state amounts to.
 
         `u [B, m, n, 3]`, `pressure [B]`, `moved [B, 4]` and `weights [B, N]`, of the normal tractions, become those after the
-        steps; `before [B, m, n, 3]` the displacement before the last; `found [B, 4]` the standard deviations of force and depth
-        by the last of the rows, with which no step is taken; `[0, 4]` where they are not asked for.
+        steps; `before [B, m, n, 3]` the displacement before the last. With the last of the rows no step is taken where `found`
+        is asked for: `[B, 4]`, the standard deviations of force and depth; `[B, 7]` what is `TOLD`, with `traction
+        [B, m, n, 3]` and `scale [B, m, n]`, what they are measured against.
 
         c: `Constants`, work: a `Workspace`, origins to gauge: `MeasuredRays`, rows: of every step tau, outlier, cone, renewal
         and damping, `[S, 5]`.
         """
-        count = len(rows) - (len(found) > 0)
+        wanted = found.shape[1]
+        count = len(rows) - (wanted > 0)
         for b in range(len(u) if sources else 0):
             state, measured = (u[b], pressure[b : b + 1], moved[b], weights[b]), (noise_level[b], gauge[b])
             seen, now, earlier = (origins[b], across[b], weight[b], motion[b]), u[b].ravel(), before[b].ravel()
@@ -206,7 +237,10 @@ def _entry(sources: str) -> Any:
                 for i in range(len(earlier) if k == count - 1 else 0):
                     earlier[i] = now[i]
                 step(c, work, *state, seen, *measured, rows[k])
-            if len(found) > 0:
+            if wanted == TOLD:
+                told = found[b], traction[b], scale[b]
+                solution_of(c, work, *state[:3], before[b], seen, *measured, rows[count], *told)
+            elif wanted > 0:
                 spread_of(c, work, *state, seen, *measured, rows[count], found[b])
 
     return frames
@@ -214,8 +248,8 @@ def _entry(sources: str) -> Any:
 
 SOURCES = fingerprint(
     __file__,
-    *(each.__file__ for each in (camera_motion, cavity, equations, gauss_newton, native_band, native_membrane)),
-    *(each.__file__ for each in (robust, spread, symmetric_2x2)),
+    *(each.__file__ for each in (camera_motion, cavity, equations, gauss_newton, markers, native_band, native_membrane)),
+    *(each.__file__ for each in (native_rows, robust, solution, spread, symmetric_2x2)),
 )
 frames = _entry(SOURCES)
 compiled = Kept(frames, SOURCES)
