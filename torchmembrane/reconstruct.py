@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from .camera.rig import turns_by_noise
-from .control_flow import in_inference_mode, traced
+from .control_flow import can_sync, in_inference_mode, traced
 from .errors import MembraneError, check_arguments, expect
 from .estimators.base import Equilibrium, Estimator, Observation, StandardDeviations
 from .estimators.contacts import Contacts
@@ -287,7 +287,7 @@ class Reconstructor(nn.Module):
             **{f"contact_{name}": getattr(contacts, name) for name in Contacts._fields[1:]},
         )
         kept = {name: value.to(markers) for name, value in values.items()}
-        if not (gone.is_cpu and torch.is_inference_mode_enabled()) or bool(gone.any()):
+        if not (can_sync(gone) and gone.is_cpu and torch.is_inference_mode_enabled()) or bool(gone.any()):
             kept = {k: torch.where(gone.reshape(-1, *(1,) * (value.ndim - 1)), torch.nan, value) for k, value in kept.items()}
         measured = by_view(torch.where(lost[..., None], torch.nan, pixels).to(markers))
         return Reconstruction(pixels=measured, confidence=by_view(confidence), status=status.to(torch.int32), **kept)
