@@ -67,6 +67,10 @@ class Verbs(nn.Module):
         return (x + rate * given * x,)
 
     @traced
+    def mixed(self, x, given, rate):
+        return (rate * x + given,)
+
+    @traced
     def smaller(self, done, values, others):
         return where_rows(done | (values[0] < others[0]).all(-1), values, others)
 
@@ -85,7 +89,7 @@ class Verbs(nn.Module):
         return self.cubed(x)
 
     def fori_loop(self, x, sign):
-        return fori_loop(self.grown, [(0.5,), (0.25,), (2.0,)], (x,), x)[0]
+        return fori_loop(self.mixed, [(0.5,), (0.25,), (2.0,)], (x,), x)[0]
 
     def cond(self, x, sign):
         return cond(self.is_done(sign), self.first(x), lambda: self.second(x, sign))[0]
@@ -129,7 +133,7 @@ def expected(verb, sign):
     return {
         "traced": first,
         "onnx_function": X**3 + (X + 1) ** 3,
-        "fori_loop": X * (1 + 0.5 * X) * (1 + 0.25 * X) * (1 + 2 * X),
+        "fori_loop": 2 * (0.25 * (0.5 * X + X) + X) + X,
         "cond": first if done.all() else second,
         "chunked": second,
         "stacked": first * (1 + 2 * X) * (1 + grown),
