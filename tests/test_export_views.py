@@ -20,6 +20,8 @@ from torchmembrane.simulate.dataset import stroke_to
 
 pytestmark = pytest.mark.full  # an export of two views takes some 90 s of processor time, opening its session 25
 
+SETTINGS = tm.ForceBalanceSettings(steps=5, retry_steps_factor=1)
+
 
 @pytest.fixture(scope="module")
 def frames():
@@ -34,8 +36,7 @@ def frames():
 @pytest.fixture(scope="module")
 def made(frames, tmp_path_factory):
     """The reconstructor, of few steps, and its model that follows the dots."""
-    settings = tm.ForceBalanceSettings(steps=5, retry_steps_factor=1)
-    reconstructor, path = tm.Reconstructor(frames[0], settings=settings), tmp_path_factory.mktemp("views") / "model.onnx"
+    reconstructor, path = tm.Reconstructor(frames[0], settings=SETTINGS), tmp_path_factory.mktemp("views") / "model.onnx"
     export(reconstructor, path, tracking=True)
     return reconstructor, path, edge.Session(path)
 
@@ -78,14 +79,14 @@ def test_a_view_without_a_picture_is_left_out_by_the_model_too(frames, made):
     np.testing.assert_allclose(frame["vertices"], expected.vertices[0].numpy(), atol=2e-3)
 
 
-def test_a_model_of_regions_takes_the_image_that_they_share(few_steps, frames, tmp_path):
+def test_a_model_of_regions_takes_the_image_that_they_share(frames, tmp_path):
     """One input, of the whole image; its outputs are those of torch, and one dark region is left out."""
     cameras = [CAMERA, tm.Camera("pinhole", (160, 120), (100, 100), (79.5 + 160, 59.5))]
     wholes = [tm.Camera("pinhole", (320, 120), camera.focal.tolist(), camera.centre.tolist()) for camera in cameras]
     first, other = (whole.in_mode((160 * w, 0, 160, 120)) for w, whole in enumerate(wholes))
     views = View("left", first, is_region=True), View("right", other, BESIDE, is_region=True)
     simulator = Simulator(replace(cap(camera=first), views=views))
-    reconstructor, path = tm.Reconstructor(simulator.at_rest(), settings=few_steps), tmp_path / "model.onnx"
+    reconstructor, path = tm.Reconstructor(simulator.at_rest(), settings=SETTINGS), tmp_path / "model.onnx"
     export(reconstructor, path)
     session = edge.Session(path)
     assert session.views == () and session.image_sizes == [(320, 120)] and session.mesh["rest_pixels"].shape == (2, 49, 2)
