@@ -554,7 +554,7 @@ def test_loading_is_told_with_its_time_before_it_begins(model, edge, images, tmp
 
 
 OUTS = {
-    "a file": (lambda out: out.write_text("x"), "is a file; expected a folder"),
+    "a file": (lambda out: out.write_text("x"), "is a file; expected a new folder"),
     "results without mesh": (lambda out: np.savez(out / "a.npz", x=1), "holds .npz files or frames/ but no mesh.npz"),
     "damaged mesh": (lambda out: (out / "mesh.npz").write_bytes(b"PK\3\4 damaged"), "not a mesh.npz of torchmembrane"),
     "empty mesh": (lambda out: (out / "mesh.npz").write_bytes(b""), "not a mesh.npz of torchmembrane"),

@@ -88,3 +88,12 @@ def test_a_copy_has_its_own_constants(copied):
     found, wanted = other(*arguments, 2), by_tensors(other, *arguments, 2)
     torch.testing.assert_close(found.centre, wanted.centre, rtol=0, atol=2e-4)
     assert float((found.centre - fit(*arguments, 2).centre).abs().max()) > 1e-2
+
+
+def test_a_frame_of_nan_changes_no_other():
+    fit, levels, *others = given(frames=3)
+    wanted = fit(levels, *others, 2)
+    found = fit([torch.cat([level[:1], torch.full_like(level[1:2], torch.nan), level[2:]]) for level in levels], *others, 2)
+    for name in wanted._fields:
+        assert getattr(found, name)[1].isnan().all(), name
+        torch.testing.assert_close(getattr(found, name)[::2], getattr(wanted, name)[::2], rtol=0, atol=0)

@@ -88,3 +88,13 @@ def test_what_records_gradients_is_left_to_tensors():
     flow = field(2).requires_grad_()
     averages.gradient(weights(), flow, field(2, 2)).sum().backward()
     assert float(flow.grad.abs().max()) > 0
+
+
+def test_a_frame_of_nan_changes_no_other_and_no_frame_gives_none():
+    averages = FlowAverages(PIXELS, PIXELS, 1.1).float()
+    given = weights(), field(2, size=5.0), field(2, 2, size=0.1)
+    spoiled = [torch.cat([value[:1], torch.full_like(value[1:2], torch.nan), value[2:]]) for value in given]
+    for function in (averages.gradient, lambda *values: averages.along(*values)[0]):
+        assert function(*spoiled)[1].isnan().any()
+        torch.testing.assert_close(function(*spoiled)[::2], function(*given)[::2], rtol=0, atol=0)
+        assert len(function(*(value[:0] for value in given))) == 0

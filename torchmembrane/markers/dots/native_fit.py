@@ -80,8 +80,8 @@ def _window(c, d, image, centre, window, middle):
         window[k] = image[first_v + c.steps[1, k], first_u + c.steps[0, k]]
         mean += window[k]
     mean /= np.float32(count)
-    for k in range(len(window)):
-        window[k] = (window[k] - mean) * c.counts[k]
+    for k in range(count):  # what follows stays 0
+        window[k] -= mean
     for a in range(2):
         middle[a] = middle[a] * stride + corner
     return mean

@@ -136,7 +136,7 @@ def is_native(*values: Tensor) -> bool:
 
 def found_by(function: Any, constants: tuple[Tensor, ...], given: tuple[Tensor, ...], *shape: int) -> Tensor:
     """What one of the functions finds, `[B, *shape]`, from the constants of a pattern and what is `given` of the frames."""
-    frames = max(len(value) for value in given)
+    frames = next((len(value) for value in given if len(value) != 1), 1)
     found = given[0].new_empty(frames, *shape)
     with KEPT_STEPS[function].compiling(np.dtype(np.float32)):
         each = (value.expand(frames, *value.shape[1:]).contiguous().numpy() for value in given)
