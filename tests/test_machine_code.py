@@ -43,6 +43,13 @@ def test_other_sources_are_not_compiled_yet(function):
     assert not Kept(function, "changed").is_compiled(SINGLE)
 
 
+def test_another_function_of_the_same_sources_is_not_compiled_yet(function):
+    with Kept(function, "sources").compiling(SINGLE):
+        pass
+    other = type("Other", (), {"stats": function.stats})
+    assert not Kept(other, "sources").is_compiled(SINGLE)
+
+
 def test_a_call_that_fails_has_compiled_nothing(function):
     code = Kept(function, "sources")
     with pytest.raises(ValueError), code.compiling(SINGLE):

@@ -92,7 +92,7 @@ class Kept:
     """The state of a `kept` function: the precisions for which it has been compiled, in this process or on disk.
 
     Args:
-        function: as for `kept` gives it.
+        function: the compiled function that `kept` gives.
         sources: `fingerprint` of its sources.
         seconds: about how long it takes to compile.
     """
@@ -101,7 +101,7 @@ class Kept:
         self.seconds = seconds
         folder, version = getattr(function.stats, "cache_path", None), f"{platform.python_version()} {numba.__version__}"
         self.folder = Path(folder) if folder else None
-        self.key = hashlib.sha256(f"{sources} {version} {get_host_cpu_name()}".encode()).hexdigest()[:16]
+        self.key = hashlib.sha256(f"{function.__name__} {sources} {version} {get_host_cpu_name()}".encode()).hexdigest()[:16]
         self.known: set[str] = set()
         self.announced: set[str] = set()
         self.called: set[np.dtype[Any]] = set()
