@@ -9,16 +9,13 @@ does; `named`: presses in which the second view's is the larger, by more than `T
 answer differs from that without the knock, rms over the dots' rms displacement, and over the force.
 """
 
-import argparse
-import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
 import torchmembrane as tm
-from bench.accuracy.views import NOISE, Pressed, followed, with_second_view
+from bench.accuracy.views import NOISE, Pressed, followed, of_sensors, options, with_second_view
 from bench.data.random_sensors import random_sensor
 from bench.data.record import write
 from torchmembrane.errors import MembraneError
@@ -121,25 +118,8 @@ def print_table(rows: list[dict]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sensors", type=int, default=10)
-    parser.add_argument("--presses", type=int, default=3)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--depth", default="0.02,0.3", help="of the presses, over the size")
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
-    warnings.simplefilter("ignore")
-    low, high = map(float, args.depth.split(","))
-    rows: list[dict] = []
-    number, made = args.first, 0
-    while made < args.sensors:
-        try:
-            rows += presses_of(number, args.presses, (low, high))
-            made += 1
-            print(f"s{number:04d}: {len(rows)} presses of {made} sensors", flush=True)
-        except MembraneError as error:
-            print(error, flush=True)
-        number += 1
+    args = options(__doc__, sensors=10, presses=3).parse_args()
+    rows = of_sensors(args, presses_of)
     print_table(rows)
     if args.json:
         write(args.json, {"presses": rows})

@@ -13,6 +13,7 @@ in place of the 25 or 33 of these sensors.
 
 import argparse
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -183,25 +184,39 @@ def print_table(rows: list[dict]) -> None:
         print(f"{band['group']:6}{band['seen']:8}{band['presses']:>8}{band['ok']:>6}{cells}", flush=True)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sensors", type=int, default=20)
-    parser.add_argument("--presses", type=int, default=60)
+def options(doc: str | None, sensors: int, presses: int) -> argparse.ArgumentParser:
+    """Options of a benchmark of random presses on random sensors."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sensors", type=int, default=sensors)
+    parser.add_argument("--presses", type=int, default=presses)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--depth", default="0.02,0.3", help="of the presses, over the size")
-    parser.add_argument("--grid", type=int)
     parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
+    return parser
+
+
+def of_sensors(args: argparse.Namespace, of_sensor: Callable[[int, int, tuple[float, float]], list[dict]]) -> list[dict]:
+    """Rows of the presses of as many sensors as are asked for, from `--first` on; those without listed dots are passed over."""
     warnings.simplefilter("ignore")
-    depths, rows, number, made = tuple(map(float, args.depth.split(","))), [], args.first, 0
+    low, high = map(float, args.depth.split(","))
+    rows: list[dict] = []
+    number, made = args.first, 0
     while made < args.sensors:
         try:
-            rows += presses_of(number, args.presses, (depths[0], depths[1]), args.grid)
+            rows += of_sensor(number, args.presses, (low, high))
             made += 1
             print(f"s{number:04d}: {len(rows)} presses of {made} sensors", flush=True)
         except MembraneError as error:
             print(error, flush=True)
         number += 1
+    return rows
+
+
+def main() -> None:
+    parser = options(__doc__, sensors=20, presses=60)
+    parser.add_argument("--grid", type=int)
+    args = parser.parse_args()
+    rows = of_sensors(args, lambda *press: presses_of(*press, args.grid))
     print_table(rows)
     if args.json:
         write(args.json, {"presses": rows})

@@ -11,10 +11,9 @@ from torch import Tensor
 from ..machine_code import Kept, compiled, fingerprint, kept
 from ..solve import native_rows
 from ..solve.native_rows import sum_rows, within
+from ..surface.tangent import ALONG_Z
 from .regions import CANDIDATES
 
-ALONG_Z = 0.9
-"""As of `tangent_frame`."""
 TOLD = 14
 """Numbers that are told of a patch."""
 TINY = 1e-37

@@ -10,7 +10,7 @@ from ...machine_code import takes
 from ...solve.elimination import solve_dense
 from ..spacing import spacing
 from .ellipse import SOFTNESS, half_axes, rms_half_axes
-from .native_fit import MISFIT, NativeFit
+from .native_fit import CONTRAST, EXPLAINED, MISFIT, STANDS_OUT, NativeFit
 from .pyramid import LEVELS
 
 RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level
@@ -201,7 +201,7 @@ class EllipseFit(nn.Module):
 
     def _intrusion(self, fit: Tensor, gain: Tensor, template: Tensor, window: Tensor) -> Tensor:
         """By what `[B, D, P]` the weight of a pixel is divided that is darker than the fit before and outside the outline."""
-        gain = gain / -0.35
+        gain = gain / -STANDS_OUT
         scaled = (fit[:4] * gain).movedim(0, -1)
         darker = (scaled[..., :3] @ self.linear).addcmul(scaled[..., 3:], template)
         darker = darker.addcmul(gain[..., None], window, value=-1).clamp(0, 10)
@@ -223,7 +223,8 @@ class EllipseFit(nn.Module):
         explained = 1 - missed / (spread.clamp_min(0) + 1e-6)
         background = (fit[1:3] * offset).sum(0)
         contrast = -fit[3] / (fit[0] - background + mean).clamp_min(1e-2)
-        return torch.sigmoid(12 * (explained - 0.6)) * torch.sigmoid(40 * (contrast - 0.12))
+        of_fit, of_contrast = EXPLAINED[0] * (explained - EXPLAINED[1]), CONTRAST[0] * (contrast - CONTRAST[1])
+        return torch.sigmoid(of_fit) * torch.sigmoid(of_contrast)
 
 
 def _missed(gram: Tensor, fit: Tensor) -> Tensor:

@@ -17,6 +17,11 @@ from ...machine_code import Kept, compiled, fingerprint, kept
 MISFIT = 0.02
 """Of the residual's variance, what differs from image to image besides noise: most of it is the model's, in all."""
 
+STANDS_OUT = 0.35
+"""Of a dot's amplitude: what is darker than the fit before by so much counts half outside the dot."""
+EXPLAINED, CONTRAST = (12.0, 0.6), (40.0, 0.12)
+"""Steepness and middle of the quality over the share of the window that is explained, and over the dot's contrast."""
+
 LANES, FIELDS, UNKNOWNS = 16, 8, 7
 """Pixels of a block; fields of a pixel, the last the window itself; unknowns of a fit."""
 HALF, ONE, TINY, DARKEST = np.float32(0.5), np.float32(1), np.float32(1e-12), np.float32(10)
@@ -190,7 +195,8 @@ def _told(c, d, gram, system, offset, moved, size, gain, mean, noise, covariance
         for b in range(2):
             covariance[a, b] = variance * (gain / unit) ** 2 * system[4 + a, 8 + b]
     of_size = np.exp(misfit * c.numbers[2])
-    return of_size / (1 + np.exp(-12 * (explained - 0.6))) / (1 + np.exp(-40 * (contrast - 0.12)))
+    of_fit, of_contrast = EXPLAINED[0] * (explained - EXPLAINED[1]), CONTRAST[0] * (contrast - CONTRAST[1])
+    return of_size / (1 + np.exp(-of_fit)) / (1 + np.exp(-of_contrast))
 
 
 def _entry(sources: str) -> Any:
@@ -225,7 +231,7 @@ def _entry(sources: str) -> Any:
                         after = change[a] + np.tanh(system[4 + a, 7] * gain / reach[a])
                         change[a] = min(max(after, c.farthest[0, a]), c.farthest[1, a])
                         moved[a] = change[a] * reach[a]
-                    before[4] = gain / np.float32(-0.35)
+                    before[4] = gain / np.float32(-STANDS_OUT)
                     for a in range(4):
                         before[a] = system[a, 7] * before[4]
                 quality = _told(c, d, gram, system, offset, moved, size, gain, mean, noise[b], covariance[b, d])
