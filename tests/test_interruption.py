@@ -116,7 +116,7 @@ def test_the_computation_of_a_frame_is_waited_for_but_not_for_ever(tmp_path):
     ended = Ended(script(body, tmp_path), signal.SIGTERM)
     assert ended.code == 143 and "closed" in ended.said
     body = "interruption.LONGER = 0.5\nwith frame_in_work(): compiled(60)"
-    ended = Ended(script(body, tmp_path), signal.SIGTERM)
+    ended = Ended(script(body, tmp_path), signal.SIGTERM, delay=0.5)  # before the frame begins, it would be closed
     assert ended.code == 143 and "closed" not in ended.said and list(tmp_path.iterdir()) == []
 
 
