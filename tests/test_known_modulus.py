@@ -78,6 +78,21 @@ def test_a_modulus_that_rises_faster_and_faster_is_summed_over_the_prestretches(
     assert half.shift == pytest.approx((2 / np.pi) ** 0.5, abs=0.02)
 
 
+@pytest.mark.parametrize("q", [0.0, 0.15])
+def test_an_interval_holds_the_truth_in_95_of_100_measurements(q):
+    """Shift `t` and noise `s` at random, the modulus `exp(g t + q t^2)`; a straight line and a parabola."""
+    s, g, rng, held = 0.05, -0.4, np.random.default_rng(0), []
+    for t, noise in rng.normal(size=(400, 2)):
+        modulus = np.exp(g * t + q * t**2)
+        at_zero = np.exp(s * noise)  # the true modulus is 1 where the shapes are right
+        sides = (at_zero * np.exp(q - g), at_zero * np.exp(q + g)) if q else None
+        found = joined([ModulusEvidence("gauge", at_zero, s * at_zero, g * at_zero, 0.0, sides)])
+        held.append([low < value < high for (low, high), value in zip(found.intervals, (t, modulus), strict=True)])
+    np.testing.assert_allclose(np.mean(held, 0), 0.95, atol=0.025)
+    wider = joined([ModulusEvidence("gauge", 1.0, s, g, 0.0), ModulusEvidence("forces", 2.0, 2 * s, g, 0.0)])
+    assert np.ptp(np.log(wider.intervals[1])) == pytest.approx(2 * 1.96 * wider.covariance[1, 1] ** 0.5, rel=1e-3)
+
+
 def test_a_height_that_is_known_otherwise_enters_with_its_mean():
     """`log m = log m_1 + c h` with `h` of mean 0.4 and deviation 0.7."""
     found = joined([ModulusEvidence("gauge", 0.5, 0.01, 0.0, 0.05)], 0.3, (0.4, 0.7))

@@ -67,7 +67,7 @@ def told(monkeypatch):
 
     made = replace(sensor, material=replace(sensor.material, shear_modulus=1.0))
     monkeypatch.setattr(weight_module, "Reconstructor", Made)
-    material = weight_module.MaterialFit(made, *[np.zeros(2)] * 6)
+    material = weight_module.MaterialFit(made, *[np.zeros(2)] * 7)
     monkeypatch.setattr(weight_module, "material_from_images", lambda *_, **__: material)
     return change, lambda weight: weight_module.material_from_weight(sensor, torch.zeros(3, 1, 480, 640), weight)
 

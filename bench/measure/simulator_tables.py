@@ -106,11 +106,11 @@ def windows(found: dict) -> Rows:
     rows = []
     for row in found["rows"]:
         ratios = [", ".join(f"{ratio:.2f}" for ratio in row[key]) for key in ("forces", "depths")]
-        material = [f"{value:.3f} ± {deviation:.3f}" for value, deviation in (row["prestretch"], row["modulus"])]
+        material = [f"{value:.3f} ({low:.3f} to {high:.3f})" for value, _, low, high in (row["prestretch"], row["modulus"])]
         rows.append([RIMS.get(row["rim"], row["rim"]), *ratios, *material])
     errors = [f"{found[of][key]:.1%}".replace("%", " %") for of in ("median", "most") for key in ("forces", "depths")]
     rows.append(["error, median (largest)", f"{errors[0]} ({errors[2]})", f"{errors[1]} ({errors[3]})", "", ""])
-    return [["rim", "force found over true", "depth found over true", "prestretch", "modulus, N/mm"], *rows]
+    return [["rim", "force found over true", "depth found over true", "prestretch (95 %)", "modulus, N/mm (95 %)"], *rows]
 
 
 def cli_errors(found: dict) -> Rows:

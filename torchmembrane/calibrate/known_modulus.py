@@ -5,6 +5,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ndtr, ndtri
 
 from ..mechanics.cavity import rest_balance
 from ..sensor.factories import elastic_energy
@@ -14,7 +16,9 @@ from ..sensor.units import hectopascal
 
 REST_ERROR = 0.05  # of the modulus from a gauge at rest, relative: that of the grid and of the reading
 FORCE_ERROR = 0.1  # of a press, relative: force balance's on presses of known force (docs/calibration.md)
+PROBABILITY = 0.95  # of intervals
 REACH, SHIFTS = 8.0, 401  # standard deviations of the prestretch to either side, over which probabilities are summed; steps
+FINE = 401  # values between which an interval ends
 CONTRADICTING = 2.5  # standard deviations between two measurements, above which it is said
 
 
@@ -79,6 +83,7 @@ class JoinedEvidence(NamedTuple):
         height: height of the rest surface, above what it is, in its standard deviations.
         covariance: `[3, 3]` of the shift, of the logarithm of the modulus, and of the height.
         contradictions: a sentence for each two kinds of measurement that contradict one another.
+        intervals: `[2, 2]`, lowest and highest value of the shift, and of the modulus, with a probability of 95 %.
     """
 
     shift: float
@@ -86,6 +91,7 @@ class JoinedEvidence(NamedTuple):
     height: float
     covariance: np.ndarray
     contradictions: list[str]
+    intervals: np.ndarray
 
 
 def joined(
@@ -124,11 +130,16 @@ def joined(
     values = np.concatenate([[0.0, mean / spread], np.log(modulus) / s])
     covariance = np.linalg.inv(rows.T @ rows)
     x = covariance @ rows.T @ values
-    off = rows @ x - values
-    if any(one.sides for one in evidence):
-        x, covariance, off = _summed(evidence, rows, values, (x[0], covariance[0, 0] ** 0.5), least)
-    at = x[1] - s * off[2:]
-    scatter, said = (off**2).sum() / max(len(s) - 1, 1), []
+    off, is_bent = rows @ x - values, any(one.sides for one in evidence)
+    about = x[0], covariance[0, 0] ** 0.5
+    if is_bent:
+        x, covariance, off = _summed(evidence, rows, values, about, least)[:3]
+    at, said = x[1] - s * off[2:], []
+    scatter = max(1.0, (off**2).sum() / max(len(s) - 1, 1))
+    covariance = scatter * covariance
+    intervals = x[:2, None] + normal_interval(covariance.diagonal()[:2, None] ** 0.5)
+    if is_bent:
+        intervals = _summed(evidence, rows, values, about, least, scatter)[3]
     for i, one in enumerate(evidence):
         for k in range(i + 1, len(evidence)):
             apart = abs(at[i] - at[k]) / np.hypot(s[i], s[k])
@@ -138,15 +149,35 @@ def joined(
                     f"{one.source} and {evidence[k].source} contradict one another: moduli of {' and '.join(told)}, "
                     f"{apart:.1f} standard deviations apart: one of them, or the rest shape, is wrong"
                 )
-    return JoinedEvidence(float(x[0]), float(np.exp(x[1])), float(x[2]), covariance * max(1.0, scatter), said)
+    intervals[1] = np.exp(intervals[1])
+    return JoinedEvidence(float(x[0]), float(np.exp(x[1])), float(x[2]), covariance, said, intervals)
+
+
+def normal_interval(deviation: ArrayLike) -> np.ndarray:
+    """How far below and above its mean a normal variable lies with a probability of `PROBABILITY`, `[..., 2]`, from its
+    standard deviation `[..., 1]`.
+
+    Example:
+        >>> normal_interval([1.0]).round(2).tolist()
+        [-1.96, 1.96]
+    """
+    tails = np.array([1 - PROBABILITY, 1 + PROBABILITY]) / 2
+    interval: np.ndarray = np.asarray(deviation) * ndtri(tails)
+    return interval
 
 
 def _summed(
-    evidence: Sequence[ModulusEvidence], rows: np.ndarray, values: np.ndarray, about: tuple[float, float], least: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean and covariance of shift, log modulus and height, and what is missed at the mean shift, rows as of `joined`, where
-    logarithms of moduli are parabolas: of each shift the best modulus and height, by least squares, with its probability."""
-    t = about[0] + about[1] * np.linspace(-REACH, REACH, SHIFTS)
+    evidence: Sequence[ModulusEvidence],
+    rows: np.ndarray,
+    values: np.ndarray,
+    about: tuple[float, float],
+    least: float,
+    scatter: float = 1.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Mean and covariance of shift, log modulus and height, what is missed at the mean shift, and intervals of shift and log
+    modulus `[2, 2]`, rows as of `joined`, where logarithms of moduli are parabolas: of each shift the best modulus and height,
+    by least squares, with its probability; `scatter`: by how much all variances are larger."""
+    t = about[0] + about[1] * scatter**0.5 * np.linspace(-REACH, REACH, SHIFTS)
     t = t[t >= least] if (t >= least).any() else np.array([least, least + 1e-9])
 
     def wanted_at(t: np.ndarray) -> np.ndarray:
@@ -163,15 +194,24 @@ def _summed(
     covariance = np.linalg.inv(others.T @ others)
     solved = others @ covariance
     best, off = (wanted := wanted_at(t)) @ solved, wanted @ (solved @ others.T) - wanted
-    loss = (off**2).sum(1) / 2
+    loss = (off**2).sum(1) / (2 * scatter)
     weight = np.exp(loss.min() - loss)
     weight /= weight.sum()
     x = np.column_stack([t, best])
     mean = weight @ x
     spread = (weight[:, None] * (x - mean)).T @ (x - mean)
-    spread[1:, 1:] += covariance
-    at_mean = wanted_at(mean[:1])[0]
-    return mean, spread, at_mean @ (solved @ others.T) - at_mean
+    spread[1:, 1:] += scatter * covariance
+    at_mean, width = wanted_at(mean[:1])[0], (scatter * covariance[0, 0]) ** 0.5
+    intervals = np.stack([_interval(weight, t, t[1] - t[0]), _interval(weight, best[:, 0], width)])
+    return mean, spread, at_mean @ (solved @ others.T) - at_mean, intervals
+
+
+def _interval(weight: np.ndarray, means: np.ndarray, deviation: float) -> np.ndarray:
+    """Lowest and highest value with a probability of `PROBABILITY`, `[2]`, of a mixture of normal distributions about `means
+    [n]` with such weights `[n]`."""
+    value = np.linspace(means.min() - REACH * deviation, means.max() + REACH * deviation, FINE)
+    below = ndtr((value[:, None] - means) / deviation) @ weight
+    return np.interp([(1 - PROBABILITY) / 2, (1 + PROBABILITY) / 2], below, value)
 
 
 def odd_ones(ratios: np.ndarray, deviations: np.ndarray) -> list[tuple[int, float, float]]:

@@ -16,7 +16,7 @@ from ..results.status import Status
 from ..sensor.inflated import InflatedSurface
 from ..sensor.sensor import Sensor
 from .explained import HEIGHT_SHARE, ExplainedPresses, MeasuredPresses, coarse_reconstructor, explained, with_material
-from .known_modulus import KnownForces, KnownPressures, ModulusEvidence, joined, modulus_at_rest
+from .known_modulus import KnownForces, KnownPressures, ModulusEvidence, joined, modulus_at_rest, normal_interval
 from .presses import GAS_ROUNDS, LossProfile
 from .rest_error import HEIGHT_ERROR, StatedHeight, changed_height
 
@@ -33,6 +33,7 @@ class MaterialFit(NamedTuple):
         sensor: the sensor with this material.
         values: `[n]` prestretch and, where forces are known, modulus = shear modulus x thickness (N per length unit).
         covariance: `[n, n]` of the values.
+        intervals: `[n, 2]`, lowest and highest value with a probability of 95 %.
         profile: the losses on which the prestretch rests.
         each: `[B, 2]` prestretch and standard deviation from each image alone.
         forces: `[B, 2]` magnitudes found and measured, N, NaN where not known.
@@ -45,6 +46,7 @@ class MaterialFit(NamedTuple):
     sensor: Sensor
     values: np.ndarray
     covariance: np.ndarray
+    intervals: np.ndarray
     profile: LossProfile
     each: np.ndarray
     forces: np.ndarray
@@ -189,15 +191,17 @@ def _material(
     shapes = at.shapes
     alone = np.exp(shapes.each)[:, None] * np.stack([np.ones(len(shapes.each)), np.sqrt(shapes.variances)], -1)
     told = (evidence.magnitudes, evidence.gauged, evidence.said + found.contradictions, found.of_force)
-    return MaterialFit(made, found.values, found.covariance, at.profile, alone, *told, height)
+    return MaterialFit(made, found.values, found.covariance, found.intervals, at.profile, alone, *told, height)
 
 
 class _Found(NamedTuple):
-    """What one round finds: values and covariance as of `MaterialFit`, the forces' relative standard deviation (None without a
-    modulus), sentences, and the rest surface's height above what it was, and its standard deviation, in those stated."""
+    """What one round finds: values, covariance and intervals as of `MaterialFit`, the forces' relative standard deviation (None
+    without a modulus), sentences, and the rest surface's height above what it was, and its standard deviation, in those stated.
+    """
 
     values: np.ndarray
     covariance: np.ndarray
+    intervals: np.ndarray
     of_force: float | None
     contradictions: list[str]
     height: float
@@ -208,15 +212,18 @@ def _found(at: ExplainedPresses, evidence: "_Evidence") -> _Found:
     shapes, by = at.shapes, at.by
     if not evidence.found:
         values = np.exp([shapes.mean + by.shift * by.mean])
-        variance = values**2 * (shapes.deviation**2 + (by.shift * by.deviation) ** 2)
-        return _Found(values, variance[:, None], None, [], by.mean, by.deviation)
+        deviation = np.hypot(shapes.deviation, by.shift * by.deviation)
+        intervals = values[:, None] * np.exp(normal_interval([[deviation]]))
+        return _Found(values, (values * deviation)[:, None] ** 2, intervals, None, [], by.mean, by.deviation)
     found = joined(evidence.found, by.shift / shapes.deviation, (by.mean, by.deviation), -shapes.mean / shapes.deviation)
     along = np.array([by.by_stretch, 1.0, by.by_height])
     of_force = float(along @ found.covariance @ along) ** 0.5
     values = np.array([np.exp(shapes.mean + found.shift * shapes.deviation), found.modulus])
     scale = values * [shapes.deviation, 1.0]
     covariance = scale[:, None] * found.covariance[:2, :2] * scale
-    return _Found(values, covariance, of_force, found.contradictions, found.height, float(found.covariance[2, 2]) ** 0.5)
+    intervals = np.stack([np.exp(shapes.mean + found.intervals[0] * shapes.deviation), found.intervals[1]])
+    height = found.height, float(found.covariance[2, 2]) ** 0.5
+    return _Found(values, covariance, intervals, of_force, found.contradictions, *height)
 
 
 def _with_own_markers(fit: MaterialFit, sensor: Sensor) -> MaterialFit:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,6 +54,7 @@ class Report(NamedTuple):
         residuals: `[N, 2]` px, there.
         noise: standard deviation of one residual, px.
         notes: lines for people.
+        intervals: `[n, 2]`, lowest and highest value with a probability of 95 %; None: not told.
 
     Example:
         >>> none = np.zeros((0, 2))
@@ -75,6 +76,7 @@ class Report(NamedTuple):
     residuals: np.ndarray
     noise: float
     notes: list[str]
+    intervals: np.ndarray | None = None
 
     @classmethod
     def from_fit(
@@ -127,6 +129,8 @@ class Report(NamedTuple):
             f"  {name:<16}{value:>z12.{decimals(max(sd, FINEST * abs(value)), 2)}f} ± {sd:<10.2g}{unit:<7} (before: {old:g})"
             for name, value, sd, unit, old in rows
         ]
+        for name, (low, high) in self._intervals.items():
+            lines.append(f"  {name}: from {low:.3g} to {high:.3g} with a probability of 95 %")
         if len(self.residuals):
             rms = float(np.sqrt((self.residuals**2).mean()))
             lines.append(
@@ -135,12 +139,20 @@ class Report(NamedTuple):
         lines += [f"  hard to identify separately: {a} and {b} (correlation {c:+.4f})" for a, b, c in self.confounded]
         return [self.title, *lines, *(f"  {note}" for note in self.notes)]
 
+    @property
+    def _intervals(self) -> dict[str, list[float]]:
+        """Of each parameter, by its name, where they are told."""
+        return {} if self.intervals is None else dict(zip(self.names, self.intervals.tolist(), strict=True))
+
     def write(self, folder: Path) -> None:
         """Write `report.json` in the folder, which is made if need be."""
         rows = zip(self.names, self.values, self.deviations, self.units, self.design, strict=True)
+        parameters: dict[str, dict[str, Any]] = {n: dict(value=v, deviation=s, unit=u, before=b) for n, v, s, u, b in rows}
+        for name, interval in self._intervals.items():
+            parameters[name]["interval"] = interval
         content = {
             "title": self.title,
-            "parameters": {n: dict(value=v, deviation=s, unit=u, before=b) for n, v, s, u, b in rows},
+            "parameters": parameters,
             "correlations": self.correlations.tolist(),
             "hardly_told_apart": self.confounded,
             "points": len(self.residuals),

@@ -64,6 +64,7 @@ def material(arguments: Namespace) -> int:
         values=found.values,
         deviations=found.deviations,
         correlations=found.covariance / np.outer(found.deviations, found.deviations),
+        intervals=found.intervals,
     )
     made = found.sensor if weighed is None else weighed.sensor
     uncertainty = found.force_deviation if weighed is None else weighed.deviation
