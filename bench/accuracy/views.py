@@ -1,6 +1,7 @@
 """Two views of a membrane against one: errors of shape, depth and force on presses of random sensors.
 
-python -m bench.accuracy.views [--sensors 20] [--presses 60] [--first 0] [--depth 0.02,0.3] [--grid 17] [--json FILE]
+python -m bench.accuracy.views [--sensors 20] [--presses 60] [--first 0] [--depth 0.02,0.3] [--grid 17] [--soft]
+    [--json FILE]
 
 Each sensor of `data/random_sensors.py` with listed dots gets a second camera of the same lens, 0.2 to 2 times the membrane's
 size beside the first, that looks at its middle. Each press that its membrane can follow is reconstructed from the dots' true
@@ -8,7 +9,7 @@ pixels with 0.05 px of noise: by the first view, by both, and by both where ever
 third from the other. Shape is the rms error of the dots over their rms displacement, depth the error of the deepest
 displacement over it, force the error over the force; `deep` are presses deeper than 0.2 of the size, `soft` open cavities and
 prestretch below 1.1. A sensor whose membrane follows not even the first press is left out. --grid: lines of the solver's grid
-in place of the 25 or 33 of these sensors.
+in place of the 25 or 33 of these sensors; --soft: only `soft` ones.
 """
 
 import argparse
@@ -124,11 +125,19 @@ def errors(result: tm.Reconstruction, truth: Pressed, depths: tuple[float, float
     return [float(shape), abs(depths[0] / depths[1] - 1), float(force)]
 
 
-def presses_of(number: int, count: int, depths: tuple[float, float], lines: int | None = None) -> list[dict]:
-    """What comes of one sensor's presses, solved on a grid of so many lines; None: on the sensor's own."""
+def presses_of(
+    number: int, count: int, depths: tuple[float, float], lines: int | None = None, soft: bool = False
+) -> list[dict]:
+    """What comes of one sensor's presses, solved on a grid of so many lines; None: on the sensor's own.
+
+    Raises:
+        MembraneError: it has no listed dots, or, where only `soft` sensors are asked for, is none.
+    """
     sensor = random_sensor(number)
     if sensor.markers.positions is None:
         raise MembraneError(f"{sensor.name}: no listed dots")
+    if soft and not is_soft(sensor):
+        raise MembraneError(f"{sensor.name}: neither open nor nearly unstretched")
     sensor, baseline = with_second_view(
         replace(sensor, markers=replace(sensor.markers, rest_image=None)), np.random.default_rng([number, 7])
     )
@@ -215,8 +224,9 @@ def of_sensors(args: argparse.Namespace, of_sensor: Callable[[int, int, tuple[fl
 def main() -> None:
     parser = options(__doc__, sensors=20, presses=60)
     parser.add_argument("--grid", type=int)
+    parser.add_argument("--soft", action="store_true")
     args = parser.parse_args()
-    rows = of_sensors(args, lambda *press: presses_of(*press, args.grid))
+    rows = of_sensors(args, lambda *press: presses_of(*press, args.grid, args.soft))
     print_table(rows)
     if args.json:
         write(args.json, {"presses": rows})
