@@ -1,4 +1,4 @@
-"""Each step of calibration takes a sensor with several views: lens and ports of one by its name, surface and poses of all."""
+"""Each step of calibration takes a sensor with several views."""
 
 from dataclasses import replace
 

@@ -131,6 +131,21 @@ def rest_from_depth_of_view(
 
     Limitations:
         Where the view is not the first one, its pose in the file must be right to half the dots' pitch in the first image.
+
+    Example:
+        >>> from scipy.interpolate import griddata
+        >>> from torchmembrane import Camera
+        >>> from torchmembrane.sensor.views import View
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> image = sensor.markers.rest_image[::2, ::2]  # every other pixel, and a camera that sees them
+        >>> camera = Camera("fisheye", (320, 240), (80.0, 80.0), (161.05, 121.45))
+        >>> views = View("one", camera), View("two", camera)  # which stand at one place
+        >>> pair = replace(sensor, camera=camera, markers=replace(sensor.markers, rest_image=image), views=views)
+        >>> rest, (v, u) = pair.membrane.rest, np.mgrid[:240, :320]
+        >>> depth = griddata(camera.point_to_pixel(rest).numpy(), rest[:, 2].numpy(), (u, v))  # NaN beside the membrane
+        >>> found = rest_from_depth_of_view(pair, 0, depth, [image, image]).sensor
+        >>> bool(np.abs(found.views[1].pose.matrix - np.eye(4)).max() < 0.05), len(found.markers.positions)
+        (True, 121)
     """
     found = rest_from_depth(sensor.in_view(number), depth, images[number], progress=within(progress, 0.0, 0.6))
     view, markers, values = sensor.views[number], found.sensor.markers, found.sensor.surface.values

@@ -111,8 +111,6 @@ def run(arguments: Namespace) -> int:
     by_ray = arguments.engine == "ray"
     sensor = Sensor.from_file(sensor_file(arguments.sensor))
     inputs = _inputs(arguments, sensor.views_apart)
-    for path in inputs.rest:
-        print(f"torchmembrane: {path} left out: it is the sensor's rest image", file=sys.stderr)
     _spare_files(arguments, inputs)
     reconstructor = build_reconstructor(sensor, arguments).to("cpu" if by_ray else arguments.device)
     pressure = _pressures(arguments.pressure, reconstructor, inputs) if arguments.pressure else None
@@ -155,7 +153,11 @@ def _inputs(arguments: Namespace, views: "list[str]") -> "Inputs":
 
     topics = of_each_view("--topic", "TOPIC", arguments.topic, views)
     found = find_inputs(arguments.images, arguments.video, next(iter(topics), None))
-    return of_first_view(without_rest(found, arguments.images, files_of(sensor_file(arguments.sensor))), views, topics)
+    inputs = of_first_view(without_rest(found, arguments.images, files_of(sensor_file(arguments.sensor))), views, topics)
+    if inputs.rest:
+        said = ", ".join(map(str, inputs.rest))
+        print(f"torchmembrane: left out, as it is the sensor's rest image: {said}", file=sys.stderr)
+    return inputs
 
 
 def _settings(reconstructor: "Reconstructor", arguments: Namespace, format: str) -> "Settings":
