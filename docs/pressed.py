@@ -12,7 +12,7 @@ from torchmembrane.estimators.paper.estimator import Segmented
 from torchmembrane.presets import preset_file
 from torchmembrane.simulate import Appearance, Cylinder, Simulator, Sphere, press
 
-NOISE = 30.0  # dB below white
+NOISE_LEVEL = 30.0  # dB below white
 PAPER, ENERGY, BALANCE = "the paper", "minimum energy", "force balance"
 ESTIMATORS = {
     PAPER: {"estimator": "paper", "locator": "soft"},
@@ -40,7 +40,7 @@ class Shown(NamedTuple):
 
 @cache
 def simulator(sensor: str) -> Simulator:
-    return Simulator(reconstructor(sensor).sensor, appearance=Appearance(noise=NOISE))
+    return Simulator(reconstructor(sensor).sensor, appearance=Appearance(noise=NOISE_LEVEL))
 
 
 @cache

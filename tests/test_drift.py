@@ -13,7 +13,7 @@ import torchmembrane as tm
 from torchmembrane import track
 from torchmembrane.files.images import to_grey
 from torchmembrane.markers import drift
-from torchmembrane.markers.drift import ENOUGH, LARGEST_ROUGHNESS, MEMORY, NEAR, DriftWatch
+from torchmembrane.markers.drift import FEWEST_FRAMES, FRAMES_OF_MEAN, LARGEST_ROUGHNESS, NEAR_REST, DriftWatch
 from torchmembrane.mechanics.cavity import rest_balance
 from torchmembrane.presets import preset
 from torchmembrane.simulate.appearance import noisy
@@ -35,7 +35,7 @@ def watch(seed=0, noise=NOISE):
     return DriftWatch(pixels, root @ root.mT, torch.ones(D) > 0, SIZE), pixels, root, generator
 
 
-def run(watch, displacement, frames=MEMORY, root=None, generator=None):
+def run(watch, displacement, frames=FRAMES_OF_MEAN, root=None, generator=None):
     """What is said after frames of this displacement `[D, 2]`, each with its own noise."""
     watch.forget()
     for _ in range(frames):
@@ -44,7 +44,7 @@ def run(watch, displacement, frames=MEMORY, root=None, generator=None):
     return watch.drift()
 
 
-@pytest.mark.parametrize("frames", [ENOUGH, 4 * MEMORY])
+@pytest.mark.parametrize("frames", [FEWEST_FRAMES, 4 * FRAMES_OF_MEAN])
 def test_certainty_counts_standard_deviations_of_what_noise_makes(monkeypatch, frames):
     """Frozen noise and that of the frames, of the covariance that is said: a chi-squared of k, its mean and variance."""
     monkeypatch.setattr(drift, "LEAST_DRIFT", 0.0)
@@ -57,7 +57,7 @@ def test_certainty_counts_standard_deviations_of_what_noise_makes(monkeypatch, f
 @pytest.mark.parametrize("threshold, share", [(0.0, 0.406), (1.0, 0.145)])
 def test_a_moved_camera_counts_standard_deviations_of_what_noise_makes(monkeypatch, threshold, share):
     """Frozen noise and that of one frame: a chi-squared of 4 over its mean, in standard deviations."""
-    monkeypatch.setattr(drift, "CERTAIN", threshold)
+    monkeypatch.setattr(drift, "LEAST_CERTAINTY", threshold)
     monkeypatch.setattr(drift, "LARGEST_ROUGHNESS", np.inf)
     watched, _, root, generator = watch()
     noise = (root @ torch.randn(600, D, 2, 1, generator=generator, dtype=torch.float64))[..., 0] * 2**0.5
@@ -79,7 +79,7 @@ def fields(pixels):
 def test_the_size_of_a_drift_is_found_beyond_the_noise(way, size):
     watched, pixels, root, generator = watch()
     frozen = (root @ torch.randn(D, 2, 1, generator=generator, dtype=torch.float64))[..., 0]
-    found = run(watched, size * fields(pixels)[way] - frozen, MEMORY, root, generator)
+    found = run(watched, size * fields(pixels)[way] - frozen, FRAMES_OF_MEAN, root, generator)
     assert found.is_certain and found.size == pytest.approx(size, abs=0.02)
 
 
@@ -87,7 +87,7 @@ def test_noise_adds_nothing_to_the_size_on_average():
     watched, pixels, root, generator = watch()
     field = 0.05 * fields(pixels)["sag"]
     frozen = [(root @ torch.randn(D, 2, 1, generator=generator, dtype=torch.float64))[..., 0] for _ in range(100)]
-    square = np.mean([run(watched, field - one, ENOUGH, root, generator).size ** 2 for one in frozen])
+    square = np.mean([run(watched, field - one, FEWEST_FRAMES, root, generator).size ** 2 for one in frozen])
     assert square == pytest.approx(0.05**2, rel=0.05)
 
 
@@ -128,7 +128,7 @@ def test_lost_markers_and_those_not_seen_at_rest_say_nothing():
     seen = torch.arange(D) % 5 > 0
     whole, part = (DriftWatch(pixels, root @ root.mT, seen, SIZE) for _ in range(2))
     field = 0.1 * fields(pixels)["turn"]
-    for k in range(MEMORY):
+    for k in range(FRAMES_OF_MEAN):
         found = seen & (torch.arange(D) % 3 != k % 3)
         part.add(torch.where(found[:, None], field, torch.nan), found.double())
         whole.add(torch.where(seen[:, None], field, torch.nan), seen.double())
@@ -140,7 +140,7 @@ def test_a_frame_is_near_where_its_markers_hardly_leave_the_mean():
     field, sure = fields(pixels)["sag"], torch.ones(D)
     assert not watched.is_near(0 * field, sure)  # there is no mean yet
     run(watched, 0.3 * field)
-    assert [watched.is_near((0.3 + step) * field, sure) for step in (0.8 * NEAR, 1.2 * NEAR)] == [True, False]
+    assert [watched.is_near((0.3 + step) * field, sure) for step in (0.8 * NEAR_REST, 1.2 * NEAR_REST)] == [True, False]
 
 
 class Stream:
@@ -229,7 +229,7 @@ def test_noise_alone_is_no_drift(stream, at_rest, step):
 @pytest.mark.parametrize("swells", [True, pytest.param(False, marks=pytest.mark.full)])
 def test_a_membrane_that_has_changed_is_said_once_and_nulled_by_rezero(stream, at_rest, swells):
     tracker, aged = tm.Tracker(stream.reconstructor), stream.images([stream.aged(0.15, swells)] * 60, seed=1)
-    assert said(tracker, at_rest[:ENOUGH]) == []
+    assert said(tracker, at_rest[:FEWEST_FRAMES]) == []
     ((frame, words),) = said(tracker, aged[:40])
     assert frame < 12 and "px (rms) off the rest image" in words and "Tracker.rezero()" in words and "camera's" not in words
     assert tracker.drift == pytest.approx(0.15, abs=0.03)

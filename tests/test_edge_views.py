@@ -13,6 +13,7 @@ from onnx import TensorProto, helper
 from PIL import Image
 from test_edge import MESH, metadata
 from torchmembrane_edge.cli import main
+from torchmembrane_edge.images import view_frames
 
 from torchmembrane.files.provenance import SourceFile
 
@@ -21,23 +22,25 @@ SIZES = {"left": (8, 6), "right": (5, 4)}
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
-    """Gives the left image's mean less the right one's as the vertices' heights."""
+    """Gives the left image's mean less the right one's as the vertices' heights; without a right one the left one's alone."""
     nodes = [helper.make_node("ReduceMean", [f"image_{name}"], [f"mean_{name}"], axes=[1, 2, 3]) for name in SIZES]
     nodes += [
-        helper.make_node("Sub", ["mean_left", "mean_right"], ["mean4"]),
+        helper.make_node("IsNaN", ["mean_right"], ["lacks4"]),
+        helper.make_node("Where", ["lacks4", "zero", "mean_right"], ["right4"]),
+        helper.make_node("Sub", ["mean_left", "right4"], ["mean4"]),
         helper.make_node("Reshape", ["mean4", "ones3"], ["mean"]),
         helper.make_node("Mul", ["mean", "surface"], ["vertices"]),
         helper.make_node("Identity", ["vertices"], ["displacement"]),
         helper.make_node("Reshape", ["mean4", "column"], ["mean2"]),
         helper.make_node("Mul", ["mean2", "push"], ["force"]),
         helper.make_node("Concat", ["force", "force"], ["wrench"], axis=1),
-        helper.make_node("Reshape", ["mean4", "one"], ["mean1"]),
-        helper.make_node("Less", ["mean1", "least"], ["never"]),
-        helper.make_node("Cast", ["never"], ["status"], to=TensorProto.INT32),
+        helper.make_node("Reshape", ["lacks4", "one"], ["lacks"]),
+        helper.make_node("Cast", ["lacks"], ["lacks1"], to=TensorProto.INT32),
+        helper.make_node("Mul", ["lacks1", "ten"], ["status"]),
     ]
     constants = {"ones3": np.array([-1, 1, 1]), "column": np.array([-1, 1]), "one": np.array([-1])}
     constants |= {"surface": np.ones((1, 9, 3), np.float32), "push": np.array([[0, 0, -1]], np.float32)}
-    constants["least"] = np.array([-2], np.float32)
+    constants |= {"zero": np.zeros(1, np.float32), "ten": np.array([10], np.int32)}
     shapes = {"vertices": [9, 3], "displacement": [9, 3], "force": [3], "wrench": [6]}
 
     def described(name, shape, kind=TensorProto.FLOAT):
@@ -51,8 +54,9 @@ def model(tmp_path_factory):
         [onnx.numpy_helper.from_array(value, name) for name, value in constants.items()],
     )
     made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    mesh = MESH | {"rest_pixels": [[[4.0, 3.0]], [[2.0, 2.0]]]}
-    helper.set_model_props(made, metadata(mesh=json.loads(json.dumps(mesh))))
+    mesh = MESH | {"rest_pixels": [[[4.0, 3.0]], [[2.0, 2.0]]], "view_names": " ".join(SIZES)}
+    texts = json.dumps({"0": "ok", "10": "a view shows too little"})
+    helper.set_model_props(made, metadata(mesh, status_texts=texts))
     path = tmp_path_factory.mktemp("model") / "model.onnx"
     path.write_bytes(made.SerializeToString())
     return path
@@ -73,23 +77,43 @@ def test_each_view_is_its_own_input(model):
         (images(0, 0)[:1], "not a list of 2"),
         ([images(0, 0)[0], images(0, 0, 2)[1]], r"\[1, 2\] images of the views left, right"),
         (images(0, 0)[::-1], "expected 8 x 6"),
+        ([None, None], r"\[\] images of the views left, right; expected as many of each, of one view at least"),
     ):
         with pytest.raises(edge.EdgeError, match=said):
             session.run(wrong)
+    found = session.run([images(204, 0, 2)[0], None])
+    assert found["status"].tolist() == [10, 10]
+    np.testing.assert_allclose(found["vertices"], np.full((2, 9, 3), 0.8), atol=1e-6)
 
 
 def test_the_command_takes_the_files_of_each_view(model, tmp_path, capsys):
-    """Results bear the first view's name, and the hash of all files."""
+    """Results bear the first view's name, and the hash of all files; a view without an image is left out, and named."""
     for number in range(2):
         for name, image in zip(SIZES, images(100 + number, 10), strict=True):
             Image.fromarray(image[0]).save(tmp_path / f"press{number}_{name}.png")
     (tmp_path / "press1_right.png").unlink()
     out = tmp_path / "out"
-    assert main([str(model), f"{tmp_path}/press*.png", "--out", str(out)]) == 1
-    assert "press1_right.png" in capsys.readouterr().err
-    assert sorted(path.name for path in out.glob("press*")) == ["press0_left.npz"]
-    np.testing.assert_allclose(np.load(out / "press0_left.npz")["vertices"], np.full((9, 3), 90 / 255), atol=1e-6)
+    assert main([str(model), f"{tmp_path}/press*.png", "--out", str(out), "--batch", "2"]) == 0
+    assert "press1_left.png: a view shows too little" in (said := capsys.readouterr().err) and "right (" in said
+    for number, height in enumerate((90, 101)):
+        found = np.load(out / f"press{number}_left.npz")["vertices"]
+        np.testing.assert_allclose(found, np.full((9, 3), height / 255), atol=1e-6)
+    lacking = (out / "summary.csv").read_text().splitlines()[2]
+    assert "right (" in lacking and SourceFile.from_files(tmp_path / "press1_left.png").content_hash in lacking
     files = [tmp_path / f"press0_{name}.png" for name in SIZES]
     assert SourceFile.from_files(*files).content_hash in (out / "summary.csv").read_text().splitlines()[1]
     assert main([str(model), str(files[1]), "--out", str(out)]) == 2
     assert "expected images NAME_left, NAME_right of each frame" in capsys.readouterr().err
+    for name in SIZES:
+        (tmp_path / f"broken_{name}.png").write_bytes(b"no image")
+    assert main([str(model), f"{tmp_path}/broken*.png", "--out", str(out)]) == 1
+    assert "view left: " in (said := capsys.readouterr().err) and "view right: " in said
+
+
+def test_pictures_of_a_stack_that_one_view_lacks(model, tmp_path, capsys):
+    """Frames bear the first view's name and the picture's number, also where that view has none."""
+    for name, count in (("left", 1), ("right", 2)):
+        pages = [Image.fromarray(page) for page in images(100, 10, count)[list(SIZES).index(name)]]
+        pages[0].save(tmp_path / f"run_{name}.tif", save_all=True, append_images=pages[1:])
+    made = view_frames(tmp_path / "run_left.tif", list(SIZES), list(SIZES.values()), None)
+    assert [(frame.name, list(frame.lacking)) for frame in made] == [("run_left", []), ("run_left_000001", ["left"])]

@@ -500,7 +500,7 @@ def test_the_line_says_rate_latency_status_and_wrench(stream):
     text = described(seen(4), stats, stream.mesh)
     assert text == (
         "5.0 Hz, 50 ms (95 %: 50), 2 dropped | ok | force +0.000 +1.000 +2.000 N | moment +3.000 +4.000 +5.000 N mm | "
-        "pressure +0.002 N/mm²"
+        "pressure +20 hPa"
     )
     blank = described(seen(6, status=int(tm.Status.BLANK)), stats, stream.mesh)
     assert "blank or saturated image" in blank and "force" not in blank

@@ -158,6 +158,14 @@ RAW = {
     "fuzz": dict(videos=dict(cases=100, kinds={"refused": 3, "decoded": 97}, broken=[], slowest=0.1, largest_MB=12)),
     "pins": dict(presses=[dict(height=h, file=f, status=0, surface=0.3, force=0.01) for h in (0, 4) for f in PINS]),
     "out-of-range": dict(rows=[PRESS | dict(depth=depth, status=status) for depth, status in ((0.15, 0), (0.25, 9))]),
+    "knocked": dict(
+        presses=[
+            {
+                kind: dict(status=7, still=0, shift=5.0, found=0.9, other=0.001, named=kind == "turned", shape=0.02, force=0.3)
+                for kind in ("turned", "shifted")
+            }
+        ]
+    ),
     "weight": dict(
         rows=[
             dict(sensor=name, weight=0, ratios=[1.05], unsure=[], deviation=0.01)
@@ -177,6 +185,7 @@ SAID = {
     "fuzz": ("| videos | 100 | 3 | 97 | 0 | 0.1 s | 12 MB |",),
     "pins": ("0 (painted)", "| 4 mm | tips taken for dots | 0.3 / 0.3 | 0.01 / 0.01 | 1 of 1 | 1 |"),
     "out-of-range": ("| 0.1 to 0.18 | 0 of 1 | 0 of 0 |", "| 0.2 to 0.3 | 1 of 1 | 0 of 0 |"),
+    "knocked": ("| 5.0 / 5.0 | 5.0 / 5.0 |", "| 1 of 1 | 0 of 1 |", "| 0.020 / 0.020 |", "| 1, 0 | 1, 0 |", "| 1 | 1 |"),
     "weight": ("3 of 4", "1.05 to 1.05", "5.0 %", "all: 20 forces"),
 }
 

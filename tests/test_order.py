@@ -14,7 +14,7 @@ from PIL import Image
 import torchmembrane as tm
 from torchmembrane.cli.main import main
 from torchmembrane.files.order import in_order
-from torchmembrane.jobs.inputs import find_inputs
+from torchmembrane.jobs.inputs import find_inputs, without_rest
 from torchmembrane.jobs.rest import recording_rest
 from torchmembrane.live.sources import folder_images
 
@@ -37,6 +37,23 @@ def written(folder, names, size=(8, 6)):
     for k in np.random.default_rng(0).permutation(len(names)):
         Image.fromarray(np.full(size[::-1], k, np.uint8)).save(folder / f"{names[k]}.png")
     return [folder / f"{name}.png" for name in names]
+
+
+def test_a_rest_image_in_a_folder_is_left_out(tmp_path):
+    """The sensor's, to the byte, wherever its file is; not one that is given by its name, nor where there is nothing else."""
+    rest, press = written(tmp_path, ["sensor_rest", "press"])
+    own = tmp_path / "mine" / "mine_rest.png"
+    own.parent.mkdir()
+    own.write_bytes(rest.read_bytes())
+
+    def found(*arguments):
+        inputs = without_rest(find_inputs(arguments), arguments, [tmp_path / "sensor.toml", own])
+        return inputs.images, list(inputs.rest)
+
+    assert found(tmp_path) == ([press], [rest])
+    assert found(str(rest), str(press)) == ([rest, press], [])
+    press.unlink()
+    assert found(tmp_path) == ([rest], [])
 
 
 @pytest.mark.parametrize("series", SERIES)

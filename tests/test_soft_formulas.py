@@ -13,8 +13,8 @@ from torchmembrane.markers.dots.flow import FlowAverages
 from torchmembrane.markers.soft import SoftLocator, SoftTextureLocator
 from torchmembrane.markers.soft.argmax import window_peak
 from torchmembrane.markers.soft.locator import _other_radii
-from torchmembrane.markers.soft.response import DISC, RUNG, DotResponse, disc_response, pyramid
-from torchmembrane.markers.soft.search import BLUNT, DotGrowth, DotSearch, Found, predict
+from torchmembrane.markers.soft.response import DISC_RESPONSE, SIGMA_RATIO, DotResponse, disc_response, pyramid
+from torchmembrane.markers.soft.search import LARGEST_RELATIVE_SPREAD, DotGrowth, DotSearch, Found, predict
 from torchmembrane.markers.soft.texture import PatchCorrelation
 from torchmembrane.markers.texture.patches import choose_patches
 
@@ -55,7 +55,7 @@ def test_the_response_to_a_disc_is_the_integral_of_the_laplacian_over_it(ratio):
     laplacian = (rho**2 / sigma**4 - 2 / sigma**2) * gaussian
     integral = -(sigma**2) * (laplacian * 2 * np.pi * rho).sum() * (rho[1] - rho[0])
     assert disc_response(np.array(ratio * sigma), np.array(sigma)) == pytest.approx(integral, rel=1e-6)
-    assert integral <= DISC + 1e-9
+    assert integral <= DISC_RESPONSE + 1e-9
 
 
 def responses(radii, others=None, coarser=0, reach=4.0, inside=None):
@@ -73,15 +73,15 @@ def disc(radius, at=(70.0, 60.0)):
 def test_responses_are_differences_of_gaussians():
     response, image = responses([2.8]), torch.rand(1, 1, 120, 140, generator=torch.Generator().manual_seed(0)).double()
     (rung,) = response.rungs[0]
-    above, below = (ndimage.gaussian_filter(image[0, 0].numpy(), RUNG**s, truncate=3.5) for s in (rung + 1, rung - 1))
+    above, below = (ndimage.gaussian_filter(image[0, 0].numpy(), SIGMA_RATIO**s, truncate=3.5) for s in (rung + 1, rung - 1))
     (maps,) = response.maps(pyramid(image))
     twin = (above - below) / 1.02  # of the mean's weight, the least share is added
     assert abs(maps[0, 0].numpy() - twin)[20:-20, 20:-20].max() < 0.01 * abs(twin).max()
-    assert rung == round(np.log(2.8 / 2**0.5) / np.log(RUNG))
+    assert rung == round(np.log(2.8 / 2**0.5) / np.log(SIGMA_RATIO))
 
 
 def test_a_dot_answers_most_at_its_own_scale_and_a_slope_not_at_all():
-    radii = 2.2 * RUNG ** np.arange(-2, 3)
+    radii = 2.2 * SIGMA_RATIO ** np.arange(-2, 3)
     middle, response = torch.tensor([[[70.0, 60.0]]]).double(), responses([2.2])
     at = [float(response.windows(response.maps(pyramid(disc(r))), middle).value[0, 0, 4, 4]) for r in radii]
     assert np.argmax(at) == 2 and at[2] > 0
@@ -114,8 +114,8 @@ def test_windows_hold_the_maps_about_the_pixel_next_to_the_centre(coarser, strid
         patch = maps[k][:, :, at[1] - half : at[1] + half + 1, at[0] - half : at[0] + half + 1]
         radius, other_radius = np.array([(2.0, 7.0), (7.0, 2.0)][dot]) / stride
         scales = np.array([radius, other_radius]) / 2**0.5
-        own, other = (response.rungs[response.levels[k]].index(r) for r in np.round(np.log(scales) / np.log(RUNG)))
-        share = min(disc_response(other_radius, scales[0]) / DISC, 0.75)
+        own, other = (response.rungs[response.levels[k]].index(r) for r in np.round(np.log(scales) / np.log(SIGMA_RATIO)))
+        share = min(disc_response(other_radius, scales[0]) / DISC_RESPONSE, 0.75)
         torch.testing.assert_close(windows.value[:, dot], patch[:, own] - share * patch[:, other])
     near = response.windows(maps, torch.full((2, 2, 2), -9.0).double())
     assert (near.middle[0] == torch.tensor(strides)[:, None] * half).all()
@@ -159,7 +159,7 @@ def test_two_dots_are_no_sharp_peak_and_no_dot_is_none():
     search, middle = dot_search(), torch.tensor([[[70.0, 60.0]]]).double()
     pair = disc(4.0, (63.5, 60.0)) + disc(4.0, (76.5, 60.0)) - 2
     seen = search(search.response.maps(pyramid(2 * pair)), middle)
-    assert float(seen.sharpness) < 0.1 < BLUNT and (seen.place - middle).abs().max() < 0.2
+    assert float(seen.sharpness) < 0.1 < LARGEST_RELATIVE_SPREAD and (seen.place - middle).abs().max() < 0.2
     empty = search(search.response.maps(pyramid(0 * pair)), middle)
     assert float(empty.response) < 1e-6 and float(empty.sharpness) < 0.5
     light = search(search.response.maps(pyramid(2 - 2 * disc(4.0))), middle)

@@ -10,8 +10,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from matplotlib.transforms import Bbox
+from PIL import Image
 
 from torchmembrane.camera.model import Camera
+from torchmembrane.cli.film import FrameImages
 from torchmembrane.plot import frames as view
 from torchmembrane.plot.drawing import save
 from torchmembrane.plot.sensor import sensor_figure
@@ -81,7 +83,27 @@ def test_three_panels_with_units_and_a_title(mesh):
     assert "[mm]" in side.get_xlabel() and "[mm]" in side.get_ylabel()
     assert len(flow.images) == 1 and side.collections and map_.collections
     title = drawing.get_suptitle()
-    assert all(part in title for part in ("press_7", "ok", "+0.0123 N/mm²", "0.25 px"))
+    assert all(part in title for part in ("press_7", "ok", "+123 hPa", "0.25 px"))
+
+
+@pytest.mark.parametrize(
+    "force, length, said", [("N", "mm", "+250 hPa"), ("N", "m", "+0.00025 hPa"), ("relative", "mm", "+0.025 relative/mm²")]
+)
+def test_a_pressure_is_said_in_hpa_where_forces_have_a_unit(mesh, force, length, said):
+    assert mesh._replace(force_unit=force, length_unit=length).pressure_in_words(0.025) == said
+
+
+def test_of_views_that_share_an_image_the_first_ones_region_is_drawn(mesh, tmp_path):
+    """Of files; an image that is that region already stays, and so does any of a sensor whose views share none."""
+    grey = np.arange(480 * 900).reshape(480, 900) % 251
+    Image.fromarray(grey.astype(np.uint8)).save(tmp_path / "a.png")
+    shared = mesh._replace(image_part=np.array([200, 0, 900, 480]))
+    drawn = FrameImages({"a": tmp_path / "a.png"}, shared).named("a")
+    np.testing.assert_allclose(255 * drawn, grey[:, 200:840], atol=1e-4)
+    assert shared.file_size == (900, 480) and shared.first_region(drawn) is drawn
+    assert mesh.file_size == SIZE and mesh.first_region(grey) is grey
+    shared.save(tmp_path / "mesh.npz")
+    assert Mesh.load(tmp_path / "mesh.npz").image_part.tolist() == [200, 0, 900, 480]
 
 
 def test_the_deepest_point_is_marked_with_its_value(mesh):
@@ -153,7 +175,7 @@ def test_an_answer_without_convergence_is_drawn_and_named(mesh):
 
 def test_relative_forces_are_called_relative():
     mesh = cap_mesh(Camera("fisheye", SIZE, (220, 220), (320, 240)), force_unit="relative")
-    assert "relative units" in view.figure(pressed(mesh), mesh).get_suptitle()
+    assert "relative/mm²" in view.figure(pressed(mesh), mesh).get_suptitle()
 
 
 def test_a_fourth_panel_shows_where_and_how_hard_something_pushes(mesh):
@@ -178,7 +200,6 @@ def test_a_fourth_panel_shows_where_and_how_hard_something_pushes(mesh):
 
 
 def test_saved_as_png_1600_wide_whole_or_not_at_all(mesh, tmp_path):
-    from PIL import Image
 
     save(view.figure(pressed(mesh), mesh), tmp_path / "a.png")
     assert Image.open(tmp_path / "a.png").size == (1600, 600)

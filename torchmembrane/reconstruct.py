@@ -21,7 +21,7 @@ from .files.grayscale import CHANNELS, Channels, to_grayscale_batch
 from .files.images import read_image
 from .files.tensors import tensor_of
 from .markers.coverage import LEAST_COVERAGE, Coverage, facings
-from .markers.observer import FOUND, MarkerFlow
+from .markers.observer import FOUND_CONFIDENCE, MarkerFlow
 from .markers.sightings import sightings
 from .mechanics.principal import FIELDS, principal_fields
 from .results.frame_status import broken_down, is_seen
@@ -253,7 +253,7 @@ class Reconstructor(nn.Module):
         self, found: Equilibrium, observation: Observation, displacement: Tensor, confidence: Tensor, status: Tensor
     ) -> Reconstruction:
         """The frames' results, NaN where there is no surface."""
-        membrane, lost, x = self.estimator.membrane, confidence <= FOUND, found.vertices
+        membrane, lost, x = self.estimator.membrane, confidence <= FOUND_CONFIDENCE, found.vertices
         u = x - membrane.rest
         markers = self.rest_markers + self.marker_shares @ u.to(self.marker_shares)
         markers = markers if self.levers is None else markers + self.levers(u.to(markers)).levers

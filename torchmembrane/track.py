@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .errors import MembraneError, expect, is_number
-from .markers.drift import ENOUGH, DriftWatch
+from .markers.drift import FEWEST_FRAMES, DriftWatch
 from .reconstruct import Reconstructor
 from .results.reconstruction import Reconstruction
 from .results.status import Status
@@ -235,7 +235,7 @@ class Tracker:
             self._watch.add(*moved)
             self._steady.forget()
         else:
-            if self._steady.frames >= ENOUGH and not self._steady.is_near(*moved):
+            if self._steady.frames >= FEWEST_FRAMES and not self._steady.is_near(*moved):
                 self._steady.forget()
             self._steady.add(*moved)
         if not self._said and (self._is_steady() or self._watch.drift().is_certain):
@@ -244,7 +244,7 @@ class Tracker:
 
     def _is_steady(self) -> bool:
         """Whether a contact that was there from the beginning has held still, and moves the markers as a drift does."""
-        found, was_free = self._steady.drift(), self._watch.frames >= ENOUGH
+        found, was_free = self._steady.drift(), self._watch.frames >= FEWEST_FRAMES
         return not was_free and self._steady.frames >= STEADY and found.is_certain and found.size < LARGEST_STEADY
 
     def _camera_motion(self, result: Reconstruction) -> tuple[Tensor | None, str]:

@@ -20,7 +20,7 @@ import torch
 import torchmembrane as tm
 from bench.accuracy.accuracy import cases_in, contact_errors
 from bench.data.record import write
-from torchmembrane.markers.observer import FOUND
+from torchmembrane.markers.observer import FOUND_CONFIDENCE
 
 GRID = 33
 BASE = tm.ForceBalanceSettings()
@@ -127,7 +127,7 @@ def errors_of(reconstructor: tm.Reconstructor, rest: torch.Tensor, press: Press,
 def unjudged(reconstructor: tm.Reconstructor, pixels, confidence, rest, assumed: float) -> tm.Reconstruction:
     """As `from_pixels`, without asking whether most markers are found: one dot in four is enough here."""
     displacement, confidence, covariance, status = reconstructor.observer.from_pixels(pixels, confidence, rest)
-    usable = torch.where(confidence > FOUND, confidence, 0.0)
+    usable = torch.where(confidence > FOUND_CONFIDENCE, confidence, 0.0)
     observation = reconstructor.observation(displacement, usable, assumed**2 * covariance)
     return reconstructor.result(reconstructor.estimator(observation), observation, displacement, usable, status)
 

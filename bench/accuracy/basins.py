@@ -20,7 +20,7 @@ from bench.accuracy.weight import SENSORS, sensor_of
 from torchmembrane.simulate.dataset import stroke_to
 
 PRESSES = 8
-NOISE = 0.03  # px
+LOCATION_NOISE = 0.03  # px
 
 
 def presses(sensor: tm.Sensor, rng: np.random.Generator) -> list[dict]:
@@ -39,7 +39,7 @@ def presses(sensor: tm.Sensor, rng: np.random.Generator) -> list[dict]:
             continue
         truth = simulator.frame(state, stroke, rng).truth
         seen = truth["uv_deformed"]
-        found.append(dict(truth, pixels=seen + NOISE * rng.standard_normal(seen.shape)))
+        found.append(dict(truth, pixels=seen + LOCATION_NOISE * rng.standard_normal(seen.shape)))
     return found
 
 

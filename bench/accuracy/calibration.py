@@ -46,7 +46,7 @@ from torchmembrane.simulate import Appearance, Plane, Simulator, Sphere
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.target_renderer import TargetRenderer
 
-NOISE = 40.0
+NOISE_LEVEL = 40.0
 LENSES = {
     "pinhole": ((265.0, 266.0), (322.4, 237.0), (-0.05, 0.01, 0.0005, -0.0003, 0.0)),
     "fisheye": ((180.0, 180.5), (321.5, 238.2), (-0.012, 0.002, 0.0, 0.0)),
@@ -123,7 +123,7 @@ def effect(seeds, figures):
     """Error of the dots in space, mm, over all presses, by sensor file and estimator."""
     for name, radius, depth in (("fingertip", 4.0, 2.0), ("half_cylinder", 4.0, 2.0)):
         design, truth = preset(name), posed(preset(name), TILT, OFFSET)
-        simulator = Simulator(truth, appearance=Appearance(noise=NOISE))
+        simulator = Simulator(truth, appearance=Appearance(noise=NOISE_LEVEL))
         image = simulator.rest_image()
         calibrated = rest_from_image(bare(design), image).sensor
         sensors = {"design": design, "calibrated": calibrated, "truth": truth}
@@ -163,7 +163,7 @@ def material(seeds, figures):
     for name, prestretch in itertools.product(("fingertip", "half_cylinder"), (1.05, 1.15, 1.3, 1.6, 2.0)):
         design = preset(name)
         truth = replace(design, material=replace(design.material, prestretch=prestretch, shear_modulus=0.3, thickness=0.4))
-        simulator = Simulator(truth, appearance=Appearance(noise=NOISE))
+        simulator = Simulator(truth, appearance=Appearance(noise=NOISE_LEVEL))
         sensor = replace(design, markers=replace(design.markers, rest_image=simulator.rest_image()))
         aim = simulator.membrane.rest[simulator.membrane.fixed].mean(0).numpy()
         strokes = [stroke_to(simulator, body, aim, travel, depth) for body, travel, depth in presses]
@@ -187,7 +187,7 @@ def gauge(seeds, figures):
     for name, prestretch in (*both, ("bubble", 1.15)):
         design = preset(name)
         truth = replace(design, material=replace(design.material, prestretch=prestretch, shear_modulus=0.3, thickness=0.4))
-        simulator = Simulator(truth, appearance=Appearance(noise=NOISE))
+        simulator = Simulator(truth, appearance=Appearance(noise=NOISE_LEVEL))
         unknown = replace(design.material, shear_modulus=None, thickness=None)
         sensor = replace(design, material=unknown, markers=replace(design.markers, rest_image=simulator.rest_image()))
         size, aim = simulator.membrane.size, simulator.membrane.rest[simulator.membrane.fixed].mean(0).numpy()
@@ -247,7 +247,7 @@ def views(seeds, figures):
 def depth(seeds, figures):
     for name in ("fingertip", "half_cylinder"):
         design, truth = preset(name), posed(preset(name), TILT, OFFSET)
-        simulator = Simulator(truth, appearance=Appearance(noise=NOISE))
+        simulator = Simulator(truth, appearance=Appearance(noise=NOISE_LEVEL))
         exact, image = simulator.renderer.depth(simulator.membrane.rest).numpy(), simulator.rest_image()
         for seed in range(seeds):
             noisy = exact + np.random.default_rng(seed).normal(size=exact.shape) * 0.2
@@ -286,7 +286,7 @@ def poses_seen(photograph: TargetRenderer, board, count: int, depths, spread: fl
         rotation = Rotation.from_rotvec(rng.uniform(-1, 1, 3) * [0.5, 0.5, 0.8]).as_matrix()
         z = rng.uniform(*depths)
         place = np.append(rng.uniform(-spread, spread, 2) * z, z)
-        image = photograph.image(board, rotation, place - rotation @ middle, NOISE, rng=rng)
+        image = photograph.image(board, rotation, place - rotation @ middle, NOISE_LEVEL, rng=rng)
         try:
             found.append(find_target(to_grey(image), board))
         except MembraneError:
@@ -320,7 +320,7 @@ def bare(sensor):
 
 
 def rest_image(sensor, seed: int) -> np.ndarray:
-    simulator = Simulator(sensor, appearance=Appearance(noise=NOISE))
+    simulator = Simulator(sensor, appearance=Appearance(noise=NOISE_LEVEL))
     return to_grey(simulator.image(simulator.membrane.rest, np.random.default_rng(seed)))
 
 

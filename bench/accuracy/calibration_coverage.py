@@ -38,7 +38,7 @@ from torchmembrane.sensor.units import hectopascal
 
 WRONG = (0.01, 0.02, 0.05)
 TOLD = {"gauge": 0.05, "force": 0.03}  # relative standard deviations of what is read
-NOISE = 0.05  # px
+LOCATION_NOISE = 0.05  # px
 PRESSES = 3  # the last one is not calibrated from
 NAMES = ("prestretch", "modulus", "force")
 
@@ -97,7 +97,7 @@ class Window:
     def seen(self, x: Tensor) -> Tensor:
         """Pixels of the dots with the vertices at `x`, `[D, 2]`."""
         pixels = self.camera.point_to_pixel((x[self.dots[0]] * self.dots[1][..., None]).sum(1))
-        return pixels + NOISE * torch.from_numpy(self.rng.standard_normal(pixels.shape))
+        return pixels + LOCATION_NOISE * torch.from_numpy(self.rng.standard_normal(pixels.shape))
 
     def sensor(self, height: float, gauge: float) -> tuple[tm.Sensor, Tensor, np.ndarray]:
         """What `init` makes of a height, mm, and a rest photograph; the pixels in it, `[D, 2]`, of those dots `[D]` that it
@@ -126,13 +126,13 @@ def calibrated(made: Drawn, rng: np.random.Generator) -> dict:
     began = time.process_time()
     known = KnownForces(given, TOLD["force"] * given[:, 0])
     rest_error = made.off * made.size / height
-    found = material_from_pixels(sensor, pixels[:-1], known, overpressure=gauge, noise=NOISE, rest_error=rest_error)
+    found = material_from_pixels(sensor, pixels[:-1], known, overpressure=gauge, noise=LOCATION_NOISE, rest_error=rest_error)
     seconds = time.process_time() - began
     written = replace(found.sensor, record=Record(uncertainty=found.force_deviation))
     reconstructor = tm.Reconstructor(written)
     there = torch.cdist(reconstructor.rest_pixels.double(), rest_pixels).argmin(1)  # dots whose rays meet the surface found
     with torch.no_grad():
-        result = reconstructor.from_pixels(pixels[-1:, there], rest_pixels=rest_pixels[there], noise=NOISE).frame(0)
+        result = reconstructor.from_pixels(pixels[-1:, there], rest_pixels=rest_pixels[there], noise=LOCATION_NOISE).frame(0)
     F = result["force"].astype(float)
     magnitude = float(np.linalg.norm(F))
     of_force = float(np.linalg.norm(result["force_deviation"] * F)) / magnitude

@@ -15,11 +15,12 @@ import numpy as np
 import torch
 
 import torchmembrane as tm
-from bench.accuracy.views import NOISE, Pressed, followed, of_sensors, options, with_second_view
+from bench.accuracy.views import LOCATION_NOISE, Pressed, followed, of_sensors, options, with_second_view
 from bench.data.random_sensors import random_sensor
 from bench.data.record import write
 from torchmembrane.errors import MembraneError
 from torchmembrane.pose import ViewPose
+from torchmembrane.results.status import Status
 from torchmembrane.sensor.units import millimetre
 from torchmembrane.simulate.simulator import Simulator
 
@@ -52,7 +53,7 @@ def moved_by(reconstructor: tm.Reconstructor, result: tm.Reconstruction, seen: t
 def knocked_press(sensor: tm.Sensor, reconstructor: tm.Reconstructor, truth: Pressed, rng: np.random.Generator) -> dict:
     """What comes of one press without a knock, and with each."""
     exact = truth.dots.pixels
-    noise = torch.from_numpy(rng.normal(0, NOISE, exact.shape))
+    noise = torch.from_numpy(rng.normal(0, LOCATION_NOISE, exact.shape))
     seen = (truth.dots.visible & exact.isfinite().all(-1)).float()
     still, row = reconstructor.from_pixels(exact + noise, seen), {}
     displacement = rms(truth.dots.positions.numpy() - truth.rest)
@@ -101,6 +102,7 @@ def bands(rows: list[dict]) -> list[dict]:
         medians = {key: float(np.median([r[key] for r in chosen])) for key in ("found", "other")}
         counts = {key: sum(bool(r[key]) for r in chosen) for key in ("named",)}
         ok = {key: sum(r[key] == 0 for r in chosen) for key in ("status", "still")}
+        ok["unexplained"] = sum(r["status"] == Status.UNEXPLAINED for r in chosen)
         found.append(dict(knock=kind, presses=len(rows), solved=len(chosen)) | spans | medians | counts | ok)
     return found
 
@@ -111,8 +113,8 @@ def print_table(rows: list[dict]) -> None:
         spans = ", ".join(f"{key} {band[key][0]:.3g} / {band[key][1]:.3g}" for key in ("shift", "shape", "force"))
         print(
             f"{band['knock']}: {band['presses']} presses, {band['solved']} solved, ok {band['status']} (without the knock "
-            f"{band['still']}), named {band['named']}, found {band['found']:.3f}, in the first view {band['other']:.3f}; "
-            f"{spans}",
+            f"{band['still']}), {band['unexplained']} unexplained, named {band['named']}, found {band['found']:.3f}, in the "
+            f"first view {band['other']:.3f}; {spans}",
             flush=True,
         )
 

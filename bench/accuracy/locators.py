@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from bench.accuracy.accuracy import cases_in
 from bench.accuracy.thresholded_dots import ThresholdedDots
 from bench.data.record import write
-from torchmembrane.markers.observer import FOUND
+from torchmembrane.markers.observer import FOUND_CONFIDENCE
 from torchmembrane.reconstruct import Reconstructor
 
 METHODS = ("fit", "soft", "threshold", "opencv")
@@ -65,7 +65,7 @@ class Package:
     def __call__(self, image):
         with torch.no_grad():
             pixels, confidence = (a[0].double().numpy() for a in self.locate(torch.from_numpy(image)[None, None])[:2])
-        return np.where(confidence[:, None] > FOUND, pixels - self.rest, np.nan)
+        return np.where(confidence[:, None] > FOUND_CONFIDENCE, pixels - self.rest, np.nan)
 
 
 def methods_of(sensor_file):

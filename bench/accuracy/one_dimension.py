@@ -19,7 +19,7 @@ from torchmembrane.estimators.paper.studies.pressed_strip import Disc, PressedSt
 from torchmembrane.estimators.paper.studies.profile import ForceBalanceProfile, MinimumEnergyProfile, StripProfile
 from torchmembrane.estimators.paper.studies.strip import Strip
 
-RADIUS, NODES, MARKERS, NOISE, DRAWS = 15.0, 61, 31, 2e-4, 8
+RADIUS, NODES, MARKERS, ANGLE_NOISE, DRAWS = 15.0, 61, 31, 2e-4, 8
 STRIPS = {"neo-Hookean": Strip("neo_hookean", 1.2), "harmonic": Strip("harmonic", 1.2)}
 EXPERIMENTS = {
     "one cylinder, radius 5, 4 mm": [Disc.pressed(RADIUS, 90, 4.0, 5.0)],
@@ -32,7 +32,11 @@ def observed(truth: PressedStrip, draw: int) -> tuple[np.ndarray, np.ndarray, np
     """Rest angles of the markers, the angles at which they are seen, with noise, and where they are."""
     theta = np.linspace(0, np.pi, MARKERS + 2)[1:-1]
     place = truth.positions(np.rad2deg(theta))
-    return theta, np.arctan2(place[:, 1], place[:, 0]) + NOISE * np.random.default_rng(draw).standard_normal(MARKERS), place
+    return (
+        theta,
+        np.arctan2(place[:, 1], place[:, 0]) + ANGLE_NOISE * np.random.default_rng(draw).standard_normal(MARKERS),
+        place,
+    )
 
 
 def score(profile: StripProfile, theta, place, truth: PressedStrip, strip: Strip, share: float) -> dict[str, float]:
@@ -56,7 +60,10 @@ def main():
     for name, discs in EXPERIMENTS.items():
         truth = PressedStrip(RADIUS, discs)
         for material, strip in STRIPS.items():
-            for estimator in (MinimumEnergyProfile(RADIUS, strip, NODES), ForceBalanceProfile(RADIUS, strip, NODES, 2 * NOISE)):
+            for estimator in (
+                MinimumEnergyProfile(RADIUS, strip, NODES),
+                ForceBalanceProfile(RADIUS, strip, NODES, 2 * ANGLE_NOISE),
+            ):
                 draws = []
                 for draw in range(DRAWS):
                     theta, psi, place = observed(truth, draw)

@@ -24,7 +24,7 @@ from bench.accuracy.accuracy import cases_in
 from bench.data.record import write
 from torchmembrane.estimators.paper.estimator import Segmented
 
-NOISE, NONE_FOUND, ROUNDS = 0.05, 10.0, 8
+LOCATION_NOISE, NONE_FOUND, ROUNDS = 0.05, 10.0, 8
 PAPER, FREE, MATERIAL, BALANCE = "loop, paper", "loop, paper, free part only", "minimum energy", "force balance"
 OPTIONS = {
     PAPER: {"estimator": "paper", "locator": "soft"},
@@ -67,7 +67,7 @@ def ways(root: Path, case: dict, images: bool) -> dict[str, tuple[float, float, 
     """Of each way the contact error, the surface error, and how many contacts are found."""
     truth = np.load(root / case["truth"])
     place = truth["contact_centroid_each"]
-    noise = NOISE * np.random.default_rng(0).standard_normal(truth["uv_deformed"].shape)
+    noise = LOCATION_NOISE * np.random.default_rng(0).standard_normal(truth["uv_deformed"].shape)
     found = {}
 
     def keep(name: str, points: torch.Tensor, result: tm.Reconstruction) -> None:

@@ -37,7 +37,7 @@ BASELINE = (0.2, 2.0)  # over the membrane's size
 LEAST_SEEN = 0.5  # of the dots, by a view that is taken
 TRIES = 40
 STROKES, SECONDS = 4, 15  # that are tried for a press, and for one equilibrium
-NOISE = 0.05  # px
+LOCATION_NOISE = 0.05  # px
 DEEP, UNSTRETCHED = 0.2, 1.1
 MEASURES = ("shape", "depth", "force")
 SEEN = ("one", "two", "hidden")
@@ -150,7 +150,7 @@ def presses_of(
     rows = []
     for k, truth in enumerate(truths):
         rng, exact = np.random.default_rng([number, 9, k]), truth.dots.pixels
-        pixels = exact + torch.from_numpy(rng.normal(0, NOISE, exact.shape))
+        pixels = exact + torch.from_numpy(rng.normal(0, LOCATION_NOISE, exact.shape))
         seen = (truth.dots.visible & pixels.isfinite().all(-1)).float()
         hidden = seen.clone()
         hidden[0, 0::3], hidden[1, 1::3] = 0, 0

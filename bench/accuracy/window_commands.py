@@ -35,7 +35,7 @@ from torchmembrane.forming.outline import encloses, outline_of
 from torchmembrane.sensor.inflated import rim_lines
 
 CAMERA = tm.Camera("pinhole", (640, 480), (480.0, 480.0), (319.5, 239.5))
-DISTANCE, NOISE, KNOWN = 40.0, 40.0, 0.03  # mm; dB; standard deviation of the forces given, relative
+DISTANCE, NOISE_LEVEL, KNOWN = 40.0, 40.0, 0.03  # mm; dB; standard deviation of the forces given, relative
 WRONG_STRETCH = 1.2
 SUPER = 6  # drawn so many times as large both ways
 RADII = 0.27 * PITCH, 0.16 * PITCH
@@ -73,7 +73,7 @@ class Paint:
         for corner in _drawn(dots):
             draw.polygon([tuple(p) for p in corner], fill=INK)
         grey = np.asarray(picture.reduce(SUPER), float)
-        noisy = grey + 255 * 10 ** (-NOISE / 20) * rng.standard_normal(grey.shape)
+        noisy = grey + 255 * 10 ** (-NOISE_LEVEL / 20) * rng.standard_normal(grey.shape)
         return Image.fromarray(noisy.round().clip(0, 255).astype(np.uint8))
 
 

@@ -37,7 +37,7 @@ from torchmembrane.simulate.quasi_static import Press, presses
 from torchmembrane.simulate.render import Renderer
 from torchmembrane.simulate.simulator import Simulator, Stroke
 
-NOISE = 30.0  # dB
+NOISE_LEVEL = 30.0  # dB
 OFF_RIM, TILT = 0.25, 20.0  # of places, over the surface's size; of directions, degrees
 ATTEMPTS = 20
 CENTRE = (317.5, 243.0)
@@ -104,7 +104,7 @@ def sensor_of(name: str, material: str) -> Sensor:
     camera = Camera(lens, (640, 480), (focal, focal), CENTRE, **options)
     membrane = surface.membrane(default_grid(markers))
     sensor = Sensor(f"{name}_{material}", "mm", camera, membrane, MATERIALS[material], Cavity("liquid"), markers, surface)
-    rest = noisy(Renderer(sensor)(membrane.rest), NOISE, np.random.default_rng(0))
+    rest = noisy(Renderer(sensor)(membrane.rest), NOISE_LEVEL, np.random.default_rng(0))
     return replace(sensor, markers=replace(markers, rest_image=to_grey((255 * rest).round().byte().numpy())))
 
 
@@ -159,7 +159,7 @@ def write(out: Path, number: int, case: Case, args: argparse.Namespace) -> dict:
     if not truth.exists():
         clean, noise = (
             Simulator(Sensor.from_file(sensor_file), (args.grid, args.grid), Appearance(noise=decibel))
-            for decibel in (None, NOISE)
+            for decibel in (None, NOISE_LEVEL)
         )
         rng = np.random.default_rng([args.seed, number])
         state, strokes = _followed(clean, case, rng)

@@ -37,7 +37,7 @@ from torchmembrane.simulate.render import Renderer
 from torchmembrane.simulate.simulator import SimulatedFrame, Simulator, Stroke
 
 IMAGE = (640, 480)
-NOISE = (30.0, 40.0)  # dB
+NOISE_LEVEL = (30.0, 40.0)  # dB
 DEPTH = (0.02, 0.3)  # of presses, over the surface's size
 LIGHT_DEPTH = (0.06, 0.15)  # at the end of a stroke that begins lightly
 RADIUS = (0.08, 0.35)  # of bodies
@@ -69,7 +69,7 @@ def random_sensor(
     material = replace(material, shear_modulus=0.3, thickness=thickness)
     cavity = Cavity(filling, 1013.0 if filling == "gas" else None)
     sensor = Sensor(f"s{number:04d}", "mm", camera, membrane, material, cavity, markers, surface)
-    noise, pattern = rng.uniform(*NOISE), Speckle(0.02 * membrane.size, number) if rng.random() < 0.1 else None
+    noise, pattern = rng.uniform(*NOISE_LEVEL), Speckle(0.02 * membrane.size, number) if rng.random() < 0.1 else None
     rest = noisy(Renderer(sensor, pattern=pattern)(membrane.rest), noise, np.random.default_rng([seed, number, 1]))
     rest = to_grey((255 * rest).round().byte().numpy())
     if pattern is not None:
@@ -208,7 +208,7 @@ def write(folder: Path, number: int, args: argparse.Namespace) -> None:
     if not (folder / "sensor.toml").exists():
         random_sensor(number, args.seed).to_file(folder / "sensor.toml")
     sensor = Sensor.from_file(folder / "sensor.toml")
-    noise = np.random.default_rng([args.seed, number, 2]).uniform(*NOISE)
+    noise = np.random.default_rng([args.seed, number, 2]).uniform(*NOISE_LEVEL)
     simulator = Simulator(sensor, appearance=Appearance(noise=noise))
 
     def keep(name: str, frame: SimulatedFrame) -> None:

@@ -1,6 +1,7 @@
 """Tables of errors: rows of cells, the first of which is the head, from the results of parts."""
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -172,9 +173,44 @@ def views(found: dict) -> Rows:
     return [["presses", "seen by", "number", "ok", "shape: median / 90 %", "depth", "force"], *rows]
 
 
+def deep_and_soft_views(deep: dict, soft: dict) -> Rows:
+    """The same of deep presses alone, and of soft sensors alone."""
+    chosen = [
+        [band for band in found["bands"] if band["group"] == group] for found, group in ((deep, "deep"), (soft, "soft"))
+    ]
+    return views(dict(bands=[*chosen[0], *chosen[1]]))
+
+
 def views_summary(results: dict) -> dict:
     """Medians and 90 % quantiles of the errors."""
     from bench.accuracy.views import bands
+
+    return dict(bands=bands(results["presses"]))
+
+
+def knocked(found: dict) -> Rows:
+    """What is found of a knock of one camera, and by how much the answer differs from that without it; a column for each."""
+    bands = found["bands"]
+
+    def row(name: str, cell: Callable[[dict], str]) -> list[str]:
+        return [name, *map(cell, bands)]
+
+    return [
+        row("", lambda band: {"turned": "turned by 1 degree", "shifted": "shifted by 0.5 mm"}[band["knock"]]),
+        row("its image's dots move by, px, median / 90 %", lambda band: spans({"shift": band["shift"]}, 1)[0]),
+        row("of that found as the second view's motion, median", lambda band: f"{band['found']:.2f}"),
+        row("of that found as the first view's", lambda band: f"{band['other']:.2f}"),
+        row("presses in which the second view is named", lambda band: f"{band['named']} of {band['presses']}"),
+        row("answer against that without the knock: shape, median / 90 %", lambda band: spans({"shape": band["shape"]}, 3)[0]),
+        row("the same of the force", lambda band: spans({"force": band["force"]}, 3)[0]),
+        row("ok before the knock, and after", lambda band: f"{band['still']}, {band['status']}"),
+        row("`UNEXPLAINED` after it", lambda band: str(band["unexplained"])),
+    ]
+
+
+def knocked_summary(results: dict) -> dict:
+    """Medians and 90 % quantiles of each knock, and counts."""
+    from bench.accuracy.knocked import bands
 
     return dict(bands=bands(results["presses"]))
 

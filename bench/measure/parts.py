@@ -107,6 +107,7 @@ PARTS = {
         for name, options in (("npz", "--format npz"), ("parquet", "--format parquet"), ("ray", "--engine ray"))
     },
     "fuzz": Part("bench.robustness.fuzz", FILES),
+    "walks": Part("bench.speed.walks", (*PRESSED, *CLI)),
     "live": Part("bench.speed.live", (*FRAME, "torchmembrane/live")),
     "live-exported": Part(
         "bench.speed.live --model DATA/video.onnx --only '17 x 17; exported,17 x 17; exported; recorded'",
@@ -135,6 +136,13 @@ PARTS = {
     "ablation": Part("bench.accuracy.ablation CASES", CASES, data="cases"),
     "gauge": Part("bench.accuracy.gauge DATA", RANDOM, data="gauge"),
     "views": Part("bench.accuracy.views --first 1 --sensors 20 --presses 3", (*RANDOM, "torchmembrane/simulate")),
+    "views-deep": Part(
+        "bench.accuracy.views --first 1 --sensors 20 --presses 3 --depth 0.2,0.3", (*RANDOM, "torchmembrane/simulate")
+    ),
+    "views-soft": Part(
+        "bench.accuracy.views --first 40 --sensors 20 --presses 3 --soft", (*RANDOM, "torchmembrane/simulate")
+    ),
+    "knocked": Part("bench.accuracy.knocked --first 1 --sensors 10 --presses 3", (*RANDOM, "torchmembrane/simulate")),
     "light": Part("bench.accuracy.range DATA --only light", RANDOM, data="light"),
     "intervals": Part(f"bench.accuracy.intervals {' '.join(f'DATA/{seed}' for seed in SEEDS)}", RANDOM, data="intervals"),
     "range": Part("bench.accuracy.range DATA", RANDOM, data="range"),

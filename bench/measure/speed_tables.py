@@ -189,6 +189,21 @@ PRECISIONS = {
 }
 
 
+def walk_sensor(found: dict) -> Rows:
+    """Processor time of the commands of the page on one's own sensor."""
+    return _walk(found, "own_sensor")
+
+
+def walk_bubble(found: dict) -> Rows:
+    """The same of the page on one's own bubble."""
+    return _walk(found, "own_bubble")
+
+
+def _walk(found: dict, page: str) -> Rows:
+    rows = [row for row in found["rows"] if row["page"] == page and not row["stands_in"]]
+    return [["", "processor time, s"], *([f"`{row['command'].partition(' --')[0]}`", f"{row['seconds']:.1f}"] for row in rows)]
+
+
 def precision(found: dict) -> Rows:
     """Size and errors of a model in half precision and in integers."""
     rows = []

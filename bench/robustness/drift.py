@@ -21,7 +21,7 @@ import torch
 from scipy import ndimage
 
 import torchmembrane as tm
-from bench.data.random_sensors import NOISE, light_frames, random_sensor
+from bench.data.random_sensors import NOISE_LEVEL, light_frames, random_sensor
 from bench.data.record import write
 from torchmembrane.markers.drift import DriftWatch
 from torchmembrane.mechanics.cavity import rest_balance
@@ -40,7 +40,7 @@ class Aged:
     """One sensor whose membrane or camera no longer is as in its rest image."""
 
     def __init__(self, number: int):
-        sensor, noise = random_sensor(number), np.random.default_rng([0, number, 2]).uniform(*NOISE)
+        sensor, noise = random_sensor(number), np.random.default_rng([0, number, 2]).uniform(*NOISE_LEVEL)
         self.simulator, self.reconstructor = Simulator(sensor, appearance=Appearance(noise=noise)), tm.Reconstructor(sensor)
         self.noise, self.rng = noise, np.random.default_rng([0, number, 9])
         self.rest = self.rendered(self.simulator.membrane.rest)

@@ -19,7 +19,7 @@ import torch
 
 import torchmembrane as tm
 from bench.data.record import write
-from bench.robustness.mistakes import NOISE, sensor_of
+from bench.robustness.mistakes import LOCATION_NOISE, sensor_of
 from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.simulator import Simulator
@@ -41,7 +41,7 @@ def weights() -> np.ndarray:
         stroke = stroke_to(simulator, Sphere(3.0), point, np.array([0.0, 0.0, -1.0]), depth)
         state = list(simulator.presses(stroke, ["push"], frames=1))[-1]
         dots = simulator.renderer.dots(state.vertices).pixels
-        seen = dots + NOISE * torch.from_numpy(rng.standard_normal(dots.shape))
+        seen = dots + LOCATION_NOISE * torch.from_numpy(rng.standard_normal(dots.shape))
         result = r.from_pixels(seen[None].to(r.rest_pixels), rest_pixels=clean.to(r.rest_pixels))
         if int(result.status[0]) == 0 and not (result.contact_at_rim == 1).any():
             known = float(state.force.norm())

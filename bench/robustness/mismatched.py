@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 import torchmembrane as tm
 from bench.accuracy.accuracy import cases_in
 from bench.data.record import write
-from torchmembrane.markers.observer import FOUND
+from torchmembrane.markers.observer import FOUND_CONFIDENCE
 
-SHARE, NOISE, ALLOWED = 0.05, 0.05, 0.2
+SHARE, LOCATION_NOISE, ALLOWED = 0.05, 0.05, 0.2
 
 
 def mismatched(rest: np.ndarray, pixels: np.ndarray, rng) -> tuple[np.ndarray, np.ndarray]:
@@ -55,7 +55,7 @@ def main():
     for case in cases_in(args.cases):
         truth = np.load(args.cases / case["truth"])
         X, Y, exact = (truth[name].astype(float) for name in ("dots_nominal", "dots_deformed", "uv_deformed"))
-        pixels, *others = (exact + NOISE * np.random.default_rng(k).standard_normal(exact.shape) for k in range(1 + n))
+        pixels, *others = (exact + LOCATION_NOISE * np.random.default_rng(k).standard_normal(exact.shape) for k in range(1 + n))
         for estimator in ("minimum-energy", "force-balance"):
             r = tm.Reconstructor.from_file(args.cases / case["sensor"], estimator)
             rest = r.rest_pixels.double().numpy()
@@ -64,7 +64,7 @@ def main():
             observed = torch.from_numpy(np.stack([pixels, *others, *wrong]))
             flow = (observed - torch.from_numpy(rest)).to(r.rest_pixels)
             with torch.no_grad():
-                suspect = (r.observer.screen(flow, torch.ones_like(flow[..., 0])) < FOUND).numpy()
+                suspect = (r.observer.screen(flow, torch.ones_like(flow[..., 0])) < FOUND_CONFIDENCE).numpy()
                 results = r.from_pixels(observed), believed(r, flow[-n:])
             error, spoiled = (np.sqrt(((x.markers.numpy() - Y) ** 2).sum((1, 2)) / ((Y - X) ** 2).sum()) for x in results)
             row = dict(clean=error[0], noise=error[1:-n], believed=np.nan_to_num(spoiled, nan=np.inf), screened=error[-n:])

@@ -26,7 +26,7 @@ from torchmembrane.simulate.dataset import stroke_to
 from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.simulator import Simulator
 
-CLOSE, NOISE, DEPTH = 0.25, 0.05, 0.1
+CLOSE, LOCATION_NOISE, DEPTH = 0.25, 0.05, 0.1
 SURFACES = {
     "dome": Surface("spherical_cap", {"rim_radius": 12.0, "height": 7.0, "base_z": 14.0}),
     "fingertip": Surface("ellipsoid_cap", {"semi_axes": [10.0, 8.0, 12.0], "base_z": 10.0}),
@@ -120,7 +120,7 @@ def main():
             stroke = stroke_to(simulator, Sphere(3.0), point, -point / np.linalg.norm(point), DEPTH * sensor.membrane.size)
             state = list(simulator.presses(stroke, ["push"], frames=1))[-1]
             dots = simulator.renderer.dots(state.vertices).pixels
-            seen.append(dots + NOISE * torch.from_numpy(rng.standard_normal(dots.shape)))
+            seen.append(dots + LOCATION_NOISE * torch.from_numpy(rng.standard_normal(dots.shape)))
             truths.append(state)
         for (kind, what), (wrong, camera) in mistakes(sensor).items():
             try:

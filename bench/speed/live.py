@@ -34,13 +34,13 @@ from torchmembrane.live.recording import Recording
 from torchmembrane.live.sources import Timed, paced
 from torchmembrane.live.streams import ModelStream, Stream, TrackedStream
 
-RATE, FRAMES, NOISE = 30.0, 40, 35.0
+RATE, FRAMES, NOISE_LEVEL = 30.0, 40, 35.0
 FRICTION, RADIUS, DEPTH, DRAG = 0.5, 4.0, 2.0, 2.5  # lengths in mm
 
 
 def rendered(sensor: tm.Sensor) -> list[np.ndarray]:
     """A ball presses and is dragged: grey images of 8 bits."""
-    simulator = tm.simulate.Simulator(sensor, grid=(37, 37), appearance=tm.simulate.Appearance(noise=NOISE))
+    simulator = tm.simulate.Simulator(sensor, grid=(37, 37), appearance=tm.simulate.Appearance(noise=NOISE_LEVEL))
     ball, half = tm.simulate.Sphere(RADIUS).touching(simulator.membrane, (0, 0, -1)), FRAMES // 2
     offsets = [(0, 0, -DEPTH * k / half) for k in range(half)] + [(DRAG * k / half, 0, -DEPTH) for k in range(half)]
     path = [ball.moved(offset) for offset in offsets]

@@ -20,7 +20,7 @@ import torch
 import torchmembrane as tm
 from bench.data.record import write
 from bench.robustness.fuzz import clear_peak, peak
-from bench.speed.scaling import NOISE, dome
+from bench.speed.scaling import NOISE_LEVEL, dome
 from torchmembrane.files.images import to_grey
 from torchmembrane.jobs.workers import frame_bytes
 from torchmembrane.sensor.parts import Markers
@@ -66,7 +66,7 @@ def main() -> None:
         pattern = Speckle(0.02 * base.membrane.size, 0) if args.kind == "texture" else None
         renderer = Renderer(dome(33, DOTS, width), base.grid, pattern)
         pair = [
-            to_grey((255 * noisy(renderer(x), NOISE, np.random.default_rng(seed))).round().byte().numpy())
+            to_grey((255 * noisy(renderer(x), NOISE_LEVEL, np.random.default_rng(seed))).round().byte().numpy())
             for seed, x in enumerate((base.membrane.rest, pressed))
         ]
         for lines in args.lines:

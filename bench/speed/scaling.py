@@ -30,7 +30,7 @@ from torchmembrane.simulate.indenters import Sphere
 from torchmembrane.simulate.render import Renderer
 from torchmembrane.simulate.simulator import Simulator
 
-RADIUS, BASE_Z, NOISE = 20.0, 4.0, 35.0
+RADIUS, BASE_Z, NOISE_LEVEL = 20.0, 4.0, 35.0
 USUAL = dict(lines=33, dots=150, width=640, batch=1)
 SWEEPS = dict(
     lines=(9, 13, 17, 25, 33, 49, 65),
@@ -57,7 +57,7 @@ def measured(settings: dict, base: Simulator, pressed: torch.Tensor, turns: int)
     bare, batch = dome(*(settings[key] for key in ("lines", "dots", "width"))), settings["batch"]
     renderer = Renderer(bare, base.grid)
     at_rest, image = (
-        torch.from_numpy(to_grey((255 * noisy(renderer(x), NOISE, np.random.default_rng(seed))).round().byte().numpy()))
+        torch.from_numpy(to_grey((255 * noisy(renderer(x), NOISE_LEVEL, np.random.default_rng(seed))).round().byte().numpy()))
         for seed, x in enumerate((base.membrane.rest, pressed))
     )
     sensor = replace(bare, markers=replace(bare.markers, rest_image=at_rest.numpy()))

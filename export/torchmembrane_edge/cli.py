@@ -21,6 +21,7 @@ from .images import Frame, frame_name, frames, numbered, pictures, view_frames
 from .session import MOST_THREADS, Session, model_file
 from .summary import UNREADABLE, Summary
 from .summary_row import AXES, CONTACTS, numbers
+from .view_status import status_in_words
 
 FINISHED = (0, 3, 7, 8, 9, 10)  # ok; not converged, unexplained, partly hidden, out of range, a view left out: it is kept
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".pgm", ".ppm")
@@ -192,7 +193,7 @@ def _kept(session: Session, frame: Frame, result: dict | None, seconds: float, s
         print(frame.says(frame.reason), file=sys.stderr)
         return UNREADABLE
     status = int(result["status"])
-    text, origin = session.status_text(status), frame.origin | {"seconds": seconds}
+    text, origin = status_in_words(session, result, frame.lacking), frame.origin | {"seconds": seconds}
     results.save(summary.path.parent / f"{frame.name}.npz", result | origin)
     summary.add(frame.name, frame.path, text, result, origin)
     if status:

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from hashlib import blake2b
-from itertools import count
+from itertools import count, zip_longest
 from math import nan
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,13 +43,14 @@ IMAGEJ = re.compile(r"ImageJ=.*^images=(\d+)", re.DOTALL | re.MULTILINE)
 
 class Frame(NamedTuple):
     """A frame to compute: `image [1, height, width]`, grey in 0..1, of several views a list of them, or the reason why there is
-    none; `origin`: of its file, as results hold it."""
+    none; `origin`: of its file, as results hold it; `lacking`: why views have no image, by their names: theirs is NaN."""
 
     name: str
     path: Path
     image: np.ndarray | list[np.ndarray] | None
     reason: str = ""
     origin: Mapping[str, Any] = {}
+    lacking: Mapping[str, str] = {}
 
     def says(self, message: str) -> str:
         """A line of a message about this frame."""
@@ -88,6 +89,8 @@ def frames(path: Path, size: tuple[int, int], bits: int | None = None) -> Iterat
 def view_frames(path: Path, views: Sequence[str], sizes: Sequence[tuple[int, int]], bits: int | None) -> Iterator[Frame]:
     """The same of several views that have files of their own, NAME_VIEW: an image of each, for `path`, the first view's.
 
+    A view without an image is left out of the frame; a frame without any has the reasons.
+
     Raises:
         EdgeError: the file is not named after the first view.
     """
@@ -95,12 +98,29 @@ def view_frames(path: Path, views: Sequence[str], sizes: Sequence[tuple[int, int
     if not path.stem.endswith(ending):
         raise EdgeError(f"{printable(path)}: expected the first view's image, NAME{ending}{path.suffix}, beside the others'")
     files = [path.with_name(f"{path.stem.removesuffix(ending)}_{view}{path.suffix}") for view in views]
-    for each in zip(*(frames(file, size, bits) for file, size in zip(files, sizes, strict=True)), strict=False):
-        failed = next((frame for frame in each if frame.image is None), None)
-        if failed is not None:
-            yield failed._replace(name=each[0].name)
-        else:
-            yield each[0]._replace(image=[frame.image for frame in each], origin=each[0].origin | _joined(files))
+    for each in zip_longest(*(frames(file, size, bits) for file, size in zip(files, sizes, strict=True))):
+        shown = [frame for frame in each if frame is not None and frame.image is not None]
+        lacking = {
+            view: "no picture at this moment" if frame is None else frame.reason
+            for view, frame in zip(views, each, strict=True)
+            if frame is None or frame.image is None
+        }
+        if not shown:
+            failed = next(frame for frame in each if frame is not None)
+            reason = "; ".join(f"view {view}: {said}" for view, said in lacking.items())
+            yield failed._replace(name=_of_first(path, failed), path=path, reason=reason)
+            continue
+        images = [
+            np.full((1, height, width), nan, np.float32) if view in lacking else frame.image
+            for view, frame, (width, height) in zip(views, each, sizes, strict=True)
+        ]
+        origin = {**shown[0].origin, "path": printable(path), **_joined([file for file in files if file.is_file()])}
+        yield Frame(_of_first(path, shown[0]), path, images, origin=origin, lacking=lacking)
+
+
+def _of_first(path: Path, frame: Frame) -> str:
+    """The name of a frame of several views, that of the first one's file with the number of the picture."""
+    return frame_name(path) + frame.name.removeprefix(frame_name(frame.path))
 
 
 def _joined(files: Sequence[Path]) -> dict[str, Any]:

@@ -95,7 +95,7 @@ def _mesh(found: dict[str, Any]) -> dict[str, Any]:
     found = {"camera_in_tool": []} | found
     if missing := [key for key in (*MESH_TEXTS, *MESH_ARRAYS) if key not in found]:
         raise ValueError(f"mesh lacks {missing[0]}")
-    if wrong := [key for key in MESH_TEXTS if not isinstance(found[key], str)]:
+    if wrong := [key for key in (*MESH_TEXTS, "view_names") if not isinstance(found.get(key, ""), str)]:
         raise ValueError(f"mesh: {wrong[0]} is not text")
     sizes: dict[str, int] = {}
     mesh = found | {key: _array(key, found[key], sizes) for key in MESH_ARRAYS}

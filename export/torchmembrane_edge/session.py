@@ -70,7 +70,7 @@ class Session:
 
         `images`: `[H, W]`, `[H, W, 3]`, `[B, H, W]`, `[B, 1 | 3, H, W]` or `[B, H, W, 1 | 3]`, grey or RGB; uint8, uint16 (of
         `bits`) or float in 0..1. A frame that cannot be reconstructed has a status and NaN. Of `views` a list of these, one for
-        each.
+        each; None, or NaN in some frames, of a view without images, which is left out.
         `previous`, for a model that tracks: the results of the frames before, where its dots are looked for first.
 
         Raises `EdgeError`: images of another shape, size or type, or results of other frames.
@@ -97,12 +97,19 @@ class Session:
         if self.views and not (isinstance(images, list | tuple) and len(images) == len(self.views)):
             raise EdgeError(f"images are not a list of {len(self.views)}; expected one with those of the views {views}")
         each = images if self.views else [images]
-        parts = [
-            grey(_arranged(_array(part), size), self.bits)[:, None] for part, size in zip(each, self.image_sizes, strict=True)
-        ]
-        if len({len(part) for part in parts}) > 1:
-            raise EdgeError(f"{[len(part) for part in parts]} images of the views {views}; expected as many of each")
-        return dict(zip(self._images, parts, strict=True))
+        parts = {
+            name: grey(_arranged(_array(part), size), self.bits)[:, None]
+            for name, part, size in zip(self._images, each, self.image_sizes, strict=True)
+            if not (self.views and part is None)
+        }
+        counts = [len(part) for part in parts.values()]
+        if len(set(counts)) != 1:
+            raise EdgeError(f"{counts} images of the views {views}; expected as many of each, of one view at least")
+        blank = {
+            name: np.full((counts[0], 1, height, width), np.nan, np.float32)
+            for name, (width, height) in zip(self._images, self.image_sizes, strict=True)
+        }
+        return {name: parts.get(name, blank[name]) for name in self._images}
 
     def track(self, images: Any) -> Iterator[dict[str, np.ndarray]]:
         """Results of a video's images, one after another, dots followed from each to the next (a generator)."""
@@ -114,7 +121,7 @@ class Session:
             raise EdgeError(f"track: {type(images).__name__}; expected a video's images, one after another")
         previous = None
         for image in images:
-            alone = [_array(each)[None] for each in image] if self.views else _array(image)[None]
+            alone = [each if each is None else _array(each)[None] for each in image] if self.views else _array(image)[None]
             previous = self.run(alone, previous)
             yield previous
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ..camera.targets import Checkerboard, DotBoard
     from .camera import CameraFit, Views, lens_from_views, ports_from_views
-    from .depth import DepthFit, rest_from_depth
+    from .depth import DepthFit, rest_from_depth, rest_from_depth_of_view
     from .detection import find_target
     from .fit import Fit
     from .known_modulus import KnownForces, KnownPressures
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "..camera.targets": ("Checkerboard", "DotBoard"),
     ".camera": ("CameraFit", "Views", "lens_from_views", "ports_from_views"),
-    ".depth": ("DepthFit", "rest_from_depth"),
+    ".depth": ("DepthFit", "rest_from_depth", "rest_from_depth_of_view"),
     ".detection": ("find_target",),
     ".fit": ("Fit",),
     ".known_modulus": ("KnownForces", "KnownPressures"),
@@ -68,6 +68,7 @@ __all__ = [
     "pixel_lattice",
     "ports_from_views",
     "rest_from_depth",
+    "rest_from_depth_of_view",
     "rest_from_image",
     "rest_from_view_images",
     "rest_from_views",

@@ -19,7 +19,7 @@ PORTS = ("port_distance", "port_thickness", "port_index", "medium_index")
 
 DESIGN = {"port_distance": 0.2, "port_thickness": 0.2, "port_index": 0.1, "medium_index": 0.1}
 """Relative standard deviation of the sensor file's values: what views leave open stays near them, with this uncertainty."""
-NOISE = 0.05  # px, of a point found in an image, before it is known
+LOCATION_NOISE = 0.05  # px, of a point found in an image, before it is known
 ROUNDS = 2  # of leaving out mistakes
 
 
@@ -170,7 +170,7 @@ class _BoardProblem:
         guess = {name: getattr(camera, name).numpy().ravel() for name in free}
         self.start = np.concatenate(list(guess.values()))
         self.design_precision = np.concatenate([1 / (values * spread.get(name, np.inf)) for name, values in guess.items()])
-        self.design_weight = self.design_precision * NOISE
+        self.design_weight = self.design_precision * LOCATION_NOISE
         self.count = len(self.start)
         self.outlines, self.pixels = torch.from_numpy(board.outlines), torch.from_numpy(views.pixels)
         self.filled = torch.from_numpy(views.filled)

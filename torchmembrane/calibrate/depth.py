@@ -1,5 +1,7 @@
-"""The rest surface from a depth image that is registered to the sensor's camera; dots placed on it."""
+"""The rest surface from a depth image that is registered to the sensor's camera, or to that of a view; dots placed on it."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -8,10 +10,12 @@ import torch
 from ..errors import MembraneError, check_arguments
 from ..files.grayscale import check_image
 from ..markers.placement import rim_mask
-from ..progress import Progress, silent
+from ..progress import Progress, silent, within
+from ..sensor.parts import Surface
 from ..sensor.sensor import Sensor
 from .surface import Correction, SurfaceProjection, correction, fine_surface, recalibrated, surface_projection
-from .views import placed_dots
+from .view_poses import placed_view, rest_from_view_images
+from .views import placed_dots, with_dots_of_each_view
 
 CELL = 24  # px: over such squares depths are averaged
 FEWEST = 8  # depths in a square
@@ -103,6 +107,65 @@ def rest_from_depth(sensor: Sensor, depth: np.ndarray, image: np.ndarray, *, pro
     dots, sizes = placed_dots(recalibrated(sensor, surface, change.vertices, None, None, image), image)
     moved = recalibrated(sensor, surface, change.vertices, dots, sizes, image)
     return DepthFit(moved, change, projection, deviations)
+
+
+def rest_from_depth_of_view(
+    sensor: Sensor, number: int, depth: np.ndarray, images: Sequence[np.ndarray], *, progress: Progress = silent
+) -> DepthFit:
+    """Rest surface of a sensor with several views from a depth image of one of them, the dots that any of them sees, and poses.
+
+    Surface and dots as of `rest_from_depth` in that view; each other camera then stands where its image shows these dots.
+
+    Args:
+        sensor: the design, with several views, their poses roughly.
+        number: number of the view to whose camera the depth image is registered, from 0.
+        depth: `[H, W]` z along that camera's axis, length unit; NaN, infinity or 0 where there is none.
+        images: of each view, `[H, W]` the membrane at rest, grey in 0..1.
+        progress: is told how far it is.
+
+    Returns:
+        As of `rest_from_depth`, the sensor with all views; what it rests on in the frame of the view.
+
+    Raises:
+        MembraneError: as of `rest_from_depth` and `rest_from_view_images`.
+
+    Limitations:
+        Where the view is not the first one, its pose in the file must be right to half the dots' pitch in the first image.
+
+    Example:
+        >>> from scipy.interpolate import griddata
+        >>> from torchmembrane import Camera
+        >>> from torchmembrane.sensor.views import View
+        >>> sensor = Sensor.from_file("examples/sensor.toml")
+        >>> image = sensor.markers.rest_image[::2, ::2]  # every other pixel, and a camera that sees them
+        >>> camera = Camera("fisheye", (320, 240), (80.0, 80.0), (161.05, 121.45))
+        >>> views = View("one", camera), View("two", camera)  # which stand at one place
+        >>> pair = replace(sensor, camera=camera, markers=replace(sensor.markers, rest_image=image), views=views)
+        >>> rest, (v, u) = pair.membrane.rest, np.mgrid[:240, :320]
+        >>> depth = griddata(camera.point_to_pixel(rest).numpy(), rest[:, 2].numpy(), (u, v))  # NaN beside the membrane
+        >>> found = rest_from_depth_of_view(pair, 0, depth, [image, image]).sensor
+        >>> bool(np.abs(found.views[1].pose.matrix - np.eye(4)).max() < 0.05), len(found.markers.positions)
+        (True, 121)
+    """
+    found = rest_from_depth(sensor.in_view(number), depth, images[number], progress=within(progress, 0.0, 0.6))
+    view, markers, values = sensor.views[number], found.sensor.markers, found.sensor.surface.values
+    shape = Surface("grid", {**values, "vertices": view.pose.points(values["vertices"])})
+    positions = view.pose.points(np.asarray(markers.positions))
+    views = tuple(replace(each, rest_image=image.astype(np.float32)) for each, image in zip(sensor.views, images, strict=True))
+    whole = replace(
+        sensor,
+        membrane=shape.membrane(sensor.membrane.grid),
+        surface=shape,
+        markers=replace(markers, positions=positions, rest_image=views[0].rest_image),
+        views=views,
+    )
+    progress(0.6, "where each view stands")
+    if number:
+        whole = rest_from_view_images(whole, images, progress=within(progress, 0.6, 0.9)).sensor
+    else:  # where the first view sees the surface is what the depths say
+        for further in range(1, len(views)):
+            whole, _ = placed_view(whole, further, images[further])
+    return found._replace(sensor=with_dots_of_each_view(whole, images))
 
 
 def _too_few(sensor: Sensor, depth: np.ndarray, squares: int) -> str:

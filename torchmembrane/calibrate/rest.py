@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd, vmap
 
+from ..camera.model import Camera
 from ..errors import MembraneError, check_arguments
 from ..files.grayscale import check_image
 from ..markers.dots.pattern import measure_dots
@@ -114,7 +115,7 @@ def rest_from_image(
     used[used] = ~outliers(result.residuals.reshape(-1, 2))
     result = fit(residuals, jacobian, result.values, "calibrate rest")
     found = result.values
-    result = with_common_errors(result, jacobian(found), shading_bias(sensor, pixels[used]).reshape(-1, 1))
+    result = with_common_errors(result, jacobian(found), shading_bias(sensor.camera, pixels[used]).reshape(-1, 1))
     rotation, offset = rotations(torch.from_numpy(found[:3])).numpy(), found[3:]
 
     def move(x: np.ndarray) -> np.ndarray:
@@ -165,9 +166,9 @@ def warn_of_press(sensor: Sensor, pixels: np.ndarray, residuals: np.ndarray) -> 
         )
 
 
-def shading_bias(sensor: Sensor, pixels: np.ndarray) -> np.ndarray:
+def shading_bias(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """One standard deviation of the error that dots located at `pixels [..., 2]` share, `[..., 2]` px."""
-    outwards = pixels - sensor.camera.centre.numpy()
+    outwards = pixels - camera.centre.numpy()
     return BIAS * outwards / np.linalg.norm(outwards, axis=-1, keepdims=True).clip(1)
 
 

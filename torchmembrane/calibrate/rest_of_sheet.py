@@ -110,7 +110,7 @@ def rest_of_sheet(sensor: Sensor, image: np.ndarray, overpressure: float | None,
             used[used] = ~outliers(result.residuals[: 2 * used.sum()].reshape(-1, 2))
         theta, noise = result.values, float(np.sqrt((result.residuals[: 2 * used.sum()] ** 2).mean()))
     jacobian = seen.jacobian(theta, used)
-    bias = np.concatenate([shading_bias(sensor, pixels[used]).ravel(), np.zeros(len(result.residuals) - 2 * used.sum())])
+    bias = np.concatenate([shading_bias(sensor.camera, pixels[used]).ravel(), np.zeros(len(result.residuals) - 2 * used.sum())])
     whole = np.concatenate([jacobian, noise * known[1]])
     result = with_common_errors(result, whole, bias[:, None])
     left = pixels - seen.modelled(torch.from_numpy(theta), np.ones(len(X), bool)).numpy()

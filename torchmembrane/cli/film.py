@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..results.read import Results
+    from ..results.store import Mesh
 
 DEFAULT_RATE = 10.0
 """Frames per second."""
@@ -20,18 +21,20 @@ class FrameImages:
 
     Args:
         files: of those that there are.
-        size: width and height that they must have, px.
+        mesh: of the results, which says how large they must be, and which part of them the first view is.
         bits: bits of the camera, where it is known that 16-bit files hold fewer.
     """
 
-    def __init__(self, files: Mapping[str, Path], size: tuple[int, int], bits: int | None = None):
-        self.files, self.size, self.bits = files, size, bits
+    def __init__(self, files: Mapping[str, Path], mesh: "Mesh", bits: int | None = None):
+        self.files, self.mesh, self.bits = files, mesh, bits
 
     def named(self, name: str) -> "np.ndarray | None":
-        """Grey values `[height, width]` in 0..1, or None."""
+        """Grey values `[height, width]` in 0..1, of several views the first one's; or None."""
         from ..files.images import read_image
 
-        return read_image(self.files[name], self.size, self.bits) if name in self.files else None
+        if name not in self.files:
+            return None
+        return self.mesh.first_region(read_image(self.files[name], self.mesh.file_size, self.bits))
 
 
 def images_in(folder: Path) -> dict[str, Path]:

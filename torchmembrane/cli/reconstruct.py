@@ -139,7 +139,7 @@ def run(arguments: Namespace) -> int:
         print(f"messages of {write_bag(bag, inputs, arguments.out)} frames in {arguments.bag}")
     if arguments.video_out is not None:
         files = {frame_name(path): path for path in inputs.images}
-        images = FrameImages(files, sensor.camera.image_size, sensor.camera.bits)
+        images = FrameImages(files, mesh, sensor.camera.bits)
         draw_film(read_results(arguments.out), images, arguments.video_out)
     print(f"frames: {_said(counts)}; results in {arguments.out}")
     return 1 if counts.failed else 0
@@ -147,10 +147,17 @@ def run(arguments: Namespace) -> int:
 
 def _inputs(arguments: Namespace, views: "list[str]") -> "Inputs":
     """What is to be reconstructed; of several views what there is of the first one."""
-    from ..jobs.inputs import find_inputs, of_first_view
+    from ..jobs.inputs import find_inputs, of_first_view, without_rest
+    from ..presets import sensor_file
+    from ..sensor.companions import files_of
 
     topics = of_each_view("--topic", "TOPIC", arguments.topic, views)
-    return of_first_view(find_inputs(arguments.images, arguments.video, next(iter(topics), None)), views, topics)
+    found = find_inputs(arguments.images, arguments.video, next(iter(topics), None))
+    inputs = of_first_view(without_rest(found, arguments.images, files_of(sensor_file(arguments.sensor))), views, topics)
+    if inputs.rest:
+        said = ", ".join(map(str, inputs.rest))
+        print(f"torchmembrane: left out, as it is the sensor's rest image: {said}", file=sys.stderr)
+    return inputs
 
 
 def _settings(reconstructor: "Reconstructor", arguments: Namespace, format: str) -> "Settings":

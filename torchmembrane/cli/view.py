@@ -79,9 +79,8 @@ def run(arguments: Namespace) -> int:
         return 0 if arguments.plot is not None else _draw(arguments)
     results, times = read_results(arguments.result), times_of(arguments.result)
     warn_of_times((name, times[name]) for name in results.names if name in times)
-    width, height = results.mesh.image_size.tolist()
     found = images_in(arguments.images or arguments.result / "images")
-    images = FrameImages(found, (width, height))
+    images = FrameImages(found, results.mesh)
     if arguments.sheet is not None:
         draw_sheet(results, images, arguments.sheet)
     if arguments.video_out is not None:
@@ -154,7 +153,7 @@ def _draw(arguments: Namespace) -> int:
         fields = save_surface(arguments.surface, frame, mesh)
         print(f"{name}: surface with {', '.join(fields)} in {arguments.surface}")
         return 0
-    image = read_image(arguments.image) if arguments.image else None
+    image = mesh.first_region(read_image(arguments.image)) if arguments.image else None
     drawing = figure(frame, mesh, image, name)
     if arguments.out is None and _has_display():
         show(drawing)

@@ -31,6 +31,7 @@ class Inputs(NamedTuple):
         topic: topic of the bags' images; None: the only one.
         views: names of the views that have images of their own; `images` and the videos that are no bags are the first one's.
         topics: topics of the bags' images of each of these views.
+        rest: images of the sensor at rest that were in a folder, and are left out.
     """
 
     images: list[Path]
@@ -38,6 +39,7 @@ class Inputs(NamedTuple):
     topic: str | None = None
     views: Sequence[str] = ()
     topics: Sequence[str] = ()
+    rest: Sequence[Path] = ()
 
     @property
     def image_topics(self) -> Sequence[str | None]:
@@ -126,6 +128,38 @@ def find_inputs(arguments: Iterable[str | Path], video: bool = False, topic: str
         if f"{image.stem}.npz" == MESH:
             raise MembraneError(f"{image}: its result would be {MESH}, which holds the mesh; rename the image")
     return inputs
+
+
+def without_rest(inputs: Inputs, arguments: Iterable[str | Path], files: Iterable[Path]) -> Inputs:
+    """Inputs without the sensor's rest images among what folders hold, unless there is nothing else.
+
+    `simulate` and calibration write the sensor's rest image beside the others; a file that is given by its own name stays.
+
+    Args:
+        inputs: as `find_inputs` gives them.
+        arguments: what it was given.
+        files: the sensor's, as of `files_of`.
+
+    Example:
+        >>> found = without_rest(find_inputs(["examples"]), ["examples"], [Path("examples/rest.png")])
+        >>> [path.name for path in found.rest], Path("examples/rest.png") in found.images
+        (['rest.png'], False)
+    """
+    folders = [Path(argument) for argument in arguments if Path(argument).is_dir()]
+    given = {path for path in map(Path, arguments) if path not in folders}
+    known = [path for path in files if path.suffix.lower() in IMAGES and path.is_file()]
+    rest = [
+        path
+        for path in inputs.images
+        if path.parent in folders and path not in given and any(_is_copy(path, image) for image in known)
+    ]
+    images = [path for path in inputs.images if path not in rest]
+    return inputs._replace(images=images, rest=rest) if images or inputs.videos else inputs
+
+
+def _is_copy(path: Path, other: Path) -> bool:
+    """Whether two files are the same to the byte."""
+    return path.stat().st_size == other.stat().st_size and path.read_bytes() == other.read_bytes()
 
 
 def of_first_view(inputs: Inputs, views: Sequence[str], topics: Sequence[str] = ()) -> Inputs:

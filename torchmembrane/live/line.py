@@ -60,7 +60,7 @@ def described(seen: LiveFrame, stats: StreamStats, mesh: Mesh) -> str:
         return f"{pace} | {status.text}{''.join(hints[:1])}"
     unit = "relative" if mesh.force_unit == "relative" else mesh.force_unit
     force, moment = (together(half, DIGITS) for half in seen.frame["wrench"].reshape(2, 3))
-    pressure = f"{seen.frame['pressure_change']:+.2g} {unit}/{mesh.length_unit}²"
+    pressure = mesh.pressure_in_words(float(seen.frame["pressure_change"]))
     left_out = status_in_words(seen.frame, mesh.view_names.split()).removeprefix(status.text)
     words = status.text.partition(":")[0] + left_out
     return f"{pace} | {words} | force {force} {unit} | moment {moment} {unit} {mesh.length_unit} | pressure {pressure}"

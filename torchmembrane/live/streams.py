@@ -114,12 +114,8 @@ class ModelStream:
         return completed({key: values[0] for key, values in self._before.items()})
 
     def _batch(self, image: Captured) -> Any:
-        """A batch of one as the model takes it; a view that lacks its image has NaN, so that it is left out."""
-        if isinstance(image, np.ndarray):
-            return image[None]
-        sizes = self._session.image_sizes
-        blanks = [np.full((1, height, width), np.nan, np.float32) for width, height in sizes]
-        return [blank if each is None else each[None] for each, blank in zip(image, blanks, strict=True)]
+        """A batch of one as the model takes it; a view without an image is left out."""
+        return image[None] if isinstance(image, np.ndarray) else [each if each is None else each[None] for each in image]
 
     def rezero(self) -> None:
         """Refused.

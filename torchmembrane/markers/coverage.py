@@ -6,13 +6,13 @@ from torch import Tensor, nn
 
 from ..surface.membrane import Membrane
 
-NEAREST = 4
+MARKERS_PER_VERTEX = 4
 """Markers that a vertex is asked of."""
-REACH = 1.5
+MARKER_REACH = 1.5
 """How far a marker sees, over the markers' spacing."""
 LEAST_COVERAGE = 0.85
 """Of what the markers see at rest: where they see less, a part of the membrane is hidden."""
-TURNED_AWAY = 0.5
+LEAST_FACING = 0.5
 """Of how a marker faces the camera at rest: one that faces it less is lost to the press, and hidden by nothing."""
 
 
@@ -43,9 +43,9 @@ class Coverage(nn.Module):
         self.views = len(seen) // len(positions)
         self.register_buffer("seen", seen)
         seen = seen.unflatten(0, (self.views, -1)).any(0)
-        reach = REACH * membrane.size / len(positions) ** 0.5
+        reach = MARKER_REACH * membrane.size / len(positions) ** 0.5
         distance = torch.where(seen, torch.cdist(membrane.rest, positions.to(membrane.rest)), torch.inf)
-        distance, nearest = distance.topk(min(NEAREST, len(positions)), largest=False)
+        distance, nearest = distance.topk(min(MARKERS_PER_VERTEX, len(positions)), largest=False)
         area = membrane.rest_area * (distance[:, 0] < reach)
         self.register_buffer("facing", facing)
         self.register_buffer("nearest", nearest)
@@ -62,7 +62,7 @@ class Coverage(nn.Module):
     def in_view(self, confidence: Tensor, facing: Tensor) -> Tensor:
         """The same, those counted too that the press has turned away: by how the markers on the surface found face the camera,
         `facing [B, D]`."""
-        turned = facing < TURNED_AWAY * self.facing
+        turned = facing < LEAST_FACING * self.facing
         if self.views > 1:  # from every view that saw it at rest
             turned = (turned | ~self.seen).unflatten(1, (self.views, -1)).all(1).repeat(1, self.views)
         counted: Tensor = self(torch.where(turned, 1.0, confidence))

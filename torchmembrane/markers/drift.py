@@ -18,18 +18,18 @@ from torch import Tensor
 
 from ..camera.motion import motion_of_pixels
 
-ORDER = 4
-"""Of the polynomials; lower where there are fewer than `PER_TERM` markers for each of their terms."""
-PER_TERM = 3
-MEMORY = 15
+POLYNOMIAL_ORDER = 4
+"""Of the polynomials; lower where there are fewer than `MARKERS_PER_TERM` markers for each of their terms."""
+MARKERS_PER_TERM = 3
+FRAMES_OF_MEAN = 15
 """Frames over which the mean runs."""
-ENOUGH = 10
+FEWEST_FRAMES = 10
 """Frames before anything is said."""
 LEAST_DRIFT = 0.02
 """px, rms: a drift that does not matter; some sensors take three times as much for a contact."""
-NEAR = 0.05
+NEAR_REST = 0.05
 """px, rms: a contact that moves the markers by less from where they lay without one is one that the drift makes."""
-CERTAIN = 6.0
+LEAST_CERTAINTY = 6.0
 """Standard deviations of a drift that is said."""
 LARGEST_ROUGHNESS = 0.04
 """Share of the mean displacement, squared and beyond its noise, that a smooth field leaves of a drift; a touch leaves more."""
@@ -39,7 +39,7 @@ class Drift(NamedTuple):
     """What a stream's frames without contact show.
 
     Attributes:
-        size: px, rms over the markers of the smooth field, beyond what noise explains; NaN before there are `ENOUGH` frames.
+        size: px, rms over the markers of the smooth field, beyond what noise explains; NaN before `FEWEST_FRAMES` frames.
         certainty: z, standard deviations beyond the noise and a drift that does not matter.
         roughness: share of the squared mean displacement that no smooth field explains, noise subtracted.
     """
@@ -51,7 +51,7 @@ class Drift(NamedTuple):
     @property
     def is_certain(self) -> bool:
         """Whether it is one, beyond chance."""
-        return self.certainty > CERTAIN and self.roughness < LARGEST_ROUGHNESS
+        return self.certainty > LEAST_CERTAINTY and self.roughness < LARGEST_ROUGHNESS
 
 
 class DriftWatch:
@@ -101,7 +101,7 @@ class DriftWatch:
         """One more frame: the markers' displacement from rest `[D, 2]` px, NaN where lost, and their confidence `[D]`."""
         moved, found = self._moved(displacement, confidence), (confidence > 0).cpu()[self.seen, None].double()
         self.frames += 1
-        gain = 1 / min(self.frames, MEMORY)
+        gain = 1 / min(self.frames, FRAMES_OF_MEAN)
         self.weight = self.weight + gain * (found - self.weight)
         self.mean = self.mean + gain / self.weight.clamp_min(gain) * (moved - self.mean)
         self.square += gain * (float(self._coefficients(moved).square().sum()) - self.square)
@@ -109,9 +109,9 @@ class DriftWatch:
 
     def is_near(self, displacement: Tensor, confidence: Tensor) -> bool:
         """Whether one more frame's markers lie where they have lain so far, as the arguments of `add`."""
-        if self.frames < ENOUGH:
+        if self.frames < FEWEST_FRAMES:
             return False
-        return self._size(self._coefficients(self._moved(displacement, confidence) - self.mean)) < NEAR
+        return self._size(self._coefficients(self._moved(displacement, confidence) - self.mean)) < NEAR_REST
 
     def is_rigid(self, displacement: Tensor, confidence: Tensor) -> bool:
         """Whether one frame's markers have moved as a moved camera makes them, beyond noise, and no press; arguments as of
@@ -120,11 +120,11 @@ class DriftWatch:
         S = float((whitened @ self.rigid).square().sum())
         terms = self.rigid.shape[1]
         rough = max(0.0, float(whitened.square().sum()) - S - (len(whitened) - terms))
-        return (S - terms) / (2 * terms) ** 0.5 > CERTAIN and rough < LARGEST_ROUGHNESS * (rough + S - terms)
+        return (S - terms) / (2 * terms) ** 0.5 > LEAST_CERTAINTY and rough < LARGEST_ROUGHNESS * (rough + S - terms)
 
     def drift(self) -> Drift:
         """What the frames so far show."""
-        if self.frames < ENOUGH:
+        if self.frames < FEWEST_FRAMES:
             return Drift(float("nan"), 0.0, 0.0)
         coefficients, (D, _, k) = self._coefficients(self.mean), self.fields.shape
         S = float(coefficients.square().sum())
@@ -157,7 +157,7 @@ class DriftWatch:
 
 def _polynomials(pixels: Tensor, image_size: tuple[int, int]) -> Tensor:
     """Monomials of `pixels [D, 2]` about the image's centre, over half its longer side, `[D, T]`."""
-    order = max(n for n in range(ORDER + 1) if n == 0 or PER_TERM * (n + 1) * (n + 2) / 2 <= len(pixels))
+    order = max(n for n in range(POLYNOMIAL_ORDER + 1) if n == 0 or MARKERS_PER_TERM * (n + 1) * (n + 2) / 2 <= len(pixels))
     size = torch.tensor(image_size, dtype=pixels.dtype)
     u, v = ((2 * pixels - size) / size.max()).unbind(-1)
     return torch.stack([u**i * v**j for i in range(order + 1) for j in range(order + 1 - i)], -1)

@@ -10,9 +10,9 @@ from .native_noise import kept_noises, noises
 STRIDE = 7  # px, between the places that are asked: at every phase of blocks of 8
 GAIN = 6  # of the second difference in u of that in v, in noise (Immerkaer 1996)
 EXPOSED = (0.03, 0.97)  # grey in which noise is not cut off
-LARGE = 100.0  # no difference of grey in 0..1 is as large
-CUT, ROUNDS = 3.0, 4
-BIAS = 0.753  # mean of |x| of what is within CUT times that mean, of a normal x of standard deviation 1
+NO_LIMIT = 100.0  # no difference of grey in 0..1 is as large
+OUTLIER_FACTOR, ROUNDS = 3.0, 4
+BIAS = 0.753  # mean of |x| of what is within OUTLIER_FACTOR times that mean, of a normal x of standard deviation 1
 
 
 def pixel_noise(images: Tensor) -> Tensor:
@@ -31,17 +31,17 @@ def pixel_noise(images: Tensor) -> Tensor:
     if images.dtype == torch.float32 and takes(images):
         found = images.new_empty(len(images))
         with kept_noises.compiling(np.dtype(np.float32)):
-            noises(images[:, 0].contiguous().numpy(), STRIDE, EXPOSED, CUT, ROUNDS, GAIN * BIAS, found.numpy())
+            noises(images[:, 0].contiguous().numpy(), STRIDE, EXPOSED, OUTLIER_FACTOR, ROUNDS, GAIN * BIAS, found.numpy())
         return found
     size = _second_difference(_second_difference(images, -2), -1).abs()
     middle = images[..., 1:-1:STRIDE, 1:-1:STRIDE]
-    size = torch.where((middle > EXPOSED[0]) & (middle < EXPOSED[1]), size, 2 * LARGE).flatten(1)[:, None]
+    size = torch.where((middle > EXPOSED[0]) & (middle < EXPOSED[1]), size, 2 * NO_LIMIT).flatten(1)[:, None]
     summands = torch.cat([size, torch.ones_like(size)], 1).mT
-    limit = torch.full_like(size[..., :1], LARGE)
+    limit = torch.full_like(size[..., :1], NO_LIMIT)
     for _ in range(ROUNDS):
         total, count = ((size <= limit).to(size.dtype) @ summands).split(1, -1)
         mean = total / count.clamp_min(1)
-        limit = CUT * mean
+        limit = OUTLIER_FACTOR * mean
     return mean[:, 0, 0] / (GAIN * BIAS)
 
 

@@ -16,15 +16,15 @@ from .locator import Locator, isotropic
 from .placement import FEWEST_MARKERS, PlacedMarkers
 from .screening import MismatchScreen
 
-NOISE = 0.05
+LOCATION_NOISE = 0.05
 """px, standard deviation of a marker in an image where nothing else is known."""
 MOST_NOISE = 100.0  # px
-FOUND = 0.5
+FOUND_CONFIDENCE = 0.5
 """Confidence above which a marker counts as found."""
 FEWEST_SHARE, ALIKE_SHARE = 0.1, 0.5  # of the markers: fewer found are too few, or an image unlike the rest image
 LARGEST_OFFSET = 0.005  # of the image's diagonal: rms, by which markers at rest may lie off the model's
 LEAST_CONTRAST, SATURATED_SHARE = 0.02, 0.98
-SPARSE = 4  # px: every so many rows and columns are asked whether they are saturated
+SATURATION_STRIDE = 4  # px: every so many rows and columns are asked whether they are saturated
 
 
 class MarkerFlow(NamedTuple):
@@ -81,7 +81,7 @@ class MarkerObserver(nn.Module):
         self.screen = MismatchScreen(markers.model_pixels, rim_pixels)
         self.register_buffer("rest_pixels", torch.from_numpy(markers.model_pixels))
         self.register_buffer("measured_rest", torch.from_numpy(markers.model_pixels))
-        self.register_buffer("rest_covariance", isotropic(self.rest_pixels[:, 0], NOISE))
+        self.register_buffer("rest_covariance", isotropic(self.rest_pixels[:, 0], LOCATION_NOISE))
         in_view = torch.from_numpy(markers.in_view)
         if in_view.sum() < FEWEST_MARKERS:
             raise MembraneError(
@@ -128,7 +128,9 @@ class MarkerObserver(nn.Module):
         nulled (5.2)."""
         with torch.no_grad(), using(is_used() and getattr(self.locator, "is_compiled", True)):
             pixels, confidence, covariance = self.locator(image[None, None])
-        found = (confidence > FOUND) & self.seen_at_rest  # what the model has outside cannot be one of the dots in view
+        found = (
+            confidence > FOUND_CONFIDENCE
+        ) & self.seen_at_rest  # what the model has outside cannot be one of the dots in view
         in_view = int(self.seen_at_rest.sum())
         if found.sum() < max(FEWEST_MARKERS, ALIKE_SHARE * in_view):
             raise MembraneError(
@@ -177,7 +179,7 @@ class MarkerObserver(nn.Module):
         """Pixels `[B, D, 2]` of the markers in grey images `[B, 1, height, width]`, and which of them are found `[B, D]`."""
         with torch.no_grad():
             pixels, confidence, _ = self.locator(images)
-        return pixels, confidence > FOUND
+        return pixels, confidence > FOUND_CONFIDENCE
 
     def forward(self, images: Tensor, previous: Tensor | None = None, rest_pixels: Tensor | None = None) -> MarkerFlow:
         """What grey images `[B, 1, height, width]` show.
@@ -194,7 +196,7 @@ class MarkerObserver(nn.Module):
     @traced
     def check(self, images: Tensor) -> Tensor:
         """Status `[B]` of images."""
-        flat, sparse = images.flatten(1), images[..., ::SPARSE, ::SPARSE]
+        flat, sparse = images.flatten(1), images[..., ::SATURATION_STRIDE, ::SATURATION_STRIDE]
         mean, low, high = flat.mean(1), flat.amin(1), flat.amax(1)
         bad = ~((mean < torch.inf) & (low > -1e-3) & (high < 1.001))  # one value that is not finite makes the mean so
         saturated = ((sparse - 0.5).abs() > 0.495).to(sparse.dtype).mean((1, 2, 3))
@@ -240,9 +242,9 @@ class MarkerObserver(nn.Module):
 
     def covariance_of(self, noise: float | None, confidence: Tensor) -> Tensor:
         """Of displacements `[B, D, 2, 2]` px^2 between pixels located elsewhere, now and at rest, each with this standard
-        deviation in u and v, px; default: `NOISE` now, and what the markers of the rest image have."""
+        deviation in u and v, px; default: `LOCATION_NOISE` now, and what the markers of the rest image have."""
         if noise is None:
-            return self.rest_covariance + isotropic(confidence, NOISE)
+            return self.rest_covariance + isotropic(confidence, LOCATION_NOISE)
         expect(0 < noise < MOST_NOISE, "noise of pixels", noise, f"more than 0 and less than {MOST_NOISE:g} px")
         return isotropic(confidence, 2**0.5 * noise)
 
@@ -264,7 +266,7 @@ class MarkerObserver(nn.Module):
     @traced
     def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
         """Displacements, zero where the frame is of no use; confidence, zero where a marker is lost; status."""
-        found = confidence > FOUND
+        found = confidence > FOUND_CONFIDENCE
         count, D = found.sum(-1), self.seen_at_rest.sum().float()
         unlike = Status.UNLIKE_REST.value * (count < ALIKE_SHARE * D).to(torch.int64)
         few = count < (FEWEST_SHARE * D).clamp_min(FEWEST_MARKERS)

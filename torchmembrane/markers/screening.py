@@ -9,7 +9,7 @@ from .neighbourhood import Neighbourhood
 from .spacing import spacing
 
 TOLERANCE = 0.2  # of the distance to the nearest marker: what a press may put between a displacement and its neighbours' fit
-FEWEST = 6
+FEWEST_NEIGHBOURS = 6
 
 
 class MismatchScreen(nn.Module):
@@ -40,8 +40,8 @@ class MismatchScreen(nn.Module):
     def __init__(self, pixels: np.ndarray, anchors: np.ndarray):
         super().__init__()
         pixels = np.asarray(pixels, float)
-        if len(pixels) < FEWEST:
-            raise MembraneError(f"MismatchScreen: {len(pixels)} markers; expected at least {FEWEST}")
+        if len(pixels) < FEWEST_NEIGHBOURS:
+            raise MembraneError(f"MismatchScreen: {len(pixels)} markers; expected at least {FEWEST_NEIGHBOURS}")
         self.neighbourhood = Neighbourhood(pixels, np.asarray(anchors, float))
         self.register_buffer("tolerance", torch.from_numpy(TOLERANCE * spacing(pixels)[0])[:, None])
 

@@ -15,7 +15,7 @@ from ..files.tensors import tensor_of
 from ..results.status import Status
 from .observer import MarkerFlow, MarkerObserver, RestState
 
-GRAVEST = (Status.BAD_VALUES, Status.BLANK, Status.TOO_FEW_MARKERS, Status.UNLIKE_REST)
+BY_GRAVITY = (Status.BAD_VALUES, Status.BLANK, Status.TOO_FEW_MARKERS, Status.UNLIKE_REST)
 """Of views that all fail: the first of these that one of them has is the frame's."""
 
 
@@ -138,7 +138,7 @@ class ViewsObserver(nn.Module):
         flow = self._together([part._replace(confidence=part.confidence * (part.status == 0)[:, None]) for part in judged])
         fails = flow.status != Status.OK.value
         gravest = torch.zeros_like(flow.status[:, 0])
-        for failure in reversed(GRAVEST):
+        for failure in reversed(BY_GRAVITY):
             gravest = torch.where((flow.status == failure.value).any(1), failure.value, gravest)
         left_out = torch.where(fails.any(1), Status.VIEW_LEFT_OUT.value, Status.OK.value)
         return flow._replace(status=torch.where(fails.all(1), gravest, left_out))

@@ -233,7 +233,7 @@ def _title(frame: dict[str, np.ndarray], mesh: Mesh, name: str) -> str:
     words = [name] * bool(name) + ["ok" if status == Status.OK else "NOT OK: " + Status(status).text.partition(":")[0]]
     if np.isfinite(frame["pressure_change"]):
         words += [
-            f"pressure change {frame['pressure_change']:+.3g} {_pressure_unit(mesh)}",
+            f"pressure change {mesh.pressure_in_words(float(frame['pressure_change']))}",
             f"residual {frame['residual'].max():.2f} px",
         ]
     return "    ".join(words)

@@ -21,7 +21,7 @@ from . import NAMES
 
 AIR = 1013.0  # hPa
 MARGIN = 0.93  # of the way from pole to rim that is dotted
-NOISE = 40.0  # dB below white
+NOISE_LEVEL = 40.0  # dB below white
 
 
 def fingertip() -> Sensor:
@@ -85,7 +85,7 @@ def _sensor(
     blank = Sensor(name, "mm", camera, membrane, material, Cavity("liquid"), markers, surface)
     if gas:
         blank = replace(blank, cavity=Cavity("gas", AIR + _overpressure(blank)))
-    image = noisy(Renderer(blank)(membrane.rest), NOISE, np.random.default_rng(0))
+    image = noisy(Renderer(blank)(membrane.rest), NOISE_LEVEL, np.random.default_rng(0))
     return replace(blank, markers=replace(markers, rest_image=to_grey((255 * image).round().byte().numpy())))
 
 

@@ -14,6 +14,7 @@ from ..pose import Pose
 from .frame_shapes import shape_mismatch
 from .npz import save_frame
 from .status import Status
+from .summary_row import METRE
 
 FINISHED = tuple(status for status in Status if status.has_surface)
 """Status of frames that are not tried again."""
@@ -97,6 +98,8 @@ class Mesh(NamedTuple):
                             sensor file has no `[tool]`; `tool` gives it as a `Pose`
     record          `[record]` of the sensor file as JSON: serial, calibrated, images, by, uncertainty; empty without
     view_names      of several views, separated by spaces; empty of one
+    image_part      [4]     int64, of views that are regions of one image: left and top of the first one, width and height of
+                            that image; [0] else
     """
 
     rest_vertices: np.ndarray
@@ -126,6 +129,7 @@ class Mesh(NamedTuple):
     camera_in_tool: np.ndarray = np.zeros((0, 4), np.float32)
     record: str = ""
     view_names: str = ""
+    image_part: np.ndarray = np.zeros(0, np.int64)
 
     @classmethod
     def from_reconstructor(cls, reconstructor: ResultMaker, settings: Settings) -> "Mesh":
@@ -148,6 +152,7 @@ class Mesh(NamedTuple):
             camera_in_tool=_rows(sensor.tool),
             record=sensor.record.text,
             view_names=" ".join(view.name for view in sensor.views),
+            image_part=_image_part(sensor),
         )
 
     @classmethod
@@ -197,6 +202,8 @@ class Mesh(NamedTuple):
             "vertex_pixels": (V, 2),
             "rest_pixels": (*self.rest_pixels.shape[:-1], 2),
         }
+        if self.image_part.size:
+            wanted["image_part"] = (4,)
         if self.camera_in_tool.size:  # none is `[0]` as `torchmembrane-edge` once wrote it
             wanted["camera_in_tool"] = (3, 4)
         for name, shape in wanted.items():
@@ -224,6 +231,24 @@ class Mesh(NamedTuple):
         """The camera's pose in the tool's frame, as `Reconstruction.wrench_in` takes it; None where it is not known."""
         known = len(self.camera_in_tool) > 0
         return Pose(self.camera_in_tool[:, :3], self.camera_in_tool[:, 3]) if known else None
+
+    def pressure_in_words(self, pressure: float) -> str:
+        """A pressure of the results with its sign and unit: hPa, as in `summary.csv`, where forces are in N."""
+        if self.force_unit != "N" or self.length_unit not in METRE:
+            return f"{pressure:+.3g} {self.force_unit}/{self.length_unit}²"
+        return f"{pressure * METRE[self.length_unit] ** 2 / 100:+.3g} hPa"
+
+    @property
+    def file_size(self) -> tuple[int, int]:
+        """Width and height of the image files, px: of regions that of the image that they share."""
+        width, height = self.image_part[2:].tolist() or self.image_size.tolist()
+        return width, height
+
+    def first_region(self, image: np.ndarray) -> np.ndarray:
+        """The first view's region of an image file's grey values `[height, width]`; the whole where views share no image."""
+        left, top = self.image_part[:2].tolist() or (0, 0)
+        width, height = self.image_size.tolist()
+        return image[top : top + height, left : left + width] if image.shape == self.file_size[::-1] else image
 
     def normal_displacement(self, frame: dict[str, np.ndarray]) -> np.ndarray:
         """Displacement along the rest normals, `[V]`, length unit: negative where the membrane is pressed in."""
@@ -259,6 +284,12 @@ def _rows(pose: Pose | None) -> np.ndarray:
     """Rotation and translation side by side, `[3, 4]`; `[0, 4]` without a pose."""
     rows = np.zeros((0, 4)) if pose is None else np.column_stack([pose.rotation, pose.translation])
     return rows.astype(np.float32)
+
+
+def _image_part(sensor: Any) -> np.ndarray:
+    """Left and top of the first view's region, and the size of the image that views share; `[0]` where they share none."""
+    region = sensor.views[0].region if sensor.views else None
+    return np.array([] if region is None else [*region[:2], *sensor.image_size], np.int64)
 
 
 def _single(values: Tensor) -> np.ndarray:

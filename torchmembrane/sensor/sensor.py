@@ -122,6 +122,24 @@ class Sensor:
             views=(),
         )
 
+    def with_camera(self, camera: Camera, number: int = 0) -> "Sensor":
+        """The sensor with another lens or other ports of its camera, or of that of a view.
+
+        Args:
+            camera: the camera, in the pixels of that view's images.
+            number: number of the view, from 0.
+
+        Example:
+            >>> sensor = Sensor.from_file("examples/sensor.toml")
+            >>> sensor.with_camera(Camera("pinhole", (640, 480), (350, 350), (320, 240))).camera.model
+            'pinhole'
+        """
+        if not self.views:
+            return replace(self, camera=camera)
+        views = list(self.views)
+        views[number] = views[number].with_camera(camera)
+        return replace(self, camera=views[0].camera, views=tuple(views))
+
     def refuse_views(self, owner: str) -> None:
         """Refuse a sensor with several views where only one is taken.
 

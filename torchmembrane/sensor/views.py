@@ -1,7 +1,7 @@
 """Several views of one membrane: cameras, or mirrors, each with its pose, and the rest surface as each of them sees it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -65,6 +65,25 @@ class View:
     def region(self) -> tuple[int, int, int, int] | None:
         """Left, top, width, height in the shared image, px; None: the view has images of its own."""
         return tuple(self.camera.mode.crop) if self.is_region and self.camera.mode is not None else None  # type: ignore[return-value]
+
+    def with_camera(self, camera: Camera) -> "View":
+        """The view with another lens or other ports, found in its own images; of a region the camera is of the region's pixels.
+
+        Example:
+            >>> whole = Camera("pinhole", (640, 480), (400, 400), (320, 240))
+            >>> right = View("right", whole.in_mode((320, 0, 320, 480)), is_region=True)
+            >>> found = right.with_camera(Camera("pinhole", (320, 480), (410, 410), (2, 240)))
+            >>> found.region, found.camera.focal.tolist(), found.camera.mode.centre
+            ((320, 0, 320, 480), [410.0, 410.0], (322.0, 240.0))
+        """
+        if self.region is None or self.camera.mode is None:
+            return replace(self, camera=camera)
+        left, top, _, _ = self.region
+        u, v = camera.centre.tolist()
+        lens = camera.focal.tolist(), (u + left, v + top), camera.distortion.tolist()
+        beyond: dict[str, Any] = dict(ports=camera.ports, medium_index=camera.medium_index.item(), bits=camera.bits)
+        whole = Camera(camera.model, self.camera.mode.image_size, *lens, **beyond)
+        return replace(self, camera=whole.in_mode(self.region))
 
     def membrane(self, membrane: Membrane) -> Membrane:
         """The membrane in the view's frame; its outward normals point away from the view's camera, also of one outside."""

@@ -67,11 +67,16 @@ def _run(module: str, step: str, arguments: Namespace) -> int:
     return int(getattr(import_module(f".{module}", __name__), step)(arguments))
 
 
+def _view_option(add: Add, whose: str) -> None:
+    add("--view", metavar="NAME", help=f"of a sensor with several views, the one {whose}")
+
+
 def _camera_options(add: Add) -> None:
     corners = count_pair("two counts, COLUMNS,ROWS")
     add("images", metavar="IMAGES", nargs="+", help="images of the checkerboard in different poses, filling the image")
     add("--corners", metavar="COLUMNS,ROWS", type=corners, required=True, help="inner corners of the checkerboard")
     add("--square", metavar="LENGTH", type=positive, required=True, help="side of its squares, in the sensor's unit")
+    _view_option(add, "whose lens is to be found, by its images of the checkerboard")
 
 
 def _ports_options(add: Add) -> None:
@@ -86,6 +91,7 @@ def _ports_options(add: Add) -> None:
         help="radius of dots (default: 0.22 pitches; the three marks: 1.7 times that)",
     )
     add("--held", metavar="NAME", nargs="+", choices=PORTS, default=[], help=f"taken as known: {', '.join(PORTS)}")
+    _view_option(add, "through whose ports the images were taken")
 
 
 def _rest_options(add: Add) -> None:
@@ -100,11 +106,14 @@ def _views_options(add: Add) -> None:
         "images",
         metavar="IMAGES",
         nargs="+",
-        help="images of the membrane at rest; the first by the camera as it is in the sensor",
+        help="images of the membrane at rest; the first by the camera as it is in the sensor; of a sensor with several views "
+        "one of each, NAME_VIEW, or the image whose regions they are",
     )
     where = "CSV x,y,z,turn_x,turn_y,turn_z: where the camera was for each image, roughly, in its first frame; degrees"
-    add("--motions", metavar="FILE.csv", type=Path, required=True, help=where)
-    scale = "standard deviation of the second image's travel, which sets the scale, in the sensor's unit (default: 0.01 mm)"
+    where += "; not for a sensor with several views, in whose file the poses are"
+    add("--motions", metavar="FILE.csv", type=Path, help=where)
+    scale = "standard deviation of the second camera's distance from the first, which sets the scale, in the sensor's unit"
+    scale += " (default: 0.01 mm)"
     add("--travel-error", metavar="LENGTH", type=positive, help=scale)
 
 
@@ -113,7 +122,9 @@ def _depth_options(add: Add) -> None:
     add("depth", metavar="DEPTH", type=Path, help=where)
     step = "of one step of its values, in the sensor's unit (default: of images of 16 bits 1 mm, else that unit)"
     add("--unit", metavar="LENGTH", type=positive, help=step)
-    add("--image", metavar="REST.png", required=True, help="the membrane at rest, to find the dots in")
+    at_rest = "the membrane at rest, to find the dots in; of several views the first one's, NAME_VIEW, or the shared image"
+    add("--image", metavar="REST.png", required=True, help=at_rest)
+    _view_option(add, "to whose camera the depth image is registered")
 
 
 def _material_options(add: Add) -> None:

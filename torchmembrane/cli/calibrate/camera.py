@@ -1,7 +1,6 @@
-"""The steps `camera` and `ports`: the camera from images of boards."""
+"""The steps `camera` and `ports`: the camera, or that of one of several views, from images of boards."""
 
 from argparse import Namespace
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,28 +12,29 @@ from ...camera.targets import Checkerboard, DotBoard
 from ...errors import MembraneError
 from ...plot.calibration import fit_figure
 from ...sensor.sensor import Sensor
-from .files import read_sensor, read_targets, write_calibrated
+from .files import read_sensor, read_targets, view_number, write_calibrated
 
 
 def camera(arguments: Namespace) -> int:
     """`torchmembrane calibrate camera`"""
-    sensor, (columns, rows) = read_sensor(arguments), arguments.corners
-    board = Checkerboard(columns, rows, arguments.square)
-    pixels = read_targets(arguments.images, sensor, board)
+    whole, (columns, rows) = read_sensor(arguments), arguments.corners
+    number, board = view_number(arguments, whole), Checkerboard(columns, rows, arguments.square)
+    pixels, sensor = read_targets(arguments.images, whole, number, board), whole.in_view(number)
     found = lens_from_views(sensor.camera, board, Views(pixels, np.zeros(len(pixels), bool)))
     try:
         refuse_folds(found.camera, sensor.membrane.rest)
     except MembraneError as error:
         raise MembraneError(f"calibrate camera: of the lens found {error}") from error
     units = [{"focal": "px", "centre": "px"}.get(name.split("[")[0], "") for name in found.names]
-    return _write(arguments, sensor, found, pixels, units, f"lens: {sensor.camera.model}, {len(pixels)} images")
+    return _write(arguments, whole, number, found, pixels, units, f"lens: {sensor.camera.model}, {len(pixels)} images")
 
 
 def ports(arguments: Namespace) -> int:
     """`torchmembrane calibrate ports`"""
-    sensor, (columns, rows) = read_sensor(arguments), arguments.dots
-    board = DotBoard(columns, rows, arguments.pitch, arguments.radius)
-    sets = [read_targets(images, sensor, board) for images in (arguments.air, arguments.medium) if images]
+    whole, (columns, rows) = read_sensor(arguments), arguments.dots
+    number, board = view_number(arguments, whole), DotBoard(columns, rows, arguments.pitch, arguments.radius)
+    sensor = whole.in_view(number)
+    sets = [read_targets(images, whole, number, board) for images in (arguments.air, arguments.medium) if images]
     if not sets:
         raise MembraneError("calibrate ports: no images; expected --air IMAGES, --medium IMAGES, best both")
     pixels = np.concatenate(sets)
@@ -42,14 +42,19 @@ def ports(arguments: Namespace) -> int:
     found = ports_from_views(sensor.camera, board, Views(pixels, filled), arguments.held)
     units = ["" if "index" in name else sensor.length_unit for name in found.names]
     title = f"ports: {(~filled).sum()} images in air, {filled.sum()} in the medium"
-    return _write(arguments, sensor, found, pixels, units, title)
+    return _write(arguments, whole, number, found, pixels, units, title)
 
 
-def _write(arguments: Namespace, sensor: Sensor, found: CameraFit, pixels: np.ndarray, units: list[str], title: str) -> int:
-    design = [_value(sensor.camera, name) for name in found.names]
+def _write(
+    arguments: Namespace, sensor: Sensor, number: int, found: CameraFit, pixels: np.ndarray, units: list[str], title: str
+) -> int:
+    camera = sensor.in_view(number).camera
+    design = [_value(camera, name) for name in found.names]
+    if sensor.views:
+        title = f"view {sensor.views[number].name!r}: {title}"
     report = Report.from_fit(title, found.names, units, design, found.fit, pixels, found.residuals)
-    drawing = fit_figure(report, sensor.camera.image_size)
-    return write_calibrated(arguments, replace(sensor, camera=found.camera), report, drawing, len(pixels))
+    drawing = fit_figure(report, camera.image_size)
+    return write_calibrated(arguments, sensor.with_camera(found.camera, number), report, drawing, len(pixels))
 
 
 def _value(camera: Camera, name: str) -> float:

@@ -46,19 +46,24 @@ FILES = ("image", "depth", "motions", "forces", "pressure", "pixels")
 """Arguments of the steps that name files to read: images, and single files."""
 
 
-def read_sensor(arguments: Namespace, with_views: bool = False) -> Sensor:
-    """The sensor that the arguments name; `with_views`: it may have several.
+def read_sensor(arguments: Namespace) -> Sensor:
+    """The sensor that the arguments name."""
+    return Sensor.from_file(sensor_file(arguments.sensor))
+
+
+def view_number(arguments: Namespace, sensor: Sensor) -> int:
+    """The number of the view that `--view` names; 0 of a sensor with one camera.
 
     Raises:
-        MembraneError: it cannot be read, or has several views: what is found of one would not be that of the others.
+        MembraneError: none of several views is named, or one that there is not.
     """
-    sensor = Sensor.from_file(sensor_file(arguments.sensor))
-    if sensor.views and not with_views:
-        raise MembraneError(
-            f"calibrate: {arguments.sensor} has {len(sensor.views)} views; expected one: calibrate each in a file of its own "
-            "with [camera], and put the values that are found into its [[camera]]"
-        )
-    return sensor
+    names = [view.name for view in sensor.views]
+    if not names and arguments.view is not None:
+        raise MembraneError(f"calibrate: --view {arguments.view}: {arguments.sensor} has one camera; leave --view out")
+    if names and arguments.view not in names:
+        given = "no --view" if arguments.view is None else f"--view {arguments.view}"
+        raise MembraneError(f"calibrate: {given}: {arguments.sensor} has several views; expected --view {' | '.join(names)}")
+    return names.index(arguments.view) if names else 0
 
 
 def spare_files(step: str, arguments: Namespace) -> None:
@@ -104,16 +109,19 @@ def write_calibrated(
     return 0
 
 
-def read_sensor_image(path: str | Path, sensor: Sensor) -> np.ndarray:
-    """An image `[H, W]` that must be as large as the sensor's."""
-    return read_image(path, sensor.camera.image_size, sensor.camera.bits)
+def read_sensor_image(path: str | Path, sensor: Sensor, number: int = 0) -> np.ndarray:
+    """An image `[H, W]` of the sensor's camera; of several views that of one of them, or its region of the one that they share.
 
-
-def read_first_image(path: str | Path, sensor: Sensor) -> np.ndarray:
-    """The image `[H, W]` of the camera, or the first view's, its own or its region of the one that views share."""
-    if not sensor.views or sensor.views_apart:
-        return read_sensor_image(path, sensor)
-    return read_view_images(path, sensor)[0]
+    Args:
+        path: path of the image, which must be as large as the camera's, or as the shared one.
+        sensor: the sensor.
+        number: number of the view, from 0.
+    """
+    camera = sensor.views[number].camera if sensor.views else sensor.camera
+    if not sensor.views or sensor.views[number].region is None or camera.mode is None:
+        return read_image(path, camera.image_size, camera.bits)
+    region: np.ndarray = camera.mode.image(read_image(path, sensor.image_size, camera.bits))
+    return region
 
 
 def read_view_images(path: str | Path, sensor: Sensor) -> list[np.ndarray]:
@@ -122,27 +130,41 @@ def read_view_images(path: str | Path, sensor: Sensor) -> list[np.ndarray]:
     Raises:
         MembraneError: one is missing, or of another size.
     """
-    views, names = sensor.views, sensor.views_apart
-    if names:
-        files = zip(view_files(Path(path), names), views, strict=True)
-        return [read_image(file, view.camera.image_size, view.camera.bits) for file, view in files]
-    shared = read_image(path, sensor.image_size, sensor.camera.bits)
-    return [view.camera.mode.image(shared) for view in views if view.camera.mode is not None]
+    names = sensor.views_apart
+    files = view_files(Path(path), names) if names else [Path(path)] * len(sensor.views)
+    return [read_sensor_image(file, sensor, number) for number, file in enumerate(files)]
 
 
-def read_targets(images: Sequence[str], sensor: Sensor, board: Checkerboard | DotBoard) -> np.ndarray:
-    """The board's points in every image that shows it, `[P, D, 2]`; an image that shows none is reported and left out."""
+def read_targets(images: Sequence[str], sensor: Sensor, number: int, board: Checkerboard | DotBoard) -> np.ndarray:
+    """The board's points in every image that shows it, `[P, D, 2]`; an image that shows none is reported and left out.
+
+    Args:
+        images: files, patterns, folders.
+        sensor: the sensor.
+        number: number of the view whose images they are, from 0; a mirror shows the board reversed.
+        board: the board.
+    """
     found, reason, paths = [], "", single_images(find_inputs(images))
+    mirrored = bool(sensor.views) and sensor.views[number].pose.determinant < 0
     for path in paths:
-        image = read_sensor_image(path, sensor)
+        image = read_sensor_image(path, sensor, number)
         try:
-            found.append(find_target(image, board))
+            found.append(reversed_target(image, board) if mirrored else find_target(image, board))
         except MembraneError as error:
             reason = str(error)
             print(f"{path} left out: {error}")
     if not found:
         raise MembraneError(f"calibrate: no image of {len(paths)} shows {board}: {reason}")
     return np.stack(found)
+
+
+def reversed_target(image: np.ndarray, board: Checkerboard | DotBoard) -> np.ndarray:
+    """The board's points `[D, 2]` in an image `[H, W]` that shows it in a mirror.
+
+    Its points lie in a plane, so that a reflected pose of them is a rotated one, too: a lens fits them as it does others.
+    """
+    u, v = find_target(np.ascontiguousarray(image[:, ::-1]), board).T
+    return np.stack([image.shape[1] - 1 - u, v], -1)
 
 
 def read_motions(path: Path) -> np.ndarray:

@@ -22,18 +22,18 @@ from ...results.status import Status
 from ...sensor.inflated import InflatedSurface
 from ...sensor.sensor import Sensor
 from ..progress import ProgressDisplay
-from .files import read_first_image, read_forces, read_sensor, write_calibrated
+from .files import read_forces, read_sensor, read_sensor_image, write_calibrated
 
 
 def material(arguments: Namespace) -> int:
     """`torchmembrane calibrate material`"""
-    whole = read_sensor(arguments, with_views=True)
+    whole = read_sensor(arguments)
     sensor, inputs = whole.in_view(0), of_first_view(find_inputs(arguments.images), whole.views_apart)
     paths = single_images(inputs)
     alone = arguments.weight is not None and not (arguments.forces or arguments.pressure or arguments.overpressure)
     forces = known_forces(arguments, inputs)
     pressures = _pressures(arguments, inputs, sensor) if arguments.pressure else None
-    images = torch.from_numpy(np.stack([read_first_image(path, whole) for path in paths]))[:, None]
+    images = torch.from_numpy(np.stack([read_sensor_image(path, whole) for path in paths]))[:, None]
     with ProgressDisplay("calibrate material") as progress:
         weighed = material_from_weight(sensor, images, arguments.weight, progress=progress) if alone else None
         known = dict(overpressure=arguments.overpressure, rest_error=arguments.rest_error, progress=progress)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from scipy.linalg import block_diag
 
-from ...calibrate.depth import rest_from_depth
+from ...calibrate.depth import rest_from_depth, rest_from_depth_of_view
 from ...calibrate.fit import Fit
 from ...calibrate.report import Report
 from ...calibrate.rest import RestFit, rest_from_image
@@ -15,13 +15,21 @@ from ...calibrate.surface import Correction, fine_surface
 from ...calibrate.view_poses import rest_from_view_images
 from ...calibrate.views import rest_from_views
 from ...errors import MembraneError
-from ...jobs.inputs import find_inputs, single_images
+from ...jobs.inputs import find_inputs, of_first_view, single_images
 from ...plot.calibration import fit_figure, surface_figure
 from ...sensor.inflated import InflatedSurface
 from ...sensor.sensor import Sensor
 from ...sensor.units import hectopascal
 from ..progress import ProgressDisplay
-from .files import read_depth, read_motions, read_sensor, read_sensor_image, read_view_images, write_calibrated
+from .files import (
+    read_depth,
+    read_motions,
+    read_sensor,
+    read_sensor_image,
+    read_view_images,
+    view_number,
+    write_calibrated,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +37,7 @@ if TYPE_CHECKING:
 
 def rest(arguments: Namespace) -> int:
     """`torchmembrane calibrate rest`"""
-    sensor = read_sensor(arguments, with_views=True)
+    sensor = read_sensor(arguments)
     if sensor.views:
         return _rest_of_views(arguments, sensor)
     image = read_sensor_image(arguments.image, sensor)
@@ -96,35 +104,59 @@ def _held(sensor: Sensor, gauge: float | None) -> list[str]:
 
 def views(arguments: Namespace) -> int:
     """`torchmembrane calibrate views`"""
-    sensor, motions = read_sensor(arguments), read_motions(arguments.motions)
-    paths = single_images(find_inputs(arguments.images))
-    if len(paths) != len(motions):
-        raise MembraneError(f"{arguments.motions}: {len(motions)} lines of motions; expected {len(paths)}, one for each image")
-    images = [read_sensor_image(path, sensor) for path in paths]
+    sensor = read_sensor(arguments)
+    images, motions = _from_several_places(arguments, sensor)
     with ProgressDisplay("calibrate views") as progress:
         found = rest_from_views(sensor, images, motions, arguments.travel_error, progress=progress)
-    unit, P = sensor.length_unit, len(motions)
-    design = np.concatenate([motions[1:, 3:], motions[1:, :3]], 1).ravel()
+    unit, P = sensor.length_unit, len(images)
     rms = np.sqrt((found.deviations**2).mean(0))
     notes = [
         f"{len(found.dots)} dots, standard deviations along x, y, z {rms[0]:.3g}, {rms[1]:.3g}, {rms[2]:.3g} {unit}",
         _moved(found.surface, unit),
     ]
+    if alone := len(found.sensor.markers.sizes or ()) - len(found.dots):
+        notes.append(f"{alone} more dots, each seen by one view alone, placed on that surface")
     units = (["degrees"] * 3 + [unit] * 3) * (P - 1)
     modelled = found.sensor.camera.point_to_pixel(torch.from_numpy(found.dots)).numpy()
     pixels = np.broadcast_to(modelled, found.residuals.shape)
     title = f"rest surface from {P} views"
-    report = Report.from_fit(title, found.names, units, design, found.fit, pixels, found.residuals, notes)
+    report = Report.from_fit(title, found.names, units, found.first_guess, found.fit, pixels, found.residuals, notes)
     return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface), P)
+
+
+def _from_several_places(arguments: Namespace, sensor: Sensor) -> tuple[list[np.ndarray], np.ndarray | None]:
+    """Images by one camera that moved, and its motions; or one image of each of several views.
+
+    Raises:
+        MembraneError: another number of images than of motions, no motions of one camera, or motions of several views.
+    """
+    paths = single_images(of_first_view(find_inputs(arguments.images), sensor.views_apart))
+    if sensor.views:
+        if arguments.motions is not None or len(paths) != 1:
+            given = f"{len(paths)} frames{'' if arguments.motions is None else ' and --motions'}"
+            raise MembraneError(
+                f"calibrate views: {given}; expected one frame, an image of each view of {arguments.sensor}, and no motions: "
+                "its poses are the first guess"
+            )
+        return read_view_images(paths[0], sensor), None
+    if arguments.motions is None:
+        raise MembraneError("calibrate views: no --motions; expected a table of where the camera was for each image")
+    motions = read_motions(arguments.motions)
+    if len(paths) != len(motions):
+        raise MembraneError(f"{arguments.motions}: {len(motions)} lines of motions; expected {len(paths)}, one for each image")
+    return [read_sensor_image(path, sensor) for path in paths], motions
 
 
 def depth(arguments: Namespace) -> int:
     """`torchmembrane calibrate depth`"""
     sensor = read_sensor(arguments)
-    values = read_depth(arguments.depth, arguments.unit, sensor.length_unit)
-    image = read_sensor_image(arguments.image, sensor)
+    number, values = view_number(arguments, sensor), read_depth(arguments.depth, arguments.unit, sensor.length_unit)
+    images = read_view_images(arguments.image, sensor) if sensor.views else [read_sensor_image(arguments.image, sensor)]
     with ProgressDisplay("calibrate depth") as progress:
-        found = rest_from_depth(sensor, values, image, progress=progress)
+        if sensor.views:
+            found = rest_from_depth_of_view(sensor, number, values, images, progress=progress)
+        else:
+            found = rest_from_depth(sensor, values, images[0], progress=progress)
     unit = sensor.length_unit
     notes = [
         f"{len(found.deviations)} squares of depths, each known to {np.median(found.deviations):.3g} {unit}",
@@ -132,7 +164,7 @@ def depth(arguments: Namespace) -> int:
         f"{len(found.sensor.markers.sizes or ())} dots placed on the surface",
     ]
     report = Report.without_parameters("rest surface from a depth image", notes)
-    return write_calibrated(arguments, found.sensor, report, _drawn(sensor, report, found.surface), 1)
+    return write_calibrated(arguments, found.sensor, report, _drawn(sensor.in_view(number), report, found.surface), len(images))
 
 
 def _drawn(sensor: Sensor, report: Report, surface: Correction) -> "Figure":

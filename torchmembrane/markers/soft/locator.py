@@ -15,20 +15,20 @@ from ..locator import LocatedMarkers, isotropic
 from ..neighbourhood import NeighbourFlow, Neighbourhood
 from ..spacing import spacing, thin_out
 from .response import pyramid
-from .search import WIDTH, DotGrowth, DotSearch, Found, predict
+from .search import AVERAGING_WIDTH, DotGrowth, DotSearch, Found, predict
 
-NOISE = 0.05  # px, of a dot in an image
-NEAR = 1.0  # radii, standard deviation of where a dot is expected on the fine level
+LOCATION_NOISE = 0.05  # px, of a dot in an image
+FINE_PREDICTION_ERROR = 1.0  # radii, standard deviation of where a dot is expected on the fine level
 
-MIDDLE = 0.5  # grey of which the logarithm is taken for 0
-DARKEST = 0.15  # of it, what the darkest has at least: noise in the dark weighs no more than that
+REFERENCE_GREY = 0.5  # grey of which the logarithm is taken for 0
+LEAST_GREY_SHARE = 0.15  # of it, what the darkest has at least: noise in the dark weighs no more than that
 REFINEMENTS = 2  # soft-argmaxes on the fine level after the first, each about what the neighbours make of the one before
-FAINTEST = 0.2  # of a drawn dot's contrast, of a dot that is half believed
-FAINTER = 0.45  # of the mean contrast of the frame's clearer half
-UNLED = 0.4  # share of the large dots around a small one that are found, where it is half believed
-DEVIATION = 0.12  # of the distance to the nearest dot, what is expected between a flow and its neighbours'
-FEWEST = 0.2  # mean confidence of a frame that is half trusted
-LOST = 0.05  # confidence below which a dot is lost
+LEAST_DOT_CONTRAST = 0.2  # of a drawn dot's contrast, of a dot that is half believed
+LEAST_RELATIVE_CONTRAST = 0.45  # of the mean contrast of the frame's clearer half
+LEAST_LED_SHARE = 0.4  # share of the large dots around a small one that are found, where it is half believed
+FLOW_TOLERANCE = 0.12  # of the distance to the nearest dot, what is expected between a flow and its neighbours'
+LEAST_MEAN_CONFIDENCE = 0.2  # mean confidence of a frame that is half trusted
+LOST_CONFIDENCE = 0.05  # confidence below which a dot is lost
 
 
 class SoftLocator(nn.Module):
@@ -36,7 +36,7 @@ class SoftLocator(nn.Module):
 
     Large dots are grown from the rim inwards on a coarse level, small ones looked for where the large ones around predict
     them (the paper's multi-scale matching, section 5); then all are refined on a fine level. A dot's weight in a window is
-    a power of its response, a difference of Gaussians at its scale (`search.FINE`: a fixed temperature).
+    a power of its response, a difference of Gaussians at its scale (`search.FINE_TEMPERATURE`: a fixed temperature).
 
     Args:
         pattern: the markers in the rest image.
@@ -96,9 +96,9 @@ class SoftLocator(nn.Module):
         large, small = np.flatnonzero(largest), np.flatnonzero(~largest)
         self.growth = DotGrowth(pixels[large], radii[large], others[large], anchors, inside)
         self.by_large = DotSearch(radii[small], others[small], 1, 0.2 * nearest[small], inside) if len(small) else None
-        self.refine = DotSearch(radii, others, -1, NEAR * radii, inside)
+        self.refine = DotSearch(radii, others, -1, FINE_PREDICTION_ERROR * radii, inside)
         nodes = np.concatenate([pixels, thin_out(anchors, 0.7 * float(np.median(mean)))])
-        self.averages = FlowAverages(pixels, nodes, WIDTH)
+        self.averages = FlowAverages(pixels, nodes, AVERAGING_WIDTH)
         self.neighbourhood = Neighbourhood(pixels, nodes[len(pixels) :])
         lead = self.averages.kernel[np.append(largest, np.ones(len(nodes) - len(pixels), bool))]
         lead, of_rim = np.split(lead / lead.sum(0), [len(large)])
@@ -110,7 +110,7 @@ class SoftLocator(nn.Module):
         self.register_buffer("lead", torch.as_tensor(lead))
         self.register_buffer("led_by_rim", torch.as_tensor(of_rim.sum(0)))
         self.register_buffer("is_small", torch.as_tensor(~largest))
-        self.register_buffer("tolerance", torch.as_tensor(DEVIATION * nearest)[:, None])
+        self.register_buffer("tolerance", torch.as_tensor(FLOW_TOLERANCE * nearest)[:, None])
         self._calibrate(draw_dots(pixels, shapes, image_size))
         self.float()
 
@@ -157,7 +157,7 @@ class SoftLocator(nn.Module):
 
     def levels(self, dark: Tensor) -> list[Tensor]:
         """Pyramid of the logarithm of images `[B, 1, H, W]`, in which uneven light only adds; zero off the membrane."""
-        return pyramid((dark.clamp(0, 1) / MIDDLE + DARKEST).log() * self.inside)
+        return pyramid((dark.clamp(0, 1) / REFERENCE_GREY + LEAST_GREY_SHARE).log() * self.inside)
 
     @traced
     def join(self, large: Tensor, small: Tensor) -> Tensor:
@@ -211,19 +211,21 @@ class SoftLocator(nn.Module):
     def quality(self, found: Found) -> Tensor:
         """How much each dot looks like one, `[B, D]` in 0..1: dark as drawn and as the others, and sharp."""
         level = found.response.topk(found.response.shape[1] // 2, 1).values.mean(1, keepdim=True)
-        alike = torch.sigmoid(20 * (found.response / (level + 1e-3) - FAINTER))
-        return torch.sigmoid(30 * (found.response - FAINTEST)) * alike * found.sharpness
+        alike = torch.sigmoid(20 * (found.response / (level + 1e-3) - LEAST_RELATIVE_CONTRAST))
+        return torch.sigmoid(30 * (found.response - LEAST_DOT_CONTRAST)) * alike * found.sharpness
 
     @traced
     def decide(self, place: Tensor, expected: Tensor, confidence: Tensor, usable: Tensor) -> LocatedMarkers:
         """As `judge`, from what `compare` gives."""
         if self.by_large is not None:
-            led = torch.sigmoid(20 * (confidence[:, self.large] @ self.lead + self.led_by_rim - UNLED))
+            led = torch.sigmoid(20 * (confidence[:, self.large] @ self.lead + self.led_by_rim - LEAST_LED_SHARE))
             confidence = confidence * torch.where(self.is_small, led, 1.0)
-        confidence = confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - FEWEST)) * usable[:, None]
-        confidence = ((confidence - LOST) / (1 - LOST)).relu()
+        confidence = (
+            confidence * torch.sigmoid(40 * (confidence.mean(-1, keepdim=True) - LEAST_MEAN_CONFIDENCE)) * usable[:, None]
+        )
+        confidence = ((confidence - LOST_CONFIDENCE) / (1 - LOST_CONFIDENCE)).relu()
         pixels = torch.where(confidence[..., None] > 0, place, expected)
-        return LocatedMarkers(pixels, confidence, isotropic(confidence, NOISE))
+        return LocatedMarkers(pixels, confidence, isotropic(confidence, LOCATION_NOISE))
 
 
 def _other_radii(pixels: np.ndarray, radii: np.ndarray, largest: np.ndarray) -> np.ndarray:

@@ -12,11 +12,11 @@ from ...control_flow import traced
 from ..texture.pyramid import low_pass
 
 LEVELS = 5  # of the pyramid, by halves
-COARSEST = 1.5  # px, least radius of a dot on the coarsest level that still shows its shape
-RUNG = 1.6**0.5  # ratio of neighbouring Gaussians; a response is the difference of two that are two rungs apart
+LEAST_RADIUS = 1.5  # px, least radius of a dot on the coarsest level that still shows its shape
+SIGMA_RATIO = 1.6**0.5  # ratio of neighbouring Gaussians; a response is the difference of two that are two rungs apart
 LEAST_SHARE = 0.02  # of a Gaussian that is on the membrane, where its mean is taken for one
-OTHER = 0.75  # share of the other size's response that is taken off at most
-DISC = 2 / np.e  # Laplacian of Gaussian at the centre of a disc of radius `2^0.5 sigma`, its largest
+MOST_TAKEN_OFF = 0.75  # share of the other size's response that is taken off at most
+DISC_RESPONSE = 2 / np.e  # Laplacian of Gaussian at the centre of a disc of radius `2^0.5 sigma`, its largest
 
 
 class Windows(NamedTuple):
@@ -30,7 +30,7 @@ def disc_response(radius: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """`sigma^2` times the Laplacian of Gaussian at the centre of a disc, of contrast 1.
 
     Example:
-        >>> bool(np.isclose(disc_response(np.array(3.0), np.array(3 / 2**0.5)), DISC))
+        >>> bool(np.isclose(disc_response(np.array(3.0), np.array(3 / 2**0.5)), DISC_RESPONSE))
         True
     """
     ratio = np.square(radius / sigma)
@@ -70,13 +70,13 @@ class DotResponse(nn.Module):
 
     def __init__(self, radii: np.ndarray, others: np.ndarray, coarser: int, reach: np.ndarray, inside: Tensor):
         super().__init__()
-        level = (np.floor(np.log2(np.maximum(radii / COARSEST, 1))).astype(int) + coarser).clip(max(coarser, 0), LEVELS - 1)
+        level = (np.floor(np.log2(np.maximum(radii / LEAST_RADIUS, 1))).astype(int) + coarser).clip(max(coarser, 0), LEVELS - 1)
         stride, masks = 2.0**level, pyramid(inside.double())
         self.levels = [int(k) for k in np.unique(level)]
         fits = min((min(masks[k].shape[-2:]) - 1) // 2 for k in self.levels)
         self.half_width = max(1, min(int(np.ceil((reach / stride).max())), fits))
         sigma, other = (r / 2**0.5 / stride for r in (radii, np.where(np.isfinite(others), others, radii)))
-        share = np.minimum(disc_response(2**0.5 * other, sigma) / DISC, OTHER)
+        share = np.minimum(disc_response(2**0.5 * other, sigma) / DISC_RESPONSE, MOST_TAKEN_OFF)
         self.rungs: dict[int, list[int]] = {}
         dots = [np.flatnonzero(level == k) for k in self.levels]
         for k, on_level in zip(self.levels, dots, strict=True):
@@ -87,7 +87,7 @@ class DotResponse(nn.Module):
 
     def _register_level(self, k: int, dots: np.ndarray, sigma: np.ndarray, other: np.ndarray, mask: Tensor) -> None:
         """Which dots have their response on level `k`, in which of its maps, and where in them a window's pixels are."""
-        own, its_other = (np.round(np.log(s[dots]) / np.log(RUNG)).astype(int) for s in (sigma, other))
+        own, its_other = (np.round(np.log(s[dots]) / np.log(SIGMA_RATIO)).astype(int) for s in (sigma, other))
         self.rungs[k] = sorted({*own.tolist(), *its_other.tolist()})
         height, width = mask.shape[-2:]
         step = np.arange(-self.half_width, self.half_width + 1)
@@ -134,8 +134,8 @@ class DotResponse(nn.Module):
 
 
 def gaussians(image: Tensor, rungs: list[int]) -> Tensor:
-    """Blurred images `[B, scales, h, w]` of `image [B, 1, h, w]`: by `RUNG ** rung` for the neighbours of each of `rungs`."""
-    return torch.cat([_blurred(image, RUNG**rung) for rung in _with_neighbours(rungs)], 1)
+    """Blurred images `[B, scales, h, w]` of `image [B, 1, h, w]`: by `SIGMA_RATIO ** rung`, of the neighbours of `rungs`."""
+    return torch.cat([_blurred(image, SIGMA_RATIO**rung) for rung in _with_neighbours(rungs)], 1)
 
 
 def _with_neighbours(rungs: list[int]) -> list[int]:

@@ -13,16 +13,16 @@ from ..spacing import spacing, thin_out
 from .argmax import Peak, window_peak
 from .response import DotResponse
 
-COARSE, FINE = 0.25, 0.3
+COARSE_TEMPERATURE, FINE_TEMPERATURE = 0.25, 0.3
 """Temperatures of the softmax, of the logarithm of the response: weights are powers of it, whatever the contrast."""
 WINDOW = 2.0  # half side of a window, standard deviations of the prediction
-FLOOR = 0.01  # of a drawn dot's response: what is weaker is no peak
-BLUNT = 2.5  # times its spread at rest, of a peak that is half believed
-WIDTH = 1.0  # of the averages that predict, pitches
-UNSUPPORTED = 0.8  # sure nodes, weighted by distance, of a prediction that is half believed
-PER_RING = 2  # steps in which the growth gains a ring: the second settles the flow from which the next is predicted
-SETTLING = 3  # steps after the growth has reached every dot
-FAINT = 0.05  # of a drawn dot's response, of a peak that is half believed in the growth
+RESPONSE_FLOOR = 0.01  # of a drawn dot's response: what is weaker is no peak
+LARGEST_RELATIVE_SPREAD = 2.5  # times its spread at rest, of a peak that is half believed
+AVERAGING_WIDTH = 1.0  # of the averages that predict, pitches
+LEAST_SUPPORT = 0.8  # sure nodes, weighted by distance, of a prediction that is half believed
+STEPS_PER_RING = 2  # steps in which the growth gains a ring: the second settles the flow from which the next is predicted
+SETTLING_STEPS = 3  # steps after the growth has reached every dot
+LEAST_GROWTH_RESPONSE = 0.05  # of a drawn dot's response, of a peak that is half believed in the growth
 
 
 class Found(NamedTuple):
@@ -53,7 +53,7 @@ class DotSearch(nn.Module):
 
     def __init__(self, radii: np.ndarray, others: np.ndarray, coarser: int, error: np.ndarray, inside: Tensor):
         super().__init__()
-        self.temperature = COARSE if coarser > 0 else FINE
+        self.temperature = COARSE_TEMPERATURE if coarser > 0 else FINE_TEMPERATURE
         self.response = DotResponse(radii, others, coarser, WINDOW * error, inside)
         self.register_buffer("error", torch.as_tensor(error))
         self.register_buffer("strength", torch.ones(len(radii), dtype=torch.float64))
@@ -69,12 +69,12 @@ class DotSearch(nn.Module):
     def forward(self, maps: Sequence[Tensor], predicted: Tensor) -> Found:
         """The dots about `predicted [B, D, 2]` px, from the responses on each level."""
         peak = self._peak(maps, predicted)
-        sharpness = torch.sigmoid(4 * (BLUNT - peak.spread / self.spread))
+        sharpness = torch.sigmoid(4 * (LARGEST_RELATIVE_SPREAD - peak.spread / self.spread))
         return Found(peak.place, (peak.strength / self.strength).relu(), sharpness)
 
     def _peak(self, maps: Sequence[Tensor], predicted: Tensor) -> Peak:
         value, middle = self.response.windows(maps, predicted)
-        score = ((value / self.strength[:, None, None]).relu() + FLOOR).log()
+        score = ((value / self.strength[:, None, None]).relu() + RESPONSE_FLOOR).log()
         return window_peak(score, value, middle, self.response.stride, predicted, self.error, self.temperature)
 
 
@@ -100,9 +100,9 @@ class DotGrowth(nn.Module):
         nearest, mean = spacing(pixels)
         anchors = thin_out(anchors, 0.7 * float(np.median(mean)))
         self.search = DotSearch(radii, others, 1, 0.3 * nearest, inside)
-        self.averages = FlowAverages(pixels, np.concatenate([pixels, anchors]), WIDTH)
+        self.averages = FlowAverages(pixels, np.concatenate([pixels, anchors]), AVERAGING_WIDTH)
         known = np.full(len(pixels), 0.0 if len(anchors) else 1.0)
-        self.steps = PER_RING * self.averages.rings(np.append(known, np.ones(len(anchors)))[None]) + SETTLING
+        self.steps = STEPS_PER_RING * self.averages.rings(np.append(known, np.ones(len(anchors)))[None]) + SETTLING_STEPS
         self.register_buffer("pixels", torch.as_tensor(pixels))
         self.register_buffer("known", torch.as_tensor(known))
 
@@ -137,7 +137,7 @@ class DotGrowth(nn.Module):
         """One step of the growth: weight `[B, D]`, flow `[B, D, 2]` and its gradient `[B, D, 2, 2]` after it."""
         predicted, gradient, support = predict(self.averages, weight, flow, gradient)
         found = self.search(maps, self.pixels + predicted)
-        believed = torch.sigmoid(10 * (support - UNSUPPORTED)) * found.response / (found.response + FAINT)
+        believed = torch.sigmoid(10 * (support - LEAST_SUPPORT)) * found.response / (found.response + LEAST_GROWTH_RESPONSE)
         return believed * found.sharpness, found.place - self.pixels, gradient
 
     @traced

@@ -8,13 +8,13 @@ from ...control_flow import traced
 from ..locator import LocatedMarkers
 from ..texture.locator import PatchLocator
 from ..texture.pyramid import low_pass_pyramid, sample
-from ..texture.template import RADIUS, Template, normalised_correlation, square_offsets
+from ..texture.template import PATCH_RADII, Template, normalised_correlation, square_offsets
 from .argmax import Peak, window_peak
 
 TEMPERATURE = 0.025  # of the softmax, of correlation
 STAGES = ((2, 7, 1.0), (2, 3, 1.0), (1, 3, 0.5), (0, 3, 0.3), (0, 2, 0.3))
 """Level of the pyramid, half side of the shifts tried in px of it, and tolerance of the neighbours' fit in px."""
-LIKENESS = (0.5, 0.3)  # correlation from which a patch is believed, and over which it comes to be wholly so
+BELIEVED_CORRELATION = (0.5, 0.3)  # correlation from which a patch is believed, and over which it comes to be wholly so
 
 
 class PatchCorrelation(nn.Module):
@@ -89,7 +89,7 @@ class SoftTextureLocator(PatchLocator):
         super().__init__(rest_image, pixels, anchors)
         levels = self.rest_levels(rest_image)
         self.stages = nn.ModuleList(
-            PatchCorrelation(levels[k], self.rest_pixels / 2**k, RADIUS[k], reach) for k, reach, _ in STAGES
+            PatchCorrelation(levels[k], self.rest_pixels / 2**k, PATCH_RADII[k], reach) for k, reach, _ in STAGES
         )
         self.to(torch.float32)
 
@@ -111,7 +111,7 @@ class SoftTextureLocator(PatchLocator):
         gradient = torch.zeros_like(flow)[..., None].expand(-1, -1, -1, 2)
         for (k, _, tolerance), stage in zip(STAGES, self.stages, strict=True):
             found, peak = stage(images[k], flow / 2**k, gradient)
-            found, weight = 2**k * found, ((peak.strength - LIKENESS[0]) / LIKENESS[1]).clamp(0, 1)
+            found, weight = 2**k * found, ((peak.strength - BELIEVED_CORRELATION[0]) / BELIEVED_CORRELATION[1]).clamp(0, 1)
             flow, local = self.settle(found, weight, flow, tolerance)
             gradient = local.gradient
         confidence = weight * local.trust(found) * finite.flatten(1).all(1)[:, None]

@@ -16,9 +16,9 @@ from ...errors import MembraneError
 from ..locator import LocatedMarkers, isotropic
 from ..neighbourhood import NEIGHBOURS, NeighbourFlow, Neighbourhood
 from .pyramid import LEVELS, low_pass_pyramid
-from .template import RADIUS, Search, Template
+from .template import PATCH_RADII, Search, Template
 
-NOISE = 0.1  # px, of a patch in an image
+LOCATION_NOISE = 0.1  # px, of a patch in an image
 LOST_WEIGHT = 1e-3  # of a lost patch's predicted flow in its neighbours' fits: it counts only where none of them is found
 
 
@@ -85,7 +85,7 @@ class PatchLocator(nn.Module):
     def located(self, found: Tensor, confidence: Tensor, local: NeighbourFlow) -> LocatedMarkers:
         """The patches with the flow `found [B, D, 2]`, or what their neighbours predict where the `confidence [B, D]` is 0."""
         pixels = self.rest_pixels + torch.where((confidence > 0)[..., None], found, local.flow)
-        return LocatedMarkers(pixels, confidence, isotropic(confidence, NOISE))
+        return LocatedMarkers(pixels, confidence, isotropic(confidence, LOCATION_NOISE))
 
 
 class TextureLocator(PatchLocator):
@@ -120,7 +120,7 @@ class TextureLocator(PatchLocator):
     def __init__(self, rest_image: np.ndarray, pixels: np.ndarray, anchors: np.ndarray | None = None):
         super().__init__(rest_image, pixels, anchors)
         levels = enumerate(self.rest_levels(rest_image))
-        templates = [Template(rest, self.rest_pixels / 2**level, RADIUS[level]) for level, rest in levels]
+        templates = [Template(rest, self.rest_pixels / 2**level, PATCH_RADII[level]) for level, rest in levels]
         self.templates = nn.ModuleList(templates)
         self.search = Search(templates[-1])
         self.to(torch.float32)

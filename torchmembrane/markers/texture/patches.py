@@ -5,7 +5,7 @@ from scipy.ndimage import binary_erosion, gaussian_filter
 
 from ...errors import MembraneError
 from ...files.levels import too_few_bits
-from .template import RADIUS
+from .template import PATCH_RADII
 
 WEAKEST_GRADIENT = 0.01  # grey per px, rms over the patch in its weakest direction: 1 % noise then moves it by 0.05 px
 
@@ -61,5 +61,5 @@ def choose_patches(image: np.ndarray, mask: np.ndarray, count: int = 1200) -> np
 def weakest_gradient(image: np.ndarray) -> np.ndarray:
     """Root of the structure tensor's smaller eigenvalue `[H, W]`, grey per px, over about a patch of `image [H, W]`."""
     v, u = np.gradient(gaussian_filter(np.asarray(image, float), 1.0))
-    uu, uv, vv = (gaussian_filter(product, RADIUS[0] / 2) for product in (u * u, u * v, v * v))
+    uu, uv, vv = (gaussian_filter(product, PATCH_RADII[0] / 2) for product in (u * u, u * v, v * v))
     return np.sqrt(np.maximum((uu + vv) / 2 - np.sqrt((uu - vv) ** 2 / 4 + uv**2), 0.0))

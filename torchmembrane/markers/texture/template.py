@@ -8,9 +8,9 @@ from torch.nn import functional as F
 
 from .pyramid import sample
 
-REACH = 7  # px of the coarsest level searched to each side: 28 px of the image
-RADIUS = (8, 8, 6)  # px of the level, half side of a patch, finest level first
-WIDTH = 0.6  # standard deviation of a patch's Gaussian window over its half side
+SEARCH_REACH = 7  # px of the coarsest level searched to each side: 28 px of the image
+PATCH_RADII = (8, 8, 6)  # px of the level, half side of a patch, finest level first
+WINDOW_WIDTH = 0.6  # standard deviation of a patch's Gaussian window over its half side
 WARP_DAMPING = 1e-3  # grey^2: keeps weak texture from bending a patch's own affine map with the noise
 
 
@@ -51,7 +51,7 @@ class Template(nn.Module):
     def __init__(self, rest: Tensor, centre: Tensor, radius: int):
         super().__init__()
         offset = square_offsets(radius)
-        weight = torch.exp(-offset.square().sum(-1) / (2 * (WIDTH * radius) ** 2))
+        weight = torch.exp(-offset.square().sum(-1) / (2 * (WINDOW_WIDTH * radius) ** 2))
         weight = weight / weight.sum()
         still = torch.eye(2).to(rest)[None, None]
         half = 0.5 * torch.eye(2).to(rest)
@@ -117,7 +117,7 @@ def normalised_correlation(window: Tensor, unit: Tensor, weight: Tensor) -> Tens
 
 
 class Search(nn.Module):
-    """Exhaustive normalised correlation of the coarsest templates over all shifts up to `REACH`."""
+    """Exhaustive normalised correlation of the coarsest templates over all shifts up to `SEARCH_REACH`."""
 
     centre: Tensor
     offset: Tensor
@@ -128,9 +128,9 @@ class Search(nn.Module):
 
     def __init__(self, template: Template):
         super().__init__()
-        side, shift = 2 * RADIUS[-1] + 1, square_offsets(REACH)
+        side, shift = 2 * PATCH_RADII[-1] + 1, square_offsets(SEARCH_REACH)
         self.register_buffer("centre", template.centre.clone())
-        self.register_buffer("offset", square_offsets(RADIUS[-1] + REACH))
+        self.register_buffer("offset", square_offsets(PATCH_RADII[-1] + SEARCH_REACH))
         self.register_buffer("unit", template.unit.reshape(-1, 1, side, side).clone())
         self.register_buffer("weight", template.weight.reshape(1, 1, side, side).clone())
         self.register_buffer("shift", shift)
