@@ -175,9 +175,7 @@ def views(found: dict) -> Rows:
 
 def deep_and_soft_views(deep: dict, soft: dict) -> Rows:
     """The same of deep presses alone, and of soft sensors alone."""
-    chosen = [
-        [band for band in found["bands"] if band["group"] == group] for found, group in ((deep, "deep"), (soft, "soft"))
-    ]
+    chosen = [[band for band in found["bands"] if band["group"] == group] for found, group in ((deep, "deep"), (soft, "soft"))]
     return views(dict(bands=[*chosen[0], *chosen[1]]))
 
 

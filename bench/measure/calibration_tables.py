@@ -50,6 +50,23 @@ def calibration_steps(found: dict) -> Rows:
     return [["step", "deviations", "worst"], *rows]
 
 
+def interval_coverage(found: dict) -> Rows:
+    """How often one standard deviation holds the truth, and how wide it is."""
+    rows = []
+    for group in found["groups"]:
+        told = [
+            f"{held:.0%}, {width:.1%}".replace("%", " %") for held, width in zip(group["held"], group["width"], strict=True)
+        ]
+        off = "all" if group["off"] is None else f"{group['off']:.0%}".replace("%", " %")
+        rows.append([off, str(group["sensors"]), *told])
+    return [["height stated to", "windows", "prestretch", "modulus", "force of a third press"], *rows]
+
+
+def coverage_summary(results: dict) -> dict:
+    """Of all windows together, and by how well their height is known."""
+    return dict(groups=results["groups"])
+
+
 def calibrated_surfaces(found: dict) -> Rows:
     """Errors of dots and of surfaces, before and after."""
     rows = []

@@ -136,12 +136,14 @@ PARTS = {
     "ablation": Part("bench.accuracy.ablation CASES", CASES, data="cases"),
     "gauge": Part("bench.accuracy.gauge DATA", RANDOM, data="gauge"),
     "views": Part("bench.accuracy.views --first 1 --sensors 20 --presses 3", (*RANDOM, "torchmembrane/simulate")),
+    "calibration-coverage": Part(
+        "bench.accuracy.calibration_coverage --seed 3 --sensors 102",
+        ("torchmembrane/calibrate", "torchmembrane/forming", "torchmembrane/presets", "bench/accuracy/windows.py"),
+    ),
     "views-deep": Part(
         "bench.accuracy.views --first 1 --sensors 20 --presses 3 --depth 0.2,0.3", (*RANDOM, "torchmembrane/simulate")
     ),
-    "views-soft": Part(
-        "bench.accuracy.views --first 40 --sensors 20 --presses 3 --soft", (*RANDOM, "torchmembrane/simulate")
-    ),
+    "views-soft": Part("bench.accuracy.views --first 40 --sensors 20 --presses 3 --soft", (*RANDOM, "torchmembrane/simulate")),
     "knocked": Part("bench.accuracy.knocked --first 1 --sensors 10 --presses 3", (*RANDOM, "torchmembrane/simulate")),
     "light": Part("bench.accuracy.range DATA --only light", RANDOM, data="light"),
     "intervals": Part(f"bench.accuracy.intervals {' '.join(f'DATA/{seed}' for seed in SEEDS)}", RANDOM, data="intervals"),

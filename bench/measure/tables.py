@@ -43,6 +43,7 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., accuracy.Rows | str]]] = 
     "agreement": (("simulator-independent",), simulator.agreement),
     "window-mistakes": (("window-mistakes",), simulator.window_mistakes),
     "windows": (("windows",), simulator.windows),
+    "calibration-coverage": (("calibration-coverage",), calibration.interval_coverage),
     "cli-errors": (("cli-errors",), simulator.cli_errors),
     "memory": (("memory",), simulator.memory),
     "ablation": (("ablation",), accuracy.ablation),
@@ -122,6 +123,7 @@ SUMMARIES: dict[str, Callable[[dict], dict]] = {
     "crash-ray": robustness.crash_summary,
     "fuzz": robustness.fuzz_summary,
     "calibration": calibration.calibration_summary,
+    "calibration-coverage": calibration.coverage_summary,
     "weight": calibration.weight_summary,
 }
 """Of a part whose results have a row for every case: what its record keeps of them."""
