@@ -226,6 +226,28 @@ def test_markers_that_one_view_sees_count_as_much(reconstructor, press):
     assert off(part, truth) < 1.5 * off(whole, truth) + 0.005
 
 
+def test_a_marker_that_two_views_see_at_one_place_is_kept_whatever_its_neighbours_do(reconstructor):
+    """One dot moves by its spacing, alone: both views see it at one place; one takes it for its neighbour; one alone sees it."""
+    moved, neighbour = 24, 25
+    dots = reconstructor.rest_markers[:49].clone()
+    dots[moved] += torch.tensor([0.6, 0.6, -1.7])
+    pixels = reconstructor.camera.point_to_pixel(dots.repeat(2, 1)).unflatten(0, (2, 49))
+    wrong = pixels.clone()
+    wrong[1, moved] = reconstructor.rest_pixels[1, neighbour]
+    one = torch.ones(2, 49)
+    one[1, moved] = 0
+    for given, confidence, kept in ((pixels, None, [True, True]), (wrong, None, [False, False]), (pixels, one, [False, False])):
+        flow = reconstructor.observer.from_pixels(given, confidence, None)
+        sure = reconstructor.observer.by_view(flow.confidence)[0] > 0.5
+        assert sure[:, moved].tolist() == kept
+        others = torch.arange(49) != moved
+        assert sure[:, others].all()
+        with_three = reconstructor.observer.by_view(
+            reconstructor.observer.from_pixels(pixels.repeat(3, 1, 1, 1), None, None)[1]
+        )
+        assert (with_three > 0.5).all()
+
+
 def test_a_knocked_view_is_found_by_its_own_motion(reconstructor, found, press):
     """The second image is 2 px to the right: that view has moved, the first has not, and the answer stays."""
     left, right = press[1]

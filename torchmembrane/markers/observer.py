@@ -226,6 +226,13 @@ class MarkerObserver(nn.Module):
 
         Arguments and errors as for `Reconstructor.from_pixels`.
         """
+        flow = self.as_given(pixels, confidence, rest_pixels, noise)
+        return flow._replace(confidence=self.screen(flow.displacement, flow.confidence))
+
+    def as_given(
+        self, pixels: Tensor, confidence: Tensor | None, rest_pixels: Tensor | None, noise: float | None
+    ) -> MarkerFlow:
+        """As `from_pixels`, each marker with the confidence that is given."""
         pixels = tensor_of("from_pixels: pixels", pixels).to(self.rest_pixels)
         pixels = pixels[None] if pixels.ndim == 2 else pixels
         if pixels.shape[1:] != self.rest_pixels.shape:
@@ -237,8 +244,7 @@ class MarkerObserver(nn.Module):
         confidence = torch.where(finite, _checked_confidence(confidence, pixels), 0.0)
         displacement = torch.where(finite[..., None], pixels - rest, 0.0)
         status = torch.zeros_like(confidence[:, 0], dtype=torch.long)
-        covariance = self.covariance_of(noise, confidence)
-        return MarkerFlow(displacement, self.screen(displacement, confidence), covariance, status)
+        return MarkerFlow(displacement, confidence, self.covariance_of(noise, confidence), status)
 
     def covariance_of(self, noise: float | None, confidence: Tensor) -> Tensor:
         """Of displacements `[B, D, 2, 2]` px^2 between pixels located elsewhere, now and at rest, each with this standard

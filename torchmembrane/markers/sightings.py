@@ -67,11 +67,10 @@ def sightings(sensor: Sensor, locator: str, dtype: torch.dtype, whole: bool, che
         observers.append(observer)
         pixels.append(torch.from_numpy(of_view.model_pixels))
     regions = [view.region for view in sensor.views if view.region is not None]
-    principal = torch.stack([view.camera.centre.double() for view in sensor.views])
-    together = ViewsObserver(observers, [view.name for view in sensor.views], regions or None, principal)
-    rays = together.with_rays(torch.cat(pixels)[None], together.seen_at_rest.double()[None])[0]
     outside = [view.side == "outside" for view in sensor.views]
     rig = Rig([view.camera for view in sensor.views], [view.pose for view in sensor.views], outside)
+    together = ViewsObserver(observers, [view.name for view in sensor.views], regions or None, rig)
+    rays = together.with_rays(torch.cat(pixels)[None], together.seen_at_rest.double()[None])[0]
     points = SurfacePoints(*(np.concatenate([field] * len(observers)) for field in markers.points))
     repeated = positions.repeat(len(observers), 1)
     levers = None if levers is None else levers.repeat(len(observers), 1)

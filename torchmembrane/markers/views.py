@@ -4,11 +4,13 @@ Of W views of D markers there are `N = W D` sightings: all markers in the first 
 """
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from ..camera.rig import Rig
 from ..control_flow import Value, traced
 from ..errors import MembraneError
 from ..files.tensors import tensor_of
@@ -19,6 +21,10 @@ BY_GRAVITY = (Status.BAD_VALUES, Status.BLANK, Status.TOO_FEW_MARKERS, Status.UN
 """Of views that all fail: the first of these that one of them has is the frame's."""
 
 
+MEETING = 1.0
+"""px by which the point that two views' rays come closest to may miss the marker in both images."""
+
+
 class ViewsObserver(nn.Module):
     """Images of all views to what their markers show; as `MarkerObserver`, of sightings.
 
@@ -26,7 +32,7 @@ class ViewsObserver(nn.Module):
         observers: of the views.
         names: of the views, for messages.
         regions: left, top, width, height of each view in the image that they share; None: each has a channel of its own.
-        principal: `[W, 2]` px, the views' principal points.
+        rig: the views' cameras.
     """
 
     principal: Tensor
@@ -36,12 +42,14 @@ class ViewsObserver(nn.Module):
         observers: Sequence[MarkerObserver],
         names: Sequence[str],
         regions: Sequence[tuple[int, int, int, int]] | None,
-        principal: Tensor,
+        rig: Rig,
     ):
         super().__init__()
         self.each, self.names, self.regions = nn.ModuleList(observers), list(names), regions
         self.count, self.views = len(observers[0].rest_pixels), len(observers)
+        principal = torch.stack([camera.centre.double() for camera in rig.cameras])  # type: ignore[operator]
         self.register_buffer("principal", principal.repeat_interleave(self.count, 0))
+        self.rig = rig
 
     def _joined(self, name: str) -> Tensor:
         return torch.cat([getattr(observer, name) for observer in self.each])
@@ -115,7 +123,10 @@ class ViewsObserver(nn.Module):
         return self._together([observer(*given) for observer, *given in each])
 
     def from_pixels(self, pixels: Any, confidence: Any, rest_pixels: Any, noise: float | None = None) -> MarkerFlow:
-        """What markers located elsewhere show; `pixels [B, W, D, 2]` or `[W, D, 2]`, `confidence` and `rest_pixels` alike."""
+        """What markers located elsewhere show; `pixels [B, W, D, 2]` or `[W, D, 2]`, `confidence` and `rest_pixels` alike.
+
+        A marker keeps its confidence where its neighbours in the view bear it out, or another view that it is the same point.
+        """
         pixels, shape = tensor_of("from_pixels: pixels", pixels), (self.views, self.count, 2)
         pixels = pixels[None] if pixels.ndim == 3 else pixels
         if tuple(pixels.shape[1:]) != shape:
@@ -124,7 +135,13 @@ class ViewsObserver(nn.Module):
         sure = [None] * self.views if confidence is None else tensor_of("from_pixels: confidence", confidence).unbind(-2)
         rests = self._split(None if rest_pixels is None else self.rest_given(rest_pixels), 0)
         each = zip(self.each, pixels.unbind(1), sure, rests, strict=True)
-        return self._together([observer.from_pixels(*given, noise) for observer, *given in each])  # type: ignore[operator]
+        flows = [observer.as_given(*given, noise) for observer, *given in each]  # type: ignore[operator]
+        pairs = zip(self.each, flows, strict=True)
+        screened = torch.cat([observer.screen(flow.displacement, flow.confidence) for observer, flow in pairs], 1)  # type: ignore[operator]
+        flow = self._together(flows)
+        shown = self.with_rays(self.rest_pixels + flow.displacement, flow.confidence)
+        is_met = met_by_another(self.rig, self.by_view(shown), self.by_view(flow.confidence > 0))
+        return flow._replace(confidence=torch.where(self.sighted(is_met), flow.confidence, screened))
 
     @traced
     def judge(self, displacement: Tensor, confidence: Tensor, covariance: Tensor, status: Tensor) -> MarkerFlow:
@@ -184,3 +201,48 @@ class ViewsObserver(nn.Module):
         return MarkerFlow(
             torch.cat(displacement, 1), torch.cat(confidence, 1), torch.cat(covariance, 1), torch.stack(status, 1)
         )
+
+
+def met_by_another(rig: Rig, pixels: Tensor, is_seen: Tensor) -> Tensor:
+    """Which sightings of markers show the same point as another view: their rays meet.
+
+    A marker that is taken for another one rarely passes: its pixel would have to lie beside the other view's epipolar line.
+
+    Args:
+        rig: the W views' cameras.
+        pixels: `[B, W, D, 2]`, with a ray each.
+        is_seen: `[B, W, D]` bool.
+
+    Returns:
+        `[B, W, D]` bool.
+
+    Example:
+        >>> import numpy as np
+        >>> from torchmembrane.camera.model import Camera
+        >>> from torchmembrane.pose import ViewPose
+        >>> camera = Camera("pinhole", (640, 480), (400, 400), (320, 240))
+        >>> rig = Rig([camera, camera], [ViewPose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 20.0)])
+        >>> pixels = torch.tensor([[[[360.0, 240.0], [360.0, 240.0]], [[320.0, 240.0], [320.0, 260.0]]]]).double()
+        >>> met_by_another(rig, pixels, torch.ones(1, 2, 2) > 0)[0].tolist()
+        [[True, False], [True, False]]
+    """
+    views = pixels.shape[1]
+    origins, directions = (value.unflatten(1, (views, -1)) for value in rig.pixel_to_ray(pixels.flatten(1, 2)))
+    is_met = torch.zeros_like(is_seen)
+    for a, b in combinations(range(views), 2):
+        point = _nearest_point(origins[:, a], directions[:, a], origins[:, b], directions[:, b])
+        missed = (rig.point_to_pixel(torch.cat([point] * views, 1)).unflatten(1, (views, -1)) - pixels).norm(dim=-1)
+        is_one = is_seen[:, a] & is_seen[:, b] & (missed[:, a] < MEETING) & (missed[:, b] < MEETING)
+        is_met[:, a] |= is_one
+        is_met[:, b] |= is_one
+    return is_met
+
+
+def _nearest_point(o: Tensor, d: Tensor, p: Tensor, e: Tensor) -> Tensor:
+    """The middle `[..., 3]` between two lines through `o` and `p` along unit vectors `d` and `e`, where they are nearest."""
+    along = (d * e).sum(-1, keepdim=True)
+    from_o, from_p = ((p - o) * d).sum(-1, keepdim=True), ((p - o) * e).sum(-1, keepdim=True)
+    apart = (1 - along**2).clamp_min(torch.finfo(d.dtype).eps)
+    s, t = (from_o - along * from_p) / apart, (along * from_o - from_p) / apart
+    middle: Tensor = (o + s * d + p + t * e) / 2
+    return middle
