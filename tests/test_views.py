@@ -227,7 +227,7 @@ def test_markers_that_one_view_sees_count_as_much(reconstructor, press):
 
 
 def test_a_marker_that_two_views_see_at_one_place_is_kept_whatever_its_neighbours_do(reconstructor):
-    """One dot moves by its spacing, alone: both views see it at one place; one takes it for its neighbour; one alone sees it."""
+    """One dot moves by its spacing, alone: both views see it at one place; one takes it for its neighbour; one sees it."""
     moved, neighbour = 24, 25
     dots = reconstructor.rest_markers[:49].clone()
     dots[moved] += torch.tensor([0.6, 0.6, -1.7])
