@@ -61,14 +61,23 @@ class ViewsFit(NamedTuple):
 
 
 def placed_dots(sensor: Sensor, image: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """The dots found in a rest image, where their rays meet the designed surface: `[D, 3]` and sizes."""
+    """The dots found in a rest image, where their rays meet the designed surface: `[D, 3]` and sizes.
+
+    Raises:
+        MembraneError: fewer than 12.
+    """
+    positions, sizes = _dots_on_surface(sensor, image)
+    if len(positions) < 12:
+        raise MembraneError(f"calibrate: {len(positions)} dots found on the rest surface; expected at least 12")
+    return positions, sizes
+
+
+def _dots_on_surface(sensor: Sensor, image: np.ndarray) -> tuple[np.ndarray, list[str]]:
     mask = rim_mask(sensor, sensor.camera.point_to_pixel(sensor.membrane.rest))
     pattern = find_dots(image, sensor.markers.polarity, mask)
     origin, direction = (ray.numpy() for ray in sensor.camera.pixel_to_ray(torch.from_numpy(pattern.pixels)))
     distance = fine_surface(sensor).ray_points(origin, direction).distance
     met = np.isfinite(distance)
-    if met.sum() < 12:
-        raise MembraneError(f"calibrate: {met.sum()} dots found on the rest surface; expected at least 12")
     positions = origin + distance[:, None] * direction
     return positions[met], ["large" if size else "small" for size in pattern.sizes[met]]
 
@@ -138,16 +147,11 @@ def rest_from_views(
     if sensor.views:
         poses = [station.pose(motion) for station, motion in zip(stations[1:], found.values[:n].reshape(-1, 6), strict=True)]
         moved = with_dots_of_each_view(_placed(moved, poses, images), images)
-    places = [f".{view.name}" for view in sensor.views[1:]] or [f"[{p}]" for p in range(1, len(images))]
-    names = [_name(number, place) for place in places for number in NUMBERS]
+    of_views = [f"{view.name}.{number}" for view in sensor.views[1:] for number in NUMBERS]
+    names = of_views or [f"{number}[{p}]" for p in range(1, len(images)) for number in NUMBERS]
     guess = np.concatenate([[*np.rad2deg(station.rotation), *station.position] for station in stations[1:]])
     found = found.in_degrees(len(images) - 1)
     return ViewsFit(moved, names, guess, found, dots, found.deviations[n:].reshape(-1, 3), change, residuals)
-
-
-def _name(number: str, place: str) -> str:
-    """The name of a pose's number: `turn_x[1]` of an image, `right.turn_x` of a view."""
-    return f"{number}{place}" if place[0] == "[" else f"{place[1:]}.{number}"
 
 
 def _refuse_unknown_scale(travel: float, error: float, unit: str) -> None:
@@ -256,10 +260,11 @@ def with_dots_of_each_view(sensor: Sensor, images: Sequence[np.ndarray]) -> Sens
     Limitations:
         A dot that is found at less than half the pitch from a known one is taken for that one.
     """
-    positions, sizes = np.asarray(sensor.markers.positions), list(sensor.markers.sizes or ())
+    positions = np.asarray(sensor.markers.positions)
+    sizes = list(sensor.markers.sizes or ["small"] * len(positions))
     pitch = np.median(np.asarray(cKDTree(positions).query(positions, k=2)[0])[:, 1])
     for number, (view, image) in enumerate(zip(sensor.views, images, strict=True)):
-        found, their_sizes = placed_dots(sensor.in_view(number), image)
+        found, their_sizes = _dots_on_surface(sensor.in_view(number), image)
         found = view.pose.points(found)
         is_new = np.asarray(cKDTree(positions).query(found)[0]) > 0.5 * pitch
         positions = np.concatenate([positions, found[is_new]])

@@ -146,13 +146,8 @@ def without_rest(inputs: Inputs, arguments: Iterable[str | Path], files: Iterabl
         (['rest.png'], False)
     """
     folders = [Path(argument) for argument in arguments if Path(argument).is_dir()]
-    given = {path for path in map(Path, arguments) if path not in folders}
     known = [path for path in files if path.suffix.lower() in IMAGES and path.is_file()]
-    rest = [
-        path
-        for path in inputs.images
-        if path.parent in folders and path not in given and any(_is_copy(path, image) for image in known)
-    ]
+    rest = [path for path in inputs.images if path.parent in folders and any(_is_copy(path, image) for image in known)]
     images = [path for path in inputs.images if path not in rest]
     return inputs._replace(images=images, rest=rest) if images or inputs.videos else inputs
 

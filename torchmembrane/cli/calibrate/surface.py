@@ -130,8 +130,8 @@ def _from_several_places(arguments: Namespace, sensor: Sensor) -> tuple[list[np.
     Raises:
         MembraneError: another number of images than of motions, no motions of one camera, or motions of several views.
     """
-    paths = single_images(of_first_view(find_inputs(arguments.images), sensor.views_apart))
     if sensor.views:
+        paths = single_images(of_first_view(find_inputs(arguments.images), sensor.views_apart))
         if arguments.motions is not None or len(paths) != 1:
             given = f"{len(paths)} frames{'' if arguments.motions is None else ' and --motions'}"
             raise MembraneError(
@@ -141,7 +141,7 @@ def _from_several_places(arguments: Namespace, sensor: Sensor) -> tuple[list[np.
         return read_view_images(paths[0], sensor), None
     if arguments.motions is None:
         raise MembraneError("calibrate views: no --motions; expected a table of where the camera was for each image")
-    motions = read_motions(arguments.motions)
+    motions, paths = read_motions(arguments.motions), single_images(find_inputs(arguments.images))
     if len(paths) != len(motions):
         raise MembraneError(f"{arguments.motions}: {len(motions)} lines of motions; expected {len(paths)}, one for each image")
     return [read_sensor_image(path, sensor) for path in paths], motions
