@@ -14,7 +14,8 @@ from .alignment import Alignment
 from .deformation import FAR, LocalDeformation
 from .flow import SUPPORT, FlowAverages
 from .native_flow import choices, found_by, is_native
-from .steps import NeighbourSteps, trust
+from .probability import own_evidence
+from .steps import NeighbourSteps
 
 ROUNDS = 2  # in which neighbours agree
 SETTLING = 3  # steps after that
@@ -66,7 +67,7 @@ class DotMatcher(nn.Module):
         self.agreement = NeighbourAgreement(pixels, seen)
         self.deformation = LocalDeformation(pixels)
         self.averages = FlowAverages(pixels, pixels, WIDTH)
-        self.neighbour_steps = NeighbourSteps(pixels)
+        self.neighbour_steps = NeighbourSteps(pixels, seen)
         self.register_buffer("seen", torch.as_tensor(seen))
         self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
         self.register_buffer("pixels", torch.as_tensor(pixels - pixels.mean(0)))
@@ -271,7 +272,8 @@ class DotMatcher(nn.Module):
     @traced
     def doubt(self, weight: Tensor, flow: Tensor, strain: Tensor, known: Tensor, base: Tensor) -> State:
         """Some steps more after those that took another's blob have been let go."""
-        state = weight * trust(*self.neighbour_steps(self.pixels.mT + flow, weight, strain)), flow, strain
+        own = own_evidence(*self.neighbour_steps(self.pixels.mT + flow, weight, strain))
+        state = weight * torch.sigmoid(own), flow, strain
         for _ in range(RESETTLING):
             state = self.settle(*state, known, base)
         return state
