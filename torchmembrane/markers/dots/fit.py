@@ -15,7 +15,7 @@ from .pyramid import LEVELS
 
 RING = 2.5  # widest ring of background around a dot in the fit, pixels of its level
 FINEST = 2.0  # a dot's short half axis on its level of the pyramid is at least this, where it can be
-RIDGE = [1e-3, 100.0, 100.0, 1e-3, 1e-3, 1e-3, 0.3]  # of the fit: background, its slope over the dot, depth, shift, growth
+SLOPE, GROWTH = 100.0, 0.3  # ridges of the fit: of the background's slope over the dot, and of the dot's growth
 
 
 class Outline(NamedTuple):
@@ -105,13 +105,13 @@ class EllipseFit(nn.Module):
         self.register_buffer("fall", torch.as_tensor(2 / sharpness)[:, None])
         self.register_buffer("ring", torch.as_tensor(2 * ring / stride)[:, None])
         self.register_buffer("size", torch.as_tensor(rms_half_axes(shapes) * unit))
-        ridge = np.ones((len(stride), 1, 1)) * np.diag(RIDGE)
-        ridge[:, 1:3, 1:3] = RIDGE[1] * shapes @ shapes.swapaxes(1, 2) / stride[:, None, None] ** 2
+        ridge = np.ones((len(stride), 1, 1)) * np.diag([*6 * [1e-3], GROWTH])
+        ridge[:, 1:3, 1:3] = SLOPE * shapes @ shapes.swapaxes(1, 2) / stride[:, None, None] ** 2
         ridge[:, 4:] /= unit[:, None, None] ** 2
         self.register_buffer("ridge", torch.as_tensor(ridge))
         self.register_buffer("unit_loads", torch.eye(7, dtype=torch.float64)[:, 4:6])
         self.register_buffer("least", torch.tensor(1e-12, dtype=torch.float64))
-        farthest = torch.tensor([[-2.0, -2.0, -1.0], [2.0, 2.0, 1.6]], dtype=torch.float32)
+        farthest = torch.tensor([[-2.0, -2.0, -1.0], [2.0, 2.0, 1.6]])
         self.register_buffer("farthest", farthest[..., None, None])
 
     def _register_levels(self, level: np.ndarray, offset: np.ndarray, sizes: np.ndarray) -> None:

@@ -20,6 +20,7 @@ from .native_flow import KEPT_STEPS
 from .pattern import DotPattern
 from .probability import LEAST, alone, among_neighbours, contrast_evidence, whole_evidence
 from .pyramid import mean_pyramid
+from .scales import REACH
 from .seams import Seams
 
 STEPS = 3  # of the fit
@@ -28,7 +29,8 @@ BLOB, SHARE, NOISE, CONFIDENCE = 1 / 8, 1 / 64, 2.0**-18, 1 / 256
 """Steps of the blobs' centres, px, of shares of one, of the noise, in grey, and of the confidence: nothing finer is known of
 what the fit starts from, and without rounding, which is each runtime's own, it starts alike in all."""
 FAINT_BLOB = 0.4  # strength of a blob, over that of the frame's clearer ones, that is as likely a dot as none
-REACH = 2.5  # pitches: how far a dot is looked for from where it is at rest
+LARGEST_STRAIN = 0.6  # of the outlines from which the fit starts
+SPARE = 1.2, 16  # blobs that are wanted for each dot, and more
 
 
 def membrane_mask(pixels: np.ndarray, anchors: np.ndarray | None, image_size: tuple[int, int]) -> Tensor:
@@ -138,7 +140,7 @@ class DotLocator(nn.Module):
         self.fit = EllipseFit(pixels, shapes, image_size, tolerance)
         inside = membrane_mask(pixels, anchors, image_size)
         radii = np.sqrt(np.abs(np.linalg.det(shapes)))
-        self.detect = BlobDetector(radii, spacing(pixels)[0].min(), int(1.2 * len(pixels)) + 16, inside)
+        self.detect = BlobDetector(radii, spacing(pixels)[0].min(), int(SPARE[0] * len(pixels)) + SPARE[1], inside)
         drawn = mean_pyramid(draw_dots(pixels, shapes, image_size))
         blobs, log_radius, strength = (x[0].numpy() for x in self.detect.double()(drawn))
         blobs, log_radius, strength = (x[strength > 1e-6] for x in (blobs, log_radius, strength))  # the rest fill up the count
@@ -202,7 +204,7 @@ class DotLocator(nn.Module):
         """The dots, by the fit about where the matcher places the dots."""
         levels, rest, shapes = [level_0, level_1, level_2], self.rest, self.shapes
         gradient = self._alike(self.match.gradient(certainty, place - rest, strain).movedim(-1, 1), SHARE)
-        shape = shapes + gradient.clamp(-0.6, 0.6).to(shapes) @ shapes
+        shape = shapes + gradient.clamp(-LARGEST_STRAIN, LARGEST_STRAIN).to(shapes) @ shapes
         noise = self._alike(pixel_noise(level_0.detach()), NOISE)
         fitted = self.fit(levels, place, shape, noise, STEPS)
         dots = FittedDots(*(value.to(rest) for value in fitted))

@@ -23,7 +23,7 @@ SHADE = 0.05
 """Contrast of dirt and shade in any frame."""
 STEP_DEVIATION = 0.12
 """Standard deviation of the steps between neighbours that are found, over their lengths."""
-WRONG_STEP = 0.25
+WRONG_STEP = 0.3
 """Error of a step to a dot that is another's, over its length."""
 LOST = 0.02
 """Share of dots lost where none is known to be."""
@@ -66,7 +66,7 @@ def own_evidence(found: Tensor, error: Tensor) -> Tensor:
 
     Example:
         >>> [round(x, 1) for x in own_evidence(torch.tensor([1.0, 1.0, 0.5]), torch.tensor([0.0, 0.3, 0.3])).tolist()]
-        [4.7, 1.6, -2.4]
+        [5.1, 1.9, -2.0]
     """
     odds = (found + LOST) / (1 - found + LOST)
     density = 0.5 * (WRONG_STEP / STEP_DEVIATION) ** 2

@@ -5,9 +5,9 @@ import torch
 from torch import Tensor, nn
 
 from ..spacing import FADED, faded, spacing, square_distance
+from .scales import PREDICTION
 
 SEAM = 2.0  # width of the neighbourhood in which a seam is looked for, pitches
-CLAIM = 0.35  # a blob so near to a dot is the dot's, pitches
 LEAST = 1e-3
 
 
@@ -40,7 +40,7 @@ class Seams(nn.Module):
         self.register_buffer("total", torch.as_tensor(kernel.sum(0)))
         self.register_buffer("narrowness", torch.as_tensor(-0.5 / (SEAM * mean) ** 2))
         self.register_buffer("origin", torch.as_tensor(pixels.mean(0)))
-        self.register_buffer("claim", torch.as_tensor((CLAIM * nearest) ** 2))
+        self.register_buffer("claim", torch.as_tensor((PREDICTION * nearest) ** 2))
         self.register_buffer("log_radius", torch.as_tensor(log_radius))
 
     def forward(self, pixels: Tensor, sure: Tensor, wrong: Tensor, blobs: Tensor, log_radius: Tensor, valid: Tensor) -> Tensor:
