@@ -7,6 +7,8 @@ import pytest
 import torch
 
 import torchmembrane as tm
+from torchmembrane.calibrate.explained import UNKNOWN, by_shapes
+from torchmembrane.calibrate.presses import STRETCHES, LossProfile
 from torchmembrane.calibrate.rest_error import PressesTold, at_other_height, height_effect
 from torchmembrane.presets.blown_up import Stated, blown_up
 from torchmembrane.sensor.parts import Cavity, Markers
@@ -58,3 +60,13 @@ def test_results_carry_how_surely_the_sensor_s_forces_are_scaled(small_sensor, s
     one, other = plain(image), scaled(image)
     assert torch.equal(one.force, other.force) and one.force.norm() > 0.05
     torch.testing.assert_close(other.force_deviation, torch.hypot(one.force_deviation, 0.2 * one.force))
+
+
+@pytest.mark.parametrize("apart, is_bounded", [(0.05, False), (0.5, True)])
+def test_presses_that_contradict_one_another_tell_no_less_of_the_prestretch_than_none(apart, is_bounded):
+    """Three images, sharp losses, so far apart in the logarithm; without any every prestretch that is tried is as likely."""
+    z, middle = np.log(STRETCHES), np.log(STRETCHES).mean()
+    losses = np.stack([np.abs(z - middle - side * apart / 2) / 2e-3 for side in (-1, 0, 1)], 1)
+    shapes = by_shapes(LossProfile(STRETCHES, losses))
+    assert (shapes.deviation == UNKNOWN) == is_bounded and shapes.deviation <= UNKNOWN
+    assert UNKNOWN == pytest.approx(np.random.default_rng(0).uniform(z[0], z[-1], 10**6).std(), rel=1e-3)

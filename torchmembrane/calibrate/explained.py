@@ -25,6 +25,7 @@ from .rest_error import HeightEffect, PressesTold, StatedHeight, changed_height,
 GRID = (17, 17)  # on finer grids the loss is less smooth in the prestretch
 PRESTRETCH_ERROR = 0.03  # of an estimate, relative: the grid's and the loss's, alike in all images
 PRESTRETCH_ERROR_INFLATED = 0.02  # the same where the rest surface's height is found with it
+UNKNOWN = float(np.log(STRETCHES[-1] / STRETCHES[0])) / 12**0.5  # of the logarithm of a prestretch that may be any of those
 WRONG = 0.02  # probability that an image is explained wrongly altogether and carries no information
 HEIGHT_ROUNDS = 4
 RANGE, NEAR = 3.0, 7  # standard deviations to either side in which the prestretch is looked for again; how many are tried
@@ -84,7 +85,7 @@ def by_shapes(profile: LossProfile, shared_error: float = PRESTRETCH_ERROR) -> B
     mean, by_losses = _log_stretch(profile.stretches, profile.losses)
     variances = own**2 + shared_error**2
     contradiction = ((each - mean) ** 2 / variances).sum() / max(len(each) - 1, 1)
-    deviation = float(np.hypot(by_losses * np.sqrt(max(1.0, contradiction)), shared_error))
+    deviation = min(float(np.hypot(by_losses * np.sqrt(max(1.0, contradiction)), shared_error)), UNKNOWN)
     return ByShapes(mean, deviation, by_losses, each, variances)
 
 
