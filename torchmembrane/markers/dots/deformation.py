@@ -8,7 +8,7 @@ from ...control_flow import fori_loop, traced
 from ..spacing import FADED, neighbours, spacing, square_distance
 from .scales import FAR, NONE
 
-FITS, WIDTH = 6, 0.25  # of the local deformation, and pitches in which a fit looks for blobs
+WIDTHS = (0.35, 0.3, 0.25, 0.2, 0.2, 0.2)  # pitches, of the fits of the local deformation
 NEIGHBOURS = 8  # that are mapped
 BESIDE = 12  # blobs on which they are laid
 AVERAGE = 0.8  # pitches, over which a deformation is averaged
@@ -61,7 +61,7 @@ class LocalDeformation(nn.Module):
         """`blobs [B, K, 2]`, `valid [B, K]` in 0..1 -> gradient `[B, 2, 2, K]`."""
         first, *scene = self.begin(blobs, valid)
         gradient: Tensor
-        (gradient,) = fori_loop(self.refine, FITS, (first,), *scene, valid)
+        (gradient,) = fori_loop(self.refine, [(width,) for width in WIDTHS], (first,), *scene, valid)
         return gradient
 
     @traced
@@ -91,12 +91,12 @@ class LocalDeformation(nn.Module):
 
     @traced
     def refine(
-        self, gradient: Tensor, around: Tensor, away: Tensor, beside: Tensor, nearby: Tensor, valid: Tensor
+        self, gradient: Tensor, around: Tensor, away: Tensor, beside: Tensor, nearby: Tensor, valid: Tensor, width: float
     ) -> tuple[Tensor]:
-        """The gradient after another fit, with blobs believed up to about `WIDTH` pitches off; the rest as of `begin`."""
+        """The gradient after another fit, with blobs believed up to about `width` pitches off; the rest as of `begin`."""
         a, b, c, d = gradient.flatten(1, 2).unbind(1)
         entries = torch.stack([a, b, c, d, a * a + c * c, a * b + c * d, b * b + d * d, torch.ones_like(a)], -1)
-        mapped = (entries * (-0.5 / WIDTH**2) @ self.monomial_map).unflatten(-1, (4, 6)) @ around
+        mapped = (entries * (-0.5 / width**2) @ self.monomial_map).unflatten(-1, (4, 6)) @ around
         target = beside @ torch.exp((away.mT @ mapped).clamp_min(-FADED))
         target = target / (target[:, :, 2:] + NONE)  # weight times position, weight: [B, K, 3, M]
         sums = (target @ around.mT).flatten(-2).mT.unflatten(1, (3, 6))
