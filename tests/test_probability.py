@@ -28,7 +28,7 @@ def judged(found):
     return p.among_neighbours(found, alone.mean(-1, keepdim=True) * share, error)
 
 
-def test_a_dot_is_as_likely_as_none_where_schwarz_finds_both_models_equal():
+def test_a_dot_and_none_are_alike_where_schwarz_finds_them_equal():
     """`n log(variance) + parameters log(n)` of independent pixels, with the dot and without."""
     share = 1 - p.PIXELS ** (-p.PARAMETERS / p.PIXELS)
     explained = torch.tensor([share, 0.3, 0.9], dtype=torch.float64)
@@ -42,7 +42,7 @@ def test_contrasts_are_told_apart_as_two_normal_distributions():
     np.testing.assert_allclose(p.contrast_evidence(torch.tensor(contrast), 0.4), right - wrong, atol=1e-9)
 
 
-def test_a_step_is_told_from_a_wrong_one_as_a_normal_from_a_uniform_distribution_in_the_plane():
+def test_right_steps_are_normal_and_wrong_ones_uniform_in_the_plane():
     error, found = np.linspace(0, 0.5, 6), np.linspace(0, 1, 6)
     right = stats.multivariate_normal(np.zeros(2), p.STEP_DEVIATION**2).logpdf(np.stack([error, 0 * error], -1))
     prior = np.log((found + p.LOST) / (1 - found + p.LOST))
@@ -59,7 +59,7 @@ def test_what_is_seen_clearly_among_its_neighbours_is_believed():
     assert judged(dots()).min() > 0.95
 
 
-def test_a_window_without_a_dot_and_a_faint_one_are_not_believed_and_cost_no_other():
+def test_no_dot_and_a_faint_one_are_not_believed_and_cost_no_other():
     for name, value in dict(explained=0.3, contrast=0.2).items():
         found = dots()
         getattr(found, name)[0, 14] = value
@@ -72,7 +72,7 @@ def test_dots_as_clear_in_a_fainter_image_are_believed_as_much():
     assert float((clear - faint).abs().max()) < 0.02
 
 
-def test_nothing_is_believed_where_most_of_a_frame_is_lost_and_the_rest_out_of_line():
+def test_nothing_is_believed_where_most_is_lost_and_the_rest_astray():
     found = dots()
     found.explained[0, 3:] = 0.1
     found.centre[0, :3, 0] += torch.tensor([0.0, 5.0, -5.0])
@@ -93,7 +93,7 @@ def test_a_tear_is_told_as_an_exponential_distribution_from_a_uniform_one():
 
 
 @pytest.mark.parametrize("lost, left, torn", [(True, True, True), (True, False, False), (False, True, False)])
-def test_a_seam_is_where_dots_are_lost_and_blobs_left_over_and_steps_are_wrong(lost, left, torn):
+def test_a_seam_has_lost_dots_and_blobs_left_over_and_wrong_steps(lost, left, torn):
     seams, centre = Seams(REST, np.zeros(len(REST)), 0.45), torch.tensor(REST)[None]
     wrong, sure = torch.full((1, len(REST)), 0.3, dtype=torch.float64), torch.ones(1, len(REST), dtype=torch.float64)
     sure[0, 14] = 1.0 - lost
